@@ -1,4 +1,4 @@
-"""What commands draw on a terminal: a block of lines that redraws in place, and a progress bar. Shell (a terminal)."""
+"""Live output of commands: a block of lines that redraws in place, and a progress bar. Shell (a terminal)."""
 
 import sys
 import time
@@ -12,32 +12,40 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
+from sightline.operator_side.table import colored, uses_color
+
 _REFRESH_S: Final = 0.2
 _PLAIN_S: Final = 1.0
 
 
 class LiveBlock:
-    """`with LiveBlock() as live: live.show(lines)`; without a terminal it prints the lines once a second.
+    """Shows lines in place: `with LiveBlock() as live: live.show(lines)`. Without one, prints them once a second.
 
-    Args: is_progress: on stderr, since stdout is for the result; gone at the end, and one line without a terminal.
+    Args:
+        is_progress: write to stderr, since stdout is for the result; remove the block at the end, and print one line
+            each time without a terminal.
     """
 
     def __init__(self, is_progress: bool = False) -> None:
         console = Console(stderr=is_progress)
+        self._stream = sys.stderr if is_progress else sys.stdout
         self._is_progress, self._due_s = is_progress, 0.0
         self._live = Live(console=console, auto_refresh=False, transient=is_progress) if console.is_terminal else None
 
     def show(self, lines: Sequence[str]) -> None:
-        """Show the newest lines; a caller may call it as often as it likes."""
+        """Show the newest lines; more frequent calls are skipped."""
         if time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + (_PLAIN_S if self._live is None else _REFRESH_S)
         if self._live is not None:
-            self._live.update(Text("\n".join(lines), no_wrap=True, overflow="ellipsis"), refresh=True)
+            self._live.update(self._text("\n".join(lines)), refresh=True)
         elif self._is_progress:
             print("  ".join(lines), file=sys.stderr, flush=True)
         else:
             print("\n".join(lines) + "\n", flush=True)
+
+    def _text(self, block: str) -> Text:
+        return Text.from_ansi(colored(block) if uses_color(self._stream) else block, no_wrap=True, overflow="ellipsis")
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -53,7 +61,7 @@ class LiveBlock:
 
 @contextmanager
 def progress_bar(total: int, what: str = "runs") -> Iterator[Callable[..., None]]:
-    """A bar on stderr, gone when it is full; silent where stderr is not a terminal. Gives `advance(steps=1)`."""
+    """Show a bar on stderr while the block runs, if stderr is a terminal. Returns `advance(steps=1)`."""
     console = Console(stderr=True)
     columns = (TextColumn(what), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:

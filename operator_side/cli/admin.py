@@ -1,10 +1,10 @@
-"""Commands that set up a machine: keys, install, doctor. Shell."""
+"""Commands that set up a machine: use, keys, install, doctor. Shell."""
 
 import getpass
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -12,32 +12,108 @@ from typing import Annotated
 
 import typer
 
-from sightline.operator_side.cli.options import print_result
+from sightline.operator_side.cli.options import CameraKind, CameraSets, Json, Secure, command_group, print_result
+from sightline.operator_side.client.pictures import viewer_role
+from sightline.operator_side.client.requests import Operator
+from sightline.operator_side.config import context as contexts
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.doctor.finding import Finding, as_object
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.setup import install as units
-from sightline.protocol.transports.open import check_endpoint
+from sightline.operator_side.table import print_table
+from sightline.protocol.channels import check_robot_id
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.open import check_endpoint, open_link
 from sightline.robot_side.config import RobotConfig
+
+ANSWER_S = 5.0
+"""Longest time in which the address of `sightline use` must answer."""
 
 Hosts = Annotated[
     list[str] | None,
-    typer.Option("--host", metavar="NAME", help="Name or address at which machines reach each other; repeatable."),
+    typer.Option("--host", metavar="NAME", help="Name or address of a listening machine; repeatable."),
 ]
-Days = Annotated[int, typer.Option(min=1, max=825, help="How long they are valid.")]
+Days = Annotated[int, typer.Option(min=1, max=825, help="Days that the certificates are valid.")]
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of keys.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
-    group = typer.Typer(help="Make and look at the certificates that --secure uses.", no_args_is_help=False,
-                        rich_markup_mode=None)
+    app.command(epilog="Example: sightline use tcp/192.168.1.20:7447 --robot r1")(use)
+    group = command_group("Create or show certificates for secure links")
     group.command(epilog="Example: sightline keys init keys --host robot.local --host 192.168.1.20")(init)
     group.command(epilog="Example: sightline keys add keys robot --host 10.0.0.7")(add)
     group.command(epilog="Example: sightline keys show keys")(show)
     app.add_typer(group, name="keys")
     app.command(epilog="Example: sightline install robot --config robot.toml --user pi")(install)
     app.command(epilog="Example: sightline doctor --peer tcp/192.168.1.20:7447")(doctor)
+
+
+def use(
+    address: Annotated[
+        str | None, typer.Argument(metavar="ADDRESS", help="Address of the robot or router, e.g. tcp/ROBOT:7447.")
+    ] = None,
+    robot: Annotated[str, typer.Option("--robot", metavar="ID", help="Robot id.")] = contexts.DEFAULT_ROBOT,
+    *,
+    secure: Secure = "",
+    clear: Annotated[bool, typer.Option("--clear", help="Forget the saved address.")] = False,
+    no_check: Annotated[bool, typer.Option("--no-check", help="Save it even if it does not answer.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Save, show or clear the default robot address
+
+    Client commands use --connect, else SIGHTLINE_CONNECT, else this address. Services ignore it.
+    """
+    path = contexts.context_path(os.environ)
+    if path is None:
+        raise ConfigError("this user has no home folder; set XDG_CONFIG_HOME to a folder that you may write")
+    if clear:
+        if address is not None:
+            raise ConfigError(f"--clear and address '{address}' exclude each other; remove one")
+        removed = contexts.clear_context(path)
+        _print_use({"cleared": removed}, "saved address cleared" if removed else "no saved address", as_json)
+        return
+    if address is None:
+        _show_target(as_json)
+        return
+    check_endpoint(address)
+    context = contexts.Context(address, check_robot_id(robot), _folder(secure))
+    note = "" if no_check else _answer(context)
+    contexts.write_context(path, context)
+    saved = f"saved robot {robot} at {address} to {contexts.shown(path)}{note}"
+    _print_use({"connect": address, "robot": robot, "secure": context.secure, "file": str(path)}, saved, as_json)
+
+
+def _show_target(as_json: bool) -> None:
+    target = contexts.find_address(os.environ, None, None)
+    keys = f", keys {target.secure}" if target.secure else ""
+    shown = {"connect": ",".join(target.connect), "robot": target.robot, "secure": target.secure,
+             "origin": target.origin}
+    _print_use(shown, f"{target}{keys}", as_json)
+
+
+def _print_use(values: Mapping[str, object], line: str, as_json: bool) -> None:
+    typer.echo(json.dumps(values) if as_json else line)
+
+
+def _folder(secure: str) -> str:
+    """Return the absolute path, since a command may start in another folder."""
+    return str(Path(secure).expanduser().absolute()) if secure else ""
+
+
+def _answer(context: contexts.Context) -> str:
+    """Connect to the address. Returns a note if its robot is silent. Raises LinkError if nothing answers."""
+    role = viewer_role(context.secure)
+    try:
+        with open_link(
+            context.robot, connect=[context.connect], role=role, secure=context.secure, timeout_s=ANSWER_S
+        ) as link:
+            Operator(link).wait_report()
+    except LinkError as error:
+        if not str(error).startswith("no status"):
+            raise LinkError(f"{error}; or save the address with --no-check") from None
+        return f"; note: {error}"
+    return ""
 
 
 def _keys() -> ModuleType:
@@ -49,106 +125,110 @@ def _keys() -> ModuleType:
 
 
 def init(folder: Folder, host: Hosts = None, days: Days = 825) -> None:
-    """Make a private authority and certificates for robot, vision, operator, detector and viewer."""
+    """Create an authority and the certificates of all roles
+
+    The roles are robot, vision, operator, detector and viewer.
+    """
     made = _keys()
     for file in made.make(folder, host or [], days):
-        print(f"made {file}")
-    print("copy ca.pem and the files of its role to each machine, every *.token to a robot that listens on wss://, and "
-          f"ca.key to none; then: --secure {folder}")
+        print(f"wrote {file}")
+    print("copy ca.pem and the files of its role to each machine, and every *.token to a robot that listens on wss://; "
+          f"copy ca.key to no machine; then use --secure {folder}")
 
 
 def add(
     folder: Folder,
-    role: Annotated[str, typer.Argument(help="robot, vision, operator, detector or viewer.")],
+    role: Annotated[str, typer.Argument(metavar="ROLE", help="robot, vision, operator, detector or viewer.")],
     host: Hosts = None,
     days: Days = 825,
 ) -> None:
-    """Make the certificate of one role anew, e.g. for other addresses."""
+    """Create the certificate of one role again
+
+    Use it for other addresses or after expiry.
+    """
     made = _keys()
     for file in made.add(folder, role, host or [], days):
-        print(f"made {file}")
+        print(f"wrote {file}")
 
 
-def show(folder: Folder, as_json: Annotated[bool, typer.Option("--json", help="For scripts.")] = False) -> None:
-    """Say of each certificate whose it is, for which hosts, and until when."""
+def show(folder: Folder, as_json: Json = False) -> None:
+    """Show role, hosts and expiry of each certificate"""
     made = _keys()
     found = made.look(folder)
     if as_json:
         print(json.dumps([{"file": str(one.file), "role": one.role, "hosts": one.hosts,
                            "ends": one.ends.isoformat()} for one in found]))
         return
-    for one in found:
-        print(f"{one.file.name:14} {one.role:20} until {one.ends:%Y-%m-%d}  {', '.join(one.hosts)}")
+    print_table((one.file.name, one.role, f"until {one.ends:%Y-%m-%d}", ", ".join(one.hosts)) for one in found)
 
 
-# `sightline install robot|vision`: shows the systemd unit, and puts it in place with --yes. Shell.
+# --- `install` ---------------------------------------------------------------------------------------------------
 
 
 def install(
-    service: Annotated[str, typer.Argument(metavar="robot|vision", help="Which service.")],
+    service: Annotated[str, typer.Argument(metavar="robot|vision", help="Service to install.")],
     config: Annotated[
         Path | None,
         typer.Option("--config", metavar="FILE", help="Its configuration [default: /etc/sightline/SERVICE.toml]."),
     ] = None,
-    user: Annotated[str, typer.Option(help="Who runs it [default: you, by sudo too].")] = "",
-    yes: Annotated[bool, typer.Option("--yes", help="Write it and begin, now and whenever the machine does.")] = False,
+    user: Annotated[str, typer.Option(help="Account of the service [default: yours, under sudo too].")] = "",
+    yes: Annotated[bool, typer.Option("--yes", help="Write the unit, start it, and enable it at boot.")] = False,
 ) -> None:
-    """Run a service for good, by systemd; where a robot's drive is `gpio`, also what puts its pins low after every end.
+    """Install a service under systemd
 
-    Without --yes it only shows what it would do.
+    Without --yes it only prints the files. For a `gpio` drive, a second file sets the pins low at each end.
     """
     program = Path(sys.executable).with_name("sightline")
-    file = (config or Path(f"/etc/sightline/{service}.toml")).expanduser().absolute()  # systemd begins elsewhere
+    file = (config or Path(f"/etc/sightline/{service}.toml")).expanduser().absolute()  # systemd changes the folder
     runs_it = user or os.environ.get("SUDO_USER") or getpass.getuser()
     planned = units.plan(service, program, file, runs_it, units.UNIT_DIR)
     if not yes:
         _show(planned, _beside(service, program, file) if file.exists() else None)
         if service == "robot" and not file.exists():
-            typer.echo(f"{file} is not there yet; if its drive is gpio, a second file puts the pins low", err=True)
+            typer.echo(f"{file} does not exist yet; with a gpio drive in it, a second file sets the pins low", err=True)
         return
-    beside = _beside(service, program, file)  # a service that cannot begin is not installed
+    beside = _beside(service, program, file)  # a service that cannot start is not installed
     stale = units.drop_in_path(planned.path.parent)
     if service == "robot" and beside is None and units.take_away(stale):
-        typer.echo(f"{stale} is gone: this robot's drive is not gpio")
+        typer.echo(f"removed {stale}: the drive of this robot is not gpio")
     units.write(planned, beside)
     if beside is not None:
-        typer.echo(f"{beside.path} is in place: the pins go low first whenever the robot ends")
-    typer.echo(f"{planned.path} is in place and runs; look at it with: systemctl status {planned.path.stem}")
+        typer.echo(f"wrote {beside.path}: the pins are set low first whenever the robot ends")
+    typer.echo(f"wrote and started {planned.path}; check it with: systemctl status {planned.path.stem}")
 
 
 def _beside(service: str, program: Path, file: Path) -> units.InstallPlan | None:
-    """Raises ConfigError where the service could not begin with this file."""
+    """Plan the second file. Raises ConfigError if the service cannot start with this configuration."""
     loaded = load_service(service, file=str(file), environ={}).config
     return units.drop_in(loaded, program, file, units.UNIT_DIR) if isinstance(loaded, RobotConfig) else None
 
 
 def _show(planned: units.InstallPlan, beside: units.InstallPlan | None) -> None:
     typer.echo(planned.text, nl=False)
-    typer.echo(f"nothing is written; with --yes: this goes to {planned.path} and begins", err=True)
+    typer.echo(f"nothing written; --yes writes this to {planned.path} and starts it", err=True)
     if beside is not None:
         typer.echo(f"\n{beside.text}", nl=False)
-        typer.echo(f"and this to {beside.path}: the pins go low first", err=True)
+        typer.echo(f"and this to {beside.path}, which sets the pins low first", err=True)
 
 
-# `sightline doctor`: what is wrong here, or on the way to a robot, and the line that mends it. Shell.
+# --- `doctor` ----------------------------------------------------------------------------------------------------
 
 
 def doctor(
     *,
-    robot: Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")] = "r1",
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Robot id.")] = contexts.DEFAULT_ROBOT,
     peer: Annotated[
-        str | None, typer.Option("--peer", metavar="ENDPOINT", help="Also look at the way to this robot or router.")
+        str | None, typer.Option("--peer", metavar="ENDPOINT", help="Also check the link to this robot or router.")
     ] = None,
-    camera: Annotated[
-        str | None, typer.Option("--camera", metavar="KIND", help="Also look at a camera of this machine, e.g. v4l2.")
-    ] = None,
-    camera_sets: Annotated[
-        list[str] | None, typer.Option("--camera-set", metavar="KEY=VALUE", help="An option of it, e.g. fps=15.")
-    ] = None,
-    secure: Annotated[str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`.")] = "",
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    camera: CameraKind = None,
+    camera_sets: CameraSets = None,
+    secure: Secure = "",
+    as_json: Json = False,
 ) -> int:
-    """Look for what commonly goes wrong, and say the exact line that mends it. Exit code 5 if something is wrong."""
+    """Find common problems and print how to fix them
+
+    It checks this machine, and with --peer the link to a robot. Exit code 5 means that it found a problem.
+    """
     if peer is not None:
         check_endpoint(peer)
     found: list[Finding] = []
@@ -157,7 +237,7 @@ def doctor(
         if not as_json:
             typer.echo(finding.line)
     bad = sum(one.ok is False for one in found)
-    last = f"{bad} of {len(found)} need mending" if bad else "nothing wrong found"
+    last = f"{bad or 'no'} problem{'s' if bad > 1 else ''} in {len(found)} checks"
     return print_result(as_object(found), [last], as_json)
 
 

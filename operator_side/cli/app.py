@@ -1,7 +1,8 @@
-"""The `sightline` command: registers the command groups and turns every error into one line and an exit code. Shell.
+"""The `sightline` command: finds the module of a subcommand, and turns every error into one line and an exit code.
+Shell.
 
-Whatever goes wrong is one line on stderr that says what, where and how to fix it, and the exit code of the design:
-0 ok, 2 bad usage or configuration, 3 hardware, 4 cannot connect, 5 a check failed.
+The help of the program comes from the table below, so that it imports no command. A command's module is imported when
+the command is used.
 """
 
 import os
@@ -10,33 +11,74 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
-from typing import Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import typer
 from typer.core import TyperGroup
 
-from sightline.operator_side.config.errors import no_such_name
 from sightline.protocol.errors import SightlineError
 from sightline.protocol.log import error_line
 
 INTERRUPTED: Final = 130
 UNEXPECTED: Final = 1
-_MODULES: Final = {
-    "sim": "services", "robot": "services", "vision": "services", "router": "services",
-    "demo": "evaluate",
-    "robots": "operate", "status": "operate", "arm": "operate", "disarm": "operate", "stop": "operate",
-    "reset": "operate",
-    "faults": "evaluate",
-    "install": "admin", "doctor": "admin",
-    "metrics": "services",
-    "teleop": "operate", "mission": "operate", "goto": "operate",
-    "scenarios": "services", "labels": "services",
-    "watch": "watch", "capture": "watch", "pick-color": "calibrate",
-    "train": "evaluate", "score": "evaluate", "bench": "bench",
-    "calibrate": "calibrate", "keys": "admin", "config": "services",
-    "conform": "conform", "detector": "detector",
+USAGE: Final = 2
+
+EXIT_CODES: Final = {
+    0: "success",
+    UNEXPECTED: "unexpected error; please report it",
+    USAGE: "invalid usage or configuration",
+    3: "a device or the simulation cannot be used",
+    4: "no connection, or no answer",
+    5: "a check failed, or the robot rejected the request",
+    INTERRUPTED: "interrupted by Ctrl-C",
 }
-"""Each command, in the order of the help, and the module beside this one that registers it."""
+"""Each exit code of every command."""
+
+
+class Entry(NamedTuple):
+    """A command in the program's help: its heading, the module in this folder that registers it, its summary."""
+
+    heading: str
+    module: str
+    summary: str
+
+
+COMMANDS: Final = {
+    "demo": Entry("Run", "evaluate", "Simulate, drive, score and film a run on this machine"),
+    "sim": Entry("Run", "services", "Simulate a robot's hardware"),
+    "robot": Entry("Run", "services", "Run a robot: motors, camera and link"),
+    "vision": Entry("Run", "services", "Run a vision service that steers a robot"),
+    "router": Entry("Run", "services", "Run a router to which all machines of a site connect"),
+    "scenarios": Entry("Run", "services", "List scenarios, or write the configuration of one"),
+    "arm": Entry("Drive", "operate", "Arm a robot so that it may move"),
+    "disarm": Entry("Drive", "operate", "Stop the wheels and disarm a robot"),
+    "stop": Entry("Drive", "operate", "STOP a robot and latch the stop until reset"),
+    "reset": Entry("Drive", "operate", "Clear a latched STOP or a drive fault"),
+    "teleop": Entry("Drive", "operate", "Drive a robot with the keyboard or a gamepad"),
+    "mission": Entry("Drive", "operate", "Show or start a robot's mission"),
+    "goto": Entry("Drive", "operate", "Send a robot to one or more waypoints"),
+    "robots": Entry("Observe", "operate", "List robots and the services connected to them"),
+    "status": Entry("Observe", "operate", "Show a robot's state and its reason"),
+    "watch": Entry("Observe", "watch", "Show a robot's images or messages live"),
+    "capture": Entry("Observe", "watch", "Save an image or a video from a robot"),
+    "metrics": Entry("Observe", "services", "Serve a robot's status to Prometheus"),
+    "use": Entry("Set up", "admin", "Save, show or clear the default robot address"),
+    "config": Entry("Set up", "services", "Check or show a service's configuration"),
+    "keys": Entry("Set up", "admin", "Create or show certificates for secure links"),
+    "install": Entry("Set up", "admin", "Install a service under systemd"),
+    "doctor": Entry("Set up", "admin", "Find common problems and print how to fix them"),
+    "calibrate": Entry("Set up", "calibrate", "Measure a robot's camera or drive"),
+    "pick-color": Entry("Set up", "calibrate", "Pick the target's color in an image"),
+    "score": Entry("Evaluate", "evaluate", "Score missions over many starts in virtual time"),
+    "faults": Entry("Evaluate", "evaluate", "Inject faults into real processes and check each stop"),
+    "bench": Entry("Evaluate", "bench", "Measure performance on this machine"),
+    "conform": Entry("Develop", "conform", "Test a robot, vision service or codec against the protocol"),
+    "detector": Entry("Develop", "detector", "List, check or serve detectors"),
+    "labels": Entry("Develop", "services", "Publish the simulation's labels in place of a detector"),
+    "train": Entry("Develop", "evaluate", "Train the learned detector"),
+}
+"""Each command, in the order of the help."""
+
 _UNKNOWN_COMMAND = re.compile(r"No such command '([^']*)'")
 
 
@@ -44,13 +86,13 @@ class _Commands(Mapping[str, Any]):
     """The commands by name; a module is imported when one of its commands is looked up."""
 
     def __getitem__(self, name: str) -> Any:
-        return _registered(_MODULES[name])[name]
+        return _registered(COMMANDS[name].module)[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(_MODULES)
+        return iter(COMMANDS)
 
     def __len__(self) -> int:
-        return len(_MODULES)
+        return len(COMMANDS)
 
 
 @cache
@@ -64,20 +106,45 @@ class _Program(TyperGroup):
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings | {"commands": _Commands()})
 
+    def format_commands(self, _ctx: Any, formatter: Any) -> None:
+        width = max(map(len, COMMANDS))
+        for heading in dict.fromkeys(entry.heading for entry in COMMANDS.values()):
+            with formatter.section(heading):
+                formatter.write_dl([(f"{name:{width}}", entry.summary) for name, entry in COMMANDS.items()
+                                    if entry.heading == heading])
+        with formatter.section("Exit codes"):
+            formatter.write_dl([(f"{code:<{width}}", meaning) for code, meaning in EXIT_CODES.items()])
+
 
 app = typer.Typer(
     name="sightline",
     cls=_Program,
-    help="Let a small robot use eyes and judgement that live on another machine, and never obey old sight.\n\n"
-    "Begin with: sightline demo",
-    add_completion=False,
+    help="Steer a small robot from a bigger computer over Wi-Fi\n\n"
+    "The robot ignores commands that answer an old image, and stops. Start with the simulated robot; it needs no "
+    "hardware.\n\n"
+    "Example: sightline demo",
+    epilog="`sightline COMMAND --help` describes a command.",
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
 
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"sightline {version('sightline-robot')}")
+        raise typer.Exit
+
+
 @app.callback(invoke_without_command=True)
-def _help_by_default(context: typer.Context) -> None:
+def _help_by_default(
+    context: typer.Context,
+    _version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Show the version and exit.")
+    ] = False,
+) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
@@ -91,7 +158,7 @@ def run(arguments: Sequence[str]) -> int:
         return _print_error(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return INTERRUPTED
-    except BrokenPipeError:  # `sightline status --watch | head`: whoever read has gone, and knows
+    except BrokenPipeError:  # `sightline status --watch | head`: the reader has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return UNEXPECTED
     except Exception as error:
@@ -99,11 +166,11 @@ def run(arguments: Sequence[str]) -> int:
 
 
 def _unexpected(error: Exception) -> int:
-    """A usage error of the command line, or a fault of the program; either way one line."""
+    """Print a usage error of the command line, or a fault of the program, as one line."""
     usage = getattr(error, "format_message", None)
     if usage is not None:
         line = _usage_line(" ".join(usage().split()), getattr(error, "ctx", None))
-        return _print_error(line, getattr(error, "exit_code", 2))
+        return _print_error(line, getattr(error, "exit_code", USAGE))
     if os.environ.get("SIGHTLINE_DEBUG") == "1":
         raise error
     where = f"{type(error).__name__}: {' '.join(str(error).split())}"
@@ -111,14 +178,16 @@ def _unexpected(error: Exception) -> int:
 
 
 def _usage_line(text: str, context: typer.Context | None) -> str:
-    """A usage error with the nearest command of the same group, where it is about one."""
+    """Add the nearest command of the same group to a usage error that is about a command."""
     unknown = _UNKNOWN_COMMAND.match(text)
-    if unknown is None:
-        return f"{text.rstrip('.')}; see --help"
     path = context.command_path if context else "sightline"
-    here = list(getattr(context and context.command, "commands", _MODULES))
-    if path != "sightline" and unknown[1] in _MODULES:
-        return f"no command called {unknown[1]!r} in {path}; did you mean 'sightline {unknown[1]}'?; see {path} --help"
+    if unknown is None:
+        return f"{text.rstrip('.')}; see {path} --help"
+    from sightline.operator_side.config.errors import no_such_name
+
+    here = list(getattr(context and context.command, "commands", COMMANDS))
+    if path != "sightline" and unknown[1] in COMMANDS:
+        return f"unknown command {unknown[1]!r} in {path}; did you mean 'sightline {unknown[1]}'?; see {path} --help"
     return no_such_name("command", unknown[1], here) + f"; see {path} --help"
 
 
@@ -128,7 +197,7 @@ def _print_error(line: str, code: int) -> int:
 
 
 def main() -> None:
-    """Entry point of the `sightline` command."""
+    """Run the command of this process and exit with its code."""
     sys.exit(run(sys.argv[1:]))
 
 

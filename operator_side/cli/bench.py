@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from sightline.operator_side.cli.options import Json, numbers, print_result
+from sightline.operator_side.cli.options import Json, command_group, numbers, print_result
 from sightline.operator_side.preflight import needs
+from sightline.operator_side.table import table_lines
 from sightline.protocol.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -22,12 +23,12 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
-    group = typer.Typer(help="Measure what things cost on this machine.", rich_markup_mode=None)
+    group = command_group("Measure performance on this machine")
     group.command(epilog="Example: sightline bench codec --json")(codec)
     group.command(epilog="Example: sightline bench gate")(gate)
     group.command(epilog="Example: sightline bench pipeline")(pipeline)
     group.command(epilog="Example: sightline bench demo --scenario circle --seeds 201,202,203")(demo)
-    group.command(epilog="Example: sightline bench loop --detector-delay-ms 80 --seconds 20 --out runs/loop")(loop)
+    group.command(epilog="Example: sightline bench loop --detector-delay-ms 80 --out runs/loop")(loop)
     group.command(epilog="Example: sightline bench watchers --viewers 10 --seconds 20")(watchers)
     group.command(epilog="Example: sightline bench network --only radio --seeds 1,2,3,4,5 --seconds 60")(network)
     group.command(epilog="Example: sightline bench detector oip+http://127.0.0.1:8000/ball_jpeg")(detector)
@@ -36,14 +37,14 @@ def register(app: typer.Typer) -> None:
 
 
 def codec(*, as_json: Json = False) -> int:
-    """Encode and decode a frame header and a twist."""
+    """Measure encoding and decoding of frame header and twist"""
     from sightline.benchmarks.costs import measure_codec
 
     return _print_checks(measure_codec(), as_json)
 
 
 def gate(*, as_json: Json = False) -> int:
-    """Judge one command and decide one step, as the driver does."""
+    """Measure the gate: one command and one step"""
     from sightline.benchmarks.costs import GATE_BOUND_US, measure_gate
     from sightline.evaluation.checks import at_most
 
@@ -51,7 +52,10 @@ def gate(*, as_json: Json = False) -> int:
 
 
 def pipeline(*, as_json: Json = False) -> int:
-    """Picture in, command out: decode, detect, track, steer. And the learned detector's network."""
+    """Measure the pipeline from image to command
+
+    The steps are decode, detect, track and steer. It also measures the network of the learned detector.
+    """
     with needs("vision"):
         from sightline.benchmarks.pipeline import LEARNED_BOUND_US, time_learned, time_steps
     from sightline.evaluation.checks import Check, at_most
@@ -72,20 +76,20 @@ def pipeline(*, as_json: Json = False) -> int:
         f"from JPEG to boxes {learned.whole_us:.0f}, decode {learned.decode_us:.0f}; {learned.engine})",
         learned.network_us, "us", LEARNED_BOUND_US,
     ))
-    checks.append(at_most("pictures in which onnx finds no ball", learned.missed, "", 0))
+    checks.append(at_most("images in which onnx finds no ball", learned.missed, "", 0))
     return _print_checks(checks, as_json)
 
 
 def demo(
     *,
     scenario: Annotated[str, typer.Option(help="`all`, or names separated by commas.")] = "all",
-    seeds: Annotated[str, typer.Option(help="Separated by commas.")] = "201,202,203",
+    seeds: Annotated[str, typer.Option(help="Seeds, separated by commas.")] = "201,202,203",
     seconds: Annotated[
-        float | None, typer.Option(min=5, max=3600, help="Of each demo [default: 20, or what the course takes].")
+        float | None, typer.Option(min=5, max=3600, help="Length of each demo [default: 20, or of the course].")
     ] = None,
     as_json: Json = False,
 ) -> int:
-    """Many demos in real time; the median over seeds is judged."""
+    """Run many demos in real time and score their median"""
     with needs("all"):
         from sightline.benchmarks.real_time import Kinds, measure_demos
         from sightline.evaluation.checks import number
@@ -97,8 +101,10 @@ def demo(
     wanted, kinds = numbers("--seeds", seeds, int), Kinds(AT_LEAST, EXACT)
     figures = measure_demos(names, wanted, seconds, kinds, lambda line: typer.echo(line, err=True))
     checks = [{**asdict(figure), "value": figure.worst} for figure in figures]
-    lines = [f"{one.name:44} median {number(one.median)}  worst {number(one.worst)} {one.unit}"
-             f"  bound {number(one.bound)}  {'ok' if one.ok else 'FAIL'}" for one in figures]
+    lines = table_lines(
+        (one.name, f"median {number(one.median)}", f"worst {number(one.worst)} {one.unit}",
+         f"bound {number(one.bound)}", "ok" if one.ok else "FAIL") for one in figures
+    )
     return print_result({"ok": all(figure.ok for figure in figures), "checks": checks}, lines, as_json)
 
 
@@ -108,38 +114,41 @@ def _print_checks(checks: "Sequence[Check]", as_json: bool) -> int:
     return print_result(to_dict(checks), check_lines(checks), as_json)
 
 
-# `sightline bench loop` and `bench watchers`: is the whole loop fresh, and does it stay so? Shell.
+# --- `bench loop` and `bench watchers` ---------------------------------------------------------------------------
 
 
 _ALONE = (
-    "Peers see as the older write-ups do. With `+our eyes` they have Sightline's pipeline instead: what their "
-    "transport alone costs, without credit, age or a gate; shown, not judged."
+    "Peers detect as the legacy programs do. With `{}` they use Sightline's pipeline, which shows the cost of their "
+    "transport alone, without credit, age or a gate; it is not scored."
 )
 Transport = Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")]
 
 
 def loop(
     *,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Of the pictures, in pixels.")] = "640x480",
-    fps: Annotated[float, typer.Option(help="Pictures a second, 1 to 240.")] = 30.0,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of the images, in pixels.")] = "640x480",
+    fps: Annotated[float, typer.Option(help="Images per second, 1 to 240.")] = 30.0,
     transport: Transport = "zenoh",
-    detector_delay_ms: Annotated[float, typer.Option(help="Make every detector this much slower, 0 to 300.")] = 0.0,
+    detector_delay_ms: Annotated[float, typer.Option(help="Delay of every detector, 0 to 300.")] = 0.0,
     overload: Annotated[
-        float, typer.Option(help="So many times more pictures than can be detected, e.g. 2; sets rate or detector.")
+        float, typer.Option(help="Images per detection, e.g. 2 for overload; sets rate or detector.")
     ] = 0.0,
-    seconds: Annotated[float, typer.Option(help="Of each contestant, 2 to 600.")] = 10.0,
+    seconds: Annotated[float, typer.Option(help="Length for each contestant, 2 to 600.")] = 10.0,
     peers: Annotated[str, typer.Option(help="all, none, or of older, lekiwi, openpi, callback.")] = "all",
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Leave loop.json and loop.png here.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write loop.json and loop.png here.")] = None,
     as_json: Json = False,
 ) -> int:
-    """Capture to the driver's verdict, beside the in-process floor, bare TCP and what others build."""
+    """Compare the time from capture to the driver with others
+
+    The others are the in-process minimum, bare TCP and the designs of other projects.
+    """
     with needs("bench"):
         from sightline.benchmarks.loop.figures import LoopSetting, peers_of, size_of
         from sightline.benchmarks.loop.race import run_race
         from sightline.evaluation.checks import check_lines
 
         if peers != "none":
-            import zmq  # noqa: F401  # a peer's need; said here, not by a process that dies
+            import zmq  # noqa: F401  # a peer needs it; fail here, not in a process that ends
     width_px, height_px = size_of(size)
     setting = LoopSetting(
         Path(), width_px, height_px, fps, transport, detector_delay_ms, overload, seconds=seconds, peers=peers_of(peers)
@@ -153,12 +162,15 @@ def loop(
 
 def watchers(
     *,
-    viewers: Annotated[int, typer.Option(min=2, max=12, help="One never reads, one reads once a second.")] = 10,
-    seconds: Annotated[float, typer.Option(min=3, max=600, help="Without viewers, and again with them.")] = 20.0,
+    viewers: Annotated[int, typer.Option(min=2, max=12, help="Viewers; one never reads, one reads slowly.")] = 10,
+    seconds: Annotated[float, typer.Option(min=3, max=600, help="Length without viewers, and again with them.")] = 20.0,
     transport: Transport = "zenoh",
     as_json: Json = False,
 ) -> int:
-    """What viewers of the robot's pictures cost whoever drives: age of the commands, memory of the robot."""
+    """Measure the cost of viewers for the driver
+
+    It measures the age of the commands and the memory of the robot.
+    """
     with needs("all"):
         from sightline.benchmarks.loop.figures import LoopSetting
         from sightline.benchmarks.loop.viewers import measure_watchers
@@ -185,15 +197,15 @@ def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
         (folder / "loop.json").write_text(json.dumps(result, indent=1), "utf-8")
         draw_race(folder / "loop.png", race)
     except OSError as error:
-        raise ConfigError(f"--out {folder}: {error.strerror}; choose a folder that can be written") from None
+        raise ConfigError(f"--out {folder}: {error.strerror}; choose a folder that you may write") from None
 
 
 def _table(race: "Race") -> list[str]:
     from sightline.benchmarks.loop.figures import OUR_DETECTOR
 
     names = f"{'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'bytes':>8} {'others':>7}"
-    head = f"{'':18} {names}  CPU ms a picture; MB"
-    alone = [_ALONE] if any(name.endswith(OUR_DETECTOR) for name in race.figures) else []
+    head = f"{'':18} {names}  CPU ms per image; MB"
+    alone = [_ALONE.format(OUR_DETECTOR)] if any(name.endswith(OUR_DETECTOR) for name in race.figures) else []
     return [head, *(_row(name, race) for name in race.figures), *alone]
 
 
@@ -206,18 +218,21 @@ def _row(name: str, race: "Race") -> str:
     return f"{name:18} {one.answered_percent:7.1f} % {ages}    {carried}  {cpu}; {memory}"
 
 
-# `sightline bench network`: two machines and a bad network between them, on this one. Shell. Needs root.
+# --- `bench network`: two machines and a bad network between them, on this one; needs root -----------------------
 
 
 def network(
     *,
     only: Annotated[list[str] | None, typer.Option("--only", metavar="ROW", help="A row; repeatable.")] = None,
     transport: Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")] = "zenoh",
-    seconds: Annotated[float, typer.Option(help="Of each row, 4 to 600.")] = 20.0,
-    seeds: Annotated[str, typer.Option(help="Of what the wire loses, for rows where it loses; by commas.")] = "1",
+    seconds: Annotated[float, typer.Option(help="Length of each row, 4 to 600.")] = 20.0,
+    seeds: Annotated[str, typer.Option(help="Seeds of the losses, separated by commas.")] = "1",
     as_json: Json = False,
 ) -> int:
-    """Robots, visions and people in two network namespaces: what slow, lossy, far, broken and shared wires cost."""
+    """Measure slow, lossy, long, broken and shared networks
+
+    Robots, vision services and clients run in two network namespaces. It needs root.
+    """
     with needs("all"):
         from sightline.benchmarks.network.cases import chosen
         from sightline.benchmarks.network.run import NetworkProgress, run_network
@@ -225,8 +240,8 @@ def network(
         from sightline.benchmarks.network.stage import NetworkSetting
         from sightline.evaluation.faults.fixture import BenchWire
     setting = NetworkSetting(transport, seconds, tuple(numbers("--seeds", seeds, int)))
-    telling = NetworkProgress(lambda line: typer.echo(line, err=True), lambda run: _print_run(run, as_json=as_json))
-    runs = run_network(chosen(only or (), transport), setting, BenchWire, telling, {"medium": medium})
+    progress = NetworkProgress(lambda line: typer.echo(line, err=True), lambda run: _print_run(run, as_json=as_json))
+    runs = run_network(chosen(only or (), transport), setting, BenchWire, progress, {"medium": medium})
     worst = list(_worst(runs))
     lines = ["worst of all seeds", *_indented(worst)] if len(setting.seeds) > 1 else []
     return print_result(_network_result(runs, worst, transport), lines, as_json)
@@ -245,7 +260,7 @@ def _network_result(runs: "Sequence[NetworkRun]", worst: "Sequence[Check]", tran
 
 
 def _worst(runs: "Sequence[NetworkRun]") -> "Iterator[Check]":
-    """Of each demand on a row, the seed that did worst."""
+    """Yield the worst seed of each check of a row."""
     from sightline.benchmarks.network.figures import worst_of_seeds
 
     for name in dict.fromkeys(run.row.name for run in runs):
@@ -275,23 +290,26 @@ def _indented(checks: "Sequence[Check]") -> list[str]:
     return [f"  {line}" for line in check_lines(checks)]
 
 
-# `sightline bench detector` and `bench streams`: what eyes elsewhere cost, and one service for many. Shell.
+# --- `bench detector` and `bench streams` ------------------------------------------------------------------------
 
 
 _BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
-"""The median that asking elsewhere on the same machine may add, hot; the rest is only told."""
+"""Bound of the median that a remote detector on the same machine may add, hot; other figures are only shown."""
 
 
 def detector(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="zenoh, or the address of a server that runs.")] = "zenoh",
+    name: Annotated[str, typer.Argument(metavar="NAME", help="zenoh, or the address of a running server.")] = "zenoh",
     *,
-    frames: Annotated[int, typer.Option(min=30, max=10_000, help="Hot, and again paced at 30 a second.")] = 300,
+    frames: Annotated[int, typer.Option(min=30, max=10_000, help="Frames hot, and paced at 30 per second.")] = 300,
     sets: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option of the detector's own Config.")
     ] = None,
     as_json: Json = False,
 ) -> int:
-    """What a detector elsewhere adds to the time of the same frames here (hsv), 320x240."""
+    """Measure the time that a remote detector adds
+
+    The comparison is hsv in this process, with the same frames of 320x240.
+    """
     from sightline.operator_side.cli.detector import own_options
 
     with needs("vision"):
@@ -315,17 +333,20 @@ def detector(
     for way, cost in costs.items():
         what = f"{name}: added, {way} (here {cost.here_us:.0f}, there {cost.there_us:.0f}, medians)"
         checks.append(at_most(what, cost.added_us, "us", bound if way == "hot" else float("inf")))
-        checks.append(at_most(f"{name}: not answered of {frames}", cost.unanswered, "", most))
+        checks.append(at_most(f"{name}: unanswered of {frames}", cost.unanswered, "", most))
     return _print_checks(checks, as_json)
 
 
 def streams(
     *,
-    streams: Annotated[int, typer.Option(min=2, max=200, help="Robots, each with 30 frames a second.")] = 40,
-    seconds: Annotated[float, typer.Option(min=5, max=3600, help="How long.")] = 60.0,
+    streams: Annotated[int, typer.Option(min=2, max=200, help="Robots, each with 30 frames per second.")] = 40,
+    seconds: Annotated[float, typer.Option(min=5, max=3600, help="Length of the run.")] = 60.0,
     as_json: Json = False,
 ) -> int:
-    """Many robots at one detector service that can look at half of their frames: age, fairness, memory."""
+    """Measure one detector service for many robots
+
+    The service has time for half of the frames. It measures age, fairness and memory.
+    """
     with needs("vision"):
         from sightline.benchmarks import detector as bench
         from sightline.evaluation.checks import Check, at_most
@@ -338,7 +359,7 @@ def streams(
         Check("offered per answered frame", load.overload, "", bench.OVERLOAD, load.overload >= 0.9 * bench.OVERLOAD),
         at_most("age of boxes, p95", load.p95_ms, "ms", bench.DEADLINE_MS),
         at_most("furthest from an equal share", load.unfair_percent, "%", bench.FAIRNESS_PERCENT),
-        at_most("robots never answered", missing, "", 0),
+        at_most("robots without an answer", missing, "", 0),
         at_most("memory of the service grew", load.growth_mb, "MB", bench.MEMORY_MB),
     ]
     return _print_checks(checks, as_json)
@@ -346,7 +367,7 @@ def streams(
 
 @contextmanager
 def _service(name: str, folder: Path) -> "Iterator[Any]":
-    """For `zenoh` a service, and a link that is both the robot's and vision's, where they meet; else None."""
+    """Start a service for `zenoh` and yield the robot's link, which the vision service shares; else yield None."""
     from sightline.evaluation.processes import Processes, free_port
     from sightline.protocol.transports.open import open_link
 
@@ -364,7 +385,7 @@ def _service(name: str, folder: Path) -> "Iterator[Any]":
 
 
 def _publish_status(robot: Any, processes: Any) -> None:
-    """Until the service has taken note."""
+    """Publish the status until the service receives the frames."""
     from sightline.protocol.channels import STATUS
     from sightline.protocol.codec import encode
     from sightline.protocol.messages import Stamp, State, Status

@@ -17,7 +17,8 @@ import typer
 
 from sightline.operator_side.calibrate.wheels import check_confirmed, opened_drive, try_wheels, turn_for
 from sightline.operator_side.cli.options import (
-    DEFAULT_CONNECT,
+    CameraKind,
+    CameraSets,
     ConfigFile,
     Connect,
     Json,
@@ -26,15 +27,17 @@ from sightline.operator_side.cli.options import (
     Secure,
     ServiceConnect,
     Sets,
+    command_group,
     numbers,
+    target_of,
 )
 from sightline.operator_side.client.pictures import Pictures, viewer_role
+from sightline.operator_side.config.context import RobotAddress
 from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import check_out_file, needs
 from sightline.protocol.channels import FRAME
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.hardware.gpio import table_of, table_text
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
     from sightline.operator_side.calibrate.camera import Ball, Board, Calibration, Mounting
     from sightline.operator_side.calibrate.color import Box, Image, Ranges
     from sightline.operator_side.calibrate.color_page import Gallery
+    from sightline.protocol.transports.link import Link
 
 
 TASKS: Final = ("test-wheels",)
@@ -51,7 +55,7 @@ _LONGEST_WAY_M: Final = 20.0
 
 
 def run_task(task: str, config: RobotConfig, confirmed: bool) -> int:
-    """A task of `sightline robot`. Raises ConfigError for one that is none."""
+    """Run a task of `sightline robot`. Raises ConfigError for an unknown one."""
     if task not in TASKS:
         hint = f" (a robot's id is given with --robot {task})" if not task.startswith("test") else ""
         raise ConfigError(no_such_name("task", task, TASKS) + hint)
@@ -64,17 +68,17 @@ def drive(
     config: ConfigFile = None,
     sets: Sets = None,
     duty: Annotated[
-        str, typer.Option(metavar="LIST", help="Duties to drive at, rising, separated by commas.")
+        str, typer.Option(metavar="LIST", help="Rising duties, separated by commas.")
     ] = "0.3,0.4,0.5,0.6,0.8,1.0",
-    seconds: Annotated[float, typer.Option(min=0.5, max=10, help="How long to drive at each.")] = 2.0,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The table to write.")] = Path("drive.toml"),
+    seconds: Annotated[float, typer.Option(min=0.5, max=10, help="Seconds at each duty.")] = 2.0,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Table to write.")] = Path("drive.toml"),
     yes: Annotated[
-        bool, typer.Option("--yes", help="Drive without asking: the way ahead is free. Distances come from stdin.")
+        bool, typer.Option("--yes", help="Confirm that the way is free; read the distances from stdin.")
     ] = False,
 ) -> None:
-    """Measure duty against speed: the car drives straight on the floor, you type how far it went.
+    """Measure the speed of a drive at each duty
 
-    For drives that work by duty (`gpio`). Give it room ahead; Ctrl-C stops it.
+    For `gpio` drives: the car drives straight on the floor and you type the distance. Ctrl-C stops it.
     """
     robot: Any = load_service("robot", file=config, sets=sets or (), environ=os.environ).config
     duties = _rising_duties(duty)
@@ -83,18 +87,20 @@ def drive(
     rows = _measured_rows(robot, duties, seconds, confirmed=yes)
     text = table_text(rows, f"measured by `sightline calibrate drive`, {seconds:g} s at each duty")
     try:
-        table_of(text, "these measurements")  # what could not be read back is not written
+        table_of(text, "these measurements")  # nothing is written that cannot be read again
         out.write_text(text, "utf-8")
     except (ConfigError, OSError) as error:
-        typer.echo(f"not written, so that nothing measured is lost:\n{text}", err=True)
-        raise error if isinstance(error, ConfigError) else ConfigError(f"{out}: {error.strerror}; see --out") from None
-    typer.echo(f"{out} is written; use it: sightline robot --set drive.options.table_file={out}")
+        typer.echo(f"not written; the measured table is:\n{text}", err=True)
+        raise error if isinstance(error, ConfigError) else ConfigError(
+            f"cannot write {out}: {error.strerror}; choose another --out"
+        ) from None
+    typer.echo(f"wrote {out}; use it: sightline robot --set drive.options.table_file={out}")
 
 
 def _rising_duties(text: str) -> list[float]:
     duties = numbers("--duty", text, float)
     if any(not 0 < one <= 1 for one in duties) or sorted(set(duties)) != duties:
-        raise ConfigError(f"--duty {text!r}: rising numbers above 0 and up to 1, e.g. --duty 0.4,0.6,1")
+        raise ConfigError(f"invalid --duty '{text}': expected rising numbers above 0 up to 1, e.g. --duty 0.4,0.6,1")
     return duties
 
 
@@ -105,21 +111,21 @@ def _measured_rows(
     with opened_drive(config) as opened:
         give = getattr(opened, "set_duty", None)
         if give is None:
-            raise ConfigError(f"drive {config.drive.kind!r} does not work by duty, there is nothing to calibrate")
+            raise ConfigError(f"drive '{config.drive.kind}' has no duty to calibrate; use a gpio drive")
         for one in duties:
             if not confirmed:
                 _prompt(f"duty {one:g} for {seconds:g} s: put the car on the floor, the way ahead free; Enter drives")
             turn_for(give, (one, one), seconds)
-            way_m = _distance_m(f"duty {one:g}: how far did it go, metres (0: it did not move)")
+            way_m = _distance_m(f"duty {one:g}: distance in meters (0: it did not move)")
             if way_m > 0:
                 rows.append((one, way_m / seconds))
     if not rows:
-        raise ConfigError("the car moved at no duty: look at its wiring with `sightline robot test-wheels`")
+        raise ConfigError("the car did not move at any duty; check its wiring with `sightline robot test-wheels`")
     return rows
 
 
 def _distance_m(question: str) -> float:
-    """Asked until it is a distance; a slip of the pen must not throw away what was measured before."""
+    """Prompt until the answer is a distance; a typing error must not discard the rows before."""
     while True:
         answer = _prompt(question)
         try:
@@ -128,7 +134,7 @@ def _distance_m(question: str) -> float:
             way_m = -1.0
         if 0 <= way_m <= _LONGEST_WAY_M:
             return way_m
-        question = f"{answer!r} is no distance; metres from 0 to {_LONGEST_WAY_M:g}, e.g. 0.35"
+        question = f"invalid distance '{answer}'; meters from 0 to {_LONGEST_WAY_M:g}, e.g. 0.35"
 
 
 def _prompt(question: str) -> str:
@@ -136,62 +142,52 @@ def _prompt(question: str) -> str:
     return answer
 
 
-# `sightline calibrate camera`: measures a camera and writes its model. Shell; heavy imports are inside.
+# --- `calibrate camera` ------------------------------------------------------------------------------------------
 
 
 _BOARD = re.compile(r"([0-9]{1,2})x([0-9]{1,2})")
 _BALL_PICTURES = 20
-_MOST_IN_FOLDER = 100  # all of a folder is used, within reason: the fit's time grows with every view
+_MOST_IN_FOLDER = 100  # the whole folder, within limits: the time of the fit grows with every view
 
-PluginName = Annotated[
-    str | None, typer.Option("--camera", metavar="KIND", help="A camera of this machine: v4l2, picamera, video, ...")
-]
-PluginSets = Annotated[
-    list[str] | None,
-    typer.Option("--camera-set", metavar="KEY=VALUE", help="One of its options, e.g. device=/dev/video2."),
-]
-Metres = Annotated[float | None, typer.Option(help="Where the lens is, from the axle's middle on the floor.")]
+Meters = Annotated[float | None, typer.Option(help="Position of the lens, from the center of the axle on the floor.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
-    group = typer.Typer(help="Measure what a robot is made of.", rich_markup_mode=None)
-    group.callback()(_calibrate)
-    group.command(epilog="Example: sightline calibrate camera --camera v4l2 --board 9x6 --square-m 0.025")(camera)
+    group = command_group("Measure a robot's camera or drive")
+    group.command(epilog="Example: sightline calibrate camera --camera v4l2 --square-m 0.025")(camera)
     group.command(epilog="Example: sightline calibrate drive --config raspberry-car.toml")(drive)
     app.add_typer(group, name="calibrate")
     app.command("pick-color", epilog="Example: sightline pick-color r1 --config vision.toml")(pick_color)
 
 
-def _calibrate() -> None:
-    """Measure what a robot is made of."""
-
-
 def camera(
     *,
-    pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="A folder of JPEGs.")] = None,
-    camera: PluginName = None,
-    camera_sets: PluginSets = None,
+    pictures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of JPEG images.")] = None,
+    camera: CameraKind = None,
+    camera_sets: CameraSets = None,
     robot: RobotName = None,
     connect: ServiceConnect = None,
     secure: Secure = "",
     board: Annotated[str, typer.Option(metavar="CxR", help="Inner corners of the chessboard.")] = "9x6",
-    square_m: Annotated[float, typer.Option(min=0.001, max=1, help="Side of one square, metres.")] = 0.025,
-    ball_radius_m: Annotated[float | None, typer.Option(min=0.005, max=2, help="Use a ball of this radius.")] = None,
-    distance_m: Annotated[float | None, typer.Option(min=0.1, max=20, help="Lens to ball, over the floor.")] = None,
-    config: Annotated[str | None, typer.Option(metavar="FILE", help="Vision's TOML: the ball's colour.")] = None,
-    views: Annotated[int, typer.Option(min=5, max=100, help="Views of the board to take from a live camera.")] = 15,
-    seconds: Annotated[float, typer.Option(min=1, max=600, help="Look at a live camera for at most this.")] = 90.0,
-    x_m: Metres = None,
-    y_m: Metres = None,
-    z_m: Metres = None,
-    pitch_rad: Annotated[float | None, typer.Option(help="Tilt of the lens, up positive.")] = None,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The model to write.")] = Path("camera.toml"),
+    square_m: Annotated[float, typer.Option(min=0.001, max=1, help="Side of one square, meters.")] = 0.025,
+    ball_radius_m: Annotated[float | None, typer.Option(min=0.005, max=2, help="Radius of a ball, meters.")] = None,
+    distance_m: Annotated[float | None, typer.Option(min=0.1, max=20, help="Lens to ball on the floor.")] = None,
+    config: Annotated[
+        str | None, typer.Option(metavar="FILE", help="TOML file of the vision service, with the color of the ball.")
+    ] = None,
+    views: Annotated[int, typer.Option(min=5, max=100, help="Views of the board from a live camera.")] = 15,
+    seconds: Annotated[float, typer.Option(min=1, max=600, help="Longest time for a live camera.")] = 90.0,
+    x_m: Meters = None,
+    y_m: Meters = None,
+    z_m: Meters = None,
+    pitch_rad: Annotated[float | None, typer.Option(help="Tilt of the lens, up is positive.")] = None,
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Model to write.")] = Path("camera.toml"),
     as_json: Json = False,
 ) -> None:
-    """Measure a camera with a chessboard, or with a ball of known size at a known distance, and write its model.
+    """Measure a camera and write its model
 
-    Pictures come from --pictures, from --camera, or from a running robot (--robot, --connect).
+    Use a chessboard, or a ball of known size and distance. Images come from --pictures, --camera or a running robot.
     """
     check_out_file(out)
     wanted = _subject(board, square_m, ball_radius_m, distance_m)
@@ -199,9 +195,9 @@ def camera(
     with needs("vision"), ExitStack() as ending:
         source, mounted = _source(ending, pictures, (camera, camera_sets or []), (robot, connect, secure), seconds)
         mounting = _mounting(mounted, given)
-        say = _quiet if as_json else _print_board
+        report = _quiet if as_json else _print_board
         most = _MOST_IN_FOLDER if pictures is not None else views
-        made = _measure(source, wanted, mounting, views=most, config=config, say=say)
+        made = _measure(source, wanted, mounting, views=most, config=config, report=report)
     _write(out, made)
     typer.echo(json.dumps(_as_object(out, made)) if as_json else _summary(out, made))
 
@@ -215,7 +211,9 @@ def _subject(board: str, square_m: float, radius_m: float | None, distance_m: fl
         raise ConfigError("a ball needs both --ball-radius-m and --distance-m")
     match = _BOARD.fullmatch(board)
     if match is None or min(int(match[1]), int(match[2])) < 3:
-        raise ConfigError(f"--board {board!r} is no board: inner corners as COLUMNSxROWS, each at least 3, e.g. 9x6")
+        raise ConfigError(
+            f"invalid --board '{board}': expected inner corners as COLUMNSxROWS, each at least 3, e.g. 9x6"
+        )
     return Board(int(match[1]), int(match[2]), square_m)
 
 
@@ -226,11 +224,11 @@ def _source(
     robot: tuple[str | None, list[str] | None, str],
     seconds: float,
 ) -> tuple[Iterator[bytes], dict[str, float]]:
-    """The pictures, and the mounting that is known already. Exactly one source must be named."""
+    """Open the images and return them with the known mounting. Raises ConfigError unless one source is named."""
     from sightline.operator_side.calibrate import camera as sources
 
     if sum((folder is not None, plugin[0] is not None, robot[:2] != (None, None))) != 1:
-        raise ConfigError("say where the pictures come from, once: --pictures DIR, --camera KIND, or --robot ID")
+        raise ConfigError("expected one source of images; give --pictures DIR, --camera KIND or --robot ID")
     if folder is not None:
         return sources.folder_pictures(folder), {}
     if plugin[0] is not None:
@@ -238,13 +236,10 @@ def _source(
 
         opened = ending.enter_context(local_camera(plugin[0], plugin[1]))
         return sources.camera_pictures(opened, seconds), {}
-    from sightline.operator_side.client.pictures import viewer_role
-    from sightline.protocol.transports.open import open_link
-
-    name, connect, secure = robot
+    target = target_of(*robot)
+    secure = target.secure
     role = viewer_role(secure) if secure else sources.ROLE
-    at = connect or [DEFAULT_ENDPOINT]
-    link = ending.enter_context(open_link(name or "r1", connect=at, role=role, secure=secure))
+    link = ending.enter_context(open_link(target.robot, connect=target.connect, role=role, secure=secure))
     model = sources.robot_model(link)
     mounted = {"x_m": model.x_m, "y_m": model.y_m, "z_m": model.z_m, "pitch_rad": model.pitch_rad}
     return sources.robot_pictures(link, seconds, role, secure), mounted
@@ -263,14 +258,14 @@ def _measure(
     *,
     views: int,
     config: str | None,
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> "Calibration":
     from sightline.operator_side.calibrate import camera as calibrate
     from sightline.operator_side.calibrate.camera import collect
 
     if isinstance(wanted, calibrate.Board):
         boards = collect(pictures, lambda _: lambda jpeg: calibrate.find_board(jpeg, wanted), calibrate.is_new_view,
-                         views, say)
+                         views, report)
         return calibrate.from_boards(boards.found, wanted, boards.size, boards.given, mounting)
     hsv = _vision_config(config).hsv
     balls = collect(pictures, lambda size: calibrate.ball_finder(size, hsv), lambda *_: True, _BALL_PICTURES, _quiet)
@@ -286,11 +281,11 @@ def _vision_config(file: str | None) -> Any:
 def _write(path: Path, made: "Calibration") -> None:
     from sightline.operator_side.config.toml_text import toml_text
 
-    head = f"# {made.used} of {made.given} pictures, {made.error:.2f} {made.error_unit}\n"
+    head = f"# {made.used} of {made.given} images, {made.error:.2f} {made.error_unit}\n"
     try:
         path.write_text(head + toml_text(made.model.model_dump(mode="json")), "utf-8")
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}; see --out") from None
+        raise ConfigError(f"cannot write {path}: {error.strerror}; choose another --out") from None
 
 
 def _hfov_deg(made: "Calibration") -> float:
@@ -301,8 +296,8 @@ def _summary(path: Path, made: "Calibration") -> str:
     model = made.model
     return (
         f"{model.width_px}x{model.height_px}: fx {model.fx_px:.1f}, fy {model.fy_px:.1f} px ({_hfov_deg(made):.1f} "
-        f"degrees wide), from {made.used} of {made.given} pictures, {made.error:.2f} {made.error_unit}\n"
-        f"{path} is written; use it: sightline robot --set camera.options.model_file={path}"
+        f"degrees wide), from {made.used} of {made.given} images, {made.error:.2f} {made.error_unit}\n"
+        f"wrote {path}; use it: sightline robot --set camera.options.model_file={path}"
     )
 
 
@@ -314,56 +309,58 @@ def _as_object(path: Path, made: "Calibration") -> dict[str, Any]:
 
 
 def _print_board(line: str) -> None:
-    typer.echo(f"board {line}; move it, and tilt it")
+    typer.echo(f"board {line}; move and tilt it")
 
 
 def _quiet(_line: str) -> None:
-    """Nothing to say: a ball lies still, and with --json only the object is printed."""
+    """Print nothing: a ball does not move, and --json prints only the object."""
 
 
-# The command `pick-color`: a place in a picture becomes a colour range that vision follows. Shell.
+# --- `pick-color` ------------------------------------------------------------------------------------------------
 
 
 _MASK = Path("pick-color-mask.png")
 _WAIT_S = 0.2
-_LAST_WORD_S = 0.3  # for the page to hear what became of it
+_PAGE_S = 0.3  # in which the page fetches the result
 
 
 def pick_color(
-    robot: Annotated[str | None, typer.Argument(metavar="[ROBOT]", help="Its pictures [default: r1].")] = None,
+    robot: Annotated[
+        str | None, typer.Argument(metavar="ROBOT", help="Robot with the images [default: of `sightline use`, or r1].")
+    ] = None,
     *,
-    picture: Annotated[Path | None, typer.Option("--picture", metavar="FILE", help="From a picture instead.")] = None,
-    video: Annotated[Path | None, typer.Option("--video", metavar="FILE", help="From a video instead.")] = None,
-    at: Annotated[str | None, typer.Option("--at", metavar="X,Y", help="Pick this pixel; no browser.")] = None,
-    box: Annotated[str | None, typer.Option("--box", metavar="X,Y,W,H", help="Pick this box; no browser.")] = None,
-    frames: Annotated[int, typer.Option("--frames", min=1, max=200, help="Pictures that the range is tried on.")] = 20,
+    picture: Annotated[Path | None, typer.Option("--picture", metavar="FILE", help="Use an image file.")] = None,
+    video: Annotated[Path | None, typer.Option("--video", metavar="FILE", help="Use a video file.")] = None,
+    at: Annotated[str | None, typer.Option("--at", metavar="X,Y", help="Pick this pixel, no browser.")] = None,
+    box: Annotated[str | None, typer.Option("--box", metavar="X,Y,W,H", help="Pick this box, no browser.")] = None,
+    frames: Annotated[int, typer.Option("--frames", min=1, max=200, help="Images for the test of the range.")] = 20,
     config: Annotated[
-        Path | None, typer.Option("--config", metavar="FILE", help="Vision's configuration, to write it into.")
+        Path | None, typer.Option("--config", metavar="FILE", help="Write the range to this configuration of vision.")
     ] = None,
     mask: Annotated[
-        Path | None, typer.Option("--mask", metavar="FILE", help="What it marks [default: pick-color-mask.png].")
+        Path | None, typer.Option("--mask", metavar="FILE", help="Image of the result [default: pick-color-mask.png].")
     ] = None,
     port: Port = 0,
-    connect: Connect = DEFAULT_CONNECT,
+    connect: Connect = None,
     secure: Secure = "",
     as_json: Json = False,
 ) -> None:
-    """Click, or draw a box, on what is to be followed: gives its colour range, tries it, and writes it where told.
+    """Pick the target's color in an image
 
-    Opens a page for a browser on this machine; with --at or --box it needs none.
+    Click or draw a box on a page for a browser on this machine, or use --at or --box. It tests and prints the range.
     """
     sources = [name for name, given in (("ROBOT", robot), ("--picture", picture), ("--video", video)) if given]
     if len(sources) > 1:
-        raise ConfigError(f"{' and '.join(sources)}: pictures come from one of them; give one")
+        raise ConfigError(f"{' and '.join(sources)} exclude each other; give one source of images")
     place = place_of(at, box)
     if as_json and place is None:
-        raise ConfigError("--json is for scripts, which have no browser: add --at X,Y or --box X,Y,W,H")
+        raise ConfigError("--json works without a browser; add --at X,Y or --box X,Y,W,H")
     with needs("vision"):
         from sightline.operator_side.calibrate.color_file import check_config
     config = config.expanduser() if config else None
     if config is not None:
         check_config(config)
-    source = _Source(robot or "r1", picture, video, connect, secure)
+    source = _Source(target_of(robot, connect, secure), picture, video)
     if place is None:
         _on_page(source, frames, config, port)
     else:
@@ -371,43 +368,48 @@ def pick_color(
 
 
 def place_of(at: str | None, box: str | None) -> "Box | None":
-    """The place of `--at` or `--box`; None for neither. Raises ConfigError for what is no place."""
+    """Read the place of `--at` or `--box`; None for neither. Raises ConfigError for an invalid one."""
     with needs("vision"):
         from sightline.operator_side.calibrate.color import Box
     if at and box:
-        raise ConfigError("--at is one pixel and --box a part of the picture; give one of them")
+        raise ConfigError("--at and --box exclude each other; give one")
     for option, text, form in (("--at", at, "X,Y"), ("--box", box, "X,Y,W,H")):
         if text is None:
             continue
         parts = [part.strip() for part in text.split(",")]
         right = len(parts) == form.count(",") + 1 and all(p.isascii() and p.isdigit() and len(p) < 6 for p in parts)
         if not right or (option == "--box" and "0" in (parts[2].lstrip("0") or "0", parts[3].lstrip("0") or "0")):
-            raise ConfigError(f"{option} {text!r} is no place: write {form} in whole pixels, e.g. {option} "
+            raise ConfigError(f"invalid {option} '{text}': expected {form} in whole pixels, e.g. {option} "
                               f"{'160,120' if option == '--at' else '150,110,20,20'}")
         return Box(*(int(part) for part in parts))
     return None
 
 
 class _Source:
-    """Where pictures come from."""
+    """A source of images: a robot, an image file or a video file."""
 
-    def __init__(self, robot: str, picture: Path | None, video: Path | None, connect: list[str], secure: str) -> None:
-        self._robot, self._picture, self._video, self._connect, self._secure = robot, picture, video, connect, secure
+    def __init__(self, target: RobotAddress, picture: Path | None, video: Path | None) -> None:
+        self._target, self._picture, self._video = target, picture, video
 
     def pictures(self, frames: int) -> "list[Image]":
-        """At most `frames`, the newest last."""
+        """Return at most `frames` images, the newest last."""
         from sightline.operator_side.calibrate.color_page import of_robot
 
         still = self._of_file(frames)
         if still is not None:
             return still
-        role = viewer_role(self._secure)
-        with open_link(self._robot, connect=self._connect, role=role, secure=self._secure) as link:
-            return of_robot(Pictures(link, role, FRAME, self._secure), frames)
+        with self._link() as (link, role):
+            return of_robot(Pictures(link, role, FRAME, self._target.secure), frames)
+
+    @contextmanager
+    def _link(self) -> "Iterator[tuple[Link, str]]":
+        target, role = self._target, viewer_role(self._target.secure)
+        with open_link(target.robot, connect=target.connect, role=role, secure=target.secure) as link:
+            yield link, role
 
     @contextmanager
     def gallery(self, frames: int) -> "Iterator[Gallery]":
-        """For a page."""
+        """Yield the images for a page."""
         from sightline.operator_side.calibrate.color_page import LiveGallery, StillGallery
         from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
 
@@ -415,9 +417,9 @@ class _Source:
         if still is not None:
             yield StillGallery(still)
             return
-        role, ending = viewer_role(self._secure), threading.Event()
-        with open_link(self._robot, connect=self._connect, role=role, secure=self._secure) as link:
-            pictures, buffer = Pictures(link, role, FRAME, self._secure), FrameBuffer(frames)
+        ending = threading.Event()
+        with self._link() as (link, role):
+            pictures, buffer = Pictures(link, role, FRAME, self._target.secure), FrameBuffer(frames)
             filling = threading.Thread(target=fill, args=(buffer, pictures, ending), name="pictures", daemon=True)
             filling.start()
             try:
@@ -428,8 +430,8 @@ class _Source:
 
     @property
     def title(self) -> str:
-        """What the page is about."""
-        return str(self._picture or self._video or f"robot {self._robot}")
+        """Return the title of the page."""
+        return str(self._picture or self._video or f"robot {self._target.robot}")
 
     def _of_file(self, frames: int) -> "list[Image] | None":
         from sightline.operator_side.calibrate.color_page import of_picture, of_video
@@ -447,39 +449,39 @@ def _at_once(pictures: "list[Image]", place: "Box", config: Path | None, mask: P
     trial = try_out(ranges, pictures)
     write_mask(mask.expanduser(), ranges, pictures[-1])
     check_trial(trial)
-    said = _use(ranges, config)
+    note = _use(ranges, config)
     if as_json:
         found: dict[str, Any] = {"ranges": [one.model_dump() for one in ranges], "trial": asdict(trial)}
         typer.echo(json.dumps({**found, "mask": str(mask), "written": str(config) if config else None}))
         return
-    typer.echo(f"{ranges_text(ranges)}\n{trial_text(trial)}\nmask: {mask}\n{said}")
+    typer.echo(f"{ranges_text(ranges)}\n{trial_text(trial)}\nmask: {mask}\n{note}")
 
 
 def _on_page(source: _Source, frames: int, config: Path | None, port: int) -> None:
     from sightline.operator_side.calibrate.color_page import PickPage
     from sightline.operator_side.cockpit.http_server import served
 
-    said: list[str] = []
+    notes: list[str] = []
 
     def use(ranges: "Ranges") -> str:
-        said.append(_use(ranges, config))
-        return f"written into {config}; restart vision to see by it" if config else "printed in the terminal"
+        notes.append(_use(ranges, config))
+        return f"written to {config}; restart the vision service to use it" if config else "printed in the terminal"
 
     with source.gallery(frames) as gallery:
         picking = PickPage(gallery, source.title, use)
         with served(picking.routes, port) as address:
-            typer.echo(f"pick-color: {source.title} is on {address} for a browser on this machine; Ctrl-C ends it")
+            typer.echo(f"pick-color: {source.title} is at {address} for a browser on this machine; Ctrl-C ends it")
             while not picking.done.wait(_WAIT_S):
                 pass
-            time.sleep(_LAST_WORD_S)
-    typer.echo(said[-1])
+            time.sleep(_PAGE_S)
+    typer.echo(notes[-1])
 
 
 def _use(ranges: "Ranges", config: Path | None) -> str:
-    """Write the ranges where told, and say what was done, or what a person can paste."""
+    """Write the ranges to `config`. Returns a note, or the lines to paste."""
     from sightline.operator_side.calibrate.color_file import ranges_toml, write_ranges
 
     if config is None:
-        return f"for vision's configuration:\n[hsv]\nranges = {ranges_toml(ranges)}"
+        return f"add to the configuration of the vision service:\n[hsv]\nranges = {ranges_toml(ranges)}"
     write_ranges(config, ranges)
-    return f"written: {config}, hsv.ranges"
+    return f"wrote hsv.ranges to {config}"

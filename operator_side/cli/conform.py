@@ -14,16 +14,15 @@ from typing import Annotated, Any, Final
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.table import Table
 
 from sightline.conformance.benches import LiveBench
-from sightline.conformance.case import Access, Case, Level
+from sightline.conformance.case import Access, Case
 from sightline.conformance.report import summary, to_dict, to_junit
 from sightline.conformance.runner import Outcome, Result, chosen, run_cases
-from sightline.operator_side.cli.options import print_result
+from sightline.operator_side.cli.options import Json, Secure, command_group, print_result
 from sightline.operator_side.preflight import check_out_file
+from sightline.operator_side.table import print_table, table_lines
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.security import own_token
 
@@ -31,12 +30,12 @@ _EXAMPLE = "e.g. --token vision=keys/vision.token"
 
 
 def access_for(secure: str, tokens: Iterable[str], roles: Sequence[str], ending: ExitStack) -> Access:
-    """Access with the folder `secure` and with `tokens`, each `ROLE=FILE`, or `FILE` for every one of `roles`.
+    """Combine the folder `secure` with `tokens`, each `ROLE=FILE`, or `FILE` for all `roles`.
 
-    Tokens named beside a folder stand before those that lie in it. Raises ConfigError for one that cannot be used.
+    A named token replaces the one in the folder. Raises ConfigError for an unusable token.
     """
     if secure and not Path(secure).expanduser().is_dir():
-        raise ConfigError(f"--secure {secure}: there is no such folder; make keys with `sightline keys init {secure}`")
+        raise ConfigError(f"--secure {secure}: folder not found; create keys with `sightline keys init {secure}`")
     given = _by_role(tokens, roles)
     if given:
         secure = _joined(secure, given, ending)
@@ -49,7 +48,7 @@ def _by_role(tokens: Iterable[str], roles: Sequence[str]) -> dict[str, Path]:
     for named in tokens:
         role, equals, file = named.rpartition("=")
         if equals and role not in roles:
-            raise ConfigError(f"--token {named}: there is no role {role!r} here, but {', '.join(roles)}; {_EXAMPLE}")
+            raise ConfigError(f"--token {named}: unknown role '{role}', expected {', '.join(roles)}; {_EXAMPLE}")
         found.update(dict.fromkeys([role] if role else roles, Path(file).expanduser()))
     return found
 
@@ -58,12 +57,12 @@ def _token_in(file: Path) -> str:
     try:
         return file.read_text("ascii").strip()
     except (OSError, UnicodeDecodeError) as error:
-        why = getattr(error, "strerror", None) or "it is not text"
-        raise ConfigError(f"--token {file} cannot be read: {why}; name a file that holds a token, {_EXAMPLE}") from None
+        why = getattr(error, "strerror", None) or "not a text file"
+        raise ConfigError(f"cannot read --token {file}: {why}; name a file with a token, {_EXAMPLE}") from None
 
 
 def _joined(secure: str, tokens: dict[str, Path], ending: ExitStack) -> str:
-    """A folder with the files of `secure` and these tokens in place of its own, gone at the end."""
+    """Make a temporary folder with the files of `secure` and these tokens in place of its own."""
     folder = Path(ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-conform-")))
     for file in Path(secure).expanduser().iterdir() if secure else _trusted_here():
         (folder / (file.name if secure else "ca.pem")).symlink_to(file.absolute())
@@ -75,27 +74,28 @@ def _joined(secure: str, tokens: dict[str, Path], ending: ExitStack) -> str:
         try:
             own_token(str(folder), role)
         except ConfigError:
-            raise ConfigError(f"--token {given} holds no token: 16 to 128 of A-Z a-z 0-9 _ -; {_EXAMPLE}") from None
+            raise ConfigError(
+                f"--token {given}: invalid token, expected 16 to 128 of A-Z a-z 0-9 _ -; {_EXAMPLE}"
+            ) from None
     return str(folder)
 
 
 def _trusted_here() -> list[Path]:
-    """The authorities that this machine trusts, for a `wss://` whose certificate needs no folder."""
+    """Return the authorities that this machine trusts, for a `wss://` whose certificate needs no folder."""
     file = ssl.get_default_verify_paths().cafile
     return [Path(file)] if file else []
 
 
-# How `sightline conform` shows itself: a bar on stderr while it runs, then a table by group. Shell (a terminal).
+# --- output: a bar on stderr while it runs, then a table by group ------------------------------------------------
 
 
 _FEW: Final = 3
-"""So many that lack the same and more are one line."""
-_COLOURS: Final = {Outcome.PASSED: "green", Outcome.FAILED: "red", Outcome.SKIPPED: "dim"}
+"""This many skipped cases with the same reason become one line."""
 
 
 @contextmanager
 def progress(total: int) -> Iterator[Callable[[Result], None]]:
-    """A bar over `total` cases with what has failed above it; a line per failure where stderr is not a terminal."""
+    """Show a bar over `total` cases below the failures; without a terminal, print a line per failure."""
     console = Console(stderr=True)
     with Progress(
         TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), console=console, transient=True,
@@ -112,25 +112,23 @@ def progress(total: int) -> Iterator[Callable[[Result], None]]:
 
 
 def print_results(results: Sequence[Result]) -> None:
-    """The table on stdout, group by group, with the reason of whatever did not pass; then the summary."""
-    console = Console()
-    table = Table(box=None, pad_edge=False, show_header=False)
-    for _ in range(4):
-        table.add_column()
+    """Print a table by group, with the reason of each case that did not pass; then the summary."""
+    rows: list[tuple[str, str, str, str]] = []
     for group, members in groupby(results, lambda one: one.case.group):
         listed = list(members)
         good = sum(one.outcome is Outcome.PASSED for one in listed)
-        table.add_row(f"[bold]{group}[/bold]", "", "", f"[bold]{good} of {len(listed)} passed[/bold]")
+        rows.append((group, "", "", f"{good} of {len(listed)} passed"))
         for alike in _alike(listed):
-            table.add_row(*_row(alike[0]) if len(alike) < _FEW else _row_of_many(alike))
-            for one in alike[1:] if len(alike) < _FEW else ():
-                table.add_row(*_row(one))
-    console.print(table)
-    console.print(summary(results), markup=False, highlight=False)
+            if len(alike) < _FEW:
+                rows += [row for one in alike for row in _rows_of(one)]
+            else:
+                rows += _rows_of_many(alike)
+    print_table(rows)
+    typer.echo(summary(results))
 
 
 def _alike(results: Sequence[Result]) -> Iterator[list[Result]]:
-    """Neighbours that are not applicable for the same reason together, every other case alone."""
+    """Group neighbors that are skipped for the same reason; every other case stays alone."""
 
     def sort(numbered: tuple[int, Result]) -> tuple[int, str]:
         number, one = numbered
@@ -140,62 +138,56 @@ def _alike(results: Sequence[Result]) -> Iterator[list[Result]]:
         yield [one for _, one in members]
 
 
-def _row_of_many(alike: Sequence[Result]) -> tuple[str, str, str, str]:
-    reported = f"{len(alike)} cases, to {alike[-1].case.id}\n[dim]{escape(alike[0].reason)}[/dim]"
-    return f"  {alike[0].case.id}", "", f"[dim]{Outcome.SKIPPED.value}[/dim]", reported
+def _rows_of_many(alike: Sequence[Result]) -> Iterator[tuple[str, str, str, str]]:
+    yield f"  {alike[0].case.id}", "", Outcome.SKIPPED.value, f"{len(alike)} cases, to {alike[-1].case.id}"
+    yield "", "", "", alike[0].reason
 
 
-def _row(one: Result) -> tuple[str, str, str, str]:
-    weak = one.outcome is Outcome.FAILED and one.case.level is Level.SHOULD
-    colour = "yellow" if weak else _COLOURS[one.outcome]
-    reported = f"\n[dim]{escape(one.reason)}[/dim]" if one.reason else ""
-    outcome = f"[{colour}]{one.outcome.value}[/{colour}]"
-    return f"  {one.case.id}", one.case.level.value, outcome, f"{escape(one.case.title)}{reported}"
+def _rows_of(one: Result) -> Iterator[tuple[str, str, str, str]]:
+    yield f"  {one.case.id}", one.case.level.value, one.outcome.value, one.case.title
+    if one.reason:
+        yield "", "", "", one.reason
 
 
 def listing(cases: Sequence[Case]) -> str:
-    """Every case in a line, for `--list`."""
+    """Format every case as a line, for `--list`."""
     return "\n".join(
-        f"{case.id:<12} {case.level.value:<6} {case.group:<14} {case.title} [{case.clause}]" for case in cases
+        table_lines((case.id, case.level.value, case.group, f"{case.title} [{case.clause}]") for case in cases)
     )
 
 
-# The commands `conform robot | vision | codec | page`: does any peer speak the protocol, point by point. Shell.
+# --- the commands ------------------------------------------------------------------------------------------------
 
 
 _ROLES = ("vision", "operator")
-"""Whom the kit plays where each role has keys of its own."""
+"""The roles that the kit plays where each role has its own keys."""
 TRIES = 3
-"""A message may be lost on any network, and a machine busy; a case that fails three times in a row failed."""
+"""A network may lose a message, and a machine may be busy: a case fails when it fails three times in a row."""
 
 Only = Annotated[
-    list[str] | None, typer.Option("--only", metavar="ID", help="A case, or how several begin: R-CAUS; repeatable.")
+    list[str] | None, typer.Option("--only", metavar="ID", help="A case, or the prefix of several: R-CAUS; repeatable.")
 ]
 Groups = Annotated[list[str] | None, typer.Option("--group", metavar="NAME", help="A group such as lease; repeatable.")]
-Listing = Annotated[bool, typer.Option("--list", help="Name the cases and what each demands; test nothing.")]
-Robot = Annotated[str, typer.Option("--robot", metavar="ID", help="The robot's id.")]
-Secure = Annotated[
-    str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`: for tls/, wss:// and tokens.")
-]
+Listing = Annotated[bool, typer.Option("--list", help="List the cases and their demands; test nothing.")]
+Robot = Annotated[str, typer.Option("--robot", metavar="ID", help="Robot id.")]
 Tokens = Annotated[
     list[str] | None,
     typer.Option(
         "--token", metavar="[ROLE=]FILE",
-        help="File with the WebSocket token of vision or operator, or of both; repeatable.",
+        help="File with the WebSocket token of vision, operator or both; repeatable.",
     ),
 ]  # fmt: skip
 OwnToken = Annotated[
-    list[str] | None, typer.Option("--token", metavar="FILE", help="File with the WebSocket token to request.")
+    list[str] | None, typer.Option("--token", metavar="FILE", help="File with the required WebSocket token.")
 ]
-Junit = Annotated[Path | None, typer.Option("--junit", metavar="FILE", help="Write JUnit XML, for a CI.")]
-Save = Annotated[Path | None, typer.Option("--save", metavar="FILE", help="Write the JSON to a file too.")]
-Name = Annotated[str, typer.Option("--name", metavar="TEXT", help="The peer's name in reports [default: where it is].")]
-Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
+Junit = Annotated[Path | None, typer.Option("--junit", metavar="FILE", help="Write JUnit XML.")]
+Save = Annotated[Path | None, typer.Option("--save", metavar="FILE", help="Also write the JSON to a file.")]
+Name = Annotated[str, typer.Option("--name", metavar="TEXT", help="Peer's name in reports [default: its address].")]
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Which cases run, and where their results go: the options that each command has."""
+    """The options of each command: the cases to run, and the files of their results."""
 
     only: Only = None
     groups: Groups = None
@@ -206,7 +198,7 @@ class RunOptions:
     as_json: Json = False
 
     def chosen(self, cases: Sequence[Case]) -> Sequence[Case]:
-        """Those of `cases` to run; none once listed. Raises ConfigError for a file that cannot be written."""
+        """Return the cases to run, or none after --list. Raises ConfigError for a file that cannot be written."""
         found = chosen(cases, self.only or (), self.groups or ())
         if self.list_cases:
             typer.echo(listing(found))
@@ -228,7 +220,7 @@ class RunOptions:
 
 
 def with_run_options(command: Callable[..., int]) -> Callable[..., int]:
-    """`command(..., run=RunOptions)` as a command that has each field of RunOptions as an option of its own."""
+    """Turn `command(..., run=RunOptions)` into a command with an option for each field of RunOptions."""
     fields = inspect.signature(RunOptions).parameters
 
     @functools.wraps(command)
@@ -246,10 +238,7 @@ def with_run_options(command: Callable[..., int]) -> Callable[..., int]:
 
 def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
-    group = typer.Typer(
-        help="Test any robot, vision or codec against the wire protocol, case by case.",
-        no_args_is_help=False, rich_markup_mode=None,
-    )  # fmt: skip
+    group = command_group("Test a robot, vision service or codec against the protocol")
     group.command(epilog="Example: sightline conform robot ws://192.168.1.20:9090")(with_run_options(robot))
     group.command(epilog="Example: sightline conform vision tcp/127.0.0.1:7447")(with_run_options(vision))
     group.command(epilog="Example: sightline conform codec -- node codec.js")(with_run_options(codec))
@@ -257,17 +246,20 @@ def register(app: typer.Typer) -> None:
 
 
 def robot(
-    endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Where it listens: tcp/..., ws:// or wss://.")],
+    endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Its address: tcp/..., ws:// or wss://.")],
     *,
     robot: Robot = "r1",
     legacy: Annotated[
-        str, typer.Option("--older", metavar="ENDPOINT", help="Its legacy protocol's port, ws-legacy://HOST:9091.")
+        str, typer.Option("--older", metavar="ENDPOINT", help="Its legacy port, ws-legacy://HOST:9091.")
     ] = "",
     secure: Secure = "",
     tokens: Tokens = None,
     run: RunOptions,
 ) -> int:
-    """Test a robot as its driver, its watcher and its enemy. It is armed and its wheels turn: lift it off the floor."""
+    """Test a robot against the protocol
+
+    The kit arms the robot and turns its wheels: lift it off the floor. It plays drivers, viewers and attackers.
+    """
     from sightline.conformance.benches import FROM_ROBOT
     from sightline.conformance.raw_peers import RawZenoh
     from sightline.conformance.robot import cases as side
@@ -293,24 +285,27 @@ def robot(
         )  # fmt: skip
         ending.enter_context(bench)
         if not side.is_there(bench):
-            raise LinkError(f"{endpoint} answers, but no robot {robot} publishes its status there; check --robot")
+            raise LinkError(f"no status from robot '{robot}' at {endpoint}; check --robot")
         show_result = ending.enter_context(progress(len(cases)))
         results = run_cases(cases, bench, side.prepare, show_result, TRIES)
     return run.report(results, "robot", endpoint)
 
 
 def vision(
-    endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Where the kit listens, as a robot would.")],
+    endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Address on which the kit listens.")],
     *,
     robot: Robot = "r1",
     dial: Annotated[
-        bool, typer.Option("--dial", help="Connect to a vision service or router that listens there.")
+        bool, typer.Option("--dial", help="Connect to a vision service or router at ENDPOINT.")
     ] = False,
     secure: Secure = "",
     tokens: OwnToken = None,
     run: RunOptions,
 ) -> int:
-    """Test a vision service: the kit plays its robot at ENDPOINT; start the service against it, before or after."""
+    """Test a vision service against the protocol
+
+    The kit plays the robot at ENDPOINT. Start the vision service with --connect ENDPOINT, before or after.
+    """
     from sightline.conformance.benches import TO_ROBOT
     from sightline.conformance.raw_peers import RawZenoh
     from sightline.conformance.vision import cases as side
@@ -332,26 +327,31 @@ def vision(
             LiveBench(robot, open_it, TO_ROBOT, put, roles=("robot",), endpoint=endpoint, access=access)
         )
         if not side.is_there(bench):
-            raise LinkError(f"no vision answers robot {robot} at {endpoint}; start one, before or after this: "
-                            f"sightline vision --connect {endpoint} --robot {robot}")
+            raise LinkError(f"no answer from a vision service for robot '{robot}' at {endpoint}; run "
+                            f"`sightline vision --connect {endpoint} --robot {robot}`")
         show_result = ending.enter_context(progress(len(cases)))
         results = run_cases(cases, bench, side.prepare, show_result, TRIES)
     return run.report(results, "vision", endpoint)
 
 
 def codec(
-    command: Annotated[list[str] | None, typer.Argument(metavar="-- COMMAND", help="The adapter.")] = None,
+    command: Annotated[
+        list[str] | None, typer.Argument(metavar="-- COMMAND", help="Program that answers the cases.")
+    ] = None,
     *,
     run: RunOptions,
 ) -> int:
-    """Test a codec in any language: a program that answers one line of JSON with one line of JSON."""
+    """Test a codec in any language against the protocol
+
+    The program answers each line of JSON with one line of JSON.
+    """
     from sightline.conformance import codec as side
 
     cases = run.chosen(side.CASES)
     if not cases:
         return 0
     if not command:
-        raise ConfigError("no command: write it after two dashes, e.g. sightline conform codec -- node codec.js")
+        raise ConfigError("no command; write it after two dashes, e.g. sightline conform codec -- node codec.js")
     with progress(len(cases)) as show_result:
         results = side.run_codec(command, cases, show_result)
     return run.report(results, "codec", " ".join(command))

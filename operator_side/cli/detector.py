@@ -1,4 +1,4 @@
-"""The commands `detector list | check`, and `detector --serve` for many robots. Shell; heavy imports inside them."""
+"""The commands `detector list | check`, and `detector --serve` for many robots. Shell."""
 
 import json
 import math
@@ -21,6 +21,7 @@ from sightline.operator_side.cli.options import (
 )
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
+from sightline.operator_side.table import print_table
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import start_log
 
@@ -31,19 +32,19 @@ if TYPE_CHECKING:
 
 
 Robots = Annotated[
-    str | None, typer.Option(metavar="ID", help="A robot's id, or several by * and ? [default: the configured or *].")
+    str | None, typer.Option(metavar="ID", help="Robot id; * and ? match several [default: the configured one, or *].")
 ]
 DeadlineMs = Annotated[
-    float, typer.Option("--deadline-ms", min=5, max=1000, help="From a frame's arrival to its boxes, at most.")
+    float, typer.Option("--deadline-ms", min=5, max=1000, help="Longest time from a frame's arrival to its boxes.")
 ]
-MaxBatch = Annotated[int, typer.Option("--max-batch", min=1, max=256, help="Frames in one batch, at most.")]
+MaxBatch = Annotated[int, typer.Option("--max-batch", min=1, max=256, help="Most frames in one batch.")]
 _REMOTE = ("zenoh", "boxes")
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = typer.Typer(
-        help="Detectors: list them, check one, and serve many robots with one.",
+        help="List, check or serve detectors",
         no_args_is_help=False, rich_markup_mode=None, invoke_without_command=True, callback=serve,
         epilog="Example: sightline detector --serve onnx:ball.onnx --listen tcp/0.0.0.0:7447",
     )  # fmt: skip
@@ -55,7 +56,7 @@ def register(app: typer.Typer) -> None:
 def serve(
     context: typer.Context,
     *,
-    name: Annotated[str, typer.Option("--serve", metavar="NAME", help="Detect for every robot in reach.")] = "",
+    name: Annotated[str, typer.Option("--serve", metavar="NAME", help="Detect for every robot that it reaches.")] = "",
     robot: Robots = None,
     listen: Listen = None,
     connect: ServiceConnect = None,
@@ -67,20 +68,21 @@ def serve(
     sets: Sets = None,
     log: LogForm = None,
 ) -> int:
-    """Publish the detections in the newest frames of every robot, until Ctrl-C.
+    """Publish the detections in the newest frames of every robot until Ctrl-C.
 
-    Raises ConfigError for a remote detector, and as `sightline vision` does.
+    Raises:
+        ConfigError: the detector is remote, or the configuration is invalid.
     """
     if context.invoked_subcommand is not None:
         if name:
-            raise ConfigError(f"--serve {name} runs by itself; leave out {context.invoked_subcommand!r}")
+            raise ConfigError(f"--serve {name} and '{context.invoked_subcommand}' exclude each other; remove one")
         return 0
     if not name:
         typer.echo(context.get_help())
         return 0
     start_log(log, "detector")
     if name in _REMOTE:
-        raise ConfigError(f"--serve {name!r} is remote; choose a local detector, e.g. hsv")
+        raise ConfigError(f"--serve '{name}' is remote; choose a local detector, e.g. hsv")
     options = {"robot": robot, "listen": tuple(listen) if listen else None,
                "connect": tuple(connect) if connect else None, "secure": secure, "detector.kind": name,
                "detector.device": device}
@@ -100,7 +102,7 @@ def serve(
 
 
 def list_detectors(as_json: Json = False) -> int:
-    """List every detector, and whether it can be used here."""
+    """List detectors, and whether each works here"""
     with needs("vision"):
         from sightline.vision_side.detect.registry import REGISTRY
     rows = [(name, _problem(REGISTRY, name)) for name in REGISTRY.names()]
@@ -109,17 +111,16 @@ def list_detectors(as_json: Json = False) -> int:
         listed = [{"name": name, "usable": not why, "why": why} for name, why in rows]
         typer.echo(json.dumps({"detectors": listed, "model_hash": model}))
     else:
-        comes = f", comes with model {model}" if model else "; comes without a model: onnx:PATH"
-        for name, why in rows:
-            typer.echo(f"{name:<12} {why or 'ok'}{comes if name == 'onnx' and not why else ''}")
-        typer.echo("or package.module:Name; boxes: those of another publisher, see docs/how-to/detectors.md")
+        comes = f", with model {model}" if model else "; without a model: give onnx:PATH"
+        print_table((name, f"{why or 'ok'}{comes if name == 'onnx' and not why else ''}") for name, why in rows)
+        typer.echo("also: package.module:Name for your own class, and boxes for those of another publisher")
     return 0
 
 
 def _shipped_model() -> str:
     try:
         from sightline.vision_side.detect.onnx.detector import shipped_digest
-    except ImportError:  # the list itself shows the missing package
+    except ImportError:  # the list shows the missing package
         return ""
     return shipped_digest()
 
@@ -139,11 +140,14 @@ def check(
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option of the detector's own Config.")
     ] = None,
     device: Device = None,
-    seed: Annotated[int, typer.Option(help="Draws the pictures.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the test images.")] = 1,
     config: ConfigFile = None,
     as_json: Json = False,
 ) -> int:
-    """Check that a detector keeps the port's promises, with drawn pictures, and time it. Exit code 5 if it does not."""
+    """Check a detector against the port's contract and time it
+
+    It uses generated images. Exit code 5 means that the detector breaks the contract.
+    """
     options: dict[str, Any] = {"detector.device": device}
     given: Any = load_service("vision", file=config, sets=(), options=options, environ=os.environ).config
     with needs("vision"):
@@ -168,14 +172,14 @@ def check(
 
 
 def own_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Read `--set KEY=VALUE` for a detector's own `Config`; a dot is for a section. Raises ConfigError."""
+    """Read `--set KEY=VALUE` for a detector's own `Config`; a dot separates sections. Raises ConfigError."""
     from sightline.operator_side.config.toml_text import options_of
 
     return _nested(options_of(texts))
 
 
 def _nested(options: dict[str, Any]) -> dict[str, Any]:
-    """`hsv.shape=any` is the option `shape` of the section `hsv`. Raises ConfigError for one that is both."""
+    """Nest `hsv.shape=any` as option `shape` of section `hsv`. Raises ConfigError for a name that is both."""
     tables: dict[str, Any] = {}
     for name, value in options.items():
         *sections, last = name.split(".")
@@ -183,9 +187,9 @@ def _nested(options: dict[str, Any]) -> dict[str, Any]:
         for section in sections:
             table = table.setdefault(section, {})
             if not isinstance(table, dict):
-                raise ConfigError(f"--set {name}: {section!r} has a value already, and so no options")
+                raise ConfigError(f"--set {name}: '{section}' already has a value; remove one of the two")
         if isinstance(table.get(last), dict):
-            raise ConfigError(f"--set {name}: options of {last!r} are given besides; give one or the other")
+            raise ConfigError(f"--set {name}: options of '{last}' are also given; remove one of the two")
         table[last] = value
     return tables
 

@@ -15,6 +15,7 @@ import typer
 from sightline.operator_side.cli.options import ConfigFile, Device, Json, Sets, numbers, print_result
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
+from sightline.operator_side.table import print_table
 from sightline.operator_side.terminal import progress_bar
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.training.schedule import Training
@@ -38,44 +39,47 @@ def register(app: typer.Typer) -> None:
     group.command(epilog="Example: sightline score detectors hsv onnx --demand")(detectors)
     app.add_typer(group, name="score")
     app.command(epilog="Example: sightline faults --only vision.kill --only wire")(faults)
-    app.command(epilog="Example: sightline train --out runs/eyes")(train)
+    app.command(epilog="Example: sightline train --out runs/train")(train)
 
 
 def demo(
     *,
-    scenario: Annotated[str, typer.Option(help="A name of `sightline scenarios`, or a .toml.")] = "circle",
-    mission: Annotated[str | None, typer.Option(help="In place of the scenario's own, e.g. a baseline law.")] = None,
-    detector: Annotated[str | None, typer.Option(help="Of `sightline detector list` [default: hsv].")] = None,
-    seconds: Annotated[
-        float | None, typer.Option(help="How long; 0: until Ctrl-C [default: 20, or what the course takes].")
+    scenario: Annotated[str, typer.Option(help="A name from `sightline scenarios`, or a .toml file.")] = "circle",
+    mission: Annotated[str | None, typer.Option(help="Mission [default: of the scenario].")] = None,
+    detector: Annotated[
+        str | None, typer.Option(help="Detector, see `sightline detector list` [default: hsv].")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Draws the start and the noise.")] = 1,
-    latency_ms: Annotated[float, typer.Option(help="Added from capture to command, half on each leg.")] = 0.0,
+    seconds: Annotated[
+        float | None, typer.Option(help="Length; 0 runs until Ctrl-C [default: 20, or the length of the course].")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the start and the noise.")] = 1,
+    latency_ms: Annotated[float, typer.Option(help="Latency added from capture to command, half on each leg.")] = 0.0,
     loss: Annotated[float, typer.Option(help="Share of messages lost on each leg, e.g. 0.1.")] = 0.0,
-    transport: Annotated[str, typer.Option(help="How vision reaches the robot: zenoh, websocket, legacy.")] = "zenoh",
+    transport: Annotated[str, typer.Option(help="Link of the vision service: zenoh, websocket or legacy.")] = "zenoh",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Run folder [default: runs/TIME-...].")] = None,
-    open_it: Annotated[bool, typer.Option("--open", help="Show the film when it is over.")] = False,
+    open_it: Annotated[bool, typer.Option("--open", help="Open the film at the end.")] = False,
     story: Annotated[bool, typer.Option("--story", help="Film of 27 s: stops, then a naive robot, a wall.")] = False,
     as_json: Json = False,
 ) -> int:
-    """Follow a ball by sight, or what else a scenario is about: simulation, robot and vision as real processes over
-    Zenoh, scored and filmed.
+    """Simulate, drive, score and film a run on this machine
+
+    Simulation, robot and vision service run as real processes over Zenoh. The results go to --out.
     """
     _check_installed("pybullet", "av", "matplotlib", "mcap")
     with needs("all"):
         from sightline.evaluation.demo.report import report, summary
         from sightline.evaluation.demo.run import DemoOptions, run_demo
-    say = _to_stderr if as_json else typer.echo
+    show = _to_stderr if as_json else typer.echo
     if story:
         _check_story(DemoOptions(scenario, seconds or 0.0, seed, latency_ms, loss, out, transport, mission, detector))
-        return _make_story(out, seed, say, as_json=as_json, open_it=open_it)
+        return _make_story(out, seed, show, as_json=as_json, open_it=open_it)
     lasting_s = _seconds(scenario, seconds)
-    run = run_demo(DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission, detector), say)
-    say("all three have ended; the run is being scored, replayed and filmed")
-    judged = report(run)
-    code = print_result(judged.to_dict(), summary(judged), as_json)
+    run = run_demo(DemoOptions(scenario, lasting_s, seed, latency_ms, loss, out, transport, mission, detector), show)
+    show("all three processes ended; scoring, replaying and filming the run")
+    scored = report(run)
+    code = print_result(scored.to_dict(), summary(scored), as_json)
     if open_it:
-        webbrowser.open((judged.run.folder / "run.mp4").as_uri())
+        webbrowser.open((scored.run.folder / "run.mp4").as_uri())
     return code
 
 
@@ -91,28 +95,28 @@ def _check_story(options: "DemoOptions") -> None:
         raise ConfigError("--story and --seconds exclude each other: the story has its own length; omit --seconds")
 
 
-def _make_story(out: Path | None, seed: int, say: Callable[[str], None], *, as_json: bool, open_it: bool) -> int:
+def _make_story(out: Path | None, seed: int, show: Callable[[str], None], *, as_json: bool, open_it: bool) -> int:
     from sightline.evaluation.demo.story_run import FILM, make_story
 
-    result = make_story(out, seed, say)
+    result = make_story(out, seed, show)
     code = print_result(result.to_dict(), result.lines(), as_json)
     if open_it:
         webbrowser.open((result.folder / FILM).as_uri())
     return code
 
 
-def _seconds(scenario: str, asked: float | None) -> float:
-    """A ball is followed for as long as one likes; a course is driven to its end."""
+def _seconds(scenario: str, given: float | None) -> float:
+    """Return the length of a demo: as given, to the end of a course, or 20 s."""
     from sightline.sim.scenario import load_scenario
 
-    if asked is not None:
-        return asked
+    if given is not None:
+        return given
     loaded = load_scenario(scenario)
     return loaded.seconds if loaded.goals_m or loaded.light else 20.0
 
 
 def _check_installed(*packages: str) -> None:
-    """So that what the end needs is missed at the beginning. Raises ConfigError."""
+    """Raise ConfigError for a missing package before the run, although only the report needs it."""
     with needs("all"):
         for package in packages:
             if find_spec(package) is None:
@@ -127,18 +131,23 @@ def score(
     context: typer.Context,
     *,
     scenario: Annotated[str, typer.Option(help="`all`, or names separated by commas.")] = "all",
-    seeds: Annotated[str, typer.Option(help="Separated by commas; judge with seeds nobody tuned on.")] = "1,2,3",
-    latency_ms: Annotated[str, typer.Option(help="Added latencies, separated by commas.")] = "50",
+    seeds: Annotated[str, typer.Option(help="Seeds, separated by commas; use seeds without tuning on them.")] = "1,2,3",
+    latency_ms: Annotated[str, typer.Option(help="Added latencies in ms, separated by commas.")] = "50",
     loss: Annotated[str, typer.Option(help="Losses on each leg, separated by commas.")] = "0.1",
-    seconds: Annotated[float | None, typer.Option(min=1, max=3600, help="[default: the scenario's own]")] = None,
-    mission: Annotated[str | None, typer.Option(help="In place of the scenario's own, e.g. a baseline law.")] = None,
-    robot_model: Annotated[str | None, typer.Option(help="In place of the scenario's own robot.")] = None,
-    look: Annotated[str | None, typer.Option(help="In place of the scenario's own light, e.g. dim.")] = None,
-    detector: Annotated[str | None, typer.Option(help="In place of the scenario's own, e.g. onnx.")] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Runs at once [default: one per core].")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=1, max=3600, help="Length of a run [default: of the scenario].")
+    ] = None,
+    mission: Annotated[str | None, typer.Option(help="Mission [default: of the scenario].")] = None,
+    robot_model: Annotated[str | None, typer.Option(help="Robot model [default: of the scenario].")] = None,
+    look: Annotated[str | None, typer.Option(help="Light, e.g. dim [default: of the scenario].")] = None,
+    detector: Annotated[str | None, typer.Option(help="Detector, e.g. onnx [default: of the scenario].")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Runs in parallel [default: one per core].")] = None,
     as_json: Json = False,
 ) -> int:
-    """Drive in virtual time, many times, and judge: the services' own logic, world truth, median and worst."""
+    """Score missions over many starts in virtual time
+
+    It runs the logic of the services against the simulated truth and prints median and worst of each figure.
+    """
     if context.invoked_subcommand is not None:
         return 0
     with needs("all"):
@@ -154,36 +163,37 @@ def score(
     return print_result(report.to_dict(), [score_text(report)], as_json)
 
 
-# Command `score detectors`: any set of detectors on the same labelled scenes. Shell.
+# --- `score detectors`: detectors on the same labeled scenes -----------------------------------------------------
 
 
 COMPARED = ("hsv", "onnx")
 FRAMES = 100
 FROM = 900_000
-"""As sim/scenes/model.py has it; that file needs more than the command line may at its start. A test compares them."""
+"""The same as in sim/scenes/model.py, whose imports are too heavy for the command line. A test compares them."""
 
 
 def detectors(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="Of `sightline detector list` [default: hsv onnx].")
+        list[str] | None, typer.Argument(metavar="NAME", help="See `sightline detector list` [default: hsv onnx].")
     ] = None,
     *,
     frames: Annotated[
         int | None, typer.Option(min=1, max=100_000, help="Scenes in each column [default: 100; with --demand 500].")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=0, max=10**9, metavar="FROM", help="The first scene's seed.")] = FROM,
+    seeds: Annotated[int, typer.Option(min=0, max=10**9, metavar="FROM", help="Seed of the first scene.")] = FROM,
     column: Annotated[str, typer.Option(help="`all`, or names separated by commas, e.g. blur,all at once.")] = "all",
-    looks: Annotated[int, typer.Option(min=1, max=100, help="Each scene this often: `adaptive` has to make sure.")] = 1,
+    looks: Annotated[int, typer.Option(min=1, max=100, help="Detections of each scene; `adaptive` needs several.")] = 1,
     demand: Annotated[
-        bool, typer.Option("--demand", help="Judge by what is demanded of a learned detector; exit code 5 if it fails.")
+        bool, typer.Option("--demand", help="Check the bounds of a learned detector; exit code 5 if it fails.")
     ] = False,
     device: Device = None,
     config: ConfigFile = None,
     sets: Sets = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    as_json: Json = False,
 ) -> int:
-    """Compare detectors on drawn scenes: hits, wrong objects, false alarms, centre error, time. Seeds from 900000 are
-    for judging only: nothing may be trained or tuned on them.
+    """Compare detectors on generated scenes
+
+    It prints hits, wrong objects, false alarms, center error and time. Seeds from 900000 are for scoring only.
     """
     with needs("all"):
         from sightline.evaluation.score.detector_report import FRAMES as DEMANDED_FRAMES
@@ -194,21 +204,21 @@ def detectors(
             score_scenes,
         )
     if demand and seeds < FROM:
-        raise ConfigError(f"--demand judges, which only seeds from {FROM} up are for, not {seeds}")
+        raise ConfigError(f"--demand needs seeds from {FROM} up, which no training uses; {seeds} is lower")
     columns, shown = _columns(column), frames or (DEMANDED_FRAMES if demand else FRAMES)
-    asked = _subjects(names or COMPARED, config, sets or (), device)
+    subjects = _subjects(names or COMPARED, config, sets or (), device)
     try:
         with progress_bar(int((len(columns) + LIGHT_SHARE) * shown)) as advance:
-            report = score_scenes(asked, shown, seeds, looks=looks, columns=columns, each=lambda _scene: advance())
+            report = score_scenes(subjects, shown, seeds, looks=looks, columns=columns, each=lambda _scene: advance())
     finally:
-        close_subjects(asked)
+        close_subjects(subjects)
     return _print_report(report, all_detector_checks(report) if demand else None, as_json)
 
 
 def _subjects(
     names: Sequence[str], file: str | None, sets: Sequence[str], device: str | None
 ) -> "list[Subject]":
-    """As `sightline vision` with the same options would build them; only the detectors, nothing that goes around."""
+    """Build the detectors as `sightline vision` does with the same options, without the service around them."""
     from sightline.evaluation.score.detector_report import subjects
 
     loaded = load_service("vision", file=file, sets=sets, options={"detector.device": device}, environ=os.environ)
@@ -218,17 +228,17 @@ def _subjects(
 
 
 def _whose_options(names: Sequence[str], loaded: "Loaded") -> str:
-    """Of the detector that the configuration names, or else of the only one that is compared."""
+    """Return the detector that the options belong to: the configured one, or the only one compared."""
     settings: Any = loaded.config
     is_named = loaded.origin(("detector", "kind")) != "default"
     whose: str = names[0] if len(names) == 1 and not is_named else settings.detector.kind
     if settings.detector.options and not is_named and whose not in names:
-        raise ConfigError("detector.options are one detector's: say whose with --set detector.kind=NAME")
+        raise ConfigError("detector.options belong to one detector; name it with --set detector.kind=NAME")
     return whose
 
 
 def _check_device(names: Sequence[str], settings: Any) -> None:
-    """Raise ConfigError where none of them has a device to choose."""
+    """Raise ConfigError if no detector of the list accepts a device."""
     from sightline.vision_side.detect.registry import check_device
 
     alone = {"fallback": "", "shadow": ""}
@@ -253,22 +263,22 @@ def _print_report(report: "DetectorReport", checks: "list[Check] | None", as_jso
     return print_result(result, [text(report), *check_lines(checks or ())], as_json)
 
 
-def _columns(asked: str) -> list[str]:
+def _columns(given: str) -> list[str]:
     from sightline.operator_side.config.errors import no_such_name
     from sightline.sim.scenes.model import COLUMNS
 
-    names = list(COLUMNS) if asked == "all" else [one.strip() for one in asked.split(",")]
+    names = list(COLUMNS) if given == "all" else [one.strip() for one in given.split(",")]
     for one in names:
         if one not in COLUMNS:
             raise ConfigError(f"--column: {no_such_name('column', one, list(COLUMNS))}")
     return names
 
 
-# The command `faults`: break things on purpose and judge what the wheels did. Shell. Exit code 5 when a row fails.
+# --- `faults` ----------------------------------------------------------------------------------------------------
 
 
 JOBS = min(4, (os.cpu_count() or 1) + 1)
-"""A row waits more than it computes; a row that was disturbed too much says so and runs again."""
+"""A row waits more than it computes. A row that other load disturbed too much runs again."""
 
 
 def faults(
@@ -276,15 +286,18 @@ def faults(
     only: Annotated[
         list[str] | None, typer.Option("--only", metavar="ID", help="A row, or a group such as `wire`; repeatable.")
     ] = None,
-    short: Annotated[bool, typer.Option("--short", help="The short set, as in CI.")] = False,
-    repeat: Annotated[int, typer.Option(min=1, max=100, help="Run each row so often.")] = 1,
+    short: Annotated[bool, typer.Option("--short", help="Run the short set, as in CI.")] = False,
+    repeat: Annotated[int, typer.Option(min=1, max=100, help="Runs of each row.")] = 1,
     jobs: Annotated[
-        int, typer.Option(min=1, max=16, help="Rows at once; those that take the whole machine run alone.")
+        int, typer.Option(min=1, max=16, help="Rows in parallel; rows that need the whole machine run alone.")
     ] = JOBS,
-    listing: Annotated[bool, typer.Option("--list", help="Name the rows and what each demands; run nothing.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    listing: Annotated[bool, typer.Option("--list", help="List the rows and their demands; run nothing.")] = False,
+    as_json: Json = False,
 ) -> int:
-    """Start real processes, break one thing at a time, and judge from the simulated motors' own log."""
+    """Inject faults into real processes and check each stop
+
+    Each row breaks one thing and checks the log of the simulated motors. Exit code 5 means that a row failed.
+    """
     with needs("all"):
         from sightline.evaluation.faults.cases import chosen
         from sightline.evaluation.faults.report import (
@@ -294,7 +307,7 @@ def faults(
         from sightline.evaluation.faults.runner import run_cases
     rows = chosen(only or (), short=short)
     if listing:
-        typer.echo("\n".join(f"{row.id:<22} {row.what}: {row.demanded}" for row in rows))
+        print_table((row.id, f"{row.what}: {row.demanded}") for row in rows)
         return 0
     folder = Path(tempfile.mkdtemp(prefix="sightline-faults-"))
     results = run_cases(
@@ -305,69 +318,74 @@ def faults(
 
 
 def _remove_if_empty(folder: Path) -> None:
-    with suppress(OSError):  # a row that failed left its logs
+    with suppress(OSError):  # a failed row leaves its logs
         folder.rmdir()
 
 
 def _summary(results: "Results", folder: Path) -> str:
     ran = [outcomes for outcomes in results if not outcomes[0].skipped]
     good = sum(all(one.ok for one in outcomes) for outcomes in ran)
-    left = f"; logs of what failed are in {folder}" if folder.exists() else ""
-    return f"{good} of {len(ran)} rows passed, {len(results) - len(ran)} could not run here{left}"
+    left = f"; logs of failed rows are in {folder}" if folder.exists() else ""
+    return f"{good} of {len(ran)} rows passed, {len(results) - len(ran)} skipped on this machine{left}"
 
 
-# Command `train`: make the learned detector again, or one's own. Shell.
+# --- `train` -----------------------------------------------------------------------------------------------------
 
 
 STEPS = [15_000, 14_000, 13_000, 14_000, 20_000, 20_000]
 SCENES = 100_000
 BATCH = 32
 VALIDATED = 5000
-"""These are those of the model that ships, so that the same command makes one of its kind; a test compares. (That one's
-rounds were trained one by one, the last from the file before, as its card says.)"""
+"""The values of the shipped model, so that the same command makes a model like it; a test compares them. (Its rounds
+were trained one by one, the last from the file before, as its card states.)"""
 OUT = Path("runs/train")
-_STEPS = "Of one round; say it again for one more, which starts the learning rate anew and takes in more scenes."
-_START = "A model that this command made: train the last round alone, from there on."
+_STEPS = "Steps of one round; repeat the option for more rounds, each with a new learning rate and more scenes."
+_START = "Train only the last round, starting from this model."
 _LEAST_SHARE = 8
-"""Of a batch for each process that trains: the normalisation needs a few pictures."""
+"""Images of a batch for each training process: the normalization needs several."""
 
 
 def train(
     *,
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Scenes, checkpoint, model and card go here.")] = OUT,
-    scenes: Annotated[int, typer.Option(min=8, max=800_000, help="Drawn once, seeds from 0 up.")] = SCENES,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of scenes, checkpoint, model and card.")] = OUT,
+    scenes: Annotated[int, typer.Option(min=8, max=800_000, help="Scenes to generate, with seeds from 0 up.")] = SCENES,
     steps: Annotated[list[int], typer.Option(min=1, max=10_000_000, metavar="<int range>", help=_STEPS)] = STEPS,
     batch: Annotated[int, typer.Option(min=2, max=1024, help="Cut-outs of scenes in each step.")] = BATCH,
-    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Draws weights, cuts and defects.")] = 1,
-    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="What trains.")] = "cpu",
+    seed: Annotated[int, typer.Option(min=0, max=2**31, help="Seed of weights, cut-outs and defects.")] = 1,
+    device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Device that trains.")] = "cpu",
     jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Processes [default: one per core].")] = None,
     start: Annotated[Path | None, typer.Option(metavar="MODEL", help=_START)] = None,
-    validated: Annotated[int, typer.Option(min=5, max=100_000, help="Scenes a column for thresholds.")] = VALIDATED,
-    judged: Annotated[int, typer.Option(min=5, help="Scenes a column for the card's table.")] = 500,
+    validated: Annotated[int, typer.Option(min=5, max=100_000, help="Scenes per column for thresholds.")] = VALIDATED,
+    scored: Annotated[
+        int, typer.Option("--scored", "--judged", min=5, help="Scenes per column for the table of the card.")
+    ] = 500,
 ) -> None:
-    """Draw labelled scenes, train the detector, write sightline.onnx and its card. Cut off, it goes on where it was."""
+    """Train the learned detector
+
+    Generates labeled scenes and writes sightline.onnx with its card. An interrupted run continues where it ended.
+    """
     with needs("train"):
         import torch
 
         from sightline.training.loop import TrainOptions, run_training
     if device == "cuda" and not torch.cuda.is_available():
-        raise HardwareError("--device cuda: this PyTorch sees no GPU; check `nvidia-smi` and that PyTorch is a CUDA "
-                            "build, or take --device cpu")
+        raise HardwareError("--device cuda: PyTorch finds no GPU; check `nvidia-smi` and that PyTorch is a CUDA "
+                            "build, or use --device cpu")
     processes = jobs or os.cpu_count() or 1
     weights, digest = _begun(start) if start else (None, "")
     sharing = _sharing(batch, processes) if device == "cpu" else 1
     training = Training(tuple(steps), batch, seed=seed, jobs=sharing, start=digest)
-    options = TrainOptions(out, scenes, training, device, processes, validated, judged, weights)
+    options = TrainOptions(out, scenes, training, device, processes, validated, scored, weights)
     try:
         out.mkdir(parents=True, exist_ok=True)
         model = run_training(options, _print_line, progress_bar)
     except OSError as error:
         raise ConfigError(f"--out {out}: {error.strerror or error}") from None
-    _print_line(f"{model}, {model.with_suffix('.md').name}: try it with `sightline score detectors onnx:{model}`")
+    _print_line(f"{model}, {model.with_suffix('.md').name}: test it with `sightline score detectors onnx:{model}`")
 
 
 def _begun(model: Path) -> "tuple[Weights, str]":
-    """The model's weights, and its SHA-256."""
+    """Read the weights of a model and its SHA-256."""
     from sightline.training.export import weights_in
 
     try:
@@ -376,11 +394,11 @@ def _begun(model: Path) -> "tuple[Weights, str]":
     except OSError as error:
         raise ConfigError(f"--start {model}: {error.strerror or error}") from None
     except ValueError as error:
-        raise ConfigError(f"--start {model}: {error}; name a model that `sightline train` made") from None
+        raise ConfigError(f"--start {model}: {error}; name a model from `sightline train`") from None
 
 
 def _sharing(batch: int, processes: int) -> int:
-    """How many processes share a batch evenly."""
+    """Return the number of processes that share a batch evenly."""
     return max(n for n in range(1, processes + 1) if n == 1 or (batch % n == 0 and batch // n >= _LEAST_SHARE))
 
 

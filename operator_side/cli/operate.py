@@ -6,40 +6,25 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from sightline.operator_side.cli.options import (
-    DEFAULT_CONNECT,
-    REJECTED_EXIT,
-    Connect,
-    Json,
-    MaybeConnect,
-    Robot,
-    Secure,
-)
-from sightline.operator_side.client.discovery import discover_all
-from sightline.operator_side.client.missions import (
-    MissionClient,
-    Waypoints,
-    cannot,
-    detector_line,
-    mission_line,
-    mission_lines,
-    request_of,
-    waypoints_of,
-    waypoints_of_file,
-)
-from sightline.operator_side.client.pictures import viewer_role
+from sightline.operator_side.cli.options import REJECTED_EXIT, Connect, Json, Robot, Secure, target_of
 from sightline.operator_side.client.requests import SOURCE, Operator
-from sightline.operator_side.client.status import status_line, status_lines
-from sightline.operator_side.config.toml_text import options_of
-from sightline.protocol.errors import ConfigError
+from sightline.operator_side.client.status import reply_line, short_lines, status_line, status_lines
+from sightline.operator_side.config.context import RobotAddress
+from sightline.operator_side.table import print_block
+from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.messages import MissionReport, Reply, Status, Verb
 from sightline.protocol.transports.open import open_link
 
-_REPORT_S = 0.8  # vision reports twice a second; where one drives, that is worth waiting for
+if TYPE_CHECKING:
+    from sightline.operator_side.client.missions import MissionClient, Waypoints
+    from sightline.protocol.transports.link import Link
+
+_PERIOD_S: Final = 0.25
+_REPORT_S: Final = 0.8  # the vision service reports twice a second; while it drives, `status` waits for a report
 
 
 def register(app: typer.Typer) -> None:
@@ -47,9 +32,9 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: sightline robots --connect tcp/192.168.1.20:7447")(robots)
     app.command(epilog="Example: sightline status r1 --watch")(status)
     app.command(epilog="Example: sightline arm r1 --connect tcp/192.168.1.20:7447")(arm)
-    app.command(epilog="Example: sightline disarm")(disarm)
-    app.command(epilog="Example: sightline stop")(stop)
-    app.command(epilog="Example: sightline reset && sightline arm")(reset)
+    app.command(epilog="Example: sightline disarm r1")(disarm)
+    app.command(epilog="Example: sightline stop r1 --connect tcp/192.168.1.20:7447")(stop)
+    app.command(epilog="Example: sightline reset r1 && sightline arm r1")(reset)
     app.command(epilog="Example: sightline mission r1 follow")(mission)
     app.command(
         epilog="Example: sightline goto r1 1.5 1.5 0 0 --wait",
@@ -59,81 +44,139 @@ def register(app: typer.Typer) -> None:
 
 
 def robots(
-    connect: MaybeConnect = None,
+    connect: Connect = None,
     secure: Secure = "",
-    seconds: Annotated[float, typer.Option(min=0.2, max=60, help="How long to listen.")] = 0.6,
+    seconds: Annotated[float, typer.Option(min=0.2, max=60, help="Listen for this long.")] = 0.6,
     as_json: Json = False,
 ) -> int:
-    """List who is there: robots and their state, who sees and steers, versions and round-trip times.
+    """List robots and the services connected to them
 
-    Without --connect it looks on this machine, then asks the network (multicast).
+    Without an address the command looks on this machine, then sends a multicast to the network.
     """
-    found = discover_all(connect, seconds, secure)
-    if as_json:
-        typer.echo(json.dumps(found.as_object()))
-    else:
-        typer.echo("\n".join(found.lines()))
+    from sightline.operator_side.client.discovery import discover_all
+
+    target = target_of(None, connect, secure)
+    places = None if target.origin == "default" else target.connect
+    found = discover_all(places, seconds, target.secure)
+    typer.echo(json.dumps(found.as_object()) if as_json else "\n".join(found.lines()))
     return 0
 
 
 def status(
-    robot: Robot = "r1",
-    connect: Connect = DEFAULT_CONNECT,
+    robot: Robot = None,
+    connect: Connect = None,
+    *,
     secure: Secure = "",
-    watch: Annotated[bool, typer.Option("--watch", help="Once a second, until Ctrl-C.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show every field.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Show it again four times a second, until Ctrl-C.")] = False,
     as_json: Json = False,
-) -> None:
-    """Say what a robot does and why: state, driver, twist, frame age, latency, every refusal; its vision's mission."""
-    role = viewer_role(secure) if secure else SOURCE  # a viewer's keys are enough to look
-    with open_link(robot, connect=connect, role=role, secure=secure) as link:
+) -> int:
+    """Show a robot's state and its reason
+
+    The lines name the driver, the wheels, the frame age and the mission. With --json --watch each line is one object.
+    """
+    from sightline.operator_side.client.missions import MissionClient
+    from sightline.operator_side.client.pictures import viewer_role
+
+    target = target_of(robot, connect, secure)
+    role = viewer_role(target.secure) if target.secure else SOURCE  # the keys of a viewer are enough
+    with _link(target, role) as link:
         missions = MissionClient(link)
-        while True:
-            state = missions.operator.wait_report().status
-            seen_to = state.holder is not None and state.holder.source == "vision"
-            mission = missions.newest(_REPORT_S if seen_to else 0.0)
+        if watch:
+            return follow_status(missions, verbose=verbose, as_json=as_json)
+        state = missions.operator.wait_report().status
+        is_seen_to = state.holder is not None and state.holder.source == "vision"
+        report = missions.newest(_REPORT_S if is_seen_to else 0.0)
+        if as_json:
+            typer.echo(_status_json(target.robot, state, report))
+        else:
+            print_block(_status_block(target.robot, state, report, verbose))
+    return 0
+
+
+def follow_status(
+    missions: "MissionClient", *, verbose: bool, as_json: bool = False, ends_s: float = float("inf")
+) -> int:
+    """Show a robot's status, or that it is silent, until `ends_s` (monotonic) or Ctrl-C; in place on a terminal."""
+    from sightline.operator_side.terminal import LiveBlock
+
+    with LiveBlock() as live:
+        while time.monotonic() < ends_s:
+            try:
+                state = missions.operator.wait_report().status
+            except LinkError as error:
+                if as_json:
+                    typer.echo(json.dumps({"robot": missions.operator.robot, "error": str(error)}))
+                else:
+                    live.show([str(error)])
+                continue
+            report = missions.newest(0.0)
             if as_json:
-                about = mission and mission.model_dump(mode="json")
-                typer.echo(json.dumps({"robot": robot, **state.model_dump(mode="json"), "mission": about}))
+                typer.echo(_status_json(missions.operator.robot, state, report))
             else:
-                lines = [*status_lines(robot, state), *(mission_lines(mission) if mission else ())]
-                typer.echo("\n".join(lines) + ("\n" if watch else ""))
-            if not watch:
-                return
-            time.sleep(1.0)
+                live.show(_status_block(missions.operator.robot, state, report, verbose))
+            time.sleep(_PERIOD_S)
+    return 0
+
+
+def _status_json(robot: str, state: Status, report: MissionReport | None) -> str:
+    about = report and report.model_dump(mode="json")
+    return json.dumps({"robot": robot, **state.model_dump(mode="json"), "mission": about})
+
+
+def _status_block(robot: str, state: Status, report: MissionReport | None, verbose: bool) -> list[str]:
+    from sightline.operator_side.client.missions import mission_line, mission_lines
+
+    if verbose:
+        return [*status_lines(robot, state), *(mission_lines(report) if report else ())]
+    return [*short_lines(robot, state), *([f"mission   {mission_line(report)}"] if report else [])]
 
 
 def arm(
-    robot: Robot = "r1",
-    connect: Connect = DEFAULT_CONNECT,
+    robot: Robot = None,
+    connect: Connect = None,
     secure: Secure = "",
-    wait: Annotated[float, typer.Option(min=0, max=60, help="Seconds to wait for live commands.")] = 5.0,
+    wait: Annotated[float, typer.Option(min=0, max=60, help="Wait this many seconds for valid commands.")] = 5.0,
     as_json: Json = False,
 ) -> int:
-    """Let whoever drives a robot move its wheels. The robot must be seeing live commands."""
-    with _operator(robot, connect, secure) as operator:
-        return _print_reply(robot, operator.arm(wait), as_json)
+    """Arm a robot so that it may move
+
+    The robot must already receive valid commands. Motion starts from zero.
+    """
+    with _operator(target_of(robot, connect, secure, announce=True)) as operator:
+        return _print_reply(operator, Verb.ARM, operator.arm(wait), as_json)
 
 
-def disarm(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> int:
-    """Wheels to zero; commands are judged but not obeyed until armed again."""
-    with _operator(robot, connect, secure) as operator:
-        return _print_reply(robot, operator.request(Verb.DISARM), as_json)
+def disarm(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_json: Json = False) -> int:
+    """Stop the wheels and disarm a robot
+
+    The robot validates commands but does not apply them until it is armed again.
+    """
+    with _operator(target_of(robot, connect, secure, announce=True)) as operator:
+        return _print_reply(operator, Verb.DISARM, operator.request(Verb.DISARM), as_json)
 
 
-def reset(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> int:
-    """Leave STOPPED or FAULT. Permits arming, starts nothing."""
-    with _operator(robot, connect, secure) as operator:
-        return _print_reply(robot, operator.request(Verb.RESET), as_json)
+def reset(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_json: Json = False) -> int:
+    """Clear a latched STOP or a drive fault
+
+    The robot is disarmed afterwards, and does not move.
+    """
+    with _operator(target_of(robot, connect, secure, announce=True)) as operator:
+        return _print_reply(operator, Verb.RESET, operator.request(Verb.RESET), as_json)
 
 
-def stop(robot: Robot = "r1", connect: Connect = DEFAULT_CONNECT, secure: Secure = "", as_json: Json = False) -> None:
-    """STOP a robot: wheels to zero, latched until `sightline reset`. Not an emergency stop: it needs the network."""
+def stop(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_json: Json = False) -> None:
+    """STOP a robot and latch the stop until reset
+
+    The wheels go to zero and stay there until `sightline reset`. STOP needs the network: it is no emergency stop.
+    """
 
     def on_slow() -> None:
-        typer.echo(f"STOP of {robot} is not confirmed yet; repeating. Be ready to cut its power by hand", err=True)
+        typer.echo(f"STOP of {target.robot} is not confirmed, repeating; be ready to cut its power by hand", err=True)
 
-    with _operator(robot, connect, secure) as operator:
-        _print_stopped(robot, operator.stop(on_slow), as_json)
+    target = target_of(robot, connect, secure, announce=True)
+    with _operator(target) as operator:
+        _print_stopped(target.robot, operator.stop(on_slow), as_json)
 
 
 def _print_stopped(robot: str, state: Status, as_json: bool) -> None:
@@ -143,24 +186,31 @@ def _print_stopped(robot: str, state: Status, as_json: bool) -> None:
         typer.echo(status_line(robot, state))
 
 
-def _print_reply(robot: str, reply: Reply, as_json: bool) -> int:
-    """Print a reply; exit code 5 if the robot refused."""
+def _print_reply(operator: Operator, verb: Verb, reply: Reply, as_json: bool) -> int:
+    """Print a reply. Returns exit code 5 if the robot rejected the request."""
+    robot = operator.robot
     if as_json:
         typer.echo(json.dumps({"robot": robot, "ok": reply.ok, "state": reply.state, "detail": reply.detail}))
-    elif reply.ok:
-        typer.echo(f"{robot}: {reply.detail} ({reply.state})")
     else:
-        typer.echo(f"error: {robot} refused: {reply.detail}", err=True)
+        driver = operator.report.status.holder if operator.report else None
+        line = reply_line(robot, verb, reply, driver.source if driver else "")
+        typer.echo(line if reply.ok else f"error: {line}", err=not reply.ok)
     return 0 if reply.ok else REJECTED_EXIT
 
 
 @contextmanager
-def _operator(robot: str, connect: list[str], secure: str) -> Iterator[Operator]:
-    with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
+def _link(target: RobotAddress, role: str) -> "Iterator[Link]":
+    with open_link(target.robot, connect=target.connect, role=role, secure=target.secure) as link:
+        yield link
+
+
+@contextmanager
+def _operator(target: RobotAddress) -> Iterator[Operator]:
+    with _link(target, SOURCE) as link:
         yield Operator(link)
 
 
-# Commands that say what vision is to do: `mission`, `goto`. Shell.
+# --- `mission` and `goto` ----------------------------------------------------------------------------------------
 
 
 Sets = Annotated[
@@ -169,120 +219,146 @@ Sets = Annotated[
 
 
 def mission(
-    robot: Robot = "r1",
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="What to begin; without it, tell.")] = None,
+    robot: Robot = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Mission to start; without it, show the mission.")
+    ] = None,
     *,
     sets: Sets = None,
-    connect: Connect = DEFAULT_CONNECT,
+    connect: Connect = None,
     secure: Secure = "",
     as_json: Json = False,
 ) -> int:
-    """Say what a robot's vision does, or what it is to do from now on. It comes to rest in between."""
+    """Show or start a robot's mission
+
+    The robot comes to rest before the new mission starts.
+    """
+    from sightline.operator_side.client.missions import request_of
+    from sightline.operator_side.config.toml_text import options_of
+
     options = options_of(sets or ())
     if options and name is None:
-        raise ConfigError("--set is for a mission to begin: name it, e.g. sightline mission r1 follow --set ...")
+        raise ConfigError("--set needs a mission to start; name it, e.g. sightline mission r1 follow --set KEY=VALUE")
     if name is not None:
-        request_of(0, name, (), options)  # what is wrong with it is said without a robot
-    with _missions(robot, connect, secure) as missions:
+        request_of(0, name, (), options)  # reports what is invalid without a robot
+    target = target_of(robot, connect, secure, announce=name is not None)
+    with _missions(target) as missions:
         report = missions.report() if name is None else missions.request(name, options=options)
-        return _print_report(robot, report, as_json, asked=name is not None)
+        return _print_report(target.robot, report, as_json, is_answer=name is not None)
 
 
 def goto(
-    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="The robot's id.")],
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Robot id.")],
     numbers: Annotated[
-        list[str] | None, typer.Argument(metavar="X Y [X Y ...]", help="Metres, in the odometry frame.")
+        list[str] | None, typer.Argument(metavar="X Y [X Y ...]", help="Waypoints in meters, in the odometry frame.")
     ] = None,
     *,
     file: Annotated[
-        Path | None, typer.Option("--file", metavar="FILE", help="One waypoint a line, X Y; # for remarks.")
+        Path | None, typer.Option("--file", metavar="FILE", help="One waypoint X Y per line; # starts a comment.")
     ] = None,
-    wait: Annotated[bool, typer.Option("--wait", help="Until it is there, or cannot get there.")] = False,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Wait until the robot arrives (exit code 0) or cannot arrive (5).")
+    ] = False,
     sets: Sets = None,
-    connect: Connect = DEFAULT_CONNECT,
+    connect: Connect = None,
     secure: Secure = "",
     as_json: Json = False,
 ) -> int:
-    """Send a robot to one place or several, round what its range sensors see. Ctrl-C does not stop it: `stop` does."""
-    waypoints, options = _given(numbers or [], file), options_of(sets or ())
+    """Send a robot to one or more waypoints
+
+    The robot drives around what its range sensors detect. Ctrl-C does not stop it; `sightline stop` does.
+    """
+    from sightline.operator_side.client.missions import cannot, mission_line, request_of
+    from sightline.operator_side.config.toml_text import options_of
+
+    waypoints, options = _waypoints(numbers or [], file), options_of(sets or ())
     request_of(0, "goto", waypoints, options)
-    with _missions(robot, connect, secure) as missions:
+    target = target_of(robot, connect, secure, announce=True)
+    with _missions(target) as missions:
         report = missions.request("goto", waypoints, options)
         if report.refused or not wait:
-            return _print_report(robot, report, as_json, asked=True)
+            return _print_report(target.robot, report, as_json, is_answer=True)
         for report in missions.follow():
             if not as_json and not report.done:
-                typer.echo(f"{robot}: {mission_line(report)}")
-        code = _print_report(robot, report, as_json, asked=True)
+                typer.echo(f"{target.robot}: {mission_line(report)}")
+        code = _print_report(target.robot, report, as_json, is_answer=True)
         return REJECTED_EXIT if cannot(report) else code
 
 
-def _given(numbers: list[str], file: Path | None) -> Waypoints:
+def _waypoints(numbers: list[str], file: Path | None) -> "Waypoints":
+    from sightline.operator_side.client.missions import waypoints_of, waypoints_of_file
+
     if file is None:
         return waypoints_of(numbers)
     if numbers:
-        raise ConfigError("waypoints are given on the command line and in a file; give one of them")
+        raise ConfigError("waypoints on the command line and --file exclude each other; remove one")
     try:
         return waypoints_of_file(file.expanduser().read_text("utf-8"), str(file))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: cannot be read: {getattr(error, 'strerror', None) or 'is no text'}") from None
+        raise ConfigError(f"cannot read {file}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
 
 
 @contextmanager
-def _missions(robot: str, connect: list[str], secure: str) -> Iterator[MissionClient]:
-    with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
+def _missions(target: RobotAddress) -> "Iterator[MissionClient]":
+    from sightline.operator_side.client.missions import MissionClient
+
+    with _link(target, SOURCE) as link:
         yield MissionClient(link)
 
 
-def _print_report(robot: str, report: MissionReport, as_json: bool, *, asked: bool) -> int:
-    """Print a report; exit code 5 if vision refused what was asked."""
-    refused = report.refused if asked else ""
+def _print_report(robot: str, report: MissionReport, as_json: bool, *, is_answer: bool) -> int:
+    """Print a report. Returns exit code 5 if the vision service rejected the request."""
+    from sightline.operator_side.client.missions import cannot, detector_line, mission_line
+
+    refused = report.refused if is_answer else ""
     if as_json:
         ok = not refused and not cannot(report)
         typer.echo(json.dumps({"robot": robot, "ok": ok, **report.model_dump(mode="json")}))
     elif refused:
-        typer.echo(f"error: vision of {robot} refused: {refused}", err=True)
+        typer.echo(f"error: the vision service of {robot} rejected the request: {refused}", err=True)
     else:
         typer.echo(f"{robot}: {mission_line(report)}")
-        if not asked and report.detector:
+        if not is_answer and report.detector:
             typer.echo(f"detector: {detector_line(report)}")
     return REJECTED_EXIT if refused else 0
 
 
-# `sightline teleop`: a person drives with the keyboard or a gamepad. Shell.
+# --- `teleop` ----------------------------------------------------------------------------------------------------
 
 
 _Gamepad = Annotated[
     str | None,
-    typer.Option(
-        "--gamepad", metavar="DEVICE", help="A gamepad too: /dev/input/event5, or `auto` for the first one found."
-    ),
+    typer.Option("--gamepad", metavar="DEVICE", help="Also a gamepad: /dev/input/event5, or `auto` for the first."),
 ]
 
 
 def teleop(
-    robot: Robot = "r1",
+    robot: Robot = None,
     *,
-    connect: Connect = DEFAULT_CONNECT,
+    connect: Connect = None,
     secure: Secure = "",
-    linear: Annotated[float, typer.Option(min=0.02, max=3, help="Speed to begin with, m/s.")] = 0.2,
-    angular: Annotated[float, typer.Option(min=0.1, max=10, help="Turn rate to begin with, rad/s.")] = 1.0,
+    linear: Annotated[float, typer.Option(min=0.02, max=3, help="Initial speed, m/s.")] = 0.2,
+    angular: Annotated[float, typer.Option(min=0.1, max=10, help="Initial turn rate, rad/s.")] = 1.0,
+    keys: Annotated[
+        str, typer.Option("--keys", metavar="LAYOUT", help="wasd, or legacy: u i o / j k l / m , .")
+    ] = "wasd",
     gamepad: _Gamepad = None,
 ) -> None:
-    """Drive a robot by hand: hold a key of u i o j l m , . and let go to stop. `a` hands over to vision.
+    """Drive a robot with the keyboard or a gamepad
 
-    The first press arms the robot. STOP is another command (`sightline stop`), and no key starts a stopped robot.
+    Hold W A S D or an arrow key to drive; Space stops, Tab switches to vision, Q quits. The first press arms.
     """
-    from sightline.operator_side.teleop.control import SOURCE, Speeds, Teleop
+    from sightline.operator_side.teleop.control import SOURCE as ROLE
+    from sightline.operator_side.teleop.control import Speeds, Teleop, layout_of
     from sightline.operator_side.teleop.gamepad import Gamepad
     from sightline.operator_side.teleop.terminal import Cockpit, check_terminal
-    from sightline.protocol.transports.open import open_link
 
+    layout = layout_of(keys)
     check_terminal()
-    session = secrets.token_hex(4)
+    target, session = target_of(robot, connect, secure, announce=True), secrets.token_hex(4)
     with ExitStack() as ending:
         pad = Gamepad(gamepad) if gamepad else None
         if pad is not None:
             ending.callback(pad.close)
-        link = ending.enter_context(open_link(robot, connect=connect, role=SOURCE, secure=secure))
-        Cockpit(link, Teleop(session, Speeds(linear, angular)), pad).run()
+        link = ending.enter_context(_link(target, ROLE))
+        Cockpit(link, Teleop(session, Speeds(linear, angular), layout), pad).run()

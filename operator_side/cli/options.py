@@ -1,74 +1,95 @@
-"""Options and exit codes that several command groups share. Shell (typer)."""
+"""Options, exit codes and the target robot that several command groups share. Shell (typer)."""
 
 import json
+import os
 from collections.abc import Callable, Iterable
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import typer
 
+from sightline.operator_side.config.context import RobotAddress, find_address
+from sightline.protocol.channels import check_robot_id
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
+from sightline.protocol.transports.open import check_endpoint
 
-REJECTED_EXIT = 5
+REJECTED_EXIT: Final = 5
 
-CHECK_FAILED = 5
+CHECK_FAILED: Final = 5
 
-DEFAULT_CONNECT = [DEFAULT_ENDPOINT]
-
-Robot = Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")]
-
-Connect = Annotated[list[str], typer.Option("--connect", metavar="ENDPOINT", help="Where the robot or router listens.")]
-
-MaybeConnect = Annotated[
-    list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Where a robot or router listens.")
+Robot = Annotated[
+    str | None, typer.Argument(metavar="ROBOT", help="Robot id [default: the one of `sightline use`, or r1].")
 ]
+
+Connect = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--connect", metavar="ENDPOINT",
+        help="Address of the robot or router [default: SIGHTLINE_CONNECT, `sightline use`, or tcp/127.0.0.1:7447].",
+    ),
+]  # fmt: skip
 
 Secure = Annotated[
-    str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; endpoints are then tls/...")
+    str, typer.Option("--secure", metavar="DIR", help="Folder of `sightline keys`, for tls/ and wss:// endpoints.")
 ]
 
-_SECURE = typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`; endpoints are then tls/...")
+MaybeSecure = Annotated[
+    str | None,
+    typer.Option("--secure", metavar="DIR", help="Folder of `sightline keys`, for tls/ and wss:// endpoints."),
+]
 
-MaybeSecure = Annotated[str | None, _SECURE]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")]
 
-Json = Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")]
-
-ConfigFile = Annotated[str | None, typer.Option("--config", metavar="FILE", help="TOML file; see `sightline config`.")]
+ConfigFile = Annotated[
+    str | None, typer.Option("--config", metavar="FILE", help="TOML file; see `sightline config --help`.")
+]
 
 ServiceConnect = Annotated[
-    list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Connect here, e.g. tcp/192.168.1.20:7447.")
+    list[str] | None,
+    typer.Option("--connect", metavar="ENDPOINT", help="Connect to this address, e.g. tcp/192.168.1.20:7447."),
 ]
 
 Sets = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Set one value; `sightline config show SERVICE` lists the keys."),
+    typer.Option("--set", metavar="KEY=VALUE", help="Set one value; `sightline config show SERVICE` lists all."),
 ]
 
 Listen = Annotated[
-    list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Listen here, e.g. tcp/0.0.0.0:7447 or ws://0.0.0.0:9090.")
+    list[str] | None,
+    typer.Option("--listen", metavar="ENDPOINT", help="Listen here, e.g. tcp/0.0.0.0:7447 or ws://0.0.0.0:9090."),
 ]
 
-RobotName = Annotated[str | None, typer.Option("--robot", metavar="ID", help="The robot's id [default: r1].")]
+RobotName = Annotated[str | None, typer.Option("--robot", metavar="ID", help="Robot id [default: r1].")]
 
 LogForm = Annotated[
-    str | None, typer.Option("--log", metavar="FORM", help="text, or json: one object a line [default: text].")
+    str | None, typer.Option("--log", metavar="FORM", help="text, or json: one object per line [default: text].")
 ]
 
 SocketDir = Annotated[
-    str | None, typer.Option("--socket-dir", metavar="DIR", help="Where the simulation's sockets are.")
+    str | None, typer.Option("--socket-dir", metavar="DIR", help="Folder of the simulation's sockets.")
 ]
 
-Port = Annotated[int, typer.Option("--port", min=0, max=65535, help="Of the page, on this machine; 0 is any free one.")]
+Port = Annotated[
+    int, typer.Option("--port", min=0, max=65535, help="Port of the page on this machine; 0 takes a free one.")
+]
 
 Device = Annotated[str | None, typer.Option("--device", help="auto, cpu, cuda or tensorrt [default: auto].")]
+
+CameraKind = Annotated[
+    str | None, typer.Option("--camera", metavar="KIND", help="A camera of this machine: v4l2, picamera, video ...")
+]
+
+CameraSets = Annotated[
+    list[str] | None,
+    typer.Option("--camera-set", metavar="KEY=VALUE", help="An option of the camera, e.g. device=/dev/video2."),
+]
 
 Number = TypeVar("Number", int, float)
 
 
 def print_result(result: dict[str, Any], lines: Iterable[str], as_json: bool) -> int:
-    """Print the result of a command with checks: as JSON, or as `lines`. Returns its exit code.
+    """Print the result of a command with checks as JSON or as `lines`, and return the exit code.
 
-    A result without `ok` has nothing that can fail.
+    A result without `ok` cannot fail.
     """
     for line in (json.dumps(result),) if as_json else lines:
         typer.echo(line)
@@ -76,8 +97,38 @@ def print_result(result: dict[str, Any], lines: Iterable[str], as_json: bool) ->
 
 
 def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:
-    """The numbers of an option, separated by commas. Raises ConfigError with an example."""
+    """Read the numbers of an option, separated by commas. Raises ConfigError with an example."""
     try:
         return [kind(part) for part in text.split(",")]
     except ValueError:
-        raise ConfigError(f"{option} {text!r}: numbers separated by commas, e.g. {option} 1,2,3") from None
+        raise ConfigError(
+            f"invalid {option} '{text}': expected numbers separated by commas, e.g. {option} 1,2,3"
+        ) from None
+
+
+def command_group(summary: str) -> typer.Typer:
+    """Make a group of subcommands that lists them when none is given."""
+    group = typer.Typer(help=summary, rich_markup_mode=None, invoke_without_command=True)
+    group.callback(invoke_without_command=True)(_list_subcommands)
+    return group
+
+
+def _list_subcommands(context: typer.Context) -> None:
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+def target_of(robot: str | None, connect: list[str] | None, secure: str, *, announce: bool = False) -> RobotAddress:
+    """Find the robot that a client command addresses. Raises ConfigError for an invalid id or address.
+
+    Args:
+        robot, connect, secure: values of the options, as given.
+        announce: whether to print address and origin on stderr, for commands that move or stop a robot.
+    """
+    target = find_address(os.environ, robot, connect, secure)
+    check_robot_id(target.robot)
+    for endpoint in target.connect:
+        check_endpoint(endpoint)
+    if announce:
+        typer.echo(str(target), err=True)
+    return target

@@ -13,9 +13,12 @@ import typer
 from pydantic import BaseModel
 
 from sightline.operator_side.cli.options import (
-    DEFAULT_CONNECT,
+    CameraKind,
+    CameraSets,
     ConfigFile,
     Connect,
+    Device,
+    Json,
     Listen,
     LogForm,
     MaybeSecure,
@@ -25,10 +28,13 @@ from sightline.operator_side.cli.options import (
     ServiceConnect,
     Sets,
     SocketDir,
+    command_group,
+    target_of,
 )
 from sightline.operator_side.config.loading import load_service, model_of
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.operator_side.preflight import needs
+from sightline.operator_side.table import print_table
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import start_log
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
@@ -46,15 +52,12 @@ _log: Final = logging.getLogger(__name__)
 def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     app.command(epilog="Example: sightline sim --scenario eight --seed 3")(sim)
-    app.command(epilog="Example: sightline robot --listen tcp/0.0.0.0:7447 --set safety.max_linear_mps=0.3")(robot)
+    app.command(epilog="Example: sightline robot --listen tcp/0.0.0.0:7447")(robot)
     app.command(epilog="Example: sightline vision --connect tcp/192.168.1.20:7447")(vision)
     app.command(epilog="Example: sightline router --listen tcp/0.0.0.0:7447")(router)
     app.command(epilog="Example: sightline scenarios thymio --out runs/thymio")(scenarios)
     app.command(epilog="Example: sightline labels r1")(labels)
-    group = typer.Typer(
-        help="Check, show and describe a service's configuration: defaults < profile < file < environment < --set.",
-        no_args_is_help=False, rich_markup_mode=None,
-    )
+    group = command_group("Check or show a service's configuration")
     group.command(epilog="Example: sightline config check robot robot.toml")(check)
     group.command(epilog="Example: sightline config show robot robot.toml --origin")(show)
     group.command(epilog="Example: sightline config schema vision")(schema)
@@ -65,20 +68,25 @@ def register(app: typer.Typer) -> None:
 def sim(
     *,
     scenario: Annotated[
-        str | None, typer.Option(help="A name of `sightline scenarios`, or a .toml file [default: circle].")
+        str | None, typer.Option(help="A name from `sightline scenarios`, or a .toml file [default: circle].")
     ] = None,
     robot_model: Annotated[
-        str | None, typer.Option(help="raspberry, gazebo-raspi, thymio, chaser, or a .toml [default: the scenario's].")
+        str | None, typer.Option(help="raspberry, gazebo-raspi, thymio, chaser, or a .toml [default: of the scenario].")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Draws the start and the noise.")] = None,
-    motor_log: Annotated[str | None, typer.Option(metavar="FILE", help="CSV of every motor command.")] = None,
-    seconds: Annotated[float | None, typer.Option(help="End by itself after this long.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the start and the noise.")] = None,
+    motor_log: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Write every motor command to this CSV file.")
+    ] = None,
+    seconds: Annotated[float | None, typer.Option(help="End after this many seconds.")] = None,
     socket_dir: SocketDir = None,
     config: ConfigFile = None,
     sets: Sets = None,
     log: LogForm = None,
 ) -> int:
-    """Simulate a robot's hardware, in place of a real one, until Ctrl-C."""
+    """Simulate a robot's hardware
+
+    Runs until Ctrl-C. `sightline robot` connects to it.
+    """
     from sightline.sim.process import run
 
     start_log(log, "sim")
@@ -94,28 +102,29 @@ def sim(
 def robot(
     task: Annotated[
         str | None,
-        typer.Argument(metavar="[test-wheels]", help="Turn each wheel by itself, off the ground, instead of running."),
+        typer.Argument(metavar="test-wheels", help="Turn each wheel alone, off the ground, in place of running."),
     ] = None,
     *,
     robot: RobotName = None,
     listen: Listen = None,
     connect: ServiceConnect = None,
     secure: MaybeSecure = None,
-    profile: Annotated[str | None, typer.Option(help="`sim`: simulated, armed without a person.")] = None,
+    profile: Annotated[str | None, typer.Option(help="`sim`: simulated hardware, armed without an operator.")] = None,
     zero_motors: Annotated[
-        bool, typer.Option("--zero-motors", help="Only set the motors to zero, e.g. after a crash, and end.")
+        bool, typer.Option("--zero-motors", help="Only set the motors to zero and end, e.g. after a crash.")
     ] = False,
     yes: Annotated[
-        bool, typer.Option("--yes", help="With test-wheels: the wheels are off the ground, ask nothing.")
+        bool, typer.Option("--yes", help="With test-wheels: confirm that the wheels are off the ground.")
     ] = False,
     socket_dir: SocketDir = None,
     config: ConfigFile = None,
     sets: Sets = None,
     log: LogForm = None,
 ) -> int:
-    """Run a robot: its wheels, its camera, its link, until Ctrl-C. Listens on this machine only unless told otherwise.
+    """Run a robot: motors, camera and link
 
-    With no configuration its hardware is the simulation (`sightline sim`).
+    Runs until Ctrl-C and accepts clients of this machine only, unless --listen permits others. Without a configuration
+    it uses the hardware of `sightline sim`.
     """
     from sightline.robot_side.driver.process import run
     from sightline.robot_side.driver.process import zero_motors as set_to_zero
@@ -144,38 +153,35 @@ def vision(
     sets: Sets = None,
     detector: Annotated[
         str | None,
-        typer.Option("--detector", metavar="NAME", help="Of `sightline detector list`, e.g. onnx:PATH [default: hsv]."),
+        typer.Option("--detector", metavar="NAME", help="Detector, see `sightline detector list` [default: hsv]."),
     ] = None,
-    device: Annotated[
-        str | None, typer.Option("--device", help="Of a model: auto, cpu, cuda or tensorrt [default: auto].")
-    ] = None,
+    device: Device = None,
     shadow: Annotated[
-        str | None, typer.Option("--shadow", metavar="NAME", help="A second detector that looks on and never steers.")
+        str | None, typer.Option("--shadow", metavar="NAME", help="A second detector, which never steers.")
     ] = None,
     mission: Annotated[
-        str | None, typer.Option("--mission", metavar="NAME", help="What to do with what is seen [default: follow].")
+        str | None, typer.Option("--mission", metavar="NAME", help="Mission [default: follow].")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Say what is seen and steer nothing.")] = False,
-    camera: Annotated[
-        str | None, typer.Option("--camera", metavar="KIND", help="With --dry-run: a camera of this machine.")
-    ] = None,
-    camera_sets: Annotated[
-        list[str] | None, typer.Option("--camera-set", metavar="KEY=VALUE", help="An option of it, e.g. fps=15.")
-    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the detections and do not steer.")] = False,
+    camera: CameraKind = None,
+    camera_sets: CameraSets = None,
     metrics: Annotated[
         str | None,
-        typer.Option("--metrics", metavar="[HOST:]PORT", help="Serve /metrics and /health there, e.g. 9465."),
+        typer.Option("--metrics", metavar="[HOST:]PORT", help="Serve /metrics and /health at this port, e.g. 9465."),
     ] = None,
     log: LogForm = None,
     shape: Annotated[str | None, typer.Option("--shape", hidden=True)] = None,
 ) -> int:
-    """Look at a robot's pictures and steer it, until Ctrl-C."""
+    """Run a vision service that steers a robot
+
+    Runs until Ctrl-C. --dry-run also accepts --camera, a camera of this machine.
+    """
     start_log(log, "vision")
     if camera is not None and not dry_run:
-        raise ConfigError("--camera looks without a robot, so there is nothing to steer: add --dry-run")
+        raise ConfigError("--camera has no robot to steer; add --dry-run")
     if camera_sets and camera is None:
-        raise ConfigError("--camera-set is for the camera of --camera; name one, e.g. --camera v4l2")
-    if robot is not None and "://" in robot:  # the address of a robot that has one endpoint and no other name
+        raise ConfigError("--camera-set needs --camera; name a camera, e.g. --camera v4l2")
+    if robot is not None and "://" in robot:  # the address of a robot that has no id
         connect, robot = [*(connect or ()), robot], None
     options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure,
                "detector.kind": detector, "detector.device": device, "detector.shadow": shadow,
@@ -205,7 +211,10 @@ def _measured(run: Any, config: Any, where: str) -> int:
 
 
 def router(listen: Listen = None, connect: ServiceConnect = None, secure: Secure = "", log: LogForm = None) -> int:
-    """Run the place where robots, visions and people of one site meet, until Ctrl-C. All of them connect to it."""
+    """Run a router to which all machines of a site connect
+
+    Runs until Ctrl-C. Robots, vision services and clients reach each other through it.
+    """
     start_log(log, "router")
     with needs("zenoh"):
         from sightline.operator_side.setup.router import run
@@ -219,7 +228,7 @@ def _dry_run(config: Any, camera: str | None, camera_sets: list[str]) -> int:
     from sightline.vision_side.serving.dry_run import watch_camera, watch_robot
 
     if config.detector.kind == "boxes":
-        raise ConfigError("--dry-run looks with vision's own eyes; name a detector, e.g. --detector hsv")
+        raise ConfigError("--dry-run needs a local detector; name one, e.g. --detector hsv")
     if camera is None:
         return watch_robot(config, _log.info, None)
     check_takes_pictures(config.detector.kind)
@@ -232,19 +241,24 @@ def _ends(endpoints: list[str] | None) -> tuple[str, ...] | None:
     return tuple(endpoints) if endpoints else None
 
 
-# Commands `scenarios`, which lists them and writes what each needs, and `labels`, which plays a detector. Shell.
+# --- `scenarios` and `labels` ------------------------------------------------------------------------------------
 
 
 def scenarios(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="One of them, or a .toml file.")] = None,
-    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write sim, robot and vision.toml for it.")] = None,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Draws the start.")] = 1,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, for scripts.")] = False,
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="A scenario, or a .toml file.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write sim.toml, robot.toml and vision.toml there.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the start.")] = 1,
+    as_json: Json = False,
 ) -> None:
-    """List what can be simulated; for one scenario, show or write the configuration that its three services need."""
+    """List scenarios, or write the configuration of one
+
+    With NAME it prints the configuration of the three services; --out writes it to files.
+    """
     if name is None:
         if out is not None:
-            raise ConfigError("--out writes the configuration of one scenario: name it, e.g. sightline scenarios ball")
+            raise ConfigError("--out needs a scenario; name it, e.g. sightline scenarios ball --out DIR")
         _list(as_json)
         return
     files = _files(name, seed)
@@ -265,8 +279,7 @@ def _list(as_json: bool) -> None:
         keys = {"name", "summary", "robot", "mission", "seconds"}
         typer.echo(json.dumps({"scenarios": [one.model_dump(include=keys) for one in all_of_them]}))
         return
-    for one in all_of_them:
-        typer.echo(f"{one.name:<20} {one.robot:<13} {one.mission:<20} {one.summary}")
+    print_table((one.name, one.robot, one.mission, one.summary) for one in all_of_them)
 
 
 def _files(name: str, seed: int) -> dict[str, dict[str, Any]]:
@@ -298,7 +311,7 @@ def _write(out: Path, name: str, files: dict[str, dict[str, Any]]) -> None:
         for service, table in files.items():
             (out / f"{service}.toml").write_text(toml_text(table), "utf-8")
     except OSError as error:
-        raise ConfigError(f"--out {out}: {error.strerror}") from None
+        raise ConfigError(f"cannot write --out {out}: {error.strerror}; choose a folder that you may write") from None
     typer.echo(f"sightline sim --config {out}/sim.toml\nsightline robot --profile sim --config {out}/robot.toml\n"
                f"sightline vision --config {out}/vision.toml")
     if load_scenario(name).labels:
@@ -306,16 +319,15 @@ def _write(out: Path, name: str, files: dict[str, dict[str, Any]]) -> None:
 
 
 def labels(
-    robot: Annotated[str, typer.Argument(metavar="[ROBOT]", help="The robot's id.")] = "r1",
-    connect: Annotated[
-        list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Where the robot or router listens.")
-    ] = None,
-    secure: Annotated[str, typer.Option("--secure", metavar="DIR", help="Keys made by `sightline keys`.")] = "",
-    socket_dir: Annotated[
-        str | None, typer.Option("--socket-dir", metavar="DIR", help="Where the simulation's sockets are.")
-    ] = None,
+    robot: Annotated[str, typer.Argument(metavar="ROBOT", help="Robot id.")] = "r1",
+    connect: ServiceConnect = None,
+    secure: Secure = "",
+    socket_dir: SocketDir = None,
 ) -> int:
-    """Publish what the simulation labels in its pictures as boxes, in place of a detector, until Ctrl-C."""
+    """Publish the simulation's labels in place of a detector
+
+    Runs until Ctrl-C. The labels are the exact boxes of the objects in each image.
+    """
     start_log(None, "labels")
     with needs("zenoh"):
         from sightline.evaluation.labels import run
@@ -324,23 +336,26 @@ def labels(
         return run(robot, connect or [DEFAULT_ENDPOINT], secure, socket_dir or default_socket_dir(), _log.info)
 
 
-# Commands about configuration: `config check | show | schema`. Shell.
+# --- `config check | show | schema` ------------------------------------------------------------------------------
 
 
 ServiceName = Annotated[str, typer.Argument(metavar="SERVICE", help="robot, vision or sim.")]
-File = Annotated[str | None, typer.Argument(metavar="[FILE]", help="The service's TOML file.")]
-Profile = Annotated[str | None, typer.Option(help="Lay this profile under it, e.g. sim.")]
+File = Annotated[str | None, typer.Argument(metavar="FILE", help="TOML file of the service.")]
+Profile = Annotated[str | None, typer.Option(help="Profile below the file, e.g. sim.")]
 
 
 def check(service: ServiceName, file: File = None, profile: Profile = None, sets: Sets = None) -> None:
-    """Say whether a configuration is good; exit 2 and name what is wrong if not."""
+    """Check a configuration
+
+    Exit code 2 means that it is invalid; the error names the value.
+    """
     loaded = load_service(service, profile=profile, file=file, sets=sets or (), environ=os.environ)
     _check_names(loaded.config)
-    typer.echo(f"{file or service}: ok, {len(loaded.given)} values set, the rest by default")
+    typer.echo(f"{file or service}: valid, {len(loaded.given)} values set, the others are defaults")
 
 
 def _check_names(config: BaseModel) -> None:
-    """What the configuration names, with its options: devices, scenario, robot, detectors, missions. Opens none."""
+    """Check that devices, scenario, robot, detectors and missions exist, with their options. Opens no device."""
     if isinstance(config, RobotConfig):
         for group in DEVICE_GROUPS:
             choice = config.devices[group.key]
@@ -360,10 +375,13 @@ def show(
     file: File = None,
     profile: Profile = None,
     sets: Sets = None,
-    origin: Annotated[bool, typer.Option("--origin", help="Say where each value comes from.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="As JSON.")] = False,
+    origin: Annotated[bool, typer.Option("--origin", help="Show where each value comes from.")] = False,
+    as_json: Json = False,
 ) -> None:
-    """Print the configuration that a service would run with, as a TOML file that it would accept."""
+    """Print the configuration that a service runs with
+
+    The output is a valid TOML file. Later sources win: defaults, profile, file, environment, --set.
+    """
     loaded = load_service(service, profile=profile, file=file, sets=sets or (), environ=os.environ)
     table = loaded.config.model_dump(mode="json")
     if as_json:
@@ -374,35 +392,38 @@ def show(
 
 
 def schema(service: ServiceName) -> None:
-    """Print a service's configuration as JSON Schema, for editors."""
+    """Print the JSON Schema of a configuration, for editors"""
     typer.echo(json.dumps(model_of(service).model_json_schema(), indent=2))
 
 
-# `sightline metrics`: a robot's status for Prometheus. Shell.
+# --- `metrics` ---------------------------------------------------------------------------------------------------
 
 
 ROLE = "metrics"
 
 
 def metrics(
-    robot: Robot = "r1",
-    connect: Connect = DEFAULT_CONNECT,
+    robot: Robot = None,
+    connect: Connect = None,
     secure: Secure = "",
-    host: Annotated[str, typer.Option(help="Address to serve on; 0.0.0.0 is a decision.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to serve on.")] = 9464,
+    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 accepts every network.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port to listen on.")] = 9464,
 ) -> int:
-    """Serve a robot's status to Prometheus at /metrics, and whether it is heard at /health, until Ctrl-C."""
+    """Serve a robot's status to Prometheus
+
+    Serves /metrics and /health until Ctrl-C.
+    """
     with needs("metrics"):
         import_module("prometheus_client")
     from sightline.operator_side.cockpit.metrics import Watched, serving
 
-    ending = threading.Event()
+    target, ending = target_of(robot, connect, secure), threading.Event()
     with (
-        open_link(robot, connect=connect, role=ROLE, secure=secure) as link,
+        open_link(target.robot, connect=target.connect, role=ROLE, secure=target.secure) as link,
         serving(Watched(link), host, port) as address,
     ):
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: ending.set())
-        typer.echo(f"metrics of {robot}: {address}metrics")
+        typer.echo(f"metrics of {target.robot}: {address}metrics")
         ending.wait()
     return 0

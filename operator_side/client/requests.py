@@ -22,15 +22,15 @@ SOURCE: Final = "operator"
 REPEAT_S: Final = 0.2
 STOP_PERIOD_S: Final = 0.05
 STOP_SLOW_S: Final = 0.3
-"""A STOP that is not seen to work within this is told to the person, while it goes on being repeated."""
+"""After this time without a confirmation the operator is warned; the STOP is repeated meanwhile."""
 _KEPT_REPLIES = 64
 _CITES_STATUS = (Verb.ARM, Verb.RESET, Verb.ACQUIRE)
-"""What permits motion must name a status younger than two seconds; what ends it need not."""
+"""Requests that permit motion must cite a status younger than two seconds; requests that end it need not."""
 
 
 @dataclass(frozen=True, slots=True)
 class StatusReport:
-    """A robot's status and when it said so."""
+    """A robot's status and its time stamp."""
 
     stamp: Stamp
     status: Status
@@ -42,13 +42,13 @@ def read_report(message: Message) -> StatusReport:
 
 
 class Operator:
-    """One person at one robot. Every method that waits is bounded and raises LinkError when nobody answers."""
+    """Sends an operator's requests to one robot. Every wait is bounded and raises LinkError without an answer."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
         self._session = secrets.token_hex(4)
         self._seq = self._id = 0
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._report: StatusReport | None = None
         self._reports = 0
         self._version_trouble = ""
@@ -57,39 +57,48 @@ class Operator:
         link.subscribe(REPLY, self._on_reply)
 
     @property
+    def robot(self) -> str:
+        """Return the robot's id."""
+        return self._link.robot
+
+    @property
     def report(self) -> StatusReport | None:
-        """The newest status heard."""
+        """Return the newest status received."""
         return self._report
 
     def wait_report(self, timeout_s: float = 2.0) -> StatusReport:
-        """The next status. Raises LinkError when none comes, saying so of a robot of another protocol version."""
-        with self._news:
+        """Wait for the next status.
+
+        Raises:
+            LinkError: no status in time, or a status of another protocol version.
+        """
+        with self._changed:
             seen, self._version_trouble = self._reports, ""
-            if not self._news.wait_for(lambda: self._reports > seen or self._version_trouble, timeout_s):
+            if not self._changed.wait_for(lambda: self._reports > seen or self._version_trouble, timeout_s):
                 raise LinkError(
-                    f"robot {self._link.robot!r} is not heard within {timeout_s:g} s; `sightline robots` lists who is"
+                    f"no status from robot '{self.robot}' after {timeout_s:g} s; run `sightline robots`"
                 )
             if self._reports == seen:
-                raise LinkError(f"robot {self._link.robot!r} speaks another protocol: {self._version_trouble}")
+                raise LinkError(f"robot '{self.robot}' uses another protocol version: {self._version_trouble}")
             assert self._report is not None
             return self._report
 
     def request(self, verb: Verb, timeout_s: float = 2.0) -> Reply:
-        """Ask once, repeating it until the reply comes. Raises LinkError when none comes in time."""
+        """Send one request, repeat it until the reply, and return the reply. Raises LinkError at `timeout_s`."""
         if verb in _CITES_STATUS:
-            self.wait_report(timeout_s)  # one of now: not from before an earlier STOP or disarm
+            self.wait_report(timeout_s)  # a new one: the stored one may precede a STOP or disarm
         self._id += 1
-        cited = self._report  # of when it was asked: a STOP that somebody says meanwhile stands above it
+        cited = self._report  # repeats cite the same status, so that a STOP in between wins
         deadline_s = time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
             self._send(verb, cited)
-            with self._news:
-                if self._news.wait_for(lambda: self._id in self._replies, REPEAT_S):
+            with self._changed:
+                if self._changed.wait_for(lambda: self._id in self._replies, REPEAT_S):
                     return self._replies[self._id]
-        raise LinkError(f"robot {self._link.robot!r} does not answer {verb} within {timeout_s:g} s")
+        raise LinkError(f"no answer from robot '{self.robot}' to {verb} after {timeout_s:g} s; repeat the command")
 
     def arm(self, patience_s: float = 5.0) -> Reply:
-        """Arm; while the robot says that something is missing (live commands, wheels at zero) ask again."""
+        """Request arming; repeat while the robot reports a missing condition (valid commands, wheels at zero)."""
         deadline_s = time.monotonic() + patience_s
         reply = self.request(Verb.ARM)
         while not reply.ok and reply.detail.startswith(RejectReason.NOT_ALLOWED) and time.monotonic() < deadline_s:
@@ -98,24 +107,28 @@ class Operator:
         return reply
 
     def stop(self, on_slow: Callable[[], None], timeout_s: float = 10.0) -> Status:
-        """Say STOP at 20 Hz until a status says STOPPED. `on_slow` is called once if that takes over 300 ms.
+        """Send STOP at 20 Hz until a status shows STOPPED.
 
-        Raises LinkError after `timeout_s`: then it is not known whether the robot has stopped.
+        Args:
+            on_slow: called once if that takes more than 300 ms.
+
+        Raises:
+            LinkError: at `timeout_s`; the robot may still move.
         """
         self._id += 1
         started_s = time.monotonic()
-        told = False
+        warned = False
         while time.monotonic() - started_s < timeout_s:
             self._send(Verb.STOP, None)
-            with self._news:
-                if self._news.wait_for(self._is_stopped, STOP_PERIOD_S):
+            with self._changed:
+                if self._changed.wait_for(self._is_stopped, STOP_PERIOD_S):
                     assert self._report is not None
                     return self._report.status
-            if not told and time.monotonic() - started_s > STOP_SLOW_S:
-                told = True
+            if not warned and time.monotonic() - started_s > STOP_SLOW_S:
+                warned = True
                 on_slow()
         raise LinkError(
-            f"robot {self._link.robot!r} did not confirm STOP within {timeout_s:g} s; cut its power by hand"
+            f"robot '{self.robot}' did not confirm STOP within {timeout_s:g} s; cut its power by hand"
         )
 
     def _is_stopped(self) -> bool:
@@ -135,14 +148,14 @@ class Operator:
             report = read_report(message)
         except WireError as error:
             if error.reason is RejectReason.UNSUPPORTED_VERSION:
-                with self._news:
+                with self._changed:
                     self._version_trouble = error.detail
-                    self._news.notify_all()
+                    self._changed.notify_all()
             return
-        with self._news:
+        with self._changed:
             self._report = report
             self._reports += 1
-            self._news.notify_all()
+            self._changed.notify_all()
 
     def _on_reply(self, message: Message) -> None:
         try:
@@ -151,8 +164,8 @@ class Operator:
             return
         if reply.to != self._session:
             return
-        with self._news:
+        with self._changed:
             self._replies.setdefault(reply.id, reply)
             if len(self._replies) > _KEPT_REPLIES:
                 self._replies.popitem(last=False)
-            self._news.notify_all()
+            self._changed.notify_all()

@@ -1,74 +1,122 @@
-"""A robot's status as text. Pure."""
+"""A robot's status and replies as text. Pure."""
 
 from collections.abc import Iterator
 
-from sightline.protocol.messages import Status, StreamStatus
+from sightline.protocol.errors import RejectReason
+from sightline.protocol.messages import Reply, State, Status, StreamStatus, Verb
 
 
 def status_line(robot: str, status: Status) -> str:
-    """One line: who, in which state, why, driven by whom."""
+    """Format robot, state, reason and driver as one line."""
     holder = f", driven by {status.holder.source}" if status.holder else ""
     return f"{robot}: {status.state} ({status.reason}){holder}"
 
 
-def status_lines(robot: str, status: Status) -> Iterator[str]:
-    """Everything a person needs to know why the robot moves or does not."""
-    stream = status.stream
-    holder = f"{status.holder.source} {status.holder.session}" if status.holder else "nobody"
+def reply_line(robot: str, verb: Verb, reply: Reply, driver: str = "") -> str:
+    """Format the answer to a request, with the next command for the operator.
+
+    Args:
+        driver: source that holds the lease, or "".
+    """
+    if not reply.ok:
+        return f"robot {robot} rejected {verb}: {reply.detail}{_fix(robot, reply)}"
+    if verb is Verb.ARM:
+        done = "was already armed" if reply.detail.startswith("already") else "is armed"
+        follows = f"it follows the commands of {driver}" if driver else "it moves when valid commands arrive"
+        return f"{robot} {done} ({reply.state}); {follows}; `sightline stop {robot}` stops it"
+    if verb is Verb.DISARM:
+        return f"{robot} is disarmed; `sightline arm {robot}` permits motion again"
+    if verb is Verb.RESET and reply.detail.startswith("reset"):
+        return f"{robot} is reset and disarmed; `sightline arm {robot}` permits motion again"
+    return f"{robot}: {reply.detail} ({reply.state})"
+
+
+def _fix(robot: str, reply: Reply) -> str:
+    if reply.detail.startswith((RejectReason.STOPPED, RejectReason.FAULT)):
+        return f"; run `sightline reset {robot}`, then arm again"
+    return ""
+
+
+def short_lines(robot: str, status: Status) -> Iterator[str]:
+    """Format what an operator needs at a glance, in the columns of `status_lines`."""
     yield f"robot     {robot}"
     yield f"state     {status.state}: {status.reason}"
-    yield f"driver    {holder}" + ("; arms by itself" if status.auto_arm else "")
+    yield f"driver    {status.holder.source if status.holder else 'none'}"
+    yield f"wheels    {twist_text(status.applied)}"
+    yield f"image     frame age {millis(status.frame_age_us)}, {status.stream.fps:.0f} fps"
+    if status.battery_v is not None:
+        yield f"battery   {status.battery_v:.2f} V"
+    if next_step := _next_step(robot, status):
+        yield f"next      {next_step}"
+
+
+def _next_step(robot: str, status: Status) -> str:
+    """Return the command with which an operator continues, or ""."""
+    if status.state in (State.STOPPED, State.FAULT):
+        return f"sightline reset {robot}"
+    if status.state is State.DISARMED and not status.auto_arm:
+        return f"sightline arm {robot}" if status.holder else "sightline vision, or sightline teleop, to drive it"
+    return ""
+
+
+def status_lines(robot: str, status: Status) -> Iterator[str]:
+    """Format every field of a status."""
+    stream = status.stream
+    holder = f"{status.holder.source} {status.holder.session}" if status.holder else "none"
+    yield f"robot     {robot}"
+    yield f"state     {status.state}: {status.reason}"
+    yield f"driver    {holder}" + ("; arms automatically" if status.auto_arm else "")
     yield f"wheels    {twist_text(status.applied)}"
     yield f"limits    {status.max_linear_mps:.2f} m/s, {status.max_angular_rad_s:.2f} rad/s"
     if status.battery_v is not None:
         yield f"battery   {status.battery_v:.2f} V"
-    yield f"sight     frame age {millis(status.frame_age_us)}, capture to command {millis(status.latency_us)}"
+    yield f"image     frame age {millis(status.frame_age_us)}, capture to command {millis(status.latency_us)}"
     camera = "calibrated" if stream.calibrated else "not calibrated"
     counts = f"{stream.sent} sent, {stream.credit_timeouts} unanswered"
     yield f"stream    {stream.fps:.0f} fps, {counts}, window {stream.window}, camera {camera}"
-    yield f"pictures  {encoding_text(stream)}"
+    yield f"encoding  {encoding_text(stream)}"
     yield f"dropped   {drops_text(stream)}"
-    yield f"commands  {status.accepted} accepted, {refusals_text(status)}, {stream.dropped_commands} dropped"
+    yield f"commands  {status.accepted} accepted, {rejections_text(status)}, {stream.dropped_commands} dropped"
     if status.last_refusal:
         last = status.last_refusal
-        yield f"refused   last: {last.reason} from {last.source}: {last.detail}"
-    yield f"driver loop late by at most {millis(status.tick_late_max_us)}; network restarts {status.network_restarts}"
+        yield f"rejected  last: {last.reason} from {last.source}: {last.detail}"
+    yield f"loop      at most {millis(status.tick_late_max_us)} late; {status.network_restarts} network restarts"
 
 
 def stream_is_whole(stream: StreamStatus) -> bool:
-    """Whether pictures are encoded as configured: the link carries what was asked for."""
+    """Return whether images are encoded as configured: the link carries them in full."""
     return stream.quality_percent == stream.scale_percent == 100
 
 
 def encoding_text(stream: StreamStatus) -> str:
-    """How pictures are encoded to fit the link."""
+    """Describe the encoding of images, which adapts to the link."""
     if stream_is_whole(stream):
         return "as configured"
-    return f"made smaller for this link: quality {stream.quality_percent} %, side length {stream.scale_percent} %"
+    return f"reduced for this link: quality {stream.quality_percent} %, side length {stream.scale_percent} %"
 
 
 def drops_text(stream: StreamStatus) -> str:
-    """What was replaced by something newer, slot by slot."""
+    """List the messages that newer ones replaced, by slot."""
     parts = [
         f"{stream.missed_captures} captures in the camera's slot" if stream.missed_captures else "",
-        *(f"{count} {name} on the way out" for name, count in stream.dropped.items()),
+        *(f"{count} {name} before sending" for name, count in stream.dropped.items()),
         f"{stream.overtaken} frames overtaken before an answer" if stream.overtaken else "",
-        f"{stream.refused_pictures} pictures refused" if stream.refused_pictures else "",
+        f"{stream.refused_pictures} invalid images" if stream.refused_pictures else "",
     ]
     return ", ".join(part for part in parts if part) or "nothing"
 
 
-def refusals_text(status: Status) -> str:
-    """Every refusal counter, most frequent first."""
+def rejections_text(status: Status) -> str:
+    """List the rejection counters, most frequent first."""
     counted = sorted(status.refused.items(), key=lambda item: -item[1])
-    return "refused: " + ", ".join(f"{name} {count}" for name, count in counted) if counted else "none refused"
+    return "rejected: " + ", ".join(f"{name} {count}" for name, count in counted) if counted else "0 rejected"
 
 
 def twist_text(twist: tuple[float, float]) -> str:
-    """(m/s, rad/s) with signs, so that forward and left are seen."""
+    """Format (m/s, rad/s) with signs, which show forward and left."""
     return f"{twist[0]:+.2f} m/s {twist[1]:+.2f} rad/s"
 
 
 def millis(time_us: int | None) -> str:
-    """Microseconds as milliseconds, `-` for none."""
+    """Format microseconds as milliseconds, `-` for None."""
     return "-" if time_us is None else f"{time_us / 1000:.0f} ms"

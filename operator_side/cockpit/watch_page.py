@@ -7,7 +7,7 @@ from typing import Any
 
 from sightline.operator_side.client.missions import MissionClient, detector_line, mission_line
 from sightline.operator_side.client.pictures import Pictures
-from sightline.operator_side.client.status import drops_text, encoding_text, millis, refusals_text, twist_text
+from sightline.operator_side.client.status import drops_text, encoding_text, millis, rejections_text, twist_text
 from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
 from sightline.operator_side.cockpit.http_server import HttpAnswer, PageRequest, as_json, page, served
 from sightline.protocol.channels import Channel
@@ -67,5 +67,5 @@ def _robot_lines(status: Status) -> list[tuple[str, str]]:
         ("obeyed sight", sight if status.frame_age_us is not None else "none now"),
         ("stream", f"{stream.fps:.0f} frames/s, {encoding_text(stream)}"),
         ("dropped", drops_text(stream)),
-        ("commands", f"{status.accepted} accepted, {refusals_text(status)}"),
+        ("commands", f"{status.accepted} accepted, {rejections_text(status)}"),
     ]

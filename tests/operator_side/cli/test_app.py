@@ -1,8 +1,10 @@
-"""The command line: help everywhere, every mistake one line and its exit code, nothing heavy before it is needed."""
+"""The command line: help, one line and an exit code for each error, and no heavy import before it is needed."""
 
 import ast
+import importlib.metadata
 import json
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -12,8 +14,9 @@ import pytest
 import typer
 
 from sightline.operator_side.cli import app as cli
+from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.operator_side.preflight import needs
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, HardwareError, LinkError, SightlineError
 
 
 def commands(group=None, path=()):
@@ -26,6 +29,7 @@ def commands(group=None, path=()):
 
 
 COMMANDS = dict(commands())
+COMMANDS_AND_GROUPS = typer.main.get_command(cli.app).commands
 
 
 def run(capsys, *arguments):
@@ -63,31 +67,93 @@ def test_the_commands_of_this_version_exist():
     assert {(group, name) for group, names in groups.items() for name in names} <= set(COMMANDS)
 
 
-@pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
-def test_every_command_says_what_it_does_and_gives_an_example(capsys, path):
+GROUPS = sorted({path[:1] for path in COMMANDS if len(path) > 1})
+
+
+@pytest.mark.parametrize("path", [*COMMANDS, *GROUPS], ids=" ".join)
+def test_help_has_a_summary_at_most_two_sentences_and_an_example(capsys, monkeypatch, path):
+    monkeypatch.setenv("COLUMNS", "80")
     code, out, err = run(capsys, *path, "--help")
     assert (code, err) == (0, "")
-    assert f"Usage: sightline {' '.join(path)}" in out
-    assert f"Example: sightline {' '.join(path)}" in out
-    for parameter in COMMANDS[path].params:
-        assert getattr(parameter, "hidden", False) or parameter.help, parameter.name
+    lines = out.splitlines()
+    assert lines[0].startswith(f"Usage: sightline {' '.join(path)}") and "[[" not in lines[0]
+    assert max(map(len, lines)) <= 80 and "..." not in out.partition("Commands:")[2]
+    description = out.split("\n\n")[1]
+    assert "\n" not in description, "the summary is one line"
+    assert_is_summary(description.strip())
+    body = " ".join(out.partition("Arguments:")[0].partition("Options:")[0].split("\n\n", 2)[2].split())
+    assert len(re.findall(r"[.!?](?= [A-Z`-]|$)", body)) <= 2, body
+    if path in COMMANDS:
+        assert out.rstrip().splitlines()[-1].startswith(f"  Example: sightline {' '.join(path)}"), "one line, the last"
+        for parameter in COMMANDS[path].params:
+            assert getattr(parameter, "hidden", False) or parameter.help, parameter.name
 
 
-def test_alone_it_shows_its_help(capsys):
-    code, out, err = run(capsys)
+def assert_is_summary(text):
+    assert 10 <= len(text) <= 60, text
+    assert text[0].isupper() and not text.endswith("."), text
+
+
+def test_program_help_lists_every_command_uncut(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, err = run(capsys, "--help")
     assert (code, err) == (0, "")
-    assert "Usage: sightline" in out
-    assert "sightline demo" in out
+    for heading in ("Run", "Drive", "Observe", "Set up", "Evaluate", "Develop"):
+        assert f"\n{heading}:\n" in out
+    for name, entry in cli.COMMANDS.items():
+        assert_is_summary(entry.summary)
+        assert re.search(rf"^  {name} +{re.escape(entry.summary)}$", out, re.MULTILINE), name
+    assert max(map(len, out.splitlines())) <= 80 and "..." not in out.partition("Options:")[2]
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_summary_in_the_program_help_is_that_of_the_command(name):
+    summary = cli.COMMANDS[name].summary
+    assert COMMANDS_AND_GROUPS[name].help.split("\n")[0].strip() == summary
+
+
+def test_exit_codes_in_the_program_help_are_those_of_the_errors(capsys):
+    _, out, _ = run(capsys, "--help")
+    errors = (SightlineError, ConfigError, HardwareError, LinkError)
+    for code in (0, *(error.exit_code for error in errors), CHECK_FAILED):
+        assert re.search(rf"^  {code} +{cli.EXIT_CODES[code]}", out, re.MULTILINE), code
+
+
+def test_version_is_that_of_the_distribution(capsys):
+    assert run(capsys, "--version") == (0, f"sightline {importlib.metadata.version('sightline-robot')}\n", "")
+
+
+@pytest.mark.parametrize("group", [(), *GROUPS], ids=" ".join)
+def test_without_a_subcommand_a_group_lists_its_own(capsys, group):
+    if group == ("score",):  # which also runs by itself
+        group = ("score", "--help")
+    code, out, err = run(capsys, *group)
+    assert (code, err) == (0, "")
+    assert f"Usage: sightline {' '.join(group[:1])}".rstrip() in out
+    names = [path[1] for path in COMMANDS if path[:1] == group[:1] and len(path) > 1] if group else cli.COMMANDS
+    for name in names:
+        assert re.search(rf"^  {name} ", out, re.MULTILINE), name
+
+
+def test_completion_of_the_shell_offers_commands_and_options():
+    def offered(words):
+        environ = {**os.environ, "_SIGHTLINE_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": "1"}
+        script = "from sightline.operator_side.cli.app import main; main()"
+        command = [sys.executable, "-P", "-c", script]
+        done = subprocess.run(command, env=environ, capture_output=True, text=True, check=True)
+        return done.stdout.split()
+
+    assert set(offered("sightline st")) == {"status", "stop"}
+    assert "--version" in offered("sightline --")
 
 
 @pytest.mark.parametrize(
     ("arguments", "code", "expected"),
     [
         (["dmeo"], 2, "did you mean 'demo'"),
-        (["config", "chekc"], 2, "no command called 'chekc'; did you mean 'check'?; see sightline config --help"),
-        (["bench", "pipline"], 2, "no command called 'pipline'; did you mean 'pipeline'?; see sightline bench --help"),
-        (["bench", "vision"], 2, "no command called 'vision' in sightline bench; did you mean 'sightline vision'?"),
-        (["config"], 2, "Missing command"),
+        (["config", "chekc"], 2, "unknown command 'chekc'; did you mean 'check'?; see sightline config --help"),
+        (["bench", "pipline"], 2, "unknown command 'pipline'; did you mean 'pipeline'?; see sightline bench --help"),
+        (["bench", "vision"], 2, "unknown command 'vision' in sightline bench; did you mean 'sightline vision'?"),
         (["config", "check"], 2, "SERVICE"),
         (["config", "check", "robto"], 2, "did you mean 'robot'"),
         (["config", "check", "robot", "no such file.toml"], 2, "no such file.toml"),
@@ -109,8 +175,7 @@ def test_alone_it_shows_its_help(capsys):
         (["robot", "--set", "drive.kind=lgo"], 2, "did you mean 'log'"),
         (["robot", "--set", "drive.kind=:"], 2, "':'"),
         (["robot", "--set", "drive.kind=.a:X"], 2, "'.a:X'"),
-        (["watch", "r1", "nope"], 2, "there are: frame, "),
-        (["keys"], 2, "--help"),
+        (["watch", "r1", "nope"], 2, "expected frame, "),
         (["robot", "--socket-dir", "/nowhere"], 3, "sightline sim"),
         (["vision", "--robot", "r1/"], 2, "'r1/'"),
         (["vision", "--set", "hsv.min_radius_px=-1"], 2, "-1"),
@@ -127,7 +192,7 @@ def test_alone_it_shows_its_help(capsys):
         (["score", "--detector", "hvs"], 2, "'hsv'"),
         (["status", "--connect", "here"], 2, "tcp/127.0.0.1:7447"),
         (["arm", "a b"], 2, "'a b'"),
-        (["robots", "--connect", "tcp/127.0.0.1:1", "--seconds", "0.3"], 4, "nobody answers at tcp/127.0.0.1:1"),
+        (["robots", "--connect", "tcp/127.0.0.1:1", "--seconds", "0.3"], 4, "at tcp/127.0.0.1:1"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -189,7 +254,7 @@ def test_config_commands_print_what_a_script_can_read(capsys, tmp_path):
     assert "target" in json.loads(out)["properties"]
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["config", "show", "robot"], ["arm", "a/b"]])
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["config", "show", "robot"], ["arm", "a/b"]])
 def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
     script = (
         "import sys; from sightline.operator_side.cli import app as cli; cli.run(sys.argv[1:]);"
@@ -213,7 +278,7 @@ def test_operator_commands_import_their_own_group_and_no_image_library(arguments
     endpoint = ["--connect", "tcp/127.0.0.1:1"]
     result = subprocess.run([sys.executable, "-P", "-c", script, *arguments, *endpoint], capture_output=True, text=True,
                             check=True, stdin=subprocess.DEVNULL)
-    assert result.stderr.startswith("error: ")
+    assert result.stderr.splitlines()[-1].startswith("error: ")
     assert result.stdout.splitlines() == ["app operate options", ""]
 
 

@@ -55,7 +55,7 @@ def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:
     assert code == 0 and {"hsv", "adaptive", "onnx", "zenoh"} <= set(listed)
     assert listed["hsv"] == {"name": "hsv", "usable": True, "why": ""}
     code, out, _ = run(capsys, "detector", "list")
-    assert code == 0 and "adaptive     ok" in out
+    assert code == 0 and "adaptive   ok" in out
 
 
 def test_a_detector_that_keeps_its_promises_passes(capsys) -> None:
@@ -88,10 +88,10 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("detector", "check", "hsv", "--device", "cuda"), 2, "no device to choose"),
         (("detector", "check", "hsv", "--device", "gpu"), 2, "device"),
         (("detector", "check", "onnx:/nowhere.onnx"), 2, "No such file"),
-        (("detector", "--serve", "hsv", "list"), 2, "runs by itself"),
+        (("detector", "--serve", "hsv", "list"), 2, "exclude each other"),
         (("vision", "--detector", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
         (("vision", "--shadow", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
-        (("vision", "--dry-run", "--detector", "boxes"), 2, "own eyes"),
+        (("vision", "--dry-run", "--detector", "boxes"), 2, "needs a local detector"),
         (("vision", "--detector", "boxes", "--device", "cuda", "--connect", "tcp/127.0.0.1:1"), 2, "'boxes' is remote"),
         (("detector", "check", "boxes"), 2, "choose a local detector"),
         (("detector", "check", "zenoh"), 2, "that the service serves"),
@@ -108,7 +108,7 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("vision", "--dry-run", "--detector", "onnx", "--set", "detector.labels=[\"bal\"]", "--camera", "folder",
           "--camera-set", "path=examples/pictures"), 2, "onnx has no label 'bal'; did you mean 'ball'?"),
         (("detector", "check", "hsv", "--set", "hsv.min_radius_px=900"), 2, "'hsv.min_radius_px'"),
-        (("detector", "check", "hsv", "--set", "label=a", "--set", "label.b=1"), 2, "'label' has a value"),
+        (("detector", "check", "hsv", "--set", "label=a", "--set", "label.b=1"), 2, "'label' already has a value"),
         (("demo", "--detector", "hsw", "--out", "/nowhere/made"), 2, "did you mean 'hsv'"),
         (("demo", "--detector", "onnx:/nowhere.onnx", "--out", "/nowhere/made"), 2, "/nowhere.onnx: No such file"),
         (("demo", "--mission", "folow", "--out", "/nowhere/made"), 2, "did you mean 'follow'"),
@@ -136,9 +136,9 @@ def test_a_copy_without_a_model_says_so(capsys, monkeypatch, tmp_path: Path) -> 
     monkeypatch.setattr(onnx_detector, "SHIPPED", tmp_path / "sightline.onnx")
     code, _, err = run(capsys, "detector", "check", "onnx")
     assert code == 2 and "without a model of its own" in err and err.count("\n") == 1
-    assert "onnx         ok; comes without a model" in run(capsys, "detector", "list")[1]
+    assert "onnx       ok; without a model" in run(capsys, "detector", "list")[1]
     brightness_model(tmp_path / "sightline.onnx", [[1, 1, 9, 9]], [0])
-    assert f"onnx         ok, comes with model {onnx_detector.shipped_digest()}" in run(capsys, "detector", "list")[1]
+    assert f"onnx       ok, with model {onnx_detector.shipped_digest()}" in run(capsys, "detector", "list")[1]
     assert json.loads(run(capsys, "detector", "list", "--json")[1])["model_hash"] == onnx_detector.shipped_digest()
 
 

@@ -1,4 +1,4 @@
-"""What people write to send a robot somewhere, and what they are told of it."""
+"""Waypoints and options of a mission request, and its reports as text."""
 
 import pytest
 
@@ -15,7 +15,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import MissionReport
 
 
-def test_waypoints_are_pairs_of_metres():
+def test_waypoints_are_pairs_of_meters():
     assert waypoints_of(["1.5", "-2", "+.5", "1e1"]) == ((1.5, -2.0), (0.5, 10.0))
     assert waypoints_of(["100", "-100"]) == ((100.0, -100.0),)
     text = "# out\n1.5 1.5\n\n 0,-2.25   # and back\n-1 , 3\n"
@@ -23,19 +23,19 @@ def test_waypoints_are_pairs_of_metres():
 
 
 @pytest.mark.parametrize(("texts", "words"), [
-    (["1", "2", "abc", "4"], "waypoint 2: 'abc' is no number"),
-    (["1", "nan"], "waypoint 1: 'nan' is no number"),
-    (["inf", "1"], "waypoint 1: 'inf' is no number"),
-    (["1_0", "1"], "waypoint 1: '1_0' is no number"),
-    (["٣", "1"], "is no number"),
-    (["1", "2", "--wiat"], "waypoint 2: '--wiat' is no number"),
+    (["1", "2", "abc", "4"], "waypoint 2: invalid number 'abc'"),
+    (["1", "nan"], "waypoint 1: invalid number 'nan'"),
+    (["inf", "1"], "waypoint 1: invalid number 'inf'"),
+    (["1_0", "1"], "waypoint 1: invalid number '1_0'"),
+    (["٣", "1"], "invalid number"),
+    (["1", "2", "--wiat"], "waypoint 2: invalid number '--wiat'"),
     (["1", "2", "3"], "waypoint 2: has an X and no Y"),
-    (["1", "100.5"], "waypoint 1: 100.5 m is out of the world; -100 to 100 m"),
-    (["1e999", "1"], "out of the world"),
-    ([], "0 waypoints; give 1 to 64"),
-    (["1", "1"] * 65, "65 waypoints; give 1 to 64"),
+    (["1", "100.5"], "waypoint 1: 100.5 m is out of range; expected -100 to 100 m"),
+    (["1e999", "1"], "out of range"),
+    ([], "0 waypoints; expected 1 to 64"),
+    (["1", "1"] * 65, "65 waypoints; expected 1 to 64"),
 ])
-def test_a_waypoint_that_is_none_is_named(texts, words):
+def test_invalid_waypoint_is_named(texts, words):
     with pytest.raises(ConfigError) as error:
         waypoints_of(texts)
     assert words in str(error.value) and len(str(error.value).splitlines()) == 1
@@ -43,16 +43,16 @@ def test_a_waypoint_that_is_none_is_named(texts, words):
 
 @pytest.mark.parametrize(("text", "words"), [
     ("1 2\n1 2 3\n", "way.txt:2: has 3 numbers"),
-    ("1 2\n1 b\n", "way.txt:2: 'b' is no number"),
+    ("1 2\n1 b\n", "way.txt:2: invalid number 'b'"),
     ("# nothing\n", "0 waypoints"),
-    ("1 500\n", "way.txt:1: 500 m is out of the world"),
+    ("1 500\n", "way.txt:1: 500 m is out of range"),
 ])
 def test_a_file_of_waypoints_names_its_line(text, words):
     with pytest.raises(ConfigError, match=words.replace("(", r"\(")):
         waypoints_of_file(text, "way.txt")
 
 
-def test_options_are_read_as_they_are_meant():
+def test_options_are_read_as_toml_values():
     assert options_of(["a=1", "b.c=0.5", "d=true", "e=left", 'f="2"', "g="]) == {
         "a": 1, "b.c": 0.5, "d": True, "e": "left", "f": "2", "g": ""}
     for wrong in ("a", "=1"):
@@ -61,14 +61,14 @@ def test_options_are_read_as_they_are_meant():
 
 
 @pytest.mark.parametrize(("name", "options", "words"), [
-    ("my_missions:Circle", {}, "is no mission's name"),
-    ("Follow", {}, "is no mission's name"),
+    ("my_missions:Circle", {}, "invalid mission"),
+    ("Follow", {}, "invalid mission"),
     ("band", {"a": [1]}, "option 'a'"),
     ("band", {"a": float("nan")}, "option 'a'"),
     ("band", {"A": 1}, "option"),
     ("band", {f"o{at}": 1 for at in range(17)}, "at most 16 options"),
 ])
-def test_what_the_wire_has_no_room_for_is_said_before_it_is_sent(name, options, words):
+def test_request_that_the_protocol_does_not_permit_is_rejected(name, options, words):
     with pytest.raises(ConfigError, match=words):
         request_of(1, name, (), options)
 
@@ -76,11 +76,11 @@ def test_what_the_wire_has_no_room_for_is_said_before_it_is_sent(name, options, 
 def test_a_report_in_words():
     report = MissionReport(mission="goto", phase="driving", note="reached 1 of 2", detector="hsv", device="cpu")
     assert mission_line(report) == "goto: driving; reached 1 of 2" and not cannot(report)
-    over = report.model_copy(update={"phase": "cannot reach", "done": True, "refused": "no mission called 'x'",
+    over = report.model_copy(update={"phase": "cannot reach", "done": True, "refused": "unknown mission 'x'",
                                      "inference_us": 1060})
     assert list(mission_lines(over)) == [
         "mission   goto: cannot reach; reached 1 of 2 (over)",
-        "          the last that was asked for is not taken up: no mission called 'x'",
-        "detector  hsv, on cpu, 1.1 ms a picture",
+        "          last mission request rejected: unknown mission 'x'",
+        "detector  hsv, on cpu, 1.1 ms per image",
     ]
     assert cannot(over) and not cannot(over.model_copy(update={"phase": "arrived"}))

@@ -18,16 +18,16 @@ from sightline.robot_side.driver.core import DriverCore
 
 
 class PumpedRobot:
-    """A robot session on a `MemoryNetwork`, ticked by a thread; `drives` makes vision answer every tick."""
+    """A robot session on a `MemoryNetwork`, ticked by a thread; with `drives` a vision service answers every tick."""
 
-    def __init__(self, *, drives: bool = True, hears: bool = True, says: str = "") -> None:
+    def __init__(self, *, drives: bool = True, receives: bool = True, version: str = "") -> None:
         config = RobotConfig(drive=PluginChoice(kind="log"), camera=PluginChoice(kind="folder"))
         self.network = MemoryNetwork()
         self.driving = DriverCore(config, "0000000a")
-        self.drives, self.version = drives, says
+        self.drives, self.version = drives, version
         self.link = self.network.link("r1")
         self.operator = Operator(self.network.link("r1", role="operator"))
-        if hears:
+        if receives:
             self.link.subscribe(REQUEST, lambda message: self.driving.on_request(message, self.now_us))
         self.now_us = self.network.now_us
         self._ending = threading.Event()
@@ -71,16 +71,16 @@ def test_arm_drive_stop_reset():
         assert operator.arm(patience_s=2.0).ok
         assert operator.wait_report().status.state in ("HOLD", "ACTIVE")
         assert operator.stop(fail_if_slow).state == "STOPPED"
-        refused = operator.arm(patience_s=2.0)
-        assert not refused.ok
-        assert "reset" in refused.detail
+        rejected = operator.arm(patience_s=2.0)
+        assert not rejected.ok
+        assert "reset" in rejected.detail
         # The first may still find turning wheels.
         assert operator.request(Verb.RESET).ok or operator.request(Verb.RESET).ok
         assert operator.wait_report().status.state == "DISARMED"
         assert operator.request(Verb.DISARM).ok
 
 
-def test_arm_waits_for_live_commands_and_says_what_is_missing():
+def test_arm_waits_for_valid_commands_and_reports_the_missing_condition():
     with PumpedRobot(drives=False) as robot:
         reply = robot.operator.arm(patience_s=0.05)
         assert not reply.ok
@@ -89,35 +89,35 @@ def test_arm_waits_for_live_commands_and_says_what_is_missing():
         assert robot.operator.arm(patience_s=3.0).ok
 
 
-def test_requests_without_an_answer_end_in_time_and_say_so():
-    with PumpedRobot(hears=False) as robot:
+def test_request_without_an_answer_ends_in_time_with_an_error():
+    with PumpedRobot(receives=False) as robot:
         robot.operator.wait_report()
-        with pytest.raises(LinkError, match="does not answer arm"):
+        with pytest.raises(LinkError, match="no answer from robot 'r1' to arm"):
             robot.operator.request(Verb.ARM, timeout_s=0.3)
 
 
-def test_stop_is_repeated_at_20_hz_and_tells_when_it_is_slow():
-    with PumpedRobot(hears=False) as robot:
-        heard, told = [], []
-        robot.network.link("r1").subscribe(REQUEST, heard.append)
+def test_stop_is_repeated_at_20_hz_and_warns_when_it_is_slow():
+    with PumpedRobot(receives=False) as robot:
+        received, warned = [], []
+        robot.network.link("r1").subscribe(REQUEST, received.append)
         started_s = time.monotonic()
         with pytest.raises(LinkError, match="cut its power"):
-            robot.operator.stop(lambda: told.append(time.monotonic() - started_s), timeout_s=0.6)
-        assert len(told) == 1
-        assert 0.3 <= told[0] < 0.5
-        assert 6 <= len(heard) <= 13
+            robot.operator.stop(lambda: warned.append(time.monotonic() - started_s), timeout_s=0.6)
+        assert len(warned) == 1
+        assert 0.3 <= warned[0] < 0.5
+        assert 6 <= len(received) <= 13
 
 
-def test_silence_and_another_version_are_told_apart():
+def test_silence_and_another_version_have_different_errors():
     robot = PumpedRobot()
-    with pytest.raises(LinkError, match="is not heard"):
+    with pytest.raises(LinkError, match="no status from robot 'r1'"):
         robot.operator.wait_report(timeout_s=0.1)
-    with PumpedRobot(says='"v":2') as other, pytest.raises(LinkError, match="version 2; this peer speaks 1"):
+    with PumpedRobot(version='"v":2') as other, pytest.raises(LinkError, match="version 2; this peer speaks 1"):
         other.operator.wait_report(timeout_s=1.0)
 
 
-def test_a_status_of_another_version_is_forgotten_once_it_is_not_heard_any_more():
-    """It was anybody's: waiting for the next report waits again, and gets it."""
+def test_stray_status_of_another_version_does_not_end_the_next_wait():
+    """Any peer may have sent it: the next wait receives a report."""
     with PumpedRobot() as robot:
         stray = Message(STATUS, "", b'{"v":2,"session":"0000000f","seq":1,"t_us":1}', b"{}")
         robot.operator._on_status(stray)
@@ -125,18 +125,18 @@ def test_a_status_of_another_version_is_forgotten_once_it_is_not_heard_any_more(
             assert robot.operator.wait_report(2.0).status is not None
 
 
-def test_replies_to_others_are_not_taken():
+def test_replies_to_other_operators_are_ignored():
     with PumpedRobot() as robot:
         other = Operator(robot.network.link("r1", role="operator"))
         other.wait_report()
         replies = [None, None]
 
-        def ask(at: int, operator: Operator, verb: Verb) -> None:
+        def request(at: int, operator: Operator, verb: Verb) -> None:
             replies[at] = operator.request(verb)
 
         threads = [
-            threading.Thread(target=ask, args=(0, robot.operator, Verb.DISARM), daemon=True),
-            threading.Thread(target=ask, args=(1, other, Verb.RESET), daemon=True),
+            threading.Thread(target=request, args=(0, robot.operator, Verb.DISARM), daemon=True),
+            threading.Thread(target=request, args=(1, other, Verb.RESET), daemon=True),
         ]
         for thread in threads:
             thread.start()
@@ -146,7 +146,7 @@ def test_replies_to_others_are_not_taken():
         assert replies[1].detail.startswith("nothing to reset")
 
 
-def test_status_says_every_counter_and_the_last_refusal():
+def test_status_text_shows_every_counter_and_the_last_rejection():
     with PumpedRobot(drives=False) as robot:
         robot.operator.arm(patience_s=0)
         for payload in (b"nan|1", b"nonsense", b"1|2|3"):

@@ -9,7 +9,7 @@ from sightline.protocol.messages import Holder, LastRejection, Stamp, State, Sta
 from sightline.protocol.transports.link import Message
 
 OTHERS = {"state": State.HOLD, "reason": "other"}
-"""Of the fields without a default."""
+"""Other values for the fields without a default."""
 GIVEN = {
     "state": State.DEGRADED,
     "reason": "slow",
@@ -23,7 +23,7 @@ NUMBERS = {"boolean": lambda _count: True, "integer": lambda count: 11 + count, 
 
 
 def sample(model, **given):
-    """One with a value of its own in every field: `given`, or a number or switch that is not the default."""
+    """Make a model with `given`, or a number or switch other than the default, in every field."""
     values = dict(given)
     for count, (field, schema) in enumerate(model.model_json_schema()["properties"].items()):
         if field in GIVEN:

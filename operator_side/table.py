@@ -1,0 +1,47 @@
+"""Prints tables and blocks of lines: columns as wide as their cells, and colors for states. Shell (a terminal).
+
+The width of the terminal changes nothing, so that a script reads the same lines as an operator.
+"""
+
+import os
+import re
+import sys
+from collections.abc import Iterable, Sequence
+from itertools import zip_longest
+from typing import Final, TextIO
+
+_GREEN, _YELLOW, _RED = "32", "33", "31"
+_COLORS: Final = {
+    "ACTIVE": _GREEN, "DEGRADED": _YELLOW, "HOLD": _YELLOW, "DISARMED": _YELLOW, "STOPPED": _RED, "FAULT": _RED,
+    "passed": _GREEN, "FAILED": _RED, "FAIL": _RED, "BAD": _RED,
+}  # fmt: skip
+_COLORED: Final = re.compile(rf"\b({'|'.join(_COLORS)})\b")
+
+
+def table_lines(rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lay out rows of cells as lines with two blanks between columns; the last cell of a row widens no column."""
+    rows = [tuple(row) for row in rows]
+    widths = [max(map(len, column)) for column in zip_longest(*(row[:-1] for row in rows), fillvalue="")]
+    padded = ([*(f"{cell:<{width}}" for cell, width in zip(row[:-1], widths, strict=False)), *row[-1:]] for row in rows)
+    return ["  ".join(cells).rstrip() for cells in padded]
+
+
+def print_table(rows: Iterable[Sequence[str]]) -> None:
+    """Print rows of cells on stdout."""
+    print_block(table_lines(rows))
+
+
+def print_block(lines: Iterable[str]) -> None:
+    """Print lines on stdout, with colors for states on a terminal."""
+    text = "\n".join(lines)
+    print(colored(text) if uses_color(sys.stdout) else text, flush=True)
+
+
+def colored(text: str) -> str:
+    """Return `text` with ANSI colors for the names of states and results."""
+    return _COLORED.sub(lambda found: f"\x1b[{_COLORS[found[1]]}m{found[1]}\x1b[0m", text)
+
+
+def uses_color(stream: TextIO) -> bool:
+    """Return whether colors may be written: to a terminal, unless NO_COLOR is set (https://no-color.org)."""
+    return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
