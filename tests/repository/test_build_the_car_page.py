@@ -10,7 +10,7 @@ import typer
 
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.config.loading import load_service
-from sightline.operator_side.teleop.terminal import KEYS
+from sightline.operator_side.teleop.control import LAYOUTS
 from sightline.robot_side.hardware.gpio import GpioDriveConfig
 
 ROOT = Path(__file__).parent.parent.parent
@@ -79,4 +79,5 @@ def test_the_files_that_they_name_exist():
 
 
 def test_the_keys_are_those_that_teleop_shows():
-    assert KEYS in TELEOP
+    for layout in LAYOUTS.values():
+        assert layout.help in TELEOP

@@ -92,9 +92,9 @@ def test_drops_in_words():
         scale_percent=50,
     )
     words = drops_text(stream)
-    for part in ("40 captures in the camera's slot", "12 frame on the way out", "5 frames overtaken", "2 pictures"):
+    for part in ("40 captures in the camera's slot", "12 frame before sending", "5 frames overtaken", "2 invalid images"):
         assert part in words
-    assert encoding_text(stream) == "made smaller for this link: quality 60 %, side length 50 %"
+    assert encoding_text(stream) == "reduced for this link: quality 60 %, side length 50 %"
     assert encoding_text(StreamStatus()) == "as configured"
     shown = "\n".join(status_lines("r1", Status(state=State.HOLD, reason="waiting", stream=stream)))
     assert words in shown and encoding_text(stream) in shown

@@ -207,10 +207,10 @@ def test_a_file_that_cannot_be_is_told_before_anything_is_looked_at(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((), "say where the pictures come from"),
-        (("--pictures", ".", "--camera", "v4l2"), "say where the pictures come from"),
-        (("--pictures", ".", "--board", "9"), "is no board"),
-        (("--pictures", ".", "--board", "2x9"), "is no board"),
+        ((), "expected one source of images"),
+        (("--pictures", ".", "--camera", "v4l2"), "expected one source of images"),
+        (("--pictures", ".", "--board", "9"), "invalid --board"),
+        (("--pictures", ".", "--board", "2x9"), "invalid --board"),
         (("--pictures", ".", "--ball-radius-m", "0.1"), "both --ball-radius-m and --distance-m"),
         (("--camera", "still", "--camera-set", "path"), "invalid --camera-set"),
         (("--camera", "v4l3"), "did you mean 'v4l2'"),

@@ -109,13 +109,13 @@ def test_whatever_a_key_or_a_terminal_sends_ends_with_zero(monkeypatch, robot, n
 
 @pytest.mark.parametrize(("arguments", "says"), [
     (["robot", "test-wheels"], "lift the robot, then add --yes"),
-    (["robot", "test-wheel"], "no task called 'test-wheel'; did you mean 'test-wheels'?"),
+    (["robot", "test-wheel"], "unknown task 'test-wheel'; did you mean 'test-wheels'?"),
     (["robot", "r7"], "--robot r7"),
     (["calibrate", "drive", "--set", "drive.kind=log"], "add --yes"),
     (["calibrate", "drive", "--duty", "0.4,0.3"], "rising numbers"),
     (["calibrate", "drive", "--duty", "0.4,x"], "--duty"),
     (["calibrate", "drive", "--duty", "0.4,1.4"], "up to 1"),
-    (["calibrate", "drive", "--yes", "--set", "drive.kind=log"], "drive 'log' does not work by duty"),
+    (["calibrate", "drive", "--yes", "--set", "drive.kind=log"], "drive 'log' has no duty to calibrate"),
     (["calibrate", "drive", "--yes", "--out", "/nowhere/drive.toml"], "there is no folder /nowhere"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line_and_nothing_moves(capsys, monkeypatch, arguments, says):

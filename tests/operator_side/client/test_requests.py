@@ -84,7 +84,7 @@ def test_arm_waits_for_valid_commands_and_reports_the_missing_condition():
     with PumpedRobot(drives=False) as robot:
         reply = robot.operator.arm(patience_s=0.05)
         assert not reply.ok
-        assert "is vision running?" in reply.detail
+        assert "start the vision service" in reply.detail
         threading.Timer(0.1, lambda: setattr(robot, "drives", True)).start()
         assert robot.operator.arm(patience_s=3.0).ok
 

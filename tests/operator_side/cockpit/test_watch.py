@@ -73,7 +73,7 @@ def test_any_channel_is_printed(site: Site, end: str, capsys: pytest.CaptureFixt
 
 def test_what_cannot_be_watched_is_one_line(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, code, words in (
-        (["r1", "fram"], 2, "no channel called 'fram'; did you mean 'frame'?"),
+        (["r1", "fram"], 2, "unknown channel 'fram'; did you mean 'frame'?"),
         (["r1", "--json"], 2, "name it"),
         (["r1", "twist", "--connect", site.web, "--seconds", "1"], 4, "for the robot alone"),
         (["r1", "scan", "--connect", "tcp/127.0.0.1:1", "--seconds", "1"], 4, "tcp/127.0.0.1:1"),
