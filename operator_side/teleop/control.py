@@ -485,7 +485,7 @@ class Teleop:
     def _gave_up(self) -> None:
         self._pending_request = None
         if self.mode is Mode.HANDING_OVER:
-            self.mode, self.note = Mode.WATCHING, "nobody has taken over: is vision running?"
+            self.mode, self.note = Mode.WATCHING, "no vision service took over; run `sightline vision`"
         else:
             self.note = "it could not be armed; press again"
 

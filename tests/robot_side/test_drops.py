@@ -92,7 +92,8 @@ def test_drops_in_words():
         scale_percent=50,
     )
     words = drops_text(stream)
-    for part in ("40 captures in the camera's slot", "12 frame before sending", "5 frames overtaken", "2 invalid images"):
+    parts = ("40 captures in the camera's slot", "12 frame before sending", "5 frames overtaken", "2 invalid images")
+    for part in parts:
         assert part in words
     assert encoding_text(stream) == "reduced for this link: quality 60 %, side length 50 %"
     assert encoding_text(StreamStatus()) == "as configured"

@@ -139,7 +139,7 @@ def test_hand_over_without_vision_stops_the_robot_and_notes_it():
     rig.tap("\t")
     rig.run(6.0)
     assert rig.state is State.DISARMED and rig.applied == STILL
-    assert "is vision running?" in rig.teleop.note
+    assert "run `sightline vision`" in rig.teleop.note
     assert rig.teleop.mode is Mode.WATCHING
 
 

@@ -232,6 +232,8 @@ def test_mistake_in_a_terminal_is_one_line(arguments, code, expected):
     try:
         exit_code = terminal.process.wait(20)
         assert exit_code in (code if isinstance(code, tuple) else (code,))
-        assert terminal.text().count("\n") == 1 and expected in terminal.text()
+        *before, error = terminal.text().splitlines()
+        assert error.startswith("error: ") and expected in error
+        assert all(line.startswith("robot r1 at ") for line in before) and len(before) <= 1
     finally:
         terminal.close()
