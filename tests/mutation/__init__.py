@@ -1,5 +1,6 @@
-"""Tests of the tests: judged files are changed in one small way each, and the boundary tables must notice it. Shell.
+"""Tests of the tests: each trial changes a file in one small way, and the test tables of that file must fail. Shell.
 
-python -m tests.mutation           coverage, then every mutant; exits 5 if one survives unexplained
-python -m tests.mutation --list    what would be changed, without running anything
+python -m tests.mutation                   coverage, then every mutant; exits 5 if one survives without a reason
+python -m tests.mutation --changed [BASE]  the same for the files that changed since BASE
+python -m tests.mutation --list            print the mutants and stop
 """

@@ -1,17 +1,16 @@
-"""The mutation gate's command: coverage, then every mutant, then the verdict. Shell."""
+"""The command of the mutation gate: coverage, then every mutant, then the result. Shell."""
 
 import argparse
 import os
 import sys
 import time
-import tomllib
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-from tests.mutation.coverage_check import uncovered
-from tests.mutation.mutants import Mutant, mutants
-from tests.mutation.trial import Outcome, finish, start
+from tests.mutation.changes import EQUIVALENTS, select
+from tests.mutation.mutants import Mutant, Name, equivalents, mutants
+from tests.mutation.trial import Outcome, finish, start, uncovered
 
 _GATE = (
     "tests/robot_side/safety/test_gate_commands.py",
@@ -28,24 +27,56 @@ TABLES = {
     "protocol/text.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
     "protocol/jpeg.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
 }
-"""Each judged file and the tables that must notice any change to it; all of `safety/` is judged."""
-EQUIVALENTS = Path(__file__).parent / "equivalents.toml"
-Name = tuple[str, str, str, str, int]
+"""Each file under the gate, all of `safety/` among them, and the tables that must notice any change to it."""
 
 
-def main() -> int:
-    """Return the exit code: 0, or 5 when the tables fail, miss a line or branch, or let a mutant live."""
-    options = _options()
-    files = [file for file in TABLES if options.only in file]
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Return the exit code: 0; 2 for an unknown commit; 5 if the tables fail, miss a branch or let a mutant live."""
+    options = _options(arguments)
+    try:
+        files = [file for file in _selected(options.changed) if options.only in file]
+    except ValueError as error:
+        print("error:", error, file=sys.stderr)
+        return 2
     found = [mutant for file in files for mutant in mutants(file, Path(file).read_text())]
     if options.list:
         print(*map(_line, found), sep="\n")
         return 0
+    if not files:
+        return 0
     missing = uncovered(files, sorted({table for file in files for table in TABLES[file]}))
     if missing:
-        print(missing, "error: the tables fail, or leave lines or branches of the judged files out (above)", sep="\n")
+        print(missing, "error: the tables fail or miss lines or branches (above); correct or extend them", sep="\n")
         return 5
-    return _verdict(_survivors(found, options.jobs), _equivalents(files))
+    reasons = equivalents(Path(EQUIVALENTS).read_text())
+    return _result(_survivors(found, options.jobs), {name: why for name, why in reasons.items() if name[0] in files})
+
+
+def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(prog="python -m tests.mutation", description=__doc__)
+    parser.add_argument("--list", action="store_true", help="print the mutants and stop")
+    parser.add_argument("--only", default="", metavar="TEXT", help="only files whose path contains TEXT")
+    parser.add_argument(
+        "--changed",
+        nargs="?",
+        const="",
+        metavar="BASE",
+        help="only files that changed since BASE (default: newest tag, else origin/main, else HEAD~1)",
+    )
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="number of parallel trials")
+    return parser.parse_args(arguments)
+
+
+def _selected(commit: str | None) -> list[str]:
+    if commit is None:
+        return list(TABLES)
+    files, base = select(TABLES, commit)
+    if base is None:
+        print("all files: the history is missing (no git, a shallow clone or a first commit)", file=sys.stderr)
+    else:
+        names = ", ".join(files) if files else "no file of the mutation gate"
+        print(f"{names} changed since {base}", file=sys.stderr)
+    return files
 
 
 def _survivors(found: list[Mutant], jobs: int) -> list[Mutant]:
@@ -58,14 +89,6 @@ def _survivors(found: list[Mutant], jobs: int) -> list[Mutant]:
     return survivors
 
 
-def _options() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m tests.mutation", description=__doc__)
-    parser.add_argument("--list", action="store_true", help="print the mutants and stop")
-    parser.add_argument("--only", default="", metavar="TEXT", help="only judged files whose path holds TEXT")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="mutants tried at once")
-    return parser.parse_args()
-
-
 def _trials(found: Iterable[Mutant], jobs: int) -> Iterator[tuple[Mutant, Outcome]]:
     running: list[tuple[Mutant, int, float]] = []
     for mutant in found:
@@ -76,19 +99,13 @@ def _trials(found: Iterable[Mutant], jobs: int) -> Iterator[tuple[Mutant, Outcom
     yield from ((mutant, finish(pid, started_s)) for mutant, pid, started_s in running)
 
 
-def _equivalents(files: Iterable[str]) -> dict[Name, str]:
-    rows = tomllib.loads(EQUIVALENTS.read_text())["equivalent"]
-    named = {(row["file"], row["where"], row["before"], row["after"], row.get("nth", 1)): row["reason"] for row in rows}
-    return {name: reason for name, reason in named.items() if name[0] in files}
-
-
-def _verdict(survivors: list[Mutant], equivalents: dict[Name, str]) -> int:
-    unexplained = [mutant for mutant in survivors if mutant.name not in equivalents]
-    outdated = set(equivalents) - {mutant.name for mutant in survivors}
+def _result(survivors: list[Mutant], reasons: dict[Name, str]) -> int:
+    unexplained = [mutant for mutant in survivors if mutant.name not in reasons]
+    outdated = set(reasons) - {mutant.name for mutant in survivors}
     for mutant in unexplained:
         print("survived:", _line(mutant))
     for name in sorted(outdated):
-        print("no survivor of this name, take it out of equivalents.toml:", *name)
+        print("no survivor has this name, remove it from equivalents.toml:", *name)
     print(f"{len(survivors) - len(unexplained)} named equivalents, {len(unexplained)} unexplained survivors")
     return 5 if unexplained or outdated else 0
 

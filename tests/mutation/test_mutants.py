@@ -1,4 +1,4 @@
-"""The mutation gate's own eyes: which changes it makes to a line, and that each is named once and compiles."""
+"""The changes that the mutation gate makes to a line; each has one name and compiles."""
 
 import subprocess
 import sys
@@ -22,6 +22,7 @@ def changes(source):
         ("-a", {("-a", "a")}),
         ("a + b", {("a + b", "a - b")}),
         ("a * b", {("a * b", "a / b")}),
+        ("a += b", {("a += b", "a -= b"), ("a += b", "a = b")}),
         ("f(7)", {("7", "6"), ("7", "8")}),
         ("f(2.0)", {("2.0", "1.98"), ("2.0", "2.02")}),
         ("f(0.0)", {("0.0", "-0.01"), ("0.0", "0.01")}),
@@ -39,17 +40,17 @@ def changes(source):
         ("[a for a in b if a]", {("for a in b if a", "for a in b")}),
     ],
 )
-def test_each_kind_of_node_has_its_changes(source, expected):
+def test_node_has_the_changes_of_its_kind(source, expected):
     stripped = {(before.strip(), after.strip()) for before, after in changes(source)}
     assert stripped == expected
 
 
-def test_statements_are_removed_and_returns_emptied_inside_functions_only():
+def test_statements_inside_functions_only_are_removed_and_returns_emptied():
     got = changes('"""Text."""\na = b\ndef f():\n    """Text."""\n    a = b\n    raise a\n    return b')
     assert got == {("a = b", "pass"), ("raise a", "pass"), ("return b", "return None"), ("return b", "pass")}
 
 
-def test_equal_changes_in_one_place_are_told_apart():
+def test_equal_changes_in_one_place_are_numbered():
     names = [mutant.name for mutant in mutants("example.py", "def f(a):\n    return a(1, 1)")]
     assert len(names) == len(set(names)) and {name[-1] for name in names if name[2] == "1"} == {1, 2}
 
@@ -59,19 +60,19 @@ def test_where_is_the_qualified_name():
     assert (mutant.where, mutant.line, mutant.file) == ("A.f", 3, "example.py")
 
 
-def test_the_gate_itself_imports_no_judged_file():
-    """Else every mutant of it counts as killed, though none was ever run."""
+def test_gate_imports_no_file_with_mutants():
+    """If it did, every mutant of that file would count as killed and none would run."""
     code = """
 import sys
 import tests.mutation.__main__ as gate
 from tests.mutation.trial import module_name
 print([file for file in gate.TABLES if module_name(file) in sys.modules])
 """
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.strip() == "[]"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.strip() == "[]"
 
 
-def test_a_mutant_whose_module_is_there_already_is_no_trial():
+def test_mutant_of_an_imported_module_is_rejected():
     code = """
 import sightline.protocol.jpeg
 from pathlib import Path
@@ -80,5 +81,5 @@ from tests.mutation.trial import start
 mutant = next(mutants("protocol/jpeg.py", Path("protocol/jpeg.py").read_text()))
 start(mutant, ["tests/protocol/test_text_and_jpeg_boundaries.py"])
 """
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert told.returncode == 1 and "imported before its mutants" in told.stderr
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode == 1 and "imported before its mutants" in ran.stderr

@@ -1,57 +1,78 @@
-"""Runs the boundary tables against one mutant, in a forked child with bounded time and memory. Shell."""
+"""Run test tables: once for coverage, then against each mutant in a forked child with bounds. Shell."""
 
 import contextlib
 import importlib
 import os
 import resource
 import signal
+import subprocess
 import sys
+import tempfile
 import time
 import types
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import Enum
 from pathlib import Path
 
 import pytest
 
-# Loaded once here, shared by all children; it imports no judged file, or no mutant of that file would ever run.
+# All children share what is loaded here. It imports no file that has mutants, or no mutant of that file would run.
 import sightline.protocol.messages  # noqa: F401
 from tests.mutation.mutants import Mutant
 
-_CPU_SECONDS = 5  # a table takes well under one; a mutant that loops for ever is ended here
+# A table takes well under one second of CPU. The bounds end a mutant that loops or allocates without end.
+_CPU_SECONDS = 5
 _WALL_SECONDS = 60.0
 _MEMORY_BYTES = 4 << 30
 
 
 class Outcome(Enum):
-    """What became of a mutant."""
+    """The end of a trial."""
 
     SURVIVED = "survived"
     KILLED = "killed"
-    TIMEOUT = "ran into the time limit"
+    TIMEOUT = "reached the time limit"
 
 
 def module_name(file: str) -> str:
-    """The dotted name of a file of the repository."""
+    """Return the dotted name of a file of the repository."""
     return "sightline." + file.removesuffix(".py").replace("/", ".")
+
+
+def uncovered(files: Iterable[str], suites: Iterable[str]) -> str:
+    """Return the report on lines and branches of `files` that `suites` miss, or on their failure; "" if all is well."""
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "COVERAGE_FILE": str(Path(folder, "data"))}
+        include = "--include=" + ",".join(files)
+        run = ("run", "--branch", include, "-m", "pytest", "-q", "-p", "no:cacheprovider", *suites)
+        report = ("report", include, "--show-missing", "--skip-covered", "--fail-under=100", "--precision=2")
+        for command in (run, report):
+            coverage = [sys.executable, "-m", "coverage", *command]
+            ran = subprocess.run(coverage, env=environment, capture_output=True, text=True, check=False)
+            if ran.returncode:
+                return ran.stdout + ran.stderr
+    return ""
 
 
 def start(mutant: Mutant, suites: Sequence[str]) -> int:
     """Fork a child that runs `suites` with `mutant` in place; return its pid.
 
-    Raises RuntimeError if the mutant's module is imported here already: every trial would then end as if killed.
+    Raises:
+        RuntimeError: this process has imported the mutant's module already, so every trial would end as if killed.
     """
     if module_name(mutant.file) in sys.modules:
-        raise RuntimeError(f"{mutant.file} was imported before its mutants; see what imports it in this process")
+        raise RuntimeError(f"{mutant.file} was imported before its mutants; find its importer in this process")
     pid = os.fork()
     if pid:
         return pid
     status = 1
     try:
-        _bound()
+        resource.setrlimit(resource.RLIMIT_CPU, (_CPU_SECONDS, _CPU_SECONDS))
+        resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         status = _run(mutant, suites)
     finally:
-        os._exit(status)  # never return into the parent's code, whatever the mutant raised
+        os._exit(status)  # the child never returns into the parent's code, whatever the mutant raised
 
 
 def finish(pid: int, started_s: float) -> Outcome:
@@ -68,13 +89,8 @@ def finish(pid: int, started_s: float) -> Outcome:
     return Outcome.KILLED if os.waitstatus_to_exitcode(status) else Outcome.SURVIVED
 
 
-def _bound() -> None:
-    resource.setrlimit(resource.RLIMIT_CPU, (_CPU_SECONDS, _CPU_SECONDS))
-    resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
 def _run(mutant: Mutant, suites: Sequence[str]) -> int:
+    options = ("-x", "-q", "--tb=no", "--assert=plain", "-p", "no:cacheprovider", "-p", "no:hypothesispytest")
     with (
         Path(os.devnull).open("w") as nowhere,
         contextlib.redirect_stdout(nowhere),
@@ -82,14 +98,13 @@ def _run(mutant: Mutant, suites: Sequence[str]) -> int:
     ):
         try:
             _install(mutant)
-            options = ["-x", "-q", "--tb=no", "--assert=plain", "-p", "no:cacheprovider", "-p", "no:hypothesispytest"]
             return int(pytest.main([*options, *suites]))
-        except BaseException:  # a mutant may raise anything at import; that is noticed, so killed
+        except BaseException:  # a mutant may raise anything at import: the table notices it
             return 1
 
 
 def _install(mutant: Mutant) -> None:
-    """Let the mutant be what every later import of its module finds."""
+    """Put the mutant where every later import of its module finds it."""
     name = module_name(mutant.file)
     module = types.ModuleType(name)
     module.__file__ = str(Path(mutant.file).resolve())
