@@ -1,6 +1,6 @@
-"""ONE table of channels; keys, encodings, priorities, sizes and the specification's tables derive from it. Pure.
+"""The only table of channels. Keys, encodings, priorities, sizes and the specification derive from it. Pure.
 
-Everything towards the robot names its source in the key (`twist/vision`), so that access rules can say who may drive.
+Each key toward the robot names its source (`twist/vision`), so that access rules can grant the right to drive.
 """
 
 import re
@@ -34,14 +34,14 @@ KEY_PREFIX = "sightline"
 
 
 class Direction(Enum):
-    """Who publishes."""
+    """Publishing side of a channel."""
 
     FROM_ROBOT = "robot -> others"
     TO_ROBOT = "others -> robot"
 
 
 class Priority(Enum):
-    """Order of sending when a link is full; the names are Zenoh's."""
+    """Order of sending on a full link. The names are those of Zenoh."""
 
     REAL_TIME = "REAL_TIME"
     INTERACTIVE_HIGH = "INTERACTIVE_HIGH"
@@ -51,7 +51,7 @@ class Priority(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """One row of the table. `payload` is a JSON model, or None where the bytes are described by `encoding`."""
+    """One row of the table. `payload` is a JSON model, or None if `encoding` describes the bytes."""
 
     name: str
     direction: Direction
@@ -62,25 +62,25 @@ class Channel:
     rate: str
     max_payload_bytes: int
     purpose: str
-    when_full: str = "a newer one takes its place"
-    """What becomes of a message that cannot leave at once."""
+    when_full: str = "a newer message replaces it"
+    """Rule for a message that cannot leave immediately."""
     passed_on: bool = False
-    """Whether the robot hands it, as it came, to every other peer that wants it."""
+    """True if the robot forwards the message unchanged to every other peer that wants it."""
     while_watched: bool = False
-    """Said, and passed on, only while somebody listens: a picture nobody looks at is not worth its encoding."""
+    """True if a peer publishes it only while a viewer subscribes, which saves the encoding."""
     said_by: tuple[str, ...] = ()
-    """Who may say it where links have keys; empty for every source."""
+    """Sources that may publish it on links with keys. Empty for every source."""
 
     @property
     def has_source(self) -> bool:
-        """Whether the key ends in the publisher's role."""
+        """Return True if the key ends in the publisher's role."""
         return self.direction is Direction.TO_ROBOT
 
 
 _OUT, _IN = Direction.FROM_ROBOT, Direction.TO_ROBOT
 _JSON = "application/json"
 JPEG: Final = "image/jpeg"
-"""Encoding of every channel whose payload is a picture."""
+"""Encoding of every channel whose payload is an image."""
 DRIVERS: Final = ("vision", "operator", "teleop")
 SOURCES_OF_ROLE: Final[dict[str, tuple[str, ...]]] = {
     "vision": ("vision",),
@@ -88,43 +88,43 @@ SOURCES_OF_ROLE: Final[dict[str, tuple[str, ...]]] = {
     "detector": ("detector",),
     "viewer": (),
 }
-"""Role of a certificate -> the sources it may speak as towards a robot. A detector says what it sees and no more, a
-viewer nothing, not even `ack`."""
+"""Role of a certificate -> the sources that it may use toward a robot. A detector publishes only its detections. A
+viewer publishes nothing, not even `ack`."""
 KNOWN_SOURCES: Final = frozenset(source for sources in SOURCES_OF_ROLE.values() for source in sources)
-"""The sources that a role speaks as; any other is made up by its peer, and possible only on a link without keys."""
+"""All sources of a role. A peer can use any other source only on a link without keys."""
 
 FRAME = Channel("frame", _OUT, FrameHeader, None, JPEG, Priority.DATA, "camera rate, by credit", 1_000_000,
-                "a picture, JPEG and nothing else", "none is taken without credit; a newer one takes its place")
+                "an image, JPEG and nothing else", "no image is captured without credit; a newer message replaces it")
 TWIST = Channel("twist", _IN, AnswerHeader, None, "text/plain", Priority.REAL_TIME, "one per frame answered",
                 MAX_TWIST_BYTES, "`linear|angular` in m/s and rad/s", said_by=DRIVERS)
 ACK = Channel("ack", _IN, AnswerHeader, None, "application/octet-stream", Priority.REAL_TIME,
               "one per frame seen but not answered by a twist", 0, "returns credit, drives nothing; empty payload",
               said_by=DRIVERS)
-REQUEST = Channel("request", _IN, RequestHeader, Request, _JSON, Priority.REAL_TIME, "as a person asks", 256,
-                  "arm, disarm, stop, reset, acquire, release", "a newer one takes its place; who asks asks again")
+REQUEST = Channel("request", _IN, RequestHeader, Request, _JSON, Priority.REAL_TIME, "on demand", 256,
+                  "arm, disarm, stop, reset, acquire, release", "a newer message replaces it; the requester repeats it")
 REPLY = Channel("reply", _OUT, Stamp, Reply, _JSON, Priority.INTERACTIVE_HIGH, "one per request", 1024,
                 "the answer to a request")
 STATUS = Channel("status", _OUT, Stamp, Status, _JSON, Priority.INTERACTIVE_HIGH, "10 Hz", 4096,
                  "state, reason, holder, counters")
 ODOMETRY = Channel("odometry", _OUT, Stamp, Odometry, _JSON, Priority.DATA, "20 Hz", 256, "pose and twist from wheels")
 SCAN = Channel("scan", _OUT, ScanHeader, None, "application/octet-stream", Priority.DATA_LOW, "10 Hz", 16_384,
-               "lidar ranges, little-endian float32, metres, inf = no return")
+               "lidar ranges, little-endian float32, meters, inf = no return")
 CAMERA = Channel("camera", _OUT, Stamp, CameraModel, _JSON, Priority.INTERACTIVE_HIGH, "2 Hz", 1024,
                  "the camera's model and mounting")
 DETECTIONS = Channel("detections", _IN, DetectionsHeader, Detections, _JSON, Priority.INTERACTIVE_HIGH,
-                     "one per picture looked at", 32_768, "boxes that somebody found; the robot passes them on",
+                     "one per examined image", 32_768, "boxes from a detector; the robot passes them on",
                      passed_on=True)
-MISSION = Channel("mission", _IN, RequestHeader, MissionRequest, _JSON, Priority.INTERACTIVE_HIGH, "as a person asks",
-                  4096, "what vision is to do; the robot passes it on", passed_on=True,
+MISSION = Channel("mission", _IN, RequestHeader, MissionRequest, _JSON, Priority.INTERACTIVE_HIGH, "on demand",
+                  4096, "the requested mission; the robot passes it on", passed_on=True,
                   said_by=("operator", "teleop"))
 REPORT = Channel("report", _IN, DetectionsHeader, MissionReport, _JSON, Priority.INTERACTIVE_HIGH,
-                 "2 Hz and on a change", 2048, "what vision does; the robot passes it on", passed_on=True,
+                 "2 Hz and on a change", 2048, "the state of the mission; the robot passes it on", passed_on=True,
                  said_by=("vision",))
 OVERLAY = Channel("overlay", _IN, DetectionsHeader, None, JPEG, Priority.DATA_LOW, "15 Hz at most, while watched",
-                  250_000, "the picture with what vision saw in it drawn over it; the robot passes it on",
+                  250_000, "the image with the detections drawn on it; the robot passes it on",
                   passed_on=True, while_watched=True, said_by=("vision",))
 PREVIEW = Channel("preview", _IN, DetectionsHeader, None, JPEG, Priority.DATA_LOW, "10 Hz at most, while watched",
-                  100_000, "the picture made small; the robot passes it on", passed_on=True, while_watched=True,
+                  100_000, "the image at a small size; the robot passes it on", passed_on=True, while_watched=True,
                   said_by=("vision",))
 
 CHANNELS: dict[str, Channel] = {
@@ -138,18 +138,32 @@ _SOURCE = re.compile(r"[a-z][a-z0-9_]{0,15}")
 
 
 def check_robot_id(robot: str) -> str:
-    """Return `robot` if it may stand in a key; raise ConfigError naming what is wrong otherwise."""
+    """Return `robot` if it is a valid id.
+
+    Raises:
+        ConfigError: the id cannot be part of a key.
+    """
     if not _ROBOT_ID.fullmatch(robot):
         raise ConfigError(
-            f"robot id {robot!r} is not usable: 1 to 32 letters, digits, '_', '-' or '.', starting with a letter or "
+            f"invalid robot id {robot!r}: expected 1 to 32 letters, digits, '_', '-' or '.', starting with a letter or "
             "digit (no '/' or '*'), e.g. --robot r1"
         )
     return robot
 
 
-@lru_cache(maxsize=1024)  # asked for each message, and after an idle camera period a pattern costs 50 us
+@lru_cache(maxsize=1024)  # used for each message; after an idle camera period the pattern alone costs 50 us
 def key_for(robot: str, channel: Channel, source: str = "") -> str:
-    """The exact key of `channel` for `robot`; `source` is required towards the robot and forbidden from it."""
+    """Return the exact key of a channel.
+
+    Args:
+        robot: robot id.
+        channel: the channel.
+        source: role of the sender, required toward the robot and forbidden from it.
+
+    Raises:
+        ValueError: the source does not fit the channel.
+        ConfigError: the robot id is invalid.
+    """
     if channel.has_source != bool(source) or (source and not _SOURCE.fullmatch(source)):
         raise ValueError(f"channel {channel.name} with source {source!r}")
     tail = f"/{source}" if source else ""
@@ -157,14 +171,14 @@ def key_for(robot: str, channel: Channel, source: str = "") -> str:
 
 
 def pattern_for(robot: str, channel: Channel) -> str:
-    """The key expression that a subscriber of `channel` declares; received keys are still checked exactly."""
+    """Return the key expression that a subscriber of `channel` declares. It still checks received keys exactly."""
     tail = "/*" if channel.has_source else ""
     return f"{KEY_PREFIX}/{check_robot_id(robot)}/{channel.name}{tail}"
 
 
 @lru_cache(maxsize=1024)
 def parse_key(key: str) -> tuple[str, Channel, str] | None:
-    """Split an exact key into (robot, channel, source); None for anything else, wildcards included."""
+    """Split an exact key into (robot, channel, source). Return None for any other text, also with wildcards."""
     parts = key.split("/")
     channel = CHANNELS.get(parts[2]) if len(parts) in (3, 4) and parts[0] == KEY_PREFIX else None
     if channel is None or channel.has_source != (len(parts) == 4) or not _ROBOT_ID.fullmatch(parts[1]):

@@ -1,35 +1,35 @@
-"""The monotonic clock of this machine, and the age of stamps of a robot whose clock is another. Shell (a clock)."""
+"""The monotonic clock of this machine, and the age of stamps from a robot's clock. Shell (a clock)."""
 
 import time
 
 
 def monotonic_us() -> int:
-    """Microseconds since some fixed moment."""
+    """Return the microseconds since a fixed moment."""
     return time.monotonic_ns() // 1000
 
 
-# How old a robot's stamp is, without synchronized clocks: checked against its quickest messages. Pure.
+# The age of a robot's stamp without synchronized clocks, estimated from its fastest message. Pure.
 #
-# The delay of the quickest message of a session cannot be separated from the offset of the clocks, so ages are lower
-# bounds: what they leave out is one way of the link at its best.
+# The delay of the fastest message of a session cannot be separated from the offset of the clocks. Ages are therefore
+# lower bounds; they lack the shortest one-way delay of the link.
 
 
 class RobotClock:
-    """One robot's monotonic clock as seen from here, again for each session."""
+    """Estimates the offset of one robot's monotonic clock, separately for each session."""
 
     def __init__(self) -> None:
         self._session = ""
         self._offset_us = 0
 
     def update(self, session: str, t_us: int, now_us: int) -> None:
-        """A message that the robot published at `t_us` of its clock arrived at `now_us` of ours."""
+        """Learn from a message that left at `t_us` on the robot's clock and arrived at `now_us` on this clock."""
         offset_us = now_us - t_us
         if session != self._session:
             self._session, self._offset_us = session, offset_us
         self._offset_us = min(self._offset_us, offset_us)
 
     def age_us(self, session: str, t_us: int, now_us: int) -> int | None:
-        """How long ago `t_us` was, at the least; None for a session other than the current one."""
+        """Return the lowest possible age of `t_us`, in us, or None for a session other than the current one."""
         if not session or session != self._session:
             return None
         return max(0, now_us - t_us - self._offset_us)

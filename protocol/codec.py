@@ -1,4 +1,4 @@
-"""Message <-> (header bytes, payload bytes). Decoders raise WireError for any bytes whatever. Pure."""
+"""Convert messages to header and payload bytes, and back. Decoders raise only WireError, for any input. Pure."""
 
 from __future__ import annotations
 
@@ -18,12 +18,28 @@ Model = TypeVar("Model", bound=WireModel)
 
 
 def encode(message: WireModel) -> bytes:
-    """`message` as compact JSON; None fields are left out, which every decoder reads as their default."""
+    """Encode a message as compact JSON.
+
+    Args:
+        message: any header or payload model.
+
+    Returns:
+        UTF-8 bytes without the fields that are None. A decoder reads an absent field as its default.
+    """
     return message.__pydantic_serializer__.to_json(message, exclude_none=True)
 
 
 def decode(model: type[Model], data: bytes, max_bytes: int = MAX_HEADER_BYTES) -> Model:
-    """Read `data` as `model`. Raises WireError UNSUPPORTED_VERSION or MALFORMED with the first wrong field named."""
+    """Decode JSON bytes.
+
+    Args:
+        model: class of the header or payload.
+        data: bytes from the wire.
+        max_bytes: security limit for the length of `data`.
+
+    Raises:
+        WireError: UNSUPPORTED_VERSION, or MALFORMED with the name of the first invalid field.
+    """
     if len(data) > max_bytes:
         raise WireError(RejectReason.MALFORMED, f"{model.__name__} is {len(data)} bytes, at most {max_bytes}")
     try:
@@ -37,12 +53,21 @@ def _wire_error(name: str, error: ValidationError) -> WireError:
     where = ".".join(str(part) for part in first["loc"])
     if where == "v":
         got = repr(first["input"])[:20]
-        return WireError(RejectReason.UNSUPPORTED_VERSION, f"{name} is of version {got}; this peer speaks {VERSION}")
+        return WireError(RejectReason.UNSUPPORTED_VERSION, f"{name} has version {got}; this peer uses {VERSION}")
     return WireError(RejectReason.MALFORMED, f"{name}{'.' + where if where else ''}: {first['msg']}"[:200])
 
 
 def check_sizes(channel: Channel, header: bytes, payload: bytes) -> None:
-    """Raise WireError MALFORMED unless both parts are within the channel's bounds."""
+    """Check both parts of a message against the bounds of its channel.
+
+    Args:
+        channel: the channel.
+        header: header bytes, may be empty.
+        payload: payload bytes.
+
+    Raises:
+        WireError: MALFORMED for a part above its bound.
+    """
     if len(header) > MAX_HEADER_BYTES:
         raise WireError(
             RejectReason.MALFORMED, f"{channel.name} header is {len(header)} bytes, at most {MAX_HEADER_BYTES}"
@@ -55,7 +80,7 @@ def check_sizes(channel: Channel, header: bytes, payload: bytes) -> None:
 
 
 def request_verb(payload: bytes) -> Verb | None:
-    """Read the verb of a `request` payload; None if it is invalid."""
+    """Read the verb of a `request` payload. Returns None for an invalid payload."""
     try:
         return decode(Request, payload, REQUEST.max_payload_bytes).verb
     except WireError:
@@ -63,7 +88,14 @@ def request_verb(payload: bytes) -> Verb | None:
 
 
 def encode_ranges(ranges_m: array.array[float]) -> bytes:
-    """Scan payload: little-endian float32 metres."""
+    """Encode a scan payload.
+
+    Args:
+        ranges_m: one distance per ray, m.
+
+    Returns:
+        Little-endian float32.
+    """
     floats = array.array("f", ranges_m)
     if sys.byteorder == "big":
         floats.byteswap()
@@ -71,15 +103,25 @@ def encode_ranges(ranges_m: array.array[float]) -> bytes:
 
 
 def decode_ranges(data: bytes) -> array.array[float]:
-    """Read a scan payload. Raises WireError MALFORMED for a ragged length, NOT_FINITE for nan or negative ranges."""
+    """Decode a scan payload.
+
+    Args:
+        data: little-endian float32.
+
+    Returns:
+        One distance per ray, m.
+
+    Raises:
+        WireError: MALFORMED for an invalid length, NOT_FINITE for a nan or a negative range.
+    """
     check_sizes(SCAN, b"", data)
     if len(data) % 4:
-        raise WireError(RejectReason.MALFORMED, f"scan payload of {len(data)} bytes is no whole number of float32")
+        raise WireError(RejectReason.MALFORMED, f"scan payload of {len(data)} bytes is not a multiple of 4 (float32)")
     floats = array.array("f", data)
     if sys.byteorder == "big":
         floats.byteswap()
     if any(math.isnan(value) or value < 0 for value in floats):
-        raise WireError(RejectReason.NOT_FINITE, "scan holds a nan or negative range")
+        raise WireError(RejectReason.NOT_FINITE, "scan contains a nan or negative range")
     return floats
 
 

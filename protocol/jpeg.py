@@ -1,7 +1,7 @@
-"""Bounds-check a JPEG from its header, before any decoder sees it. Pure.
+"""Check the size of a JPEG from its header, before a decoder reads it. Pure.
 
-A JPEG of some hundred bytes can cost a decoder half a minute and gigabytes; this walk costs microseconds.
-Marker layout: ITU-T T.81, annex B.
+A JPEG of some hundred bytes can cost a decoder half a minute and gigabytes of memory. Reading its header costs
+microseconds. Marker layout: ITU-T T.81, annex B.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _ALONE = (0x01, *range(0xD0, 0xD9))
 
 @dataclass(frozen=True, slots=True)
 class JpegSize:
-    """What the frame header says: pixels and colour components (1 grey, 3 colour)."""
+    """Size from the frame header, with the number of color components (1 gray, 3 color)."""
 
     width_px: int
     height_px: int
@@ -24,13 +24,22 @@ class JpegSize:
 
 
 def read_jpeg_size(data: bytes, max_pixels: int = 1920 * 1080) -> JpegSize:
-    """The picture's size from its SOF segment.
+    """Read the image size without decoding.
 
-    Security limit: `max_pixels` (width x height). Raises WireError MALFORMED for anything that is not a plain baseline
-    or progressive JPEG within it; never decodes.
+    Args:
+        data: the JPEG, or its beginning.
+        max_pixels: security limit, width x height.
+
+    Returns:
+        Width and height in px, and the number of color components.
+
+    Raises:
+        WireError: MALFORMED unless the data is a baseline or progressive JPEG within the limit.
+
+    Source: ITU-T T.81, annex B.
     """
     if data[:2] != b"\xff\xd8":
-        raise _bad("does not start with SOI; is it a JPEG?")
+        raise _bad("not a JPEG, no SOI marker at its start")
     at = 2
     for _ in range(MAX_SEGMENTS):
         if at + 4 > len(data) or data[at] != 0xFF:
@@ -63,9 +72,9 @@ def _size_from_sof(data: bytes, at: int, max_pixels: int) -> JpegSize:
     if data[at + 4] != 8 or components not in (1, 3):
         raise _bad(f"{data[at + 4]} bits and {components} components; 8 bits and 1 or 3 are supported")
     if not width or not height or width * height > max_pixels:
-        raise _bad(f"{width}x{height} pixels, at most {max_pixels} in all")
+        raise _bad(f"{width}x{height} pixels, at most {max_pixels} in total")
     return JpegSize(width, height, components)
 
 
 def _bad(what: str) -> WireError:
-    return WireError(RejectReason.MALFORMED, f"picture: {what}")
+    return WireError(RejectReason.MALFORMED, f"image: {what}")

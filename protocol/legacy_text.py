@@ -22,7 +22,7 @@ LINE_CHARACTERS: Final = 76
 MAX_BOXES: Final = 16
 MAX_BOXES_BYTES: Final = 1024
 BOX_LABEL: Final = "box"
-"""What a box is called whose text does not say what is in it."""
+"""Label of a box whose text contains no class."""
 
 _DASHED_NUMBER: Final = rb"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
 _DASHED: Final = re.compile(rb"(%b)-(%b)" % (_DASHED_NUMBER, _DASHED_NUMBER))
@@ -32,13 +32,18 @@ _CLASSED_BOX: Final = re.compile(rb"([A-Za-z0-9_ ]{1,32})," + _BOX.pattern)
 
 
 def text_bound(picture_bytes: int) -> int:
-    """The most characters that a picture of `picture_bytes` takes as text, line ends of two characters included."""
+    """Return the largest number of characters of an image as text, including line ends of two characters."""
     characters = (picture_bytes + 2) // 3 * 4
     return characters + 2 * (characters // LINE_CHARACTERS + 1)
 
 
 def encode_picture(jpeg: bytes, newlines: bool = True) -> bytes:
-    """`jpeg` as base64 text; with `newlines` one after every 76 characters and at the end, as the write-up sends it."""
+    """Encode an image as base64 text.
+
+    Args:
+        jpeg: the image.
+        newlines: True for a newline after every 76 characters and at the end, as the legacy robot sends it.
+    """
     text = binascii.b2a_base64(jpeg, newline=False)
     if not newlines:
         return text
@@ -46,27 +51,37 @@ def encode_picture(jpeg: bytes, newlines: bool = True) -> bytes:
 
 
 def decode_picture(text: bytes, max_bytes: int) -> bytes:
-    """The bytes behind base64 `text`, with or without line ends.
+    """Decode base64 text with or without line ends.
 
-    Security limit: `max_bytes` of picture. Raises WireError MALFORMED for anything else than base64 within it.
+    Args:
+        text: the text.
+        max_bytes: security limit for the image.
+
+    Raises:
+        WireError: MALFORMED for invalid base64, or for an image above the limit.
     """
     if len(text) > text_bound(max_bytes):
         raise WireError(
-            RejectReason.MALFORMED, f"picture text is {len(text)} characters, at most {text_bound(max_bytes)}"
+            RejectReason.MALFORMED, f"image text is {len(text)} characters, at most {text_bound(max_bytes)}"
         )
     try:
         jpeg = binascii.a2b_base64(text.replace(b"\r", b"").replace(b"\n", b""), strict_mode=True)
     except binascii.Error as error:
-        raise WireError(RejectReason.MALFORMED, f"picture text is no base64: {error}") from None
+        raise WireError(RejectReason.MALFORMED, f"image text is not base64: {error}") from None
     if len(jpeg) > max_bytes:
-        raise WireError(RejectReason.MALFORMED, f"picture is {len(jpeg)} bytes, at most {max_bytes}")
+        raise WireError(RejectReason.MALFORMED, f"image is {len(jpeg)} bytes, at most {max_bytes}")
     return jpeg
 
 
 def parse_dashed(text: bytes, swapped: bool = False) -> Twist:
-    """Read `linear-angular` (m/s, rad/s), or `angular-linear` if `swapped`; either may be negative: `0.2--0.35`.
+    """Read `linear-angular` (m/s, rad/s). Either number may be negative: `0.2--0.35`.
 
-    Raises WireError as `parse_twist` does.
+    Args:
+        text: at most 64 bytes.
+        swapped: True for `angular-linear`.
+
+    Raises:
+        WireError: as in `parse_twist`.
     """
     match = _DASHED.fullmatch(text) if len(text) <= MAX_TWIST_BYTES else None
     if match is None:
@@ -79,7 +94,7 @@ def parse_dashed(text: bytes, swapped: bool = False) -> Twist:
 
 @dataclass(frozen=True, slots=True)
 class LegacyBox:
-    """A bounding box as fractions 0..1 of the picture, from its top-left corner."""
+    """A bounding box in fractions 0..1 of the image, from its top-left corner."""
 
     y_min: float
     x_min: float
@@ -88,20 +103,20 @@ class LegacyBox:
     label: str = BOX_LABEL
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what is no box inside the picture."""
+        """Raise ValueError for a box that is not inside the image."""
         if not (0 <= self.y_min <= self.y_max <= 1 and 0 <= self.x_min <= self.x_max <= 1):
-            raise ValueError(f"{self} does not lie in the picture")
+            raise ValueError(f"{self} is outside the image")
 
 
 def format_boxes(boxes: Sequence[LegacyBox]) -> bytes:
-    """`boxes` as text with four decimals, without their labels; empty for none. Raises ValueError for more than 16."""
+    """Write boxes as text with four decimals, without labels. Raises ValueError for more than 16."""
     if len(boxes) > MAX_BOXES:
         raise ValueError(f"{len(boxes)} boxes, at most {MAX_BOXES}")
     return "-".join(f"{box.y_min:.4f},{box.x_min:.4f},{box.y_max:.4f},{box.x_max:.4f}" for box in boxes).encode("ascii")
 
 
 def parse_boxes(text: bytes) -> tuple[LegacyBox, ...]:
-    """Read boxes joined by `-`. Raises WireError MALFORMED for anything outside the grammar or over a bound."""
+    """Read boxes joined by `-`. Raises WireError MALFORMED for text outside the grammar or above a bound."""
     parts = text.split(b"-") if text else []
     if len(text) > MAX_BOXES_BYTES or len(parts) > MAX_BOXES:
         raise WireError(RejectReason.MALFORMED, f"{len(parts)} boxes in {len(text)} bytes, at most {MAX_BOXES}")
@@ -129,5 +144,5 @@ def _parse_box(text: bytes) -> LegacyBox:
             return LegacyBox(y_min, x_min, y_max, x_max, classed[1].decode("ascii"))
     except ValueError:
         pass
-    said = f"box {text[:80]!r} is neither y_min,x_min,y_max,x_max nor class,x_min,y_min,x_max,y_max within 0..1"
-    raise WireError(RejectReason.MALFORMED, said)
+    detail = f"box {text[:80]!r} is neither y_min,x_min,y_max,x_max nor class,x_min,y_min,x_max,y_max within 0..1"
+    raise WireError(RejectReason.MALFORMED, detail)

@@ -1,7 +1,8 @@
-"""Every message on the wire as a frozen, strict, bounded pydantic model. Pure.
+"""Define every message on the wire as a frozen, strict, bounded pydantic model. Pure.
 
-Headers travel beside the payload (Zenoh attachment); payloads of JSON channels are the other models. Units are in the
-names; signs as in REP 103: x forward, y left, counter-clockwise positive. Times are the robot's monotonic clock.
+A header travels next to its payload (Zenoh attachment). The other models are the payloads of JSON channels.
+Names contain units. Signs follow REP 103: x forward, y left, counter-clockwise positive. Times are the robot's
+monotonic clock.
 """
 
 from enum import StrEnum
@@ -13,9 +14,9 @@ from sightline.protocol import VERSION
 
 MAX_INTEGER = 2**53 - 1  # the largest integer that every JSON reader holds exactly
 MAX_CHANNELS_SHOWN = 16
-"""Of a status, so that it stays small."""
+"""Most channels in a status, so that it stays small."""
 MAX_DETECTED_BOXES = 64
-"""Security limit: more is no scene that a robot steers by."""
+"""Security limit for the boxes of one image."""
 
 # A Literal would let `true` and 1.0 pass as 1.
 Version = Annotated[int, Field(ge=VERSION, le=VERSION, description="version of this protocol")]
@@ -28,20 +29,20 @@ Microseconds = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
 Number = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
 LEAST_SIDE_PX, MOST_SIDE_PX = 16, 8192
 PixelCount = Annotated[int, Field(ge=LEAST_SIDE_PX, le=MOST_SIDE_PX)]
-"""Width or height of a picture."""
+"""Width or height of an image."""
 Planar = tuple[Number, Number]  # (linear_mps, angular_rad_s)
 Pose = tuple[Number, Number, Number]
 """(x_m, y_m, yaw_rad) in the odometry frame."""
 
 
 class WireModel(BaseModel):
-    """Base of everything on the wire. Unknown fields are ignored, so that a newer minor peer is understood."""
+    """Base of every message. Unknown fields are ignored, so that a peer can add fields without a new version."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="ignore", ser_json_inf_nan="constants")
 
 
 class Twist(WireModel):
-    """A velocity: forward speed and turn rate. Finite; the robot clamps it to its own limits."""
+    """A velocity: forward speed and turn rate, both finite. The robot reduces it to its own limits."""
 
     linear_mps: Annotated[float, Field(allow_inf_nan=False)]
     angular_rad_s: Annotated[float, Field(allow_inf_nan=False)]
@@ -54,16 +55,16 @@ STILL = Twist(linear_mps=0.0, angular_rad_s=0.0)
 
 
 class Stamp(WireModel):
-    """Header of everything a robot publishes: its session (new at each start), a count per channel, its clock."""
+    """Header of every message from a robot: its session (new at each start), a count per channel, its clock."""
 
     v: Version = VERSION
     session: SessionId = Field(description="the sender's start: 8 hex digits drawn at random")
     seq: Counter = Field(description="count of the sender's messages on this channel within the session")
-    t_us: Microseconds = Field(description="the robot's monotonic clock: capture of a frame or scan, else publishing")
+    t_us: Microseconds = Field(description="the robot's monotonic clock: capture of a frame or scan, else publication")
 
 
 class FrameHeader(Stamp):
-    """Header of a frame. `t_us` is the capture time; the rest is what the robot did and knew at that moment."""
+    """Header of a frame. `t_us` is the capture time. All other fields describe the robot at that moment."""
 
     pose: Pose = Field(default=(0.0, 0.0, 0.0), description="odometry: x, y, yaw")
     moving: Planar = Field(default=(0.0, 0.0), description="measured at the wheels: linear, angular")
@@ -76,18 +77,18 @@ class FrameHeader(Stamp):
 
 
 class ScanHeader(Stamp):
-    """Header of a lidar scan; the payload is little-endian float32 ranges in metres, inf for no return."""
+    """Header of a lidar scan; the payload is little-endian float32 ranges in meters, inf for no return."""
 
     angle_min_rad: Number = Field(description="direction of the first ray; 0 is ahead, left positive")
     angle_increment_rad: Number = Field(description="from one ray to the next")
     range_min_m: Number = Field(
-        description="a smaller range: something is there, too close to measure; 0: no echo, so nothing is known"
+        description="a smaller range: an obstacle too close to measure; 0: no echo, so nothing is known"
     )
-    range_max_m: Number = Field(description="nothing is known beyond; inf: nothing is there")
+    range_max_m: Number = Field(description="nothing is known beyond; inf: no obstacle")
 
 
 class Echo(WireModel):
-    """Names one thing the robot issued, field for field, so that the robot can compute its age from its own record."""
+    """Names one message of the robot, field for field, so that the robot computes its age from its own record."""
 
     channel: Literal["frame", "status", "beat"] = Field(description="which of its channels")
     session: SessionId = Field(description="the robot's")
@@ -109,7 +110,7 @@ class RequestId(WireModel):
 
 
 class SenderHeader(WireModel):
-    """Header of everything that a peer sends to a robot or beside its twists: role, session, count per channel."""
+    """Header of every message to a robot: role, session, count per channel."""
 
     v: Version = VERSION
     source: Source = Field(description="the sender's role; equal to the one in the key")
@@ -118,9 +119,9 @@ class SenderHeader(WireModel):
 
 
 class AnswerHeader(SenderHeader):
-    """Header of a twist and of an ack: the sender, the frame, and how long the computing took.
+    """Header of a twist and of an ack: the sender, the frame, and the computing time.
 
-    `scan` and `mission` name what else it used, so that a recording can be answered again, byte for byte.
+    `scan` and `mission` name its other inputs, so that a replayed recording produces the same answer, byte for byte.
     """
 
     echo: Echo = Field(description="what this message answers, field for field")
@@ -134,13 +135,13 @@ class AnswerHeader(SenderHeader):
 
 
 class RequestHeader(SenderHeader):
-    """Header of a request or mission. `echo` names the newest `status` seen; only stop, disarm, release may lack it."""
+    """Header of a request or mission. `echo` names the newest `status`. Only stop, disarm and release may omit it."""
 
-    echo: Echo | None = Field(default=None, description="the newest `status` seen")
+    echo: Echo | None = Field(default=None, description="the newest received `status`")
 
 
 class DetectionsHeader(SenderHeader):
-    """Header of what vision sends beside its twists: the sender and the frame; without `echo` for display only."""
+    """Header of detections, reports and images: the sender and the frame. Without `echo` it is for display only."""
 
     echo: Echo | None = Field(
         default=None, description="the frame that was examined or is shown; of a report the newest"
@@ -151,7 +152,7 @@ class DetectionsHeader(SenderHeader):
 
 
 class Verb(StrEnum):
-    """What can be requested of a robot."""
+    """The requests that a robot accepts."""
 
     ARM = "arm"
     DISARM = "disarm"
@@ -162,14 +163,14 @@ class Verb(StrEnum):
 
 
 class Request(WireModel):
-    """A request; `id` comes back in the reply."""
+    """A request. The reply repeats `id`."""
 
     id: Counter = Field(description="the requester's own count of requests")
     verb: Verb = Field(strict=False, description="what is requested")
 
 
 class Reply(WireModel):
-    """The answer to a request: `to` and `id` name it."""
+    """The answer to the request that `to` and `id` name."""
 
     to: SessionId = Field(description="session of the requester")
     id: Counter = Field(description="of the request")
@@ -190,7 +191,7 @@ class State(StrEnum):
 
 
 class Holder(WireModel):
-    """The driver of the moment."""
+    """The driver that holds the lease."""
 
     source: Source = Field(description="the sender's role; equal to the one in the key")
     session: SessionId = Field(description="the sender's start: 8 hex digits drawn at random")
@@ -200,12 +201,12 @@ class LastRejection(WireModel):
     """The newest rejection."""
 
     source: str = Field(max_length=32, description="role in the key of the rejected message")
-    reason: str = Field(max_length=32, description="as counted in `refused`")
+    reason: str = Field(max_length=32, description="its counter")
     detail: str = Field(max_length=200, description="one line for the operator")
 
 
 class StreamStatus(WireModel):
-    """What the robot's stream does: frames sent, answers that never came, frames allowed in flight, rate."""
+    """State of the frame stream: frames sent, missing answers, frames in flight, rate."""
 
     sent: Counter = Field(default=0, description="frames sent")
     credit_timeouts: Counter = Field(default=0, description="frames whose answer never came")
@@ -228,7 +229,7 @@ class StreamStatus(WireModel):
 
 
 class Status(WireModel):
-    """Everything an operator needs to know why the robot moves or does not. Published at 10 Hz."""
+    """The state of the robot and the reason for it. Published at 10 Hz."""
 
     state: State = Field(strict=False, description="of the gate")
     reason: str = Field(max_length=200, description="why it is in this state, one line for the operator")
@@ -257,14 +258,14 @@ class Status(WireModel):
 
 
 class Odometry(WireModel):
-    """Where the robot is by its wheels, and how it moves."""
+    """Position and velocity of the robot, measured at its wheels."""
 
     pose: Pose = Field(description="odometry: x, y, yaw")
     moving: Planar = Field(description="measured at the wheels: linear, angular")
 
 
 class DetectedCircle(WireModel):
-    """A circle in pixels of the encoded picture, where the detector knows one."""
+    """A circle in pixels of the encoded image, if the detector finds one."""
 
     cx_px: Number = Field(description="center, from the left")
     cy_px: Number = Field(description="center, from the top")
@@ -272,7 +273,7 @@ class DetectedCircle(WireModel):
 
 
 class DetectedBox(WireModel):
-    """One object in pixels of the encoded picture; `x2_px` >= `x1_px` and `y2_px` >= `y1_px`, which are exclusive."""
+    """One object in pixels of the encoded image. `x2_px` >= `x1_px` and `y2_px` >= `y1_px` are exclusive."""
 
     label: str = Field(pattern=r"^[^\x00-\x1f\x7f]{1,64}$", description="what it is, as the detector names it")
     score: float = Field(ge=0, le=1, description="how sure the detector is")
@@ -280,21 +281,21 @@ class DetectedBox(WireModel):
     y1_px: Number = Field(description="top edge")
     x2_px: Number = Field(description="right edge, exclusive; not left of `x1_px`")
     y2_px: Number = Field(description="bottom edge, exclusive; not above `y1_px`")
-    circle: DetectedCircle | None = Field(default=None, description="where the detector knows one")
+    circle: DetectedCircle | None = Field(default=None, description="if the detector finds one")
     track: Counter | None = Field(default=None, description="the detector's number for an object that it follows")
 
     @model_validator(mode="after")
     def _is_not_inside_out(self) -> Self:
         if self.x2_px < self.x1_px or self.y2_px < self.y1_px:
-            raise ValueError("the second corner of a box is not left of or above the first")
+            raise ValueError("the second corner of a box must not be left of or above the first")
         return self
 
 
 class Detections(WireModel):
-    """What was found in one image of this size."""
+    """The objects found in one image of this size."""
 
-    width_px: PixelCount = Field(description="width of the picture as encoded")
-    height_px: PixelCount = Field(description="height of the picture as encoded")
+    width_px: PixelCount = Field(description="width of the encoded image")
+    height_px: PixelCount = Field(description="height of the encoded image")
     boxes: tuple[DetectedBox, ...] = Field(
         default=(), max_length=MAX_DETECTED_BOXES, description="best first; empty: nothing was found"
     )
@@ -304,14 +305,14 @@ class Detections(WireModel):
 
 
 class CameraModel(WireModel):
-    """Pinhole model of the encoded picture. Pixel (0, 0) is the top-left corner of the top-left pixel.
+    """Pinhole model of the encoded image. Pixel (0, 0) is the top-left corner of the top-left pixel.
 
-    Mounting: the lens at (`x_m`, `y_m`, `z_m`) from the axle's midpoint on the floor, looking forward,
-    tilted up by `pitch_rad`.
+    Mounting: the lens is at (`x_m`, `y_m`, `z_m`) from the midpoint of the axle on the floor. It points forward, tilted
+    up by `pitch_rad`.
     """
 
-    width_px: PixelCount = Field(description="width of the picture as encoded")
-    height_px: PixelCount = Field(description="height of the picture as encoded")
+    width_px: PixelCount = Field(description="width of the encoded image")
+    height_px: PixelCount = Field(description="height of the encoded image")
     fx_px: float = Field(gt=0, le=1e5, description="focal length, across")
     fy_px: float = Field(gt=0, le=1e5, description="focal length, down")
     cx_px: Number = Field(description="principal point, from the left")
@@ -319,53 +320,53 @@ class CameraModel(WireModel):
     distortion: tuple[Number, ...] = Field(
         default=(), max_length=8, description="k1, k2, p1, p2, k3 ... in OpenCV's order; empty for none"
     )
-    x_m: Number = Field(default=0.0, description="the lens, ahead of the axle's middle")
+    x_m: Number = Field(default=0.0, description="the lens, ahead of the center of the axle")
     y_m: Number = Field(default=0.0, description="the lens, left of it")
     z_m: Number = Field(default=0.0, description="the lens, above the floor")
     pitch_rad: Number = Field(default=0.0, description="upwards positive")
     calibrated: bool = Field(default=False, description="whether the camera's model was measured")
 
 
-# Missions: what vision is to do, and what it does.
+# Missions: requests to the vision service, and its reports.
 
 
 MAX_WAYPOINTS: Final = 64
-"""Of one mission; a longer way is several."""
+"""Most waypoints of one mission."""
 MAX_WAYPOINT_M: Final = 100.0
-"""Each way from where odometry began: further off, wheels no longer know where they are."""
+"""Largest distance from the start of odometry on each axis. Beyond it, wheel odometry is no longer accurate."""
 MAX_OPTIONS: Final = 16
 
 MissionName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,31}$")]
-"""As vision's own machine knows it; never a path to code."""
+"""A name that the vision service knows, never a path to code."""
 OptionName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.]{0,63}$")]
 OptionValue = bool | Number | Annotated[str, Field(max_length=64)]
 Metres = Annotated[float, Field(ge=-MAX_WAYPOINT_M, le=MAX_WAYPOINT_M)]
 
 
 class MissionRequest(WireModel):
-    """What vision is to do from now on; `id` comes back in the report."""
+    """The mission that the vision service runs from now on. The report repeats `id`."""
 
     id: Counter = Field(description="the requester's own count of missions; the same in a repetition")
-    name: MissionName = Field(description="of the mission, as vision's own machine knows it")
+    name: MissionName = Field(description="of the mission, as the vision service knows it")
     waypoints: tuple[tuple[Metres, Metres], ...] = Field(
         default=(), max_length=MAX_WAYPOINTS, description="x, y in the odometry frame, in order"
     )
     options: dict[OptionName, OptionValue] = Field(
         default={},
         max_length=MAX_OPTIONS,
-        description="of the mission's own configuration; a dot reaches into its tables",
+        description="from the configuration of the mission; a dot selects an entry of a table",
     )
 
 
 class MissionReport(WireModel):
-    """What vision does at the moment."""
+    """The state of the current mission."""
 
     mission: str = Field(max_length=64, description="its name")
     phase: str = Field(max_length=32, description="one or two words for the operator")
     note: str = Field(default="", max_length=200, description="the rest of the line")
     done: bool = Field(default=False, description="whether the mission is over; the robot stays where it is")
     asked: RequestId | None = Field(default=None, description="the newest requested mission")
-    refused: str = Field(default="", max_length=200, description="why `asked` was rejected; empty if it was not")
+    refused: str = Field(default="", max_length=200, description="why it was rejected; empty if it was accepted")
     detector: str = Field(default="", max_length=64, description="name of the detector")
     device: str = Field(default="", max_length=32, description="what the detector runs on")
     model: str = Field(default="", max_length=64, description="hash of its model")

@@ -1,6 +1,6 @@
-"""The payload of a twist: the text `linear|angular`. Pure.
+"""Write and read the payload of a twist, the text `linear|angular`. Pure.
 
-`float()` takes nan, inf, `1_0`, blanks and digits of other scripts; none of these may reach a wheel.
+`float()` accepts nan, inf, `1_0`, blanks and digits of other scripts. None of these may reach a wheel.
 Grammar: NUMBER "|" NUMBER, NUMBER = [+-] (DIGITS [. DIGITS*] | . DIGITS) [(e|E) [+-] 1*3DIGIT].
 """
 
@@ -18,7 +18,7 @@ _NON_FINITE = re.compile(rb"[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
 
 
 def format_twist(twist: Twist) -> bytes:
-    """Write `twist` as `linear|angular`, four decimals, never `-0.0000`."""
+    """Write a twist as `linear|angular` (m/s, rad/s) with four decimals. It never writes `-0.0000`."""
     return f"{_decimals(twist.linear_mps)}|{_decimals(twist.angular_rad_s)}".encode("ascii")
 
 
@@ -28,9 +28,16 @@ def _decimals(value: float) -> str:
 
 
 def parse_twist(data: bytes) -> Twist:
-    """Read `linear|angular` (m/s, rad/s).
+    """Read `linear|angular`.
 
-    Raises WireError MALFORMED for anything outside the grammar or over 64 bytes, NOT_FINITE for nan, inf or overflow.
+    Args:
+        data: ASCII text, at most 64 bytes.
+
+    Returns:
+        The twist, m/s and rad/s.
+
+    Raises:
+        WireError: MALFORMED outside the grammar or above 64 bytes, NOT_FINITE for nan, inf or an overflow.
     """
     if len(data) > MAX_TWIST_BYTES:
         raise WireError(RejectReason.MALFORMED, f"twist text is {len(data)} bytes, at most {MAX_TWIST_BYTES}")

@@ -95,7 +95,7 @@ export function decode(fields, bytes) {
     return tables.readFields(fields, parseJson(UTF8.decode(bytes)));
   } catch (error) {
     if (error instanceof tables.FieldError && error.where === "v") {
-      throw new WireError("UNSUPPORTED_VERSION", `another version; this peer speaks ${tables.VERSION}`);
+      throw new WireError("UNSUPPORTED_VERSION", `another version; this peer uses ${tables.VERSION}`);
     }
     const known = error instanceof tables.FieldError || error instanceof JsonError || error instanceof TypeError;
     if (!known) throw error;
@@ -182,7 +182,7 @@ export function decodeRanges(bytes) {
   if (bytes.length % 4 !== 0) throw new WireError("MALFORMED", "scan is no whole number of float32");
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);
   const ranges = Array.from({ length: bytes.length / 4 }, (_, index) => view.getFloat32(index * 4, true));
-  if (!ranges.every((range) => range >= 0)) throw new WireError("NOT_FINITE", "scan holds a nan or negative range");
+  if (!ranges.every((range) => range >= 0)) throw new WireError("NOT_FINITE", "scan contains a nan or negative range");
   return ranges;
 }
 

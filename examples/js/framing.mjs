@@ -57,7 +57,7 @@ export function readHello(text, robot) {
     hello = parseHello(text);
   } catch (error) {
     if (!(error instanceof WireError)) throw error;
-    throw new PeerError(1008, `this text is no hello: ${error.message}`);
+    throw new PeerError(1008, `invalid hello: ${error.message}`);
   }
   if (hello.robot !== robot) throw new PeerError(1008, `this is robot ${robot}, not ${hello.robot}`);
   return hello;

@@ -43,7 +43,7 @@ export function parseBoxes(text) {
 
 function parseBox(text) {
   const { y_min, x_min, y_max, x_max, label } = BOX.test(text) ? plainBox(text) : classedBox(text);
-  if (y_min > y_max || x_min > x_max || y_max > 1 || x_max > 1) malformed("box does not lie in the picture");
+  if (y_min > y_max || x_min > x_max || y_max > 1 || x_max > 1) malformed("box is outside the image");
   return { y_min, x_min, y_max, x_max, label };
 }
 

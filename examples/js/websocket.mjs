@@ -134,7 +134,7 @@ export function admissionProblem(rawHeaders, listenHost) {
   if (hosts.length !== 1 || name === "" || !local) return [403, `Host ${host.slice(0, 80)} is not this machine`];
   const own = [`http://${host}`, `https://${host}`];
   if (origins.length > 1 || (origins.length === 1 && !own.includes(origins[0].toLowerCase()))) {
-    return [403, `Origin ${origins[0].slice(0, 80)} is another site than Host ${host}`];
+    return [403, `Origin ${origins[0].slice(0, 80)} differs from Host ${host}`];
   }
   return null;
 }
@@ -219,7 +219,7 @@ export function connect(url, { token, ca } = {}) {
     });
     asked.on("upgrade", (response, socket, head) => {
       const right = response.headers["sec-websocket-accept"] === acceptKey(key) && response.headers["sec-websocket-protocol"] === SUBPROTOCOL;
-      if (!right) return socket.destroy(reject(new Error(`what answers there does not speak ${SUBPROTOCOL}`)));
+      if (!right) return socket.destroy(reject(new Error(`the service there does not support ${SUBPROTOCOL}`)));
       socket.setTimeout(0);
       const connection = new Connection(socket, false);
       resolve(connection);

@@ -67,7 +67,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
 def _no_link(error: SightlineError, endpoint: str) -> Finding:
     """Nobody there at all, which a handshake would have shown, or somebody who does not speak as the endpoint says."""
     found = trouble("link", error)
-    if "nobody answers" not in found.value:
+    if "no answer from" not in found.value:
         return found
     transport, _, port = _address(endpoint)
     form = f"ws://0.0.0.0:{port}" if transport == "ws" else f"{transport}/0.0.0.0:{port}"

@@ -14,9 +14,9 @@ _SCHEMAS: Final = "#/components/schemas/"
 _OLDER: Final = {
     "picture": ("send", None, "base64 of a JPEG, a newline after every 76 characters and at the end"),
     "twist": ("receive", MAX_TWIST_BYTES, "linear|angular in m/s and rad/s, as a guest"),
-    "boxes": ("receive", MAX_BOXES_BYTES, "y_min,x_min,y_max,x_max in fractions of the picture, joined by -"),
+    "boxes": ("receive", MAX_BOXES_BYTES, "y_min,x_min,y_max,x_max in fractions of the image, joined by -"),
 }
-"""Texts of the older dialect: who sends them, the most bytes, what they are."""
+"""Texts of the legacy protocol: the sender, the most bytes, the meaning."""
 
 
 def document(definitions: Node) -> Node:
@@ -53,7 +53,7 @@ def _servers() -> Node:
         },
         "older": {
             "host": "{host}:9091", "pathname": "/", "protocol": "ws", "variables": host,
-            "description": "the older dialect: text without headers and sub-protocol, where the owner opened it",
+            "description": "the legacy protocol: text without headers and sub-protocol, if the owner enabled it",
         },
     }  # fmt: skip
 
@@ -75,7 +75,7 @@ def _channel(one: Channel) -> Node:
 
 
 def _connections() -> Node:
-    """What belongs to a connection and has no key."""
+    """Return the messages of a connection that have no key."""
     names = [f"older_{name}" for name in _OLDER]
     return {
         "hello": {
@@ -86,7 +86,7 @@ def _connections() -> Node:
         },
         "older": {
             "address": None,
-            "description": "everything that is said in the older dialect",
+            "description": "all messages of the legacy protocol",
             "servers": _references("servers", "older"),
             "messages": {name: _reference("components/messages", name) for name in names},
         },

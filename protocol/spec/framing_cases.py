@@ -1,10 +1,10 @@
 """Golden cases of WebSocket framing, of hellos, and of the texts of the legacy protocol. Pure.
 
-Folder of a case -> what its `given` is and what reading it makes of it:
+Each folder of cases has one kind of input, `given`, and one kind of result:
 
-    websocket      a binary message from a peer whose hello said `robot` and `role`: key, header, payload
+    websocket      a binary message from a peer with `robot` and `role` in its hello: key, header, payload
     hello          the text of a hello: its fields
-    older_picture  base64 text, at most `max_bytes` of picture: the JPEG's bytes
+    older_picture  base64 text, at most `max_bytes` of image: the bytes of the JPEG
     older_dashed   `linear-angular`: the twist
     older_boxes    boxes joined by `-`
 """
@@ -36,7 +36,7 @@ Fields = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class FramingCase:
-    """One thing off a wire and what must become of it; `refuse` is None where it is accepted."""
+    """One input from the wire and its required result. `refuse` is None for an accepted input."""
 
     folder: str
     name: str
@@ -76,7 +76,7 @@ READERS: Final[dict[str, Callable[[Fields], Fields]]] = {
 
 
 def framing_outcome(folder: str, given: Fields) -> Fields:
-    """What a receiver makes of the input: {"accept": {...}} or {"refuse": reason}. Never raises."""
+    """Return the result at a receiver, `{"accept": {...}}` or `{"refuse": reason}`. Never raises."""
     try:
         return {"accept": READERS[folder](given)}
     except WireError as error:
@@ -109,13 +109,13 @@ def _messages() -> list[FramingCase]:
         _message("no_header", "a guest without a header", framed(alone), role=""),
         _message("no_header_role", "the hello's role is the source", framed(b'{"channel":"twist"}'), role="guest"),
         _message("header_after_it", "what follows is the header as it is", framed(alone + packed(ANSWER)), role=""),
-        _message("header_broken", "the header is refused later", framed(b'{"channel":"twist","v":1,')),
+        _message("header_broken", "the header is rejected later", framed(b'{"channel":"twist","v":1,')),
         _message("source_of_header", "a header's source is before the role's", framed(TWIST_BLOCK), role="teleop"),
         _message("source_of_role", "no source in the header", framed(b'{"channel":"twist",' + packed(
             without(ANSWER, "source"))[1:])),
-        _message("source_number", "a source that is none", framed(b'{"channel":"twist","source":7}')),
+        _message("source_number", "an invalid source", framed(b'{"channel":"twist","source":7}')),
         _message("channel_twice", "the first one, as it stands first", framed(b'{"channel":"ack",' + late[1:], b"")),
-        _message("unknown_channel", "nobody's channel: dropped later", framed(b'{"channel":"later","v":1}')),
+        _message("unknown_channel", "an unknown channel: dropped later", framed(b'{"channel":"later","v":1}')),
         _message("payload_empty", "an ack", framed(b'{"channel":"ack",' + packed(ANSWER)[1:], b"")),
         _message("block_576", "576 bytes of block", framed(TWIST_BLOCK.ljust(MAX_BLOCK_BYTES))),
         _message("block_577", "577 bytes of block", framed(TWIST_BLOCK.ljust(MAX_BLOCK_BYTES + 1)), MALFORMED),
@@ -124,7 +124,7 @@ def _messages() -> list[FramingCase]:
         _message("empty", "no bytes", b"", MALFORMED),
         _message("block_empty", "no channel", framed(b""), MALFORMED),
         _message("no_channel", "an object that names none", framed(packed(ANSWER)), MALFORMED),
-        _message("channel_number", "a channel that is no text", framed(b'{"channel":7}'), MALFORMED),
+        _message("channel_number", "a channel that is not text", framed(b'{"channel":7}'), MALFORMED),
         _message("not_json", "no object", framed(b"channel=twist"), MALFORMED),
         _message("array", "no object", framed(b'["twist"]'), MALFORMED),
         _message("deep", "nested beyond reading", framed(b"[" * 500), MALFORMED),
@@ -139,12 +139,12 @@ def _hello(name: str, purpose: str, text: str | Fields, refuse: str | None = Non
 def _hellos() -> list[FramingCase]:
     usual = packed(HELLO).decode()
     return [
-        _hello("usual", "a vision's", HELLO),
+        _hello("usual", "from a vision service", HELLO),
         _hello("robot", "a robot's", HELLO | {"role": "robot", "wants": ["twist", "ack", "request"]}),
         _hello("least", "who only watches, and wants nothing yet", {"robot": "r1", "session": PEER}),
         _hello("unknown_wants", "of a newer peer", HELLO | {"wants": ["frame", "later"]}),
         _hello("unknown_field", "unknown fields are ignored", HELLO | {"later": True}),
-        _hello("version_2", "another version is refused by name", HELLO | {"v": 2}, VERSION),
+        _hello("version_2", "another version is rejected by name", HELLO | {"v": 2}, VERSION),
         _hello("no_robot", "whose it is", without(HELLO, "robot"), MALFORMED),
         _hello("robot_wildcard", "an id, no pattern", HELLO | {"robot": "*"}, MALFORMED),
         _hello("role_upper", "a role is lower-case", HELLO | {"role": "Vision"}, MALFORMED),
@@ -153,14 +153,14 @@ def _hellos() -> list[FramingCase]:
         _hello("wants_33", "one too many", HELLO | {"wants": ["frame"] * 33}, MALFORMED),
         _hello("text_1024", "1024 bytes", usual.ljust(MAX_HELLO_BYTES)),
         _hello("text_1025", "1025 bytes", usual.ljust(MAX_HELLO_BYTES + 1), MALFORMED),
-        _hello("twist", "the older dialect on the wrong port", "0.2|0.1", MALFORMED),
+        _hello("twist", "the legacy protocol on the wrong port", "0.2|0.1", MALFORMED),
         _hello("empty", "no text", "", MALFORMED),
         _hello("cut", "cut short", usual[:-1], MALFORMED),
         _hello("echo", "something else altogether", ECHO, MALFORMED),
     ]
 
 
-# --- the older dialects ------------------------------------------------------------------------------------------
+# --- the legacy protocol -----------------------------------------------------------------------------------------
 
 _PICTURE: Final = jpeg(640, 480) + bytes(range(256))
 _LINES: Final = encode_picture(_PICTURE).decode()
@@ -177,8 +177,8 @@ def _pictures() -> list[FramingCase]:
         _picture("one_line", "no newlines", flat),
         _picture("crlf", "line ends of two characters", _LINES.replace("\n", "\r\n")),
         _picture("no_last_newline", "none at the end", _LINES.rstrip("\n")),
-        _picture("empty", "no picture: refused as a frame, not as base64", ""),
-        _picture("blank", "a blank is no base64", flat[:76] + " " + flat[76:], MALFORMED),
+        _picture("empty", "no image: rejected as a frame, not as base64", ""),
+        _picture("blank", "a blank is not base64", flat[:76] + " " + flat[76:], MALFORMED),
         _picture("url_alphabet", "the other alphabet", flat.replace("+", "-").replace("/", "_"), MALFORMED),
         _picture("padding_missing", "cut short", flat.rstrip("=")[:-1], MALFORMED),
         _picture("padding_early", "something after the end", "/9g=" + flat, MALFORMED),

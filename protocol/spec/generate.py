@@ -77,7 +77,7 @@ def reject_reason_table() -> str:
     rows = ["| reason | meaning |", "|---|---|"]
     meanings = dict(re.findall(r'"(\w+)"  # (.*)', inspect.getsource(refusals)))
     rows += [f"| `{reason}` | {meanings[reason]} |" for reason in RejectReason]
-    rows.append(f"| `{CLAMPED}` | no refusal: the command was accepted, but cut to the robot's limits |")
+    rows.append(f"| `{CLAMPED}` | not a rejection: the command was accepted, and reduced to the robot's limits |")
     return "\n".join(rows) + "\n"
 
 
@@ -176,7 +176,7 @@ GENERATED: Final = {
 
 
 def readme(text: str) -> str:
-    """`text` with every generated block filled in anew."""
+    """Return `text` with every generated block filled in again."""
     return _BLOCK.sub(lambda block: block[1] + GENERATED[block[2]]() + block[3], text)
 
 
@@ -226,7 +226,7 @@ def main(arguments: list[str] | None = None) -> int:
     wrong = differing()
     for path in wrong:
         print(
-            f"protocol/{path} is not what the code says: python -m sightline.protocol.spec.generate --write",
+            f"protocol/{path} differs from the code; run python -m sightline.protocol.spec.generate --write",
             file=sys.stderr,
         )
     return 5 if wrong else 0

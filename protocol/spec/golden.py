@@ -3,7 +3,7 @@
 `message_cases.py` and `framing_cases.py` state each case and its outcome by hand; a file is made only if the decoders
 agree. A message lies in `vectors/<channel>/<case>.json`:
 
-    {"purpose", "key", "header_hex", "payload_hex", "accept": {"source", "header", "payload"} or "refuse": reason}
+    `{"purpose", "key", "header_hex", "payload_hex", "accept": {"source", "header", "payload"} or "refuse": reason}`
 
 `header` and `payload` are as read, with defaults filled in; `null` is a header that may be missing. A picture's payload
 is its size, a scan's the ranges with "inf" for no return. What carries messages lies beside them, in folders that
@@ -24,13 +24,13 @@ from sightline.protocol.spec.message_cases import CASES, MessageCase
 from sightline.protocol.text import parse_twist
 
 INEXACT_KEY = "INEXACT_KEY"
-"""The outcome of a key that is not exact: nobody is told, the receiver counts it."""
+"""The outcome of a key that is not exact. The receiver counts it and sends no reply."""
 Outcome = dict[str, Any]
 _SAID = ("purpose", "accept", "refuse")
 
 
 def outcome(key: str, header: bytes, payload: bytes) -> Outcome:
-    """What a receiver makes of a message: {"accept": {...}} or {"refuse": reason}. Never raises."""
+    """Return the result at a receiver, `{"accept": {...}}` or `{"refuse": reason}`. Never raises."""
     parsed = parse_key(key)
     if parsed is None:
         return {"refuse": INEXACT_KEY}
@@ -86,7 +86,7 @@ def _wire_vector(case: FramingCase) -> Outcome:
 
 
 def read_again(folder: str, vector: Outcome) -> Outcome:
-    """What a receiver makes of a file's contents, from these alone."""
+    """Return the result at a receiver for the contents of a file alone."""
     if "key" in vector:
         return outcome(vector["key"], bytes.fromhex(vector["header_hex"]), bytes.fromhex(vector["payload_hex"]))
     return framing_outcome(folder, {name: value for name, value in vector.items() if name not in _SAID})
@@ -104,9 +104,9 @@ def _text(contents: Outcome) -> str:
 
 
 def vector_table() -> str:
-    """How many vectors there are of what, as a Markdown table."""
+    """Count the vectors of each folder in a Markdown table."""
     stated = [(case.channel, case.refuse) for case in CASES] + [(case.folder, case.refuse) for case in FRAMING_CASES]
-    rows = ["| folder | accepted | refused |", "|---|---|---|"]
+    rows = ["| folder | accepted | rejected |", "|---|---|---|"]
     for folder in dict.fromkeys(name for name, _ in stated):
         accepted = sum(name == folder and refuse is None for name, refuse in stated)
         refused = sum(name == folder for name, _ in stated) - accepted

@@ -116,8 +116,8 @@ def frames() -> list[MessageCase]:
         case("frame", "stamp_only", "odometry and latency may be left out", header=STAMP),
         case("frame", "latency_null", "null is as good as absent", header=FRAME_HEADER | {"latency_us": None}),
         case("frame", "seq_max", "the largest integer", header=FRAME_HEADER | {"seq": 2**53 - 1}),
-        case("frame", "seq_real", "7.0 is no integer", MALFORMED, header=FRAME_HEADER | {"seq": 7.0}),
-        case("frame", "time_true", "true is no integer", MALFORMED, header=FRAME_HEADER | {"t_us": True}),
+        case("frame", "seq_real", "7.0 is not an integer", MALFORMED, header=FRAME_HEADER | {"seq": 7.0}),
+        case("frame", "time_true", "true is not an integer", MALFORMED, header=FRAME_HEADER | {"t_us": True}),
         case("frame", "pose_of_two", "a pose has three numbers", MALFORMED, header=FRAME_HEADER | {"pose": [0, 0]}),
         case("frame", "pose_far", "numbers end at a million", MALFORMED, header=FRAME_HEADER | {"pose": [2e6, 0, 0]}),
         case("frame", "pose_nan", "NaN in a header", MALFORMED, header=FRAME_HEADER | {"pose": [float("nan"), 0, 0]}),
@@ -262,10 +262,10 @@ def payloads() -> list[MessageCase]:
         case("request", "verb_upper", "verbs are lower-case", MALFORMED, payload={"id": 1, "verb": "STOP"}),
         case("request", "no_id", "a request has an id", MALFORMED, payload={"verb": "stop"}),
         case("request", "payload_257", "257 bytes", MALFORMED, payload=packed(stop).ljust(257)),
-        case("reply", "refused", "a request refused", payload=REPLY | {"ok": False, "detail": "vision drives"}),
+        case("reply", "refused", "a rejected request", payload=REPLY | {"ok": False, "detail": "vision drives"}),
         case("reply", "ok_as_1", "1 is not true", MALFORMED, payload=REPLY | {"ok": 1}),
         case("reply", "detail_201", "at most 200 characters", MALFORMED, payload=REPLY | {"detail": "x" * 201}),
-        case("status", "with_holder", "somebody drives", payload=counted),
+        case("status", "with_holder", "with a driver", payload=counted),
         case("status", "unknown_state", "a closed list", MALFORMED, payload=status | {"state": "FLYING"}),
         case("status", "refused_negative", "not below 0", MALFORMED, payload=status | {"refused": {"STALE": -1}}),
         case("status", "payload_4097", "4097 bytes", MALFORMED, payload=packed(status).ljust(4097)),
@@ -290,13 +290,13 @@ def _found(*boxes: dict[str, Any]) -> dict[str, Any]:
 
 
 def detections() -> list[MessageCase]:
-    """Boxes that somebody found."""
+    """Return cases of boxes from a detector."""
     name, guest = "detections", ANSWER | {"source": "guest"}
     circle = {"cx_px": 320.0, "cy_px": 225.0, "radius_px": 40.0}
     return [
         case(name, "saw_nothing", "looked, and saw nothing", payload=_found()),
         case(name, "boxes_absent", "as good as none", payload=without(DETECTIONS, "boxes")),
-        case(name, "without_echo", "nobody knows which frame", header=without(guest, "echo")),
+        case(name, "without_echo", "without the frame", header=without(guest, "echo")),
         case(name, "of_vision", "another role", header=ANSWER, key="sightline/r1/detections/vision"),
         case(name, "no_role", "a key without its role", "INEXACT_KEY", key="sightline/r1/detections"),
         case(name, "circle_and_track", "what a detector may add", payload=_found(BOX | {"circle": circle, "track": 9})),
@@ -309,7 +309,7 @@ def detections() -> list[MessageCase]:
         case(name, "label_empty", "a label is not empty", MALFORMED, payload=_found(BOX | {"label": ""})),
         case(name, "label_newline", "no control characters", MALFORMED, payload=_found(BOX | {"label": "a\nb"})),
         case(name, "score_above_1", "a score ends at 1", MALFORMED, payload=_found(BOX | {"score": 1.01})),
-        case(name, "score_nan", "NaN is no number here", MALFORMED, payload=_found(BOX | {"score": float("nan")})),
+        case(name, "score_nan", "NaN is not a number here", MALFORMED, payload=_found(BOX | {"score": float("nan")})),
         case(name, "corner_infinite", "nor is Infinity", MALFORMED, payload=_found(BOX | {"x2_px": float("inf")})),
         case(name, "inside_out", "the second corner is first", MALFORMED, payload=_found(BOX | {"x1_px": 361.0})),
         case(name, "beyond_the_picture", "a box may leave the picture", payload=_found(BOX | {"x1_px": -20.0})),
@@ -322,7 +322,7 @@ def detections() -> list[MessageCase]:
 
 
 def missions() -> list[MessageCase]:
-    """What vision is asked to do."""
+    """Return cases of requested missions."""
     name, most = "mission", {"options": {f"option_{number}": 1 for number in range(16)}}
     return [
         case(name, "name_alone", "what a mission needs is its own default", payload={"id": 1, "name": "follow"}),
@@ -334,7 +334,7 @@ def missions() -> list[MessageCase]:
              payload=MISSION | {"options": most["options"] | {"more": 1}}),
         case(name, "option_list", "no list", MALFORMED, payload=MISSION | {"options": {"a": [1]}}),
         case(name, "option_null", "nor nothing", MALFORMED, payload=MISSION | {"options": {"a": None}}),
-        case(name, "option_nan", "NaN is no number", MALFORMED, payload=MISSION | {"options": {"a": float("nan")}}),
+        case(name, "option_nan", "NaN is not a number", MALFORMED, payload=MISSION | {"options": {"a": float("nan")}}),
         case(name, "option_text_65", "65 characters", MALFORMED, payload=MISSION | {"options": {"a": "x" * 65}}),
         case(name, "option_name_upper", "names are lower-case", MALFORMED, payload=MISSION | {"options": {"A": 1}}),
         case(name, "path_to_code", "a name, never a path to code", MALFORMED, payload=MISSION | {"name": "os:system"}),
@@ -351,12 +351,12 @@ def missions() -> list[MessageCase]:
 
 
 def reports() -> list[MessageCase]:
-    """What vision does."""
+    """Return cases of mission reports."""
     name = "report"
     return [
         case(name, "without_echo", "before the first frame", header=without(ANSWER, "echo")),
         case(name, "name_and_phase", "all that is needed", payload={"mission": "follow", "phase": "tracking"}),
-        case(name, "refused", "why a mission was not taken up",
+        case(name, "refused", "why a mission was rejected",
              payload=REPORT | {"refused": "no mission called 'gota'; did you mean 'goto'?"}),
         case(name, "done", "it is over", payload=REPORT | {"done": True, "note": "reached 2 of 2"}),
         case(name, "measured", "with the model and its time",
@@ -371,7 +371,7 @@ def reports() -> list[MessageCase]:
     ]
 
 
-# The golden cases, stated by hand: key, header, payload, and the refusal if there is one. Pure.
+# The golden cases, stated by hand: key, header, payload, and the rejection, if any. Pure.
 
 
 def _usual() -> list[MessageCase]:
@@ -379,14 +379,14 @@ def _usual() -> list[MessageCase]:
 
 
 def _stamps() -> list[MessageCase]:
-    """What holds for every header, on every channel."""
+    """Return cases that apply to every header, on every channel."""
     return [one for channel in CHANNELS for one in _header_cases(channel, USUAL[channel][1])]
 
 
 def _header_cases(channel: str, header: dict[str, Any]) -> list[MessageCase]:
     return [
         case(channel, "unknown_field", "unknown fields are ignored", header=header | {"later": [1]}),
-        case(channel, "version_2", "another version is refused by name", VERSION, header=header | {"v": 2}),
+        case(channel, "version_2", "another version is rejected by name", VERSION, header=header | {"v": 2}),
         case(channel, "no_session", "a required field is missing", MALFORMED, header=without(header, "session")),
         case(channel, "session_upper", "8 lower-case hex", MALFORMED, header=header | {"session": "0A1B2C3D"}),
         case(channel, "seq_negative", "integers are bounded below", MALFORMED, header=header | {"seq": -1}),

@@ -35,7 +35,7 @@ def process_with_open(files: Collection[str], besides: int = 0) -> str:
 
 
 def connections(ports: Collection[int]) -> Counter[str]:
-    """How many TCP connections each host has to `ports` of this machine, those that are ending included."""
+    """Count the TCP connections of each host to `ports` of this machine, including those that are closing."""
     return Counter(_host(row[2]) for row in _rows(ports) if row[3] != _LISTEN)
 
 
@@ -80,19 +80,19 @@ def _name(process: Path) -> str:
         return "a process"
 
 
-# Why a TLS link did not come about, in words: Zenoh says only that nobody answered. Shell (one connection).
+# The cause of a failed TLS link. Zenoh reports only that no peer answered. Shell (one connection).
 
 
 _TLS_TIMEOUT_S = 1.0
-_PLAIN = "it is a plain link, not TLS; give --secure there too, or on neither end"
+_PLAIN = "it is a plain link, not TLS; pass --secure there too, or on neither end"
 _CAUSES = (
     ("certificate has expired", "its certificate has expired; make new keys there"),
     ("Hostname mismatch", "its certificate names other hosts; sightline keys add DIR ROLE --host HOST"),
     ("IP address mismatch", "its certificate names other addresses; sightline keys add DIR ROLE --host ADDRESS"),
     ("CERTIFICATE_VERIFY_FAILED", "its certificate is of another authority; use keys of one `sightline keys init`"),
-    ("ALERT_UNKNOWN_CA", "it does not know our certificate's authority; use keys of one `sightline keys init`"),
-    ("ALERT_CERTIFICATE_EXPIRED", "it finds our certificate expired; sightline keys add DIR ROLE"),
-    ("ALERT_CERTIFICATE_REQUIRED", "it asks for a certificate; give --secure DIR"),
+    ("ALERT_UNKNOWN_CA", "it does not know the authority of this certificate; use keys of one `sightline keys init`"),
+    ("ALERT_CERTIFICATE_EXPIRED", "the certificate of this end has expired; run `sightline keys add DIR ROLE`"),
+    ("ALERT_CERTIFICATE_REQUIRED", "it requires a certificate; pass --secure DIR"),
     ("ALERT_DECRYPT_ERROR", "it does not know our certificate's authority; use keys of one `sightline keys init`"),
     ("WRONG_VERSION_NUMBER", _PLAIN),
     ("RECORD_LAYER_FAILURE", _PLAIN),
@@ -100,14 +100,14 @@ _CAUSES = (
 
 
 def diagnose_tls(endpoint: str, secured: RoleKeys | None) -> str:
-    """What is wrong between this end and `endpoint`; "" if TLS is not what is wrong."""
+    """Return the cause of a failed TLS link to `endpoint`, or "" if TLS is not the cause."""
     transport, host, port = parse_zenoh_endpoint(endpoint)
     if transport == "quic" or (transport != "tls" and secured is None and not _speaks_tls(host, port)):
         return ""
     if transport != "tls":
-        return "it speaks TLS only; write tls/... and give --secure DIR"
+        return "it accepts only TLS; use tls/... and pass --secure DIR"
     if secured is None:
-        return "a tls/ endpoint needs keys; give --secure DIR"
+        return "a tls/ endpoint needs keys; pass --secure DIR"
     import ssl
 
     context = ssl.create_default_context(cafile=f"{secured.folder}/ca.pem")
@@ -131,7 +131,7 @@ def _speaks_tls(host: str, port: int) -> bool:
 
 
 def _try_handshake(host: str, port: int, context: ssl.SSLContext) -> str:
-    """Shake hands as Zenoh would, and wait a moment for the other end's verdict on our certificate."""
+    """Run a handshake as Zenoh does, and wait briefly for the reply of the other end to our certificate."""
     import ssl
 
     try:

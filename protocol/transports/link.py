@@ -1,7 +1,7 @@
-"""The transport interface: `Link`, `Message`, slots and queues, and the rules that every link enforces. Shell (locks).
+"""Define the transport interface: `Link`, `Message`, slots, queues, and the rules of every link. Shell (locks).
 
-A `Link` belongs to one robot id. It promises what `tests/protocol/transports/test_link.py` checks on every transport:
-newest wins, memory is bounded, both ends may restart, nothing raised in a callback ends anything, `close` never hangs.
+A `Link` belongs to one robot id. `tests/protocol/transports/test_link.py` checks its promises on every transport:
+newest wins, memory is bounded, both ends may restart, an error in a callback ends nothing, `close` never hangs.
 """
 
 import sys
@@ -34,7 +34,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Raw bytes off the wire. `source` is the role in the key ("" from a robot); `header` may be empty."""
+    """Raw bytes from the wire. `source` is the role in the key, "" from a robot. `header` may be empty."""
 
     channel: Channel
     source: str
@@ -43,20 +43,18 @@ class Message:
 
 
 class LatestSlot(Generic[Item]):
-    """A one-place box: putting replaces and counts what nobody took. Safe between threads.
-
-    Two plain locks: a condition would wake the taker a third slower, on a path that every frame and command takes.
-    """
+    """Holds the newest item. A new item replaces one that no thread took, and counts it. Safe between threads."""
 
     def __init__(self) -> None:
+        # Two plain locks: a condition would wake the taker a third slower, on the path of every frame and command.
         self._guard = threading.Lock()
-        self._full = threading.Lock()  # free while there is an item; whoever gets hold of it takes the item out
+        self._full = threading.Lock()  # free while there is an item; the thread that acquires it takes the item
         self._full.acquire()
         self._item: Item | None = None
         self.dropped = 0
 
     def put(self, item: Item) -> None:
-        """Replace whatever is there; never blocks."""
+        """Store `item`, in place of an older one. Never blocks."""
         with self._guard:
             waiting = self._item is not None
             self._item = item
@@ -65,7 +63,14 @@ class LatestSlot(Generic[Item]):
                 self._full.release()
 
     def take(self, timeout_s: float = 0.0) -> Item | None:
-        """Remove and return the newest, waiting up to `timeout_s`; None if there is none."""
+        """Remove and return the newest item.
+
+        Args:
+            timeout_s: longest wait, s.
+
+        Returns:
+            The item, or None if no item arrived in time.
+        """
         if not self._full.acquire(timeout=max(0.0, timeout_s)):
             return None
         with self._guard:
@@ -74,18 +79,18 @@ class LatestSlot(Generic[Item]):
 
 
 MAX_UNKNOWN_SOURCES: Final = 16
-"""Security limit: items of one channel in a queue from sources that no role has."""
+"""Security limit: queued items of one channel from sources without a role."""
 _RANKS: Final = {priority: rank for rank, priority in enumerate(Priority, start=1)}
 _FIRST_RANK: Final = -1
 
 
 def rank(channel: Channel, verb: Verb | None) -> int:
-    """Order of sending, the lowest first: a STOP, then by the channel's priority."""
+    """Return the order of sending, the lowest first: a STOP, then by the priority of the channel."""
     return 0 if verb is Verb.STOP else _RANKS[channel.priority]
 
 
 class _Place(NamedTuple):
-    """Where an item of a queue waits."""
+    """The place of an item in a queue. A newer item replaces only an item in the same place."""
 
     rank: int
     channel: str = ""
@@ -94,25 +99,25 @@ class _Place(NamedTuple):
 
 
 class OutgoingQueue(Generic[Item]):
-    """The newest item per channel and source, for requests also per verb; the most urgent leaves first.
+    """Queues the newest item per channel and source, for requests also per verb. The most urgent item leaves first.
 
-    Only a newer item of its own place replaces one, so a STOP yields to nothing but another STOP. Of sources that no
-    role has, few fit at a time on channels that are passed on; more are dropped. A role's source always fits.
+    Only another STOP replaces a STOP. Sources without a role share a few places on channels that are passed on. The
+    source of a role always has a place.
     """
 
     def __init__(self, max_items: int = sys.maxsize) -> None:
-        """Security limit: `max_items`; in a full queue a STOP takes the place of another request."""
+        """Limit the queue to `max_items` (security limit). In a full queue a STOP replaces another request."""
         self._max_items = max_items
         self._lock = threading.Lock()
         self._items: dict[_Place, Item] = {}
-        self.dropped = Counter(dict.fromkeys(CHANNELS, 0))  # never grows, so that other threads may read it
-        """Items replaced by a newer one before they were sent, or without a place, by channel."""
+        self.dropped = Counter(dict.fromkeys(CHANNELS, 0))  # fixed keys, so that other threads may read it
+        """Items that were replaced before they were sent, or found no place, by channel."""
 
     def __len__(self) -> int:
         return len(self._items)
 
     def put(self, message: Message, item: Item) -> bool:
-        """Put `item`, which sends `message`; False if it was dropped. Never blocks."""
+        """Queue `item` for `message`. Returns False if it was dropped. Never blocks."""
         channel = message.channel
         verb = request_verb(message.payload) if channel is REQUEST else None
         place = _Place(rank(channel, verb), channel.name, message.source, verb)
@@ -125,17 +130,17 @@ class OutgoingQueue(Generic[Item]):
         return fits
 
     def put_first(self, item: Item) -> None:
-        """Put `item` before everything else; only a newer one replaces it."""
+        """Queue `item` before all others. Only a newer call replaces it."""
         with self._lock:
             self._items[_Place(_FIRST_RANK)] = item
 
     def take(self) -> Item | None:
-        """Remove and return the most urgent; None if there is nothing."""
+        """Remove and return the most urgent item, or None from an empty queue."""
         with self._lock:
             return self._items.pop(self._next()) if self._items else None
 
     def flush(self, send: Callable[[Item], bool]) -> bool:
-        """Hand items to `send`, the most urgent first, until it returns False; whether nothing is left."""
+        """Pass items to `send`, the most urgent first, until it returns False. Returns True for an empty queue."""
         with self._lock:
             while self._items:
                 place = self._next()
@@ -150,13 +155,15 @@ class OutgoingQueue(Generic[Item]):
     def _make_room(self, place: _Place, channel: Channel) -> bool:
         if len(self._items) >= self._max_items:
             return place.verb is Verb.STOP and self._drop_one()
+        # A relayed channel accepts any source. Without this bound, one peer with invented sources fills the queue.
         if not channel.passed_on or place.source in KNOWN_SOURCES:
             return True
         unknown = (one for one in self._items if one.channel == place.channel and one.source not in KNOWN_SOURCES)
         return sum(1 for _ in unknown) < MAX_UNKNOWN_SOURCES
 
     def _drop_one(self) -> bool:
-        """Drop what is no STOP, else the oldest STOP: of many, one stops as well."""
+        """Drop an item that is not a STOP, otherwise the oldest STOP."""
+        # Every STOP has the same effect, so one of many is enough.
         oldest = next((place for place in self._items if place.verb is not Verb.STOP), next(iter(self._items)))
         self.dropped[oldest.channel] += 1
         del self._items[oldest]
@@ -164,11 +171,11 @@ class OutgoingQueue(Generic[Item]):
 
 
 class Closing(ABC):
-    """Used in a `with`, whose end closes it."""
+    """Base of objects for a `with`, which closes them at its end."""
 
     @abstractmethod
     def close(self) -> None:
-        """End it; idempotent, returns within two seconds."""
+        """Close it. Idempotent, returns within two seconds."""
 
     def __enter__(self) -> Self:
         return self
@@ -180,123 +187,144 @@ class Closing(ABC):
 
 
 class Link(Closing):
-    """One robot's channels on one transport. Callbacks run on a transport thread: store and return, nothing more."""
+    """The channels of one robot on one transport. A callback runs on a transport thread and only stores the message."""
 
     robot: str
 
     @abstractmethod
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """Send now or drop; never block on a slow peer. False if it was dropped or no peer is connected.
+        """Send a message now, or drop it. Never blocks on a slow peer.
 
-        Towards the robot `source` defaults to the link's role. Raises ValueError for parts over the channel's bounds.
+        Args:
+            channel: the channel.
+            header: encoded header, may be empty.
+            payload: encoded payload.
+            source: role of the sender toward the robot. The default is the role of the link.
+
+        Returns:
+            False if it was dropped or no peer is connected.
+
+        Raises:
+            ValueError: a part is above the bound of the channel.
         """
 
     @abstractmethod
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
-        """Call `callback` for every message of `channel` with the exact key and within its bounds."""
+        """Call `callback` for every message of `channel` with the exact key and within its bounds.
+
+        Args:
+            channel: the channel.
+            callback: called on a transport thread. An error in it is counted and ends nothing.
+        """
 
     @abstractmethod
     def unsubscribe(self, channel: Channel) -> None:
-        """End every subscription of this link to `channel`; the other ends see that it has none."""
+        """End every subscription of this link to `channel`. The peers see the change."""
 
     @abstractmethod
     def has_listener(self, channel: Channel) -> bool:
-        """Whether a peer subscribes to what this end publishes on `channel`; display and economy only."""
+        """Return True if a peer subscribes to `channel`. Use it to save work, never for safety."""
 
     @property
     def dropped(self) -> Counter[str]:
-        """Publications replaced by newer ones before they left, by channel, where the link counts them."""
+        """Return the publications that newer ones replaced before they left, by channel, if the link counts them."""
         return Counter()
 
     @property
     def rejected(self) -> Counter[str]:
-        """Messages and peers rejected, by reason."""
+        """Return the rejected messages and peers, by reason."""
         return Counter()
 
     def latest(self, channel: Channel) -> LatestSlot[Message]:
-        """Subscribe with a slot that holds the newest message of `channel`."""
+        """Subscribe to `channel` and return a slot that holds its newest message."""
         slot: LatestSlot[Message] = LatestSlot()
         self.subscribe(channel, slot.put)
         return slot
 
 
 class FleetLink(Closing):
-    """Links to all robots that one session receives."""
+    """The links to all robots of one session."""
 
     @abstractmethod
     def robots(self) -> list[str]:
-        """Ids of all robots received so far, in the order of their first message."""
+        """Return the ids of all robots so far, in the order of their first message."""
 
     @abstractmethod
     def on_new_robot(self, callback: Callable[[], None]) -> None:
-        """Call `callback`, on a transport thread, at the first message of each robot."""
+        """Call `callback` on a transport thread at the first message of each robot."""
 
     @abstractmethod
     def link(self, robot: str) -> Link:
-        """A link to `robot`, closed with this one."""
+        """Return a link to `robot`, which closes with this one."""
 
 
 class LinkWrapper(Link):
-    """A link that forwards to `link`; a subclass overrides only what it changes."""
+    """Forwards every call to another link. A subclass overrides only the methods that differ."""
 
     def __init__(self, link: Link) -> None:
         self.robot = link.robot
         self._link = link
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """As `Link`."""
+        """Forward to the link."""
         return self._link.publish(channel, header, payload, source)
 
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
-        """As `Link`."""
+        """Forward to the link."""
         self._link.subscribe(channel, callback)
 
     def unsubscribe(self, channel: Channel) -> None:
-        """As `Link`."""
+        """Forward to the link."""
         self._link.unsubscribe(channel)
 
     def has_listener(self, channel: Channel) -> bool:
-        """As `Link`."""
+        """Forward to the link."""
         return self._link.has_listener(channel)
 
     @property
     def dropped(self) -> Counter[str]:
-        """As `Link`."""
+        """Forward to the link."""
         return self._link.dropped
 
     @property
     def rejected(self) -> Counter[str]:
-        """As `Link`."""
+        """Forward to the link."""
         return self._link.rejected
 
     def close(self) -> None:
-        """As `Link`."""
+        """Forward to the link."""
         self._link.close()
 
 
-# What every link enforces, whatever carries it: exact keys, bounds, contained callbacks. Shell (a lock).
+# The rules of every link on any transport: exact keys, bounds, contained callbacks. Shell (a lock).
 #
-# A bad message or a raising callback is counted and dropped; neither ends anything.
+# A bad message, or an error in a callback, is counted and dropped. Neither ends a link.
 
 
 INEXACT_KEY = "INEXACT_KEY"
-"""Counted for a key that is not exactly that of the robot and channel: a wildcard, another robot, a bad role."""
+"""Counted for a key that differs from that of the robot and channel: a wildcard, another robot, a bad role."""
 OVERSIZE = "OVERSIZE"
-"""Counted for a header or payload over the channel's bound."""
+"""Counted for a header or payload above the bound of the channel."""
 NOT_A_PUT = "NOT_A_PUT"
-"""Counted for anything that is not a publication, e.g. Zenoh's delete."""
+"""Counted for a sample that is not a publication, e.g. Zenoh's delete."""
 
 
 class LinkRules:
-    """The rules of one link to `robot`, used by `role`. `rejected` and `callback_errors` only grow."""
+    """The rules of one link to `robot` with role `role`. `rejected` and `callback_errors` never decrease."""
 
     def __init__(self, robot: str, role: str = "", max_frame_bytes: int = FRAME.max_payload_bytes) -> None:
-        """Security limit: `max_frame_bytes` (1 up to the channel's bound) for the payload of a frame.
+        """Create the rules of one link.
 
-        Raises ConfigError for a robot id or a limit that is none.
+        Args:
+            robot: robot id.
+            role: default source of messages toward the robot.
+            max_frame_bytes: security limit for the payload of a frame, 1 to the bound of the channel.
+
+        Raises:
+            ConfigError: the robot id or the limit is invalid.
         """
         if not 1 <= max_frame_bytes <= FRAME.max_payload_bytes:
-            raise ConfigError(f"max_frame_bytes {max_frame_bytes} is out of range: 1 to {FRAME.max_payload_bytes}")
+            raise ConfigError(f"invalid max_frame_bytes {max_frame_bytes}: expected 1 to {FRAME.max_payload_bytes}")
         self.robot = check_robot_id(robot)
         self.role = role
         self.rejected: Counter[str] = Counter()
@@ -305,15 +333,15 @@ class LinkRules:
         self._counting = threading.Lock()
 
     def payload_bound(self, channel: Channel) -> int:
-        """The largest payload of `channel` that this link carries, in bytes."""
+        """Return the largest payload of `channel` on this link, in bytes."""
         return min(channel.max_payload_bytes, self._max_frame_bytes) if channel is FRAME else channel.max_payload_bytes
 
     def key(self, channel: Channel, source: str = "") -> str:
-        """The key to publish on; towards the robot `source` defaults to the role. Raises ValueError if it has none."""
+        """Return the key for publishing. Toward the robot `source` defaults to the role; ValueError without one."""
         return key_for(self.robot, channel, source or (self.role if channel.has_source else ""))
 
     def check(self, channel: Channel, header: bytes, payload: bytes) -> None:
-        """Raise ValueError for parts that this end must not send."""
+        """Raise ValueError for a header or payload above its bound."""
         bound = self.payload_bound(channel)
         if len(header) > MAX_HEADER_BYTES or len(payload) > bound:
             raise ValueError(
@@ -324,7 +352,7 @@ class LinkRules:
     def deliver(
         self, channel: Channel, key: str, header: bytes, payload: bytes, callback: Callable[[Message], None]
     ) -> None:
-        """Give the message to `callback` if its key is exactly right and it is within bounds; never raises."""
+        """Pass the message to `callback` if its key is exact and its parts are within bounds. Never raises."""
         parsed = parse_key(key)
         if parsed is None or parsed[0] != self.robot or parsed[1] is not channel:
             self.reject(INEXACT_KEY)
@@ -341,13 +369,13 @@ class LinkRules:
     def _call(self, callback: Callable[[Message], None], message: Message) -> None:
         try:
             callback(message)
-        except Exception:  # whatever a callback raises must not reach the transport's thread
+        except Exception:  # an error in a callback must not end the thread of the transport
             with self._counting:
                 self.callback_errors += 1
 
 
 class BaseLink(Link):
-    """A link of a transport: its rules and what they counted."""
+    """Base of the links of a transport, with rules and counters."""
 
     def __init__(self, rules: LinkRules) -> None:
         self.robot = rules.robot
@@ -356,15 +384,15 @@ class BaseLink(Link):
 
     @property
     def rejected(self) -> Counter[str]:
-        """As `Link`."""
+        """Return the rejected messages and peers, by reason."""
         return self._rules.rejected
 
     @property
     def callback_errors(self) -> int:
-        """How often a subscriber's callback raised."""
+        """Return the number of errors in callbacks."""
         return self._rules.callback_errors
 
     @property
     @abstractmethod
     def connected(self) -> bool:
-        """Whether at least one peer is connected; never blocks."""
+        """Return True if at least one peer is connected. Never blocks."""

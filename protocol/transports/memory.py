@@ -1,12 +1,12 @@
-"""A network in memory and in virtual time: seeded delay and loss, no threads, bit for bit repeatable. Pure.
+"""Simulate a network in memory and in virtual time: seeded delay and loss, no threads, repeatable. Pure.
 
     network = MemoryNetwork(seed=7, delay_us=50_000, loss=0.1)
     robot, vision = network.link("r1"), network.link("r1", role="vision")
     robot.publish(FRAME, header, jpeg)
     network.advance(now_us)  # callbacks run here, each at its own due time
 
-Each way between two links draws from a random stream of its own, per key: more `status` does not change which frames
-are lost. A way keeps its order, as a TCP connection does.
+Each way between two links has its own random stream per key, so that more `status` does not change the lost frames. A
+way keeps its order, as a TCP connection does.
 """
 
 import heapq
@@ -20,12 +20,12 @@ from sightline.protocol.channels import FRAME, Channel, Direction, parse_key, pa
 from sightline.protocol.transports.link import BaseLink, LinkRules, Message
 
 MAX_IN_FLIGHT: Final = 4096
-"""Messages under way in one network; what would go over is dropped and counted as `overflow`."""
+"""Messages in flight in one network. A further message is dropped and counted as `overflow`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """What one direction does to a message. `loss` is a share 0..1; `burst` the mean number lost in a row, >= 1."""
+    """The effect of one direction on a message. `loss` is a share 0..1, `burst` the mean number lost in a row, >= 1."""
 
     delay_us: int = 0
     jitter_us: int = 0
@@ -33,15 +33,15 @@ class Leg:
     burst: float = 1.0
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what no network can do."""
+        """Raise ValueError for impossible values."""
         if self.delay_us < 0 or self.jitter_us < 0 or not 0 <= self.loss <= 1 or not self.burst >= 1:
-            raise ValueError(f"{self}: delay and jitter >= 0, loss 0..1, burst >= 1")
+            raise ValueError(f"invalid {self}: expected delay and jitter >= 0, loss 0..1, burst >= 1")
         if self.burst > 1 and self.loss > self.burst / (self.burst + 1):
             raise ValueError(f"{self}: bursts of {self.burst:g} lose at most {self.burst / (self.burst + 1):.3f}")
 
 
 def split_legs(delay_us: int, jitter_us: int, loss: float, burst: float) -> dict[Direction, Leg]:
-    """Total added latency as half on each leg (an odd microsecond on the way out); loss is each leg's own."""
+    """Split the total added latency into halves, one per leg. Loss applies to each leg."""
     return {
         Direction.FROM_ROBOT: Leg(delay_us - delay_us // 2, jitter_us - jitter_us // 2, loss, burst),
         Direction.TO_ROBOT: Leg(delay_us // 2, jitter_us // 2, loss, burst),
@@ -58,7 +58,8 @@ class _Way:
         self._last_due_us = 0
 
     def due_us(self, now_us: int) -> int | None:
-        """When a message sent now arrives; None if it is lost. Always draws twice, so that streams stay in step."""
+        """Return the arrival time of a message sent now, or None if it is lost."""
+        # It always draws twice, so that a lost message does not change the random stream.
         lost, jitter_us = self._loses(self._random.random()), int(self._random.random() * (self._leg.jitter_us + 1))
         if lost:
             return None
@@ -69,14 +70,14 @@ class _Way:
         loss, burst = self._leg.loss, self._leg.burst
         if burst == 1:
             return draw < loss
-        # Gilbert's two states: leaving "losing" with 1/burst and entering it at the rate that makes the share `loss`.
+        # Gilbert's model: it leaves the state "losing" with 1/burst, and enters it so that the share is `loss`.
         self._losing = draw >= 1 / burst if self._losing else draw < loss / (burst * (1 - loss))
         return self._losing
 
 
 @dataclass(frozen=True, slots=True)
 class _Packet:
-    """What is sent, on which key, and which way; `sender` is 0 for a stranger."""
+    """A message with its key and direction. `sender` is 0 for a third party."""
 
     sender: int
     direction: Direction
@@ -86,7 +87,7 @@ class _Packet:
 
 
 class _Flight(NamedTuple):
-    """A packet under way; equal due times arrive in order of sending."""
+    """A packet in flight. Packets with equal due times arrive in order of sending."""
 
     due_us: int
     number: int
@@ -95,10 +96,10 @@ class _Flight(NamedTuple):
 
 
 class MemoryNetwork:
-    """Links of any robots, joined by one virtual clock.
+    """Links of any robots with one virtual clock.
 
-    `sent`, `delivered`, `dropped` count messages per direction (`dropped` also `overflow`); a message to three links is
-    three.
+    `sent`, `delivered`, `dropped` count messages per direction, `dropped` also `overflow`. A message to three links
+    counts three times.
     """
 
     def __init__(
@@ -111,9 +112,18 @@ class MemoryNetwork:
         burst: float = 1.0,
         legs: Mapping[Direction, Leg] | None = None,
     ) -> None:
-        """`delay_us` and `jitter_us` are totals, half on each leg; `loss` and `burst` hold for each leg on its own.
+        """Create a network.
 
-        `legs` replaces them with each direction's own. Raises ValueError for what no network can do.
+        Args:
+            seed: seed of all random streams.
+            delay_us: total delay, half on each leg.
+            jitter_us: total jitter, half on each leg.
+            loss: share of lost messages on each leg, 0 to 1.
+            burst: mean number of messages lost in a row, at least 1.
+            legs: separate values for each direction, in place of the others.
+
+        Raises:
+            ValueError: a value is impossible.
         """
         self.now_us = 0
         self.sent: Counter[str] = Counter()
@@ -128,39 +138,39 @@ class MemoryNetwork:
         self._ways: dict[tuple[int, int, str], _Way] = {}
 
     def link(self, robot: str, role: str = "", max_frame_bytes: int = FRAME.max_payload_bytes) -> "MemoryLink":
-        """A new link to `robot`; `role` is the default source of what it publishes towards the robot."""
+        """Create a link to `robot`. `role` is the default source of its messages toward the robot."""
         self._joined += 1
         link = MemoryLink(self, self._joined, LinkRules(robot, role, max_frame_bytes))
         self._links.append(link)
         return link
 
     def peers_of(self, link: "MemoryLink") -> list["MemoryLink"]:
-        """The other open links of the same robot."""
+        """Return the other open links of the same robot."""
         return [other for other in self._links if other is not link and other.robot == link.robot]
 
     def leave(self, link: "MemoryLink") -> None:
-        """Forget `link` and what is under way to it."""
+        """Remove `link` and all messages in flight to it."""
         self._links = [other for other in self._links if other is not link]
         self._flights = [flight for flight in self._flights if flight.to is not link]
         heapq.heapify(self._flights)
         self._ways = {ends: way for ends, way in self._ways.items() if link.number not in ends[:2]}
 
     def advance(self, now_us: int) -> None:
-        """Move the clock to `now_us`, delivering all that is due on the way. Raises ValueError for going back."""
+        """Move the clock to `now_us`, and deliver every message that is due. Raises ValueError for an earlier time."""
         if now_us < self.now_us:
-            raise ValueError(f"time goes back from {self.now_us} to {now_us} us")
+            raise ValueError(f"the clock cannot go back from {self.now_us} to {now_us} us")
         while self._flights and self._flights[0].due_us <= now_us:
             self._arrive(heapq.heappop(self._flights))
         self.now_us = now_us
 
     def next_due_us(self) -> int | None:
-        """When the next message arrives; None if none is under way."""
+        """Return the time of the next arrival, or None without a message in flight."""
         return self._flights[0].due_us if self._flights else None
 
     def put(self, key: str, header: bytes, payload: bytes, sender: "MemoryLink | None" = None) -> bool:
-        """Send raw bytes on any key, as a stranger could; False if there was no room.
+        """Send raw bytes on any key, as a third party can. Returns False without room.
 
-        A key with a wildcard reaches every link that has subscribed, as it would on Zenoh; its receivers turn it away.
+        A key with a wildcard reaches every subscribed link, as on Zenoh. The receivers reject it.
         """
         parsed = parse_key(key)
         takers = [link for link in self._links if link is not sender and link.subscribes_to(key)]
@@ -196,10 +206,10 @@ class MemoryNetwork:
 
 
 class MemoryLink(BaseLink):
-    """A `Link` of a `MemoryNetwork`. It does not hear what it publishes itself."""
+    """A `Link` of a `MemoryNetwork`. It does not receive its own publications."""
 
     def __init__(self, network: MemoryNetwork, number: int, rules: LinkRules) -> None:
-        """Made by `MemoryNetwork.link`."""
+        """Use `MemoryNetwork.link` in place of this constructor."""
         super().__init__(rules)
         self.number = number
         self._network = network
@@ -207,11 +217,11 @@ class MemoryLink(BaseLink):
 
     @property
     def connected(self) -> bool:
-        """Whether another link of the same robot is open."""
+        """Return True if another link of the same robot is open."""
         return not self._closed and bool(self._network.peers_of(self))
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """As `Link`."""
+        """Send a message to the other links of the robot, see `Link`."""
         self._rules.check(channel, header, payload)
         key = self._rules.key(channel, source)
         return self.connected and self._network.put(key, header, payload, self)
@@ -225,22 +235,22 @@ class MemoryLink(BaseLink):
         self._callbacks = [one for one in self._callbacks if one[0] is not channel]
 
     def has_listener(self, channel: Channel) -> bool:
-        """Whether another link subscribes to what this end publishes on `channel`."""
+        """Return True if another link subscribes to `channel` of this end."""
         key = self._rules.key(channel)
         return not self._closed and any(peer.subscribes_to(key) for peer in self._network.peers_of(self))
 
     def subscribes_to(self, key: str) -> bool:
-        """Whether a subscription here matches `key`, as Zenoh matches: a wildcard in the key matches all."""
+        """Return True if a subscription matches `key`. As on Zenoh, a key with a wildcard matches all."""
         return any("*" in key or _matches(self.robot, channel, key) for channel, _ in self._callbacks)
 
     def receive(self, key: str, header: bytes, payload: bytes) -> None:
-        """Called by the network when a message arrives: each subscription judges it, as on Zenoh."""
+        """Deliver an arrived message. Each subscription checks it, as on Zenoh."""
         for channel, callback in tuple(self._callbacks):
             if "*" in key or _matches(self.robot, channel, key):
                 self._rules.deliver(channel, key, header, payload, callback)
 
     def close(self) -> None:
-        """Leave the network; what is under way to this end is lost. Idempotent."""
+        """Leave the network. Messages in flight to this end are lost. Idempotent."""
         self._closed = True
         self._network.leave(self)
 

@@ -1,6 +1,6 @@
-"""Opens a link on a set of endpoints, joins several links into one, and relays between them. Shell.
+"""Open a link on a set of endpoints, join several links into one, and relay between them. Shell.
 
-A robot may listen on several at once; then its link is all of them, and what any peer says is heard alike.
+A robot may listen on several transports. Its link then contains one link of each, with the same rules.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from sightline.protocol.transports.link import Link, Message
 
 
 def check_endpoint(endpoint: str) -> None:
-    """Raise ConfigError, with the right form, unless `endpoint` is one of some transport."""
+    """Raise ConfigError, with the correct form, for an endpoint that no transport accepts."""
     if "://" in endpoint:
         websocket_endpoints.parse_websocket_endpoint(endpoint)
     else:
@@ -37,10 +37,21 @@ def open_link(
     secure: str = "",
     session: str = "",
 ) -> Link:
-    """Open `robot`'s link on every endpoint given; use it in a `with`. `secure` is a folder of `sightline keys`,
-    `session` what this end calls its start, where it has said so elsewhere.
+    """Open a robot's link on all endpoints. Use it in a `with`.
 
-    Raises ConfigError and LinkError as `open_zenoh` and `open_websocket` do; nothing stays open then.
+    Args:
+        robot: robot id.
+        listen: endpoints to listen on.
+        connect: endpoints to connect to.
+        role: default source of messages toward the robot; "robot" on the robot.
+        timeout_s: longest wait for the first answer, if there are only endpoints to connect to.
+        max_frame_bytes: security limit for the payload of a frame.
+        secure: folder from `sightline keys`, or "".
+        session: session id of this end, 8 hex digits, if it has published one already.
+
+    Raises:
+        ConfigError: an argument is invalid, or an optional package is missing.
+        LinkError: an endpoint cannot be opened or reached. No endpoint stays open then.
     """
     options: dict[str, Any] = {"role": role, "timeout_s": timeout_s, "max_frame_bytes": max_frame_bytes}
     web, zenoh = ([_of_kind(ends, is_web) for ends in (listen, connect)] for is_web in (True, False))
@@ -65,61 +76,60 @@ def _of_kind(ends: Sequence[str], is_web: bool) -> list[str]:
 
 
 class LinkGroup(Link):
-    """Several links of one robot as one. They do not hear one another."""
+    """Joins several links of one robot. They do not receive each other's messages."""
 
     def __init__(self, links: Sequence[Link]) -> None:
-        """Take over `links`, all of one robot. Raises ConfigError for none or for several robots."""
+        """Take over links of one robot. Raises ConfigError for an empty list and for several robots."""
         if len({link.robot for link in links}) != 1:
-            raise ConfigError("links of one robot can be joined, and at least one is needed")
+            raise ConfigError("a link group needs at least one link, and all of the same robot")
         self.robot = links[0].robot
         self.links = tuple(links)
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """As `Link` says, on all of them; True if any took it."""
+        """Publish on all links. Returns True if at least one accepted the message."""
         taken = [link.publish(channel, header, payload, source) for link in self.links]
         return any(taken)
 
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
-        """As `Link` says, on all of them."""
+        """Subscribe on all links."""
         for link in self.links:
             link.subscribe(channel, callback)
 
     def unsubscribe(self, channel: Channel) -> None:
-        """As `Link` says, on all of them."""
+        """End the subscriptions on all links."""
         for link in self.links:
             link.unsubscribe(channel)
 
     def has_listener(self, channel: Channel) -> bool:
-        """Whether somebody listens on any of them."""
+        """Return True if a peer subscribes on at least one link."""
         return any(link.has_listener(channel) for link in self.links)
 
     @property
     def dropped(self) -> Counter[str]:
-        """As `Link`, of all of them."""
+        """Return the sum of all links, by channel."""
         return sum((link.dropped for link in self.links), Counter())
 
     @property
     def rejected(self) -> Counter[str]:
-        """As `Link`, of all of them."""
+        """Return the sum of all links, by reason."""
         return sum((Counter(dict(link.rejected)) for link in self.links), Counter())
 
     def close(self) -> None:
-        """Close all, the last opened first."""
+        """Close all links, the newest first."""
         for link in reversed(self.links):
             link.close()
 
 
-# What a robot passes on between its transports: what its peers say to one another. Shell.
+# The relay of a robot between its transports. Shell.
 #
-# Peers of one transport hear one another without it: on Zenoh they meet at the router, and who listens on WebSocket
-# passes on itself.
+# Peers of one transport do not need it: on Zenoh they meet at the router, and the listening WebSocket end passes on.
 
 
 class Relay:
-    """Passes on what the table of channels says; what is said only while watched, only while another side watches."""
+    """Passes messages on between links, as the table of channels defines. Overlays need a viewer on another link."""
 
     def __init__(self, link: Link) -> None:
-        """Begin with what is always passed on."""
+        """Start with the channels that are always passed on."""
         self._links: tuple[Link, ...] = link.links if isinstance(link, LinkGroup) else (link,)
         self._watched = [one for one in CHANNELS.values() if one.while_watched]
         self._open: set[tuple[str, int]] = set()
@@ -129,7 +139,7 @@ class Relay:
                     self._begin(channel, near)
 
     def look(self) -> None:
-        """Begin or end with what is said only while watched; to be called a few times a second, by one thread."""
+        """Start or stop the channels that need a viewer. One thread calls it a few times a second."""
         for channel in self._watched:
             for number, near in enumerate(self._links):
                 wanted = any(other.has_listener(channel) for other in self._others(near))

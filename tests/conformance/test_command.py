@@ -83,7 +83,7 @@ def test_a_robot_behind_keys_conforms(capsys, tmp_path, scheme):
 def test_nobody_there_is_exit_code_4(capsys):
     code, out, err = run(capsys, "robot", free_endpoint("ws://"), "--only", "R-CAUS-02")
     assert (code, out) == (4, "")
-    assert err.startswith("error: nobody answers at ws://127.0.0.1:") and err.count("\n") == 1
+    assert err.startswith("error: no answer from ws://127.0.0.1:") and err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -69,11 +69,11 @@ def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, ro
 
 @pytest.mark.slow
 def test_without_keys_nobody_even_watches(robot):
-    with pytest.raises(LinkError, match="speaks TLS only"):
+    with pytest.raises(LinkError, match="accepts only TLS"):
         open_zenoh("r1", connect=[robot.endpoint.replace("tls/", "tcp/")], role="vision", timeout_s=1.0)
     asked = _sightline("status", "r1", "--connect", robot.endpoint)
     assert asked.returncode == 4
-    assert asked.stderr == f"error: refused at {robot.endpoint}: a tls/ endpoint needs keys; give --secure DIR\n"
+    assert asked.stderr == f"error: cannot connect to {robot.endpoint}: a tls/ endpoint needs keys; pass --secure DIR\n"
 
 
 def _with_other_keys(folder, tmp_path):
@@ -89,9 +89,9 @@ def _expired(folder, tmp_path):
 
 
 REFUSALS = {
-    "plain": (None, "it speaks TLS only; write tls/... and give --secure DIR"),
+    "plain": (None, "it accepts only TLS; use tls/... and pass --secure DIR"),
     "other authority": (_with_other_keys, "authority; use keys of one `sightline keys init`"),
-    "expired": (_expired, "it finds our certificate expired; sightline keys add DIR ROLE"),
+    "expired": (_expired, "the certificate of this end has expired; run `sightline keys add DIR ROLE`"),
 }
 
 

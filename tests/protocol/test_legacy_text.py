@@ -125,7 +125,7 @@ def test_what_is_no_list_of_boxes_is_refused(text):
 
 def test_a_box_outside_the_picture_cannot_exist():
     for corners in ((0, 0, 1, 1.01), (-0.1, 0, 1, 1), (0.5, 0, 0.4, 1), (float("nan"), 0, 1, 1)):
-        with pytest.raises(ValueError, match="does not lie"):
+        with pytest.raises(ValueError, match="outside the image"):
             LegacyBox(*corners)
     with pytest.raises(ValueError, match="at most 16"):
         format_boxes([LegacyBox(0, 0, 1, 1)] * (MAX_BOXES + 1))

@@ -136,7 +136,7 @@ def test_a_header_cut_at_any_byte_is_refused(header):
 @pytest.mark.parametrize("model", [Stamp, FrameHeader, ScanHeader, AnswerHeader, RequestHeader])
 def test_another_version_is_named_in_the_refusal(model, version):
     usual = next(c for c in CASES if c.refuse is None and CHANNELS[c.channel].header is model)
-    with pytest.raises(WireError, match="this peer speaks 1") as refusal:
+    with pytest.raises(WireError, match="this peer uses 1") as refusal:
         decode(model, json.dumps(json.loads(usual.header) | {"v": version}).encode())
     assert refusal.value.reason is RejectReason.UNSUPPORTED_VERSION
 

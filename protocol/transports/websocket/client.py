@@ -1,4 +1,4 @@
-"""The connecting end: reaches one endpoint and reconnects when it is lost. Shell."""
+"""The connecting end: connects to one endpoint, and again after a loss. Shell."""
 
 from __future__ import annotations
 
@@ -32,27 +32,33 @@ class Client:
         self,
         endpoint: WebSocketEndpoint,
         serve: Callable[[Connection], None],
-        refuse: Callable[[str], None],
+        count_rejection: Callable[[str], None],
         keys: tuple[str, str] = ("", ""),
     ) -> None:
-        """`serve` is called for each connection and returns when it is gone; it may raise PeerError to drop it.
+        """Start to connect.
 
-        `keys` are a folder with this end's token and whom it trusts, and the role of the link. Raises ConfigError for
-        a folder with broken files.
+        Args:
+            endpoint: the endpoint.
+            serve: called for each connection until it is gone; it raises PeerError to drop the connection.
+            count_rejection: counts a rejection by its reason.
+            keys: folder with the token and the trusted authority of this end, and the role of the link.
+
+        Raises:
+            ConfigError: a file of the folder is invalid.
         """
         self.endpoint = endpoint
         self._token = "" if endpoint.legacy else own_token(*keys)
         self._context = client_tls_context(keys[0]) if endpoint.secure else None
-        self._serve, self._refuse = serve, refuse
+        self._serve, self._count_rejection = serve, count_rejection
         self._closing = threading.Event()
         self.trouble = ""
-        """Why the last attempt failed, for a person; empty if nobody answered."""
+        """Cause of the last failure, for the operator. Empty without an answer."""
         self.turned_away = threading.Event()
-        """Set when somebody answered who will not speak to this end."""
+        """Set when a peer answered and rejects this end for good."""
         threading.Thread(target=self._run, name="websocket-dial", daemon=True).start()
 
     def close(self) -> None:
-        """Connect no more. An open connection is for the link to close."""
+        """End the attempts to connect. The link closes an open connection."""
         self._closing.set()
 
     def _run(self) -> None:
@@ -64,7 +70,7 @@ class Client:
             pause_s = min(LONGEST_PAUSE_S, pause_s * PAUSE_GROWTH)
 
     def _connect(self) -> bool:
-        """One connection from beginning to end. Returns whether it came about."""
+        """Serve one connection from beginning to end. Returns False if it failed."""
         from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
         try:
@@ -81,22 +87,22 @@ class Client:
             if isinstance(error.__cause__, EOFError):
                 self._turned_away(self._hangs_up(), False)
             else:
-                self._turned_away(f"what answers there is no Sightline WebSocket ({type(error).__name__})", True)
+                self._turned_away(f"the service there is not a Sightline WebSocket ({type(error).__name__})", True)
         except (ssl.SSLEOFError, ssl.SSLZeroReturnError):
             self._turned_away(self._hangs_up(), False)
         except ssl.SSLError as error:
             why = getattr(error, "verify_message", "") or error.reason or type(error).__name__
-            self._turned_away(f"no TLS with it: {why}; is the ca.pem of --secure its authority's?", True)
-        except OSError:  # nobody there, or not in time
+            self._turned_away(f"no TLS: {why}; use the ca.pem of its authority in --secure", True)
+        except OSError:  # no listener, or no answer in time
             self.trouble = ""
-        except Exception as error:  # whatever a broken peer makes the library raise, this thread must try again
+        except Exception as error:  # a broken peer can make the library raise any error; this thread must continue
             self._turned_away(f"{type(error).__name__}: {error}"[:200], False)
         return False
 
     def _hangs_up(self) -> str:
-        """Of who closes the connection without a byte, as a listener does that has too many at once."""
+        """Return the likely causes of a connection that closes without a byte."""
         other = "ws://" if self.endpoint.secure else "wss://"
-        return f"it hangs up without an answer: too many connections at once, or it speaks {other}, or is no Sightline"
+        return f"it closed without an answer: too many connections, or it expects {other}, or it is not Sightline"
 
     def _open(self) -> Connection:
         from websockets.client import ClientProtocol
@@ -122,17 +128,17 @@ class Client:
         return Connection(near, protocol)
 
     def _speak(self, wire: Connection) -> None:
-        """Shake hands, and serve until it is over."""
+        """Run the handshake, and serve until the connection ends."""
         try:
             wire.flush()
             wire.receive_one(time.monotonic() + OPEN_S)
             if wire.protocol.handshake_exc is not None:
                 raise wire.protocol.handshake_exc
             if not self.endpoint.legacy and wire.protocol.subprotocol != SUBPROTOCOL:
-                raise PeerError("WRONG_SUBPROTOCOL", 1002, f"what answers there does not speak {SUBPROTOCOL}")
+                raise PeerError("WRONG_SUBPROTOCOL", 1002, f"the service there does not support {SUBPROTOCOL}")
             self._serve(wire)
         except PeerError as error:
-            self._refuse(error.counted)
+            self._count_rejection(error.counted)
             wire.close(error.code, str(error))
             wire.linger()
             raise
@@ -146,5 +152,6 @@ class Client:
 
 
 def _is_final(closed: ConnectionClosed) -> bool:
-    """Whether trying again is of no use: anything but a peer that is just going away, or has no place just now."""
+    """Return True if another attempt is useless."""
+    # 1000 and 1001: the peer ends or restarts. 1013: it has no free place now. Both can change.
     return closed.rcvd is not None and closed.rcvd.code not in (1000, 1001, 1013)

@@ -1,7 +1,7 @@
-"""One WebSocket connection on a socket that never blocks: messages, keepalive, send path. Shell.
+"""Run one WebSocket connection on a socket that never blocks: messages, keepalive, send path. Shell.
 
-A pong waits behind what its reader has not read yet. So silence alone ends only a connection whose way out is clear;
-while it is full, the reader is slow, and stays as long as it goes on taking.
+A pong waits behind data that its reader has not read yet. Silence alone therefore ends only a connection with an empty
+send path. A full send path means a slow reader, which stays connected while it reads.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ if TYPE_CHECKING:
 
 
 PING_EVERY_US: Final = 1_000_000
-"""A peer that says nothing of its own is asked so often."""
+"""Interval of pings to a silent peer."""
 SILENCE_US: Final = 2_000_000
-"""A ping, and a second to answer it."""
+"""One ping interval, and one second for the pong."""
 STALLED_LIMIT_US: Final = 30_000_000
-"""A full way out that nobody takes anything from, e.g. a stopped process: it costs one socket buffer and a place."""
+"""Limit for a full send path without progress, e.g. to a stopped process. It costs one socket buffer and a place."""
 _LOOK_AFTER_US: Final = 500_000
-"""Silent for so long, the way out is watched."""
+"""Silence after which the send path is observed."""
 _LONG_AGO_US: Final = -(10**12)
 
 
 @dataclass(frozen=True, slots=True)
 class SendPath:
-    """What is known of the way to the other end."""
+    """The state of the path to the other end."""
 
     full: bool
-    """Something waits, or may lie unread at the other end, which takes it slowly or not at all."""
+    """Data waits here, or may wait unread at the other end, which reads slowly or not at all."""
     taken_bytes: int
-    """What the other end's machine has acknowledged so far."""
+    """Bytes that the other machine has acknowledged so far."""
     lost: bool
-    """Something is under way, and that machine has acknowledged nothing for `SILENCE_US`."""
+    """Data is in flight, and the other machine has acknowledged nothing for `SILENCE_US`."""
 
 
 class Keepalive:
-    """One connection's. `look` tells of the way out, and is asked only of who is silent."""
+    """Decides on pings and on the end of one connection. It reads the send path only of a silent peer."""
 
     def __init__(self, now_us: int) -> None:
         self._heard_us = self._pinged_us = self._taken_us = now_us
@@ -59,18 +59,23 @@ class Keepalive:
         self._taken_bytes = -1
 
     def hear(self, now_us: int) -> None:
-        """Something arrived, whatever it was."""
+        """Note that data arrived."""
         self._heard_us = now_us
 
     def is_ping_due(self, now_us: int) -> bool:
-        """Whether to send a ping now; then the next is due a second later."""
+        """Return True if a ping is due. The next one is due a second later."""
         due = now_us - max(self._pinged_us, self._heard_us) >= PING_EVERY_US
         if due:
             self._pinged_us = now_us
         return due
 
     def is_over(self, now_us: int, look: Callable[[], SendPath]) -> bool:
-        """Whether to give the other end up."""
+        """Return True if the connection has to end.
+
+        Args:
+            now_us: monotonic clock.
+            look: reads the send path.
+        """
         if now_us - self._heard_us < _LOOK_AFTER_US:
             return False
         way = look()
@@ -80,15 +85,16 @@ class Keepalive:
             self._full_us = now_us
         if now_us - self._heard_us < SILENCE_US:
             return False
+        # A reader with a full send path gets no chance to answer a ping in time. It is slow, not gone.
         is_slow = now_us - self._full_us < SILENCE_US
         return way.lost or not is_slow or now_us - max(self._heard_us, self._taken_us) >= STALLED_LIMIT_US
 
 
-# What the kernel knows of a TCP connection's way out (Linux; elsewhere only what this end still holds). Shell.
+# The kernel's state of a TCP send path (Linux; elsewhere only the data that still waits here). Shell.
 
 
 class _Fields(NamedTuple):
-    """Of `struct tcp_info` in linux/tcp.h, whose fields never move."""
+    """Fields of `struct tcp_info` in linux/tcp.h, which keep their positions."""
 
     probes: int
     unacked_packets: int
@@ -102,22 +108,23 @@ _OPTION: Final = getattr(socket, "TCP_INFO", None)
 
 
 def send_path(near: socket.socket, full: bool) -> SendPath:
-    """The way out of `near`; `full` is what this end can tell of it by itself."""
+    """Read the send path of a socket. `full` is True if data already waits at this end."""
     if _OPTION is None:
         return SendPath(full, 0, False)
     try:
         fields = _Fields(*_LAYOUT.unpack(near.getsockopt(socket.IPPROTO_TCP, _OPTION, _LAYOUT.size)))
-    except (OSError, struct.error):  # closed, or a kernel that knows less
+    except (OSError, struct.error):  # closed, or an older kernel
         return SendPath(full, 0, False)
-    # A machine whose reader is slow still answers a probe of its full window: two unanswered are many.
+    # A machine with a slow reader still answers a probe of its full window. Two probes without an answer mean a loss.
     is_asked = fields.unacked_packets > 0 or fields.probes >= 2
     lost = is_asked and fields.last_ack_ms * 1000 >= SILENCE_US
     return SendPath(full or fields.unsent_bytes > 0, fields.acked_bytes, lost)
 
 
-# Whole messages out of a connection's bytes, and into them; the usual kind without detours. Shell (the library).
-# `websockets` reads and writes any frame. A message in one frame that arrives in one piece, or leaves unmasked, is by
-# far the most common, and then a frame's picture need not be copied four times.
+# Messages from the bytes of a connection, and back. Shell (the library).
+#
+# `websockets` reads and writes every kind of frame. Most messages arrive in one piece and one frame, or leave unmasked.
+# The direct path for them avoids four copies of each image.
 
 
 if TYPE_CHECKING:
@@ -131,7 +138,7 @@ _SHORT, _LONG = 126, 127
 
 
 class MessageReader:
-    """What arrived on one connection and was not taken yet."""
+    """Collects whole messages of one connection until the reader takes them."""
 
     def __init__(self, protocol: Protocol) -> None:
         from websockets.frames import Frame, Opcode
@@ -147,7 +154,7 @@ class MessageReader:
         self._messages = (Opcode.TEXT, Opcode.BINARY, Opcode.CONT)
 
     def feed(self, data: bytes) -> None:
-        """Take what arrived; the protocol may have something to say afterwards."""
+        """Take received bytes. Afterwards the protocol may have data to send."""
         if not self._is_masked and self._is_at_start() and (at := _start_of_only(data, self._bound())):
             self._put(data[at:], data[0] == _FIN | _TEXT)
             return
@@ -155,7 +162,7 @@ class MessageReader:
         self._collect(self._protocol.events_received())
 
     def _is_at_start(self) -> bool:
-        """Whether a frame begins here, and a message with it."""
+        """Return True if the next byte begins a frame and a message."""
         protocol = self._protocol
         return protocol.state is self._open and not protocol.reader.buffer and protocol.current_size is None
 
@@ -185,12 +192,12 @@ class MessageReader:
         try:
             self.ready.append(data.decode() if is_text else data)
         except UnicodeDecodeError as error:
-            self._is_broken = True  # what came with it was taken apart already
+            self._is_broken = True  # later messages of the same bytes are already parsed
             self._protocol.fail(1007, f"{error.reason} at position {error.start}")
 
 
 def _start_of_only(data: bytes, bound: int) -> int:
-    """Where the message begins if `data` is one whole unmasked message within `bound` and nothing else; 0 if not."""
+    """Return the start of the payload if `data` is exactly one unmasked message within `bound`, otherwise 0."""
     size = len(data)
     if size < 2 or data[0] not in (_FIN | _TEXT, _FIN | _BINARY) or data[1] & _MASK:
         return 0
@@ -200,31 +207,31 @@ def _start_of_only(data: bytes, bound: int) -> int:
 
 
 def unmasked_head(size: int, is_text: bool) -> bytes:
-    """What a server puts before a message of `size` bytes that it sends in one frame."""
+    """Return the frame header of a server for a message of `size` bytes in one frame."""
     first = _FIN | (_TEXT if is_text else _BINARY)
     if size < _SHORT:
         return bytes((first, size))
     return struct.pack("!BBH", first, _SHORT, size) if size < 1 << 16 else struct.pack("!BBQ", first, _LONG, size)
 
 
-# One WebSocket connection: a socket that never blocks, and the protocol of `websockets` on it. Shell (sockets).  One
-# thread reads and waits; any may send. Nothing is given to the socket that it cannot take at once, but for the end of
-# the message under way: so a slow reader is still heard, and what it is sent next can still be replaced by what is
-# newer.
+# The connection: a socket that never blocks, with the protocol of `websockets`. Shell (sockets).
+#
+# One thread reads and waits; any thread may send. A new message goes to the socket only if it has room. Otherwise it
+# waits in the queue of the peer, where a newer message can replace it, and the thread continues to read.
 
 
 CLOSE_S: Final = 1.0
 """Security limit: a connection that is closing is cut off after this."""
 _CHUNK_BYTES: Final = 65_536
-_SMALL_CHUNK_BYTES: Final = 4_096  # where only small messages are due: each of a flood's becomes an object first
-_MUCH_BYTES: Final = 32_768  # sent since the other end was last heard: so much may lie unread before our ping
-_MAX_UNSENT: Final = 12  # Security limit: pieces that wait for room, e.g. pongs, before reading stops
+_SMALL_CHUNK_BYTES: Final = 4_096  # for small messages: a flood of them must not become one large batch of objects
+_MUCH_BYTES: Final = 32_768  # sent since the last data from the other end: so much may wait unread before the ping
+_MAX_UNSENT: Final = 12  # security limit: waiting pieces, e.g. pongs, before reading stops
 _MAX_REASON_BYTES: Final = 123  # RFC 6455, 5.5
 _NOT_NOW: Final = (BlockingIOError, InterruptedError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
 
 class Connection:
-    """The connection. `lock` guards the protocol and what the socket has not taken yet."""
+    """One connection. `lock` guards the protocol and the data that the socket has not accepted yet."""
 
     def __init__(self, near: socket.socket, protocol: Protocol) -> None:
         from websockets.protocol import SERVER, State
@@ -234,9 +241,9 @@ class Connection:
         self.protocol = protocol
         self.lock = threading.Lock()
         self.granted: frozenset[tuple[str, ...]] | None = None
-        """(channel, source) of what the other end may publish; None for all. Set by who checked its token."""
+        """(channel, source) pairs that the other end may publish, None for all. Set with the check of its token."""
         self.heard_us = monotonic_us()
-        """When the other end was last heard."""
+        """Time of the last data from the other end."""
         self._unheard_bytes = 0
         self._near = near
         self._unsent: deque[bytes | memoryview] = deque()
@@ -253,7 +260,7 @@ class Connection:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Of the other end; empty if it is gone already."""
+        """Return address and port of the other end, empty if it is already gone."""
         try:
             name: tuple[str, int] = self._near.getpeername()[:2]
         except OSError:
@@ -263,7 +270,7 @@ class Connection:
     # --- reading: one thread ----------------------------------------------------------------------------------------
 
     def wait(self, timeout_s: float) -> None:
-        """Until there is something to read, room for what waits, or a bell; `timeout_s` at most."""
+        """Wait for data to read, room for waiting data, or a bell, for `timeout_s` at most."""
         events = select.POLLIN if len(self._unsent) < _MAX_UNSENT else 0
         if self._unsent or self._wants_room:
             events |= select.POLLOUT
@@ -280,9 +287,11 @@ class Connection:
                 self._wants_room = False
 
     def receive(self) -> list[Received]:
-        """Whole messages that have arrived, the handshake's among them.
+        """Return the messages that have arrived, including those of the handshake.
 
-        Raises ConnectionClosed or InvalidHandshake once the connection has ended.
+        Raises:
+            ConnectionClosed: the connection has ended.
+            InvalidHandshake: it ended during the handshake.
         """
         with self.lock:
             self._over = self._over or not self._read() or self._is_late()
@@ -296,7 +305,7 @@ class Connection:
         return ready
 
     def receive_one(self, deadline_s: float) -> Received:
-        """The next message, waited for. Raises TimeoutError at `deadline_s`, and what `receive` raises."""
+        """Wait for the next message. Raises TimeoutError at `deadline_s`, and the errors of `receive`."""
         ready = self.receive()
         while not ready:
             left_s = deadline_s - time.monotonic()
@@ -311,7 +320,7 @@ class Connection:
         return self._cut_off_s is not None and time.monotonic() > self._cut_off_s
 
     def _read(self) -> bool:
-        """Take one piece of what the socket has; False at the end."""
+        """Read one chunk from the socket. Returns False at its end."""
         if len(self._unsent) >= _MAX_UNSENT:
             return True
         try:
@@ -328,9 +337,13 @@ class Connection:
     # --- sending: any thread ------------------------------------------------------------------------------------------
 
     def fill(self, take: Callable[[], tuple[Sequence[bytes], bool] | None]) -> bool:
-        """Send what `take` gives, (pieces of a message, whether text), while there is room; False once there is none.
+        """Send messages while the socket has room. Call it with `lock` held.
 
-        With `lock` held. Without room `wait` also ends when there is some.
+        Args:
+            take: returns the next message as (pieces, True for text), or None.
+
+        Returns:
+            False without room. `wait` then also ends when there is room again.
         """
         has_room = self._has_room()
         while has_room:
@@ -346,40 +359,41 @@ class Connection:
         return False
 
     def send_text(self, text: str) -> None:
-        """Send a text, or as much of it as there is room for now and the rest later."""
+        """Send a text. The part without room follows later."""
         with self.lock:
             self._frame((text.encode("utf-8"),), True)
             self._flush()
 
     def ping(self) -> None:
-        """Ask for a sign of life, if there is room."""
+        """Send a ping, if the socket has room."""
         with self.lock:
             if self.protocol.state is self._open and self._has_room():
                 self.protocol.send_ping(b"")
                 self._flush()
 
     def close(self, code: int, reason: str) -> None:
-        """Begin to close, telling why; the reading thread sees the end of it, within `CLOSE_S`."""
+        """Begin to close with a reason. The reading thread ends within `CLOSE_S`."""
         with self.lock, suppress(OSError):
             if self.protocol.state is self._open:
                 self.protocol.send_close(code, _bounded(reason))
                 self._flush()
-            elif not self.protocol.close_expected():  # there are no words yet
+            elif not self.protocol.close_expected():  # before the handshake there is no close frame
                 self._near.shutdown(socket.SHUT_RDWR)
         self._ring()
 
     def flush(self) -> None:
-        """Send what the protocol has to say, e.g. a handshake."""
+        """Send the pending data of the protocol, e.g. a handshake."""
         with self.lock:
             self._flush()
 
     def send_path(self) -> SendPath:
-        """What is known of the way to the other end."""
+        """Return the state of the path to the other end."""
         holds = bool(self._unsent) or self._wants_room
         return send_path(self._near, holds or self._unheard_bytes >= _MUCH_BYTES)
 
     def linger(self) -> None:
-        """Discard what still comes until the connection has ended, so that the other end reads the reason."""
+        """Discard further data until the connection has ended."""
+        # A close with unread data sends a reset, and the other end would lose the reason.
         from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
         with suppress(ConnectionClosed, InvalidHandshake):
@@ -388,9 +402,9 @@ class Connection:
                 self.receive()
 
     def shut(self) -> None:
-        """Give back the sockets."""
+        """Close the sockets."""
         with self.lock:
-            self._is_shut = True  # whoever gets the descriptor's number next must not be polled
+            self._is_shut = True  # another socket may get the same descriptor number and must not be polled
             for end in (self._near, self._alarm, self._bell):
                 end.close()
 
@@ -407,7 +421,7 @@ class Connection:
         return not (self._unsent or self._wants_room or self._is_shut) and bool(self._room.poll(0))
 
     def _flush(self) -> None:
-        """Give the socket what it takes of what the protocol has to say."""
+        """Pass pending data of the protocol to the socket, as far as it has room."""
         self._unsent.extend(_joined(self.protocol.data_to_send()))
         if self._cut_off_s is None and self.protocol.close_expected():
             self._cut_off_s = time.monotonic() + CLOSE_S
@@ -420,7 +434,7 @@ class Connection:
             self._unsent.clear()
 
     def _send_some(self) -> bool:
-        """Whether the socket took all that it was given."""
+        """Send one batch. Returns True if the socket accepted all of it."""
         if not self._unsent[0]:  # the protocol's sign for the end
             self._near.shutdown(socket.SHUT_WR)
             self._unsent.popleft()
@@ -446,7 +460,7 @@ class Connection:
 
 
 def _joined(writes: Sequence[bytes]) -> list[bytes]:
-    """Few pieces of what may be many small ones; the end stays by itself."""
+    """Join small pieces into one. The empty piece, which marks the end, stays separate."""
     if len(writes) < 2:
         return list(writes)
     text = b"".join(writes)

@@ -1,9 +1,9 @@
-"""The sub-protocol `sightline.v1`: hello, framing of channel messages, and the codec of one peer. Pure.
+"""Implement the sub-protocol `sightline.v1`: hello, framing of messages, and the codec of one peer. Pure.
 
     uint16 BE length of the header block | header block | payload
 
-The header block is the message's header, a JSON object, with `"channel"` put in as its first field. A header that is no
-object with fields (most of all none) follows an object of its own: `{"channel":"twist","source":"guest"}`.
+The header block is the header of the message, a JSON object, with `"channel"` as its first field. An empty header, or
+one that is not an object with fields, follows a separate object: `{"channel":"twist","source":"guest"}`.
 """
 
 import json
@@ -22,9 +22,9 @@ from sightline.protocol.transports.link import Message
 
 SUBPROTOCOL: Final = "sightline.v1"
 MAX_BLOCK_BYTES: Final = MAX_HEADER_BYTES + 64
-"""Security limit: a header and the names in front of it."""
+"""Security limit: a header with the names before it."""
 MAX_HELLO_BYTES: Final = 1024
-"""Security limit: the text of a hello; also the least that a peer must be ready to receive as one message."""
+"""Security limit: the text of a hello. Every peer must accept a message of this size."""
 
 _LENGTH_BYTES: Final = 2
 _WITHOUT_SOURCE: Final = frozenset(name.encode("ascii") for name, row in CHANNELS.items() if not row.has_source)
@@ -33,23 +33,23 @@ _ALONE: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{
 
 
 class Hello(WireModel):
-    """Who a peer is and what it wants; the first message each way, as JSON text, sent again when `wants` changes."""
+    """Names a peer and the channels that it wants. It is the first message each way. A change of `wants` repeats it."""
 
     v: Version = VERSION
-    robot: RobotId = Field(description="the robot's id; of a peer that connects, the one that it means")
+    robot: RobotId = Field(description="the robot's id; from a connecting peer the robot that it requests")
     role: str = Field(
         default="",
         pattern=r"^([a-z][a-z0-9_]{0,15})?$",
-        description="`source` of what the sender sends towards the robot; empty or `robot` for a robot",
+        description="`source` of the sender's messages toward the robot; empty or `robot` for a robot",
     )
     session: SessionId = Field(description="the sender's start: 8 hex digits drawn at random")
     wants: tuple[Annotated[str, Field(max_length=32)], ...] = Field(
-        default=(), max_length=32, description="channels that the other end is to send; unknown names are ignored"
+        default=(), max_length=32, description="channels that the other end must send; unknown names are ignored"
     )
 
 
 class IncomingMessage(NamedTuple):
-    """What came off the wire; the key is made of what the peer claimed and is still to be checked."""
+    """A message from the wire. The key contains the claims of the peer and is not checked yet."""
 
     key: str
     header: bytes
@@ -62,12 +62,23 @@ def parse_hello(text: str) -> Hello:
 
 
 def pack(channel: Channel, source: str, role: str, header: bytes, payload: bytes) -> bytes:
-    """One binary message from a peer whose hello said `role`."""
+    """Pack a message.
+
+    Args:
+        channel: the channel.
+        source: source of the message, or "" from a robot.
+        role: role in the hello of this end. The header block omits an equal source.
+        header: encoded header, may be empty.
+        payload: encoded payload.
+
+    Returns:
+        One binary WebSocket message.
+    """
     return b"".join(pack_pieces(channel, source, role, header, payload))
 
 
 def pack_pieces(channel: Channel, source: str, role: str, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
-    """The same in two pieces, the second being `payload` itself: a picture need not be copied."""
+    """Pack a message in two pieces. The second is `payload` itself, which avoids a copy of the image."""
     if header[:2] == b'{"' and source in ("", role):
         block = b'{"channel":"%b",%b' % (channel.name.encode("ascii"), header[1:])
     else:
@@ -77,9 +88,15 @@ def pack_pieces(channel: Channel, source: str, role: str, header: bytes, payload
 
 
 def unpack(message: bytes, robot: str, role: str) -> IncomingMessage:
-    """Take a binary message of a peer apart; `robot` and `role` are those of its hello.
+    """Unpack a binary message of a peer.
 
-    The source of a message is its header's, else that of the hello. Raises WireError MALFORMED for broken framing.
+    Args:
+        message: one binary WebSocket message.
+        robot: robot id of its hello.
+        role: role of its hello, the source of a message whose header names none.
+
+    Raises:
+        WireError: MALFORMED for broken framing.
     """
     size = int.from_bytes(message[:_LENGTH_BYTES])
     if len(message) < _LENGTH_BYTES + size or size > MAX_BLOCK_BYTES:
@@ -90,19 +107,19 @@ def unpack(message: bytes, robot: str, role: str) -> IncomingMessage:
         source = role if alone[2] is None else alone[2].decode("utf-8", "replace")
         return IncomingMessage(_key(robot, alone[1].decode("utf-8", "replace"), source), block[alone.end() :], payload)
     first = _FIRST.match(block)
-    if first is not None and first[1] in _WITHOUT_SOURCE:  # most bytes of a link: no need to look any further
+    if first is not None and first[1] in _WITHOUT_SOURCE:  # frames, the most bytes of a link, need no JSON parser here
         return IncomingMessage(_key(robot, first[1].decode("ascii"), ""), b"{" + block[first.end() :], payload)
     fields = _fields(block)
     name = fields.get("channel") if first is None else first[1].decode("utf-8", "replace")
     if not isinstance(name, str):
-        raise WireError(RejectReason.MALFORMED, "the header block is no JSON object that names its channel")
+        raise WireError(RejectReason.MALFORMED, "the header block is not a JSON object with a channel")
     source = fields.get("source", role)
     header = block if first is None else b"{" + block[first.end() :]
     return IncomingMessage(_key(robot, name, source if isinstance(source, str) else ""), header, payload)
 
 
 def _fields(block: bytes) -> dict[str, Any]:
-    """The block as an object; empty for what is none, which who decodes the header will refuse with a reason."""
+    """Parse the block as an object. Returns {} for other data, which the decoder of the header then rejects."""
     try:
         fields = json.loads(block)
     except (ValueError, RecursionError):
@@ -116,20 +133,22 @@ def _key(robot: str, name: str, source: str) -> str:
     return f"{KEY_PREFIX}/{robot}/{name}{tail}"
 
 
-# What is said to one WebSocket peer: what a dialect is, and `sightline.v1`. Pure.  A dialect turns publications into
-# messages and messages into packets; whose turn it is and the socket are not its own.
+# The codec of one WebSocket peer: the interface, and `sightline.v1`. Pure.
+#
+# A codec converts publications to messages, and messages to packets. It knows neither the order of sending nor the
+# socket.
 
 
 BAD_HELLO: Final = "BAD_HELLO"
-"""Counted for a first message, or a later text, that is no hello."""
+"""Counted for a first message, or a later text, that is not a hello."""
 OTHER_ROBOT: Final = "OTHER_ROBOT"
 """Counted for a hello that names another robot."""
 BAD_FRAMING: Final = "BAD_FRAMING"
-"""Counted for a message of the wrong kind, or one that cannot be taken apart."""
+"""Counted for a message of the wrong kind, or with broken framing."""
 
 
 class PeerError(Exception):
-    """A peer must be dropped: `code` and the text are its close code and reason, `counted` is what it counts as."""
+    """A peer must be dropped. `code` and the text are the close code and reason, `counted` is the counter."""
 
     def __init__(self, counted: str, code: int, reason: str) -> None:
         super().__init__(reason)
@@ -138,55 +157,60 @@ class PeerError(Exception):
 
 
 class PeerCodec(Protocol):
-    """One peer's way of speaking."""
+    """Encodes and decodes the messages of one peer."""
 
     text: bool
-    """Whether `write` gives text."""
+    """True if `write` returns text."""
 
     @property
     def wants(self) -> tuple[str, ...]:
-        """Channels that the peer said it wants; of a dialect without words for it none."""
+        """Return the channels that the peer requested. Always empty in the legacy protocol."""
         ...
 
     def subscribes_to(self, channel: Channel) -> bool:
-        """Whether the peer wants `channel`."""
+        """Return True if the peer wants `channel`."""
         ...
 
     @property
     def form(self) -> Hashable:
-        """Equal for peers that are sent the same bytes."""
+        """Return a value that is equal for peers that receive the same bytes."""
         ...
 
     def write(self, message: Message) -> tuple[bytes, ...]:
-        """A publication as one message of the transport, in as many pieces as it is made of."""
+        """Encode a publication as one message, in one or more pieces."""
         ...
 
     def note_sent(self, message: Message) -> None:
-        """Take note that this peer is now being sent `message`."""
+        """Note that `message` is being sent to this peer."""
         ...
 
     def note_gone(self) -> None:
-        """Take note that the connection has ended."""
+        """Note that the connection has ended."""
         ...
 
     def read(self, message: str | bytes) -> list[IncomingMessage]:
-        """What a message says, oldest first. Raises PeerError to drop the peer, WireError to drop just the message."""
+        """Decode a message into packets, oldest first.
+
+        Raises:
+            PeerError: the peer must be dropped.
+            WireError: only the message must be dropped.
+        """
         ...
 
     def bound(self, wanted_bytes: int, /) -> int:
-        """Security limit on a message from the peer in bytes; `wanted_bytes` is the largest payload this end wants."""
+        """Return the security limit for one message, in bytes. `wanted_bytes` is the largest payload of this end."""
         ...
 
 
 class SightlineV1:
-    """`sightline.v1` with a peer of `robot`; `role` is this end's own. Until it says hello, the peer wants nothing."""
+    """Speaks `sightline.v1` with a peer of `robot`. `role` is the local one. A peer wants nothing until its hello."""
 
     text = False
 
     def __init__(self, robot: str, role: str) -> None:
         self._robot, self._role = robot, role
         self.peer_role = ""
-        """As its hello says."""
+        """Role in the hello of the peer."""
         self.wants: tuple[str, ...] = ()
 
     @property
@@ -218,11 +242,11 @@ class SightlineV1:
         return max(MAX_HELLO_BYTES, 2 + MAX_BLOCK_BYTES + wanted_bytes)
 
     def accept(self, text: str) -> None:
-        """Take the peer's hello. Raises PeerError, whose text a person can read, for none or another robot's."""
+        """Take the hello of the peer. Raises PeerError for an invalid one, and for another robot."""
         try:
             hello = parse_hello(text)
         except WireError as error:
-            raise PeerError(BAD_HELLO, 1008, f"this text is no hello: {error.detail}") from None
+            raise PeerError(BAD_HELLO, 1008, f"invalid hello: {error.detail}") from None
         if hello.robot != self._robot:
             raise PeerError(OTHER_ROBOT, 1008, f"this is robot {self._robot}, not {hello.robot}")
         self.peer_role, self.wants = hello.role, hello.wants

@@ -1,6 +1,6 @@
-"""The legacy text protocol as a peer codec, at either end, and the one slot of its driver. Pure.
+"""Implement the legacy protocol as a peer codec, at both ends, with the one slot of its driver. Pure.
 
-They all are the same `guest` to the robot, which so cannot tell two that contradict each other from one.
+All its clients are the same `guest` to the robot. Without the slot, the robot would mix the commands of two clients.
 """
 
 from collections.abc import Callable, Hashable
@@ -26,40 +26,40 @@ from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING, IncomingMessage, PeerError
 
 DRIVER_SLOT_US: Final = 1_000_000
-"""A driver that has said nothing valid for so long has left its slot; as long as the robot's own lease."""
+"""Time without a valid command after which a driver loses the slot. Equal to the robot's lease."""
 
 
 class DriverSlot:
-    """The one slot of a link."""
+    """The slot of the one driver of a link."""
 
     def __init__(self) -> None:
         self._driver = ""
         self._until_us = 0
 
     def claim(self, who: str, now_us: int) -> str:
-        """Who drives after `who` said something valid: `who` itself if the slot was its own, or free."""
+        """Claim the slot for `who` after a valid command. Returns the driver, which is `who` if the slot was free."""
         if who == self._driver or now_us >= self._until_us:
             self._driver, self._until_us = who, now_us + DRIVER_SLOT_US
         return self._driver
 
     def leave(self, who: str) -> None:
-        """`who` is gone."""
+        """Free the slot when `who` is gone."""
         if who == self._driver:
             self._driver, self._until_us = "", 0
 
 
-# The older text dialect from either end of a WebSocket; who speaks it has no header, token or session. Pure.
+# The legacy protocol at both ends of a WebSocket. Its clients have no header, token or session. Pure.
 
 
 GUEST: Final = "guest"
 GUEST_SESSION: Final = "00000000"
-"""The session of everybody who speaks without headers."""
+"""The session of all clients without headers."""
 MAX_COMMAND_TEXT_BYTES: Final = 256
-"""Security limit: a text towards a robot; a twist over its own 64 bytes is still counted, not a reason to hang up."""
+"""Security limit: a text toward a robot. A twist above 64 bytes is counted, and does not close the connection."""
 
 
 class LegacyClient(NamedTuple):
-    """Who speaks the older dialect with a robot, the slot it shares with others, and where lines for the log go."""
+    """A client of the legacy protocol, with the slot that it shares with others, and the writer of log lines."""
 
     who: str
     driver_slot: DriverSlot
@@ -67,17 +67,17 @@ class LegacyClient(NamedTuple):
 
 
 class LegacyToVision:
-    """The robot's end of the older dialect: pictures out as base64, `linear|angular` in, as source `guest`.
+    """The robot's end of the legacy protocol: base64 images out, `linear|angular` in, as source `guest`.
 
-    Such a peer cannot acknowledge. Each of its answers is also taken as the answer to the newest picture it was sent,
-    so that it gets pictures at the rate of its own answers.
+    Such a peer cannot acknowledge. Each of its answers also counts as the answer to the newest image that it received,
+    so that it receives images at the rate of its own answers.
     """
 
     text = True
     wants: tuple[str, ...] = ()
 
     def __init__(self, robot: str, options: LegacyOptions, now_us: Callable[[], int], client: LegacyClient) -> None:
-        """`now_us` reads a monotonic clock."""
+        """Create the codec. `now_us` reads a monotonic clock."""
         self._robot, self._options, self._now_us = robot, options, now_us
         self._who, self._driver_slot, self._tell = client
         self._told = ""
@@ -97,12 +97,13 @@ class LegacyToVision:
 
     def note_sent(self, message: Message) -> None:
         self._sent = message.header, self._now_us()
-        if self._looked_at is None:  # of several it may have looked at, the oldest: never younger than the truth
+        # The peer may have examined any image since its last answer. The oldest one never makes the answer too young.
+        if self._looked_at is None:
             self._looked_at = message.header, message.payload
 
     def read(self, message: str | bytes) -> list[IncomingMessage]:
         if isinstance(message, bytes):
-            raise PeerError(BAD_FRAMING, 1003, "binary message; this port speaks text: linear|angular")
+            raise PeerError(BAD_FRAMING, 1003, "binary message; this port expects text: linear|angular")
         text = message.encode("utf-8", "surrogatepass")
         if self._options.boxes and (b"," in text or not text):
             return [self._detections(text), *self._acknowledgement()]
@@ -112,11 +113,11 @@ class LegacyToVision:
         return MAX_BOXES_BYTES if self._options.boxes else MAX_COMMAND_TEXT_BYTES
 
     def note_gone(self) -> None:
-        """The client is gone: another may drive."""
+        """Free the slot, so that another client may drive."""
         self._driver_slot.leave(self._who)
 
     def _twist(self, text: bytes) -> IncomingMessage:
-        """What is no twist stays as it is: the robot refuses it, and says why in `status`."""
+        """Convert a twist. Other text stays unchanged: the robot rejects it, and shows the reason in `status`."""
         try:
             twist = parse_dashed(text, self._options.swapped) if self._options.dashed else parse_twist(text)
         except WireError:
@@ -126,7 +127,7 @@ class LegacyToVision:
         return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", barred)
 
     def _claim_driver_slot(self) -> None:
-        """Raise WireError, told once for each driver, if another client drives."""
+        """Raise WireError if another client drives. Each new driver is logged once."""
         driver = self._driver_slot.claim(self._who, self._now_us())
         if driver != self._told:
             self._told = driver
@@ -137,7 +138,7 @@ class LegacyToVision:
     def _detections(self, text: bytes) -> IncomingMessage:
         looked_at, self._looked_at = self._looked_at, None
         if looked_at is None:
-            raise WireError(RejectReason.UNKNOWN_FRAME, "boxes without a picture to look at")
+            raise WireError(RejectReason.UNKNOWN_FRAME, "boxes without an image")
         found = detections_from_boxes(parse_boxes(text), read_jpeg_size(looked_at[1]))
         self._answers += 1
         echo = _echo(looked_at[0])
@@ -150,14 +151,15 @@ class LegacyToVision:
         if sent is None or echo is None:  # there is no credit to return
             return []
         self._answers += 1
-        # How much of the time was computing is unknown; called computing, none of it widens the window.
+        # The share of computing in the answer time is unknown. All of it counts as computing, so that the congestion
+        # window does not widen for a slow peer.
         spent_us = max(0, self._now_us() - sent[1])
         answer = AnswerHeader(source=GUEST, session=GUEST_SESSION, seq=self._answers, echo=echo, compute_us=spent_us)
         return [IncomingMessage(key_for(self._robot, ACK, GUEST), encode(answer), b"")]
 
 
 def _echo(header: bytes) -> Echo | None:
-    """Names the frame of `header`; None for one published without."""
+    """Cite the frame of `header`. Returns None for a frame without a header."""
     try:
         frame = decode(FrameHeader, header)
     except WireError:
@@ -166,10 +168,10 @@ def _echo(header: bytes) -> Echo | None:
 
 
 class LegacyToRobot:
-    """Vision's end of the older dialect: base64 text in as frames, twists out as bare text.
+    """The vision service's end of the legacy protocol: base64 text in as frames, twists out as bare text.
 
-    The header of a frame is made up here: the session stands for this connection, `t_us` is the time of arrival on
-    this machine's clock, and what the robot did is not known.
+    The codec creates the header of a frame. Its session stands for this connection, and `t_us` is the arrival time on
+    the clock of this machine. The motion of the robot is unknown.
     """
 
     text = True
@@ -178,7 +180,7 @@ class LegacyToRobot:
     def __init__(
         self, robot: str, options: LegacyOptions, now_us: Callable[[], int], session: str, max_frame_bytes: int
     ) -> None:
-        """`session` is 8 hex digits, new for each connection; `now_us` reads a monotonic clock."""
+        """Create the codec. `session` is 8 hex digits, new for each connection. `now_us` reads a monotonic clock."""
         self._robot, self._options, self._now_us = robot, options, now_us
         self._session, self._max_frame_bytes = session, max_frame_bytes
         self._seq = 0
@@ -205,7 +207,7 @@ class LegacyToRobot:
 
     def read(self, message: str | bytes) -> list[IncomingMessage]:
         if isinstance(message, bytes):
-            raise PeerError(BAD_FRAMING, 1003, "binary message; the older dialect is text: base64 pictures")
+            raise PeerError(BAD_FRAMING, 1003, "binary message; the legacy protocol is text: base64 images")
         jpeg = decode_picture(message.encode("utf-8", "surrogatepass"), self._max_frame_bytes)
         self._seq += 1
         self._last_us = max(self._now_us(), self._last_us + 1)

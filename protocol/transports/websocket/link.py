@@ -1,6 +1,6 @@
-"""`WebSocketLink`: subscriptions and peers behind the `Link` interface. Shell.
+"""Implement `Link` on WebSocket: subscriptions, peers, and what a listening end passes on. Shell.
 
-That is what it subscribed to; and where all connect, what is said only while watched, as long as one of them watches.
+A link announces the channels that it subscribed to. A listening end also announces overlays while a peer watches them.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ _WATCHED = tuple(one for one in CHANNELS.values() if one.while_watched)
 
 
 class Subscriber(Protocol):
-    """Another end."""
+    """A peer that receives the announcements of this end."""
 
     def subscribes_to(self, channel: Channel) -> bool:
-        """Whether it wants `channel`."""
+        """Return True if the peer wants `channel`."""
         ...
 
     def limit(self, wanted_bytes: int) -> None:
-        """Accept no larger messages than what is wanted makes necessary."""
+        """Limit incoming messages to the largest payload that this end wants."""
         ...
 
     def tell(self, hello: str) -> None:
-        """Say it who this end is and what it wants."""
+        """Send the hello of this end."""
         ...
 
 
 class Subscriptions:
-    """The wants of one link. `announced` is what its peers know of them."""
+    """The subscriptions of one link. `announced` is the list that its peers have received."""
 
     def __init__(self, rules: LinkRules, session: str) -> None:
         self._rules, self._session = rules, session
@@ -59,33 +59,34 @@ class Subscriptions:
         self.announced: tuple[str, ...] = ()
 
     def add(self, channel: Channel, callback: Callback) -> None:
-        """One more that is called for `channel`."""
+        """Add a callback of `channel`."""
         self._callbacks.setdefault(channel.name, []).append(callback)
 
     def drop(self, channel: Channel) -> None:
-        """Nobody is called for `channel` any more."""
+        """Remove all callbacks of `channel`."""
         self._callbacks.pop(channel.name, None)
 
     def of(self, channel: Channel) -> tuple[Callback, ...]:
-        """Who is called for `channel`."""
+        """Return the callbacks of `channel`."""
         return tuple(self._callbacks.get(channel.name, ()))
 
     def hello(self) -> str:
-        """The hello that says what was announced last."""
+        """Return the hello with the newest announcement."""
         about = Hello(robot=self._rules.robot, role=self._rules.role, session=self._session, wants=self.announced)
         return encode(about).decode("utf-8")
 
     def bound(self) -> int:
-        """The largest payload of what was announced last, in bytes."""
+        """Return the largest payload of all announced channels, in bytes."""
         return max((self._rules.payload_bound(CHANNELS[name]) for name in self.announced), default=0)
 
     def tell(self, peer: Subscriber) -> None:
-        """Announce to one peer what the others know."""
+        """Send the newest announcement to one peer."""
         peer.limit(self.bound())
         peer.tell(self.hello())
 
     def announce(self, peers: Sequence[Subscriber], passing_on: bool) -> None:
-        """Tell all `peers` what is wanted now, if it changed. `passing_on`: what one says is for the others too."""
+        """Announce a changed list of channels to all `peers`. `passing_on` is True at a listening end."""
+        # A listening end subscribes to an overlay only while another peer wants it. It saves the encoding otherwise.
         watched = (one.name for one in _WATCHED if passing_on and any(peer.subscribes_to(one) for peer in peers))
         names = tuple(dict.fromkeys((*self._callbacks, *watched)))
         if names != self.announced:
@@ -94,10 +95,12 @@ class Subscriptions:
                 self.tell(peer)
 
 
-# WebSocket as a `Link`: `sightline.v1`, or the older text dialect, with threads; newest-only per peer. Shell.
-# with open_websocket("r1", listen="ws://127.0.0.1:9090") as link:         link.publish(STATUS, header, payload)  Only
-# what the table of channels calls passed on goes from peer to peer: who listens speaks with each who connects, and
-# they do not hear one another.
+# WebSocket as a `Link`: `sightline.v1` or the legacy protocol, with threads, newest-only per peer. Shell.
+#
+#     with open_websocket("r1", listen="ws://127.0.0.1:9090") as link:
+#         link.publish(STATUS, header, payload)
+#
+# Only the channels that the table marks as passed on go from peer to peer.
 
 
 CLOSE_S: Final = 1.5
@@ -116,17 +119,25 @@ def open_websocket(
 ) -> WebSocketLink:
     """Open a link to `robot`; use it in a `with`.
 
-    Endpoints are `ws://host:port`, `wss://` and `ws-legacy://` (`sightline.protocol.transports.endpoints`). Who listens
-    reaches `connect` in the background; a lost connection is made again by itself. `role` is the default source of what
-    is published towards the robot. `secure` is a folder of tokens and certificates (`security.py`, `tls.py`).
-    Raises ConfigError for a robot id, endpoint, limit or folder that is none, for an endpoint open to anybody, and for
-    a missing `websockets`; LinkError for a port in use, if nobody answers within `timeout_s`, or if who answers will
-    not speak.
+    A listening end connects to `connect` in the background. A lost connection is restored automatically.
+
+    Args:
+        robot: robot id.
+        listen: `ws://host:port`, `wss://` or `ws-legacy://`, see `sightline.protocol.transports.endpoints`.
+        connect: endpoints to connect to.
+        role: default source of messages toward the robot.
+        timeout_s: longest wait for the first answer, if there are only endpoints to connect to.
+        max_frame_bytes: security limit for the payload of a frame.
+        secure: folder of tokens and certificates, or "".
+
+    Raises:
+        ConfigError: an argument is invalid, an endpoint accepts every client, or `websockets` is missing.
+        LinkError: a port is in use, no peer answers in time, or the peer rejects this end.
     """
     rules = LinkRules(robot, role, max_frame_bytes)
     near, far = [[parse_websocket_endpoint(text) for text in _listed(ends)] for ends in (listen, connect)]
     if not near and not far:
-        raise ConfigError("no endpoint: give one to listen on (--listen) or to connect to (--connect)")
+        raise ConfigError("no endpoint; pass one to listen on (--listen) or to connect to (--connect)")
     try:
         import websockets  # noqa: F401
     except ImportError:
@@ -147,13 +158,13 @@ def _listed(ends: str | Sequence[str]) -> Sequence[str]:
 
 
 class WebSocketLink(BaseLink):
-    """A `Link` over any number of WebSocket connections. A link does not hear what it publishes itself."""
+    """A `Link` over any number of WebSocket connections. It does not receive its own publications."""
 
     def __init__(self, rules: LinkRules) -> None:
-        """Made by `open_websocket`."""
+        """Use `open_websocket` in place of this constructor."""
         super().__init__(rules)
         self._subscriptions = Subscriptions(rules, secrets.token_hex(4))
-        # Who drives comes first. Replaced, never changed, so that publishing needs no lock.
+        # The driver comes first. The tuple is replaced and never changed, so that publishing needs no lock.
         self._peers: tuple[Peer, ...] = ()
         self._joining = threading.Lock()
         self._joined = threading.Event()
@@ -166,16 +177,16 @@ class WebSocketLink(BaseLink):
 
     @property
     def dropped(self) -> Counter[str]:
-        """As `Link`."""
+        """Return the publications that newer ones replaced, by channel, including those of former peers."""
         return sum((peer.queue.dropped for peer in self._peers), self._dropped)
 
     @property
     def connected(self) -> bool:
-        """Whether at least one peer is connected; never blocks. A silent peer counts for two seconds."""
+        """Return True if at least one peer is connected. Never blocks. A silent peer counts for two seconds."""
         return not self._closed and bool(self._peers)
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """As `Link`."""
+        """Send a message to every peer that wants it, see `Link`."""
         self._rules.check(channel, header, payload)
         key = self._rules.key(channel, source)
         if not self.connected:
@@ -186,7 +197,7 @@ class WebSocketLink(BaseLink):
         return True
 
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
-        """Call `callback`, on a peer's thread, for every message with the exact key and within bounds."""
+        """Call `callback` on the thread of a peer for every message with the exact key and within bounds."""
         with self._joining:
             self._subscriptions.add(channel, callback)
             self._announce()
@@ -198,11 +209,11 @@ class WebSocketLink(BaseLink):
             self._announce()
 
     def has_listener(self, channel: Channel) -> bool:
-        """Whether a peer said that it wants `channel`; never blocks on the network."""
+        """Return True if a peer requested `channel`. Never blocks on the network."""
         return self.connected and any(peer.subscribes_to(channel) for peer in self._peers)
 
     def close(self) -> None:
-        """Tell the peers and end it; idempotent, over within two seconds, safe even inside a callback."""
+        """Close with a reason for the peers. Idempotent, returns within two seconds, safe inside a callback."""
         with self._joining:
             if self._closed:
                 return
@@ -215,13 +226,14 @@ class WebSocketLink(BaseLink):
         for listener in self._listeners:
             listener.close(reason)
         deadline_s = time.monotonic() + CLOSE_S
-        for peer in () if getattr(self._in_callback, "now", False) else peers:  # a callback's own peer waits for it
+        # The peer that runs a callback waits for its end, so that callback must not wait for the peer.
+        for peer in () if getattr(self._in_callback, "now", False) else peers:
             peer.wait_gone(max(0.0, deadline_s - time.monotonic()))
 
     # --- opening -------------------------------------------------------------------------------------------------
 
     def open(self, near: Sequence[WebSocketEndpoint], far: Sequence[WebSocketEndpoint], secure: str) -> None:
-        """Listen on `near` and begin to connect to `far`. Raises what `open_websocket` does."""
+        """Listen on `near` and begin to connect to `far`. Raises the errors of `open_websocket`."""
         refuse, keys = self._rules.reject, KeyFolder(secure, self._rules.role)
         for end in near:
             self._listeners.append(Server(end, partial(self._serve, end), refuse, self._tell, keys))
@@ -229,23 +241,30 @@ class WebSocketLink(BaseLink):
             self._dialers.append(Dialer(end, partial(self._serve, end), refuse, keys))
 
     def wait_connected(self, timeout_s: float) -> None:
-        """Wait for the first peer. Raises LinkError with the reason if there is none."""
+        """Wait for the first peer. Raises LinkError with the cause after `timeout_s`."""
         deadline_s = time.monotonic() + timeout_s
         while not self._joined.wait(0.01):
             late = time.monotonic() > deadline_s
             for dialer in self._dialers:
                 if dialer.trouble and (late or dialer.turned_away.is_set()):
-                    raise LinkError(f"{dialer.endpoint.text} refused: {dialer.trouble}")
+                    raise LinkError(f"cannot connect to {dialer.endpoint.text}: {dialer.trouble}")
             if late:
                 where = " or ".join(dialer.endpoint.text for dialer in self._dialers)
-                raise LinkError(f"nobody answers at {where}; is the robot running? tried for {timeout_s:g} s")
+                raise LinkError(f"no answer from {where} after {timeout_s:g} s; start the robot or check the address")
 
-    # --- peers, on threads of their own ------------------------------------------------------------------------------
+    # --- peers, each on a separate thread ----------------------------------------------------------------------------
 
     def _serve(self, end: WebSocketEndpoint, wire: Connection, settle: Promote | None = None) -> None:
-        """Speak with one peer until it is gone; `settle` gives it a place where this end listens.
+        """Serve one peer until it is gone.
 
-        Raises PeerError or ConnectionClosed if it says no proper hello.
+        Args:
+            end: endpoint of the connection.
+            wire: the connection.
+            settle: assigns a client place at a listening end, or None at a connecting end.
+
+        Raises:
+            PeerError: the hello is invalid, or no place is free.
+            ConnectionClosed: the peer closed before its hello.
         """
         dialect = self._dialect(end, settle is not None, "{}:{}".format(*wire.address))
         with self._joining:
@@ -282,21 +301,21 @@ class WebSocketLink(BaseLink):
             self._announce()
 
     def _on_change(self) -> None:
-        """A peer wants something else now, which may be what another says only while it is watched."""
+        """Announce again after a peer changed its wants, which can start or stop an overlay of another peer."""
         with self._joining:
             self._announce()
 
     def _announce(self) -> None:
-        """With the lock held."""
+        """Announce the current list. Call it with the lock held."""
         self._subscriptions.announce(self._peers, bool(self._listeners))
 
     def _put_first(self, peer: Peer) -> None:
-        """Who drives is sent everything before those who watch."""
+        """Move the driver to the front, so that it receives each message before the viewers."""
         with self._joining:
             self._peers = (peer, *(other for other in self._peers if other is not peer))
 
     def _pass_on(self, sender: Peer, message: Message) -> None:
-        """Where all connect, what one has found is for the others too."""
+        """Pass a message of one peer to the others, because they connect only to this end."""
         post = Publication(message)
         for peer in self._peers:
             if peer is not sender:

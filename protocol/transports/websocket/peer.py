@@ -1,4 +1,4 @@
-"""One connected peer: its queue of newest messages, STOP first, and the thread that reads. Shell."""
+"""Serve one connected peer: its queue of newest messages, STOP first, and the thread that reads. Shell."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
 
 
 class WireFormat(Protocol):
-    """How a message is written for one kind of peer."""
+    """Writes messages for one kind of peer."""
 
     @property
     def form(self) -> Hashable:
-        """Equal for peers that are sent the same bytes."""
+        """Return a value that is equal for peers that receive the same bytes."""
         ...
 
     def write(self, message: Message) -> tuple[bytes, ...]:
-        """The message as those bytes, in as many pieces as it is made of."""
+        """Encode the message, in one or more pieces."""
         ...
 
 
 class Publication:
-    """One publication, written at most once for all peers that are sent the same bytes."""
+    """One publication, encoded once for all peers that receive the same bytes."""
 
     __slots__ = ("_written", "message")
 
@@ -49,40 +49,42 @@ class Publication:
         self._written: dict[Hashable, tuple[bytes, ...]] = {}
 
     def written(self, dialect: WireFormat) -> tuple[bytes, ...]:
-        """The bytes for a peer of `dialect`. Two threads may both write; they write the same."""
+        """Return the bytes for a peer of `dialect`."""
+        # Without a lock: two threads may both encode, with the same result.
         data = self._written.get(dialect.form)
         if data is None:
             data = self._written[dialect.form] = dialect.write(self.message)
         return data
 
 
-# One WebSocket peer: what waits for it is sent by whoever has something new; a thread of its own reads. Shell.
+# One WebSocket peer. The thread that publishes also sends; a separate thread reads. Shell.
 
 
 OPEN_S: Final = 2.0
-"""Security limit: for connecting and the handshake, and once more for the hello."""
+"""Security limit for the handshake, and again for the hello."""
 _LIBRARY_LOG: Final = logging.getLogger("websockets.sightline")
-_LIBRARY_LOG.setLevel(logging.CRITICAL + 1)  # it has lines for every connection, which is what a flood is made of
+# The library writes lines for every connection. A flood of connections must not become a flood of lines.
+_LIBRARY_LOG.setLevel(logging.CRITICAL + 1)
 PROTOCOL_OPTIONS: Final[dict[str, Any]] = {"extensions": None, "logger": _LIBRARY_LOG}
-"""No compression: pictures do not shrink, and trying costs three times the CPU."""
+"""No compression: it does not reduce JPEG images, and costs three times the CPU time."""
 SILENT: Final = "SILENT"
-"""Counted for a peer that left a ping unanswered, or took nothing for long."""
+"""Counted for a peer that did not answer a ping, or did not read for a long time."""
 
 NOT_GRANTED: Final = "NOT_GRANTED"
-"""Counted for a message that the role of the sender's token may not publish."""
+"""Counted for a message that the role of the sender's token does not permit."""
 
 Promote = Callable[[str], None]
-"""Gives a client of that role a place; raises PeerError if there is none."""
+"""Assigns a place to a client of that role. Raises PeerError without a free place."""
 
-_TICK_US: Final = 250_000  # how late a ping may be, and silence be noticed
+_TICK_US: Final = 250_000  # longest delay of a ping and of the detection of silence
 _COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE}
 
 
 class Peer:
-    """An open connection whose other end is known, and the dialect that it speaks."""
+    """An open connection to a known peer, with its codec."""
 
     def __init__(self, wire: Connection, dialect: PeerCodec, on_change: Callable[[], None] = lambda: None) -> None:
-        """`on_change` is called on the reading thread when the peer says that it wants something else."""
+        """Create a peer. The reading thread calls `on_change` when the peer changes its wants."""
         self.queue: OutgoingQueue[Publication | str] = OutgoingQueue()
         self._on_change = on_change
         self._wire, self._dialect = wire, dialect
@@ -91,41 +93,41 @@ class Peer:
         self._look_us = 0
 
     def subscribes_to(self, channel: Channel) -> bool:
-        """Whether the peer wants `channel`."""
+        """Return True if the peer wants `channel`."""
         return self._dialect.subscribes_to(channel)
 
     def admits(self, key: str, refuse: Callable[[str], None], tell: Callable[[str], None]) -> bool:
-        """Whether its token lets it publish on `key`; if not, that is counted and logged."""
+        """Return True if the token of the peer permits `key`. Otherwise count and log the rejection."""
         said = tuple(key.split("/")[2:])
         if self._wire.granted is None or said in self._wire.granted:
             return True
         refuse(NOT_GRANTED)
-        if said[0] != ACK.name:  # a viewer that acknowledges
+        if said[0] != ACK.name:  # a viewer that acknowledges is harmless, and would fill the log
             who = self._wire.address[0] or "a client"
             tell(f"rejected {'/'.join(said)} from {who}: the role of its token does not permit it "
                  "(docs/how-to/secure-the-link.md)")
         return False
 
     def offer(self, post: Publication) -> None:
-        """Send it if the peer wants it, now or when there is room and nothing newer; never blocks."""
+        """Send a publication if the peer wants it, now or later. A newer one replaces it. Never blocks."""
         if self._dialect.subscribes_to(post.message.channel):
             self.queue.put(post.message, post)
             self._send()
 
     def tell(self, hello: str) -> None:
-        """Say who this end is and what it wants now, in a dialect that has words for it."""
+        """Send the hello of this end, except in the legacy protocol."""
         if isinstance(self._dialect, SightlineV1):
             self.queue.put_first(hello)
             self._send()
 
     def limit(self, wanted_bytes: int) -> None:
-        """Accept no larger messages than what this end wants makes necessary."""
+        """Limit incoming messages to the largest payload that this end wants."""
         with self._wire.lock:
             self._wire.protocol.max_message_size = self._dialect.bound(wanted_bytes)
-        self._send()  # whoever found the lock taken left it to this thread
+        self._send()  # a thread that found the lock taken left its message to this one
 
     def run(self, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> None:
-        """Read until the connection ends; a peer that breaks the rules is dropped and told why."""
+        """Read until the connection ends. A peer that breaks the rules is closed with the reason."""
         from websockets.exceptions import ConnectionClosed
 
         keepalive = Keepalive(monotonic_us())
@@ -147,11 +149,11 @@ class Peer:
     def _turn(
         self, keepalive: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]
     ) -> bool:
-        """Read what there is, and send; False if the other end is to be given up."""
-        now_us = monotonic_us()  # before reading: however long this end stood still, what came meanwhile counts
+        """Read all available messages, and send. Returns False if the connection has to end."""
+        now_us = monotonic_us()  # before reading, so that data counts that arrived during a pause of this process
         for message in self._wire.receive():
             self._read(message, deliver, refuse)
-        if now_us < self._look_us:  # whoever was given a message waits for this thread to rest
+        if now_us < self._look_us:  # the receiver of a message runs only when this thread waits
             self._send()
             return True
         self._look_us = now_us + _TICK_US
@@ -176,16 +178,17 @@ class Peer:
             deliver(self, packet)
 
     def close(self, reason: str) -> None:
-        """Begin to say goodbye."""
+        """Begin to close with a reason."""
         self._wire.close(1001, reason)
 
     def wait_gone(self, timeout_s: float = CLOSE_S) -> None:
-        """Until the peer is gone, but not for the thread that is about to see to that."""
+        """Wait until the peer is gone. The reading thread itself does not wait."""
         if threading.current_thread() is not self._reader:
             self._gone.wait(timeout_s)
 
     def _send(self) -> None:
-        """Send while there is room. Who finds another thread at it leaves the rest to that one."""
+        """Send while the socket has room."""
+        # A publisher never waits for the lock: the thread that holds it also sends the new message.
         lock = self._wire.lock
         while len(self.queue) and lock.acquire(blocking=False):
             try:
@@ -207,7 +210,7 @@ class Peer:
 
 
 def exchange_hellos(wire: Connection, dialect: SightlineV1, hello: str, settle: Promote | None) -> None:
-    """Exchange hellos; who connects, and so gives no place, speaks first."""
+    """Exchange hellos. The connecting end, which has no places to assign, sends first."""
     if settle is None:
         wire.send_text(hello)
     try:
@@ -223,7 +226,7 @@ def exchange_hellos(wire: Connection, dialect: SightlineV1, hello: str, settle: 
 
 
 def count_close(closed: ConnectionClosed, refuse: Callable[[str], None]) -> None:
-    """Count a connection that this end closed because the peer broke a rule; one that the peer ended is no fault."""
+    """Count a connection that this end closed after a broken rule. A close by the peer does not count."""
     counted = _COUNTED_FOR_CODE.get(closed.sent.code) if closed.sent and not closed.rcvd_then_sent else None
     if counted is not None:
         refuse(counted)

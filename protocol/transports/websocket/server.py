@@ -1,7 +1,7 @@
-"""The listening end: connection limits, access checks, handshake. Shell.
+"""Run the listening end: connection limits, access checks, handshake. Shell.
 
-A stranger is who has not yet said what it is. None takes the places of another address, and nobody who only watches
-takes the last ones of who may say STOP.
+A connection is unidentified until its hello. One address cannot take all places of unidentified connections, and
+viewers cannot take the last places of clients that may send STOP.
 """
 
 from __future__ import annotations
@@ -44,40 +44,40 @@ if TYPE_CHECKING:
 
 
 MAX_CLIENTS: Final = 16
-"""Security limit: open connections of one endpoint that have said what they are."""
+"""Security limit: identified connections of one endpoint."""
 RESERVED_SLOTS: Final = 4
-"""Security limit: of these, for who may steer or ask."""
+"""Security limit: places among these for clients that may drive or send requests."""
 MAX_HANDSHAKES: Final = 16
-"""Security limit: connections beyond these that have not yet said what they are; more are closed unheard."""
+"""Security limit: further, unidentified connections. More are closed without a reply."""
 MAX_HANDSHAKES_PER_ADDRESS: Final = 8
-"""Security limit: of these, from one address. A browser opens up to six connections to one host at a time."""
+"""Security limit: of these, from one address. A browser opens up to six connections to one host."""
 
 _CONTROL_CHANNELS: Final = (TWIST.name, REQUEST.name, FRAME.name)
 
 
 def may_control(granted: frozenset[tuple[str, ...]]) -> bool:
-    """Whether who may publish `granted` steers, asks or is the robot; all others only watch, or say what they see."""
+    """Return True if `granted` permits driving, requests or frames. All other clients only watch or detect."""
     return any(key[0] in _CONTROL_CHANNELS for key in granted)
 
 
 @dataclass(eq=False, slots=True)
 class Slot:
-    """One connection's."""
+    """The place of one connection."""
 
     address: str
     acts: bool | None = None
-    """Whether it may act, see `may_control`; None for a stranger."""
+    """True if it may control, see `may_control`. None for an unidentified connection."""
 
 
 class ConnectionLimits:
-    """Who has a place at one endpoint."""
+    """Assigns the places of one endpoint."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._taken: set[Slot] = set()
 
     def admit(self, address: str) -> Slot | None:
-        """A stranger's place for who comes from `address`; None if there is none."""
+        """Assign a place for an unidentified connection from `address`, or None without a free one."""
         with self._lock:
             strangers = [one.address for one in self._taken if one.acts is None]
             if len(strangers) >= MAX_HANDSHAKES or strangers.count(address) >= MAX_HANDSHAKES_PER_ADDRESS:
@@ -87,12 +87,12 @@ class ConnectionLimits:
             return slot
 
     def problem(self, acts: bool) -> str:
-        """Why one more client that `acts`, or only watches, has no place; "" if it has."""
+        """Return the reason why one more client has no place, or "". `acts` is True for a client that may control."""
         with self._lock:
             return self._problem(acts)
 
     def promote(self, slot: Slot, acts: bool) -> str:
-        """Give a client's place to the stranger at `slot`; returns why not, or ""."""
+        """Assign a client place to the unidentified connection `slot`. Returns the reason for a rejection, or ""."""
         with self._lock:
             problem = self._problem(acts)
             if not problem:
@@ -100,7 +100,7 @@ class ConnectionLimits:
             return problem
 
     def leave(self, slot: Slot) -> None:
-        """Its connection has ended."""
+        """Free the place of a connection that has ended."""
         with self._lock:
             self._taken.discard(slot)
 
@@ -110,15 +110,15 @@ class ConnectionLimits:
             return f"{MAX_CLIENTS} clients are connected, which is the limit"
         most = MAX_CLIENTS - RESERVED_SLOTS
         if not acts and clients.count(False) >= most:
-            return f"{most} clients watch, which is the limit: the other places are kept for who may steer or ask"
+            return f"{most} clients watch, which is the limit: the other places are for clients that control"
         return ""
 
 
-# The socket that a WebSocket endpoint listens on, and why there is none. Shell (sockets).
+# The listening socket of a WebSocket endpoint, and the cause of its failure. Shell (sockets).
 
 
 def listening_socket(endpoint: WebSocketEndpoint) -> socket.socket:
-    """Listen at `endpoint`. Raises LinkError, with the cause and the way out, if that is not possible."""
+    """Listen on `endpoint`. Raises LinkError with the cause and the fix."""
     family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET
     try:
         listening = socket.create_server((endpoint.host, endpoint.port), family=family)
@@ -133,38 +133,38 @@ def _cannot_listen(endpoint: WebSocketEndpoint, error: OSError) -> LinkError:
         owner = port_owner(endpoint.port) or "another process"
         fix = f"port {endpoint.port} is in use by {owner}; end it or choose another port"
         return LinkError(f"cannot listen on {endpoint.text}: {fix}")
-    # create_server adds to strerror what it attempted; a name that is not known has an errno of its own below zero.
+    # create_server adds its arguments to strerror. An unknown host name has a negative errno.
     cause = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
     return LinkError(
         f"cannot listen on {endpoint.text}: {cause}; use an address of this machine, e.g. ws://127.0.0.1:{endpoint.port}"
     )
 
 
-# The listening end of WebSocket: who may come in, how many, and for how long a stranger is waited for. Shell.
+# The listening end of WebSocket: access, number of clients, and time limits of the handshake. Shell.
 
 
 CROSS_SITE: Final = "CROSS_SITE"
-"""Counted for a browser's request from another site, or under a name that is not this machine's."""
+"""Counted for a browser request from another site, or with a host name of another machine."""
 WRONG_SUBPROTOCOL: Final = "WRONG_SUBPROTOCOL"
 """Counted for a client that does not offer `sightline.v1`."""
 TOO_MANY_CLIENTS: Final = "TOO_MANY_CLIENTS"
-"""Counted for a client over a limit of `ConnectionLimits`."""
+"""Counted for a client above a limit of `ConnectionLimits`."""
 NO_TLS: Final = "NO_TLS"
-"""Counted for a client of wss:// that does not agree on TLS."""
+"""Counted for a client of wss:// whose TLS handshake fails."""
 
-_GUEST: Final = "guest"  # shows a viewer's certificate, and may steer where no keys are asked for
+_GUEST: Final = "guest"  # has the certificate of a viewer, and may drive without keys
 _PAUSE_S: Final = 0.1  # after an accept that failed, e.g. without descriptors left
 
 
 class KeyFolder(NamedTuple):
-    """A folder of keys and tokens, "" for none, and the role of the link that uses it."""
+    """A folder of keys and tokens, or "", and the role of the link that uses it."""
 
     folder: str
     source: str
 
 
 class Server:
-    """Accepts clients at `endpoint`, each on a thread of its own, until closed."""
+    """Accepts clients at `endpoint`, each on a separate thread, until closed."""
 
     def __init__(
         self,
@@ -174,11 +174,19 @@ class Server:
         log: Callable[[str], None],
         keys: KeyFolder,
     ) -> None:
-        """`serve` is called for each client and returns when it is gone; it may raise PeerError to drop it.
+        """Start to listen.
 
-        It calls what it is given with the role in the client's hello, which raises PeerError if there is no place.
-        `log` writes one line to the log. Raises LinkError if the endpoint cannot be listened on, ConfigError if it
-        would be open to anybody, or if `keys` lack what it needs.
+        Args:
+            endpoint: the endpoint.
+            serve: called for each client until it is gone. It calls its second argument with the role of the client,
+                which raises PeerError without a free place. It raises PeerError to drop the client.
+            count_rejection: counts a rejection by its reason.
+            log: writes one line to the log.
+            keys: folder of keys and tokens, and the role of the link.
+
+        Raises:
+            LinkError: the endpoint cannot be opened.
+            ConfigError: the endpoint accepts every client, or a key is missing.
         """
         self._endpoint, self._serve, self._count_rejection, self._log = endpoint, serve, count_rejection, log
         self._tokens = {} if endpoint.legacy else read_tokens(keys.folder)
@@ -189,12 +197,12 @@ class Server:
         self._counting = threading.Lock()
         self._connection_limits = ConnectionLimits()
         self._wires: set[Connection] = set()
-        # Daemons: no client keeps a finished process alive.
+        # Daemon threads, so that a client does not keep a finished process alive.
         self._acceptor = threading.Thread(target=self._accept_all, name="websocket-listen", daemon=True)
         self._acceptor.start()
 
     def close(self, reason: str) -> None:
-        """Stop listening and tell every client why; the threads end by themselves."""
+        """Stop listening, and close every client with a reason. The threads end on their own."""
         with suppress(OSError):
             self._bell.send(b"!")
         self._acceptor.join(CLOSE_S)
@@ -211,7 +219,7 @@ class Server:
             try:
                 near, address = self._listener.accept()
                 self._welcome(near, address[0])
-            except OSError:  # gone again, or no descriptor left
+            except OSError:  # already gone, or no descriptor left
                 time.sleep(_PAUSE_S)
         for end in (self._listener, self._alarm, self._bell):
             end.close()
@@ -224,7 +232,7 @@ class Server:
         near.close()
 
     def _is_begun(self, near: socket.socket, slot: Slot) -> bool:
-        """Whether a thread of its own has taken over; a machine may have none left."""
+        """Start the thread of a client. Returns False if the machine has no thread left."""
         thread = threading.Thread(target=self._handle, args=(near, slot), name="websocket-peer", daemon=True)
         try:
             thread.start()
@@ -235,7 +243,7 @@ class Server:
 
     def _reject(self, counted: str, address: str, why: str) -> None:
         self._count_rejection(counted)
-        self._log(f"{self._endpoint.text}: turned {address or 'a client'} away: {why}")
+        self._log(f"{self._endpoint.text}: rejected {address or 'a client'} ({why})")
 
     def _handle(self, near: socket.socket, slot: Slot) -> None:
         try:
@@ -246,7 +254,7 @@ class Server:
             self._connection_limits.leave(slot)
 
     def _secured(self, near: socket.socket) -> socket.socket | None:
-        """`near`, with TLS where that is asked for; None for a client that does not agree."""
+        """Return the socket, with TLS if the endpoint uses it, or None after a failed handshake."""
         if self._context is None:
             return near
         address = ""
@@ -284,13 +292,14 @@ class Server:
             self._reject(error.counted, wire.address[0], str(error))
             wire.close(error.code, str(error))
             wire.linger()
-        except ConnectionClosed as closed:  # before it said who it is
+        except ConnectionClosed as closed:  # before its hello
             count_close(closed, self._count_rejection)
         except (InvalidHandshake, TimeoutError):
             pass
 
     def _promote(self, wire: Connection, slot: Slot, role: str) -> None:
-        """Give it a client's place. Where no token says what it may do, its hello does. Raises PeerError for none."""
+        """Assign a client place. Raises PeerError without a free one."""
+        # Without tokens, the role in the hello decides between the places of clients that control and that watch.
         granted = grants_of_role(certificate_role(role)) if wire.granted is None else wire.granted
         claims = wire.granted is None and role == _GUEST
         acts = self._endpoint.legacy is not None or claims or may_control(granted)
@@ -299,10 +308,10 @@ class Server:
             raise PeerError(TOO_MANY_CLIENTS, 1013, problem)
 
     def _shake_hands(self, wire: Connection, protocol: ServerProtocol) -> bool:
-        """Whether the client came in; else it has been told why not."""
+        """Run the handshake. Returns False after a rejection, which the client has received."""
         request: Request = cast(Any, wire.receive_one(time.monotonic() + OPEN_S))
-        if protocol.close_expected():  # what came with it is so broken that the protocol has hung up
-            self._reject(BAD_FRAMING, wire.address[0], "nonsense behind its request")
+        if protocol.close_expected():  # the data after the request is invalid
+            self._reject(BAD_FRAMING, wire.address[0], "invalid data after its request")
             return False
         response = self._answer(wire, protocol, request)
         with wire.lock:
@@ -321,7 +330,7 @@ class Server:
         return protocol.reject(rejection[1], rejection[2] + "\n")
 
     def _rejection(self, wire: Connection, address: str, request: Request) -> tuple[str, int, str] | None:
-        """What it counts as, HTTP status, and why; None for a client that may come in."""
+        """Return counter, HTTP status and reason of a rejection, or None for an accepted client."""
         headers = request.headers
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         problem = host_problem(hosts, self._endpoint.host) or origin_problem(origins, hosts[0])
@@ -334,12 +343,12 @@ class Server:
             offers = headers.get_all("Sec-WebSocket-Protocol")
             role = role_of_token(self._tokens, headers.get_all("Authorization"), offers)
             if role is None:
-                return NO_TOKEN, 401, "show the token of your role: Authorization: Bearer TOKEN, or --secure DIR"
+                return NO_TOKEN, 401, "token missing or unknown; send Authorization: Bearer TOKEN, or pass --secure DIR"
             wire.granted = grants_of_role(role)
         return None
 
     def _crowding(self, wire: Connection) -> tuple[str, int, str] | None:
-        """The same, for want of a place: told by HTTP where that is known before the hello."""
+        """Return the rejection of a client without a free place, if that is certain before its hello."""
         problem = self._connection_limits.problem(wire.granted is None or may_control(wire.granted))
         return (TOO_MANY_CLIENTS, 503, problem) if problem else None
 
@@ -350,4 +359,4 @@ class Server:
             if subprotocol == SUBPROTOCOL:
                 return subprotocol
         self._reject(WRONG_SUBPROTOCOL, "", f"it does not offer {SUBPROTOCOL}")
-        raise NegotiationError(f"offer the sub-protocol {SUBPROTOCOL}; the older text dialect has a port of its own")
+        raise NegotiationError(f"offer the sub-protocol {SUBPROTOCOL}; the legacy protocol has a separate port")

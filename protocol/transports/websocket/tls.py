@@ -1,9 +1,9 @@
-"""TLS for `wss://`, with certificates from a `--secure` folder. Shell (files, sockets).
+"""Provide TLS for `wss://`, with certificates from a `--secure` folder. Shell (files, sockets).
 
-    <role>.pem <role>.key  what this end shows when it listens, e.g. robot.pem
-    ca.pem                 whose signature this end trusts when it connects
+    <role>.pem <role>.key  certificate of a listening end, e.g. robot.pem
+    ca.pem                 authority that a connecting end trusts
 
-A file of its own, since `ssl` takes 4 MB that a robot without `wss://` need not have.
+This is a separate file, because `ssl` takes 4 MB that a robot without `wss://` does not need.
 """
 
 import select
@@ -17,32 +17,40 @@ from sightline.protocol.transports.security import certificate_role
 
 
 def server_tls_context(folder: str, source: str) -> ssl.SSLContext:
-    """TLS for who listens. Raises ConfigError for a certificate or key that is missing or does not fit."""
+    """Create the TLS context of a listening end. Raises ConfigError for a missing or invalid certificate or key."""
     role = certificate_role(source)
     certificate, key = (Path(folder).expanduser() / f"{role}.{kind}" for kind in ("pem", "key"))
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_cert_chain(certificate, key)
     except FileNotFoundError:
-        raise ConfigError(f"wss:// needs {role}.pem and {role}.key in a folder: give it with --secure DIR") from None
+        raise ConfigError(f"wss:// needs {role}.pem and {role}.key in a folder; pass --secure DIR") from None
     except (OSError, ssl.SSLError) as error:
-        raise ConfigError(f"{certificate} and {key} are no certificate and its key: {error}") from None
+        raise ConfigError(f"{certificate} and {key} are not a certificate and its key: {error}") from None
     return context
 
 
 def client_tls_context(folder: str) -> ssl.SSLContext:
-    """TLS for who connects: trusts the folder's `ca.pem`, or without a folder what this machine trusts."""
+    """Create the TLS context of a connecting end. It trusts `ca.pem`, or without a folder the system's authorities."""
     authority = Path(folder).expanduser() / "ca.pem"
     try:
         return ssl.create_default_context(cafile=str(authority) if folder else None)
     except (OSError, ssl.SSLError) as error:
-        raise ConfigError(f"{authority} holds no certificate of an authority: {error}") from None
+        raise ConfigError(f"{authority} contains no certificate of an authority: {error}") from None
 
 
 def tls_handshake(near: socket.socket, context: ssl.SSLContext, host: str, deadline_s: float) -> ssl.SSLSocket:
-    """`near` with TLS agreed on; `host` is whom this end connects to, "" for who listens.
+    """Run the TLS handshake.
 
-    Raises TimeoutError at `deadline_s` however slowly the other end goes on, and SSLError for one that does not agree.
+    Args:
+        near: a connected socket.
+        context: context of this end.
+        host: server name, or "" at a listening end.
+        deadline_s: end of the handshake on the monotonic clock, even for a slow peer.
+
+    Raises:
+        TimeoutError: at `deadline_s`.
+        SSLError: the handshake failed.
     """
     near.setblocking(False)
     wrapped = context.wrap_socket(

@@ -1,4 +1,4 @@
-"""Finds listeners by multicast, and robots and peers behind an endpoint. Shell."""
+"""Find listeners by multicast, and robots and peers behind an endpoint. Shell."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ MAX_LISTENERS: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Discovered:
-    """The newest status of each robot, and everybody who answered."""
+    """The newest status of each robot, and all peers that answered."""
 
     statuses: dict[str, Message]
     peers: list[PeerInfo]
 
 
 def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discovered:
-    """Everybody heard at `connect` within `seconds`. Raises as `open_zenoh` does."""
+    """Find robots and peers at `connect` within `seconds`. Raises the errors of `open_zenoh`."""
     check_zenoh_endpoints((), connect)
     with ExitStack() as ending:
         session = open_session((), connect, seconds, _own_keys(secure))
@@ -55,12 +55,12 @@ def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discov
 
 
 def list_robots(connect: Sequence[str], seconds: float, secure: str = "") -> dict[str, Message]:
-    """The newest `status` of every robot heard within `seconds` at `connect`. Raises as `open_zenoh` does."""
+    """Return the newest `status` of every robot at `connect` within `seconds`. Raises the errors of `open_zenoh`."""
     return discover(connect, seconds, secure).statuses
 
 
 def peers_at(connect: Sequence[str], seconds: float, secure: str = "") -> list[PeerInfo]:
-    """Everybody who answers at `connect`, with the quickest of a few round trips. Raises as `open_zenoh` does."""
+    """Return all peers at `connect`, with the shortest of a few round trips. Raises the errors of `open_zenoh`."""
     check_zenoh_endpoints((), connect)
     with ExitStack() as ending:
         session = open_session((), connect, seconds, _own_keys(secure))
@@ -69,7 +69,7 @@ def peers_at(connect: Sequence[str], seconds: float, secure: str = "") -> list[P
 
 
 def _own_keys(folder: str) -> RoleKeys | None:
-    """An operator's, or a viewer's where there are only those: to look takes no more."""
+    """Load the keys of an operator, or those of a viewer if the folder has no others. Viewing needs no more."""
     only_viewer = folder and not _has(folder, OPERATOR_ROLE) and _has(folder, VIEWER_ROLE)
     return load_role_keys(folder, VIEWER_ROLE if only_viewer else OPERATOR_ROLE)
 
@@ -94,7 +94,7 @@ def _query_rounds(session: zenoh.Session, ends_s: float) -> list[PeerInfo]:
 
 
 def _statuses(session: zenoh.Session, ending: ExitStack) -> dict[str, Message]:
-    """The newest status of every robot, kept up to date until `ending`."""
+    """Return the newest status of every robot, updated until `ending`."""
     import zenoh
 
     found: dict[str, Message] = {}
@@ -123,7 +123,7 @@ def _usable(locator: str) -> str:
 
 
 def find_listeners(seconds: float) -> list[str]:
-    """An endpoint of each listener that answers within `seconds`; none where multicast does not work.
+    """Return one endpoint of each listener that answers within `seconds`, or an empty list without multicast.
 
     Raises ConfigError if Zenoh is not installed.
     """

@@ -1,9 +1,9 @@
-"""`ZenohLink` for one robot, and `ZenohFleet` for many robots over one session. Shell.
+"""Implement `Link` on Zenoh: `ZenohLink` for one robot, `ZenohFleet` for many robots over one session. Shell.
 
     with open_zenoh("r1", listen=["tcp/127.0.0.1:7447"]) as link:
         link.publish(STATUS, header, payload)
 
-A session that is not closed keeps the interpreter from exiting, so a link is always used in a `with`.
+A session that is not closed prevents the exit of the interpreter. Always use a link in a `with`.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 CLOSE_S: Final = 1.5
 """A close that takes longer is left to a daemon thread, so that no process hangs on a dead peer."""
 EXPRESS_UP_TO_BYTES: Final = 4096
-"""Channels bounded by this are sent at once, never batched."""
+"""Messages of channels up to this bound are sent immediately, never in a batch."""
 MAX_KEPT_PUBLISHERS: Final = 32
-"""Security limit: beyond them only those of our own role and of the roles there are stay; peers make up sources."""
+"""Security limit: stored publishers of unknown sources. A peer can invent any number of sources."""
 
 
 def open_zenoh(
@@ -49,12 +49,22 @@ def open_zenoh(
 ) -> ZenohLink:
     """Open a link to `robot`; use it in a `with`.
 
-    Who listens is the router, inside this process, and reaches `connect` in the background; who only connects is a
-    client and reconnects by itself. `role` is the default source of what is published towards the robot. `secure` is a
-    folder of `sightline keys`: mutual TLS, and only what the certificate's role may say or hear passes. Who has a role
-    answers when somebody asks who is there, as `session` if given. Raises ConfigError for a robot id, endpoint or limit
-    that is none or for a missing Zenoh; LinkError for a port in use, if nobody answers within `timeout_s`, or for a
-    robot whose id another has there.
+    A listening end is the router, inside this process, and connects to `connect` in the background. An end that only
+    connects is a client and reconnects automatically.
+
+    Args:
+        robot: robot id.
+        listen: e.g. `tcp/127.0.0.1:7447`.
+        connect: endpoints to connect to.
+        role: default source of messages toward the robot. A link with a role answers presence queries.
+        timeout_s: longest wait for the first answer, if there are only endpoints to connect to.
+        max_frame_bytes: security limit for the payload of a frame.
+        secure: folder from `sightline keys`, or "". With it, mutual TLS, and access by the role of the certificate.
+        session: session id in presence replies, 8 hex digits. The default is random.
+
+    Raises:
+        ConfigError: an argument is invalid, or Zenoh is missing.
+        LinkError: a port is in use, no peer answers in time, or another robot has this id.
     """
     rules = LinkRules(robot, role, max_frame_bytes)
     check_zenoh_endpoints(listen, connect)
@@ -73,17 +83,17 @@ def _parts(sample: zenoh.Sample) -> tuple[bytes, bytes]:
 
 
 class ZenohLink(BaseLink):
-    """A `Link` over one Zenoh session. A link does not hear what it publishes itself."""
+    """A `Link` over one Zenoh session. It does not receive its own publications."""
 
     def __init__(self, session: zenoh.Session, rules: LinkRules, shared: bool = False) -> None:
-        """Use an open `session`; closing the link closes it unless it is `shared` with others."""
+        """Use an open `session`. The end of the link closes it, unless it is `shared` with other links."""
         super().__init__(rules)
         self._session = session
         self._outlets: dict[str, _MatchedPublisher] = {}
         self._subscribers: defaultdict[str, list[zenoh.Subscriber[None]]] = defaultdict(list)
         self._ending = ExitStack()
         if not shared:
-            self._ending.callback(session.close)  # first in, so last to run
+            self._ending.callback(session.close)  # first in, so it runs last
         self._ending.callback(lambda: self._undeclare([one for some in self._subscribers.values() for one in some]))
         self._declaring = threading.Lock()
         self._in_callback = threading.local()
@@ -91,11 +101,11 @@ class ZenohLink(BaseLink):
 
     @property
     def connected(self) -> bool:
-        """Whether at least one peer is connected; never blocks. A silent peer counts until its lease is over (2 s)."""
+        """Return True if at least one peer is connected. Never blocks. A silent peer counts for its lease of 2 s."""
         return not self._closed and bool(self._peers.zids)
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """As `Link`."""
+        """Publish a message, see `Link`."""
         import zenoh
 
         self._rules.check(channel, header, payload)
@@ -105,14 +115,14 @@ class ZenohLink(BaseLink):
         try:
             if self._is_kept(key, source):
                 self._outlet(key, channel).publisher.put(payload, attachment=header or None)
-            else:  # it passes all the same, so that nobody starves another, and leaves nothing behind
+            else:  # the message still passes, so that no source starves another; only no publisher is stored
                 self._session.put(key, payload, attachment=header or None, **_options(channel))
         except zenoh.ZError:  # closed meanwhile
             return False
         return True
 
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
-        """Call `callback`, on Zenoh's thread, for every message with the exact key and within bounds."""
+        """Call `callback` on a thread of Zenoh for every message with the exact key and within bounds."""
         import zenoh
 
         def receive(sample: zenoh.Sample) -> None:
@@ -135,7 +145,7 @@ class ZenohLink(BaseLink):
         self._undeclare(ended)
 
     def has_listener(self, channel: Channel) -> bool:
-        """Whether a peer subscribes to what this end publishes on `channel`; never blocks on the network."""
+        """Return True if a peer subscribes to `channel` of this end. Never blocks on the network."""
         import zenoh
 
         try:
@@ -144,14 +154,14 @@ class ZenohLink(BaseLink):
             return False
 
     def announce(self, here: PresenceAnnouncer) -> None:
-        """Answer whoever asks who is there. Raises LinkError for a robot whose id another has."""
+        """Answer presence queries. Raises LinkError for a robot if another one has its id."""
         with self._declaring:
             self._ending.callback(here.answer_in(self._session))
         if here.role == ROBOT_ROLE:
             here.claim(self._session)
 
     def peers(self) -> list[PeerInfo]:
-        """Everybody else who can be reached, with round trips; waits up to half a second. For display only."""
+        """Return all other peers with their round trips, within half a second. For display only."""
         import zenoh
 
         try:
@@ -160,14 +170,15 @@ class ZenohLink(BaseLink):
             return []
 
     def close(self) -> None:
-        """Undeclare all and close the session; idempotent, over within two seconds, safe even inside a callback."""
+        """Undeclare all and close the session. Idempotent, returns within two seconds, safe inside a callback."""
         with self._declaring:
             if self._closed:
                 return
             self._closed = True
         ending = threading.Thread(target=self._end, name="zenoh-close", daemon=True)
         ending.start()
-        if not getattr(self._in_callback, "now", False):  # Zenoh's close waits for its callbacks, so one cannot wait
+        # Zenoh's close waits for its callbacks, so a callback must not wait for it.
+        if not getattr(self._in_callback, "now", False):
             ending.join(CLOSE_S)
 
     def _receive(self, channel: Channel, sample: zenoh.Sample, callback: Callable[[Message], None]) -> None:
@@ -180,12 +191,12 @@ class ZenohLink(BaseLink):
         self._rules.deliver(channel, str(sample.key_expr), header, payload, callback)
 
     def _is_kept(self, key: str, source: str) -> bool:
-        """Whether the publisher on `key` stays: a relay is given sources without number by who makes them up."""
+        """Return True if the publisher on `key` may be stored. A peer can send a relay any number of sources."""
         is_ours = source in ("", self._rules.role) or source in KNOWN_SOURCES
         return is_ours or key in self._outlets or len(self._outlets) < MAX_KEPT_PUBLISHERS
 
     def _outlet(self, key: str, channel: Channel) -> _MatchedPublisher:
-        """The publisher on `key`, declared at its first use and kept."""
+        """Return the publisher on `key`. The first use declares it."""
         outlet = self._outlets.get(key)
         if outlet is not None:
             return outlet
@@ -205,15 +216,15 @@ class ZenohLink(BaseLink):
     def _end(self) -> None:
         import zenoh
 
-        # A session that broke is closed. A publisher that somebody puts with now cannot be undeclared ("Already
-        # borrowed", a RuntimeError); the session's close, which runs last in any case, ends it.
+        # A broken session is already closed. A publisher that another thread uses now cannot be undeclared ("Already
+        # borrowed", a RuntimeError). The close of the session, which always runs last, ends it.
         with suppress(zenoh.ZError, RuntimeError):
             self._ending.close()
         self._session = CLOSED_SESSION
 
 
 def _options(channel: Channel) -> dict[str, Any]:
-    """How Zenoh is to carry `channel`."""
+    """Return the options of a publication on `channel`."""
     import zenoh
 
     return {
@@ -226,7 +237,7 @@ def _options(channel: Channel) -> dict[str, Any]:
 
 
 class _MatchedPublisher:
-    """A publisher and whether anybody matches it, kept up to date by Zenoh's thread."""
+    """A publisher with its matching status. A thread of Zenoh updates it."""
 
     def __init__(self, session: zenoh.Session, key: str, channel: Channel, ending: ExitStack) -> None:
         import zenoh
@@ -241,7 +252,8 @@ class _MatchedPublisher:
 
     @property
     def matched(self) -> bool:
-        """Read without asking Zenoh; a change that came during the declaration outweighs what was read then."""
+        """Return True if a subscriber matches, without a call of Zenoh."""
+        # A change during the declaration is newer than the first status.
         return self._at_first if self._changed is None else self._changed
 
     def _note(self, status: zenoh.MatchingStatus) -> None:
@@ -249,7 +261,7 @@ class _MatchedPublisher:
 
 
 class _ConnectedPeers:
-    """Who is connected, kept up to date by Zenoh's thread."""
+    """The connected peers. A thread of Zenoh updates them."""
 
     def __init__(self, session: zenoh.Session, ending: ExitStack) -> None:
         import zenoh
@@ -266,14 +278,14 @@ class _ConnectedPeers:
         change(str(event.transport.zid))
 
 
-# Many robots over one Zenoh session: who is there, and a `Link` to each. Shell.
+# Many robots over one Zenoh session: their ids, and a `Link` to each. Shell.
 #
 # with open_fleet("r*", connect=["tcp/127.0.0.1:7447"], role="vision") as fleet_link:
 #     link = fleet_link.link("r1")
 
 
 MAX_ROBOTS: Final = 256
-"""Security limit: no more robots than this, whatever a network claims."""
+"""Security limit: robots of one fleet."""
 
 
 def open_fleet(
@@ -287,10 +299,21 @@ def open_fleet(
     secure: str = "",
     about: Callable[[], str] | None = None,
 ) -> ZenohFleet:
-    """Open a session for every robot whose id fits `pattern` (`*` any text, `?` any letter); use it in a `with`.
+    """Open one session for all robots whose id fits `pattern`. Use it in a `with`.
 
-    `about` gives the line that who asks who is there is told of this end, besides its role.
-    Raises ConfigError for an endpoint or pattern that is none or not of Zenoh, LinkError as `open_zenoh` does.
+    Args:
+        pattern: robot ids, with `*` for any text and `?` for any letter.
+        listen: Zenoh endpoints to listen on.
+        connect: Zenoh endpoints to connect to.
+        role: default source of messages toward the robots.
+        timeout_s: longest wait for the first answer, if there are only endpoints to connect to.
+        max_frame_bytes: security limit for the payload of a frame.
+        secure: folder from `sightline keys`, or "".
+        about: returns one line about this end for presence replies.
+
+    Raises:
+        ConfigError: an endpoint or the pattern is invalid, or an endpoint is not of Zenoh.
+        LinkError: as in `open_zenoh`.
     """
     for endpoint in (*listen, *connect):
         if "://" in endpoint:
@@ -305,7 +328,7 @@ def open_fleet(
 
 
 class ZenohFleet(FleetLink):
-    """One session. Robots are noticed by their status; a link to one shares the session."""
+    """The links to many robots over one session. It finds robots by their status."""
 
     def __init__(self, session: zenoh.Session, pattern: str, role: str, max_frame_bytes: int) -> None:
         """Take over an open `session`."""
@@ -317,19 +340,19 @@ class ZenohFleet(FleetLink):
         self._listen()
 
     def announce(self, here: PresenceAnnouncer) -> None:
-        """Answer whoever asks who is there."""
+        """Answer presence queries."""
         self._ending.callback(here.answer_in(self._session))
 
     def robots(self) -> list[str]:
-        """As `FleetLink`."""
+        """Return the ids of all robots so far, in the order of their first status."""
         return list(self._seen)
 
     def on_new_robot(self, callback: Callable[[], None]) -> None:
-        """As `FleetLink`."""
+        """Call `callback` on a thread of Zenoh at the first status of each robot."""
         self._on_new_robot = callback
 
     def link(self, robot: str) -> Link:
-        """A link to `robot` over the shared session."""
+        """Return a link to `robot` over the shared session."""
         rules = LinkRules(robot, self._role, self._max_frame_bytes)
         return self._ending.enter_context(ZenohLink(self._session, rules, shared=True))
 

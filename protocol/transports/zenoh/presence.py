@@ -1,7 +1,7 @@
-"""Presence: each peer answers a query with its role, robot, host and version. Shell.
+"""Answer and send presence queries: role, robot, host and version of each peer. Shell.
 
-For people: `sightline robots`, the doctor, and a robot's check that nobody else has its id. No frame, no command and no
-judgement of either depends on it.
+`sightline robots`, the doctor, and the check for a second robot with the same id use it. No frame, command or
+validation depends on it.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 PRESENCE_PATTERN: Final = f"{PRESENCE_PREFIX}/**"
 MAX_BYTES: Final = 512
 MAX_PEERS: Final = 256
-"""Security limit: no more answers than this are kept, whatever a network claims."""
+"""Security limit: stored replies of one query."""
 QUERY_ROUNDS: Final = 3
-"""A first answer also pays for routes that nobody used before; the best of a few is the way itself."""
+"""The first reply also contains the time to set up its route. The best of a few replies shows the link alone."""
 
 _PRINTED: Final = r"^[^\x00-\x1f\x7f-\x9f]*$"
 _Line = Annotated[str, Field(max_length=64, pattern=_PRINTED)]
@@ -39,7 +39,7 @@ MAX_ABOUT: Final = 160
 
 
 class Presence(WireModel):
-    """What a peer says of itself. `clock_us` is its wall clock, to be shown and never to be judged by."""
+    """A peer's description of itself. `clock_us` is its wall clock, for display only, never for validation."""
 
     role: Source
     robot: Annotated[str, Field(pattern=r"^[A-Za-z0-9_.*?-]{1,32}$")]
@@ -47,14 +47,14 @@ class Presence(WireModel):
     software: _Line = ""
     host: _Line = ""
     about: Annotated[str | None, Field(max_length=MAX_ABOUT, pattern=_PRINTED)] = None
-    """One line of those who serve others: what they run, on what, and how they fare."""
+    """One line from a service: its task, device and state."""
     up_us: Microseconds = 0
     clock_us: Microseconds = 0
 
 
 @dataclass(frozen=True, slots=True)
 class PeerInfo:
-    """Somebody who answered, how long that took, and how far its wall clock is ahead of ours."""
+    """A peer that replied, its round trip, and the lead of its wall clock over the local one."""
 
     presence: Presence
     round_trip_us: int
@@ -62,14 +62,22 @@ class PeerInfo:
 
 
 def presence_key(role: str, session: str) -> str:
-    """Where a peer of `role` answers: under the role of its certificate, so that access rules can hold it to that."""
+    """Return the key of a presence reply. It contains the role of the certificate for the access rules."""
     return f"{PRESENCE_PREFIX}/{certificate_role(role)}/{session}"
 
 
 def parse_presence_reply(key: str, payload: bytes, asked_us: int, answered_us: int, clock_us: int) -> PeerInfo | None:
-    """The peer behind an answer; None for one that is no presence, or claims a role that its key is not of.
+    """Parse a presence reply.
 
-    Times are ours: monotonic when asked and answered, `clock_us` the wall clock of the answer's arrival.
+    Args:
+        key: key of the reply.
+        payload: JSON of a `Presence`.
+        asked_us: local monotonic time of the query.
+        answered_us: local monotonic time of the reply.
+        clock_us: local wall clock at the arrival of the reply.
+
+    Returns:
+        The peer, or None for an invalid reply, and for a role that differs from its key.
     """
     try:
         presence = decode(Presence, payload, MAX_BYTES)
@@ -82,7 +90,7 @@ def parse_presence_reply(key: str, payload: bytes, asked_us: int, answered_us: i
 
 
 def best_round_trips(rounds: Iterable[Iterable[PeerInfo]]) -> list[PeerInfo]:
-    """Each peer once, as it answered quickest, in the order in which people look for them."""
+    """Return each peer once, with its shortest round trip: robots first, then vision services, then others."""
     best: dict[tuple[str, str], PeerInfo] = {}
     for peer in (peer for answers in rounds for peer in answers):
         name = (peer.presence.role, peer.presence.session)
@@ -101,10 +109,11 @@ def _order(peer: PeerInfo) -> tuple[int, str, str, str]:
 
 
 def robot_with_same_id(own: Presence, answers: Iterable[PeerInfo]) -> Presence | None:
-    """The robot that had the id of `own` before it; None if nobody else has it.
+    """Return the robot that had the id of `own` first, or None.
 
-    Of two that start at once the one that is up for longer stays. Its own session is a robot's earlier self.
+    Of two robots with the same id, the one that has run longer stays.
     """
+    # The same session is the same robot, seen through an earlier process.
     for peer in answers:
         other = peer.presence
         if other.role == ROBOT_ROLE and other.robot == own.robot and other.session != own.session \
@@ -113,53 +122,54 @@ def robot_with_same_id(own: Presence, answers: Iterable[PeerInfo]) -> Presence |
     return None
 
 
-# Presence over Zenoh: a peer answers one question, and only when it is asked. Shell.  A query that nobody asks costs
-# nothing; an answer costs some microseconds. The way of frames and commands knows nothing of it. An answer comes from
-# the living process itself, so who has died or hangs is not there.
+# Presence over Zenoh: a peer replies to a query. Shell.
+#
+# Without a query it costs nothing, and a reply costs some microseconds. It is independent of frames and commands. The
+# process itself replies, so that a process that died or hangs does not appear.
 
 
 REPLY_TIMEOUT_S: Final = 0.5
-"""Who has not answered by then is not there."""
+"""A peer without a reply by then counts as absent."""
 _SECOND_LOOK_S: Final = 1.0
-"""What is left of a robot that has just ended is gone by then: it leaves when its socket closes."""
+"""Pause before the second query. A robot that has just ended no longer replies then."""
 _HOST_CHARACTERS: Final = 64
 
 
 class PresenceAnnouncer:
-    """This end of a session: what it answers when it is asked. Raises ConfigError for a role that is none."""
+    """Replies to presence queries for this end of a session. Raises ConfigError for an invalid role."""
 
     def __init__(self, role: str, robot: str, session: str, about: Callable[[], str] | None = None) -> None:
-        """`about` is asked for its line each time, on Zenoh's thread."""
+        """Create the reply. A thread of Zenoh calls `about` for each query."""
         self.role = role
         self._about = about
         self._began_ns = time.monotonic_ns()
         try:
             self._fixed = Presence(role=role, robot=robot, session=session, software=software_version(), host=_host())
         except ValidationError:
-            raise ConfigError(f"role {role!r} of robot {robot!r} cannot be announced: a role is 1 to 16 lower-case "
+            raise ConfigError(f"invalid role {role!r} of robot {robot!r}: expected 1 to 16 lower-case "
                               "letters, digits or '_', e.g. vision") from None
 
     def now(self) -> Presence:
-        """Of this moment."""
+        """Return the reply of this moment."""
         up_us = (time.monotonic_ns() - self._began_ns) // 1000
-        said = {"about": _printed(self._about())[:MAX_ABOUT]} if self._about else {}
-        return self._fixed.model_copy(update={"up_us": up_us, "clock_us": time.time_ns() // 1000, **said})
+        extra = {"about": _printed(self._about())[:MAX_ABOUT]} if self._about else {}
+        return self._fixed.model_copy(update={"up_us": up_us, "clock_us": time.time_ns() // 1000, **extra})
 
     def answer_in(self, session: zenoh.Session) -> Callable[[], None]:
-        """Answer whoever asks, until what this returns is called."""
+        """Reply to queries until the returned function is called."""
         import zenoh
 
         key = presence_key(self._fixed.role, self._fixed.session)
 
         def answer(query: zenoh.Query) -> None:
-            with suppress(zenoh.ZError):  # it went away, or waits no longer
+            with suppress(zenoh.ZError):  # the requester is gone
                 query.reply(key, encode(self.now()))
 
         handler = zenoh.handlers.Callback(answer, indirect=False)
         return session.declare_queryable(key, handler, allowed_origin=zenoh.Locality.REMOTE).undeclare
 
     def claim(self, session: zenoh.Session) -> None:
-        """Raise LinkError if another robot that is reached here has this id; look twice before saying so."""
+        """Raise LinkError if another robot on this network has this id. It queries twice before."""
         other = robot_with_same_id(self.now(), query_presence(session))
         if other is not None:
             time.sleep(_SECOND_LOOK_S)
@@ -167,13 +177,13 @@ class PresenceAnnouncer:
         if other is None:
             return
         raise LinkError(
-            f"robot id {self._fixed.robot!r} is taken: a robot on {other.host or 'another machine'} has had it for "
-            f"{other.up_us / 1e6:.0f} s (session {other.session}); give this one another with --robot"
+            f"robot id {self._fixed.robot!r} is in use on host {other.host or 'unknown'} "
+            f"({other.up_us / 1e6:.0f} s, session {other.session}); pass --robot ID"
         )
 
 
 def query_presence(session: zenoh.Session, timeout_s: float = REPLY_TIMEOUT_S) -> list[PeerInfo]:
-    """Everybody else who can be reached, each once; over as soon as all have answered."""
+    """Return all other peers, each once. It ends as soon as all have replied."""
     import zenoh
 
     answers: list[PeerInfo] = []
@@ -194,7 +204,7 @@ def query_presence(session: zenoh.Session, timeout_s: float = REPLY_TIMEOUT_S) -
 
 
 def software_version() -> str:
-    """This program's name and version."""
+    """Return the name and version of this program."""
     try:
         return f"sightline {metadata.version('sightline-robot')}"
     except metadata.PackageNotFoundError:

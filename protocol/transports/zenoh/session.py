@@ -1,7 +1,7 @@
-"""Opens a Zenoh session with our settings and turns its errors into `LinkError`. Shell.
+"""Open a Zenoh session with Sightline's settings, and convert its errors to `LinkError`. Shell.
 
-Who listens beyond loopback answers on a group and port of Sightline's own, so that other Zenoh programs on the network
-neither find it nor are found; it connects to nobody by itself. Explicit endpoints need none of this.
+An end that listens beyond loopback answers on Sightline's own multicast group and port. Other Zenoh programs on the
+network therefore do not find it. It never connects to a peer that it found. Explicit endpoints do not need multicast.
 """
 
 from __future__ import annotations
@@ -27,36 +27,37 @@ if TYPE_CHECKING:
 
 
 MULTICAST_GROUP: Final = ("224.0.0.224", 7449)
-"""Zenoh's own group, three ports above Zenoh's own port."""
+"""The group of Zenoh, with a port three above that of Zenoh."""
 MULTICAST_OFF: Final = {"enabled": False}
 LOOPBACK: Final = ("localhost", "127.", "::1")
 
 
 def multicast_section(listen: Sequence[str]) -> dict[str, Any]:
-    """Zenoh's `scouting/multicast`: on for who listens beyond loopback, which is an owner's decision."""
+    """Return Zenoh's `scouting/multicast`. It is on only if the owner listens beyond loopback."""
     if all(parse_zenoh_endpoint(endpoint)[1].startswith(LOOPBACK) for endpoint in listen):
         return MULTICAST_OFF
-    nobody: dict[str, list[str]] = {"router": [], "peer": [], "client": []}
-    return {"enabled": True, "listen": True, "address": multicast_address(), "autoconnect": nobody}
+    never: dict[str, list[str]] = {"router": [], "peer": [], "client": []}
+    return {"enabled": True, "listen": True, "address": multicast_address(), "autoconnect": never}
 
 
 def multicast_address() -> str:
     return f"{MULTICAST_GROUP[0]}:{MULTICAST_GROUP[1]}"
 
 
-# Opening a Zenoh session the way Sightline uses it, with its errors in words. Shell.  Shared memory is off because it
-# hides the network, gossip because it finds strangers (who listens may be found by people, see `discovery.py`); a
-# lease of 2 s tells of a silent link before a person wonders; a message over 1 MiB is refused before it is buffered.
+# The Zenoh session and its errors. Shell.
+#
+# Shared memory is off, because it hides the network. Gossip is off, because it finds third parties. A lease of 2 s
+# detects a silent link early. A message above 1 MiB is rejected before it is buffered.
 
 
 LEASE_MS: Final = 2000
 KEEP_ALIVES_PER_LEASE: Final = 50
-"""One 40 ms after the last message. TCP learns from what follows that a packet was lost; of a last one that nothing
-follows, a frame's end or a twist, it learns only by its timeout of 200 ms and more."""
+"""One 40 ms after the last message. TCP detects a lost packet by the packets after it. Without them, after the end of a
+frame or a twist, it needs its timeout of at least 200 ms."""
 MAX_MESSAGE_BYTES: Final = 1_048_576
 HANDSHAKE_MS: Final = 3000
 MAX_SESSIONS: Final = 64
-"""At one who listens: a fleet of twenty robots, its visions, and the people who watch."""
+"""Sessions at a listening end: a fleet of twenty robots, their vision services, and viewers."""
 _OVER_UDP: Final = ("udp", "quic")
 _FLOOD_CHECK_S: Final = 0.5
 _PROBE_TIMEOUT_S: Final = 0.3
@@ -64,7 +65,7 @@ RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_f
 
 
 class _ClosedSession:
-    """In place of a session that is closed; asked for anything, it raises ZError as that one would."""
+    """Replaces a closed session. Every access raises ZError, as the closed session does."""
 
     def __getattr__(self, name: str) -> Any:
         import zenoh
@@ -73,29 +74,37 @@ class _ClosedSession:
 
 
 CLOSED_SESSION: Final[Any] = _ClosedSession()
-"""Who closes a session lets go of it at once. To free a router's stops every Python thread for up to 10 s where another
-session of the process hears something meanwhile (eclipse-zenoh 1.10.2 waits for a task with the interpreter's lock in
-hand), and if it is part of a cycle, the collector does that at any later time."""
+"""A link drops its reference to a closed session immediately. To free a router's session can block every Python thread
+for up to 10 s while another session of the process receives data: eclipse-zenoh 1.10.2 waits for a task and holds the
+lock of the interpreter. In a reference cycle, the garbage collector does that at any later time."""
 
 
 def open_session(
     listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: RoleKeys | None = None
 ) -> zenoh.Session:
-    """Open a session on checked endpoints; with `secured`, by mutual TLS, and whoever listens checks who may what.
+    """Open a session.
 
-    Raises ConfigError if Zenoh is not installed or an endpoint does not fit `secured`, LinkError if an endpoint cannot
-    be listened on, or if there is only `connect` and nobody answers there within `timeout_s`.
+    Args:
+        listen: valid endpoints to listen on.
+        connect: valid endpoints to connect to.
+        timeout_s: longest wait for an answer, if there are only endpoints to connect to.
+        secured: keys for mutual TLS, or None. The listening end then applies the access rules.
+
+    Raises:
+        ConfigError: Zenoh is missing, or an endpoint does not fit `secured`.
+        LinkError: an endpoint cannot be opened, or no peer answers in time.
     """
     if secured is not None:
         secured.check((*listen, *connect))
     elif keyless := next((one for one in (*listen, *connect) if one.startswith(("tls/", "quic/"))), ""):
-        raise LinkError(f"refused at {keyless}: a {keyless.partition('/')[0]}/ endpoint needs keys; give --secure DIR")
+        kind = keyless.partition("/")[0]
+        raise LinkError(f"cannot connect to {keyless}: a {kind}/ endpoint needs keys; pass --secure DIR")
     try:
         import zenoh
     except ImportError:
         raise ConfigError("Zenoh is not installed: pip install 'sightline-robot[zenoh]'") from None
     zenoh.init_log_from_env_or("off")  # RUST_LOG, see docs/how-to/secure-the-link.md
-    logging.getLogger("zenoh").addHandler(logging.NullHandler())  # else Python prints its warnings to the terminal
+    logging.getLogger("zenoh").addHandler(logging.NullHandler())  # otherwise Python prints its warnings to the terminal
     try:
         return _open(session_config(listen, connect, timeout_s, secured))
     except zenoh.ZError as error:
@@ -103,7 +112,7 @@ def open_session(
 
 
 def _open(config: dict[str, Any]) -> zenoh.Session:
-    """Open it; where multicast is what fails, without it."""
+    """Open the session. If multicast fails, open it without multicast."""
     import zenoh
 
     try:
@@ -118,11 +127,11 @@ def _open(config: dict[str, Any]) -> zenoh.Session:
 def session_config(
     listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: RoleKeys | None = None
 ) -> dict[str, Any]:
-    """The Zenoh configuration. Who listens is a router and reaches `connect` in the background, else a client."""
+    """Return the Zenoh configuration. A listening end is a router, other ends are clients."""
     config = _session_config(listen, connect, timeout_s)
     if secured is not None:
         config["transport"]["link"]["tls"] = secured.tls_section()
-        if listen:  # a client has one peer, whoever listens, and that one judges
+        if listen:  # the only peer of a client is a listening end, which applies the rules
             config["access_control"] = secured.access_section()
             config["low_pass_filter"] = size_limit_section()
     return config
@@ -152,7 +161,7 @@ def _transport_config() -> dict[str, Any]:
             "tx": {
                 "lease": LEASE_MS,
                 "keep_alive": KEEP_ALIVES_PER_LEASE,
-                # A queue of one batch: what is behind a full link is dropped here, not sent late.
+                # A queue of one batch: data for a full link is dropped here, not sent late.
                 "queue": {"size": {"data_low": 1, "real_time": 1}},
             },
             "rx": {"max_message_size": MAX_MESSAGE_BYTES},
@@ -164,17 +173,19 @@ def _transport_config() -> dict[str, Any]:
 def _error_of(
     text: str, listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: RoleKeys | None
 ) -> SightlineError:
-    """Zenoh's error as one line that names the endpoint and the fix; its source paths are left out."""
+    """Convert Zenoh's error to one line with the endpoint and the fix, without its source paths."""
     if not listen:
         where = " or ".join(connect)
         trouble = next((found for endpoint in connect if (found := diagnose_tls(endpoint, secured))), "")
         if trouble:
-            return LinkError(f"refused at {where}: {trouble}")
+            return LinkError(f"cannot connect to {where}: {trouble}")
         more = ""
         if "quic/" in where:
             more = ", or one end rejects the other's keys: start the robot with RUST_LOG=zenoh_link_commons=warn"
-        more += ", and what listens there does not speak Zenoh" if any(map(_is_open, connect)) else ""
-        return LinkError(f"nobody answers at {where}; is the robot or router running? tried for {timeout_s:g} s{more}")
+        more += ", and the service that listens there is not Zenoh" if any(map(_is_open, connect)) else ""
+        return LinkError(
+            f"no answer from {where} after {timeout_s:g} s; start the robot or router, or check the address{more}"
+        )
     where = next((endpoint for endpoint in listen if endpoint.partition("#")[0] in text), " or ".join(listen))
     if "in use" in text:
         return _port_in_use(where)
@@ -201,7 +212,7 @@ def _port_in_use(endpoint: str) -> LinkError:
 
 @contextmanager
 def report_floods(listen: Sequence[str], report: Callable[[str], None]) -> Iterator[None]:
-    """While inside, `report` each host that has more connections to `listen` than Zenoh accepts from all together."""
+    """Report each host with more connections to `listen` than Zenoh accepts in total, until the end of the `with`."""
     ports = {parse_zenoh_endpoint(endpoint)[2] for endpoint in listen if "://" not in endpoint}
     ending = threading.Event()
     if ports:
@@ -218,5 +229,5 @@ def _watch_floods(ports: set[int], report: Callable[[str], None], ending: thread
     while not ending.wait(_FLOOD_CHECK_S):
         for host, count in connections(ports).most_common(1):
             if count > MAX_SESSIONS and limiter.due(host, monotonic_us()):
-                report(f"{count} connections from {host}, more than the {MAX_SESSIONS} accepted from all; "
+                report(f"{count} connections from {host}, more than the total limit of {MAX_SESSIONS}; "
                        "block that address or end the program there")

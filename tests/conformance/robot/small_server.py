@@ -343,7 +343,7 @@ class Client:
 
     def check_hello(self, hello):
         if hello.get("session") is None and not self.has("takes any text"):
-            raise EndError(1008, "this text is no hello")
+            raise EndError(1008, "invalid hello")
         if hello.get("v", 1) != 1 and not self.has("any version"):
             raise EndError(1008, "another version")
         if hello.get("robot", "r1") != "r1" and not self.has("any robot"):

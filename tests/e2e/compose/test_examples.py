@@ -114,7 +114,7 @@ def test_programs_without_a_robot_say_so():
         program("compose/older_client.py", free_endpoint("ws://")) as client,
     ):
         assert "refused" in client.stdout.readline()
-        assert detector.stderr.readline().startswith("error: nobody answers at tcp/127.0.0.1:")
+        assert detector.stderr.readline().startswith("error: no answer from tcp/127.0.0.1:")
         assert detector.wait(5) == 4
 
 

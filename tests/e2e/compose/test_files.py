@@ -110,7 +110,7 @@ def test_health_checks_fail_where_nothing_runs_and_name_what_exists(name, tmp_pa
     if name == "sim":
         code, why = code.replace("/run/sightline", str(tmp_path)), "nothing simulates a robot"
     else:
-        arguments[0], why = nowhere, f"nobody answers at {nowhere}"
+        arguments[0], why = nowhere, f"no answer from {nowhere}"
     said = ask(sys.executable, "-c", code, *arguments)
     assert said.returncode == 1
     assert why in said.stderr

@@ -192,7 +192,7 @@ def test_completion_of_the_shell_offers_commands_and_options():
         (["score", "--detector", "hvs"], 2, "'hsv'"),
         (["status", "--connect", "here"], 2, "tcp/127.0.0.1:7447"),
         (["arm", "a b"], 2, "'a b'"),
-        (["robots", "--connect", "tcp/127.0.0.1:1", "--seconds", "0.3"], 4, "at tcp/127.0.0.1:1"),
+        (["robots", "--connect", "tcp/127.0.0.1:1", "--seconds", "0.3"], 4, "no answer from tcp/127.0.0.1:1"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -112,7 +112,7 @@ def test_silence_and_another_version_have_different_errors():
     robot = PumpedRobot()
     with pytest.raises(LinkError, match="no status from robot 'r1'"):
         robot.operator.wait_report(timeout_s=0.1)
-    with PumpedRobot(version='"v":2') as other, pytest.raises(LinkError, match="version 2; this peer speaks 1"):
+    with PumpedRobot(version='"v":2') as other, pytest.raises(LinkError, match="version 2; this peer uses 1"):
         other.operator.wait_report(timeout_s=1.0)
 
 

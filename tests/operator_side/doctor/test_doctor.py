@@ -183,14 +183,14 @@ def test_somebody_else_on_the_port_is_no_robot(capsys):
 
 def test_what_mends_a_link_stands_apart_from_what_is_wrong():
     (found,) = between.findings("quic/127.0.0.1:1", "r1", "")
-    assert found.value == "refused at quic/127.0.0.1:1: a quic/ endpoint needs keys"
+    assert found.value == "cannot connect to quic/127.0.0.1:1: a quic/ endpoint needs keys"
     assert found.fix == "give --secure DIR"
 
 
 def test_an_endpoint_that_is_none_is_refused(capsys):
     assert cli.run(["doctor", "--json", "--peer", "foo"]) == 2
     said = capsys.readouterr()
-    assert "error: endpoint 'foo' is none" in said.err and said.out == "", "before anything is looked at"
+    assert "error: invalid endpoint 'foo'" in said.err and said.out == "", "before anything is looked at"
 
 
 def test_a_camera_that_is_not_there_says_so(capsys):

@@ -223,7 +223,7 @@ def test_without_a_terminal_it_is_one_line(capsys):
 
 
 @pytest.mark.parametrize(("arguments", "code", "expected"), [
-    (("teleop", "r1", "--connect", "tcp/127.0.0.1:1"), 4, "at tcp/127.0.0.1:1"),
+    (("teleop", "r1", "--connect", "tcp/127.0.0.1:1"), 4, "no answer from tcp/127.0.0.1:1"),
     (("teleop", "a/b"), 2, "'a/b'"), (("teleop", "--linear", "9"), 2, "--linear"),
     (("teleop", "--gamepad", "/dev/null"), (2, 3), "gamepad"),
 ])  # fmt: skip

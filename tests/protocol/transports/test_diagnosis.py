@@ -38,6 +38,6 @@ def test_a_flood_of_connections_is_reported_once_with_its_address():
             ending.enter_context(socket.create_connection(address))
         assert until(lambda: reported, 3.0)
         assert reported == [
-            "67 connections from 127.0.0.1, more than the 64 accepted from all; "
+            "67 connections from 127.0.0.1, more than the total limit of 64; "
             "block that address or end the program there"
         ]

@@ -33,7 +33,7 @@ def test_a_failure_on_one_endpoint_leaves_none_open():
 
 @pytest.mark.parametrize("endpoint", ["ws:/127.0.0.1:1", "http://127.0.0.1:80", "wss//x:1", "ws://127.0.0.1:99999"])
 def test_an_endpoint_that_is_none_is_named(endpoint):
-    with pytest.raises(ConfigError, match="is none"):
+    with pytest.raises(ConfigError, match="invalid endpoint"):
         open_link("r1", connect=[endpoint])
 
 

@@ -92,7 +92,7 @@ def test_a_robot_whose_authority_is_not_trusted_is_refused_in_one_line(secured, 
     robot, endpoint, _ = secured
     other = folder_of(tmp_path / "other", STRANGER)
     for folder in (other, ""):
-        with pytest.raises(LinkError, match="no TLS with it: unable to get local issuer certificate; is the ca") as why:
+        with pytest.raises(LinkError, match="no TLS: unable to get local issuer certificate; use the ca") as why:
             open_websocket("r1", connect=endpoint, role="vision", secure=folder)
         assert "\n" not in str(why.value)
     assert until(lambda: robot.rejected[NO_TLS] >= 2)
@@ -102,7 +102,7 @@ def test_a_certificate_of_another_host_is_refused(tmp_path):
     endpoint, folder = free_endpoint("wss://"), folder_of(tmp_path / "keys", host="192.0.2.9")
     with (
         open_websocket("r1", listen=endpoint, role="robot", secure=folder),
-        pytest.raises(LinkError, match="no TLS with it: IP address mismatch"),
+        pytest.raises(LinkError, match="no TLS: IP address mismatch"),
     ):
         open_websocket("r1", connect=endpoint, role="vision", secure=folder)
 
@@ -112,7 +112,7 @@ def test_who_speaks_no_tls_is_counted_and_gone(secured, caplog):
     with socket.create_connection(address_of(endpoint)) as near:
         near.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
         assert until(lambda: robot.rejected == {NO_TLS: 1})
-    assert until(lambda: "turned 127.0.0.1 away: no TLS: HTTP_REQUEST" in caplog.text)  # counted first, then logged
+    assert until(lambda: "rejected 127.0.0.1 (no TLS: HTTP_REQUEST" in caplog.text)  # counted first, then logged
     open_websocket("r1", connect=endpoint, role="vision", secure=folder).close()
 
 
@@ -149,7 +149,7 @@ def test_another_library_comes_in_over_tls_with_its_token(secured):
 def test_a_folder_without_what_is_needed_is_one_line(tmp_path, missing):
     folder = folder_of(tmp_path / "keys")
     (tmp_path / "keys" / missing).unlink()
-    with pytest.raises(ConfigError, match=r"wss:// needs robot\.pem and robot\.key in a folder: give it with --s"):
+    with pytest.raises(ConfigError, match=r"wss:// needs robot\.pem and robot\.key in a folder; pass --s"):
         open_websocket("r1", listen=free_endpoint("wss://"), role="robot", secure=folder)
 
 

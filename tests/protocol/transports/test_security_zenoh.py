@@ -163,7 +163,7 @@ def test_an_expired_certificate_is_named(folder, endpoint, broken):
 
 def test_our_own_expired_certificate_is_named(folder, endpoint, broken):
     keys.add(broken, "vision", [], days=-0.5)
-    assert "our certificate expired" in _refusal(endpoint, folder, broken)
+    assert "the certificate of this end has expired" in _refusal(endpoint, folder, broken)
 
 
 def test_a_certificate_of_another_host_is_named(folder, endpoint, broken, monkeypatch):
@@ -173,12 +173,12 @@ def test_a_certificate_of_another_host_is_named(folder, endpoint, broken, monkey
 
 
 def test_plain_to_secured_and_secured_to_plain_are_refused_with_the_cause(folder, endpoint):
-    assert "speaks TLS only" in _refusal(endpoint, folder, None)
+    assert "accepts only TLS" in _refusal(endpoint, folder, None)
     assert "plain link, not TLS" in _refusal(endpoint, folder, folder, plain_robot=True)
 
 
 def test_there_is_no_silent_way_back_to_a_plain_link(folder):
-    with pytest.raises(ConfigError, match="is not secured"):
+    with pytest.raises(ConfigError, match="has no TLS"):
         open_zenoh("r1", connect=["tcp/127.0.0.1:7447"], role="vision", secure=str(folder))
 
 

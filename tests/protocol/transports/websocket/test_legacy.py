@@ -175,7 +175,7 @@ def test_a_frame_without_a_header_is_answered_by_a_twist_alone():
 @pytest.mark.parametrize(
     ("message", "code", "said", "counted"),
     [
-        (b"0.1|0", 1003, "binary message; this port speaks text", BAD_FRAMING),
+        (b"0.1|0", 1003, "binary message; this port expects text", BAD_FRAMING),
         ("0" * 257, 1009, "", OVERSIZE),
         (bytes(10_000_000), 1009, "", OVERSIZE),
     ],

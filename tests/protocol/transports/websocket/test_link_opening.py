@@ -82,7 +82,7 @@ def test_who_hangs_up_unheard_is_tried_again(kind, other, tmp_path):
         threading.Thread(target=hang_up, daemon=True).start()
         secure = {"secure": str(tmp_path / "keys")} if kind == "wss" else {}
         endpoint = f"{kind}://127.0.0.1:{door.getsockname()[1]}"
-        with pytest.raises(LinkError, match=f"it hangs up without an answer: .* speaks {other}://|nobody answers"):
+        with pytest.raises(LinkError, match=f"it closed without an answer: .* expects {other}://|no answer"):
             open_websocket("r1", connect=endpoint, timeout_s=1.5, **secure)
         door.shutdown(socket.SHUT_RDWR)
     assert len(tried) >= 3
@@ -90,7 +90,7 @@ def test_who_hangs_up_unheard_is_tried_again(kind, other, tmp_path):
 
 def test_nobody_answering_is_said_in_time():
     endpoint, begin_s = free_endpoint("ws://"), time.monotonic()
-    said = f"nobody answers at {endpoint}; is the robot running? tried for 0.4 s"
+    said = f"no answer from {endpoint} after 0.4 s; start the robot or check the address"
     with pytest.raises(LinkError, match=re.escape(said)):
         open_websocket("r1", connect=endpoint, timeout_s=0.4)
     assert 0.3 < time.monotonic() - begin_s < 2
@@ -111,7 +111,7 @@ def test_a_port_in_use_is_said_with_who_has_it(robot):
 def test_who_answers_but_is_no_websocket_is_said():
     with socket.create_server(("127.0.0.1", free_port())) as door:
         threading.Thread(target=_answer_with, args=(door, b"SSH-2.0-something\r\n"), daemon=True).start()
-        with pytest.raises(LinkError, match="refused: what answers there is no Sightline WebSocket"):
+        with pytest.raises(LinkError, match="the service there is not a Sightline WebSocket"):
             open_websocket("r1", connect=f"ws://127.0.0.1:{door.getsockname()[1]}", timeout_s=2)
 
 
@@ -123,7 +123,7 @@ def _answer_with(door: socket.socket, text: bytes) -> None:
 
 
 def test_another_robots_listener_is_an_error_for_who_opens(robot):
-    with pytest.raises(LinkError, match=f"{robot.endpoint} refused: this is robot r1, not r2"):
+    with pytest.raises(LinkError, match=f"cannot connect to {robot.endpoint}: this is robot r1, not r2"):
         open_websocket("r2", connect=robot.endpoint)
     assert robot.rejected == {OTHER_ROBOT: 1}
     robot.still_serves()

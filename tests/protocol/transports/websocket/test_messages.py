@@ -35,9 +35,9 @@ def test_who_says_no_hello_is_sent_away_and_told_why(robot):
 
 BAD_HELLOS = (
     (b"\0\2{}", 1003, "the first message must be a hello, as text", BAD_HELLO),
-    ("0.1|0", 1008, "this text is no hello: Hello", BAD_HELLO),
-    (json.dumps(HELLO | {"v": 2}), 1008, "this text is no hello: Hello is of version 2; this peer speaks 1", BAD_HELLO),
-    (json.dumps(HELLO | {"session": "x"}), 1008, "this text is no hello: Hello.session", BAD_HELLO),
+    ("0.1|0", 1008, "invalid hello: Hello", BAD_HELLO),
+    (json.dumps(HELLO | {"v": 2}), 1008, "invalid hello: Hello has version 2; this peer uses 1", BAD_HELLO),
+    (json.dumps(HELLO | {"session": "x"}), 1008, "invalid hello: Hello.session", BAD_HELLO),
     (json.dumps(HELLO | {"robot": "r2"}), 1008, "this is robot r1, not r2", OTHER_ROBOT),
     ("x" * 1025, 1009, "", OVERSIZE),
 )
@@ -80,11 +80,11 @@ def test_a_later_hello_changes_what_a_peer_wants(robot):
 
 
 BAD_MESSAGES = (
-    ("0.1|0", 1008, "this text is no hello", BAD_HELLO),
+    ("0.1|0", 1008, "invalid hello", BAD_HELLO),
     (json.dumps(HELLO | {"robot": "r2"}), 1008, "this is robot r1, not r2", OTHER_ROBOT),
     (b"", 1007, "header block of 0 bytes", BAD_FRAMING),
     (b"\xff\xff{}", 1007, "header block of 65535 bytes in a message of 4", BAD_FRAMING),
-    (b"\0\2{}", 1007, "the header block is no JSON object that names its channel", BAD_FRAMING),
+    (b"\0\2{}", 1007, "the header block is not a JSON object with a channel", BAD_FRAMING),
     (bytes(10_000_000), 1009, "", OVERSIZE),
     (claim(TWIST_KEY, b"", bytes(2000)), 1009, "", OVERSIZE),
 )

@@ -42,7 +42,7 @@ def test_a_page_of_another_site_does_not_come_in(robot, origin):
     with pytest.raises(InvalidStatus) as refusal:
         connect(robot.endpoint, origin=origin, **V1)
     assert refusal.value.response.status_code == 403
-    assert b"is another site than Host" in refusal.value.response.body
+    assert b"differs from Host" in refusal.value.response.body
     assert robot.rejected == {CROSS_SITE: 1}
     robot.still_serves()
 

@@ -99,7 +99,7 @@ def test_pictures_of_several_sizes_are_refused(tmp_path):
         FolderCamera(FolderCamera.Config(path=tmp_path))
 
 
-@pytest.mark.parametrize(("content", "said"), [(None, "cannot be read"), (b"GIF89a", "is it a JPEG")])
+@pytest.mark.parametrize(("content", "said"), [(None, "cannot be read"), (b"GIF89a", "not a JPEG")])
 def test_a_still_that_is_none_is_said(tmp_path, content, said):
     if content is not None:
         (tmp_path / "a.jpg").write_bytes(content)
