@@ -59,7 +59,8 @@ def test_taking_again_renews():
 @pytest.mark.parametrize(
     ("holder", "who", "may"),
     [
-        (VISION, VISION, True), (VISION, VISION.model_copy(), True), (VISION, OTHER_VISION, False), (VISION, HUMAN, True), (VISION, GUEST, False),
+        (VISION, VISION, True), (VISION, VISION.model_copy(), True),
+        (VISION, OTHER_VISION, False), (VISION, HUMAN, True), (VISION, GUEST, False),
         (HUMAN, HUMAN, True), (HUMAN, OTHER_HUMAN, False), (HUMAN, VISION, False), (HUMAN, GUEST, False),
         (GUEST, GUEST, True), (GUEST, VISION, True), (GUEST, HUMAN, True),
     ],
