@@ -46,6 +46,9 @@ BUILD_MINUTES = 6
 BUILD_OBJECTS = 300
 # Python's own flags add debug symbols and warnings, which only cost time and space.
 BUILD_FLAGS = "-O2 -g0 -w"
+# Below it a log may lack the line that names the cause.
+FULL_BYTES = 1_000_000
+DISK_FULL = "the disk is full; free some space and repeat"
 
 
 class SetupError(Exception):
@@ -76,7 +79,7 @@ class Setup:
             check_compiler()
         packages = len(pins(self.lock))
         print(f"setting up {self.venv} for `make {self.goal}`: {packages} packages ({self.wanted.purpose}), "
-              f"{self.wanted.installed_mb} MB installed, {self.wanted.download_mb} MB to download if not in pip's cache",
+              f"{self.wanted.installed_mb} MB installed, {self.wanted.download_mb} MB to download if not in the cache",
               flush=True)
         self.check_space(BUILD_MB if builds else 0)
         self.create()
@@ -201,7 +204,8 @@ class Setup:
         except OSError as error:
             raise SetupError(f"{label}: {error.strerror}: {self.log}") from None
         if code:
-            raise SetupError(f"{label}: {cause(output)}; full output in {self.log}")
+            full = shutil.disk_usage(self.venv).free < FULL_BYTES
+            raise SetupError(f"{label}: {DISK_FULL if full else cause(output)}; full output in {self.log}")
         print(f"  {label}: done after {elapsed(begin)}", flush=True)
 
 
@@ -247,7 +251,7 @@ def entries(lock: str) -> Iterator[str]:
 
 def name_of(entry: str) -> str:
     """Read the package's name from an entry of a lock."""
-    return entry.split("==")[0].strip()
+    return entry.partition("==")[0].strip()
 
 
 def without(lock: str, name: str) -> str:
@@ -290,7 +294,7 @@ def numbers(version: str) -> list[int]:
 
 
 def applies(marker: str) -> bool:
-    """Evaluate an environment marker of the lock. The syntax is Python's; `packaging` is not in every Python."""
+    """Evaluate an environment marker of the lock, whose syntax is Python's. Not every Python brings `packaging`."""
     values = {
         "python_version": Version(".".join(map(str, sys.version_info[:2]))),
         "python_full_version": Version(".".join(map(str, sys.version_info[:3]))),
@@ -301,7 +305,7 @@ def applies(marker: str) -> bool:
         "sys_platform": sys.platform,
         "os_name": os.name,
     }
-    return not marker or bool(eval(marker, {"__builtins__": {}}, values))  # noqa: PLW0123  the lock is ours
+    return not marker or bool(eval(marker, {"__builtins__": {}}, values))
 
 
 def objects_in(folder: Path) -> str:
@@ -312,14 +316,29 @@ def objects_in(folder: Path) -> str:
 @contextmanager
 def started(command: list[str], log: Any, environ: dict[str, str]) -> Iterator["subprocess.Popen[bytes]"]:
     """Start a command with its own process group, which ends with this program, however that ends."""
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
-                               env=os.environ | environ, start_new_session=True)
+    arrived: list[int] = []
+    handlers = {number: signal.signal(number, lambda number, frame: arrived.append(number))
+                for number in (signal.SIGINT, signal.SIGTERM)}
+    process = None
     try:
+        # A signal between fork and assignment would leave a process that nothing ends.
+        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
+                                   env=os.environ | environ, start_new_session=True)
+        restore(handlers)
+        if arrived:
+            raise KeyboardInterrupt
         yield process
     finally:
-        if process.poll() is None:
+        restore(handlers)
+        if process and process.poll() is None:
             os.killpg(process.pid, signal.SIGTERM)
             process.wait()
+
+
+def restore(handlers: dict[signal.Signals, Any]) -> None:
+    """Install the handlers of before."""
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
 
 
 def waited(process: "subprocess.Popen[bytes]", seconds: float) -> int | None:
@@ -333,7 +352,7 @@ def waited(process: "subprocess.Popen[bytes]", seconds: float) -> int | None:
 def cause(log: str) -> str:
     """Name cause and fix of a failed pip in one line."""
     for pattern, line in (
-        (r"No space left on device|\[Errno 28\]|Disk quota exceeded", "the disk is full; free some space and repeat"),
+        (r"No space left on device|\[Errno 28\]|Disk quota exceeded", DISK_FULL),
         (r"DO NOT MATCH THE HASHES", "a download does not match its hash in the lock; clear it with `pip cache purge`"),
         (r"NewConnectionError|Connection refused|name resolution|Name or service not known|Network is unreachable|"
          r"[Cc]onnect(ion)? ?[Tt]ime|Read timed out|ProxyError|SSLError|Connection ?(broken|aborted|reset)|"
