@@ -317,7 +317,7 @@ def objects_in(folder: Path) -> str:
 def started(command: list[str], log: Any, environ: dict[str, str]) -> Iterator["subprocess.Popen[bytes]"]:
     """Start a command with its own process group, which ends with this program, however that ends."""
     arrived: list[int] = []
-    handlers = {number: signal.signal(number, lambda number, frame: arrived.append(number))
+    handlers = {number: signal.signal(number, lambda number, _: arrived.append(number))
                 for number in (signal.SIGINT, signal.SIGTERM)}
     process = None
     try:

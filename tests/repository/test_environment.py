@@ -215,7 +215,8 @@ def test_compiled_pybullet_is_stored_and_used_again(environment, venv, tmp_path,
     assert {"--no-build-isolation", "--require-hashes", "--no-binary"} <= set(build.split())
     calls.unlink()
     # What pip is to install: PyBullet is not to be compiled by pip again.
-    monkeypatch.setenv("FAKE_PIP", f"for word; do case $word in */locked.txt) cat $word > {tmp_path}/locked;; esac; done")
+    copy = f"for word; do case $word in */locked.txt) cat $word > {tmp_path}/locked;; esac; done"
+    monkeypatch.setenv("FAKE_PIP", copy)
     environment.Setup("test", venv).run()
     assert "\nnumpy==" in (tmp_path / "locked").read_text() and "pybullet" not in (tmp_path / "locked").read_text()
     text = calls.read_text()
