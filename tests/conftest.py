@@ -20,8 +20,8 @@ def pytest_configure(config):
 
 
 def pytest_xdist_auto_num_workers(config):
-    """Three workers for each processor: most tests wait for processes and sockets."""
-    return 3 * len(os.sched_getaffinity(0))
+    """Three workers for each processor, since most tests wait; one for the second tier, whose tests start several."""
+    return (1 if config.option.markexpr.startswith("slow") else 3) * len(os.sched_getaffinity(0))
 
 
 @pytest.fixture(autouse=True)

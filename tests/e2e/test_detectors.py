@@ -15,7 +15,7 @@ from sightline.evaluation.processes import Processes
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.onnx import brightness_model
 from tests.fixtures.vision.remote import Server, box, http_reply, said
@@ -80,7 +80,7 @@ def test_a_shadow_is_compared_and_never_steers(tmp_path: Path) -> None:
         VisionProcess(tmp_path, "--connect", robot.endpoint, "--shadow", f"onnx:{model}") as vision,
     ):
         connect = ("--connect", robot.endpoint)
-        assert until(lambda: turning(robot) > 0.5, 20), vision.output()
+        assert until(lambda: turning(robot) > 0.5, START_S), vision.output()
         assert until(lambda: "onnx:right.onnx ball at" in vision.output(), 5), "they disagree"
         assert turning(robot) > 0.5, "the shadow steers nothing"
         state = json.loads(sightline("status", "r1", "--json", *connect).stdout)["mission"]
@@ -135,7 +135,7 @@ def _driving(tmp_path, detector, *options, beside=None):
             beside(robot.endpoint)
         vision = subprocess.Popen(command, stdout=out, stderr=out)
         try:
-            assert until(lambda: robot.drive_log.exists() and robot.speed() > 0.5, 20), log.read_text()
+            assert until(lambda: robot.drive_log.exists() and robot.speed() > 0.5, START_S), log.read_text()
             yield robot, log
         finally:
             vision.terminate()

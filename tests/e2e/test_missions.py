@@ -16,7 +16,7 @@ from sightline.protocol.transports.open import open_link
 from sightline.robot_side.ports import Ranges
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.process import serve
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import jpeg_of
@@ -87,13 +87,13 @@ def test_a_person_sends_a_robot_somewhere_and_calls_it_off(tmp_path, transport):
 
 
 def _course(robot, connect, said):
-    assert until(lambda: any("frames from robot r1" in line for line in said), 10)
+    assert until(lambda: any("frames from robot r1" in line for line in said), START_S)
     told = sightline("mission", "r1", *connect)
     assert told.returncode == 0 and "r1: follow: lost" in told.stdout and "detector: hsv, on cpu" in told.stdout
     assert robot.speed() == 0.0
     sent = sightline("goto", "r1", "30", "-10", *connect)  # so far that it still drives when all is said
     assert (sent.returncode, sent.stderr) == (0, ""), sent
-    assert until(lambda: robot.speed() > 1.0, 10), "it drives"
+    assert until(lambda: robot.speed() > 1.0, START_S), "it drives"
     state = json.loads(sightline("status", "r1", "--json", *connect).stdout)
     assert state["mission"]["mission"] == "goto" and not state["mission"]["done"]
     refused = sightline("mission", "r1", "folow", *connect)

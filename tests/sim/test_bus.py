@@ -166,7 +166,7 @@ def test_malformed_motor_packets_change_nothing(sim):
             SimDrive(sim.config()).set(bad, 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_it_ends_cleanly_within_a_second_and_ports_say_so_and_come_back(sim, number, tmp_path):
     camera, drive, lidar = SimCamera(sim.config()), SimDrive(sim.config()), SimRange(sim.config())

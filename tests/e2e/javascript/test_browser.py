@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 
 from tests.fixtures.javascript import Browser, JsProcess, JsRobot, chromium, node
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_port
 
 SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
-PATIENCE_S = 20.0
+
 # Brightness of the canvas at a grid of points: a picture has several, an empty canvas one.
 LEVELS = """(() => {
   const canvas = document.getElementById("picture");
@@ -42,7 +42,7 @@ class Started:
         self.process.wait(10)
         self._log.close()
 
-    def says(self, pattern: str, seconds: float = PATIENCE_S) -> bool:
+    def says(self, pattern: str, seconds: float = START_S) -> bool:
         """Whether it prints a line like `pattern` in time."""
         return until(lambda: re.search(pattern, Path(self._log.name).read_text()), seconds)
 
@@ -96,16 +96,16 @@ def is_moving(page: Browser) -> bool:
 @pytest.mark.slow
 def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer: tuple[Browser, Started]) -> None:
     page, robot = our_viewer
-    assert until(lambda: page.text("link") == "connected", PATIENCE_S), page.text("link")
-    assert until(lambda: is_drawn(page), PATIENCE_S), page.text("age")
-    assert until(lambda: answered(page) > 30, PATIENCE_S), page.text("pictures")
+    assert until(lambda: page.text("link") == "connected", START_S), page.text("link")
+    assert until(lambda: is_drawn(page), START_S), page.text("age")
+    assert until(lambda: answered(page) > 30, START_S), page.text("pictures")
     assert re.fullmatch(r"\d+ pictures/s, the newest \d+ ms ago", page.text("age"))
     assert page.text("driver") == "nobody"  # it only watches until asked to
 
     page.click("drive")
-    assert until(lambda: page.text("driver") == "this page", PATIENCE_S), page.text("driver")
-    assert until(lambda: is_armed(page), PATIENCE_S), page.text("news")
-    assert until(lambda: is_moving(page), PATIENCE_S), page.text("reason")
+    assert until(lambda: page.text("driver") == "this page", START_S), page.text("driver")
+    assert until(lambda: is_armed(page), START_S), page.text("news")
+    assert until(lambda: is_moving(page), START_S), page.text("reason")
     assert "ms old" in page.text("sight")
     page.screenshot(tmp_path / "driving.png")
     assert (tmp_path / "driving.png").stat().st_size > 10_000
@@ -121,7 +121,7 @@ def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer
 def test_a_page_whose_robot_is_gone_says_so_and_finds_it_again(tmp_path: Path) -> None:
     port = free_port()
     with JsRobot(tmp_path, port=port) as robot, Browser(tmp_path, f"http://127.0.0.1:{port}/") as page:
-        assert until(lambda: answered(page) > 10, PATIENCE_S), page.text("pictures")
+        assert until(lambda: answered(page) > 10, START_S), page.text("pictures")
         robot.kill()
         assert until(lambda: page.text("age").startswith("no picture for"), 5.0), page.text("age")
         assert until(lambda: page.text("link").startswith("no connection"), 5.0), page.text("link")
@@ -138,9 +138,9 @@ def test_a_page_behind_a_token_comes_in_with_the_one_behind_the_hash(tmp_path: P
     with JsRobot(tmp_path, "--token-file", str(tmp_path / "token")) as robot:
         address = f"http://127.0.0.1:{robot.port}/"
         with Browser(tmp_path, address + "#0123456789abcdef") as page:
-            assert until(lambda: is_drawn(page), PATIENCE_S), page.text("link")
+            assert until(lambda: is_drawn(page), START_S), page.text("link")
         stranger = tmp_path / "stranger"
         stranger.mkdir()
         with Browser(stranger, address) as page:
-            assert until(lambda: page.text("link").startswith("no connection"), PATIENCE_S), page.text("link")
+            assert until(lambda: page.text("link").startswith("no connection"), START_S), page.text("link")
             assert answered(page) == 0

@@ -15,9 +15,9 @@ import pytest
 
 from sightline.operator_side.cli.app import run
 from sightline.operator_side.recording.film import Film
-from tests.e2e.javascript.test_browser import LEVELS, PATIENCE_S, Started
+from tests.e2e.javascript.test_browser import LEVELS, Started
 from tests.fixtures.javascript import Browser, chromium
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint
 from tests.operator_side.calibrate.test_color import ball_picture
 
@@ -114,7 +114,7 @@ def test_a_video_that_is_ended_early_is_whole(site: Site, tmp_path: Path) -> Non
     where = ("r1", "--connect", site.zenoh, "--seconds", "60", "--out", str(film))
     with Started(tmp_path, "capture", *where) as capturing:
         unfinished = tmp_path / ".run.mp4.part.mp4"
-        assert until(lambda: unfinished.exists() and unfinished.stat().st_size > 0, PATIENCE_S)
+        assert until(lambda: unfinished.exists() and unfinished.stat().st_size > 0, START_S)
         assert not until(lambda: capturing.process.poll() is not None, 1.5)
         capturing.process.send_signal(signal.SIGINT)
         assert capturing.process.wait(10) == 0
@@ -165,15 +165,15 @@ def test_the_page_shows_what_vision_sees_and_frames_without_it(tmp_path: Path) -
         watch = ending.enter_context(Started(tmp_path, "watch", "r1", "--connect", site.web))
         page = ending.enter_context(Browser(tmp_path, address_of(watch)))
         assert until(lambda: re.fullmatch(r"overlay 640x480, \d+ pictures/s, at least \d+ ms old", page.text("age")),
-                     PATIENCE_S), page.text("age")
-        assert until(lambda: page.text("state") == "DISARMED" and page.text("link") == "connected", PATIENCE_S)
-        assert until(lambda: "follow: " in page.text("lines") and "on cpu" in page.text("lines"), PATIENCE_S)
+                     START_S), page.text("age")
+        assert until(lambda: page.text("state") == "DISARMED" and page.text("link") == "connected", START_S)
+        assert until(lambda: "follow: " in page.text("lines") and "on cpu" in page.text("lines"), START_S)
         assert page.run(LEVELS)[2] >= 4
         page.screenshot(tmp_path / "overlay.png")
         site.vision.process.send_signal(signal.SIGKILL)
-        assert until(lambda: page.text("age").startswith("frame "), PATIENCE_S), page.text("age")
+        assert until(lambda: page.text("age").startswith("frame "), START_S), page.text("age")
         with Started(tmp_path, "vision", "--connect", site.zenoh):
-            assert until(lambda: page.text("age").startswith("overlay "), PATIENCE_S), page.text("age")
+            assert until(lambda: page.text("age").startswith("overlay "), START_S), page.text("age")
         page.screenshot(tmp_path / "frame.png")
         watch.process.send_signal(signal.SIGINT)
         assert watch.process.wait(10) == 0
@@ -188,7 +188,7 @@ def test_a_colour_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) 
     config.write_text("# eyes\n[hsv] # of mine\nshape = 'any'\n")
     where = ("--connect", site.zenoh, "--config", str(config))
     with Started(tmp_path, "pick-color", "r1", *where) as picking, Browser(tmp_path, address_of(picking)) as page:
-        assert until(lambda: page.run(LEVELS)[2] >= 4, PATIENCE_S)
+        assert until(lambda: page.run(LEVELS)[2] >= 4, START_S)
         drag(page, 5, 5, 5, 5)
         assert until(lambda: "there is no" in page.text("error") or "marks" in page.text("error"), 5.0)
         assert page.run("document.getElementById('use').disabled")
@@ -216,7 +216,7 @@ def test_a_colour_is_picked_in_a_video_by_its_box(tmp_path: Path) -> None:
             film.add(ball_picture(120 if number < 6 else 0, 1.0, 0.2, seed=number), number * 100_000)
     arguments = ("pick-color", "--video", str(tmp_path / "run.mp4"), "--frames", "8")
     with Started(tmp_path, *arguments) as picking, Browser(tmp_path, address_of(picking)) as page:
-        assert until(lambda: page.run(LEVELS)[0] == 320, PATIENCE_S)
+        assert until(lambda: page.run(LEVELS)[0] == 320, START_S)
         assert page.run("document.getElementById('pictures').max") == "8"
         page.run("(() => { const slider = document.getElementById('pictures'); slider.value = 2;"
                  "slider.dispatchEvent(new Event('input')); })()")

@@ -16,7 +16,7 @@ from sightline.operator_side.doctor.finding import Finding, as_object, histogram
 from sightline.operator_side.setup import keys
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint, free_port, port_of
 from tests.fixtures.robot_process import RobotProcess
 
@@ -206,7 +206,7 @@ def test_the_rate_that_a_camera_delivers_is_measured(capsys):
 @pytest.mark.slow
 def test_a_robot_is_looked_at_and_its_frames_counted(capsys, tmp_path):
     with RobotProcess(tmp_path) as robot:
-        assert until(lambda: port_owner(port_of(robot.endpoint)))
+        assert until(lambda: port_owner(port_of(robot.endpoint)), START_S)
         checks = _checks(capsys, "--peer", robot.endpoint)
     assert checks["frames"]["ok"] and checks["round trip p95"]["ok"] and checks["stream"]["ok"]
     assert checks["version of robot"]["ok"] and "robot's clock is" in checks["clock skew"]["value"]

@@ -39,10 +39,10 @@ def test_robot_and_vision_meet_at_a_router_that_ends_when_told(tmp_path, secured
             open_zenoh("r1", connect=[endpoint], role="vision", secure=secure) as vision,
         ):
             frames, twists = vision.latest(FRAME), robot.latest(TWIST)
-            until(lambda: robot.has_listener(FRAME))
+            assert until(lambda: robot.has_listener(FRAME))
             robot.publish(FRAME, b"{}", b"jpeg")
             assert frames.take(2.0).payload == b"jpeg"
-            until(lambda: vision.has_listener(TWIST))
+            assert until(lambda: vision.has_listener(TWIST))
             vision.publish(TWIST, b"{}", b"0.1|0")
             assert twists.take(2.0).source == "vision"
             with _router("--listen", endpoint, *(["--secure", secure] if secured else [])) as second:

@@ -48,7 +48,7 @@ def test_picamera(monkeypatch):
     assert seen.cameras[0].closed
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_simulation(tmp_path):
     demanded.module("pybullet", "sim")
     from sightline.sim.bus import SimCamera
