@@ -22,7 +22,7 @@ from sightline.evaluation.faults.report import figure_text, value_text
 
 DOCS: Final = Path(__file__).parents[1]
 RESULTS: Final = Path("reference", "results")
-SAFETY: Final = Path("explanation", "safety.md")
+SAFETY: Final = Path("reference", "safety-limits.md")
 PACKAGES: Final = ("eclipse-zenoh", "pybullet", "opencv-python-headless", "pydantic")
 _SHOWN_IF_WRONG: Final = ("on old sight", "drives again", "reset refused", "exit code", "last speed told")
 """Yes or no: in the table they are in what was demanded."""

@@ -16,25 +16,16 @@ from typing import Any, Final
 import click
 import typer
 
-from sightline.operator_side.cli.app import INTERRUPTED, UNEXPECTED, app
+from sightline.operator_side.cli.app import COMMANDS, EXIT_CODES, app
 from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.operator_side.config.loading import SERVICES, model_of
-from sightline.operator_side.teleop.terminal import KEYS
+from sightline.operator_side.teleop.control import LAYOUTS
 from sightline.protocol.config import Config
-from sightline.protocol.errors import CLAMPED, ConfigError, HardwareError, LinkError, RejectReason
+from sightline.protocol.errors import CLAMPED, RejectReason
 
 ROOT: Final = Path(__file__).parents[2]
 REFERENCE: Final = ROOT / "docs" / "reference"
 NOTE: Final = "<!-- Written by `python -m docs.make.reference`; do not edit. -->\n"
-EXIT_CODES: Final = {
-    0: ("success", "The command did what it was told to do."),
-    UNEXPECTED: ("unexpected error", "A defect in Sightline or in a plug-in. `SIGHTLINE_DEBUG=1` shows the traceback."),
-    ConfigError.exit_code: ("usage or configuration", "Correct the option, file or variable in the message."),
-    HardwareError.exit_code: ("hardware", "A device or the simulation is missing or broken."),
-    LinkError.exit_code: ("connection", "The address cannot be opened or does not answer."),
-    CHECK_FAILED: ("check failed", "A check, score or condition did not hold, e.g. `doctor`, `score`, `conform`."),
-    INTERRUPTED: ("interrupted", "Ctrl-C ended the command."),
-}
 REMEDIES: Final = {
     "MALFORMED": ("The message does not follow the protocol.", "Run `sightline conform` against the peer."),
     "UNSUPPORTED_VERSION": ("The header has another protocol version.", "Install the same release on both machines."),
@@ -109,9 +100,13 @@ def cli_page() -> str:
     parts = [NOTE, "# Command line\n",
              "This page lists each command with its options. `sightline COMMAND --help` prints the same text. "
              "[Exit codes](exit-codes.md) are the same for all commands.\n"]
+    heading = ""
     for name, command in commands(root, "sightline"):
+        if name.count(" ") == 1 and (here := COMMANDS[name.split()[1]].heading) != heading:
+            heading = here
+            parts.append(f"## {heading}\n")
         text = inspect.cleandoc(command.help or "").replace("\b", "").replace("\f", "")
-        parts.append(f"{'##' if name.count(' ') == 1 else '###'} `{name}`\n")
+        parts.append(f"{'###' if name.count(' ') == 1 else '####'} `{name}`\n")
         context = click.Context(command, info_name=name)
         usage = " ".join(command.collect_usage_pieces(context))
         parts.append(f"```text\n{name} {usage}\n```\n")
@@ -125,11 +120,12 @@ def cli_page() -> str:
 
 def exit_codes_page() -> str:
     """Return the page of exit codes."""
-    rows = [f"| {code} | {name} | {meaning} |" for code, (name, meaning) in sorted(EXIT_CODES.items())]
+    rows = [f"| {code} | {meaning} |" for code, meaning in EXIT_CODES.items()]
     return "\n".join([NOTE, "# Exit codes", "",
                       "Each `sightline` command ends with one of these codes. An error is one line on the standard "
                       "error output: what is wrong, where, and how to fix it.", "",
-                      "| code | name | meaning |", "|---|---|---|", *rows, ""])
+                      "| code | meaning |", "|---|---|", *rows, "",
+                      "`SIGHTLINE_DEBUG=1` shows the traceback of an unexpected error.", ""])
 
 
 def rejections_page() -> str:
@@ -210,7 +206,9 @@ def figures(language: str) -> str:
 
 
 def _keys() -> str:
-    return f"```text\n{KEYS.rstrip()}\n```\n"
+    """Return the keys of each layout, as teleop shows them."""
+    parts = [f"With `--keys {name}`:\n\n```text\n{layout.help.rstrip()}\n```\n" for name, layout in LAYOUTS.items()]
+    return "\n".join(parts)
 
 
 BLOCKS: Final[Mapping[str, tuple[str, Callable[[], str]]]] = {

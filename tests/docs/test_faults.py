@@ -100,7 +100,6 @@ def test_the_script_writes_results_and_both_pages(tmp_path, monkeypatch):
 
     monkeypatch.setattr(faults.subprocess, "run", run)
     (tmp_path / RESULTS).mkdir(parents=True)
-    (tmp_path / SAFETY).parent.mkdir()
     (tmp_path / SAFETY).write_text(PAGE)
     assert main(["--repeat", "2"], tmp_path) == 5
     assert ran[0][-4:] == ["faults", "--repeat", "2", "--json"]

@@ -26,7 +26,7 @@ READY = {"sim": "", "robot": "robot r1: on", "vision": "vision: frames from robo
 
 def _commands(section):
     """(machine, arguments of sightline) for each line of the block marked `section`."""
-    block = re.search(rf"<!-- run: {section} -->\n```\n(.*?)```", PAGE, re.DOTALL)[1]
+    block = re.search(rf"<!-- run: {section} -->\n```console\n(.*?)```", PAGE, re.DOTALL)[1]
     lines = block.replace("ROBOT", ADDRESS_A).replace("LAPTOP", ADDRESS_B).splitlines()
     return [re.fullmatch(r"(robot|laptop)\$ sightline (.*)", line).groups() for line in lines]
 

@@ -21,7 +21,7 @@ CAR, TELEOP = ((DOCS / name).read_text() for name in ("tutorials/build-the-car.m
 
 def commands(page):
     """The arguments of every `sightline ...` line in a block."""
-    for block in re.findall(r"^```\n(.*?)^```", page, re.DOTALL | re.MULTILINE):
+    for block in re.findall(r"^```(?:console|sh)\n(.*?)^```", page, re.DOTALL | re.MULTILINE):
         for line in block.splitlines():
             words = shlex.split(re.sub(r"^(car|laptop)\$ (sudo )?", "", line))
             if words[:1] == ["sightline"]:

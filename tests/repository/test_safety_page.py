@@ -1,4 +1,4 @@
-"""The safety page takes states and limits from the code. `python -m tests.repository.test_safety_page` writes it."""
+"""The page of safety limits takes its tables from the code. `python -m tests.repository.test_safety_page` writes it."""
 
 import json
 import re
@@ -9,7 +9,8 @@ from sightline.protocol.spec.generate import unit_of
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.safety.states import TRANSITIONS, Event
 
-PAGE = Path(__file__).parent.parent.parent / "docs" / "explanation" / "safety.md"
+DOCS = Path(__file__).parent.parent.parent / "docs"
+PAGE = DOCS / "reference" / "safety-limits.md"
 MARKS = re.compile(r"(<!-- generated: (\w+)[^\n]*-->\n).*?(<!-- /generated -->)", re.DOTALL)
 BOUNDS = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
 
@@ -50,8 +51,8 @@ def test_the_page_shows_the_tables_of_the_code():
     assert page_with_tables(text) == text
 
 
-def test_the_page_states_the_default_numbers():
-    text, config = PAGE.read_text(), RobotConfig().safety
+def test_the_safety_page_states_the_default_numbers():
+    text, config = (DOCS / "explanation" / "safety.md").read_text(), RobotConfig().safety
     for number in (config.full_speed_age_ms, config.zero_speed_age_ms, config.silence_ms):
         assert f"{number} ms" in text
 

@@ -156,6 +156,6 @@ def test_a_killed_triton_is_no_answer_by_the_deadline_and_back_within_three_seco
 
 
 def test_the_page_shows_the_configuration_that_was_run():
-    page = (ROOT / "docs" / "how-to" / "detectors.md").read_text()
-    shown = page.partition("<!-- triton -->\n```\n")[2].partition("```")[0]
+    page = (ROOT / "docs" / "how-to" / "remote-detectors.md").read_text()
+    shown = page.partition("<!-- triton -->\n```text\n")[2].partition("```")[0]
     assert shown == (triton_server.MODELS / "ball_jpeg" / "config.pbtxt").read_text()
