@@ -143,6 +143,7 @@ def test_key_and_header_name_one_known_driver():
         ("operator", None),
         ("operator", rig.header(source="operator")),
         ("vision", rig.header(source="teleop")),
+        ("teleop", rig.header(source="vision")),
     ]:
         verdict = rig.gate.offer(source, header, STILL, rig.now_us)
         assert verdict.reason is RejectReason.UNKNOWN_SOURCE and repr(source) in verdict.detail
