@@ -130,6 +130,9 @@ class Planner:
         self.goal = goal
         low, high = _window(filled, robot, goal, roomy_m)
         self._low, size = low, high - low + 1
+        self._corner: Cell = (int(low[0]), int(low[1]))
+        self._size: Cell = (int(size[0]), int(size[1]))
+        self._next: dict[Cell, Cell | None] = {}
         away_m = _away(filled - low, size)
         self._blocked, self._tight = away_m < keep_m, away_m < roomy_m
         self._steps = _flooded(self._blocked, self._tight, self._seeds(size))
@@ -146,17 +149,16 @@ class Planner:
         return [(steps - nearest, one) for one, steps in away.items()]
 
     def _cell(self, point: Point) -> Cell:
-        i, j = cells_of(np.array([point]))[0] - self._low
-        return int(i), int(j)
+        return math.floor(point[0] / CELL_M) - self._corner[0], math.floor(point[1] / CELL_M) - self._corner[1]
 
     def covers(self, point: Point) -> bool:
         """Whether the plan says anything about `point`."""
         i, j = self._cell(point)
-        return bool(0 <= i < self._steps.shape[0] and 0 <= j < self._steps.shape[1])
+        return 0 <= i < self._size[0] and 0 <= j < self._size[1]
 
     def middle(self, cell: Cell) -> Point:
         """Where the middle of a cell of the plan is."""
-        return (float((cell[0] + self._low[0] + 0.5) * CELL_M), float((cell[1] + self._low[1] + 0.5) * CELL_M))
+        return (cell[0] + self._corner[0] + 0.5) * CELL_M, (cell[1] + self._corner[1] + 0.5) * CELL_M
 
     def entry(self, robot: Point, within_m: float) -> Cell | None:
         """The robot's cell, or the nearest one from which a way leads to the goal; None if there is none so near."""
@@ -196,15 +198,27 @@ class Planner:
 
     def _way(self, entry: Cell) -> list[Cell]:
         way = [entry]
-        while len(way) < _LOOK_AHEAD_CELLS and self._steps[way[-1]] > 0:
-            i, j = way[-1]
-            around = [(i + a, j + b) for a, b in _AROUND
-                      if 0 <= i + a < self._steps.shape[0] and 0 <= j + b < self._steps.shape[1]]
-            best = min(around, key=lambda one: (int(self._steps[one]), math.dist(self.middle(one), self.goal)))
-            if self._steps[best] >= self._steps[i, j]:
+        while len(way) < _LOOK_AHEAD_CELLS:
+            cell = way[-1]
+            if cell not in self._next:
+                self._next[cell] = self._after(cell)
+            after = self._next[cell]
+            if after is None:
                 break
-            way.append(best)
+            way.append(after)
         return way
+
+    def _after(self, cell: Cell) -> Cell | None:
+        """The neighbor of `cell` that the wave reached first, the one nearer to the goal of two; None at its source."""
+        steps = self._steps
+        i, j = cell
+        near = [(int(steps[i + a, j + b]), (i + a, j + b)) for a, b in _AROUND
+                if 0 <= i + a < self._size[0] and 0 <= j + b < self._size[1]]
+        fewest = min(count for count, _ in near)
+        if fewest >= steps[cell]:
+            return None
+        best = [one for count, one in near if count == fewest]
+        return best[0] if len(best) == 1 else min(best, key=lambda one: math.dist(self.middle(one), self.goal))
 
     def sees(self, start: Point, end: Point, skip_cells: float = 1.5) -> bool:
         """Whether a straight line meets no cell that is blocked or tight; the first `skip_cells` and what is off the
@@ -212,12 +226,15 @@ class Planner:
         """
         count = max(2, math.ceil(2 * math.dist(start, end) / CELL_M))
         first = min(count, math.ceil(2 * skip_cells))
-        share = np.arange(first, count + 1)[:, None] / count
-        cells = cells_of(np.array([start]) * (1 - share) + np.array([end]) * share) - self._low
-        inside = ((cells >= 0) & (cells < self._steps.shape)).all(axis=1)
+        share = np.arange(first, count + 1) / count
+        rest = 1 - share
+        i = np.floor((start[0] * rest + end[0] * share) / CELL_M).astype(np.int64) - self._corner[0]
+        j = np.floor((start[1] * rest + end[1] * share) / CELL_M).astype(np.int64) - self._corner[1]
+        inside = (i >= 0) & (i < self._size[0]) & (j >= 0) & (j < self._size[1])
+        i, j = i[inside], j[inside]
         own = self._cell(start)
         closed = self._blocked if self.covers(start) and self._tight[own] else self._tight
-        return not closed[tuple(cells[inside].T)].any()
+        return not closed[i, j].any()
 
 
 def _window(filled: Cells, robot: Point, goal: Point, keep_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
