@@ -11,6 +11,7 @@ The order of answers is free; each question gets exactly one.
 import base64
 import contextlib
 import json
+import math
 import os
 import select
 import signal
@@ -232,6 +233,8 @@ VECTORS: Final = Path(__file__).parent.parent / "protocol" / "vectors"
 _HEX: Final = "_hex"
 _CUT_EVERY: Final = 8
 """Of all but a channel's usual message: each is much like that one, and a kit should not take minutes."""
+_MOST_CUTS: Final = 512
+"""Of one payload: each cut sends its beginning again, 90 MB for one of 32 KB that is cut at every 8th byte."""
 _VECTORS_FROM, _CUTS_FROM, _WRITES_FROM = 1001, 2001, 3001
 
 _WRITTEN: Final = {
@@ -289,15 +292,17 @@ def _cut_case(number: int, name: str, vector: dict[str, Any]) -> CodecCase:
     key, header, payload = vector["key"], bytes.fromhex(vector["header_hex"]), bytes.fromhex(vector["payload_hex"])
 
     step = 1 if name.endswith("/usual") else _CUT_EVERY
+    payload_step = max(step, math.ceil(len(payload) / _MOST_CUTS))
 
     def questions() -> Iterator[Question]:
         for size in range(0, min(len(header), len(header.rstrip()) + 1), step):
             yield _message(key, header[:size], payload)
-        for size in range(0, len(payload), step):
+        for size in range(0, len(payload), payload_step):
             yield _message(key, header, payload[:size])
 
     where = "every byte" if step == 1 else f"every {step}th byte"
-    purpose = f"`vectors/{name}.json`, header or payload cut short at {where}."
+    apart = "" if payload_step == step else f", the payload at every {payload_step} bytes"
+    purpose = f"`vectors/{name}.json`, header or payload cut short at {where}{apart}."
     return CodecCase(number, "cut", purpose, True, "17.2 Golden vectors", questions)
 
 
