@@ -213,7 +213,8 @@ class MemoryLink(BaseLink):
         super().__init__(rules)
         self.number = number
         self._network = network
-        self._callbacks: list[tuple[Channel, Callable[[Message], None]]] = []
+        self._callbacks: list[tuple[Channel, str, Callable[[Message], None]]] = []
+        """Channel, the pattern of its keys, callback."""
 
     @property
     def connected(self) -> bool:
@@ -228,7 +229,7 @@ class MemoryLink(BaseLink):
 
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
         """Call `callback`, inside `MemoryNetwork.advance`, for every message with the exact key and within bounds."""
-        self._callbacks.append((channel, callback))
+        self._callbacks.append((channel, pattern_for(self.robot, channel), callback))
 
     def unsubscribe(self, channel: Channel) -> None:
         """End every subscription to `channel`."""
@@ -241,12 +242,12 @@ class MemoryLink(BaseLink):
 
     def subscribes_to(self, key: str) -> bool:
         """Return True if a subscription matches `key`. As on Zenoh, a key with a wildcard matches all."""
-        return any("*" in key or _matches(self.robot, channel, key) for channel, _ in self._callbacks)
+        return any("*" in key or _matches(pattern, key) for _, pattern, _ in self._callbacks)
 
     def receive(self, key: str, header: bytes, payload: bytes) -> None:
         """Deliver an arrived message. Each subscription checks it, as on Zenoh."""
-        for channel, callback in tuple(self._callbacks):
-            if "*" in key or _matches(self.robot, channel, key):
+        for channel, pattern, callback in tuple(self._callbacks):
+            if "*" in key or _matches(pattern, key):
                 self._rules.deliver(channel, key, header, payload, callback)
 
     def close(self) -> None:
@@ -255,6 +256,5 @@ class MemoryLink(BaseLink):
         self._network.leave(self)
 
 
-def _matches(robot: str, channel: Channel, key: str) -> bool:
-    pattern = pattern_for(robot, channel)
+def _matches(pattern: str, key: str) -> bool:
     return key == pattern or (pattern.endswith("/*") and key.rpartition("/")[0] == pattern[:-2])

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -184,6 +185,7 @@ class StopBound:
     distance_m: float
 
 
+@lru_cache(maxsize=64)  # 5 ms for each configuration, and a process builds the same one several times
 def stop_bound(config: SafetyConfig) -> StopBound:
     """The stop that `config` implies, by running its own ramp: the worst case, a command on a frame of age zero.
 
