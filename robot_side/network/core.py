@@ -112,7 +112,7 @@ class NetworkCore:
             full_model: of the camera's images at full size.
         """
         model = scaled_model(full_model, self._scale_percent)
-        if now_us < self._camera_due_us and model == self._announced:
+        if now_us < self._camera_due_us and (model is self._announced or model == self._announced):
             return None
         self._announced = model
         self._camera_due_us = now_us + _CAMERA_PERIOD_US

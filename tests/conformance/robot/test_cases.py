@@ -72,9 +72,10 @@ def test_a_broken_robot_fails_exactly_its_case(matrix, broken_id):
     assert set(failed) == {broken_id}, failed
 
 
-def test_one_robot_passes_all_cases_in_a_row():
+@pytest.mark.parametrize("cases", [VIRTUAL[::4], pytest.param(VIRTUAL, marks=pytest.mark.slow)], ids=["some", "all"])
+def test_one_robot_passes_cases_in_a_row(cases):
     bench, _robot = virtual_robot()
-    results = run_cases(VIRTUAL, bench, prepare)
+    results = run_cases(cases, bench, prepare)
     assert {one.case.id: one.reason for one in results if one.outcome is Outcome.FAILED} == {}
     assert {one.case.id: one.reason for one in results if one.outcome is Outcome.SKIPPED} == {}
 

@@ -1,5 +1,7 @@
 """The kit's pictures and its JPEG writer: what the files are, and that two decoders see in them what was drawn."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from sightline.conformance.vision.images import CAMERA, HALF_CAMERA, claiming, c
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from tests.conformance.vision import drawing as vision_pictures
-from tests.conformance.vision.drawing import DRAWINGS, encode_jpeg
+from tests.conformance.vision.drawing import DRAWINGS, Drawing, encode_jpeg
 
 
 def decoded(jpeg):
@@ -26,8 +28,10 @@ def test_the_files_are_what_the_code_draws():
 
 def test_verify_finds_what_was_changed_and_write_restores_it(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(vision_pictures, "FOLDER", tmp_path)
+    small = Drawing("a small ball", 16, 16, 4, 32, 32)
+    monkeypatch.setattr(vision_pictures, "DRAWINGS", {"small": small, "gray": replace(small, grey=True)})
     assert vision_pictures.main(["--verify"]) == 5
-    assert "absent, centre" in capsys.readouterr().err
+    assert "gray, small" in capsys.readouterr().err
     assert vision_pictures.main(["--write"]) == 0
     (tmp_path / "left_over.jpg").write_bytes(b"")
     assert vision_pictures.main(["--verify"]) == 5

@@ -6,6 +6,7 @@ The table is over BGR565, so any number of ranges, and a hue range through red, 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache, lru_cache
 from typing import Any
 
 import cv2
@@ -56,15 +57,17 @@ def codes_565(bgr: NDArray[np.uint8]) -> NDArray[np.uint16]:
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
 
 
+@cache
 def colors_565() -> NDArray[np.float64]:
     """The colour (65536, 3) in the middle of each BGR565 code: blue, green, red, 0..255."""
     codes = np.arange(65536, dtype=np.uint32)
     blue, green, red = (codes & 31) * 8 + 3.5, (codes >> 5 & 63) * 4 + 1.5, (codes >> 11) * 8 + 3.5
-    return np.stack([blue, green, red], axis=-1)
+    return _read_only(np.stack([blue, green, red], axis=-1))
 
 
+@lru_cache(maxsize=32)  # 64 KB each; a fleet's robots share one
 def color_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
-    """255 for every BGR565 code whose colour is within one of `ranges`, 0 elsewhere; 65536 entries."""
+    """255 for every BGR565 code whose colour is within one of `ranges`, 0 elsewhere; 65536 entries, read-only."""
     bgr = (colors_565() / 255).astype(np.float32)[None]
     hue, saturation, value = cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV)[0].T
     inside = np.zeros(65536, bool)
@@ -73,7 +76,13 @@ def color_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
         turn = above & below if one.hue_low_deg <= one.hue_high_deg else above | below
         inside |= (turn & (saturation >= one.saturation_low) & (saturation <= one.saturation_high)
                    & (value >= one.value_low) & (value <= one.value_high))
-    return np.where(inside, 255, 0).astype(np.uint8)
+    return _read_only(np.where(inside, 255, 0).astype(np.uint8))
+
+
+def _read_only(values: NDArray[Any]) -> NDArray[Any]:
+    """Of a result that is stored and shared."""
+    values.flags.writeable = False
+    return values
 
 
 # Where exactly the edge of a coloured blob is: half-way between its own colour and what is around it. Pure.  A colour
