@@ -10,11 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
-
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any, Final
 
 from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, run_lockstep
@@ -40,6 +36,9 @@ from sightline.operator_side.terminal import progress_bar
 from sightline.sim.scenario import Scenario, Start, load_scenario
 from sightline.sim.truth import Truth
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "behaviors.md"
 LATENCY_MS, LOSS = 50.0, 0.1
 LOOKS: Final = ("dim", "bright", "warm", "desaturated", "quality30")
@@ -55,6 +54,8 @@ class Row:
     robot: str | None = None
     looks: tuple[str, ...] = ()
     """In what other light it is run too."""
+    seconds: float | None = None
+    """The length of each run; None: the scenario's own."""
 
     @property
     def law(self) -> str:
@@ -75,12 +76,13 @@ class Row:
     @property
     def default(self) -> "Row":
         """What a baseline is compared with."""
-        return Row(self.scenario, "", self.robot)
+        return Row(self.scenario, "", self.robot, seconds=self.seconds)
 
     def cases(self, seeds: Sequence[int], look: str | None = None) -> list[ScoreCase]:
         """Its runs in one light, the scenario's own if None."""
         mission = self.baseline or None
-        return [ScoreCase(self.scenario, LATENCY_MS, LOSS, seed, None, mission, self.robot, look) for seed in seeds]
+        return [ScoreCase(self.scenario, LATENCY_MS, LOSS, seed, self.seconds, mission, self.robot, look)
+                for seed in seeds]
 
     def all_cases(self, seeds: Sequence[int]) -> list[ScoreCase]:
         """Its runs in every light."""
@@ -202,6 +204,9 @@ _COLOURS = dict(zip(LAWS, (ROBOT_COLOUR, "tab:red"), strict=True))
 
 def plot_speeds(path: Path, runs: Sequence[SpeedRun]) -> None:
     """Draw `runs`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(12, 6), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     for column, goal_m in enumerate(GOALS_M):
@@ -215,7 +220,7 @@ def plot_speeds(path: Path, runs: Sequence[SpeedRun]) -> None:
     canvas.print_png(path)  # type: ignore[no-untyped-call]
 
 
-def _plot(axes: Axes, runs: Sequence[SpeedRun], label: str, values: Sequence[Sequence[float]]) -> None:
+def _plot(axes: "Axes", runs: Sequence[SpeedRun], label: str, values: Sequence[Sequence[float]]) -> None:
     axes.axhline(0.0, color="0.7", linewidth=1)
     for run, each in zip(runs, values, strict=True):
         axes.plot(run.times_s, each, color=_COLOURS[run.wish.law], label=run.wish.law)

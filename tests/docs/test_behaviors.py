@@ -1,5 +1,6 @@
 """The behaviors page follows from the runs: figures, verdicts, baselines beside defaults, pictures."""
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -22,6 +23,8 @@ from docs.make.behaviors import (
     speeds_of,
     write_page,
 )
+from sightline.evaluation.plots import plot_run
+from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.score.figures import Score
 from sightline.sim.scenario import load_scenario, scenario_names
 from tests.evaluation.score.test_figures import truth
@@ -111,16 +114,32 @@ def test_both_laws_reach_a_near_waypoint():
         assert drive.off_m < 0.06 and 0.05 < drive.top_mps <= 0.5 and abs(drive.speeds_mps[-1]) < 0.01
 
 
-def test_the_command_writes_the_page_and_a_picture_of_the_first_start(tmp_path, monkeypatch):
-    rows, advanced = [Row("legs-slow"), Row("legs-slow", "legs-baseline")], []
+@contextmanager
+def workers_in_this_process(jobs):
+    with ThreadPoolExecutor(jobs) as pool:
+        yield pool
+
+
+def write_samples(path, samples, scenario, title):
+    path.write_bytes(b"\x89PNG" + f"{scenario.name} {title} {len(samples)}".encode())
+
+
+@pytest.mark.parametrize(("workers", "plot"), [
+    (workers_in_this_process, write_samples),  # a process and Matplotlib take longer than the runs
+    pytest.param(worker_pool, plot_run, marks=pytest.mark.slow),
+])
+def test_the_command_writes_the_page_and_a_picture_of_the_first_start(workers, plot, tmp_path, monkeypatch):
+    rows, advanced = [Row("legs-slow", seconds=1.5), Row("legs-slow", "legs-baseline", seconds=1.5)], []
 
     @contextmanager
     def progress(total):
         yield lambda: advanced.append(total)
 
     monkeypatch.setattr("docs.make.behaviors.progress_bar", progress)
+    monkeypatch.setattr("docs.make.behaviors.worker_pool", workers)
+    monkeypatch.setattr("docs.make.behaviors.plot_run", plot)
     path = tmp_path / "behaviors.md"
-    ok = write_page(path, [905], 2, rows)
+    ok = write_page(path, [905], 1, rows)
     text = path.read_text()
     assert ok == ("**not kept**" not in text) and advanced == [2, 2]
     assert sorted(one.name for one in (tmp_path / "behaviors").iterdir()) == [

@@ -19,16 +19,17 @@ def run(name, seed, conditions, seconds):
 
 def test_a_run_repeats_bit_for_bit():
     conditions = Conditions(latency_ms=50, loss=0.1, jitter_ms=20)
-    first, _ = run("circle", 101, conditions, 6.0)
-    second, _ = run("circle", 101, conditions, 6.0)
-    other, _ = run("circle", 102, conditions, 6.0)
+    first, _ = run("circle", 101, conditions, 4.0)
+    second, _ = run("circle", 101, conditions, 4.0)
+    other, _ = run("circle", 102, conditions, 1.0)
     assert first.twists == second.twists and first.samples == second.samples
-    assert first.twists != other.twists
+    assert len(other.twists) > 10 and other.twists != first.twists[:len(other.twists)]
     assert len(first.twists) > 80
 
 
 @pytest.mark.parametrize(("name", "seconds"), [
-    ("static", 6.0), ("circle", 10.0), ("eight", 12.0), ("pushed", 10.0), ("behind", 8.0), ("walls", 14.0),
+    ("static", 3.0), ("circle", 5.0), ("eight", 5.0), ("pushed", 6.0), ("behind", 6.0), ("walls", 5.0),
+    *(pytest.param(name, seconds, marks=pytest.mark.slow) for name, seconds in (("eight", 12.0), ("pushed", 10.0))),
 ])
 def test_every_scenario_holds_its_figures(name, seconds):
     _, result = run(name, 103, Conditions(latency_ms=50, loss=0.1), seconds)
@@ -36,7 +37,7 @@ def test_every_scenario_holds_its_figures(name, seconds):
 
 
 def test_with_400_ms_the_robot_stands_still():
-    result, figures = run("eight", 104, Conditions(latency_ms=400, loss=0.1), 6.0)
+    result, figures = run("eight", 104, Conditions(latency_ms=400, loss=0.1), 3.0)
     assert all(check.ok for check in checks_of("eight", figures, 400))
     assert State.ACTIVE not in result.states
     assert len(result.twists) > 5, "vision did answer; the gate refused"
