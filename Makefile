@@ -21,7 +21,7 @@ test: test-environment  ## at most two minutes: at least 90 % of all tests; or j
 	$(PYTEST) $(or $(ARGS),--numprocesses auto --dist worksteal)
 
 test-all: test-environment  ## what is longer: first what can share the machine, then what measures real time
-	$(PYTEST) -m "slow and not long" --numprocesses auto --dist worksteal; shared=$$?; \
+	$(PYTEST) -m "slow and not alone and not long" --numprocesses auto --dist worksteal; shared=$$?; \
 	$(PYTEST) -m "alone and not long" && exit $$shared
 
 test-long: test-environment  ## once before a release: the fault bench, the kit against every broken peer, all mutants

@@ -9,6 +9,7 @@ import threading
 import pytest
 
 from sightline.protocol import log
+from tests.fixtures import own_process
 from tests.fixtures.cpu_times import CpuTimes
 
 # A shell that starts the tests in its background has Ctrl-C ignored, and every child would inherit that.
@@ -16,8 +17,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_configure(config):
-    """Measure the CPU time of each test."""
+    """Measure the CPU time of each test; give some tests a process of their own."""
     config.pluginmanager.register(CpuTimes())
+    config.pluginmanager.register(own_process)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -75,7 +75,7 @@ def test_what_cannot_be_watched_is_one_line(site: Site, capsys: pytest.CaptureFi
     for arguments, code, words in (
         (["r1", "fram"], 2, "unknown channel 'fram'; did you mean 'frame'?"),
         (["r1", "--json"], 2, "name it"),
-        (["r1", "twist", "--connect", site.web, "--seconds", "1"], 4, "for the robot alone"),
+        (["r1", "twist", "--connect", site.web, "--seconds", "1"], 4, "deliver it to the robot only"),
         (["r1", "scan", "--connect", "tcp/127.0.0.1:1", "--seconds", "1"], 4, "tcp/127.0.0.1:1"),
     ):
         assert run(["watch", *arguments]) == code
@@ -118,7 +118,7 @@ def test_a_video_that_is_ended_early_is_whole(site: Site, tmp_path: Path) -> Non
         assert not until(lambda: capturing.process.poll() is not None, 1.5)
         capturing.process.send_signal(signal.SIGINT)
         assert capturing.process.wait(10) == 0
-        assert capturing.says(r"run\.mp4: frame of r1, \d+x\d+, \d+ pictures in [\d.]+ s")
+        assert capturing.says(r"run\.mp4: frame of r1, \d+x\d+, \d+ images in [\d.]+ s")
     with av.open(str(film)) as opened:
         assert sum(1 for _ in opened.decode(video=0)) > 3
     assert not unfinished.exists()
@@ -158,6 +158,7 @@ def _yellow(picture):
     return tuple(int(part[len(part) // 2]) for part in mask.nonzero()[::-1])
 
 
+@pytest.mark.alone
 def test_the_page_shows_what_vision_sees_and_frames_without_it(tmp_path: Path) -> None:
     chromium()
     with ExitStack() as ending:
@@ -202,7 +203,7 @@ def test_a_colour_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) 
                                                       page.text("trial")), page.text("trial")
         page.screenshot(tmp_path / "picked.png")
         page.click("use")
-        assert until(lambda: page.text("said").startswith("written into "), 5.0), page.text("error")
+        assert until(lambda: page.text("said").startswith("written to "), 5.0), page.text("error")
         assert picking.process.wait(10) == 0
         assert page.errors == []
     assert 30 < tomllib.loads(config.read_text())["hsv"]["ranges"][0]["hue_low_deg"] < 60

@@ -4,13 +4,13 @@ import itertools
 import random
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST
 from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE, LinkRules, Message
 from tests.fixtures.links import RIGS, MemoryRig
+from tests.fixtures.websocket import resident_kib
 
 
 @pytest.fixture(params=RIGS, ids=RIGS)
@@ -83,18 +83,15 @@ def test_newest_wins_with_a_consumer_of_200_ms(rig):
     assert frames.dropped >= 30
 
 
+@pytest.mark.own_process
 def test_a_consumer_that_never_takes_costs_no_memory(rig):
     robot, _, frames, _ = _pair(rig)
-    before_kib = _resident_kib()
+    before_kib = resident_kib()
     for number in range(300):  # 90 MB
         robot.publish(FRAME, b"", number.to_bytes(2) + bytes(300_000))
         rig.wait(0.004)
     assert rig.until(lambda: frames.dropped > 200)
-    assert _resident_kib() - before_kib < 25_000
-
-
-def _resident_kib() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4
+    assert resident_kib() - before_kib < 25_000
 
 
 def test_a_callback_that_raises_ends_nothing(rig):

@@ -25,6 +25,7 @@ def robot():
     robot.close()
 
 
+@pytest.mark.own_process
 def test_who_never_reads_delays_nobody_costs_little_and_is_heard(robot):
     took_s, heard, before_kib = [], 0, resident_kib()
     with never_reads(robot.endpoint, wants=["frame"], role="teleop") as stalled:
@@ -46,6 +47,7 @@ def test_who_never_reads_delays_nobody_costs_little_and_is_heard(robot):
     robot.still_serves()
 
 
+@pytest.mark.own_process
 @pytest.mark.parametrize("picture_bytes", [3_000, 46_000, 200_000])
 def test_who_reads_a_picture_a_second_stays_and_is_never_far_behind_what_fits_its_sockets(picture_bytes):
     """Such a reader answers a ping only when it comes to it: seconds late."""
@@ -85,6 +87,7 @@ def test_an_end_that_stands_still_is_noticed_within_three_seconds():
         assert robot.rejected == {SILENT: 1}
 
 
+@pytest.mark.own_process
 def test_a_flood_of_pings_that_nobody_reads_the_answers_to_costs_little(robot):
     before_kib = resident_kib()
     with bare_client(robot.endpoint, receive_bytes=4096, wants=[]) as near:

@@ -6,7 +6,6 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
@@ -15,6 +14,7 @@ from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
+from tests.fixtures.websocket import resident_kib
 
 PRELUDE = """
 import sys, time
@@ -56,10 +56,6 @@ def start(tmp_path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     for process in started:
         process.kill()
         process.communicate()
-
-
-def _resident_kib() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4
 
 
 def test_a_port_in_use_is_named_with_who_uses_it(start):
@@ -108,6 +104,7 @@ def test_a_client_reconnects_after_being_away_longer_than_its_timeout(start):
         assert frames.take(4) is not None
 
 
+@pytest.mark.own_process
 def test_a_stopped_peer_costs_neither_time_nor_memory_nor_others(start):
     endpoint = free_endpoint()
     with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as healthy:
@@ -117,7 +114,7 @@ def test_a_stopped_peer_costs_neither_time_nor_memory_nor_others(start):
         robot.publish(FRAME, b"", bytes(100_000))
         assert frames.take(2) is not None
         stalled.send_signal(signal.SIGSTOP)
-        before_kib, took_s, seen = _resident_kib(), [], 0
+        before_kib, took_s, seen = resident_kib(), [], 0
         for number in range(150):  # 15 MB, more than any buffer on the way
             begin_s = time.perf_counter()
             robot.publish(FRAME, b"", number.to_bytes(2) + bytes(100_000))
@@ -125,7 +122,7 @@ def test_a_stopped_peer_costs_neither_time_nor_memory_nor_others(start):
             message = frames.take(0.02)
             seen += message is not None and message.payload[:2] == number.to_bytes(2)
         assert seen > 140
-        assert _resident_kib() - before_kib < 8_000
+        assert resident_kib() - before_kib < 8_000
         assert max(took_s) < 0.06
         stalled.send_signal(signal.SIGCONT)
 

@@ -149,10 +149,12 @@ def test_what_fails_to_close_is_told_by_who_closes_it(held, monkeypatch):
 
 
 def test_close_ends_the_thread_and_what_is_inside(held):
+    before = set(threading.enumerate())
     one = DeadlineDetector(held)
     one.detect([frame(1)], within(2))
     one.close()
-    assert held.closed and until(lambda: not [some for some in threading.enumerate() if some.name == "detector"])
+    assert held.closed
+    assert until(lambda: all(some.name != "detector" for some in set(threading.enumerate()) - before))
 
 
 # --- fallback --------------------------------------------------------------------------------------------------------

@@ -168,6 +168,7 @@ def test_a_hostile_answer_is_refused_and_counted_and_ends_nothing(name):
     assert len(lines) == 2 and reason in lines[0] and "answers again" in lines[1]
 
 
+@pytest.mark.own_process
 def test_a_gzip_bomb_and_a_million_boxes_take_no_memory():
     before_kb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     replies = iter([HOSTILE["gzip bomb"][0], HOSTILE["a million boxes"][0]] * 5)
@@ -202,6 +203,7 @@ def test_nobody_there_costs_no_time_and_is_tried_again_soon():
 
 
 def test_a_killed_server_is_no_answer_by_the_deadline_and_back_by_itself():
+    before = set(threading.enumerate())
     with Server(lambda request: GOOD) as server:
         port = server.port
         detector = HttpJpeg(HttpJpeg.Config(address=f"http+jpeg://127.0.0.1:{port}/"))
@@ -215,7 +217,7 @@ def test_a_killed_server_is_no_answer_by_the_deadline_and_back_by_itself():
             assert until(lambda: _ask(detector, seconds=0.1), 3.0)
         finally:
             detector.close()
-    assert not [one for one in threading.enumerate() if one.name == "detector"]
+    assert not [one for one in set(threading.enumerate()) - before if one.name == "detector"]
 
 
 def test_a_server_that_hangs_while_connecting_is_no_answer_by_the_deadline():
