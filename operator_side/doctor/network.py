@@ -67,7 +67,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
 def _no_link(error: SightlineError, endpoint: str) -> Finding:
     """Nobody there at all, which a handshake would have shown, or somebody who does not speak as the endpoint says."""
     found = trouble("link", error)
-    if "no answer from" not in found.value:
+    if not found.value.startswith("no answer from"):
         return found
     transport, _, port = _address(endpoint)
     form = f"ws://0.0.0.0:{port}" if transport == "ws" else f"{transport}/0.0.0.0:{port}"
@@ -137,7 +137,7 @@ def _probe(host: str, port: int) -> tuple[list[float], str]:
             why = "nothing comes back: firewall, wrong address, or client isolation on the access point"
             return times_ms, why + neighbour(host)
         except socket.gaierror:
-            return times_ms, f"no machine is called {host!r}: check the name, or use its address"
+            return times_ms, f"host '{host}' does not resolve: check the name or use its IP address"
         except OSError as error:
             why = _UNREACHED.get(error.errno or 0, error.strerror or "unknown")
             return times_ms, why + (neighbour(host) if error.errno == errno.EHOSTUNREACH else "")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import socket
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -31,6 +31,16 @@ def process_with_open(files: Collection[str], besides: int = 0) -> str:
     for process in Path("/proc").glob("[0-9]*"):
         if process.name != str(besides) and any(_target(link) in files for link in _descriptors(process)):
             return f"{_name(process)} (pid {process.name})"
+    return ""
+
+
+def unresolved_host(hosts: Iterable[str]) -> str:
+    """Return the first of `hosts` that has no address, "" if all have one; a name server may take seconds."""
+    for host in hosts:
+        try:
+            socket.getaddrinfo(host, None)
+        except (socket.gaierror, UnicodeError):  # a label of more than 63 characters cannot be encoded
+            return host
     return ""
 
 

@@ -16,7 +16,7 @@ from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.config import PLUGIN_ERRORS
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.log import RepeatLimiter, start_log_thread
 from sightline.protocol.messages import LastRejection, State, StreamStatus
 from sightline.robot_side import pipe as ipc
@@ -147,6 +147,7 @@ class Driver:
         self._logged_level = BatteryLevel.SILENT
         self._driver_core = DriverCore(config, secrets.token_hex(4), stopped=latch.is_set())
         self._logged_state = self._driver_core.gate.state
+        self._is_waiting_logged = False
         self._ending_since_us: int | None = None
         self._systemd_notifier = SystemdNotifier()
         self._watchdog_due_us = self._ticked_us = 0
@@ -280,6 +281,7 @@ class Driver:
     def _log_state(self, state: State, reason: str) -> None:
         """One line per change of state."""
         logged, self._logged_state = self._logged_state, state
+        self._is_waiting_logged &= state is State.DISARMED
         if state is not logged and {state, logged} != {State.ACTIVE, State.DEGRADED}:
             self._log(f"{state} ({reason})")  # on a lossy link those two alternate many times a second
 
@@ -345,6 +347,12 @@ class Driver:
         return True
 
     def _log_rejection(self, rejection: LastRejection, times: int = 1) -> None:
+        # A driver sends commands before it is armed: a normal state, and one line says how it ends.
+        if rejection.reason == RejectReason.DISARMED:
+            if not self._is_waiting_logged:
+                self._is_waiting_logged, robot = True, self._driver_core.config.robot
+                self._log(f"receives commands from {rejection.source}; waiting for `sightline arm {robot}`")
+            return
         if count := self._rejection_limiter.due(rejection.reason, monotonic_us(), times):
             often = f" ({count} times)" if count > 1 else ""
             source = rejection.source or "an unknown source"

@@ -19,6 +19,7 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.log import RepeatLimiter
+from sightline.protocol.transports.diagnosis import unresolved_host
 from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_websocket_endpoint
 from sightline.protocol.transports.link import INEXACT_KEY, BaseLink, LinkRules, Message
 from sightline.protocol.transports.websocket.client import Client as Dialer
@@ -250,6 +251,8 @@ class WebSocketLink(BaseLink):
                     raise LinkError(f"cannot connect to {dialer.endpoint.text}: {dialer.trouble}")
             if late:
                 where = " or ".join(dialer.endpoint.text for dialer in self._dialers)
+                if host := unresolved_host(dialer.endpoint.host for dialer in self._dialers):
+                    raise LinkError(f"host '{host}' in {where} does not resolve; check the name or use an IP address")
                 raise LinkError(f"no answer from {where} after {timeout_s:g} s; start the robot or check the address")
 
     # --- peers, each on a separate thread ----------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError
 from sightline.protocol.log import RepeatLimiter
-from sightline.protocol.transports.diagnosis import connections, diagnose_tls, port_owner
+from sightline.protocol.transports.diagnosis import connections, diagnose_tls, port_owner, unresolved_host
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
 from sightline.protocol.transports.security import RoleKeys, size_limit_section
 
@@ -179,6 +179,8 @@ def _error_of(
         trouble = next((found for endpoint in connect if (found := diagnose_tls(endpoint, secured))), "")
         if trouble:
             return LinkError(f"cannot connect to {where}: {trouble}")
+        if host := unresolved_host(parse_zenoh_endpoint(endpoint)[1] for endpoint in connect):
+            return LinkError(f"host '{host}' in {where} does not resolve; check the name or use an IP address")
         more = ""
         if "quic/" in where:
             more = ", or one end rejects the other's keys: start the robot with RUST_LOG=zenoh_link_commons=warn"

@@ -167,7 +167,7 @@ def test_nobody_listening_is_told_apart_from_no_such_name(capsys, monkeypatch):
     refused = _checks(capsys, "--peer", free_endpoint())["reach"]
     assert "firewall" not in refused["fix"], "who refuses is there"
     unknown = _checks(capsys, "--peer", "tcp/no-such-name.invalid:7447")["reach"]
-    assert "nobody listens" in refused["fix"] and "no machine is called" in unknown["fix"]
+    assert "nobody listens" in refused["fix"] and "does not resolve" in unknown["fix"]
     assert not refused["ok"] and not unknown["ok"]
 
 

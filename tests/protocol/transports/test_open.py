@@ -1,5 +1,7 @@
 """One robot on several endpoints of different kinds at once."""
 
+import socket
+
 import pytest
 
 from sightline.protocol.channels import FRAME, STATUS, TWIST
@@ -35,6 +37,20 @@ def test_a_failure_on_one_endpoint_leaves_none_open():
 def test_an_endpoint_that_is_none_is_named(endpoint):
     with pytest.raises(ConfigError, match="invalid endpoint"):
         open_link("r1", connect=[endpoint])
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/no-such-host.invalid:7447", "ws://no-such-host.invalid:9090"])
+def test_host_name_that_does_not_resolve_is_reported(endpoint, monkeypatch):
+    """Not as a robot that does not answer. Resolution fails here without a query, which may take seconds."""
+    def fail(host, *_arguments, **_options):
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", fail)
+    with pytest.raises(LinkError) as error:
+        open_link("r1", connect=[endpoint], timeout_s=0.3)
+    assert str(error.value) == (
+        f"host 'no-such-host.invalid' in {endpoint} does not resolve; check the name or use an IP address"
+    )
 
 
 def test_links_of_several_robots_are_not_joined():

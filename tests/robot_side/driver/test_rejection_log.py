@@ -1,6 +1,9 @@
 """Rejected commands in the log of a robot: the first at once, a flood in a few lines, each reason by itself."""
 
+from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.protocol.channels import ACK, TWIST, key_for
+from sightline.protocol.messages import Verb
+from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.zenoh.session import open_session
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision
@@ -48,3 +51,17 @@ def test_what_an_earlier_network_process_counted_stays_in_the_status(tmp_path):
             if count == 1:
                 robot.kill_network()
                 assert until(lambda: len(vision.headers) and refused() == 1, 10), "the old count, from the new process"
+
+
+def test_commands_before_arming_are_one_line_that_names_the_next_command(tmp_path):
+    with RobotProcess(tmp_path, safety={"auto_arm": False}) as robot, Vision(robot.endpoint) as vision:
+        assert until(lambda: vision.status().refused.get("DISARMED", 0) > 30, 10)
+        waiting = "receives commands from vision; waiting for `sightline arm r1`"
+        assert until(lambda: waiting in robot.output(), 2)
+        assert robot.output().count(waiting) == 1
+        assert "rejected DISARMED" not in robot.output()
+        with open_link("r1", connect=[robot.endpoint], role=SOURCE) as link:
+            operator = Operator(link)
+            assert operator.arm().ok
+            assert operator.request(Verb.DISARM).ok
+        assert until(lambda: robot.output().count(waiting) == 2, 5), "again after it was armed"
