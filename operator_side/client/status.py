@@ -1,9 +1,12 @@
 """A robot's status and replies as text. Pure."""
 
 from collections.abc import Iterator
+from typing import Final
 
 from sightline.protocol.errors import RejectReason
 from sightline.protocol.messages import Reply, State, Status, StreamStatus, Verb
+
+_LATCHED: Final = (RejectReason.STOPPED, RejectReason.FAULT)
 
 
 def status_line(robot: str, status: Status) -> str:
@@ -19,7 +22,9 @@ def reply_line(robot: str, verb: Verb, reply: Reply, driver: str = "") -> str:
         driver: source that holds the lease, or "".
     """
     if not reply.ok:
-        return f"robot {robot} rejected {verb}: {reply.detail}{_fix(robot, reply)}"
+        reason, _, words = reply.detail.partition(": ")
+        fix = f"; run `sightline reset {robot}`, then arm again" if reason in _LATCHED else ""
+        return f"robot {robot} rejected {verb} ({reason}): {words.removesuffix('; reset first')}{fix}"
     if verb is Verb.ARM:
         done = "was already armed" if reply.detail.startswith("already") else "is armed"
         follows = f"it follows the commands of {driver}" if driver else "it moves when valid commands arrive"
@@ -29,12 +34,6 @@ def reply_line(robot: str, verb: Verb, reply: Reply, driver: str = "") -> str:
     if verb is Verb.RESET and reply.detail.startswith("reset"):
         return f"{robot} is reset and disarmed; `sightline arm {robot}` permits motion again"
     return f"{robot}: {reply.detail} ({reply.state})"
-
-
-def _fix(robot: str, reply: Reply) -> str:
-    if reply.detail.startswith((RejectReason.STOPPED, RejectReason.FAULT)):
-        return f"; run `sightline reset {robot}`, then arm again"
-    return ""
 
 
 def short_lines(robot: str, status: Status) -> Iterator[str]:

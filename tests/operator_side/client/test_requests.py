@@ -6,11 +6,11 @@ import time
 import pytest
 
 from sightline.operator_side.client.requests import Operator, read_report
-from sightline.operator_side.client.status import status_line, status_lines
+from sightline.operator_side.client.status import reply_line, short_lines, status_line, status_lines
 from sightline.protocol.channels import REQUEST, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError
-from sightline.protocol.messages import AnswerHeader, Echo, Status, Verb
+from sightline.protocol.messages import AnswerHeader, Echo, Holder, Reply, State, Status, Verb
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.robot_side.config import PluginChoice, RobotConfig
@@ -159,6 +159,35 @@ def test_status_text_shows_every_counter_and_the_last_rejection():
         assert f"{reason} {count}" in text
     assert status.last_refusal.detail in text
     assert status_line("r1", status) == "r1: DISARMED (not armed)"
+
+
+@pytest.mark.parametrize(("verb", "reply", "expected"), [
+    ("arm", (True, "HOLD", "armed"), "r1 is armed (HOLD); it follows the commands of vision; `sightline stop r1`"),
+    ("arm", (True, "ACTIVE", "already armed"), "r1 was already armed (ACTIVE); it follows"),
+    ("arm", (False, "DISARMED", "NOT_ALLOWED: none; start it"), "robot r1 rejected arm (NOT_ALLOWED): none; start"),
+    ("arm", (False, "STOPPED", "STOPPED: STOP by x; reset first"),
+     "robot r1 rejected arm (STOPPED): STOP by x; run `sightline reset r1`, then arm again"),
+    ("disarm", (True, "DISARMED", "disarmed"), "r1 is disarmed; `sightline arm r1` permits motion again"),
+    ("reset", (True, "DISARMED", "reset; arm to drive"), "r1 is reset and disarmed; `sightline arm r1`"),
+    ("reset", (True, "HOLD", "nothing to reset: HOLD"), "r1: nothing to reset: HOLD (HOLD)"),
+])
+def test_reply_names_the_next_command(verb, reply, expected):
+    ok, state, detail = reply
+    line = reply_line("r1", Verb(verb), Reply(to="0000000a", id=1, ok=ok, state=state, detail=detail), "vision")
+    assert line.startswith(expected)
+
+
+@pytest.mark.parametrize(("state", "holder", "expected"), [
+    (State.DISARMED, True, "next      sightline arm r1"), (State.DISARMED, False, "next      sightline vision,"),
+    (State.STOPPED, True, "next      sightline reset r1"), (State.ACTIVE, True, ""),
+])
+def test_short_status_fits_a_glance_and_names_the_next_command(state, holder, expected):
+    driver = Holder(source="vision", session="0000000a") if holder else None
+    lines = list(short_lines("r1", Status(state=state, reason="why", holder=driver, frame_age_us=84_000)))
+    assert lines[1] == f"state     {state}: why" and len(lines) <= 7
+    assert "frame age 84 ms" in lines[4]
+    assert [line for line in lines if line.startswith("next")] == ([lines[-1]] if expected else [])
+    assert lines[-1].startswith(expected)
 
 
 def test_a_report_is_what_was_published():

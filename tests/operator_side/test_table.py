@@ -1,0 +1,43 @@
+"""Tables and colors on the terminal."""
+
+import io
+
+import pytest
+
+from sightline.operator_side.table import colored, print_table, table_lines, uses_color
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_columns_are_as_wide_as_their_cells_whatever_the_terminal(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "10")
+    long = "word " * 40
+    assert table_lines([("a", "b", long.strip()), ("long name", "", "c"), ("alone",)]) == [
+        f"a          b  {long.strip()}", "long name     c", "alone",
+    ]  # fmt: skip
+    assert table_lines([]) == []
+
+
+@pytest.mark.parametrize(("environ", "expected"), [
+    ({}, True), ({"NO_COLOR": "1"}, False), ({"NO_COLOR": ""}, True), ({"TERM": "dumb"}, False),
+])
+def test_colors_need_a_terminal_and_no_no_color(monkeypatch, environ, expected):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    for name, value in environ.items():
+        monkeypatch.setenv(name, value)
+    assert uses_color(Terminal()) is expected
+    assert uses_color(io.StringIO()) is False
+
+
+def test_states_are_colored_and_other_words_are_not():
+    assert colored("state STOPPED: x") == "state \x1b[31mSTOPPED\x1b[0m: x"
+    assert colored("HOLDING ACTIVELY") == "HOLDING ACTIVELY"
+
+
+def test_a_pipe_gets_plain_lines(capsys):
+    print_table([("r1", "FAULT")])
+    assert capsys.readouterr().out == "r1  FAULT\n"
