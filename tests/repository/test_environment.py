@@ -103,7 +103,7 @@ def test_environment_whose_python_is_gone_gives_one_line(venv):
     assert (code, lines) == (2, [f"error: the Python of {venv} is gone: run `make clean`, then `make test`"])
 
 
-def test_folder_that_is_no_environment_stays_as_it_is(tmp_path, calls):
+def test_folder_without_environment_stays_as_it_is(tmp_path, calls):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos/cat").touch()
     code, (line,) = make("demo", f"PYTHON={sys.executable}", f"VENV={tmp_path / 'photos'}")
