@@ -62,8 +62,11 @@ CMD ["vision"]
 
 # --- sim ---------------------------------------------------------------------------------------------------------------
 FROM pictures AS sim-packages
-# PyBullet has a ready-made wheel for x86_64 only; elsewhere pip compiles it.
-RUN [ "$(uname -m)" = x86_64 ] || { apt-get update && apt-get install -y --no-install-recommends g++; }
+# PyBullet has a ready-made wheel for x86_64 only; elsewhere pip compiles it, with the NumPy of `pictures` present: without
+# NumPy each image of the simulated camera would be a tuple. No debug symbols, as in environment.py.
+RUN [ "$(uname -m)" = x86_64 ] || { apt-get update && apt-get install -y --no-install-recommends g++ \
+ && /opt/sightline/bin/pip install setuptools \
+ && CFLAGS="-O2 -g0 -w" CXXFLAGS="-O2 -g0 -w" /opt/sightline/bin/pip install --no-build-isolation --use-pep517 pybullet; }
 RUN /opt/sightline/bin/pip install "$(echo /empty/*.whl)[sim]"
 COPY --from=wheel /dist /dist
 RUN /opt/sightline/bin/pip install --no-deps --force-reinstall /dist/*.whl

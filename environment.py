@@ -41,8 +41,8 @@ SETS = {
     "test": PackageSet("requirements.lock", "a demo, the tests and the linters", 1070, 340),
 }
 # What the compilation of PyBullet writes below TMPDIR, and how long it takes on two cores.
-BUILD_MB = 900
-BUILD_MINUTES = 6
+BUILD_MB = 500
+BUILD_MINUTES = 4
 BUILD_OBJECTS = 267
 # Python's own flags add debug symbols and warnings, which only cost time and space.
 BUILD_FLAGS = "-O2 -g0 -w"
@@ -107,7 +107,7 @@ class Setup:
 
     def digest(self) -> str:
         """Digest of all that decides what is installed."""
-        facts = hashlib.sha256(sys.version.encode())
+        facts = hashlib.sha256(f"{sys.version} {ROOT}".encode())
         for path in (self.lock, ROOT / "pyproject.toml", ROOT / "setup.py"):
             facts.update(path.read_bytes())
         return facts.hexdigest()
@@ -164,7 +164,7 @@ class Setup:
     def build_pybullet(self, wheel: Path) -> None:
         """Compile PyBullet's locked source with the locked NumPy present, and store the wheel for later set-ups."""
         print(f"PyBullet has no ready-made package for Python {sys.version_info[0]}.{sys.version_info[1]} here: "
-              f"compiling it once, about {BUILD_MINUTES} minutes on 2 cores; stored in {wheel.parent}", flush=True)
+              f"compiling it once, about {BUILD_MINUTES} minutes on 2 idle cores; stored in {wheel.parent}", flush=True)
         wheel.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="sightline-build-") as folder:
             needs, source = Path(folder) / "needs.txt", Path(folder) / "source.txt"
