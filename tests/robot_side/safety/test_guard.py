@@ -2,20 +2,16 @@
 
 import array
 import math
-import time
-from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
 from sightline.evaluation.scenario_config import robot_config
-from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, Twist
 from sightline.robot_side.ports import Ranges
 from sightline.robot_side.safety.guard import BlindZoneError, GuardConfig, RangeGuard, _Near, check_blind_zone
 from sightline.sim.robot import load_robot
-from tests.fixtures.robot_process import RobotProcess
 
 DEFAULTS = {
     "front_m": 0.07,
@@ -395,49 +391,3 @@ def test_a_simulated_robot_is_refused_with_its_name():
     model = load_robot("gazebo-raspi").model_copy(update={"settings": {"guard": {"stop_m": 0.08}}})
     with pytest.raises(ConfigError, match=r"^robot gazebo-raspi: \[settings\] guard.stop_m = 0.08: .* below 0.1 m.*$"):
         robot_config(model)
-
-
-class Settings(Config):
-    """`fog`: once this file is there the sensor is blinder than it was."""
-
-    least_m: float = 0.13
-    fog: Path = Path("/nonexistent")
-
-
-class NearSighted:
-    """A range sensor with nothing about it, at 10 Hz."""
-
-    Config = Settings
-
-    def __init__(self, config):
-        self._config, self._due_s = config, 0.0
-
-    def read(self):
-        now_s = time.monotonic()
-        if now_s < self._due_s:
-            return None
-        self._due_s = now_s + 0.1
-        least_m = self._config.least_m + self._config.fog.exists()
-        return Ranges(round(now_s * 1e6), 0.0, 0.1, least_m, 8.0, array.array("f", [math.inf] * 3))
-
-    def close(self):
-        pass
-
-
-def test_a_robot_with_such_a_sensor_does_not_start(tmp_path):
-    """The default stop zone is 0.08 m, its sensor's 0.055 + 0.13 is 0.115 beyond the front."""
-    with RobotProcess(tmp_path, range_sensor={"kind": f"{__name__}:NearSighted"}) as robot:
-        assert robot.process.wait(10) == 2
-        said = [line for line in robot.output().splitlines() if "error" in line]
-        assert len(said) == 1 and "guard.stop_m = 0.08" in said[0] and "Traceback" not in robot.output()
-        assert robot.speed() == 0.0 and robot.motor_rows(), "the motors were told zero"
-
-
-def test_with_a_larger_stop_zone_it_does_and_a_sensor_that_turns_blind_ends_it(tmp_path):
-    fog = tmp_path / "fog"
-    sensor = {"kind": f"{__name__}:NearSighted", "options": {"fog": str(fog)}}
-    with RobotProcess(tmp_path, range_sensor=sensor, guard={"stop_m": 0.13}) as robot:
-        robot.wait_until_on()
-        fog.touch()
-        assert robot.process.wait(10) == 2
-        assert "below 1.13 m" in robot.output() and robot.speed() == 0.0
