@@ -131,7 +131,8 @@ def compose(safe: Take, naive: Take) -> Story:
     """Compute the figures of both takes. Raises SightlineError where one of them did not end as the film shows."""
     lost_us = naive.events["wifi lost"]
     if "wall" not in naive.events:
-        raise SightlineError("the naive robot met no wall while the radio was gone; run it again, or choose --seed")
+        raise SightlineError("the naive robot met no wall while the radio was gone, as its last command was slow; "
+                             "run it again on a machine with less load")
     hit_us = naive.events["wall"]
     return Story(
         safe, naive, stop_after(safe, "wifi lost", "wifi back"), stop_after(safe, "vision killed", "vision back"),

@@ -224,7 +224,7 @@ class Page:
         """Which robot, and on the right what works."""
         draw.text((14, _TOP_PX / 2), about.name, _INK, self._fonts.large, anchor="lm")
         chips = [(about.state, _STATES.get(about.state, RED)),
-                 ("vision on" if about.vision else "vision dead", GREEN if about.vision else RED),
+                 ("vision on" if about.vision else "vision killed", GREEN if about.vision else RED),
                  ("Wi-Fi on" if about.wifi else "Wi-Fi lost", GREEN if about.wifi else RED)]
         right_px = WIDTH_PX - 12
         for text, color in chips:

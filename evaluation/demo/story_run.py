@@ -5,6 +5,7 @@ between vision service and robot passes. The runner itself reads the robot's mes
 """
 
 import json
+import shutil
 import signal
 import tempfile
 import threading
@@ -43,7 +44,7 @@ from sightline.operator_side.preflight import check_out_file, needs
 from sightline.protocol.channels import FRAME, STATUS, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
-from sightline.protocol.errors import HardwareError, SightlineError, WireError
+from sightline.protocol.errors import ConfigError, HardwareError, SightlineError, WireError
 from sightline.protocol.messages import AnswerHeader, FrameHeader, Status
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
@@ -79,6 +80,8 @@ LOST_AT_X_M: Final = 1.1
 OUTAGE_S: Final = 3.6
 """How long the radio is gone: a robot that drives on meets the wall within it."""
 _FOLLOWS_MPS: Final = 0.2
+_FAST_MPS: Final = 0.3
+"""The radio is lost while the robot drives at least this fast."""
 _MOVES_S: Final = 60.0
 _AGAIN_WITHIN_S: Final = 40.0
 _DYING_S: Final = 1.0
@@ -223,7 +226,7 @@ def _lose_radio(stage: TakeProcesses) -> None:
     """Drive toward the wall, then stop the relay and watch the consequence."""
     stage.until(lambda now: now.linear_mps > _FOLLOWS_MPS, _MOVES_S, "motion")
     stage.mark("moving")
-    stage.until(lambda now: now.x_m >= LOST_AT_X_M, _MOVES_S, "straight toward the wall")
+    stage.until(lambda now: now.x_m >= LOST_AT_X_M and now.linear_mps >= _FAST_MPS, _MOVES_S, "straight toward the wall")
     stage.mark("wifi lost")  # before the signal: the figures include what it takes
     stage.processes.signal("relay", signal.SIGSTOP)
     stage.watch(OUTAGE_S)
@@ -294,6 +297,8 @@ def run_takes(folder: Path, seed: int, say: Callable[[str], None]) -> tuple[Take
 
 
 FILM: Final = "story.webp"
+SPACE_BYTES: Final = 10_000_000
+"""Logs and film of a story take a third of this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,15 +326,29 @@ class StoryResult:
 
 
 def make_story(out: Path | None, seed: int, say: Callable[[str], None]) -> StoryResult:
-    """Run both takes and write the film. Raises ConfigError for a place that cannot be written, before any run."""
+    """Run both takes and write the film.
+
+    Raises ConfigError for a place that cannot be written or is too small, before any run where that can be known.
+    """
     with needs("report"):
         from sightline.evaluation.demo.story_film import write_story
     folder = run_folder(out, f"story-{seed}")
     check_out_file(folder / FILM)
-    with terminated_like_interrupted():
-        story = compose(*run_takes(folder, seed, say))
-    scenario = load_scenario(str(folder / "sightline" / SCENARIO))
-    images = write_story(folder / FILM, story, scenario, robot_of(scenario), say=say)
-    result = StoryResult(story, folder, images)
-    (folder / "story.json").write_text(json.dumps(result.to_dict(), indent=2) + "\n", "utf-8")
+    check_space(folder, shutil.disk_usage(folder).free)
+    try:
+        with terminated_like_interrupted():
+            story = compose(*run_takes(folder, seed, say))
+        scenario = load_scenario(str(folder / "sightline" / SCENARIO))
+        images = write_story(folder / FILM, story, scenario, robot_of(scenario), say=say)
+        result = StoryResult(story, folder, images)
+        (folder / "story.json").write_text(json.dumps(result.to_dict(), indent=2) + "\n", "utf-8")
+    except OSError as error:
+        raise ConfigError(f"run folder {folder}: {error.strerror or error}; pass another with --out") from None
     return result
+
+
+def check_space(folder: Path, free_bytes: int) -> None:
+    """Raise ConfigError where the logs and the film would not fit."""
+    if free_bytes < SPACE_BYTES:
+        raise ConfigError(f"run folder {folder}: {free_bytes / 1e6:.1f} MB free, the story needs "
+                          f"{SPACE_BYTES / 1e6:.0f} MB; free some space or pass another folder with --out")

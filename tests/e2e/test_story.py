@@ -10,7 +10,7 @@ from PIL import Image
 
 from sightline.evaluation.faults.evidence import measure_stop, read_motors
 
-pytestmark = pytest.mark.alone
+pytestmark = pytest.mark.slow
 
 COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "demo"]
 

@@ -25,7 +25,7 @@ from sightline.evaluation.demo.story_film import (
     truth_at,
     write_story,
 )
-from sightline.evaluation.demo.story_run import SCENE, write_configuration
+from sightline.evaluation.demo.story_run import SCENE, check_space, write_configuration
 from sightline.evaluation.faults.evidence import MotorRow
 from sightline.evaluation.scenario_config import robot_of
 from sightline.protocol.channels import FRAME, TWIST
@@ -234,6 +234,12 @@ def test_truth_at_is_the_newest_so_far():
 def test_film_that_cannot_be_written_is_one_line(tmp_path, story, scene):
     with pytest.raises(ConfigError, match=r"cannot be written: .*; pass another folder with --out"):
         write_story(tmp_path / "gone" / "story.webp", story, *scene, say=lambda _line: None, fps=0.2)
+
+
+def test_place_that_is_too_small_is_one_line(tmp_path):
+    check_space(tmp_path, 10_000_000)
+    with pytest.raises(ConfigError, match=r"9\.9 MB free, the story needs 10 MB; free some space"):
+        check_space(tmp_path, 9_900_000)
 
 
 def test_film_loops_and_holds_its_last_image(tmp_path, story, scene):
