@@ -226,7 +226,7 @@ def _lose_radio(stage: TakeProcesses) -> None:
     """Drive toward the wall, then stop the relay and watch the consequence."""
     stage.until(lambda now: now.linear_mps > _FOLLOWS_MPS, _MOVES_S, "motion")
     stage.mark("moving")
-    stage.until(lambda now: now.x_m >= LOST_AT_X_M and now.linear_mps >= _FAST_MPS, _MOVES_S, "straight toward the wall")
+    stage.until(lambda now: now.x_m >= LOST_AT_X_M and now.linear_mps >= _FAST_MPS, _MOVES_S, "way to the wall")
     stage.mark("wifi lost")  # before the signal: the figures include what it takes
     stage.processes.signal("relay", signal.SIGSTOP)
     stage.watch(OUTAGE_S)
