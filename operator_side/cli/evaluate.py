@@ -58,7 +58,7 @@ def demo(
     transport: Annotated[str, typer.Option(help="Link of the vision service: zenoh, websocket or legacy.")] = "zenoh",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Run folder [default: runs/TIME-...].")] = None,
     open_it: Annotated[bool, typer.Option("--open", help="Open the film at the end.")] = False,
-    story: Annotated[bool, typer.Option("--story", help="Film of 27 s: stops, then a naive robot, a wall.")] = False,
+    story: Annotated[bool, typer.Option("--story", help="Film the stops, then a naive robot at a wall.")] = False,
     as_json: Json = False,
 ) -> int:
     """Simulate, drive, score and film a run on this machine
