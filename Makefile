@@ -25,7 +25,7 @@ test-all: test-environment  ## what is longer: first what can share the machine,
 	$(PYTEST) -m "alone and not long" && exit $$shared
 
 test-long: test-environment  ## once before a release: the fault bench, the kit against every broken peer, all mutants
-	$(PYTEST) -m long; tests=$$?; $(BIN)/python -m tests.mutation && exit $$tests
+	$(PYTEST) -m long; tests=$$?; $(MAKE) --no-print-directory mutation && exit $$tests
 
 lint: test-environment
 	$(BIN)/ruff check .
