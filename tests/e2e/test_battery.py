@@ -92,7 +92,7 @@ def test_battery_that_raises_returns_nan_or_hangs_slows_the_robot_and_delays_not
         robot.wait_until_on()
         with Vision(robot.endpoint, twist=b"0.4000|0.0000") as vision:
             assert driving(robot, HALF_RAD_S * 0.99)
-            time.sleep(4)
+            assert until(lambda: vision.status().reason == "the battery is silent; half speed", 15)
             assert robot.speed() == pytest.approx(HALF_RAD_S, rel=0.01)
             status = vision.status()
             assert (status.state, status.reason) == (State.DEGRADED, "the battery is silent; half speed")

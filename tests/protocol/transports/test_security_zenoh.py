@@ -91,13 +91,16 @@ def test_each_role_says_what_it_may_and_nothing_else(folder, endpoint):
         for role in SOURCES_OF_ROLE:
             with open_zenoh("r1", connect=[endpoint], role=role, secure=str(folder)) as peer:
                 frames = peer.latest(FRAME)
-                until(lambda: robot.has_listener(FRAME))
+                assert until(lambda: robot.has_listener(FRAME))
                 robot.publish(FRAME, b"{}", b"jpeg")
                 assert frames.take(2.0) is not None, f"{role} may watch"
                 allowed = {key for key in may_publish(role) if CHANNELS[key.split("/")[2]] in SAID}
-                until(lambda peer=peer, allowed=allowed: says_all(peer) or said(heard) >= allowed)
+                assert until(lambda peer=peer, allowed=allowed: says_all(peer) or said(heard) >= allowed)
+                heard.clear()
+                says_all(peer)  # what is denied comes before the second round of what is allowed
                 says_all(peer)
-            time.sleep(0.1)  # what is denied must have had its chance
+                assert until(lambda allowed=allowed: all(count(heard, key) >= 2 for key in allowed))
+            assert until(lambda: not robot.has_listener(FRAME)), "the link ends after all that was published on it"
             assert said(heard) == allowed
             heard.clear()
 
@@ -124,6 +127,10 @@ def says_all(peer):
     """Once on every key, and as every source; a peer that has just come in may not yet know who listens to what."""
     for channel, source in product(SAID, ("vision", "operator", "teleop", "guest")):
         peer.publish(channel, b"{}", b"", source)
+
+
+def count(heard, key):
+    return sum(f"sightline/*/{channel}/{source}" == key for channel, source in tuple(heard))
 
 
 def said(heard):
