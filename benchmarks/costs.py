@@ -1,4 +1,4 @@
-"""What encoding a message and judging a command cost. Shell (a clock)."""
+"""Measure the time to encode a message and to validate a command. Shell (a clock)."""
 
 import statistics
 import time
@@ -61,7 +61,7 @@ def _median_us(call: Callable[[], None]) -> float:
     return statistics.median(rounds)
 
 
-# What the safety gate costs: one command judged and one step decided. Shell (reads the clock).
+# The time of the safety gate: one command validated, one step computed. Shell (reads the clock).
 
 
 GATE_BOUND_US: Final = 20.0

@@ -1,4 +1,4 @@
-"""What a detector elsewhere costs, and one service for many streams; with a detector that is slow on purpose. Shell."""
+"""Measure a remote detector, and one service for many streams, with a deliberately slow detector. Shell."""
 
 import subprocess
 import sys
@@ -32,7 +32,7 @@ class SlowDetector:
     """`--serve sightline.benchmarks.detector:SlowDetector`."""
 
     class Config(Settings):
-        """How slow."""
+        """Time per frame."""
 
         each_us: Annotated[int, Field(ge=0, le=1_000_000)] = 1_667
         """The time that one frame takes, in a batch or alone: 600 a second."""
@@ -42,14 +42,15 @@ class SlowDetector:
         self._found = (Detection(10, 10, 30, 30, 0.9, "thing"),)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
-        """As the port says; the pixels are not looked at."""
+        """Return an empty result after the delay, without the pixels."""
         time.sleep(self._each_s * len(frames))
         return [result_of(frame, self._found, Maker("slow", device="cpu")) for frame in frames]
 
 
-# What a detector elsewhere costs beside the same one in this process: time from frame to result. Shell (the clock).
-# The two are asked in turns about the same frames, so that whatever else the machine does falls on both: hot, one
-# frame after the other, and paced as a robot sends them, when caches are cold on every side.
+# The cost of a remote detector against the same one in this process: time from frame to result. Shell (the clock).
+#
+# Both receive the same frames in turns, so that other load on the machine affects both: hot, one frame after the other,
+# and paced as a robot sends them, with cold caches.
 
 
 PACED_S: Final = 1 / 30
@@ -60,7 +61,7 @@ _DEADLINE_US: Final = 500_000
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Microseconds for one frame, medians; `unanswered` of the frames that were asked about elsewhere."""
+    """Microseconds for one frame, medians; `unanswered` counts frames without a remote answer."""
 
     here_us: float
     there_us: float
@@ -68,13 +69,13 @@ class Cost:
 
     @property
     def added_us(self) -> float:
-        """What it costs to ask elsewhere."""
+        """Return the additional time of the remote detector, us."""
         return self.there_us - self.here_us
 
 
 def measure_cost(here: Detector, there: Detector, jpeg: bytes, size_px: tuple[int, int], *, frames: int = 300,
                  period_s: float = HOT_S, robot: Link | None = None) -> Cost:
-    """Ask both about `frames` frames. With `robot` they are also published, for a service that hears them itself."""
+    """Send `frames` frames to both detectors. With `robot` they are also published, for a service that subscribes."""
     decoder, numbers, took = Decoder(*size_px, size_px[0] * size_px[1]), count(1), (list[float](), list[float]())
     unanswered = 0
     next_s = time.monotonic()
@@ -119,7 +120,7 @@ _READY_S: Final = 30.0
 
 @dataclass
 class Load:
-    """What came of one run."""
+    """The result of one run."""
 
     offered: int = 0
     answered: Counter[str] = field(default_factory=Counter)
@@ -134,13 +135,13 @@ class Load:
 
     @property
     def unfair_percent(self) -> float:
-        """How far the robot that is furthest from the mean is from it."""
+        """Return the largest deviation of a robot from the mean, in percent."""
         mean = sum(self.answered.values()) / len(self.answered) if self.answered else 0.0
         return max(abs(count - mean) for count in self.answered.values()) / mean * 100 if mean else 100.0
 
     @property
     def growth_mb(self) -> float:
-        """Of the second half's mean over the first's."""
+        """Return the growth of the mean from the first half to the second, in MB."""
         half = len(self.memory_mb) // 2
         first, second = self.memory_mb[:half], self.memory_mb[half:]
         return sum(second) / len(second) - sum(first) / len(first) if first else float("inf")

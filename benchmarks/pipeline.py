@@ -1,5 +1,7 @@
-"""How long one `Pipeline.step` takes: hot, paced as a camera paces it, and the decode alone; and how long the detectors
-`hsv` and `onnx` do. Shell (a clock)."""
+"""Measure one `Pipeline.step` hot, at the pace of a camera, and the decode alone; and the detectors `hsv` and `onnx`.
+
+Shell (a clock).
+"""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -32,7 +34,7 @@ _FRAME_US = 33_333
 
 @dataclass(frozen=True, slots=True)
 class StepTime:
-    """One size of picture, medians; `phase` tells that the whole line ran.
+    """One size of picture, medians; `phase` shows that all steps ran.
 
     `median_us`: hot, one frame right after the other; the bound holds for this one. `alone_us`: of its rounds, the
     best. `paced_us`: 30 frames a second with sleep between, when caches and clock speed have to be regained each time.
@@ -134,7 +136,7 @@ def _took_us(call: Callable[[Any], object], inputs: Iterable[Any]) -> list[float
 def _alone(took_us: list[float]) -> float:
     """The least median of the rounds: what it takes when the machine is least disturbed. On a shared machine the same
     work was seen to take a third longer in most half-seconds, for which no counter gave a reason. (Python's `timeit`
-    says to look at the least, too.)
+    recommends the minimum, too.)
     """
     return min(median(took_us[first : first + _ROUND]) for first in range(0, len(took_us), _ROUND))
 

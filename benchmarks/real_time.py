@@ -1,4 +1,4 @@
-"""Many demos, judged by their median: real processes over Zenoh, in real time. Shell (processes)."""
+"""Run many demos and check their median: real processes over Zenoh, in real time. Shell (processes)."""
 
 import json
 import subprocess
@@ -14,12 +14,12 @@ _JUDGED: Final = (0, 5)
 
 @dataclass(frozen=True, slots=True)
 class Kinds:
-    """Which figures are judged otherwise than by a median that must not exceed its bound."""
+    """The figures with another check than a median below its bound."""
 
     at_least: str
     """How the names of those begin that must not fall below it."""
     exact: Collection[str]
-    """Those that leave no room: every run is judged."""
+    """Figures without tolerance: every run is checked."""
 
 
 @dataclass(frozen=True, slots=True)

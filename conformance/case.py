@@ -59,7 +59,7 @@ GROUPS: Final = {
 
 
 class Level(StrEnum):
-    """How binding a case is, in the words of RFC 2119."""
+    """The level of a case, in the words of RFC 2119."""
 
     MUST = "MUST"
     SHOULD = "SHOULD"
@@ -70,7 +70,7 @@ class ConformanceError(Exception):
 
 
 class NotApplicableError(Exception):
-    """What the case builds on is missing here; the text reports what."""
+    """A requirement of the case is missing here; the text names it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,14 +163,14 @@ Model = TypeVar("Model", bound=WireModel)
 
 @dataclass(frozen=True, slots=True)
 class Access:
-    """What the kit shows, or requests: a token for each role, and a folder of keys. Both are empty at an open peer."""
+    """The credentials of the kit: a token for each role, and a folder of keys. Both are empty for an open peer."""
 
     tokens: Mapping[str, str] = field(default_factory=dict)
     folder: str = ""
 
     @property
     def is_guarded(self) -> bool:
-        """Whether roles are kept apart by tokens or certificates."""
+        """Return True if tokens or certificates separate the roles."""
         return bool(self.tokens or self.folder)
 
     @property
@@ -179,11 +179,11 @@ class Access:
         return "operator" if self.is_guarded else "viewer"
 
     def may_request(self, source: str) -> bool:
-        """Whether requests of `source` get through."""
+        """Return True if the peer accepts requests of `source`."""
         return not self.is_guarded or source in SOURCES_OF_ROLE["operator"]
 
     def token_of(self, source: str) -> str:
-        """What `source` shows; "" where no token is demanded."""
+        """Return the token of `source`, or "" without tokens."""
         return self.tokens.get(certificate_role(source), "")
 
 
@@ -275,7 +275,7 @@ class Bench(ABC):
         return next(self._numbers)
 
     def received(self, channel: Channel, since: int = 0) -> list[Received]:
-        """What came on `channel` after the mark `since`, oldest first."""
+        """Return the messages on `channel` after the mark `since`, oldest first."""
         newer: list[Received] = []
         for one in reversed(self._log.get(channel.name, ())):
             if one.number <= since:

@@ -3,7 +3,7 @@
     {"id", "kind": "message", "key", "header", "payload"}      header and payload in base64
     {"id", "kind": "hello" | "websocket" | "older_...", fields}  a vector of that folder, in its own words
     {"id", "kind": "write_twist", "linear_mps", "angular_rad_s"}
-    -> {"id", "ok": ...}  or  {"id", "refusal": reason}  or  {"id", "unsupported": true}
+    -> `{"id", "ok": ...}`  or  `{"id", "refusal": reason}`  or  `{"id", "unsupported": true}`
 
 The order of answers is free; each question gets exactly one.
 """
@@ -32,6 +32,7 @@ MAX_ANSWER_BYTES: Final = 1_048_576
 """Security limit: a longer line is not an answer."""
 _PRINTED: Final = 120
 Fields = Mapping[str, Any]
+_RESULTS: Final = ("ok", "refusal", "unsupported")
 
 
 class ProgramError(Exception):
@@ -46,10 +47,10 @@ class Question:
     fields: Fields
     """As in the line; bytes stand for base64."""
     expected: Fields
-    """{"ok": ...} or {"refusal": reason}."""
+    """The expected answer with "ok", or with the reason of a rejection."""
 
     def line(self, number: int) -> bytes:
-        """As sent, with its line end."""
+        """Return the line as sent, with its line end."""
         fields = {name: base64.b64encode(value).decode("ascii") if isinstance(value, bytes) else value
                   for name, value in self.fields.items()}
         return json.dumps({"id": number, "kind": self.kind, **fields}).encode("ascii") + b"\n"
@@ -71,8 +72,8 @@ def read_answer(line: bytes) -> tuple[int, dict[str, Any]]:
     number = answer.pop("id", None) if isinstance(answer, dict) else None
     if not isinstance(number, int) or isinstance(number, bool):
         raise ProgramError(f"this answer has no id: {shown(line)}")
-    if len(answer.keys() & {"ok", "refusal", "unsupported"}) != 1:
-        raise ProgramError(f"this answer is not one of ok, refusal, unsupported: {shown(line)}")
+    if len(answer.keys() & set(_RESULTS)) != 1:
+        raise ProgramError(f"invalid answer: expected exactly one of {', '.join(_RESULTS)}: {shown(line)}")
     return number, answer
 
 
@@ -83,7 +84,10 @@ def shown(line: bytes) -> str:
 
 
 def same(expected: Any, got: Any, where: str = "") -> str:
-    """Where two values differ first, or an empty text. Numbers compare by value: 0, 0.0 and -0.0 are one."""
+    """Return the place of the first difference, or an empty text.
+
+    Numbers compare by value: 0, 0.0 and -0.0 are equal.
+    """
     if isinstance(expected, bool) or isinstance(got, bool) or not isinstance(expected, (dict, list, int, float)):
         return "" if type(expected) is type(got) and expected == got else _differ(expected, got, where)
     if isinstance(expected, (int, float)):

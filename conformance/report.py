@@ -10,7 +10,7 @@ from sightline.conformance.runner import Outcome, Result, passed, printable
 
 
 def counts(results: Sequence[Result]) -> Counter[str]:
-    """How many of each outcome; failed SHOULDs apart."""
+    """Count each outcome, with failed SHOULDs separately."""
     return Counter(_counted_as(one) for one in results)
 
 

@@ -9,7 +9,7 @@ from sightline.protocol.errors import ConfigError, LinkError
 
 
 class Outcome(StrEnum):
-    """What came out of a case."""
+    """The result of a case."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -73,14 +73,14 @@ def run_cases(
 
 
 def _after(last: Result, this: Result, count: int) -> Result:
-    """What to keep of two runs of a case, of which the last failed: only passing, at try `count`, makes up for it."""
+    """Return the result of two runs of a case after a failed first one. Only a pass, at try `count`, replaces it."""
     if this.outcome is not Outcome.PASSED:
         return this if this.outcome is Outcome.FAILED else last
     return Result(this.case, this.outcome, f"at try {count}; before: {last.reason}", this.took_us)
 
 
 def passed(results: Sequence[Result]) -> bool:
-    """Whether the peer conforms: no MUST failed, and something was tested."""
+    """Return True if the peer conforms: no MUST failed, and at least one case ran."""
     broken = any(one.outcome is Outcome.FAILED and one.case.level is Level.MUST for one in results)
     return not broken and any(one.outcome is Outcome.PASSED for one in results)
 

@@ -59,7 +59,7 @@ def at_least(name: str, value: float, unit: str, bound: float) -> Check:
 
 
 def worst_checks(runs: Iterable[Sequence[Check]]) -> list[Check]:
-    """Of each name the worst of several runs: the farthest outside its bound, or the nearest inside."""
+    """Return the worst check of each name: the farthest outside its bound, or the nearest inside."""
     by_name: dict[str, list[Check]] = {}
     for checks in runs:
         for check in checks:

@@ -18,7 +18,7 @@ from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.tracking.locate import BoxReader
 
 SOURCE = "guest"
-"""Whose boxes they are: somebody's who looks at frames and drives nothing."""
+"""Source of the boxes: a service that examines frames and does not drive."""
 
 
 def boxes_message(
@@ -53,11 +53,11 @@ class Labels:
 
 # Publishes the simulation's labels as boxes of a robot's frames, as a detector elsewhere would. Shell.
 #
-# It looks at no picture: the simulation says what is in each, by the time it was captured at.
+# It examines no image. The simulation publishes the contents of each image by its capture time.
 
 
 _WAIT_S = 0.03
-"""For a frame; then it takes in what the simulation said meanwhile."""
+"""Wait for a frame. Afterwards it reads the labels of the simulation."""
 
 
 def run(robot: str, connect: list[str], secure: str, socket_dir: str, say: Callable[[str], None]) -> int:

@@ -41,7 +41,7 @@ _ROBOT_SESSION, _VISION_SESSION = "00000001", "00000002"
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What the network does: added latency in all (half on each leg), jitter in all, loss on each leg."""
+    """The network: total added latency (half on each leg), total jitter, loss on each leg."""
 
     latency_ms: float = 0.0
     loss: float = 0.0
@@ -50,7 +50,7 @@ class Conditions:
 
 @dataclass(slots=True)
 class Run:
-    """What a run leaves."""
+    """The result of a run."""
 
     samples: list[Truth] = field(default_factory=list)
     twists: list[bytes] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Run:
     said: list[tuple[int, str, str]] = field(default_factory=list)
     """Capture time of each frame that was answered, and the mission's phase and note."""
     news: list[str] = field(default_factory=list)
-    """What the detector had to tell a person."""
+    """Lines of the detector for the operator."""
 
 
 class Lockstep:
@@ -109,7 +109,7 @@ class Lockstep:
             self.run.samples.append(self.world.truth())
 
     def close(self) -> None:
-        """Hear what the detector has to say, and let go of it."""
+        """Collect the notices of the detector and close it."""
         self.run.news += notices_of(self._detector)
         close_detector(self._detector)
 
@@ -144,7 +144,7 @@ class Lockstep:
         self.run.states.add(self.driving.gate.state)
 
     def _publish_scans(self) -> None:
-        """For a mission that goes by them; of all that the driver publishes, nothing else is listened to here."""
+        """Pass scans to a mission that uses them. It needs no other message of the driver."""
         if self._scanned is None:
             return
         for message in self.driving.messages(self._now_us):
@@ -193,7 +193,7 @@ def run_lockstep(
     mission: str | None = None,
     on_progress: Callable[[int], None] = lambda _now_us: None,
 ) -> Run:
-    """One run of `scenario` for `seconds` (its own length if None). `on_progress` is told the time each second.
+    """One run of `scenario` for `seconds` (its own length if None). `on_progress` receives the time each second.
 
     `vision` and `mission` stand in for what the scenario names.
     """

@@ -191,7 +191,7 @@ def _plot_clearance(axes: "Axes", times_s: list[float], samples: Sequence[Truth]
 
 
 def _plot_line(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
-    """How far the front is beyond the line, on the colour that is lit."""
+    """Plot the distance of the front beyond the line, on the color of the light."""
     axes.axhline(0.0, color="black", linewidth=1)
     ways_m = [truth.past_line_m or 0.0 for truth in samples]
     for colour, shown in (("red", "tab:red"), ("yellow", "gold"), ("green", "tab:green")):

@@ -21,7 +21,7 @@ from sightline.protocol.log import LOG_FORMAT_VARIABLE, LOG_FORMATS
 
 @contextmanager
 def terminated_like_interrupted() -> Iterator[None]:
-    """SIGTERM raises KeyboardInterrupt inside, as Ctrl-C does, so that whoever is running is ended."""
+    """Convert SIGTERM to KeyboardInterrupt inside, as Ctrl-C does, so that all processes are ended."""
 
     def interrupt(_number: int, _frame: FrameType | None) -> None:
         raise KeyboardInterrupt
@@ -101,7 +101,7 @@ class Processes:
         return self.pid(name)
 
     def log(self, name: str) -> Path:
-        """Where `name` writes."""
+        """Return the log of process `name`."""
         return self._folder / f"{name}.log"
 
     def pid(self, name: str) -> int:
@@ -124,7 +124,7 @@ class Processes:
             self.check()
             if time.monotonic() > deadline_s:
                 last = last_line(self.log(name))
-                raise ProcessError(f"{name} is not ready within {timeout_s:g} s; it last said: {last}")
+                raise ProcessError(f"{name} is not ready after {timeout_s:g} s; its last line: {last}")
             time.sleep(_POLL_S)
 
     def check(self, wait_s: float = 0.0) -> None:
@@ -169,8 +169,8 @@ class Processes:
     def end(self) -> list[str]:
         """Wake those that are stopped and end one after the other; idempotent.
 
-        The newest first, so that nobody sees another vanish, or the oldest, so that a robot keeps its notes before its
-        peer vanishes. Returns the names of those that had to be killed.
+        The newest first, so that no process observes the end of another, or the oldest, so that a robot writes its
+        events before its peer ends. Returns the names of those that had to be killed.
         """
         for name in self._running:
             self.signal(name, signal.SIGCONT)
@@ -210,13 +210,13 @@ def free_port() -> int:
             return port
 
 
-# Work on several processes that ends when it is told to. Shell (processes).
+# Work on several processes that ends on request. Shell (processes).
 
 
 @contextmanager
 def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
     """So many, for as long as the context lasts. Left by an error, what has not begun never does: a pool by itself
-    would first do all of it. Ctrl-C at the terminal, which every process hears, ends them at once.
+    would first do all of it. Ctrl-C at the terminal reaches every process and ends them immediately.
 
     Spawned, since a forked child would share PyBullet's state. Raises HardwareError when something else ends one.
     """

@@ -1,6 +1,6 @@
 """The robot's and vision's configuration for a simulated scenario. Pure.
 
-Nothing here is told to the services behind anybody's back: `sightline demo` leaves both files in its run folder.
+All settings are visible: `sightline demo` writes both files to its run folder.
 """
 
 import array
@@ -29,12 +29,12 @@ _MARGIN_M = 0.01  # around the outline as it is drawn
 
 
 def robot_of(scenario: Scenario, model: str | None = None) -> RobotModel:
-    """The robot of `scenario`, or another that somebody asked for. Raises ConfigError."""
+    """Return the robot of `scenario`, or the requested one. Raises ConfigError."""
     return load_robot(model or scenario.robot)
 
 
 def robot_table(model: RobotModel) -> Table:
-    """robot.toml of this robot: its wheels and outline as they are, and whatever its own file says besides."""
+    """Return robot.toml of this robot: its wheels, its outline, and the settings of its file."""
     reach = outline(model)
     measured = {
         "wheels": {
@@ -51,7 +51,7 @@ def robot_table(model: RobotModel) -> Table:
 
 
 def vision_table(scenario: Scenario, model: RobotModel, seed: int = 0, mission: str | None = None) -> Table:
-    """vision.toml for this scenario: target, limits of the robot, mission, and whatever its file says besides.
+    """Return vision.toml of this scenario: target, limits of the robot, mission, and the settings of its file.
 
     Another `mission` than the scenario's own starts with its own options, waypoints included if there are any.
     """
@@ -68,7 +68,7 @@ def vision_table(scenario: Scenario, model: RobotModel, seed: int = 0, mission: 
 
 
 def _limits(model: RobotModel) -> Table:
-    """What steering must know of a robot that is not as quick as most: its own limits."""
+    """Return the limits of a slow robot for steering."""
     safety = model.settings.get("safety")
     if not isinstance(safety, Mapping):
         return {}
@@ -98,7 +98,7 @@ def robot_config(model: RobotModel, *, auto_arm: bool = False) -> RobotConfig:
 
 
 def _check_sight(config: RobotConfig, model: RobotModel) -> None:
-    """What a robot's driver finds with the first scan, before there is one."""
+    """Check the blind zone before the first scan, as the driver process does with it."""
     lidar = model.lidar
     free = array.array("f", [math.inf] * lidar.rays)
     scan = Ranges(0, math.radians(lidar.first_deg), lidar.increment_rad, lidar.range_min_m, lidar.range_max_m, free)

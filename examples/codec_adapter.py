@@ -1,7 +1,7 @@
-"""A codec on a pipe, as `sightline conform codec -- python examples/codec_adapter.py` asks it. Shell.
+"""Run a codec on a pipe for `sightline conform codec -- python examples/codec_adapter.py`. Shell.
 
-One question per line of stdin, one answer per line of stdout, JSON both. This one asks Sightline's own codec; write its
-like in the language of yours, with your own codec in the place of `outcome` and `format_twist`.
+Each line of stdin is a question, and each line of stdout an answer, both JSON. This program uses Sightline's own codec.
+Write the same program in your language, with your codec in place of `outcome` and `format_twist`.
 """
 
 import base64
@@ -16,7 +16,7 @@ from sightline.protocol.text import format_twist
 
 
 def answer(question: dict[str, Any]) -> dict[str, Any]:
-    """What is answered, but for the id."""
+    """Return the answer without its id."""
     if question["kind"] == "message":
         header, payload = (base64.b64decode(question[name]) for name in ("header", "payload"))
         came_to = outcome(question["key"], header, payload)

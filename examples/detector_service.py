@@ -3,8 +3,8 @@
     python examples/detector_service.py tcp/127.0.0.1:7447 r1
     sightline vision --detector boxes --set boxes.source=detector --set boxes.height_m=0.2
 
-Put your network into `look`; this one finds the largest yellow thing by its colour. It drives nothing: boxes name the
-frame in which they were found, vision answers that frame, and the robot judges how old the sight behind it is.
+Put your network into `look`; this one finds the largest yellow thing by its colour. It does not drive: boxes name their
+frame, the vision service answers that frame, and the robot validates its age.
 """
 
 import itertools
@@ -34,7 +34,7 @@ Pixels = NDArray[Any]
 
 
 def look(bgr: Pixels) -> tuple[DetectedBox, ...]:
-    """What is in a picture, best first; empty is "looked, and saw nothing"."""
+    """Find objects in an image, best first. An empty result means "looked, and saw nothing"."""
     mask = cv2.inRange(cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV), np.array(YELLOW[0]), np.array(YELLOW[1]))
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     x, y, width, height = cv2.boundingRect(max(outlines, key=cv2.contourArea)) if outlines else (0, 0, 0, 0)
@@ -44,7 +44,7 @@ def look(bgr: Pixels) -> tuple[DetectedBox, ...]:
 
 
 def boxes_of(jpeg: bytes) -> Detections:
-    """Look at a JPEG. Raises WireError for what is none, before any decoder sees it."""
+    """Find objects in a JPEG. Raises WireError for other data, before a decoder reads it."""
     size = read_jpeg_size(jpeg)
     bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     if bgr is None:

@@ -30,10 +30,10 @@ def look(bgr: Any) -> list[dict[str, Any]]:
 
 
 def answer(jpeg: bytes) -> tuple[int, dict[str, Any]]:
-    """(status, what is said) of a body."""
+    """Return (status, reply) for a body."""
     bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR) if jpeg else None
     if bgr is None:
-        return 422, {"error": "the body is no JPEG"}
+        return 422, {"error": "the body is not a JPEG"}
     return 200, {"width_px": bgr.shape[1], "height_px": bgr.shape[0], "boxes": look(bgr), "detector": "yellow"}
 
 

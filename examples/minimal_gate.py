@@ -1,4 +1,4 @@
-"""The gate of `minimal_robot.py`: what is obeyed, and what the wheels do. Pure.
+"""Implement the gate of `minimal_robot.py`: accept commands, and compute the twist of the wheels. Pure.
 
 Numbers in comments are clauses of protocol/README.md.
 """
@@ -19,7 +19,7 @@ Header = dict[str, Any]
 
 
 class Gate:
-    """The only road to the wheels: judges on arrival, and again whenever it is asked what the wheels do."""
+    """The only path to the wheels: validates a command on arrival, and again at each step."""
 
     def __init__(self) -> None:
         self.issued: dict[tuple[str, int], int] = {}  # 5.2: (channel, seq) -> t_us
@@ -54,7 +54,7 @@ class Gate:
         return wrong or self.take(who, header["seq"], (linear, angular, echo["t_us"], now))
 
     def issue(self, channel: str, seq: int, t_us: int) -> None:
-        """Write down what is about to leave, so that nobody can answer it before."""
+        """Record a message before it is sent, so that no peer can answer it earlier."""
         self.issued = dict([*self.issued.items(), ((channel, seq), t_us)][-512:])
 
     def young(self, echo: Header, channel: str, now: int, most_us: int) -> dict[str, bool]:
@@ -87,12 +87,12 @@ class Gate:
         return now - self.held_us < LEASE_US
 
     def disarm(self) -> None:
-        """Wheels off, and nobody but a person lets them turn again."""
+        """Turn the wheels off. Only an operator can permit motion again."""
         self.armed, self.arms_itself, self.good, self.command = False, False, 0, NOTHING
         self.denied = max((seq for channel, seq in self.issued if channel == "status"), default=-1)
 
     def request(self, verb: str, who: tuple[str, str], echo: Any, now: int) -> str:
-        """Do what is asked; the reason against it, with words, or "" (8.2)."""
+        """Carry out a request. Returns the reason of a rejection with a text, or "" (8.2)."""
         mine = self.live(now) and self.holder == who
         if verb in ("stop", "disarm"):
             self.stopped = self.stopped or verb == "stop"
@@ -106,7 +106,7 @@ class Gate:
         return ""
 
     def permit(self, verb: str, who: tuple[str, str], echo: Any, now: int) -> str:
-        """What lets the robot move again cites a fresh status (8.3)."""
+        """Check a request that permits motion: it must cite a fresh status (8.3)."""
         if not isinstance(echo, dict):
             return "MALFORMED: cite a status"
         checks = {**self.young(echo, "status", now, STATUS_US), "STALE ": echo["seq"] > self.denied,

@@ -33,7 +33,7 @@ def now_us() -> int:
 
 
 class Robot:
-    """What is said and heard, whatever carries it."""
+    """Messages in and out, on any transport."""
 
     def __init__(self, pictures: list[bytes]) -> None:
         self.gate, self.pictures, self.lock = Gate(), itertools.cycle(pictures), threading.Lock()
@@ -41,7 +41,7 @@ class Robot:
         self.sent: tuple[int, int] | None = None  # the frame under way and since when: no credit (7.2)
 
     def due(self) -> Iterator[Message]:
-        """What is to be sent now."""
+        """Yield the messages that are due now."""
         now = now_us()
         if self.sent and now - self.sent[1] > CREDIT_US:  # 7.5
             self.sent = None
@@ -173,7 +173,7 @@ def serve_zenoh(robot: Robot, port: int) -> None:
         subscribers = [session.declare_subscriber(f"{prefix}{one}/*", heard) for one in ("twist", "ack", "request")]
         frames = session.declare_publisher(prefix + "frame")
         while subscribers:
-            if frames.matching_status:  # 3.4: nobody listens, nothing is sent
+            if frames.matching_status:  # 3.4: without a subscriber, no frame is sent
                 say(robot.due())
             time.sleep(0.005)
 

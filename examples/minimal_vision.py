@@ -1,4 +1,5 @@
-"""A minimal Sightline vision without Sightline: bare `websockets` or bare `zenoh`. Put your eyes into `look`. Shell.
+"""Run a minimal vision service without Sightline: bare `websockets` or bare `zenoh`. Add your detector in `look`.
+Shell.
 
     sightline robot --listen ws://127.0.0.1:9090      python examples/minimal_vision.py ws://127.0.0.1:9090
     sightline robot --listen tcp/127.0.0.1:7447       python examples/minimal_vision.py tcp/127.0.0.1:7447
@@ -26,13 +27,13 @@ Answer = Callable[[str, Header, bytes], None]
 
 
 def look(jpeg: bytes) -> tuple[float, float] | None:
-    """A picture in, (m/s, rad/s) out; None says only that it was seen. This one turns slowly on the spot."""
+    """Map an image to (m/s, rad/s), or to None to acknowledge it only. This one turns slowly on the spot."""
     width, height = jpeg_size(jpeg)
     return (0.0, 0.3) if 0 < width * height <= MAX_PIXELS else None  # 3.2: before any decoder sees it
 
 
 def jpeg_size(jpeg: bytes) -> tuple[int, int]:
-    """Width and height from the frame header; (0, 0) for what is no plain JPEG with one within 64 segments."""
+    """Read width and height from the frame header. Returns (0, 0) without one within 64 segments."""
     at = 2 if jpeg[:2] == b"\xff\xd8" else len(jpeg)
     for _ in range(64):
         kind, body = jpeg[at : at + 2], jpeg[at + 4 : at + 10]  # bits, height, width, components
@@ -90,7 +91,7 @@ def run_websocket(url: str) -> None:
 
         vision = Vision(answer)
         robot.send(json.dumps({"v": 1, "robot": ROBOT, "role": SOURCE, "session": SESSION, "wants": ["frame"]}))
-        print("robot says", robot.recv(timeout=2), flush=True)
+        print("robot sent", robot.recv(timeout=2), flush=True)
         for message in robot:
             if isinstance(message, bytes):
                 with suppress(KeyError, RecursionError, TypeError, ValueError):  # a bad message ends nothing
@@ -100,7 +101,7 @@ def run_websocket(url: str) -> None:
 
 
 def run_zenoh(endpoint: str) -> None:
-    """Clause 16. Zenoh calls on a thread of its own: one place for the newest frame, and the eyes look there (1.5)."""
+    """Run on Zenoh (clause 16). Its thread stores only the newest frame, and `look` reads it (1.5)."""
     import zenoh
 
     prefix = f"sightline/{ROBOT}/"

@@ -34,7 +34,7 @@ class BrightestSpot:
         return [self.look(frame) for frame in frames]
 
     def look(self, frame: DetectFrame) -> DetectionResult | None:
-        """What is in one frame."""
+        """Find objects in one frame."""
         started_ns = time.perf_counter_ns()
         try:
             picture = frame.picture()

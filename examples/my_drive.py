@@ -1,6 +1,6 @@
 """A drive plug-in to copy: two wheels on a motor controller that takes `left right` lines over a serial port.
 
-A drive is a class with a `Config`, `set`, `wheels` and `close` (robot_side/ports.py says what each promises).
+A drive is a class with a `Config`, `set`, `wheels` and `close` (robot_side/ports.py defines the promises of each).
 """
 
 import time
@@ -18,7 +18,7 @@ class MyDriveConfig(Config):
 
 
 class MyDrive:
-    """Without encoders: the wheels are taken to turn as they are told."""
+    """A drive without encoders: the wheels are assumed to turn at the set speeds."""
 
     Config = MyDriveConfig
 
@@ -40,7 +40,7 @@ class MyDrive:
             raise HardwareError(f"motor controller: {error.strerror}; check its cable") from None
 
     def wheels(self) -> WheelAngles:
-        """Where the wheels should be by now."""
+        """Return the assumed angles of the wheels now."""
         now_us = time.monotonic_ns() // 1000
         seconds = (now_us - self._angles.t_us) / 1e6
         left, right = self._speeds

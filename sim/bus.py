@@ -53,13 +53,13 @@ def default_socket_dir() -> str:
 
 
 class SimSocketConfig(Config):
-    """Where the simulation listens."""
+    """Address of the simulation."""
 
     socket_dir: Annotated[str, Field(min_length=1, max_length=90)] = Field(default_factory=default_socket_dir)
 
 
 class BusConnection:
-    """Comes back by itself: a call after a loss connects anew. Never blocks unless asked to wait."""
+    """Connects to the simulation, and again after a loss. Never blocks without a timeout."""
 
     def __init__(self, socket_dir: str, name: str) -> None:
         self._dir, self._name = socket_dir, name
@@ -68,11 +68,11 @@ class BusConnection:
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection was there at the last use."""
+        """Return True if the connection existed at the last use."""
         return self._socket is not None
 
     def open(self) -> socket.socket:
-        """The connection, made now if there is none. Raises HardwareError when nothing listens."""
+        """Return the connection, and open it if needed. Raises HardwareError without a listener."""
         if self._socket is not None:
             return self._socket
         fresh = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -97,7 +97,7 @@ class BusConnection:
         return True
 
     def receive(self) -> bytes | None:
-        """The oldest waiting message, None if there is none. Raises HardwareError when the simulation is gone."""
+        """Return the oldest waiting message, or None. Raises HardwareError when the simulation is gone."""
         connection = self.open()
         try:
             size = connection.recv_into(self._buffer)
@@ -149,10 +149,10 @@ class BusConnection:
 
 
 class SimCamera:
-    """The simulated camera. A picture is drawn only when `read` asks for one."""
+    """The simulated camera. The simulation draws an image only for a call of `read`."""
 
     class Config(SimSocketConfig):
-        """Where the simulation listens."""
+        """Address of the simulation."""
 
     live = True
 
@@ -171,7 +171,7 @@ class SimCamera:
         """The next capture; None if none came within `timeout_s`. Raises HardwareError when the simulation is gone."""
         deadline_s = time.monotonic() + timeout_s
         self._greet()
-        self._connection.newest()  # an answer that came too late for an earlier call: old sight
+        self._connection.newest()  # drops a late answer to an earlier call, which is an old image
         self._connection.send(self._request)
         message = self._connection.wait(deadline_s - time.monotonic())
         if message is None:
@@ -180,7 +180,7 @@ class SimCamera:
         return Picture(message[PICTURE_HEAD.size :], t_us, scale_percent)
 
     def adjust(self, quality_percent: int, scale_percent: int) -> bool:
-        """As `sightline.robot_side.ports.Adjustable` says."""
+        """Encode the next images so, see `sightline.robot_side.ports.Adjustable`."""
         self._request = PICTURE_REQUEST.pack(quality_percent, scale_percent)
         return True
 
@@ -193,7 +193,7 @@ class SimDrive:
     """The simulated wheels: they latch, whatever becomes of this process."""
 
     class Config(SimSocketConfig):
-        """Where the simulation listens."""
+        """Address of the simulation."""
 
     def __init__(self, config: SimSocketConfig) -> None:
         self._connection = BusConnection(config.socket_dir, MOTION)
@@ -213,7 +213,7 @@ class SimDrive:
     def wheels(self) -> WheelAngles | None:
         """The newest encoder reading received. Raises HardwareError when the simulation is gone.
 
-        Meant to be called at 20 Hz or more; after a longer pause the first reading is as old as its `t_us` says.
+        Call it at 20 Hz or more. After a longer pause the first reading is old, see its `t_us`.
         """
         message = self._connection.newest()
         if message is not None:
@@ -229,7 +229,7 @@ class SimRange:
     """The simulated lidar."""
 
     class Config(SimSocketConfig):
-        """Where the simulation listens."""
+        """Address of the simulation."""
 
     def __init__(self, config: SimSocketConfig) -> None:
         self._connection = BusConnection(config.socket_dir, RANGE)
@@ -253,7 +253,7 @@ class SimBattery:
     """A battery that the simulated wheels drain: from full to empty over the distance that they turn."""
 
     class Config(SimSocketConfig):
-        """Where the simulation listens, and what the battery holds."""
+        """Address of the simulation, and the voltages of the battery."""
 
         full_v: Annotated[float, Field(gt=0, le=100)] = 8.4
         empty_v: Annotated[float, Field(gt=0, le=100)] = 6.0
@@ -286,7 +286,7 @@ class SimBattery:
 
 
 class SimulationInfo(Config):
-    """What a simulation says of itself: enough to load its scenario and robot again."""
+    """The description of a simulation, sufficient to load its scenario and robot again."""
 
     scenario: str
     robot: str
@@ -315,7 +315,8 @@ class TruthReader:
 
 # What a simulation labels in its pictures, written to and read from its bus; `labels.py` makes it. Shell (sockets).
 #
-# They come over the truth's socket, between its reports: whoever reads truth may read labels, a robot reads neither.
+# They come over the socket of the truth, between its reports. A client of the truth may read labels; a robot reads
+# neither.
 
 
 KEPT = 64

@@ -1,6 +1,6 @@
 """A bad network, one direction at a time: delay, jitter, loss, bursts, rate, reordering. Pure.
 
-Packets in and out in the time it is told, chance from a seed. `sim/tun_emulator.py` carries real packets through it.
+The caller passes the time and the packets, and a seed defines the losses. `sim/tun_emulator.py` carries real packets.
 """
 
 import heapq
@@ -22,7 +22,7 @@ Milliseconds = Annotated[float, Field(ge=0, le=60_000)]
 
 
 class LinkShape(Config):
-    """What one direction does to packets. The default is a perfect wire."""
+    """The effect of one direction on packets. The default is a perfect wire."""
 
     delay_ms: Milliseconds = 0
     jitter_ms: Milliseconds = 0
@@ -56,7 +56,7 @@ class LinkShapes(Config):
 
 @dataclass(slots=True)
 class Counts:
-    """What one direction did so far."""
+    """Counters of one direction."""
 
     taken: int = 0
     delivered: int = 0
@@ -72,7 +72,7 @@ class Counts:
 
 @dataclass(slots=True)
 class Medium:
-    """What packets are sent on, one after the other; legs that share it are half duplex."""
+    """A medium that carries one packet at a time. Legs that share it are half duplex."""
 
     free_us: float = 0.0
 
@@ -138,7 +138,7 @@ class EmulatedLeg:
         heapq.heappush(self._waiting, (due_us, self._order, packet))
 
     def take_due(self, now_us: int) -> Iterator[bytes]:
-        """What comes out by now, in order; on a cut wire it is lost instead."""
+        """Yield the packets that arrive by now, in order. A cut wire loses them."""
         while self._waiting and self._waiting[0][0] <= now_us:
             packet = heapq.heappop(self._waiting)[2]
             if self.shape.cut:
@@ -175,5 +175,5 @@ class EmulatedLink:
             self.ba.medium = self.ab.medium if shapes.half_duplex else Medium()
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Of each direction, since the start."""
+        """Return the counters of both directions since the start."""
         return {"ab": asdict(self.ab.counts), "ba": asdict(self.ba.counts)}

@@ -47,33 +47,34 @@ _log: Final = logging.getLogger(__name__)
 
 
 class PeriodicTimer:
-    """On average exactly at its rate, whatever the steps in which it is asked."""
+    """Ticks exactly at its average rate, for any steps of its caller."""
 
     def __init__(self, period_us: float) -> None:
         self._period_us = period_us
         self._count = 0
 
     def due(self, now_us: int) -> bool:
-        """Whether it is due at `now_us`; each period answers once."""
+        """Return True once per period."""
         count = int(now_us / self._period_us)
         is_due, self._count = count > self._count, count
         return is_due
 
 
-# Where motor commands arrive: stamped, logged, latched. Shell (clock, file); called from the receiving thread.  The
-# log is what stopping is judged by, so a line is with the kernel before its command is obeyed, and survives kill -9.
+# The motor commands: stamped, logged, latched. Shell (clock, file); called from the receiving thread.
+#
+# The log measures a stop. Each line is with the kernel before its command is applied, so that it survives kill -9.
 
 
 LOG_HEADER = b"t_us,left_rad_s,right_rad_s,left_rad,right_rad\n"
 
 
 class MotorPort:
-    """Holds the last speeds given; nobody's leaving changes them, as with real PWM."""
+    """Latches the last speeds, as real PWM does. The end of a client does not change them."""
 
     def __init__(self, log_path: str | None) -> None:
         self.speeds_rad_s = (0.0, 0.0)
         self.angles_rad = (0.0, 0.0)
-        """How far each wheel has turned, as the physics last said."""
+        """Total angle of each wheel, from the last physics step."""
         self.refused = 0
         try:
             self._log = Path(log_path).open("wb", buffering=0) if log_path else None  # noqa: SIM115  closed by close()
@@ -83,7 +84,7 @@ class MotorPort:
             self._log.write(LOG_HEADER)
 
     def take(self, data: bytes) -> None:
-        """One packet from a drive; what is no pair of finite speeds is counted and changes nothing."""
+        """Take one packet of a drive. A packet without two finite speeds is counted and changes nothing."""
         t_us = monotonic_us()
         speeds = MOTION_SET.unpack(data) if len(data) == MOTION_SET.size else (math.nan, math.nan)
         if not all(map(math.isfinite, speeds)):
@@ -100,8 +101,9 @@ class MotorPort:
             self._log.close()
 
 
-# The simulation's side of the bus: who is connected, and what they say. Shell (sockets, one thread).  The thread
-# accepts and receives; the physics loop only sends, and never waits: what a client does not take is dropped.
+# The simulation's end of the bus: its clients and their messages. Shell (sockets, one thread).
+#
+# The thread accepts and receives. The physics loop only sends, and never waits: data for a full client is dropped.
 
 
 SEND_BYTES = {MOTION: 4096, RANGE: 16_384, CAMERA: 1 << 20, TRUTH: 1 << 17}
@@ -154,7 +156,7 @@ class SocketFolder:
 
 
 class BusClients:
-    """Everybody connected to the four sockets of a folder."""
+    """The clients of the four sockets of a folder."""
 
     def __init__(self, folder: SocketFolder, hellos: dict[str, bytes], on_motion: Callable[[bytes], None]) -> None:
         self._hellos, self._on_motion = hellos, on_motion
@@ -170,24 +172,24 @@ class BusClients:
         self._thread.start()
 
     def has(self, name: str) -> bool:
-        """Whether anybody is connected there."""
+        """Return True if a client is connected there."""
         return bool(self._clients[name])
 
     def send(self, name: str, data: bytes) -> None:
-        """Send to everybody there who has room."""
+        """Send to every client there that has room."""
         with self._lock:
             for client in self._clients[name]:
                 _send(client, data)
 
     def wanted_pictures(self) -> set[tuple[int, int]]:
-        """The (quality_percent, scale_percent) that cameras asked the next capture in."""
+        """Return the (quality_percent, scale_percent) that cameras requested for the next capture."""
         with self._lock:
             return set(self._wanting.values())
 
     def send_picture(self, wanted: tuple[int, int], data: bytes) -> None:
-        """Send to the cameras that asked for it so, which settles their requests."""
+        """Send to the cameras that requested this encoding, and clear their requests."""
         with self._lock:
-            for client in [one for one, asked in self._wanting.items() if asked == wanted]:
+            for client in [one for one, requested in self._wanting.items() if requested == wanted]:
                 _send(client, data)
                 del self._wanting[client]
 
@@ -247,7 +249,7 @@ class BusClients:
 
 
 def _send(client: socket.socket, data: bytes) -> None:
-    """Send or drop: a full buffer and a client that just left are no concern of the physics."""
+    """Send or drop. A full buffer and a client that just left must not delay the physics."""
     try:
         client.send(data)
     except OSError as error:
@@ -258,7 +260,7 @@ def _send(client: socket.socket, data: bytes) -> None:
 
 
 def _wanted(data: bytes) -> tuple[int, int]:
-    """How a picture was asked for; what is no such request asks for it as it is."""
+    """Return the requested encoding of an image. An unknown request returns the full quality and size."""
     if len(data) != PICTURE_REQUEST.size:
         return 100, 100
     quality_percent, scale_percent = PICTURE_REQUEST.unpack(data)
@@ -311,7 +313,7 @@ class Simulation:
         return {CAMERA: encode(self._world.camera_model), TRUTH: about.model_dump_json().encode()}
 
     def run(self) -> None:
-        """Step until told to stop or the time is over."""
+        """Step until a signal or the end of the time."""
         end_us = self._config.seconds * 1e6 if self._config.seconds else float("inf")
         self._offset_us = monotonic_us()
         while not self.stopping and self._world.now_us < end_us:
@@ -350,11 +352,11 @@ class Simulation:
             self._clients.send(TRUTH, truth.to_json())
 
     def _draw(self, t_us: int) -> None:
-        """A picture for each way in which one is wanted: one, unless cameras differ in what they ask."""
-        asked = self._clients.wanted_pictures()
-        if asked and self._world.scenario.labels and self._clients.has(TRUTH):
+        """Draw an image for each requested encoding, usually one."""
+        requested = self._clients.wanted_pictures()
+        if requested and self._world.scenario.labels and self._clients.has(TRUTH):
             self._clients.send(TRUTH, to_json(self._world.labels(), t_us, self._world.camera_model.width_px))
-        for wanted in asked:
+        for wanted in requested:
             self._clients.send_picture(wanted, PICTURE_HEAD.pack(t_us, wanted[1]) + self._world.render(*wanted))
 
     def _scan(self, t_us: int) -> bytes:
@@ -400,7 +402,7 @@ def _simulate(simulation: Simulation, config: SimConfig, robot: str) -> None:
 
 
 def _world_class() -> type[World]:
-    """Imported late: whoever only reads `SimConfig` needs neither PyBullet nor NumPy."""
+    """Import the world late, because `SimConfig` alone needs neither PyBullet nor NumPy."""
     try:
         from sightline.sim.world.world import World
     except ImportError as error:

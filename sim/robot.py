@@ -110,8 +110,8 @@ class LidarModel(Config):
     """The range sensor: a lidar over an arc, or several small sensors (`eyes`) merged into one scan.
 
     Rays are evenly spaced from `first_deg` to `last_deg`, counter-clockwise, both ends included; a whole turn leaves
-    out its last, which is its first. With `eyes`, each echo is put where it is seen from (`x_m`, 0) and the nearest in
-    each ray's place counts; what no eye sees is inf, as free space is.
+    out its last, which is its first. With `eyes`, each echo is placed as seen from (`x_m`, 0), and the nearest one per
+    ray counts. A direction that no sensor covers is inf, as free space is.
     """
 
     link: str = ""
@@ -143,7 +143,7 @@ class LidarModel(Config):
 
 
 class RobotModel(Config):
-    """One robot. `settings` is what a person would write into this robot's robot.toml."""
+    """One robot. `settings` are the contents of its robot.toml."""
 
     name: str
     summary: str = ""
@@ -180,7 +180,7 @@ def load_robot(name: str) -> RobotModel:
 
 
 def _measure(table: dict[str, Any], path: Path) -> None:
-    """Fill in what the URDF says of wheels and sensors. Raises ConfigError."""
+    """Add the wheels and sensors of the URDF. Raises ConfigError."""
     file = path.parent / str(table["urdf"])
     if not file.exists() and (ROBOTS / str(table["urdf"])).exists():
         file = ROBOTS / str(table["urdf"])  # it is that of the robot which this one extends
@@ -209,7 +209,7 @@ def _table(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
 
 
 def _mount(sensor: dict[str, Any], where: Transform, is_eye: bool) -> None:
-    """Put a sensor where its link is; an eye, which lies in the scan's plane, faces as its link does."""
+    """Place a sensor at its link. A single-ray sensor, which lies in the plane of the scan, faces as its link does."""
     sensor["x_m"] = where.at[0]
     if is_eye:
         sensor |= {"y_m": where.at[1], "facing_deg": math.degrees(where.yaw_rad)}
@@ -224,7 +224,7 @@ def _mount(sensor: dict[str, Any], where: Transform, is_eye: bool) -> None:
 
 @dataclass(frozen=True, slots=True)
 class UrdfBody:
-    """What PyBullet is to load, and what it must know of it."""
+    """The file for PyBullet, with the properties of its body."""
 
     text: str
     joints: tuple[str, str] = ("left", "right")
@@ -247,7 +247,7 @@ def urdf_body(robot: RobotModel) -> UrdfBody:
 
 
 def outline(robot: RobotModel) -> Outline:
-    """How far `robot` reaches over the floor, from its axle's midpoint."""
+    """Return the outline of `robot` over the floor, from the midpoint of its axle."""
     wheels = robot.wheels
     if robot.urdf:
         file = Urdf(urdf_text(Path(robot.urdf)), robot.urdf)

@@ -23,7 +23,7 @@ class PathLeg(Config):
 
 
 class Place(NamedTuple):
-    """A point and the heading of whoever moves through it."""
+    """A point, and the heading at it."""
 
     x_m: float
     y_m: float
@@ -96,7 +96,7 @@ Amounts = Annotated[tuple[Amount, Amount], AfterValidator(_ordered)]
 
 
 class LegShape(Config):
-    """A person from the knees down: two upright cylinders that walk. A foot stands, or swings twice as fast."""
+    """A human from the knees down: two upright cylinders that walk. A foot stands, or swings twice as fast."""
 
     apart_m: Side = 0.20
     """Between the legs' middles."""
@@ -104,13 +104,13 @@ class LegShape(Config):
     """Way of one whole step of both legs."""
 
     def ahead_m(self, way_m: float, is_left: bool) -> float:
-        """How far a leg is ahead of the person, who has walked `way_m`: a triangle wave of a quarter stride."""
+        """Return the lead of a leg after `way_m` of walking: a triangle wave of a quarter stride."""
         turn = (way_m / self.stride_m + (0.0 if is_left else 0.5)) % 1.0
         return self.stride_m * (abs(2.0 * turn - 1.0) - 0.5) / 2.0
 
 
 class Thing(Config):
-    """What every one of them has: a shape on the floor."""
+    """A shape on the floor, the base of all things."""
 
     renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color"}
     shape: Literal["ball", "box", "cylinder", "legs", "place"] = "ball"
@@ -126,7 +126,7 @@ class Thing(Config):
 
     @property
     def middle_m(self) -> float:
-        """How high its middle is."""
+        """Return the height of its center, in m."""
         heights = {"ball": 2 * self.radius_m, "box": self.size_m[2], "place": 0.0}
         return heights.get(self.shape, self.height_m) / 2
 
@@ -214,8 +214,8 @@ Standing = Annotated[Static | OnPath, Field(discriminator="kind")]
 
 # A traffic light: what it looks like and when it is which colour. Pure.
 #
-# Three lamps in a housing on a pole, or one box that changes its colour as a whole. It faces whoever drives along the
-# lane; the stop line crosses the lane `line_m` before it.
+# Three lamps in a housing on a pole, or one box that changes its colour as a whole. It faces the traffic of the
+# lane. The stop line crosses the lane `line_m` before it.
 
 
 State = Literal["red", "yellow", "green"]
@@ -242,7 +242,7 @@ class Part(NamedTuple):
 
 
 class Light(Config):
-    """One light. The older write-up's schedule is the default: red 5 s, green 5 s, yellow 2 s."""
+    """One light. The default is the schedule of the legacy article: red 5 s, green 5 s, yellow 2 s."""
 
     kind: Literal["lamps", "box"] = "lamps"
     at_m: Point
@@ -295,14 +295,14 @@ class Light(Config):
         return self.at_m[0] + way_m * math.cos(faces_rad), self.at_m[1] + way_m * math.sin(faces_rad)
 
     def past_line_m(self, x_m: float, y_m: float) -> float:
-        """How far a point is beyond the stop line, negative before it."""
+        """Return the distance of a point beyond the stop line, negative before it, in m."""
         faces_rad = math.radians(self.faces_deg)
         line_x_m, line_y_m = self.ahead(self.line_m)
         return (line_x_m - x_m) * math.cos(faces_rad) + (line_y_m - y_m) * math.sin(faces_rad)
 
 
 def color_of(part: Part, state: State) -> Color:
-    """What a part looks like while `state` is lit."""
+    """Return the color of a part while `state` is lit."""
     if part.state == "":
         return 0.07, 0.07, 0.08
     if part.state == "all":
@@ -321,7 +321,7 @@ Gain = Annotated[float, Field(gt=0, le=4)]
 
 
 class Look(Config):
-    """What happens to a picture between the scene and the JPEG, in this order."""
+    """The effects on an image between the scene and the JPEG, in this order."""
 
     exposure: Gain = 1.0
     """Brightness factor; above 1 the bright parts burn out."""
@@ -352,8 +352,7 @@ def look_named(name: str) -> Look:
 SCENARIOS = Path(__file__).parent / "scenarios"
 
 class Start(Config):
-    """Where the robot begins, the seed draws within each span: seen from its lens and from the target, or on the map.
-    """
+    """The start of the robot, drawn within each span: relative to lens and target, or on the map."""
 
     distance_m: Amounts = (0.0, 0.0)
     """Lens to the target's middle."""
@@ -395,7 +394,7 @@ class Wall(Config):
 class Scenario(Config):
     """One scenario. `stand_off_m` is what both the steering and the score go by: lens to the target's middle.
 
-    `robot`, `mission` and `vision` (keys of vision.toml) are what a person would choose for it.
+    `robot`, `mission` and `vision` (keys of vision.toml) are the settings that an operator chooses for it.
     """
 
     name: str
@@ -416,7 +415,7 @@ class Scenario(Config):
     reachable: bool = True
     """Whether there is a way to the last of them."""
     labels: Literal["", "legs"] = ""
-    """What the simulation itself labels in each picture, for a vision whose detector is `boxes`."""
+    """Objects that the simulation labels in each image, for a vision service with the detector `boxes`."""
 
 
 def scenario_names() -> list[str]:

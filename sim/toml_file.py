@@ -1,4 +1,4 @@
-"""TOML text and names -> frozen models, with errors a person can act on. Pure (reads files, keeps no state)."""
+"""Convert TOML text and names to frozen models, with a fix in each error. Pure (reads files, stores no state)."""
 
 import difflib
 import tomllib
@@ -15,7 +15,7 @@ Model = TypeVar("Model", bound=BaseModel)
 def find(kind: str, name: str, folder: Path) -> Path:
     """The file that `name` means: a path when it ends in `.toml`, otherwise a file of `folder`.
 
-    Raises ConfigError with the nearest name and all names when there is none.
+    Raises ConfigError with the nearest name and all names for an unknown one.
     """
     path = Path(name) if name.endswith(".toml") else folder / f"{name}.toml"
     if path.is_file() and (name.endswith(".toml") or name in names_in(folder)):
@@ -36,9 +36,9 @@ def _nearest(name: str, folder: Path) -> str:
 
 
 def read_table(path: Path, folder: Path | None = None) -> dict[str, Any]:
-    """The file as a table, laid over the one of `folder` that it `extends`, if it says so.
+    """Read a file as a table, over the one of `folder` that it `extends`, if any.
 
-    Raises ConfigError naming the file and the line that is no TOML.
+    Raises ConfigError with the file and the line of invalid TOML.
     """
     try:
         table = tomllib.loads(path.read_text("utf-8"))
@@ -67,7 +67,7 @@ def laid_over(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_more_of(under: Any, over: Any) -> bool:
-    """Whether a table adds to another; with another `kind` it means another thing, of which nothing is kept."""
+    """Return True if a table extends another one. With another `kind` it replaces it."""
     both = isinstance(under, dict) and isinstance(over, dict) and bool(over)
     return both and over.get("kind", under.get("kind")) == under.get("kind")
 

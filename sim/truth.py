@@ -1,4 +1,4 @@
-"""What is really so in a simulated world, for scores and plots. Never given to the robot. Pure."""
+"""Describe the true state of a simulated world, for scores and plots. The robot never receives it. Pure."""
 
 import json
 from dataclasses import asdict, dataclass

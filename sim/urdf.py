@@ -18,7 +18,7 @@ Rotation = tuple[Vector, Vector, Vector]
 
 
 class Transform(NamedTuple):
-    """Where something is and how it is turned, seen from something else."""
+    """Position and rotation of a frame relative to another."""
 
     turn: Rotation = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     at: Vector = (0.0, 0.0, 0.0)
@@ -66,9 +66,10 @@ def _column(turn: Rotation, index: int) -> Vector:
     return turn[0][index], turn[1][index], turn[2][index]
 
 
-# A robot's URDF, read and checked: where wheels and sensors are, how far the body reaches. Pure.  Everything is told
-# about the axle's midpoint on the floor, x forward, whatever frame the file was drawn in. A file that cannot be a two-
-# wheeled robot is refused with one line that names the link or joint and the fix.
+# The URDF of a robot: positions of wheels and sensors, and the outline. Pure.
+#
+# All positions are relative to the midpoint of the axle on the floor, x forward, for any frame in the file. A file that
+# is not a two-wheeled robot is rejected with one line that names the link or joint and the fix.
 
 
 Front = Literal["+x", "-x"]
@@ -79,7 +80,7 @@ _NUMBERS = {
 }
 _PLACED_WITHIN_M = 0.001
 _ACROSS = 0.999  # cosine: a URDF that writes a quarter turn as 1.57 is meant to be square
-_RIM = 0.03  # of the track width: so narrow a rim turns within 0.1 % of what the joints' distance says
+_RIM = 0.03  # of the track width: so narrow a rim turns within 0.1 % of the distance of the joints
 _REST = 0.97  # of the radius
 _FEATHER = (
     '<inertial><mass value="0.001"/><inertia ixx="1e-6" iyy="1e-6" izz="1e-6" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -96,7 +97,7 @@ class Wheel(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """How far the body's collision shapes reach from the axle's midpoint, over the floor."""
+    """The extent of the collision shapes over the floor, from the midpoint of the axle."""
 
     front_m: float
     rear_m: float
@@ -115,7 +116,7 @@ class Urdf:
         self._check_bodies()
         self._frames = self._link_frames()
 
-    # --- what a robot asks of it -------------------------------------------------------------------------------------
+    # --- the queries of a robot --------------------------------------------------------------------------------------
 
     def foot(self, left_joint: str, right_joint: str, front: Front) -> Transform:
         """The axle's midpoint on the floor, x forward, seen from the root link."""
@@ -133,18 +134,18 @@ class Urdf:
         uneven_m = max(abs(left.place[0]), abs(left.place[1] + right.place[1]), abs(left.radius_m - right.radius_m))
         if uneven_m > _PLACED_WITHIN_M:
             raise self._wrong(
-                f"{left_joint!r} and {right_joint!r} are no pair: give them one radius, one x and opposite y"
+                f"{left_joint!r} and {right_joint!r} are not a pair; use one radius, one x and opposite y"
             )
         return left, right
 
     def place(self, link: str, foot: Transform) -> Transform:
-        """Where a link is, about the axle's midpoint on the floor."""
+        """Return the position of a link relative to the midpoint of the axle on the floor."""
         if link not in self._links:
             raise self._wrong(f"has no link {link!r}{_nearest(link, self._links)}")
         return foot.inverse().of(self._frames[link])
 
     def outline(self, foot: Transform) -> Outline:
-        """Of all collision shapes, wheels included."""
+        """Return the outline of all collision shapes, including the wheels."""
         back = foot.inverse()
         corners = [
             back.of(self._frames[name]).of(_origin(shape)).point(corner)
@@ -180,9 +181,9 @@ class Urdf:
         try:
             root = ElementTree.fromstring(text)
         except ElementTree.ParseError as error:
-            raise self._wrong(f"is no XML: {error}") from None
+            raise self._wrong(f"invalid XML: {error}") from None
         if root.tag != "robot":
-            raise self._wrong(f"is no URDF: its outermost element is <{root.tag}>, not <robot>")
+            raise self._wrong(f"not a URDF: its outermost element is <{root.tag}>, not <robot>")
         return root
 
     def _check_numbers(self) -> None:
@@ -210,7 +211,7 @@ class Urdf:
             for end in ("parent", "child"):
                 link = _end(joint, end)
                 if link not in self._links:
-                    raise self._wrong(f"joint {name!r}: its {end} {link!r} is no link{_nearest(link, self._links)}")
+                    raise self._wrong(f"joint {name!r}: its {end} {link!r} is not a link{_nearest(link, self._links)}")
             above[_end(joint, "child")] = joint
         roots = [name for name in self._links if name not in above]
         if len(roots) != 1:
@@ -258,7 +259,7 @@ class Urdf:
         x, y, z = _numbers(axis.get("xyz", "1 0 0")) if axis is not None else (1.0, 0.0, 0.0)
         _, across, _ = here.direction((x, y, z))
         if abs(across) < _ACROSS * math.hypot(x, y, z) or not across:
-            raise self._wrong(f"joint {name!r} does not turn about an axle across the robot; mend its <axis> or rpy")
+            raise self._wrong(f"joint {name!r} does not turn about an axle across the robot; correct its <axis> or rpy")
         return Wheel(name, here.at, self._wheel_radius(name), math.copysign(1.0, across))
 
     def _wrong(self, what: str) -> ConfigError:
@@ -280,7 +281,7 @@ def _origin(element: Element) -> Transform:
 
 
 def _numbers(text: str) -> list[float]:
-    """The finite numbers of `text`; none at all if one of them is no such number."""
+    """Return the finite numbers of `text`, or an empty list if one is invalid."""
     try:
         values = [float(part) for part in text.split()]
     except ValueError:
@@ -302,7 +303,7 @@ def _round_shapes(link: Element) -> Iterator[Element]:
 
 
 def _corners(shape: Element) -> Iterable[Vector]:
-    """Of the box around a collision shape, in the shape's own frame."""
+    """Yield the corners of the box around a collision shape, in the frame of the shape."""
     half = (0.0, 0.0, 0.0)
     for kind in shape.findall("geometry/*"):
         radius = _number(kind, "radius", 0.0)

@@ -137,7 +137,7 @@ def _made(card: Card) -> list[str]:
         f"{start}`", "",
         f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {_families(TRAINED)}; from seed "
         f"{LATER_FROM} up {_families(TRAINED_LATER)}; from {HARDER_FROM} up {_families(TRAINED_HARDER)}, with more "
-        "legs and more boxes of the ball's colour. Defects are drawn anew each time a scene is shown; from the third "
+        "legs and more boxes of the ball's colour. Defects are drawn again each time a scene is shown; from the third "
         "round on a third of the pictures are clear, and a third are dim, blurred and coarse at once.",
         f"- Steps: {' and '.join(map(str, training.rounds))} of {training.batch} cut-outs (the last "
         f"{100 * (1 - WHOLE_FROM):.0f} % of a round half as many whole pictures), AdamW, learning rate "

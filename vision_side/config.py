@@ -44,7 +44,7 @@ class HsvConfig(Config):
 
 
 Device = Literal["auto", "cpu", "cuda", "tensorrt"]
-"""What a model runs on. `auto` takes what there is and says so; the others are kept to, or nothing starts."""
+"""Device of a model. `auto` takes the best available one and logs it. Any other value is required at the start."""
 
 
 class DetectorConfig(Config):
@@ -57,11 +57,14 @@ class DetectorConfig(Config):
     """For the detector's own `Config`."""
     device: Device = "auto"
     deadline_s: Annotated[float, Field(ge=0.005, le=1)] = 0.1
-    """A remote detector's answer that takes longer is no answer. Later than this, the robot is slowing down already."""
+    """Deadline of a remote detector. After it, the robot already slows down, so a later answer does not count."""
     labels: Annotated[tuple[str, ...], Field(max_length=64)] = ()
     """Only detections with one of these labels count, and `target` of the colour detectors; empty for all."""
     only_color: bool = False
-    """Only detections that are mostly of the colours of `hsv.ranges` count: the model says ball, the colour which."""
+    """Only detections that are mostly of the colors of `hsv.ranges` count.
+
+    The model finds balls, the color selects one.
+    """
     tracked: bool = False
     """Give what is found in one frame after the other the same `track_id`."""
     fallback: Annotated[str, Field(max_length=256)] = ""
@@ -72,7 +75,7 @@ class DetectorConfig(Config):
 
 
 class BoxesConfig(Config):
-    """What is steered by when the detector is `boxes`. Without a size the robot only turns towards the box.
+    """Steering by boxes, when the detector is `boxes`. Without a size the robot only turns toward the box.
 
     The sizes are also those of what the colour detector finds with `hsv.shape` `any`.
     """
@@ -89,21 +92,21 @@ class BoxesConfig(Config):
 
 
 class MissionConfig(Config):
-    """What to do with what is seen: a mission's name or `package.module:Name`; `options` are for its own `Config`."""
+    """The mission: its name or `package.module:Name`. `options` are for its own `Config`."""
 
     kind: Annotated[str, Field(min_length=1, max_length=64)] = "follow"
     options: dict[str, Any] = Field(default_factory=dict)
 
 
 class TargetConfig(Config):
-    """What is followed, and from how far."""
+    """The target and its distance."""
 
     radius_m: Annotated[float, Field(gt=0.005, le=2)] = 0.1
     stand_off_m: Annotated[float, Field(gt=0.1, le=10)] = 0.8
     """Distance to keep from the lens to the target's centre, over the floor."""
     max_range_m: Annotated[float, Field(gt=0.2, le=50)] = 6.0
     label: Annotated[str, Field(max_length=64)] = ""
-    """What is followed, by the detector's label; empty for whatever is no traffic light and no pair of legs."""
+    """Label of the target. Empty selects any detection except traffic lights and legs."""
 
 
 class TrackConfig(Config):
@@ -146,7 +149,7 @@ class SteerConfig(Config):
 
 
 class LatencyConfig(Config):
-    """What is known of the delay from capture to wheels. If unsure, low: too low is slow, too high is unstable."""
+    """The delay from capture to wheels. Prefer a low value: too low is slow, too high is unstable."""
 
     first_guess_s: Annotated[float, Field(ge=0, le=0.5)] = 0.03
     max_s: Annotated[float, Field(gt=0, le=1)] = 0.4
@@ -170,7 +173,7 @@ class SearchConfig(Config):
 
 
 class ViewingConfig(Config):
-    """What people are shown while they watch: the channels `overlay` and `preview`."""
+    """The channels `overlay` and `preview` for viewers."""
 
     overlay_hz: Annotated[float, Field(gt=0, le=60)] = 15.0
     overlay_width_px: Annotated[int, Field(ge=160, le=1920)] = 640
@@ -182,7 +185,7 @@ class ViewingConfig(Config):
 
 
 def _camera_of_file(value: Any) -> Any:
-    """A file's lists are as good as the tuples that the wire's strict model asks for."""
+    """Read lists from a file as tuples, which the strict model of the wire requires."""
     return CameraModel.model_validate(value, strict=False) if isinstance(value, dict) else value
 
 
@@ -196,7 +199,7 @@ class VisionConfig(Config):
     secure: str = ""
     """A folder of `sightline keys`: mutual TLS and access rules; endpoints are then tls/... or quic/..."""
     max_frame_bytes: Annotated[int, Field(ge=1_000, le=FRAME.max_payload_bytes)] = 400_000
-    """Security limit: larger frames are refused by the link."""
+    """Security limit: the link rejects larger frames."""
     max_pixels: Annotated[int, Field(ge=256, le=4096 * 4096)] = 1920 * 1080
     """Security limit: larger pictures are never decoded."""
     detector: DetectorConfig = DetectorConfig()
@@ -212,4 +215,4 @@ class VisionConfig(Config):
     search: SearchConfig = SearchConfig()
     viewing: ViewingConfig = ViewingConfig()
     camera: Annotated[CameraModel | None, BeforeValidator(_camera_of_file)] = None
-    """For robots that do not say what camera they have (the older dialect); one that says is believed."""
+    """Model for robots that do not publish one (legacy protocol). A published model takes precedence."""

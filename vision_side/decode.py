@@ -47,7 +47,7 @@ class Decoder:
         return self._picture
 
     def check(self, jpeg: bytes) -> None:
-        """Raise WireError MALFORMED unless `jpeg` says that it is a picture of the camera's size, by its head alone."""
+        """Raise WireError MALFORMED unless the header of `jpeg` has the size of the camera. Does not decode."""
         if self._checked_head is None or not jpeg.startswith(self._checked_head):
             self._checked_head = self._head_of(jpeg)
 
@@ -56,7 +56,7 @@ class Decoder:
         size = read_jpeg_size(jpeg, self._max_pixels)
         if (size.width_px, size.height_px) != self.size_px:
             own = f"{self.size_px[0]}x{self.size_px[1]}"
-            raise _bad(f"is {size.width_px}x{size.height_px}, the camera model says {own}")
+            raise _bad(f"is {size.width_px}x{size.height_px}, the camera model has {own}")
         head = _head_of_one_scan(jpeg, size.components)
         if head is None and _count_scans(jpeg) > MAX_SCANS:
             raise _bad(f"has more than {MAX_SCANS} scans")

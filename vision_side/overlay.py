@@ -34,10 +34,10 @@ _FAR_PX: Final = 9e3  # OpenCV draws in 16 bits
 
 @dataclass(frozen=True, slots=True)
 class OverlayData:
-    """What is told of one frame.
+    """The data for the overlay of one frame.
 
-    `radius_m` is the target's, for where the track says that its middle is; `age_us` is the least that the frame's age
-    can be, where the robot has not measured one.
+    `radius_m` is the radius of the target, for the predicted center. `age_us` is a lower bound of the frame age, if the
+    robot has not measured one.
     """
 
     header: FrameHeader
@@ -88,14 +88,14 @@ def raw_px(target: Detection) -> Point:
 
 
 def radius_px(target: Detection) -> float:
-    """Of the circle; of what has none, that of a disc of the box's area."""
+    """Return the radius of the circle, or without one that of a disc with the area of the box, in px."""
     if target.circle is not None:
         return target.circle.radius_px
     return math.sqrt(max(0.0, (target.x2_px - target.x1_px) * (target.y2_px - target.y1_px)) / math.pi)
 
 
 def filtered_px(shown: OverlayData) -> Point | None:
-    """Where the track says that the target's middle is, in pixels of the encoded picture; None if not in front."""
+    """Return the tracked center of the target in pixels of the encoded image, or None if it is not in front."""
     seen, camera = shown.seen, shown.camera
     if seen.bearing_rad is None or seen.distance_m is None:
         return None
@@ -106,7 +106,7 @@ def filtered_px(shown: OverlayData) -> Point | None:
     if not (math.isfinite(ahead) and ahead > 0.01):  # behind the lens there are no pixels
         return None
     across_px, down_px = camera.cx_px - camera.fx_px * left / ahead, camera.cy_px + camera.fy_px * down / ahead
-    # A mission that says no height goes by floor things of any: in sight, what was found says how high it is.
+    # A mission without a height follows objects of any height. The detection gives the height.
     return across_px, raw_px(seen.target)[1] if seen.target is not None else down_px
 
 
@@ -156,7 +156,7 @@ def _what_it_does(shown: OverlayData) -> StyledText:
 
 
 def _age_text(shown: OverlayData) -> str:
-    """From capture to accepted command, the robot's own measure; while it obeys nothing, what is known here."""
+    """Return the time from capture to accepted command as the robot measures it, otherwise the local frame age."""
     if shown.header.latency_us is not None:
         return f"{shown.header.latency_us / 1000:.0f} ms"
     return "?" if shown.age_us is None else f">= {shown.age_us / 1000:.0f} ms"
@@ -202,7 +202,7 @@ def _write_line(canvas: Image, words: StyledText, y_px: int, font: float) -> Non
 
 
 def _fitting(text: str, room_px: int, font: float) -> str:
-    """As much of `text` as there is room for."""
+    """Cut `text` to the available width."""
     if _width(text, font) <= room_px:
         return text
     while text and _width(text + "...", font) > room_px:

@@ -1,4 +1,4 @@
-"""A frame in, a command out: bound, decode, detect, then the mission. Pure: the clock is the frame's capture time."""
+"""Turn a frame into a command: check bounds, decode, detect, run the mission. Pure: its clock is the capture time."""
 
 from dataclasses import dataclass, field
 
@@ -15,13 +15,14 @@ from sightline.vision_side.tracking.prediction import LatencyEstimator
 
 SOURCE = "vision"
 NO_ANSWER = "NO_ANSWER"
-"""In `skipped`: the detector did not answer the frame, in time or at all."""
-_MAX_DT_S = 0.5  # a longer gap between frames says nothing more about what happened in it
+"""Value of `skipped` for a frame without an answer of the detector in time."""
+# A longer gap between frames contains no further information about the motion in it.
+_MAX_DT_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A frame as it came. `deadline_us`, on this machine's clock, is how long a detector elsewhere may take."""
+    """A received frame. `deadline_us`, on this machine's clock, limits the time of a remote detector."""
 
     header: FrameHeader
     jpeg: bytes
@@ -30,10 +31,16 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a person may want to see of one step.
+    """The result of one step for viewers.
 
-    `phase` is the mission's own word (of `follow`: tracking, coasting, searching, lost), or no picture; bearing (left
-    positive) and distance are those of what the mission goes by; `target` is the detection that is followed.
+    Args:
+        phase: word of the mission (`follow`: tracking, coasting, searching, lost), or "no picture".
+        detections: all detections, best first.
+        target: the detection that the mission follows.
+        bearing_rad: bearing of the target, left positive.
+        distance_m: distance of the target, m.
+        note: the rest of the line.
+        done: True after the end of the mission.
     """
 
     phase: str
@@ -47,31 +54,38 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class PipelineAnswer:
-    """The answer to one frame; without a twist it only acknowledges."""
+    """The answer to one frame. Without a twist it only acknowledges the frame."""
 
     twist: Twist | None
     seen: Observation
     scan: int | None = None
-    """The number of the range scan that it used."""
+    """Sequence number of the range scan that it used."""
     mission: str = ""
-    """The mission's name."""
+    """Name of the mission."""
     request: RequestId | None = None
-    """The request for this mission; None for the one it began with."""
+    """The request for this mission, or None for the first mission."""
     result: DetectionResult | None = field(default=None, compare=False)
-    """Not compared: it has the time that the detector took."""
+    """Result of the detector. It is not compared, because it contains the computing time."""
     skipped: str = ""
-    """Why the frame was not used; empty if it was."""
+    """Reason why the frame was not used, or empty."""
 
 
 class Pipeline:
-    """One robot's pictures with one camera model. A deterministic function of what it is given, in that order."""
+    """Steers one robot by its frames. It is a deterministic function of its inputs, in their order."""
 
     def __init__(
         self, config: VisionConfig, camera: CameraModel, detector: Detector, chosen: MissionSpec | None = None
     ) -> None:
-        """`chosen` is the mission to begin with, that of `config` if None.
+        """Create the pipeline of one robot.
 
-        Raises ConfigError for a mission that there is not.
+        Args:
+            config: configuration of the vision service.
+            camera: model of the robot's camera.
+            detector: finds objects in its frames.
+            chosen: first mission, or None for that of `config`.
+
+        Raises:
+            ConfigError: the mission is unknown.
         """
         self._config = config
         self._camera = camera
@@ -83,7 +97,7 @@ class Pipeline:
         self._forget()
 
     def _forget(self) -> None:
-        """Everything that was learned from earlier frames, and the mission that was requested since."""
+        """Forget all earlier frames and the requested mission."""
         self._mission_switch = MissionSwitch(self._first, self._camera)
         self._request: RequestId | None = None
         self._begin_clock()
@@ -94,13 +108,16 @@ class Pipeline:
 
     @property
     def mission(self) -> MissionSpec:
-        """The newest chosen."""
+        """Return the newest mission."""
         return self._mission_switch.chosen
 
     def switch(self, chosen: MissionSpec, request: RequestId, session: str) -> None:
-        """From the next frame on come to rest, then carry out `chosen`; it ends with the robot's `session`.
+        """Switch to another mission from the next frame on. The robot first comes to rest.
 
-        A request that was applied already changes nothing.
+        Args:
+            chosen: the mission. It ends with the session.
+            request: the request; a repeated one changes nothing.
+            session: session id of the robot.
         """
         self._use_session(session)
         if request != self._request:
@@ -108,17 +125,18 @@ class Pipeline:
             self._mission_switch.switch(chosen)
 
     def _use_session(self, session: str) -> None:
-        """A new session of the robot begins with nothing."""
+        """Forget everything at a new session of the robot."""
+        # A new session has new odometry, so old positions would be wrong.
         if session != self._session:
             self._session = session
             self._forget()
 
     def put_scan(self, stamp: ScanHeader, scan: RangeScan) -> None:
-        """The newest range scan, for the frames from the next one on."""
+        """Store the newest range scan for the following frames."""
         self._scan = (stamp, scan)
 
     def set_camera(self, camera: CameraModel) -> None:
-        """Use another camera of the same robot from the next frame on; a requested mission continues."""
+        """Use another camera model from the next frame on. A requested mission continues."""
         self._camera = camera
         self._decoder = Decoder(camera.width_px, camera.height_px, self._config.max_pixels)
         if self._request is None:
@@ -129,7 +147,14 @@ class Pipeline:
             self._mission_switch = MissionSwitch(self.mission, camera)
 
     def step(self, frame: Frame) -> PipelineAnswer:
-        """Answer `frame`. Never raises for any JPEG bytes; the answer's `skipped` gives why one cannot be used."""
+        """Answer one frame. Never raises for any JPEG bytes.
+
+        Args:
+            frame: header and JPEG.
+
+        Returns:
+            The answer. Its `skipped` names the reason if the frame cannot be used.
+        """
         if not self._is_new(frame.header):
             return self._skip("OUT_OF_ORDER", "frame is not newer than the last")
         try:
@@ -144,13 +169,18 @@ class Pipeline:
         return self._answer(frame.header, result.detections, picture, result)
 
     def follow(self, header: FrameHeader, detections: tuple[Detection, ...]) -> PipelineAnswer:
-        """Answer the frame of `header`, in which another service found `detections`; empty is "saw nothing"."""
+        """Answer a frame with detections of another service.
+
+        Args:
+            header: header of the examined frame.
+            detections: objects, best first; empty means "saw nothing".
+        """
         if not self._is_new(header):
-            return self._skip("OUT_OF_ORDER", "what was looked at is not newer than the last")
+            return self._skip("OUT_OF_ORDER", "the examined frame is not newer than the last")
         return self._answer(header, detections, None)
 
     def _is_new(self, header: FrameHeader) -> bool:
-        """Whether `header` is newer than the last; a robot that started again begins with nothing."""
+        """Return True if `header` is newer than the last frame of its session."""
         self._use_session(header.session)
         return self._last_us is None or header.t_us > self._last_us
 
@@ -158,7 +188,7 @@ class Pipeline:
         return self.acknowledge(Observation(phase, note=note), reason)
 
     def acknowledge(self, seen: Observation, skipped: str = "") -> PipelineAnswer:
-        """An answer without a step: it names the mission and does not steer."""
+        """Acknowledge a frame without a step. The answer names the mission and contains no twist."""
         return PipelineAnswer(None, seen, None, self.mission.name, self._request, skipped=skipped)
 
     def _answer(
@@ -173,14 +203,15 @@ class Pipeline:
                               self._request, result)
 
     def _tick(self, header: FrameHeader) -> float:
-        """Seconds since the last picture; also takes in what the robot measured."""
+        """Return the seconds since the last frame, and update the latency from the robot's measurement."""
         dt_s = min((header.t_us - self._last_us) / 1e6, _MAX_DT_S) if self._last_us is not None else 0.0
         self._last_us = header.t_us
         self._latency.measure(header.latency_us, dt_s)
         return dt_s
 
     def _newest_scan(self, header: FrameHeader) -> tuple[ScanHeader | None, RangeScan | None]:
-        """For a mission that goes by scans; one of another session is of another robot, as far as anybody knows."""
+        """Return the newest scan for a mission that uses scans."""
+        # A scan of another session can be from another robot, and its clock is not comparable.
         if self._scan is None or not self.mission.wants_scan or self._scan[0].session != header.session:
             return None, None
         return self._scan
@@ -193,7 +224,15 @@ def _seen(plan: Plan, detections: tuple[Detection, ...]) -> Observation:
 def answer_header(
     frame: FrameHeader, session: str, seq: int, compute_us: int = 0, answer: PipelineAnswer | None = None
 ) -> AnswerHeader:
-    """The header of the answer to `frame`, naming it field for field, and what else `answer` went by."""
+    """Create the header of an answer.
+
+    Args:
+        frame: header of the frame, which `echo` cites field for field.
+        session: session id of the vision service.
+        seq: sequence number of the answer.
+        compute_us: computing time, us.
+        answer: the answer, which names its scan and its mission.
+    """
     scan, mission = (answer.scan, answer.request) if answer else (None, None)
     return AnswerHeader(source=SOURCE, session=session, seq=seq, echo=Echo.of(frame), compute_us=compute_us, scan=scan,
                         mission=mission)

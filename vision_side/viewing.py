@@ -36,7 +36,7 @@ class RateLimiter:
         self._due_us = float("-inf")
 
     def is_due(self, now_us: int) -> bool:
-        """Whether one may pass now; then it has."""
+        """Return True if an image may pass now, and count it."""
         if now_us < self._due_us - _EARLY * self._period_us:
             return False
         # Counted from when it was due, so that neither early nor late ones change the mean; after a pause, from now.
@@ -45,9 +45,10 @@ class RateLimiter:
         return True
 
 
-# Shows people what vision sees: `overlay` and `preview`, only while somebody watches, newest only. Shell (a thread).
-# The twist never waits for it: a frame is handed over after its answer is out, as the JPEG that came, and a thread of
-# low priority decodes, draws and encodes. Nobody watches: one question to the link a frame, and no thread.
+# The channels `overlay` and `preview`: only while a viewer subscribes, newest only. Shell (a thread).
+#
+# The twist never waits for them. A frame is passed on after its answer is sent, as the received JPEG, and a thread of
+# low priority decodes, draws and encodes. Without a viewer, each frame costs one check of the link, and no thread runs.
 
 
 IDLE_S: Final = 2.0
@@ -55,7 +56,7 @@ IDLE_S: Final = 2.0
 KEPT: Final = 4
 """Frames whose answer comes later, from another service's detector: one that is further behind is not shown."""
 NO_PICTURE: Final = "no picture"
-"""The phase of what vision refused to decode; it is not decoded here either."""
+"""Phase of an image that the pipeline rejected. It is not decoded here either."""
 _NICE: Final = 10  # of this thread: answering the next frame comes first
 _QUALITIES_BELOW: Final = (50, 30)
 """Tried where a picture is over the channel's bound, before it is left out."""
@@ -72,7 +73,7 @@ class _Job:
 
 
 class ViewPublisher:
-    """What one vision shows of one robot."""
+    """The images that a vision service publishes for one robot."""
 
     def __init__(self, config: VisionConfig, link: Link, log_change: Callable[[str, str], None]) -> None:
         """`log_change` prints a line (about what, the line) if it changed."""
@@ -98,7 +99,7 @@ class ViewPublisher:
         self, header: FrameHeader, answer: PipelineAnswer, camera: CameraModel | None, *, started_ns: int,
         jpeg: bytes | None = None,
     ) -> None:
-        """Show an answered frame to who watches, if it is time; without `jpeg` one that was kept."""
+        """Publish an answered frame for viewers, if one is due. Without `jpeg` it uses a stored frame."""
         now_us = monotonic_us()
         self._clock.update(header.session, header.t_us, now_us)
         channels = tuple(
@@ -181,7 +182,7 @@ class ViewPublisher:
 
 
 def _encoded(picture: NDArray[np.uint8], quality: int, most_bytes: int) -> bytes | None:
-    """As JPEG within the bound, at the best quality that fits; None if none does."""
+    """Encode as JPEG at the best quality within the bound, or return None."""
     for percent in (quality, *(one for one in _QUALITIES_BELOW if one < quality)):
         jpeg: bytes = simplejpeg.encode_jpeg(
             np.ascontiguousarray(picture), quality=percent, colorspace="BGR", colorsubsampling="420", fastdct=True

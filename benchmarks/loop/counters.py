@@ -65,8 +65,8 @@ def _cpu_s(pid: int) -> float:
 
 
 # Bytes that TCP connections on loopback have carried, as the kernel counts them for each. Shell (netlink, Linux).  The
-# counters of the loopback interface are everybody's; these are of the sockets that a contestant listens on. What is
-# asked for and what comes back is described in sock_diag(7); tcp_info is that of linux/tcp.h.
+# counters of the loopback interface include all programs; these are only of the sockets of a contestant. sock_diag(7)
+# describes the query and the reply; tcp_info is that of linux/tcp.h.
 
 
 Connection = tuple[int, int]
@@ -84,7 +84,7 @@ _MESSAGE_BYTES: Final = 72
 
 
 def carried_bytes(ports: Collection[int]) -> dict[Connection, int]:
-    """Payload bytes, both ways, of every open connection to one of `ports`; empty where the kernel does not tell."""
+    """Return the payload bytes, both ways, of every open connection to `ports`; empty without kernel support."""
     query = _QUERY.pack(socket.AF_INET, socket.IPPROTO_TCP, 1 << (_INET_DIAG_INFO - 1), 0, 1 << _ESTABLISHED)
     try:
         with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, _NETLINK_SOCK_DIAG) as kernel:
@@ -98,7 +98,7 @@ def carried_bytes(ports: Collection[int]) -> dict[Connection, int]:
 def carried_between(before: Mapping[Connection, int], after: Mapping[Connection, int]) -> int | None:
     """Bytes carried in the time between two readings; of several connections to one port, the busiest is taken.
 
-    The others are of whoever watches. None where nothing was told.
+    The others are those of viewers. None without counters.
     """
     busiest: dict[int, int] = {}
     for connection, count in after.items():

@@ -16,12 +16,14 @@ TCP: Final = "tcp"
 """The least that two processes can do; a reference, and a rival only when the detector is slow."""
 PEERS: Final = ("older", "lekiwi", "openpi", "callback")
 """What a user would build, one by one."""
-OUR_DETECTOR: Final = "+our eyes"
+OUR_DETECTOR: Final = "+our detector"
 """After a peer's name: the peer with Sightline's own pipeline instead of its own, so that its transport alone shows."""
 WITH_OUR_DETECTOR: Final = ("openpi", "callback")
-"""Peers whose transport is quick enough for that to tell something."""
+"""Peers whose transport is fast enough for this comparison."""
 OWN_DETECTOR: Final = ("lekiwi", "openpi", "callback")
-"""Peers that see as the older write-ups do; all others, floor and bare TCP included, have Sightline's pipeline."""
+"""Peers with the detector of the legacy articles.
+
+All others, including floor and bare TCP, use Sightline's pipeline."""
 MAX_FPS: Final = 240.0
 """As much as the robot service takes."""
 TAKEN_BOUND_PERCENT: Final = 5.0
@@ -59,18 +61,18 @@ class LoopSetting:
 
     @property
     def is_loaded(self) -> bool:
-        """Whether more pictures come than can be detected."""
+        """Return True if more images arrive than the detector can process."""
         return self.overload > 1 or self.detector_delay_ms > 1000 / self.fps
 
     @property
     def contestants(self) -> tuple[str, ...]:
-        """Whoever runs, in this order; transports alone last."""
+        """Return the contestants in order, with the transports alone last."""
         alone = tuple(name + OUR_DETECTOR for name in WITH_OUR_DETECTOR if name in self.peers)
         return (FLOOR, OURS, *((TCP, *self.peers, *alone) if self.peers else ()))
 
 
 def size_of(text: str) -> tuple[int, int]:
-    """`640x480` as (width, height). Raises ConfigError for what is none."""
+    """`640x480` as (width, height). Raises ConfigError for other text."""
     width, cross, height = text.partition("x")
     if not cross or not (width + height).isascii() or not width.isdigit() or not height.isdigit():
         raise ConfigError(f"--size {text!r}: write WIDTHxHEIGHT, e.g. 640x480")
@@ -78,7 +80,7 @@ def size_of(text: str) -> tuple[int, int]:
 
 
 def peers_of(text: str) -> tuple[str, ...]:
-    """`all`, `none`, or names separated by commas. Raises ConfigError for a name that is none of `PEERS`."""
+    """`all`, `none`, or names separated by commas. Raises ConfigError for a name that is not in `PEERS`."""
     if text in ("all", "none"):
         return PEERS if text == "all" else ()
     names = tuple(text.split(","))
@@ -99,7 +101,7 @@ Accepted = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """`ages_us` are (time of the verdict or nearly, age of the picture at the verdict), in the order of time."""
+    """`ages_us` are (approximate time of the result, age of the image at the result), in the order of time."""
 
     captured: int
     answered_percent: float
@@ -108,10 +110,10 @@ class Course:
 
 @dataclass(frozen=True, slots=True)
 class LoopSample:
-    """What was measured of `name` within `seconds`; processor time and memory are by process.
+    """The measurements of `name` within `seconds`. Processor time and memory are per process.
 
     `taken_percent` is the share of the machine's time that others had; `hot_us` one step without pauses (floor only);
-    `carried_bytes` what went over the contestant's sockets, None where the kernel does not tell.
+    `carried_bytes` are the bytes on the contestant's sockets, None without kernel support.
     """
 
     name: str
@@ -126,7 +128,7 @@ class LoopSample:
 
 
 def joined(samples: Sequence[LoopSample]) -> LoopSample:
-    """What was measured of one contestant in several turns, as one sample; memory and disturbance are the worst."""
+    """Join several turns of one contestant into one sample. Memory and disturbance are the worst."""
     first, courses = samples[0], [sample.course for sample in samples]
     captured = sum(course.captured for course in courses)
     answered = sum(course.captured * course.answered_percent for course in courses) / max(1, captured)
@@ -146,10 +148,10 @@ def joined(samples: Sequence[LoopSample]) -> LoopSample:
 def course_of_tally(
     captured_us: Sequence[int], judged_us: Sequence[Sequence[int]], begin_us: int, end_us: int
 ) -> Course:
-    """Of a contestant that noted everything itself.
+    """Return the course of a contestant that recorded everything itself.
 
-    Ages are those of verdicts within the time, so that a growing queue shows; answered is what was captured within it
-    and judged at all, late or not.
+    Ages are those of results within the time, so that a growing queue shows. An image captured within it counts as
+    answered even with a late result.
     """
     captured = {t_us for t_us in captured_us if begin_us <= t_us < end_us}
     answered = captured & {t_us for t_us, _ in judged_us}
@@ -158,7 +160,8 @@ def course_of_tally(
 
 
 def course_of_headers(headers: Sequence[Header], accepted: Sequence[Accepted], begin_us: int, end_us: int) -> Course:
-    """Of the services: ages as the driver measured them, carried by the next frame's header; accepted by its own count.
+    """Return the course of the services: ages as the driver measured them, from the next frame header; its accepted
+    count.
 
     A header whose latency is the one before it brings no news: nothing was accepted in between.
     """
@@ -178,12 +181,12 @@ def course_of_headers(headers: Sequence[Header], accepted: Sequence[Accepted], b
 
 
 def _accepted_percent(headers: Sequence[Header], statuses: Sequence[Accepted], lag_us: int) -> float:
-    """Share of the frames captured between the first and the last status; verdicts lag captures by `lag_us`."""
+    """Share of the frames captured between the first and the last status; results lag captures by `lag_us`."""
     times_us = [t_us for _, t_us, _ in headers]
     seqs = [headers[max(0, bisect_right(times_us, t_us - lag_us) - 1)][0] for t_us, _ in statuses]
     if len(statuses) < 2 or seqs[-1] == seqs[0]:
         return 0.0
-    # A verdict on the very edge may be counted on its other side.
+    # A result at the boundary may count on its other side.
     return min(100.0, 100 * (statuses[-1][1] - statuses[0][1]) / (seqs[-1] - seqs[0]))
 
 
@@ -206,7 +209,7 @@ _PARTS: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class LoopFigures:
-    """One contestant. Times are from capture to the verdict; None where nothing was answered.
+    """One contestant. Times are from capture to the result; None without an answer.
 
     `first_ms` and `last_ms` are medians of the first and the last ten seconds, or fifths of a shorter time; `cpu_ms` is
     per answered picture and process, `memory_mb` the high-water mark, `bytes_per_picture` what went over the sockets,
@@ -278,8 +281,8 @@ def _parts(ages_us: Sequence[tuple[int, int]]) -> tuple[float | None, float | No
 def loop_checks(figures: Mapping[str, LoopFigures], setting: LoopSetting) -> list[Check]:
     """Hold Sightline against the floor of the same run, or, with a detector slower than the camera, against its delay.
 
-    And against every rival there is; transports with our eyes are shown and not judged. `figures` has at least the
-    floor and Sightline.
+    And against every competitor; transports with Sightline's detector are shown and not checked. `figures` has at least
+    the floor and Sightline.
     """
     ours, floor = figures[OURS], figures[FLOOR]
     like_ms = setting.detector_delay_ms or OVERLOADED_LIKE_MS

@@ -31,12 +31,12 @@ class Ours:
     accepted: list[Accepted] = field(default_factory=list)
 
     def note(self, message: Message) -> None:
-        """Keep what a status says of the commands accepted."""
+        """Store the count of accepted commands in a status."""
         stamp, status = decode(Stamp, message.header), decode(Status, message.payload, STATUS.max_payload_bytes)
         self.accepted.append((stamp.t_us, status.accepted))
 
     def course(self, begin_us: int, end_us: int) -> Course:
-        """What became of the pictures of that time; only after the vision has ended."""
+        """Return the course of that time. Call it only after the end of the vision service."""
         headers = [(seq, t_us, latency_us) for seq, t_us, latency_us in json.loads(self.tally.read_text())]
         return course_of_headers(headers, self.accepted, begin_us, end_us)
 

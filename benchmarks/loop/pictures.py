@@ -1,6 +1,6 @@
 """The recorded pictures of `bench loop`: a ball going round in a textured room. Shell (files).
 
-Their size is that of a camera's own JPEG (about 46 kB at 640x480), because size is what a transport is asked to carry.
+Their size is that of a camera's own JPEG (about 46 kB at 640x480), because the transport has to carry this size.
 """
 
 import math

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LABELS: Final = {
-    FLOOR: "floor (one process)", OURS: "sightline", TCP: "bare TCP", "older": "older write-up",
+    FLOOR: "floor (one process)", OURS: "sightline", TCP: "bare TCP", "older": "legacy article",
     "lekiwi": "ZeroMQ as LeKiwi", "openpi": "WebSocket as openpi", "callback": "zenoh, plain callback",
     "openpi" + OUR_DETECTOR: "openpi's transport alone", "callback" + OUR_DETECTOR: "callback's transport alone",
 }
@@ -23,15 +23,15 @@ _PAUSE_US: Final = 2_000_000
 
 
 def draw_race(path: Path, race: Race) -> None:
-    """Write a PNG: left the share of verdicts by age, right the age over time."""
+    """Write a PNG: left the share of results by age, right the age over time."""
     figure = Figure(figsize=(12, 5), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     shares, times = figure.subplots(1, 2)
     for name, sample in race.samples.items():
         if sample.course.ages_us:
             _draw_one(shares, times, name, sample.course.ages_us)
-    _finish(shares, "age at the verdict, ms", "share of verdicts, %")
-    _finish(times, "seconds", "age at the verdict, ms")
+    _finish(shares, "age at the result, ms", "share of results, %")
+    _finish(times, "seconds", "age at the result, ms")
     shares.set_xscale("log")
     times.set_yscale("log")
     for axis in (shares.xaxis, times.yaxis):

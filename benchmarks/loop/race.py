@@ -57,11 +57,11 @@ class Contestant(Protocol):
 
     @property
     def ports(self) -> Sequence[int]:
-        """Where its processes listen."""
+        """Return the ports of its processes."""
         ...
 
     def course(self, begin_us: int, end_us: int) -> Course:
-        """What became of the pictures of that time."""
+        """Return the course of that time."""
         ...
 
 
@@ -142,7 +142,7 @@ def _hot_us(contestant: Contestant) -> float | None:
     return json.loads(contestant.tally.read_text())["hot_us"] if isinstance(contestant, Contestants) else None
 
 
-# `sightline bench loop`: capture to the driver's verdict, against the floor and what others build. Shell.
+# `sightline bench loop`: capture to the driver's result, against the floor and other stacks. Shell.
 
 
 _TURNS: Final = 3
@@ -181,8 +181,8 @@ def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
 def _samples(setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> dict[str, LoopSample]:
     """One of each contestant.
 
-    Floor and Sightline take turns, since what is judged is their difference and a shared machine's clock changes from
-    minute to minute; under load there is one turn, for age is to be watched over the whole time.
+    Floor and Sightline take turns, because the result is their difference, and a shared machine changes its clock from
+    minute to minute. Under load there is one turn, because the age must be observed over the whole time.
     """
     turns = 1 if setting.is_loaded else max(1, min(_TURNS, int(setting.seconds // _LEAST_TURN_S)))
     part = replace(setting, seconds=setting.seconds / turns)

@@ -1,4 +1,4 @@
-"""What viewers cost the driver of a robot: the bench, and the viewers' process. Shell (processes).
+"""Measure the cost of viewers for the driver of a robot: the bench, and the process of the viewers. Shell (processes).
 
 Opens COUNT links, each with its own connection, and takes every frame; with NAP_S it sleeps so long over each one, on
 the transport's thread, so that its connection is read no faster than that.
@@ -50,7 +50,7 @@ def main(endpoint: str, count: int, nap_s: float) -> None:
         threading.Event().wait()
 
 
-# `sightline bench watchers`: what viewers cost whoever drives; one never reads, one slowly. Shell (processes).
+# `sightline bench watchers`: the cost of viewers for the driver; one never reads, one slowly. Shell (processes).
 #
 # First the loop alone, then with viewers who take the control stream itself: the worst that a viewer may do.
 

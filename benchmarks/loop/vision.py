@@ -36,7 +36,7 @@ class DelayedDetector:
         self._detector, self._delay_s, self._busy_s = detector, delay_s, busy_s
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """As the detector inside, later."""
+        """Return the detections of the inner detector after the delay."""
         if self._delay_s:
             time.sleep(self._delay_s)
         until_s = time.perf_counter() + self._busy_s
@@ -71,8 +71,8 @@ class PipelineVision:
 
 
 # More pictures than can be detected, by a chosen factor: by their rate, else by a slower detector. Shell (a clock).
-# The robot service takes at most `MAX_FPS` pictures a second. Where the pipeline is quicker than that, the rate stays
-# as it was asked and every contestant's detector is made to work for as long as the factor demands.
+# The robot service takes at most `MAX_FPS` pictures a second. If the pipeline is faster, the rate stays
+# unchanged, and every contestant's detector works for the time that the factor requires.
 
 
 _STEPS: Final = 60
@@ -80,7 +80,7 @@ _FRAME_US: Final = 33_333
 
 
 def overloaded(setting: LoopSetting, say: Callable[[str], None]) -> LoopSetting:
-    """`setting` with the rate, or the detector's time, that its `overload` asks for. Its pictures are written."""
+    """Return `setting` with the rate, or the detector's time, for its `overload`. Its images are written."""
     step_ms = _step_ms(PipelineVision(setting.width_px, setting.height_px), setting.pictures)
     found = with_overload(setting, step_ms)
     say(f"overload {setting.overload:g}: one step takes {step_ms:.2f} ms; {found.fps:g} pictures a second, "
@@ -107,7 +107,7 @@ def _step_ms(eyes: PipelineVision, pictures: Path) -> float:
     return median(took_ms)
 
 
-# The vision service with a tap: keeps what the frames' headers say, and may be made slow. Shell.  `python -m
+# The vision service with a tap: it records the frame headers, and may be slow. Shell.  `python -m
 # sightline.benchmarks.loop.vision SETTINGS`. The service is `sightline.vision_side.serving.service.Service` as it is;
 # the tap costs an append per frame, and only a detector made slow is put into its pipeline.
 

@@ -19,7 +19,7 @@ WEBSOCKET: Final = "websocket"
 
 @dataclass(frozen=True, slots=True)
 class NetworkPhase:
-    """Shapes in force for `seconds`, or for its share of the time asked for where that is None."""
+    """Shapes in force for `seconds`, or for a share of the requested time if that is None."""
 
     shapes: LinkShapes
     seconds: float | None = None
@@ -32,8 +32,8 @@ class NetworkPhase:
 class NetworkCase:
     """One network. Bounds that are None are not demanded; `over_first_ms` is over the first phase's p50.
 
-    A row with a `scene` is more than one robot and one vision: its scene runs and judges it. With `passes_through` the
-    camera hands over its own JPEGs, which nobody can make smaller.
+    A row with a `scene` has more than one robot and one vision service: its scene runs and scores it. With
+    `passes_through` the camera provides its own JPEGs, which cannot be made smaller.
     """
 
     name: str
@@ -52,7 +52,7 @@ class NetworkCase:
 
     @property
     def draws(self) -> bool:
-        """Whether chance has a part in it, so that one seed is not another."""
+        """Return True if it is random, so that the seeds differ."""
         legs = [leg for phase in self.phases for leg in (phase.shapes.ab, phase.shapes.ba)]
         return not self.scene and any(
             leg.loss or leg.burst_start or leg.jitter_ms or leg.reorder or leg.duplicate or leg.corrupt for leg in legs
@@ -144,7 +144,7 @@ CASES: Final = (
     ),
     NetworkCase(
         "medium",
-        "one half-duplex medium of 1 Mbit/s, video offered at 4, an operator says STOP",
+        "one half-duplex medium of 1 Mbit/s, video offered at 4, an operator sends STOP",
         (NetworkPhase(both(rate_bit_s=1e6).model_copy(update={"half_duplex": True})),),
         scene="medium",
         transports=_SITE,
@@ -184,11 +184,11 @@ def chosen(only: Iterable[str], transport: str = ZENOH) -> tuple[NetworkCase, ..
     known = [row.name for row in possible]
     for name in names:
         if name not in known:
-            raise ConfigError(f"--only {name!r} is no row over {transport}; there are: {', '.join(known)}")
+            raise ConfigError(f"unknown --only {name!r} over {transport}; known: {', '.join(known)}")
     return tuple(row for row in possible if not names or row.name in names)
 
 
 def spans_s(row: NetworkCase, seconds: float) -> list[float]:
-    """How long each phase lasts when `seconds` are shared among those that have no length of their own."""
+    """Return the length of each phase, with `seconds` shared among those without a length."""
     shared = sum(phase.seconds is None for phase in row.phases)
     return [seconds / shared if phase.seconds is None else phase.seconds for phase in row.phases]

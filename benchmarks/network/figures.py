@@ -1,4 +1,4 @@
-"""Figures and bounds of a network case, and of what its wheels were told. Pure."""
+"""Compute the figures of a network case and of its wheel commands, with their bounds. Pure."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,13 +12,13 @@ from sightline.evaluation.checks import Check, at_least, at_most, worst_checks
 from sightline.robot_side.safety.limits import TICK_US, SafetyConfig, stop_bound
 
 _LATE_US: Final = 2 * TICK_US
-"""A decision holds for a tick; who notes a twist may hear it a little after the robot."""
+"""A decision holds for one tick. The recorder of a twist may receive it slightly after the robot."""
 _OLD_US: Final = SafetyConfig().zero_speed_age_ms * 1000 + _LATE_US
 _RAMPED_OUT_US: Final = (stop_bound(SafetyConfig()).ramped_us + 2 * _LATE_US) // TICK_US * TICK_US
 """Age of a frame, in whole ticks, at which even the ramp that it left behind is at its end; its answer and the zero may
 both be late."""
 _FASTER_RAD_S: Final = 0.15
-"""Less is no gain of speed: turning a twist into wheel speeds rounds."""
+"""Smallest gain of speed. The conversion of a twist to wheel speeds rounds."""
 
 
 class WheelCommand(NamedTuple):
@@ -30,7 +30,7 @@ class WheelCommand(NamedTuple):
 
     @property
     def moves(self) -> bool:
-        """Whether a wheel is to turn."""
+        """Return True if a wheel must turn."""
         return bool(self.left_rad_s or self.right_rad_s)
 
 
@@ -83,7 +83,7 @@ def _stands(rows: Sequence[WheelCommand]) -> Iterator[tuple[int, int]]:
             begin_us = None
 
 
-# What a robot's own notes say of a row of `bench network`, and whether it is enough. Pure.
+# The figures of a row of `bench network` from the robot's records, and their check. Pure.
 
 
 DRIVING: Final = ("ACTIVE", "DEGRADED")
@@ -102,7 +102,7 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class NetworkFigures:
-    """Of one stretch. Ages are from capture to the accepted command; what came too late counts as infinitely old."""
+    """Figures of one period. Ages are from capture to the accepted command. A late command counts as infinitely old."""
 
     p50_ms: float | None
     p95_ms: float | None
@@ -143,7 +143,7 @@ def figures_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: Stretch) -
 
 
 def sent_between(statuses: Sequence[Sequence[Any]], begin_us: int, end_us: int) -> float:
-    """How many frames the robot sent in that time, from counts that come ten times a second."""
+    """Return the number of frames that the robot sent in that time, from its counts at 10 Hz."""
     counts = [(row[NOTED.index("t_us")], row[NOTED.index("sent")]) for row in statuses]
     return _count_at(counts, end_us) - _count_at(counts, begin_us)
 
@@ -164,7 +164,7 @@ def _ages_us(frames: Sequence[Sequence[Any]]) -> Iterator[int]:
 
 
 def _holds_s(statuses: Sequence[Mapping[str, Any]]) -> Iterator[float]:
-    """How long it was held, each time, after it had driven."""
+    """Yield the length of each HOLD after driving, in s."""
     since_us: int | None = None
     driven = False
     for one in statuses:

@@ -36,7 +36,7 @@ _CONNECT_S = 15.0
 
 
 class Settings(Config):
-    """How many, how often, what they see and where they are met."""
+    """Number, rate, images and endpoint of the robots."""
 
     endpoint: str
     robots: int
@@ -47,7 +47,7 @@ class Settings(Config):
 
 
 class PlayedRobot:
-    """One robot: `play` does what is due and says when it wants to be called again."""
+    """One robot: `play` does the due work and returns the time of its next call."""
 
     def __init__(self, name: str, link: Link, settings: Settings, due_us: int) -> None:
         self.name = name

@@ -44,7 +44,7 @@ _SETTLE_S: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class NetworkProgress:
-    """Who hears how it goes: that a run begins, and what came of it."""
+    """Receives the progress: the start of each run, and its result."""
 
     begins: Callable[[str], None]
     ended: Callable[[NetworkRun], None]
@@ -123,7 +123,7 @@ def _course(row: NetworkCase, stage: Stage) -> NetworkRun:
 
 
 def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[Check]:
-    """From what the wheels were told, whatever the robot says of itself; over Zenoh, where twists can be heard."""
+    """Yield checks of the wheel commands, independent of the robot's reports. Only Zenoh shows twists."""
     if notes["twists"]:
         lines = on_old_sight(read_wheel_commands(stage.wheels.read_text("ascii")), notes["twists"])
         yield at_most("moved on frames over 400 ms", float(lines), "lines", 0)

@@ -1,6 +1,6 @@
 """Cases with a course of their own: takeover, uplink, twenty robots, STOP through a full medium. Shell (processes).
 
-Judged from what the wheels were told: they stop, and turn again.
+The score uses the wheel commands: they stop, and turn again.
 """
 
 import json
@@ -38,7 +38,7 @@ _OTHER_ADDRESS: Final = "10.213.77.3"
 
 
 def standby(row: NetworkCase, stage: Stage) -> NetworkRun:
-    """Two visions; whoever drives is killed and a new one stands by, for as long as there is time."""
+    """Run two vision services. The driving one is killed and a new one stands by, until the end of the time."""
     endpoint = stage.form.format(ADDRESS_A)
     with _on_site(row, stage) as (wire, ending):
         start_robot(stage, ending.enter_context(stage.processes("robot")), wire.robot_side)
@@ -60,7 +60,7 @@ def standby(row: NetworkCase, stage: Stage) -> NetworkRun:
 
 
 def router(row: NetworkCase, stage: Stage) -> NetworkRun:
-    """Everybody is a client of a router that is killed; counted from when there is one again."""
+    """Run all services as clients of a router that is killed. The time counts from the new router."""
     with _on_site(row, stage) as (wire, ending):
         groups: list[tuple[Processes, int]] = []
 
@@ -242,7 +242,7 @@ _FLEET_SETTLE_S: Final = 3.0
 
 
 def fleet(row: NetworkCase, stage: Stage) -> NetworkRun:
-    """All of them for as long as there is time; judged by the robot that fared worst."""
+    """Run all robots until the end of the time. The worst robot is the score."""
     pictures = stage.folder / "small"
     pictures.mkdir()
     write_pictures(pictures, WIDTH_PX, HEIGHT_PX)
@@ -285,9 +285,9 @@ def fleet_checks(
     )
 
 
-# A row of `bench network`: one half-duplex medium, full of video, and a person beyond it who says STOP. Shell.
+# A row of `bench network`: one half-duplex medium, full of video, and an operator beyond it who sends STOP. Shell.
 #
-# Judged from the simulated motors' own log, with the fault bench's robot and judge.
+# The score uses the log of the simulated motors, with the robot and the checks of the fault bench.
 
 
 REACHES_MS: Final = 300.0
@@ -316,7 +316,8 @@ def _medium_run(row: NetworkCase, stage: Stage, rig: RobotFixture) -> NetworkRun
                         namespace=rig.wire.far_side)
     rig.processes.wait_line("person", "person ready")
     if rig.processes.exit_code("person", stage.setting.seconds + _BESIDE_S) != 0:
-        raise HardwareError(f"the person gave up: {rig.processes.log('person').read_text('utf-8').strip()[-200:]}")
+        last = rig.processes.log("person").read_text("utf-8").strip()[-200:]
+        raise HardwareError(f"the operator process failed: {last}")
     injected = rig.wire.shape(LinkShapes()) - before
     told_us = [one.t_us for one in rig.noted("person", REQUESTED)]
     rows = rig.motors()
@@ -330,8 +331,8 @@ def _medium_run(row: NetworkCase, stage: Stage, rig: RobotFixture) -> NetworkRun
 
 
 def stop_checks_of(rows: Sequence[MotorRow], told_us: Sequence[int], reset_us: Sequence[int]) -> Sequence[Check]:
-    """When each STOP, said at `told_us`, shows in what the motors were told, and when the wheels stood; each holds
-    until the wheels turn after its reset.
+    """Check the times from each STOP, sent at `told_us`, to the motor commands and to zero speed. Each must last until
+    the wheels turn after its reset.
     """
     ends_us = [_again_us(rows, at_us) for at_us in reset_us]
     pairs = list(zip(told_us, ends_us, strict=True))
@@ -344,10 +345,10 @@ def stop_checks_of(rows: Sequence[MotorRow], told_us: Sequence[int], reset_us: S
 
 
 def reported_check(told_us: Sequence[int], stopped_us: Sequence[int]) -> Check:
-    """When the robot itself said, in the status with that stamp, that it was stopped."""
-    said = [(stop_us - at_us) / 1000 for at_us, stop_us in zip(told_us, stopped_us, strict=False)]
-    value = percentile(said, 99) if len(stopped_us) == len(told_us) else None
-    return at_most(f"robot says STOPPED, p99 of {len(said)}", value, "ms", REPORTED_MS)
+    """Check the time from each STOP to the first status that reports STOPPED."""
+    delays_ms = [(stop_us - at_us) / 1000 for at_us, stop_us in zip(told_us, stopped_us, strict=False)]
+    value = percentile(delays_ms, 99) if len(stopped_us) == len(told_us) else None
+    return at_most(f"robot reports STOPPED, p99 of {len(delays_ms)}", value, "ms", REPORTED_MS)
 
 
 def _again_us(rows: Sequence[MotorRow], reset_us: int) -> int:
@@ -356,7 +357,7 @@ def _again_us(rows: Sequence[MotorRow], reset_us: int) -> int:
 
 
 def _window(rows: Sequence[MotorRow], begin_us: int, end_us: int) -> list[MotorRow]:
-    """What they were told when it began, and all up to its end."""
+    """Return the last row before its start, and all rows up to its end."""
     before = [row for row in rows if row.t_us <= begin_us]
     return [*before[-1:], *(row for row in rows if begin_us < row.t_us <= end_us)]
 

@@ -1,4 +1,4 @@
-"""What the rows of `bench network` are run with: a setting, a folder, robots and visions on the wire. Shell (files)."""
+"""Provide the rows of `bench network` with a setting, a folder, robots and vision services. Shell (files)."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -23,7 +23,7 @@ _TOKENED: Final = (WEBSOCKET,)
 
 
 class ShapedWire(Protocol):
-    """What shapes the packets between the two namespaces."""
+    """Shapes the packets between the two namespaces."""
 
     robot_side: str
     far_side: str
@@ -99,7 +99,7 @@ class Stage:
 
     @property
     def wheels(self) -> Path:
-        """What the robot's wheels were told: t_us,left_rad_s,right_rad_s."""
+        """Return the file of the wheel commands: t_us,left_rad_s,right_rad_s."""
         return self.folder / "wheels.csv"
 
 
@@ -117,7 +117,7 @@ def start_robot(
 
 
 def start_vision(stage: Stage, processes: Processes, namespace: str, endpoint: str) -> int:
-    """A vision, seen working; returns its process id."""
+    """Start a vision service and wait until it works. Returns its process id."""
     secure = ("--secure", str(stage.folder)) if stage.setting.transport in _TOKENED else ()
     arguments = ["vision", "--robot", ROBOT, "--connect", endpoint, *secure]
     pid = processes.start("vision", arguments, namespace=namespace)
@@ -130,7 +130,7 @@ def _robot_toml(stage: Stage, connect: str, passes_through: bool) -> Path:
     path = stage.folder / "robot.toml"
     where = {"connect": [connect]} if connect else {"listen": [stage.form.format(EVERYWHERE)]}
     top: dict[str, Any] = {"robot": ROBOT, **where, "state_dir": str(stage.folder)}
-    if stage.setting.transport in _TOKENED:  # beyond loopback it asks for tokens
+    if stage.setting.transport in _TOKENED:  # beyond loopback it requires tokens
         top["secure"] = str(stage.folder)
         for role in ("vision", "operator"):
             (stage.folder / f"{role}.token").write_text(f"{role}-of-the-bench", "ascii")

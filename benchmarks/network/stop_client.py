@@ -17,9 +17,9 @@ from sightline.protocol.messages import Reply, State, Status, Verb
 from sightline.protocol.transports.zenoh.link import open_zenoh
 
 STOPPED: Final = "stopped"
-"""Noted with the stamp of the first status that said so."""
+"""Recorded with the stamp of the first status that reports it."""
 RESET: Final = "reset"
-"""Noted just before it is asked: the wheels stay at zero until then."""
+"""Recorded just before the request. The wheels stay at zero until then."""
 DRIVES_MPS: Final = 0.2
 _PATIENCE_S: Final = 20.0
 _PAUSE_S: Final = 0.2, 0.8
@@ -49,11 +49,11 @@ def run(endpoint: str, robot: str, ledger: EventLog, seconds: float, seed: int) 
 
 
 def _agreed(ask: Callable[[], Reply]) -> None:
-    """As a person does, ask anew when the robot says that what was asked came too late: the medium is full."""
+    """Repeat a request that the robot rejects as too old, because the medium is full."""
     deadline_s = time.monotonic() + _PATIENCE_S
     while not (reply := ask()).ok:
         if not reply.detail.startswith(RejectReason.STALE) or time.monotonic() > deadline_s:
-            raise SystemExit(f"the robot refused: {reply.detail}")
+            raise SystemExit(f"the robot rejected the request: {reply.detail}")
 
 
 def _drives(status: Status) -> bool:

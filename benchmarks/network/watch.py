@@ -1,10 +1,11 @@
-"""Notes what a robot says of itself, for `bench network`. Shell.
+"""Record the messages of a robot for `bench network`. Shell.
 
     python -m sightline.benchmarks.network.watch ENDPOINT FILE [statuses]
 
 It runs beside the robot, on the near side of the wire, so that watching costs the wire nothing, and acknowledges
 nothing. Written at SIGTERM as JSON: frames (seq, t_us, latency_us, bytes), statuses (t_us and what `NOTED` names), and
-over Zenoh, where peers hear one another, twists (heard_us, t_us of the frame answered). With `statuses` only those.
+over Zenoh, where peers receive each other's messages, twists (`heard_us`, t_us of the frame). With `statuses` only
+those.
 """
 
 import json
@@ -27,7 +28,7 @@ NOTED: Final = ("t_us", "state", "frame_age_us", "accepted", "stale", "window", 
 
 
 class Notes:
-    """Everything heard, as it came."""
+    """All received messages, not decoded."""
 
     def __init__(self) -> None:
         self.frames: list[tuple[bytes, int]] = []
@@ -49,7 +50,7 @@ class Notes:
         self.heard.set()
 
     def decoded(self) -> dict[str, list[tuple[Any, ...]]]:
-        """What is written."""
+        """Return the contents of the file."""
         return {
             "frames": [_frame_row(header, size) for header, size in self.frames],
             "statuses": [_status_row(header, payload) for header, payload in self.statuses],

@@ -26,7 +26,7 @@ def main(name: str, role: str, settings: dict[str, Any]) -> None:
     while True:
         try:
             play()
-        except ConnectionRefusedError:  # whoever listens may start later
+        except ConnectionRefusedError:  # the listener may start later
             time.sleep(_RETRY_S)
 
 

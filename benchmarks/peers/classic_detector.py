@@ -1,4 +1,4 @@
-"""The eyes that a user would build: the colour pipeline of the older write-ups, as they wrote it down. Shell (a clock).
+"""Run the color pipeline of the legacy articles, as a detector that a user would build. Shell (a clock).
 
 Whole picture decoded, blurred, turned to HSV, thresholded, opened; the largest outline's middle steers, in pixels, with
 an integral that has neither time nor bound. Constants are theirs. OpenCV's threads are left as they come.
@@ -23,7 +23,7 @@ _DEAD_BAND: Final = 0.1
 
 
 class ClassicVision:
-    """Pictures in, `linear|angular` out; as slow as was asked, by waiting (`delay_ms`) or by work (`busy_ms`)."""
+    """Images in, `linear|angular` out, slowed by a pause (`delay_ms`) or by work (`busy_ms`)."""
 
     def __init__(self, delay_ms: float, busy_ms: float) -> None:
         self._delay_s, self._busy_s = delay_ms / 1000, busy_ms / 1000
@@ -54,7 +54,7 @@ class ClassicVision:
 
 
 def largest_outline(picture: NDArray[Any]) -> NDArray[Any] | None:
-    """Of everything in the write-ups' range of yellow; None if nothing is."""
+    """Return the largest outline in the yellow range of the legacy articles, or None."""
     hsv = cv2.cvtColor(cv2.GaussianBlur(picture, _BLUR_PX, 0), cv2.COLOR_BGR2HSV)
     mask = cv2.inRange(hsv, _LOWER_HSV, _UPPER_HSV)
     mask = cv2.dilate(cv2.erode(mask, _SQUARE, iterations=2), _SQUARE, iterations=2)

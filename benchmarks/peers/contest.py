@@ -1,4 +1,4 @@
-"""What every rival is given: a camera, a vision to call, a tally. Shell (a clock)."""
+"""Provide each competitor with a camera, a detector and a tally. Shell (a clock)."""
 
 import json
 import time
@@ -18,8 +18,8 @@ class Vision(Protocol):
 
 # A camera for the peers of `bench loop`: the recorded pictures at their pace, stamped when shown. Shell (a clock).
 #
-# The caller sleeps itself (`film.next_in_s()`), as its own loop does: a thread's sleep or a coroutine's. Pictures that
-# nobody came for in time are not made up for, as with the folder camera of the robot service.
+# The caller sleeps itself (`film.next_in_s()`), as its own loop does: a thread's sleep or a coroutine's. Missed
+# images are not repeated, as with the folder camera of the robot service.
 
 
 class RecordedFrames:
@@ -32,7 +32,7 @@ class RecordedFrames:
         self._shown = 0
 
     def next_in_s(self) -> float:
-        """How long to sleep until the next picture."""
+        """Return the time until the next image, in s."""
         now_s = time.monotonic()
         self._due_s = max(self._due_s + self._interval_s, now_s)
         return self._due_s - now_s
@@ -43,7 +43,7 @@ class RecordedFrames:
         return time.monotonic_ns() // 1000, self._jpegs[self._shown % len(self._jpegs)]
 
 
-# What one contestant of `bench loop` captured, and when each answer was judged. Shell.  Kept in memory, at the cost of
+# The captures of one contestant of `bench loop`, and the time of each result. Shell.  Kept in memory, at the cost of
 # an append, and written at the end. All processes of a machine share its monotonic clock.
 
 

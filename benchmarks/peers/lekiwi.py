@@ -39,7 +39,7 @@ def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
         try:
             observations.send_string(json.dumps(observation), flags=zmq.NOBLOCK)
         except zmq.Again:
-            continue  # nobody reads
+            continue  # no reader
 
 
 def _read_command(commands: Socket, tally: Tally) -> None:

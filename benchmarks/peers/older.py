@@ -1,7 +1,7 @@
-"""The older write-up's pattern: base64 text over WebSocket, every second picture, a command loop of 55.1 ms. Shell.
+"""Run the pattern of the legacy article: base64 text over WebSocket, every second image, commands every 55.1 ms. Shell.
 
-The robot's server is an asyncio one here; the write-up's own looked for work every 100 ms and was slower still. The
-vision keeps the newest text in a variable, which its main loop watches without a pause, as the write-up does.
+The robot's server is an asyncio one here; that of the article polled every 100 ms and was slower still. The vision
+function stores the newest text in a variable, which its main loop polls without a pause, as in the article.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class RepeatedCommand:
 
 
 def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
-    """Serve pictures to whoever connects."""
+    """Serve images to each client."""
     asyncio.run(_serve(film, tally, port))
 
 

@@ -1,4 +1,4 @@
-"""One WebSocket request per picture, as openpi does it: the robot asks, waits, and acts on the answer. Shell.
+"""One WebSocket request per picture, as openpi does it: the robot sends it, waits, and applies the answer. Shell.
 
 The vision is an asyncio server that computes inside its handler; compression is off and messages are binary, as there.
 """
@@ -21,7 +21,7 @@ ANSWER: Final = struct.Struct("<Qdd")
 
 
 def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
-    """Ask the vision at `port` about one picture after the other."""
+    """Send one image after the other to the vision service at `port`."""
     connection = connect(f"ws://127.0.0.1:{port}", compression=None, max_size=None)
     while True:
         time.sleep(film.next_in_s())

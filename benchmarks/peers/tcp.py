@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 HEAD: Final = struct.Struct("<IQ")
-"""Bytes of JPEG, and the capture time in microseconds, by which the answer is told apart in measuring."""
+"""Bytes of JPEG, and the capture time in microseconds, which identifies the answer."""
 
 
 def robot(film: RecordedFrames, tally: Tally, port: int) -> None:

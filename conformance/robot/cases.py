@@ -32,7 +32,7 @@ CASES: Final[tuple[Case, ...]] = tuple(
 
 
 def is_there(bench: Bench) -> bool:
-    """Whether a robot of this id publishes a status: no case can be tested without."""
+    """Return True if a robot with this id publishes a status, which every case needs."""
     return bench.wait(lambda: bench.newest(STATUS), _FIRST_US)
 
 

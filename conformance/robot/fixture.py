@@ -31,7 +31,7 @@ _SENT_AGAIN: Final = 2
 
 
 class Robot:
-    """What is received from the robot under test."""
+    """The messages from the robot under test."""
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
@@ -55,7 +55,7 @@ class Robot:
         return self.status()
 
     def reaches(self, holds: Callable[[Status], object], within_us: int) -> bool:
-        """Whether a status for which `holds` comes within `within_us` from now."""
+        """Return True if a status that satisfies `holds` arrives within `within_us`."""
         looked_at = [self.bench.mark()]
 
         def seen() -> bool:
@@ -69,7 +69,7 @@ class Robot:
         return self.bench.wait(seen, within_us)
 
     def becomes(self, *states: State, within_us: int = 500_000) -> bool:
-        """Whether a status with one of `states` comes in time."""
+        """Return True if a status with one of `states` arrives in time."""
         return self.reaches(lambda status: status.state in states, within_us)
 
     def expect_state(self, *states: State, within_us: int = 500_000, what: str = "then") -> None:
@@ -78,11 +78,11 @@ class Robot:
         self.bench.expect(reached, f"{what} it is {self.status().state}: {self.status().reason}")
 
     def stops(self, within_us: int) -> bool:
-        """Whether a status with the wheels at zero comes in time."""
+        """Return True if a status with the wheels at zero arrives in time."""
         return self.reaches(lambda status: status.applied == (0.0, 0.0), within_us)
 
     def counts(self, reason: str, before: int, within_us: int = 400_000) -> bool:
-        """Whether more than `before` rejections for `reason` are counted in time."""
+        """Return True if more than `before` rejections for `reason` are counted in time."""
         return self.reaches(lambda status: status.refused.get(reason, 0) > before, within_us)
 
     def stamp(self) -> Stamp:

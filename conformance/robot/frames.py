@@ -69,7 +69,7 @@ def one_session(bench: Bench, _robot: Robot) -> None:
 
 @SUITE.should("R-FRAM-04", "1.4 Sizes")
 def small_overhead(bench: Bench) -> None:
-    """What is around a frame's JPEG (header and key) takes at most 320 bytes."""
+    """Header and key of a frame take at most 320 bytes."""
     key_bytes = len(f"{KEY_PREFIX}/{bench.robot}/{FRAME.name}")
     most = _MAX_OVERHEAD_BYTES - key_bytes
     _all_frames(watched(bench), lambda one: len(one.message.header) <= most, f"over {_MAX_OVERHEAD_BYTES} bytes")

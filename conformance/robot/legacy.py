@@ -36,7 +36,7 @@ def _picture(text: bytes) -> bytes:
     return data
 
 
-@SUITE.must("R-DIAL-11", "15.1 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-11", "15.1 On WebSocket: the legacy protocol", real=True)
 def pictures_as_text(bench: Bench) -> None:
     """A client that connects without a sub-protocol gets pictures: text, base64, a JPEG."""
     with _legacy(bench) as raw:
@@ -47,7 +47,7 @@ def pictures_as_text(bench: Bench) -> None:
         bench.expect(all(good), f"{len(good) - sum(map(bool, good))} of {len(good)} messages are not images as text")
 
 
-@SUITE.should("R-DIAL-12", "15.1 On WebSocket: the older dialect", real=True)
+@SUITE.should("R-DIAL-12", "15.1 On WebSocket: the legacy protocol", real=True)
 def newlines(bench: Bench) -> None:
     """The base64 has a newline after every 76 characters and at the end (robots with `?oneline` have none)."""
     with _legacy(bench) as raw:
@@ -59,7 +59,7 @@ def newlines(bench: Bench) -> None:
             bench.expect(all(len(line) == _LINE for line in lines[:-1]), "its lines are not of 76 characters")
 
 
-@SUITE.must("R-DIAL-13", "15.2 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-13", "15.2 On WebSocket: the legacy protocol", real=True)
 def commands_as_text(bench: Bench) -> None:
     """`linear|angular` is validated as a twist of `guest`."""
     watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
@@ -68,7 +68,7 @@ def commands_as_text(bench: Bench) -> None:
         bench.expect(result in (GOOD, "UNKNOWN_SOURCE"), f"it was {result}")
 
 
-@SUITE.must("R-DIAL-14", "15.2 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-14", "15.2 On WebSocket: the legacy protocol", real=True)
 def no_binary(bench: Bench) -> None:
     """A binary message ends the connection with 1003."""
     with _legacy(bench) as raw:
@@ -77,7 +77,7 @@ def no_binary(bench: Bench) -> None:
         bench.expect(end is not None and end[0] == 1003, f"it ends with {end}")
 
 
-@SUITE.must("R-DIAL-15", "15.2 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-15", "15.2 On WebSocket: the legacy protocol", real=True)
 def no_long_texts(bench: Bench) -> None:
     """A text over 256 bytes ends the connection."""
     with _legacy(bench) as raw:
@@ -85,7 +85,7 @@ def no_long_texts(bench: Bench) -> None:
         bench.expect(raw.end(2.5) is not None, "the connection stays open")
 
 
-@SUITE.must("R-DIAL-16", "15.2 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-16", "15.2 On WebSocket: the legacy protocol", real=True)
 def ill_formed_stays(bench: Bench) -> None:
     """An ill-formed twist is rejected and counted; the connection stays."""
     watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
@@ -99,7 +99,7 @@ def ill_formed_stays(bench: Bench) -> None:
         bench.expect(counted, "it was not counted")
 
 
-@SUITE.must("R-DIAL-17", "15.3 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-17", "15.3 On WebSocket: the legacy protocol", real=True)
 def silent_clients_stay(bench: Bench) -> None:
     """A client that neither sends nor reads anything for a second and a half stays."""
     with _legacy(bench, answers_pings=True) as raw:
@@ -107,7 +107,7 @@ def silent_clients_stay(bench: Bench) -> None:
         bench.expect(raw.end(0.8) is None, "the connection ended")
 
 
-@SUITE.must("R-DIAL-18", "15.3 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-18", "15.3 On WebSocket: the legacy protocol", real=True)
 def twists_return_credit(bench: Bench) -> None:
     """Its twist after a frame returns the credit: who answers gets picture after picture."""
     with _legacy(bench) as raw:
@@ -121,7 +121,7 @@ def twists_return_credit(bench: Bench) -> None:
         bench.expect(answered >= 1.5 * silent, counts)
 
 
-@SUITE.must("R-DIAL-19", "15.2 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-19", "15.2 On WebSocket: the legacy protocol", real=True)
 def origins(bench: Bench) -> None:
     """An Origin that is the Host, as older libraries send it, is let in; another site's fails with 403."""
     bench.need(bench.legacy, "no port of the legacy protocol was named (--older)")
@@ -131,7 +131,7 @@ def origins(bench: Bench) -> None:
             bench.expect(raw.status == status, f"Origin {origin}: HTTP {raw.status}, expected {status}")
 
 
-@SUITE.must("R-DIAL-20", "15.3 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-20", "15.3 On WebSocket: the legacy protocol", real=True)
 def several_clients(bench: Bench) -> None:
     """Several clients each get pictures."""
     with _legacy(bench) as first, _legacy(bench) as second:
@@ -140,9 +140,9 @@ def several_clients(bench: Bench) -> None:
         bench.expect(first_came and second_came, f"{len(first_came)} to the first, {len(second_came)} to the second")
 
 
-@SUITE.must("R-DIAL-21", "15.3 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-21", "15.3 On WebSocket: the legacy protocol", real=True)
 def first_client_drives(bench: Bench) -> None:
-    """Of several clients the first with a valid twist drives; what another sends meanwhile is NOT_HOLDER."""
+    """The first of several clients with a valid twist drives; a twist of another client is NOT_HOLDER."""
     watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
     with _legacy(bench) as first, _legacy(bench) as second:
         result = watcher.result_of(lambda: first.send(TEXT, b"0.1|0"))
@@ -152,7 +152,7 @@ def first_client_drives(bench: Bench) -> None:
         watcher.expect_result("NOT_HOLDER", lambda: second.send(TEXT, b"0.1|0"), what="a second client's twist")
 
 
-@SUITE.must("R-DIAL-22", "15.2 On WebSocket: the older dialect", real=True)
+@SUITE.must("R-DIAL-22", "15.2 On WebSocket: the legacy protocol", real=True)
 def hosts(bench: Bench) -> None:
     """A Host that a foreign site could own fails with 403 on this port too."""
     with _legacy(bench, host="evil.example.com:9091") as raw:

@@ -21,7 +21,7 @@ _ZERO: Final = (0.0, 0.0)
 
 
 def _settled(robot: Robot) -> Planar:
-    """What is applied once the ramps are over."""
+    """Return the applied twist after the ramps."""
     robot.bench.rest(1_200_000)
     reported = [robot.next_status(2).applied, *(header.applied for _, header in robot.frames()[-1:])]
     return max(reported, key=lambda pair: abs(pair[0]) + abs(pair[1]))

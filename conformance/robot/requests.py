@@ -256,7 +256,7 @@ SUITE.must_all(teleop, {
 
 @SUITE.must("R-STAT-11", "9. Status", operator)
 def counters_never_fall(bench: Bench, operator: Sender) -> None:
-    """What `refused` counts only grows, over STOP and reset too."""
+    """The counters in `refused` never decrease, also over STOP and reset."""
     sender = Sender(operator.robot)
     sender.need_unknown()
     before = operator.robot.next_status().refused

@@ -221,7 +221,7 @@ def _newest_seq(robot: Robot) -> int:
 
 @SUITE.must("R-CAUS-11", "5.1 Order", ready)
 def reasons_in_order(bench: Bench, sender: Sender) -> None:
-    """Of several faults the first in the order of validation is the reason: session before `seq`."""
+    """The first of several faults in the order of validation is the reason: session before `seq`."""
     foreign = sender.twist_result(echo_session="fffffff0")
     bench.need(foreign == "OTHER_SESSION", f"another session is {foreign} (R-CAUS-06)")
     sender.expect("OTHER_SESSION", echo_session="fffffff0", seq=0)
@@ -277,7 +277,7 @@ def _watcher(bench: Bench) -> Sender:
 
 
 def _good(status: Status) -> int:
-    """How many twists were accepted: applied, or kept from the wheels by nothing but the arming."""
+    """Return the number of valid twists: applied, or rejected only as DISARMED."""
     return status.accepted + status.refused.get("DISARMED", 0)
 
 

@@ -83,7 +83,7 @@ def disarm_request(bench: Bench) -> bytes:
 
 
 def packets_of(raw: RawWebSocket, bench: Bench, for_s: float) -> list[IncomingMessage]:
-    """What comes in whole messages, taken apart; what cannot be taken apart has an empty key."""
+    """Unpack all whole messages. A message with broken framing has an empty key."""
     return [_packet(data, bench) for opcode, data in raw.messages(for_s) if opcode == BINARY]
 
 
@@ -405,7 +405,7 @@ _HANDSHAKE_S: Final = 4.0
 
 
 def _reason_given(bench: Bench, send: Callable[[], None]) -> tuple[str, str]:
-    """What became of what `send` sends, and whom the robot took for its sender."""
+    """Return the result of the message that `send` sends, and the sender that the robot assumed."""
     watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
     result = watcher.result_of(send)
     last = watcher.robot.status().last_refusal
@@ -574,7 +574,7 @@ def token_is_not_repeated(bench: Bench) -> None:
 
 @SUITE.must("R-SOCK-40", _CLAUSE, real=True)
 def roles_are_kept_apart(bench: Bench) -> None:
-    """What the token's role may not publish is dropped, and the connection stays: a vision service requests nothing."""
+    """A message that the token's role does not permit is dropped, and the connection stays."""
     _token(bench)
     bench.need(len(set(bench.access.tokens.values())) > 1, "one token stands for every role here")
     with RawWebSocket(endpoint_of(bench), offered(bench, source="vision")) as raw:

@@ -270,7 +270,7 @@ _STILL_MPS: Final = 0.001
 
 
 def _last_twist(bench: Bench, robot: RobotPlayed, name: str, frames: int = _SECOND) -> VisionAnswer:
-    """What it reports after so many pictures of one kind."""
+    """Return its answer after a number of images of one kind."""
     mark = bench.mark()
     robot.film(name, frames, _EVERY_US)
     twists = robot.twists(mark)

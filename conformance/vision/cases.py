@@ -17,7 +17,7 @@ CASES: Final[tuple[Case, ...]] = tuple(case for part in _PARTS for case in part.
 
 
 def is_there(bench: Bench) -> bool:
-    """Whether a vision service answers at all: it may have been started a moment ago, or be started now."""
+    """Return True if a vision service answers. It may have just been started, or be started now."""
     prepare(bench)
     return bool(bench.mark() or bench.dropped_here.total())
 

@@ -59,7 +59,7 @@ def no_frame_twice(bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.must("V-CAUS-07", "1.5 Delivery", met)
 def newest_wins(bench: Bench, robot: RobotPlayed) -> None:
-    """Of a burst of 20 frames no older one is answered after a newer one."""
+    """In a burst of 20 frames no older frame is answered after a newer one."""
     mark = bench.mark()
     for _ in range(_BURST):
         robot.frame("left")

@@ -54,12 +54,12 @@ class VisionAnswer:
 
     @property
     def is_twist(self) -> bool:
-        """Whether it drives."""
+        """Return True for a twist."""
         return self.received.message.channel is TWIST
 
     @property
     def echo(self) -> dict[str, Any]:
-        """What it cites; empty for nothing."""
+        """Return its echo, or an empty object."""
         echo = self.fields.get("echo")
         return echo if isinstance(echo, dict) else {}
 
@@ -78,7 +78,7 @@ class VisionAnswer:
         return linear, angular
 
     def cites(self, sent: Sent) -> bool:
-        """Whether it means `sent`, one wrong field forgiven."""
+        """Return True if it cites `sent`, with one wrong field permitted."""
         return self.echo.get("seq") == sent.seq or self.echo.get("t_us") == sent.t_us
 
     def words(self) -> str:
@@ -96,7 +96,7 @@ def read_answer(received: Received) -> VisionAnswer:
 
 
 def met(bench: Bench) -> "RobotPlayed":
-    """How most cases begin: a robot that the vision service drives."""
+    """Start most cases with a robot that the vision service drives."""
     return RobotPlayed(bench).met()
 
 
@@ -204,7 +204,7 @@ class RobotPlayed:
         return [one for one in self.answers() if one.cites(sent)]
 
     def is_answered(self, sent: Sent, within_us: int = ANSWER_US) -> bool:
-        """Whether an answer to `sent` comes in time."""
+        """Return True if an answer to `sent` arrives in time."""
         return self.bench.wait(lambda: self.answers_to(sent), within_us)
 
     def answer_to(self, sent: Sent, within_us: int = ANSWER_US) -> VisionAnswer:
@@ -244,7 +244,7 @@ class RobotPlayed:
         return self
 
     def _drives(self, sent: Sent) -> bool:
-        """Whether a twist came; after an ack, it is not yet time for the next frame."""
+        """Return True after a twist. After an ack, the next frame is not due yet."""
         if self.twists_to(sent):
             return True
         self.bench.rest(FRAME_US)

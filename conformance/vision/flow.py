@@ -21,14 +21,14 @@ _STEADY_ANSWERED: Final = 0.9
 
 
 SUITE.must_all(met, {
-    "V-FLOW-01": ("3.3 A refused picture", "An invalid image is acknowledged, so that its credit comes back.",
+    "V-FLOW-01": ("3.3 A rejected image", "An invalid image is acknowledged, so that its credit comes back.",
                   lambda it: it.bench.expect(it.answer_to(it.frame(jpeg=b"no picture at all")), "no answer")),
 }, level=Level.SHOULD)
 
 
 @SUITE.must("V-FLOW-02", "7.1 Answers", met)
 def burst(_bench: Bench, robot: RobotPlayed) -> None:
-    """Of a burst of 20 frames the newest is answered within a second."""
+    """The newest of a burst of 20 frames is answered within a second."""
     sent = [robot.frame("left") for _ in range(_BURST)]
     robot.answer_to(sent[-1], _CATCH_UP_US)
 
@@ -118,7 +118,7 @@ def back_after_silence(bench: Bench, robot: RobotPlayed) -> None:
     robot.answer_to(robot.frame())
 
 
-@SUITE.must("V-SIL-03", "3.3 A refused picture", met)
+@SUITE.must("V-SIL-03", "3.3 A rejected image", met)
 def silent_about_no_pictures(bench: Bench, robot: RobotPlayed) -> None:
     """When pictures cease to be pictures, twists cease."""
     robot.film("left", 5)
@@ -274,7 +274,7 @@ def counts_on(bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.must("V-RECO-05", "1.5 Delivery", met)
 def nothing_kept_back(bench: Bench, robot: RobotPlayed) -> None:
-    """What it could not send while the robot was gone is not sent later."""
+    """A message that it could not send while the robot was gone is not sent later."""
     sent = robot.film("left", 3, 0)
     bench.leave()
     bench.rest(1_000_000)

@@ -89,7 +89,7 @@ SECTIONS: Final = (
         "Capture to the driver's verdict over Zenoh, robot and vision in their own processes on this machine, beside "
         "the floor (the same pipeline in one process, paced the same), bare TCP, and what others build, on the same "
         "pictures in the same run. On loopback transports tie: what is compared is what a user gets. Peers see as the "
-        "older write-ups do, with OpenCV's whole-picture pipeline; `+our eyes` shows a peer's transport alone, with "
+        "older write-ups do, with OpenCV's whole-picture pipeline; `+our detector` shows its transport alone, with "
         "Sightline's pipeline in it and without credit, age or a gate, and is not judged.",
         ("bench", "loop", "--seconds", "15"),
         "loop-zenoh.png",

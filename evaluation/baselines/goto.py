@@ -153,7 +153,7 @@ class GotoBaseline:
 
 
 def _three_sensors(scan: RangeScan) -> dict[str, list[float]]:
-    """What each sensor sees itself: the scan has its echoes from the axle's midpoint, the law goes by each sensor's."""
+    """Convert the scan, measured from the axle's midpoint, to the readings of each sensor, which the law needs."""
     angles = scan.angle_min_rad + np.arange(len(scan.ranges_m)) * scan.angle_increment_rad
     seen = np.isfinite(scan.ranges_m) & (scan.ranges_m <= scan.range_max_m)
     x_m, y_m = scan.ranges_m[seen] * np.cos(angles[seen]), scan.ranges_m[seen] * np.sin(angles[seen])

@@ -47,7 +47,7 @@ Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class BandConfig(Config):
-    """The write-up's numbers. Shares are of the picture's width."""
+    """Numbers of the legacy article. Shares are of the image width."""
 
     min_radius_share: Share = 0.05
     max_radius_share: Share = 1 / 3
@@ -97,11 +97,11 @@ Pixels = Annotated[float, Field(ge=0, le=1e4)]
 
 
 class PixelPConfig(Config):
-    """The write-up's numbers, in pixels of the encoded picture."""
+    """Numbers of the legacy article, in pixels of the encoded image."""
 
     angular_rad_s_per_px: Annotated[float, Field(ge=0, le=1)] = 0.009
     min_radius_px: Pixels = 10.0
-    """A target that looks no larger is none."""
+    """Smallest radius of a target."""
     stop_radius_px: Pixels = 50.0
     """A target that looks larger is near enough: only turn."""
     centred_px: Pixels = 20.0
@@ -147,7 +147,7 @@ class PixelP:
 # PI steering in pixels, a baseline: the nearer the target looks the slower, and an integral without time. Pure.  The
 # law of an older robot that was split over a WebSocket, its numbers as defaults: speed 200 / area, whatever that comes
 # to, and an integral per picture that nothing bounds. What else was wrong there (the position of another outline than
-# the largest, an integral that began anew with each picture) is not repeated.
+# the largest, an integral that started again with each image) is not repeated.
 # docs/how-to/missions.md has sane numbers.
 
 
@@ -155,14 +155,14 @@ Bound = Annotated[float | None, Field(gt=0, le=1e6)]
 
 
 class PixelPiConfig(Config):
-    """The write-up's numbers, in pixels of the encoded picture; None is no bound, as there."""
+    """Numbers of the legacy article, in pixels of the encoded image. None means no bound, as in the article."""
 
     area_mps: Annotated[float, Field(gt=0, le=1e5)] = 200.0
     """Speed for an area of one pixel; it falls with the area."""
     angular_rad_s_per_px: Annotated[float, Field(ge=-1, le=1)] = -0.005
     integral_share: Annotated[float, Field(ge=0, le=10)] = 0.007
     dead_band_rad_s: Annotated[float, Field(ge=0, le=10)] = 0.1
-    """Smaller corrections are none; the integral goes on."""
+    """Smaller corrections become zero. The integral continues."""
     min_area_px: Annotated[float, Field(ge=0, le=1e6)] = 40.0
     """A target that looks no larger is not followed."""
     stop_area_px: Bound = None

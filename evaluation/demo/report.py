@@ -39,11 +39,11 @@ class DemoReport:
 
     @property
     def ok(self) -> bool:
-        """Whether every check holds."""
+        """Return True if every check passes."""
         return all(check.ok for check in self.checks)
 
     def to_dict(self) -> dict[str, Any]:
-        """What `--json` prints and score.json holds."""
+        """Return the contents of `--json` and score.json."""
         options = self.run.options
         return {
             **to_dict(self.checks),
@@ -56,7 +56,7 @@ class DemoReport:
 
 
 def report(run: DemoRun) -> DemoReport:
-    """Judge `run` and write its files. Raises SightlineError for a run that was ended before it began."""
+    """Score `run` and write its files. Raises SightlineError for a run that ended before its start."""
     if not run.samples:
         raise SightlineError(f"ended before the robot drove; the logs are in {run.folder}")
     recording = run.folder / RECORDING
@@ -73,7 +73,7 @@ def report(run: DemoRun) -> DemoReport:
 
 
 def _printed(step: Step) -> tuple[int, str, str]:
-    """What the mission said of a frame: the same pipeline says the same of the same frames."""
+    """Return the phase and note of a frame. The same pipeline produces the same for the same frames."""
     return step.frame.header.t_us, step.answer.seen.phase, step.answer.seen.note
 
 
@@ -102,7 +102,7 @@ def read_statuses(recording: Path) -> "list[StatusAt]":
 
 
 def _injected(run: DemoRun) -> dict[str, Any] | None:
-    """What the shaped link says it did; None if it was not asked for or did not say."""
+    """Read the counters of the shaped link from its log, or return None without them."""
     line = last_line(run.folder / "vision.log")
     if not line.startswith(INJECTED):
         return None
@@ -118,13 +118,13 @@ def _injection_checks(run: DemoRun, injected: dict[str, Any] | None) -> list[Che
     sent = sum(leg["sent"] for leg in injected.values()) if injected else 0
     share = lost / sent if sent else 0.0
     wanted = run.options.loss
-    # Three standard deviations of a fair draw: outside of that the loss was not what was asked for.
+    # Three standard deviations of a fair draw. Outside of them the loss differs from the requested one.
     near = 3 * math.sqrt(wanted * (1 - wanted) / sent) if sent else 0.0
     return [Check("injected_loss", share, "share", wanted, sent > 0 and abs(share - wanted) <= near + 1e-9)]
 
 
 def _checks(run: DemoRun, result: Score) -> list[Check]:
-    """The scenario's bounds; of the older dialect, slow and without odometry, only that it follows is demanded."""
+    """Return the checks of the scenario. The legacy protocol, slow and without odometry, only has to follow."""
     if run.options.transport != "legacy":
         return checks_of(run.options.scenario, result, run.options.latency_ms, REAL_TIME_FACTOR)
     unseen = 100 * sum(not sample.visible for sample in run.samples) / len(run.samples)

@@ -58,12 +58,12 @@ _SILENT_S: Final = 2.0
 RECORDING: Final = "run.mcap"
 MOTOR_LOG: Final = "motors.csv"
 TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}", "legacy": "ws-legacy://127.0.0.1:{}"}
-"""How vision reaches the robot; the person and the recorder are on Zenoh in any case."""
+"""Endpoint of the vision service by transport. The operator and the recorder always use Zenoh."""
 
 
 @dataclass(frozen=True, slots=True)
 class DemoOptions:
-    """What a person asked for. `seconds` 0 runs until Ctrl-C."""
+    """The options of a demo. `seconds` 0 runs until Ctrl-C."""
 
     scenario: str = "circle"
     seconds: float = 20.0
@@ -88,7 +88,7 @@ class DemoOptions:
 
 @dataclass(slots=True)
 class DemoRun:
-    """What a run left, beside the files in `folder`."""
+    """The result of a run, next to the files in `folder`."""
 
     options: DemoOptions
     scenario: Scenario
@@ -121,14 +121,14 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
 
 
 def _check_vision(options: DemoOptions, scenario: Scenario) -> None:
-    """Raise ConfigError for a mission or detector that vision would refuse, before anything is started."""
+    """Raise ConfigError for a mission or detector that the vision service would reject, before any start."""
     config = vision_config(scenario, robot_of(scenario), options.seed, options.mission)
     configured_mission(config)
     kind = options.detector
     if kind is None or (kind == BOXES and scenario.labels):
         return
     if kind == BOXES:
-        raise ConfigError(f"--detector {BOXES}: nobody finds boxes in {scenario.name}; take one that looks itself, "
+        raise ConfigError(f"--detector {BOXES}: no service publishes boxes in {scenario.name}; choose a local one, "
                           "e.g. hsv")
     check_choice(kind, {}, config)
 
@@ -139,7 +139,7 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str]
     listen = [part for end in dict.fromkeys((endpoint, for_vision)) for part in ("--listen", end)]
     _write_configuration(run, sockets)
     say(f"simulation, robot and vision start as three processes; their logs are in {run.folder}")
-    # What the run is about is said on the command lines: the environment, which lies over files, may say the rest.
+    # The options of the run are on the command lines, because the environment takes precedence over files.
     processes.start("sim", ["sim", "--config", str(run.folder / "sim.toml"), "--scenario", options.scenario,
                             "--seed", str(options.seed), "--motor-log", str(run.folder / MOTOR_LOG),
                             "--socket-dir", sockets])
@@ -165,7 +165,7 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str]
 
 
 def arm_robot(operator: Operator, processes: Processes) -> None:
-    """As a person would: ask until the robot sees live commands, and give up with its own reason."""
+    """Repeat the arm request until the robot receives live commands. Raises with the robot's reason otherwise."""
     deadline_s = time.monotonic() + ARM_S
     while True:
         processes.check()
@@ -187,7 +187,7 @@ def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthR
         processes.check()
         sample = truth.read(timeout_s=_SILENT_S)
         if sample is None:
-            raise HardwareError("the simulation says nothing any more; see sim.log in the run folder")
+            raise HardwareError("the simulation stopped responding; see sim.log in the run folder")
         run.samples.append(sample)
         report = operator.report
         lines = _lines(report.status if report else None, sample, run.scenario.stand_off_m)
@@ -203,7 +203,7 @@ def _discard_old(truth: TruthReader) -> None:
 
 
 def _write_configuration(run: DemoRun, sockets: str) -> None:
-    """Leave each service's file in the run folder, so that a person can start the same by hand."""
+    """Write the file of each service to the run folder, so that an operator can start the same services."""
     device = {"kind": "sim", "options": {"socket_dir": sockets}}
     options, model = run.options, robot_of(run.scenario)
     legacy = options.transport == "legacy"
@@ -218,7 +218,7 @@ def _write_configuration(run: DemoRun, sockets: str) -> None:
         }),
         "vision": {
             "robot": ROBOT, **vision_table(run.scenario, model, options.seed, options.mission),
-            # The older dialect carries no camera model.
+            # The legacy protocol has no camera model.
             **({"camera": model.camera.camera_model().model_dump()} if legacy else {}),
         },
     }

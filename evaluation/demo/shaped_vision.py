@@ -1,7 +1,7 @@
 """The vision service behind a link with added latency and seeded loss. Shell (a thread).
 
-`DelayLine` is the pure part: a bounded queue in the time it is told. `ShapedLink` puts one on each leg and releases
-what is due on a thread of its own. What it did is counted, so that a run in which nothing was injected shows.
+`DelayLine` is the pure part: a bounded queue with the time as an argument. `ShapedLink` puts one on each leg and sends
+due messages from a separate thread. It counts its effects, so that a run without injected faults is detected.
 """
 
 import json
@@ -29,7 +29,7 @@ MAX_WAITING: Final = 256
 
 @dataclass(slots=True)
 class Count:
-    """What one leg was given and what it lost."""
+    """Messages of one leg, and lost ones."""
 
     sent: int = 0
     lost: int = 0
@@ -87,7 +87,7 @@ class ShapedLink(LinkWrapper):
 
     @property
     def counts(self) -> dict[str, Count]:
-        """What each leg did: `from_robot` and `to_robot`."""
+        """Return the counters of both legs, `from_robot` and `to_robot`."""
         return {direction.name.lower(): line.count for direction, line in self._lines.items()}
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
@@ -96,7 +96,7 @@ class ShapedLink(LinkWrapper):
         return True
 
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
-        """As the link does, later, and not every message."""
+        """Subscribe with the delay and the loss of the leg."""
         self._link.subscribe(
             channel, lambda message: self._put(Direction.FROM_ROBOT, lambda: callback(message))
         )
@@ -132,19 +132,19 @@ class ShapedLink(LinkWrapper):
 
 
 INJECTED = "injected: "
-"""How the line begins that says, at the end, what the legs did."""
+"""Prefix of the last line, which contains the counters of the legs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What to add to the network: latency in all, loss 0..1 on each leg."""
+    """The added faults: total latency, and loss 0..1 on each leg."""
 
     latency_ms: float
     loss: float
     seed: int
 
     def text(self) -> str:
-        """As `parse` reads it."""
+        """Return the text that `parse` reads."""
         return f"{self.latency_ms:g},{self.loss:g},{self.seed}"
 
     @classmethod
@@ -154,7 +154,7 @@ class Shape:
             latency_ms, loss, seed = text.split(",")
             return cls(float(latency_ms), float(loss), int(seed))
         except ValueError:
-            raise ConfigError(f"--shape {text!r} is none: write latency_ms,loss,seed, e.g. 50,0.1,1") from None
+            raise ConfigError(f"invalid --shape {text!r}: expected latency_ms,loss,seed, e.g. 50,0.1,1") from None
 
 
 def run_shaped(config: VisionConfig, shape: str) -> int:

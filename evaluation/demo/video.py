@@ -100,7 +100,7 @@ class TopView:
 
 # run.mp4: the robot's view with what vision saw in it, beside the world from above. Shell (reads and writes files).
 #
-# Made after the run from its recording, so it costs the run nothing: the pipeline says again what it saw.
+# It is made after the run from its recording, so it does not slow the run. The pipeline processes the frames again.
 
 
 FPS: Final = 15

@@ -43,7 +43,7 @@ class FaultyCamera:
         self._held = False
 
     def read(self, timeout_s: float) -> Picture | None:
-        """As `Camera` says, after what the mode does."""
+        """Return the next image after the effect of the mode, see `Camera`."""
         mode = self._mode.read_text("ascii") if self._mode.exists() else ""
         picture = self._camera.read(timeout_s)
         if picture is None or mode not in (*FAULTS, *SPARE) or (mode == "gil" and self._held):
@@ -56,7 +56,7 @@ class FaultyCamera:
         return FAULTS[mode](picture, self._last or picture)
 
     def close(self) -> None:
-        """As `Camera` says."""
+        """Close the camera."""
         self._camera.close()
 
 
@@ -66,7 +66,7 @@ def _hold_gil(now: Picture, _last: Picture) -> Picture:
 
 
 def _unplugged(_now: Picture, _last: Picture) -> Picture:
-    raise HardwareError("the camera is unplugged, as the bench told it to be; plug it in again")
+    raise HardwareError("the camera is unplugged (injected by the bench); plug it in again")
 
 
 def _frozen(now: Picture, last: Picture) -> Picture:

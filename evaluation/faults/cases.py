@@ -135,7 +135,7 @@ def _end_robot(rig: RobotFixture, number: signal.Signals) -> Injected:
     last_mps = rig.probe_motors()
     checks = (
         at_most("port free after", free_ms, "ms", FREE_MS),
-        at_most("last speed told", last_mps, "m/s", 0.0),
+        at_most("last speed set", last_mps, "m/s", 0.0),
         at_most("exit code", code, "", 0),
     )
     return Injected(1, at_us, checks=checks)
@@ -153,7 +153,7 @@ def _is_free(endpoint: str) -> bool:
 
 _VISION: Final = Setup(driver="vision")
 _SCRIPT: Final = Setup()
-_ENDED: Final = "zero is the last speed told, exit code 0, port free <= 2 s"
+_ENDED: Final = "zero is the last speed set, exit code 0, port free <= 2 s"
 
 PROCESS_CASES: Final = (
     FaultCase("vision.kill", "vision: SIGKILL", _kill_vision, _VISION, short=True),
@@ -203,7 +203,7 @@ def shape(rig: RobotFixture, shapes: LinkShapes) -> int:
 
 
 def _cut(rig: RobotFixture, shapes: LinkShapes, seconds: float) -> Injected:
-    """Cut for a while: nothing sent after the cut is obeyed until the wire is whole again."""
+    """Cut the wire for a while: no command from after the cut is applied until the wire is restored."""
     before = shape(rig, shapes)
     at_us = monotonic_us()
     rig.watch(seconds)
@@ -273,7 +273,7 @@ NETWORK_CASES: Final = (
 )
 
 
-# Rows: commands that lie about what they answer, that are no commands, or too many; and who may drive. Shell.
+# Rows: commands with a false echo, invalid commands, too many commands, and several drivers. Shell.
 
 
 ATTACKED_S: Final = 3.0
@@ -285,7 +285,7 @@ FLOOD_AT_LEAST: Final = 20_000
 
 
 def _attack(rig: RobotFixture, at_least_times: int = ENOUGH) -> Injected:
-    """From the trigger on, only what must be refused is sent."""
+    """From the trigger on, send only commands that must be rejected."""
     at_us = rig.trigger()
     rig.watch(ATTACKED_S)
     times = rig.injected()
@@ -300,7 +300,7 @@ def _reverse(rig: RobotFixture) -> Injected:
 
 
 def _replay_earlier(rig: RobotFixture) -> Injected:
-    """Record a session, start the robot anew, drive, and then play the recording to it."""
+    """Record a session, restart the robot, drive, and then replay the recording."""
     recording = rig.folder / "earlier.txt"
     rig.start_peer("recorder", "driver", source="teleop", recording=recording, seconds=3.0)
     rig.until(lambda: recording.exists() and len(recording.read_text("ascii").splitlines()) > 30, 15.0, "a recording")
@@ -316,9 +316,9 @@ def _replay_earlier(rig: RobotFixture) -> Injected:
 
 
 def _two_visions(rig: RobotFixture) -> Injected:
-    """A second vision asks for the opposite all the time; then both die."""
+    """A second vision service sends the opposite commands; then both die."""
     rig.start_peer("second", "driver", linear_mps=-0.5, angular_rad_s=0.0)
-    rig.until(lambda: len(rig.sent("second")) > 30, 15.0, "a second vision")
+    rig.until(lambda: len(rig.sent("second")) > 30, 15.0, "a second vision service")
     last = [row for row in rig.motors() if row.t_us >= rig.sent("second")[0].t_us]
     backwards = sum(row.left_rad_s + row.right_rad_s < 0 for row in last)
     slowest_mps = min(map(wheel_mps, last))
@@ -327,14 +327,14 @@ def _two_visions(rig: RobotFixture) -> Injected:
     rig.processes.kill("peer")
     rig.watch(SETTLED_S)
     checks = (
-        at_most("obeyed the second", backwards, "lines", 0),
+        at_most("applied from the second", backwards, "lines", 0),
         at_least("speed kept", slowest_mps, "m/s", 0.4),
     )
     return Injected(len(rig.sent("second")), at_us, checks=checks)
 
 
 def _take_over(rig: RobotFixture) -> Injected:
-    """A person takes over at full speed and drives back, then is lost: a stop that vision does not end."""
+    """An operator takes over at full speed and drives back, then is lost: a stop that vision does not end."""
     rig.start_peer("person", "driver", source="teleop", linear_mps=-0.4, angular_rad_s=0.0)
     rig.until(lambda: _goes_back(rig), 15.0, "a takeover")
     took_ms = (monotonic_us() - rig.sent("person")[0].t_us) / 1000
@@ -342,7 +342,7 @@ def _take_over(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
     rig.processes.kill("person")
     rig.watch(SETTLED_S + 1.0)
-    return Injected(1, at_us, checks=(at_most("person obeyed after", took_ms, "ms", 1000.0),))
+    return Injected(1, at_us, checks=(at_most("operator applied after", took_ms, "ms", 1000.0),))
 
 
 def _goes_back(rig: RobotFixture) -> bool:
@@ -387,10 +387,11 @@ COMMAND_CASES: Final = (
         also=f"speed changes by <= {GAIN_MPS2:g} m/s2"
     ),
     _command_case("heartbeat", "none, but frames are acknowledged and the link is alive", short=True),
-    FaultCase("driver.two", "drivers: two visions, then none", _two_visions, Setup(), also="the second is not obeyed"),
+    FaultCase("driver.two", "drivers: two vision services, then none", _two_visions, Setup(),
+              also="the second is not applied"),
     FaultCase(
-        "driver.person", "drivers: a person takes over at full speed, and is lost", _take_over, Setup(), blind=True,
-        also="obeyed <= 1000 ms; vision does not resume by itself"
+        "driver.person", "drivers: an operator takes over at full speed, and is lost", _take_over, Setup(), blind=True,
+        also="applied <= 1000 ms; vision does not resume by itself"
     ),
     FaultCase(
         "driver.dies", "drivers: the holder dies while another waits", _holder_dies, Setup(), blind=True, again=True,
@@ -399,7 +400,7 @@ COMMAND_CASES: Final = (
 )
 
 
-# Rows: many who want to watch, some of them badly, while somebody drives; and how punctual the driver stays. Shell.
+# Rows: many viewers, some of them faulty, while a driver drives; and the timing of the driver process. Shell.
 
 
 LOADED_S: Final = 6.0
@@ -413,7 +414,7 @@ HONEST_MS: Final = 10.0
 
 
 def _load(rig: RobotFixture, kind: str, at_least_times: int) -> Injected:
-    """They come while the robot is driven and stay; then whoever drives dies."""
+    """The clients connect while the robot drives, and stay. Then the driver dies."""
     came_us = monotonic_us()
     rig.start_crowd(kind)
     rig.processes.wait_line("crowd", READY)
@@ -434,7 +435,7 @@ def _load(rig: RobotFixture, kind: str, at_least_times: int) -> Injected:
 
 
 def _keep_time(rig: RobotFixture) -> Injected:
-    """Drive beside busy processes for long enough to tell a 99.9th percentile; then the driving peer dies."""
+    """Drive next to busy processes long enough for a 99.9th percentile. Then the driving peer dies."""
     rig.start_peer("person", "operator", fault="lateness")
     rig.processes.wait_line("person", "person ready", AGAIN_S)
     with busy_processes():
@@ -527,7 +528,7 @@ def _forward_mps(row: MotorRow) -> float:
 
 
 def _send_stop(rig: RobotFixture, fault: str = "") -> int:
-    """A person says STOP; returns when it was first sent."""
+    """An operator sends STOP. Returns the time of the first message."""
     rig.start_peer("person", "operator", fault=fault)
     rig.processes.wait_line("person", "person ready", AGAIN_S)
     rig.trigger("person")
@@ -577,7 +578,7 @@ def _reset_moving(rig: RobotFixture) -> Injected:
     """Reset while the wheels still turn; the wheels must come to zero and vision must not take it up again."""
     injected = _stop(rig, "reset")
     refused = "reset False" in rig.processes.log("person").read_text("utf-8")
-    return Injected(injected.count, injected.at_us, checks=(at_least("reset refused", refused, "", 1),))
+    return Injected(injected.count, injected.at_us, checks=(at_least("reset rejected", refused, "", 1),))
 
 
 # --- clocks ------------------------------------------------------------------------------------------------------
@@ -635,7 +636,7 @@ OPERATOR_CASES: Final = (
         "stop.restart", "STOP: then the network process is killed", _stop_then_restart, _SCRIPT, blind=True, also=_STAYS
     ),
     FaultCase(
-        "stop.reset", "STOP: then reset while moving", _reset_moving, _SCRIPT, blind=True, also="refused; " + _STAYS
+        "stop.reset", "STOP: then reset while moving", _reset_moving, _SCRIPT, blind=True, also="rejected; " + _STAYS
     ),
     FaultCase("clock.ahead", "clocks: a day ahead, then vision: SIGKILL", _drive_on, Setup(clock=f"{DAY_S}")),
     FaultCase("clock.behind", "clocks: a day behind, then vision: SIGKILL", _drive_on, Setup(clock=f"-{DAY_S}")),

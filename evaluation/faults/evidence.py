@@ -1,6 +1,6 @@
-"""What the motor log and the event logs say of a stop, compared with the demanded bounds. Pure but for the logs.
+"""Compare the motor log and the event logs of a stop with the bounds. Pure except for the logs.
 
-Nothing here believes the software under test: the motors' log is stamped by the simulation, the ledger by whoever sent.
+It does not trust the software under test. The simulation stamps the motor log, and each sender stamps its event log.
 """
 
 import itertools
@@ -23,17 +23,17 @@ MEMORY_MB: Final = 5.0
 _LEAVES_MAXIMUM: Final = 0.99
 """Speed counts as falling from where it leaves 99 % of its maximum for good."""
 _FASTER_MPS: Final = 0.005
-"""Less than this is no gain of speed: turning a wheel's speed into a twist and back rounds."""
+"""Smallest gain of speed. The conversion between wheel speed and twist rounds."""
 _AT_REST_MPS: Final = 0.01
-"""A wheel is at zero when its motor is told zero and its rim moves slower than this: 2 % of top speed, as in the
-bound that the robot computes for itself."""
+"""A wheel is at zero when its motor is set to zero and its rim moves slower than this: 2 % of top speed, as in the
+bound that the robot computes."""
 _RAMPED_OUT_US: Final = stop_bound(SafetyConfig()).ramped_us + 2 * TICK_US
 """Age of a frame at which even the ramp that it left behind is at its end, by the robot's own limits."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotorRow:
-    """One line of the motors' log: speeds as told, and how far the wheels had really turned."""
+    """One line of the motor log: the set speeds, and the true angles of the wheels."""
 
     t_us: int
     left_rad_s: float
@@ -52,7 +52,7 @@ class SentCommand:
 
 @dataclass(frozen=True, slots=True)
 class Blind:
-    """From `from_us` on nothing that is sent counts as sight any more, until `until_us` (None: to the end).
+    """From `from_us` to `until_us` (None: to the end) no new command is based on a fresh frame.
 
     With `by_frame`, nothing that is captured: where only pictures are cut off, one under way may still be answered.
     """
@@ -62,11 +62,11 @@ class Blind:
     by_frame: bool = False
 
     def is_earlier(self, one: SentCommand) -> bool:
-        """Whether a command is from before the blindness."""
+        """Return True for a command from before the fault."""
         return (one.frame_us if self.by_frame else one.t_us) <= self.from_us
 
     def hides(self, one: SentCommand, now_us: int) -> bool:
-        """Whether a command must not move the wheels at `now_us`."""
+        """Return True if a command must not move the wheels at `now_us`."""
         return not self.is_earlier(one) and (self.until_us is None or now_us < self.until_us)
 
 
@@ -87,7 +87,7 @@ def read_motors(text: str) -> list[MotorRow]:
 
 
 def wheel_mps(row: MotorRow) -> float:
-    """Speed that the faster wheel is told, at its rim, m/s."""
+    """Return the set speed of the faster wheel at its rim, m/s."""
     return max(abs(row.left_rad_s), abs(row.right_rad_s)) * DiffDriveConfig().wheel_radius_m
 
 
@@ -175,7 +175,7 @@ def _ages_us(rows: Iterable[MotorRow], sent: Sequence[SentCommand], blind: Blind
 
 
 def most_gain_mps2(rows: Sequence[MotorRow], since_us: int, over_us: int = 100_000) -> float:
-    """The hardest change of a wheel's told speed over `over_us`, at its rim, since `since_us`."""
+    """Return the largest change of a set wheel speed over `over_us`, at its rim, since `since_us`."""
     radius_m = DiffDriveConfig().wheel_radius_m
     late = [row for row in rows if row.t_us >= since_us]
     most, first = 0.0, 0
@@ -198,9 +198,9 @@ def stop_checks(stop: Stop, zero_ms: float = ZERO_MS, distance_m: float = DISTAN
 
 # What the bench's own processes note while they run, whatever becomes of them: one line per event. Shell (files).
 #
-# good,T_US,FRAME_US      a command that the robot should obey was sent, citing the frame captured at FRAME_US
-# injected,T_US,0         the fault was done once more
-# told,T_US,0             a person's request was sent
+# `good,T_US,FRAME_US`    a command that the robot must apply was sent, citing the frame captured at FRAME_US
+# `injected,T_US,0`       the fault was injected once more
+# `told,T_US,0`           a request of an operator was sent
 
 
 GOOD: Final = "good"

@@ -32,7 +32,7 @@ _RESIDENT: Final = "RssAnon:"
 
 
 def memory_kib(processes: Processes, names: Iterable[str]) -> dict[tuple[str, bool], int]:
-    """Memory that each of these that runs holds for itself, and (True) its child: one started anew counts as it."""
+    """Return the private memory of each running process and (True) of its child. A restarted one counts as the same."""
     pids = {(name, is_child): processes.child(name) if is_child else processes.pid(name)
             for name in names if name in processes.names for is_child in (False, True)}
     return {who: held for who, pid in pids.items() if pid and (held := _resident_kib(pid)) is not None}
@@ -159,7 +159,7 @@ _EMPTY: Final[dict[str, Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """Who drives and through what. `fault` is what the driving peer does when triggered."""
+    """The driver and its link. `fault` is the fault of the driving peer after the trigger."""
 
     driver: Role = "driver"
     fault: str = ""
@@ -173,7 +173,7 @@ class Setup:
 
     @property
     def at_speed_mps(self) -> float:
-        """A scripted driver asks for 0.5 m/s; vision follows a ball at 0.4 m/s."""
+        """Return the speed before a fault. A scripted driver sends 0.5 m/s; vision follows a ball at 0.4 m/s."""
         return 0.3 if self.driver == "vision" else 0.48
 
 
@@ -251,7 +251,7 @@ class RobotFixture:
         self.processes.wait_line("robot", f"robot {ROBOT}: on")
 
     def start_peer(self, name: str, role: Role, **changes: Any) -> None:
-        """Start a vision, a scripted driver or a person."""
+        """Start a vision service, a scripted driver or an operator."""
         options = PeerOptions(
             role=role, endpoint=self.endpoint, ledger=self.folder / f"{name}.ledger",
             config=self.folder / "vision.toml" if role == "vision" else None, **changes,
@@ -275,7 +275,7 @@ class RobotFixture:
         return at_us
 
     def camera_mode(self, mode: str) -> int:
-        """From the next picture on the camera does this; returns when it was told."""
+        """Set the mode of the camera from the next image on. Returns the time of the change."""
         at_us, new = monotonic_us(), self.folder / "camera.new"
         new.write_text(mode, "ascii")
         new.replace(self.folder / camera.MODE)
@@ -310,7 +310,10 @@ class RobotFixture:
         return len(late) > STEADY_US / 40_000 and all(wheel_mps(row) >= mps for row in late)
 
     def probe_motors(self) -> float:
-        """With the robot gone: the last speed it told a wheel, m/s. Then tells zero itself, so that the log goes on."""
+        """Return the last set wheel speed after the end of the robot, m/s.
+
+        It then sets zero, so that the log continues.
+        """
         last_mps = wheel_mps(self.motors()[-1])
         drive = SimDrive(SimSocketConfig(socket_dir=self._sockets))
         for _ in range(_PROBES):
@@ -341,11 +344,11 @@ class RobotFixture:
         return sorted((one for peer in names for one in self.noted(peer, GOOD)), key=lambda one: one.t_us)
 
     def noted(self, name: str, kind: str) -> list[SentCommand]:
-        """What a peer, `camera` or `clock` noted of one kind."""
+        """Return the events of one kind from a peer, `camera` or `clock`."""
         return read_events(self.folder / f"{name}.ledger", kind)
 
     def injected(self, name: str = "peer") -> int:
-        """How often the fault was done."""
+        """Return the number of injected faults."""
         return len(self.noted(name, INJECTED))
 
     @property
@@ -354,7 +357,7 @@ class RobotFixture:
         return ("sim", "robot", "peer") if self.setup.driver == "vision" else ("sim", "robot")
 
     def grown_mb(self) -> float:
-        """The most that any judged process has grown since the wheels were at speed."""
+        """Return the largest growth of a measured process since the wheels were at speed, in MB."""
         after_kib = memory_kib(self.processes, self._judged)
         grown_kib = (after_kib[who] - before for who, before in self._before_kib.items() if who in after_kib)
         return max(grown_kib, default=0) / 1024

@@ -2,8 +2,8 @@
 
     python -m sightline.evaluation.faults.load_clients viewers|handshakes ENDPOINT LEDGER
 
-It stands for other people's machines, so it takes little of this one's processor. Whoever is turned away or dropped
-comes again, for ever. The first of the viewers watch with an operator's role, for whom places are kept.
+It represents other machines, so it uses little of this processor. A client that is rejected or dropped connects again,
+forever. The first viewers have the role of an operator, for which places are reserved.
 """
 
 import os
@@ -49,10 +49,10 @@ class LoadViewer:
         self.admitted = False
 
     def watch(self, wire: "Connection") -> None:
-        """Say hello and take pictures, until the robot has had enough."""
+        """Send hello and receive frames until the robot closes the connection."""
         wire.protocol.max_message_size = MAX_BLOCK_BYTES + FRAME.max_payload_bytes
         wire.send_text(self._hello)
-        wire.receive_one(time.monotonic() + OPEN_S)  # the robot's, which says that there is a place
+        wire.receive_one(time.monotonic() + OPEN_S)  # the robot's hello, which confirms a place
         self.admitted = True
         self._ledger.note(ADMITTED)
         if not self._reads:

@@ -38,7 +38,7 @@ Role = Literal["vision", "driver", "operator"]
 
 
 class PeerOptions(Config):
-    """What one peer is to do."""
+    """The task of one peer."""
 
     role: Role
     endpoint: str
@@ -95,7 +95,7 @@ WAIT_S: Final = 0.05
 
 
 class Script:
-    """What an attack works with: the link, the newest frame, everything sent so far."""
+    """The context of an attack: the link, the newest frame, all sent messages."""
 
     def __init__(self, options: "PeerOptions", link: ZenohLink, ledger: EventLog) -> None:
         self.options, self.link = options, link
@@ -203,7 +203,7 @@ def _is_late(frame: FrameHeader) -> bool:
 
 
 def replay(script: Script) -> None:
-    """What was sent before, again and again: this session's, or a recording of an earlier one."""
+    """Replay earlier messages of this session or of a recording, repeatedly."""
     recording = script.options.recording
     earlier = [tuple(map(bytes.fromhex, line.split())) for line in recording.open()] if recording else script.sent
     messages = list(earlier)
@@ -237,14 +237,14 @@ def wrapped(script: Script) -> None:
 
 
 def malformed(script: Script) -> None:
-    """Every text that is no twist, with a header that would do."""
-    with open_session((), [script.options.endpoint], 5.0) as stranger:
+    """Send every text that is not a twist, with a valid header."""
+    with open_session((), [script.options.endpoint], 5.0) as third_party:
         for frame in _frames(script):
             for text in MALFORMED:
                 script.attack(script.answer(frame), text)
-            for text in OVERSIZED:  # the link would refuse to send these
+            for text in OVERSIZED:  # the link rejects these
                 script.injected()
-                stranger.put(script.key, text, attachment=encode(script.answer(frame)))
+                third_party.put(script.key, text, attachment=encode(script.answer(frame)))
             script.attack(b"{" * MAX_HEADER_BYTES)
             time.sleep(0.1)
 
@@ -295,11 +295,11 @@ ATTACKS: Final[dict[str, Callable[[Script], None]]] = {
 }
 
 
-# A person at the robot, as a process: asks for STOP (then reset), or for what the robot says of itself. Shell.
+# An operator as a process: requests STOP (then reset), or the presence of the robot. Shell.
 
 
 def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
-    """Wait for the trigger, ask, and say what was answered."""
+    """Wait for the trigger, send the request, and print the reply."""
     with open_zenoh(options.robot, connect=[options.endpoint], role=OPERATOR_SOURCE, timeout_s=15) as link:
         operator = Operator(link)
         operator.wait_report(10.0)
@@ -332,14 +332,14 @@ class LoggingLink(LinkWrapper):
         self._ledger = ledger
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """As `Link`."""
+        """Publish with the fault of this peer, see `Link`."""
         if channel is TWIST:
             self._ledger.note(GOOD, decode(AnswerHeader, header).echo.t_us)
         return self._link.publish(channel, header, payload, source)
 
 
 def _raise() -> None:
-    raise RuntimeError("the detector fails, as the bench told it to")
+    raise RuntimeError("the detector fails (injected by the bench)")
 
 
 FAULTS: Final[dict[str, Callable[[], None]]] = {

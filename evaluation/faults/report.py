@@ -12,13 +12,13 @@ _COUNTED_FROM: Final = 1000
 
 
 def passed(results: Results) -> bool:
-    """Whether something ran, and all that ran is within bounds; rows that could not run here do not count."""
+    """Return True if at least one row ran, and all that ran are within bounds. Skipped rows do not count."""
     ran = [outcome for outcomes in results for outcome in outcomes if not outcome.skipped]
     return bool(ran) and all(outcome.ok for outcome in ran)
 
 
 def run_line(outcome: FaultOutcome) -> str:
-    """One run, for a person who waits."""
+    """Format the line of one run for the operator."""
     if outcome.skipped:
         return f"{outcome.row.id:<22} skip  {outcome.skipped}"
     wrong = [_figure(check) + f" (bound {number(check.bound)})" for check in outcome.checks if not check.ok]
@@ -51,7 +51,7 @@ def value_text(value: float | None) -> str:
 
 
 def to_dict(results: Results) -> dict[str, Any]:
-    """One object, as every judging command prints with `--json`."""
+    """Return the object that every checking command prints with `--json`."""
     checks = [
         asdict(check) | {"name": f"{outcomes[0].row.id}: {check.name}"}
         for outcomes in results

@@ -1,4 +1,4 @@
-"""A fault case, how it is run and judged, and many of them side by side. Shell (processes)."""
+"""Run and score fault cases, several side by side. Shell (processes)."""
 
 import multiprocessing
 import shutil
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Injected:
-    """What an injection did: how often, when it began, when sight or commands were good again."""
+    """The record of an injection: count, start, and the time when frames or commands were valid again."""
 
     count: int
     at_us: int
@@ -57,7 +57,7 @@ class FaultCase:
     inject: "Callable[[RobotFixture], Injected]"
     setup: "Setup"
     blind: bool = False
-    """Commands go on while they must not be obeyed any more: from the injection on, none counts as good."""
+    """True if commands continue but must not be applied: from the injection on, none counts as good."""
     by_frame: bool = False
     """It is pictures that end, not commands: one under way may still be answered."""
     stops: bool = True
@@ -86,7 +86,7 @@ class FaultCase:
 
 @dataclass(frozen=True, slots=True)
 class FaultOutcome:
-    """What became of one run of a row. `skipped` says why it could not run."""
+    """The result of one run of a row. `skipped` is the reason if it could not run."""
 
     row: FaultCase
     checks: tuple[Check, ...] = ()
@@ -100,7 +100,7 @@ class FaultOutcome:
         return bool(self.checks) and not self.trouble and all(check.ok for check in self.checks)
 
 
-# Runs a row of the fault bench and judges it. Shell (processes, files).
+# The run and the score of one row. Shell (processes, files).
 
 
 MOST_TRIES: Final = 3
@@ -145,7 +145,7 @@ def _run_once(row: FaultCase, place: Path) -> tuple[tuple[Check, ...], int]:
 
 
 def watched_us(checks: Sequence[Check]) -> int:
-    """How long after the injection stamps must be right: as long as a stop takes, or for good where something failed.
+    """Return the time after the injection with exact stamps: the time of a stop, or the whole run after a failure.
 
     A motor's log is stamped by the simulation, which may have stood still between a command and its stamp.
     """
@@ -160,12 +160,12 @@ def _motion_checks(row: FaultCase, rig: RobotFixture, injected: Injected) -> Ite
         since_us = last_valid_us(sent, blind or Blind(until_us))
         stop = measure_stop(rows, since_us, injected.resumed_us) if since_us else Stop(None, None, 0.0)
         yield from stop_checks(stop, row.zero_ms, row.distance_m)
-    yield at_most("on old sight", moved_on_old_sight(rows, sent, blind), "lines", 0)
+    yield at_most("on an old frame", moved_on_old_sight(rows, sent, blind), "lines", 0)
     if row.again:
         yield at_least("drives again", bool(injected.again), "", 1)
 
 
-# Runs rows side by side, each in a process of its own, and says how long the rest will take. Shell (processes).
+# Rows side by side, each in a separate process, with an estimate of the remaining time. Shell (processes).
 
 
 _FORK: Final = multiprocessing.get_context("fork")  # nothing is open here that a copy could spoil: no link, no thread
@@ -174,7 +174,7 @@ _END_S: Final = 30.0
 
 
 class FaultProgress(NamedTuple):
-    """How far the whole is; `left_s` is a guess from what has run."""
+    """Progress of all rows. `left_s` is an estimate from the finished ones."""
 
     done: int
     total: int
@@ -253,7 +253,7 @@ def _start(turn: _Turn, folder: Path) -> _Running:
 
 
 def _run(turn: _Turn, folder: Path, answer: connection.Connection) -> None:
-    """In the process of its own; whoever waits is told what became of the row, whatever did."""
+    """Run a row in its process, and send its result to the parent in every case."""
     with suppress(KeyboardInterrupt), terminated_like_interrupted():
         outcome = run_case(turn.row, folder, turn.number)
         answer.send((outcome.checks, outcome.skipped, outcome.trouble))
@@ -265,7 +265,7 @@ def _collect(ended: _Running) -> FaultOutcome:
         checks, skipped, trouble = ended.answer.recv()
         outcome = replace(outcome, checks=checks, skipped=skipped, trouble=trouble)
     except EOFError:
-        outcome = replace(outcome, trouble="the bench's own process for this row ended; it said why above")
+        outcome = replace(outcome, trouble="the process of this row ended; see its lines above")
     ended.answer.close()
     ended.process.join()
     return outcome

@@ -1,7 +1,7 @@
 """Detectors on labelled scenes: runs, bounds and tables. Shell (draws scenes).
 
-Every detector gets the same JPEGs through the port that vision uses; each scene is a session of its own. What it says
-is checked as vision checks it: whatever a plug-in does, it is an answer that a robot could get, or none.
+Every detector receives the same JPEGs through the port of the vision service, each scene in a new session. Its answers
+pass the same checks as in the vision service.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -34,14 +34,14 @@ _FRAME_US: Final = 33_333
 _ROBOT: Final = "judge"
 LIGHT_SHARE: Final = 2.5
 """As many scenes of lights and legs as of each column's: the three states share them."""
-_MOST_SAID: Final = 2  # lines of a detector's own beside why it gave no answer: the first say what is wrong
+_MOST_SAID: Final = 2  # lines from a detector next to the cause of a missing answer
 LABELLED: Final = LABELS[1:]
-"""What is judged by average precision; the ball has columns of its own."""
+"""Labels with a score of average precision. The ball has separate columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """One detector under judgement, by the name it was asked for."""
+    """One scored detector, by its requested name."""
 
     name: str
     detector: Detector
@@ -51,7 +51,7 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class ScoredScene:
-    """One scene as it was shown, and what each subject said of it."""
+    """One scene with the answer of each detector."""
 
     scene: Scene
     jpeg: bytes
@@ -62,7 +62,7 @@ class ScoredScene:
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """How many of how many scenes a subject gave no answer to, and why."""
+    """The number of scenes without an answer of a detector, and the cause."""
 
     scenes: int
     of: int
@@ -80,9 +80,9 @@ class DetectorReport:
     """Objects, AP50."""
     made_by: dict[str, dict[str, str]]
     silent: dict[str, Silence]
-    """Who did not always answer. No answer counts as missed, which the figures do not tell from having seen nothing."""
+    """Detectors with missing answers. A missing answer counts as missed, as an empty one does."""
     uncounted: dict[str, list[str]]
-    """Who saw what nobody asks for, and what they called it: the labels of another model, as like as not."""
+    """Detectors with unknown labels, and these labels. They are usually those of another model."""
 
     def to_dict(self) -> dict[str, Any]:
         """For --json."""
@@ -92,8 +92,8 @@ class DetectorReport:
 def subjects(
     names: Sequence[str], config: VisionConfig | None = None, options: Mapping[str, Mapping[str, Any]] | None = None
 ) -> list[Subject]:
-    """Each once, with its own of the `options`; to be closed. Raises ConfigError for a name that is none, or what it
-    needs is missing, and HardwareError for a device that is not there.
+    """Build each detector once with its `options`; close them afterwards. Raises ConfigError for an unknown name or a
+    missing package, and HardwareError for a missing device.
     """
     settings, given, asked = config or VisionConfig(), options or {}, list[Subject]()
     balls = (*BALL_LABELS, settings.target.label) if settings.target.label else BALL_LABELS
@@ -126,7 +126,7 @@ def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks:
 
 
 def _answer(detector: Detector, seed: int, jpeg: bytes, decoder: Decoder, looks: int) -> DetectionResult | str:
-    """The last look's answer, or why there is none."""
+    """Return the answer of the last call, or the cause of a missing one."""
     result: DetectionResult | str = ""
     for look in range(looks):
         header = FrameHeader(session=f"{seed:08x}", seq=look, t_us=(1 + look) * _FRAME_US)
@@ -140,7 +140,7 @@ def score_scenes(
 ) -> DetectorReport:
     """All columns, `frames` scenes each, and `LIGHT_SHARE` times as many of lights and legs.
 
-    `each` is told of every scene.
+    `each` is called for every scene.
     """
     seeds = range(first_seed, first_seed + frames)
     counts = [_Count(one, columns) for one in asked]
@@ -188,7 +188,7 @@ class _Count:
             self._why = self._why or why
 
     def silence(self) -> Silence:
-        """With what the detector itself says, if it says anything."""
+        """Return the missing answers, with the notices of the detector."""
         said = notices_of(self._detector)[:_MOST_SAID]
         return Silence(self.unanswered, self.scenes, "; ".join(dict.fromkeys([self._why, *said])))
 
@@ -199,7 +199,7 @@ def detections(result: DetectionResult | None) -> tuple[Detection, ...]:
 
 
 def scene_result(result: DetectionResult | None, scene: Scene, balls: Sequence[str] = BALL_LABELS) -> FrameResult:
-    """Of one answer; `balls` is what a ball may be called."""
+    """Score one answer. `balls` are the labels of a ball."""
     return (
         frame_result(None, scene)
         if result is None
@@ -207,9 +207,10 @@ def scene_result(result: DetectionResult | None, scene: Scene, balls: Sequence[s
     )
 
 
-# What is demanded of a learned detector, and whether a report keeps it. Pure.  Demanded on `FRAMES` scenes a column
-# that nothing was trained or tuned on. Who did not ask for this is not judged by it: a colour detector, for one, finds
-# no traffic lights.
+# The bounds of a learned detector, and their check. Pure.
+#
+# They apply to `FRAMES` scenes per column, without training or tuning on them. Other detectors are not checked: a color
+# detector, for example, finds no traffic lights.
 
 
 FRAMES: Final = 500
@@ -220,12 +221,12 @@ LEAST_HITS: Final = {
 MOST_WRONG: Final = 0.05
 """Wrong objects, and false alarms, in every column: going for either is what must not happen."""
 CLEAN: Final = "nominal"
-"""The column of clean pictures, where the centre is judged."""
+"""The column of clean images, for the score of the center."""
 CENTRE_PX: Final = 1.0
 """The median."""
 LEAST_AP50: Final = 0.80
 LEAST_OBJECTS: Final = 300
-"""Of each label; a figure of fewer says too little."""
+"""Smallest number of objects per label for a score."""
 
 
 def all_detector_checks(report: DetectorReport) -> list[Check]:
@@ -308,7 +309,7 @@ def markdown(report: DetectorReport) -> str:
 
 
 def silence_lines(report: DetectorReport) -> list[str]:
-    """One for each detector that did not always answer, and for each that calls things what nobody asks for."""
+    """Return a line for each detector with missing answers, and for each with unknown labels."""
     silent = [f"{name}: no answer to {one.scenes} of {one.of} scenes, which count as missed: {one.why}"
               for name, one in report.silent.items()]
     calls = [
@@ -330,5 +331,5 @@ def _line(cells: Sequence[str]) -> str:
 def _made(report: DetectorReport) -> str:
     ran = ", ".join(f"{name} on {by['device'] or 'its own'}" for name, by in report.made_by.items())
     last = report.first_seed + report.frames - 1
-    return f"{report.frames} scenes a column, seeds {report.first_seed} to {last}; {ran or 'nobody answered'}"
+    return f"{report.frames} scenes a column, seeds {report.first_seed} to {last}; {ran or 'no detector answered'}"
 

@@ -1,7 +1,7 @@
 """Hits, misses, localisation and average precision of a detector. Pure.
 
-A frame's answer is what somebody who follows a ball would steer by: the surest detection that is called a ball.
-Going for another object is the unsafe failure, and is counted by itself.
+The answer to a frame is the best detection with the label of a ball, as the mission `follow` uses it. A detection on
+another object is the unsafe failure, and is counted separately.
 """
 
 import math
@@ -43,7 +43,7 @@ def frame_result(
     compute_us: int | None = None,
     balls: Sequence[str] = BALL_LABELS,
 ) -> FrameResult:
-    """The verdict on one frame; None is no answer, which is no hit. `balls` is what a ball may be called."""
+    """Score one frame. None is a missing answer and not a hit. `balls` are the labels of a ball."""
     ball = ball_of(scene)
     asked = [one for one in detections or () if one.label in balls]
     if not asked:
@@ -56,7 +56,7 @@ def frame_result(
 
 
 def is_hit(one: Detection, ball: LabelledBox) -> bool:
-    """Whether the detection is that ball."""
+    """Return True if the detection is that ball."""
     boxes = [ball.box] if ball.whole is None else [ball.box, ball.whole]
     drawn = [corners(one)]
     if one.circle is not None:
@@ -76,7 +76,7 @@ def _off_px(one: Detection, ball: LabelledBox) -> float | None:
 
 
 def _is_on_another(one: Detection, scene: Scene) -> bool:
-    """Whether its middle lies in the box of something that is no ball."""
+    """Return True if its center is in the box of another object."""
     x, y = (one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2
     others = [*scene.others, *(truth.box for truth in scene.truths if truth.label != "ball")]
     return any(box[0] <= x <= box[2] and box[1] <= y <= box[3] for box in others)
@@ -84,7 +84,7 @@ def _is_on_another(one: Detection, scene: Scene) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class DetectorFigures:
-    """Of one detector in one column. Shares are 0..1."""
+    """Figures of one detector in one column. Shares are 0..1."""
 
     frames: int
     balls: int
@@ -147,7 +147,7 @@ class LabelMatches:
                 self.marks.append((one.score, False))
 
     def take(self, more: "LabelMatches") -> None:
-        """What was found of this label in other frames."""
+        """Add the matches of this label in other frames."""
         self.objects += more.objects
         self.marks += more.marks
 
@@ -167,7 +167,7 @@ class LabelMatches:
 
 
 def precisions(found: Mapping[str, LabelMatches]) -> dict[str, tuple[int, float | None]]:
-    """Objects and AP50 of each label; of a label that was never found too, but nothing of who finds none of them."""
+    """Return objects and AP50 of each label. A detector that finds none of the labels has no figures."""
     if not any(one.marks for one in found.values()):
         return {}
     return {label: (one.objects, one.average_precision()) for label, one in found.items()}

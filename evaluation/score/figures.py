@@ -100,7 +100,7 @@ AT_LEAST = "least_"
 
 # The figures of scenarios that are more than following one ball: legs, waypoints, traffic lights. Pure.
 #
-# From world truth alone, but for what a mission says aloud: that it cannot reach a waypoint, and which colour it sees.
+# From world truth alone, except for the reports of a mission: an unreachable waypoint, and the color of the light.
 
 
 Figures = dict[str, float | None]
@@ -123,7 +123,7 @@ SETTLED_S = 0.35
 
 
 def figures_of(scenario: Scenario, samples: Sequence[Truth], said: MissionPhases = ()) -> Figures:
-    """Whatever `scenario` is judged by besides what every following is."""
+    """Return the figures of `scenario` in addition to those of following."""
     figures: Figures = {"wall_contact_s": (samples[-1].wall_contacts - samples[0].wall_contacts) * STEP_S}
     if scenario.target.shape == "legs":
         figures |= legs_figures(samples, scenario.stand_off_m)
@@ -135,7 +135,7 @@ def figures_of(scenario: Scenario, samples: Sequence[Truth], said: MissionPhases
 
 
 def legs_figures(samples: Sequence[Truth], stand_off_m: float) -> Figures:
-    """How near and how far, from the first acquisition on; and the nearest ever."""
+    """Return the distances from the first acquisition on, and the smallest of the whole run."""
     acquired_s = score(samples, stand_off_m).acquired_s
     begin_us = samples[0].t_us + acquired_s * 1e6 if acquired_s is not None else math.inf
     distances = [truth.distance_m for truth in samples if truth.t_us >= begin_us]
@@ -146,7 +146,7 @@ def legs_figures(samples: Sequence[Truth], stand_off_m: float) -> Figures:
 
 
 def goal_figures(scenario: Scenario, samples: Sequence[Truth], said: MissionPhases) -> Figures:
-    """When the last waypoint was reached, each after the one before; how near to anything; when it said it cannot."""
+    """Return the time of the last waypoint, the smallest clearance, and the time of "cannot reach"."""
     goals, reached_s = list(scenario.goals_m), None
     for truth in samples:
         if goals and math.dist((truth.x_m, truth.y_m), goals[0]) <= REACHED_WITHIN_M:
@@ -172,7 +172,7 @@ def light_figures(samples: Sequence[Truth], said: MissionPhases) -> Figures:
 
 
 def _crossings(samples: Sequence[Truth]) -> Iterator[tuple[str, bool]]:
-    """What the light showed at each crossing, and whether the robot could have stopped when it left green."""
+    """Yield the light at each crossing, and True if the robot could have stopped at the end of green."""
     could_stop = False
     for before, now in pairwise(samples):
         if before.light == "green" != now.light:
@@ -183,7 +183,7 @@ def _crossings(samples: Sequence[Truth]) -> Iterator[tuple[str, bool]]:
 
 
 def _starts(samples: Sequence[Truth]) -> Iterator[float]:
-    """How long after each green a robot that waited began to move."""
+    """Yield the delay between each green and the start of a waiting robot, in s."""
     green_us: int | None = None
     for before, now in pairwise(samples):
         waits = abs(now.linear_mps) < STANDING_MPS and -WAITS_WITHIN_M < (now.past_line_m or 0.0) < 0
@@ -195,7 +195,7 @@ def _starts(samples: Sequence[Truth]) -> Iterator[float]:
 
 
 def _wrong_percent(samples: Sequence[Truth], said: MissionPhases) -> float | None:
-    """Of the frames on the way to the line, those in which the mission names another colour than is lit, or none."""
+    """Return the share of frames before the line with a wrong or missing color of the mission, in percent."""
     times_us = [truth.t_us for truth in samples]
     changes = [now.t_us for before, now in pairwise(samples) if before.light != now.light]
     looked = right = 0
@@ -214,12 +214,13 @@ def _wrong_percent(samples: Sequence[Truth], said: MissionPhases) -> float | Non
 
 
 def _is_new(t_us: int, changes: Sequence[int]) -> bool:
-    """Whether the light changed just before."""
+    """Return True if the light has just changed."""
     return any(0 <= t_us - change < SETTLED_S * 1e6 for change in changes)
 
 
-# What is demanded of each scenario, and whether a run keeps it. Pure.  For 0 to 200 ms added latency and 10 % loss on
-# each leg. No contact is demanded everywhere but where it says how much.
+# The bounds of each scenario, and their check. Pure.
+#
+# They apply to 0 to 200 ms added latency and 10 % loss on each leg. Contact is permitted only where a bound names it.
 
 
 UNITS = {
@@ -230,7 +231,7 @@ UNITS = {
     "start_s": "s", "wrong_states_percent": "%",
 }
 STANDS_STILL_FROM_MS = 350
-"""With so much added latency no frame is young enough any more: the robot is to stand still, and that is judged."""
+"""Added latency from which every frame is too old. The robot must stand still, and the score checks it."""
 
 _CIRCLE = {"bearing_rms_deg": 1.0, "lost_percent": 0.0, "target_contacts": 0.0}
 _EIGHT = {"bearing_rms_deg": 3.0, "lost_percent": 0.0, "target_contacts": 0.0}
@@ -282,14 +283,14 @@ def checks_of(scenario: str, result: Score, latency_ms: float = 0.0, factor: flo
 
 
 def _usual(result: Score) -> dict[str, float]:
-    """Of a scenario of somebody's own: what its kind demands, by what there was to be judged."""
+    """Return the bounds of a user's scenario by its kind."""
     if "least_crossings" in result.figures:
         return _LIGHT
     return {**_COURSE, "reached_s": result.seconds} if "reached_s" in result.figures else {}
 
 
 def _must_acquire(bounds: dict[str, float]) -> bool:
-    """Where nothing else of a following is demanded, that it began at all is."""
+    """Return True if the run must acquire the target, because no other bound of following applies."""
     return any(name in _ACQUIRES for name in bounds) or set(bounds) <= {"wall_contacts", "wall_contact_s"}
 
 

@@ -40,14 +40,14 @@ class ScoreCase:
 
     @property
     def group(self) -> str:
-        """What it shares with the runs of other seeds."""
+        """Return the name that it shares with the runs of other seeds."""
         others = "".join(f" {one}" for one in (self.mission, self.robot, self.look, self.detector) if one)
         return f"{self.scenario}{others} +{self.latency_ms:g} ms {100 * self.loss:g}% loss"
 
 
 @dataclass(frozen=True, slots=True)
 class ScoredFigure:
-    """One figure of one group: its median and its worst over the seeds; the worst is what is judged."""
+    """One figure of one group: its median and its worst over the seeds. The worst is checked."""
 
     group: str
     name: str
@@ -65,11 +65,11 @@ class ScoreReport:
     runs: list[tuple[ScoreCase, Score]]
     judged: list[ScoredFigure]
     news: dict[str, list[str]] = field(default_factory=dict)
-    """What the detector had to tell a person, by group: why it gave no answer, for one."""
+    """Lines of the detector for the operator by group, e.g. the cause of a missing answer."""
 
     @property
     def ok(self) -> bool:
-        """Whether every run is within every bound."""
+        """Return True if every run is within every bound."""
         return all(one.ok for one in self.judged)
 
     def to_dict(self) -> dict[str, Any]:
@@ -91,7 +91,7 @@ def cases(
     seconds: float | None, *, mission: str | None = None, robot: str | None = None, look: str | None = None,
     detector: str | None = None,
 ) -> list[ScoreCase]:
-    """Every combination, those of one group together. Raises ConfigError for a name or number that is none."""
+    """Every combination, those of one group together. Raises ConfigError for an invalid name or number."""
     if mission is not None:
         REGISTRY.load(mission)
     for name in scenarios:
@@ -136,7 +136,7 @@ def run_of(case: ScoreCase) -> tuple[Scenario, Run]:
 
 
 def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCase], None]) -> ScoreReport:
-    """Run `wanted` on `jobs` processes, in any order, and judge them. `on_done` is called as each is done."""
+    """Run `wanted` on `jobs` processes, in any order, and score them. `on_done` is called after each."""
     results: dict[ScoreCase, tuple[Score, list[str]]] = {}
     with worker_pool(min(jobs, len(wanted))) as pool:
         futures = {pool.submit(run_case, case): case for case in wanted}
@@ -173,7 +173,7 @@ def _scored_figure(group: str, checks: list[Check], results: list[Score]) -> Sco
 
 
 def score_text(report: ScoreReport) -> str:
-    """One line per figure, under the name of its group and what its detector had to say."""
+    """Return one line per figure, below the name of its group and the notices of its detector."""
     lines: list[str] = []
     group = ""
     for one in report.judged:

@@ -1,4 +1,4 @@
-"""A client of the older dialect, as the write-ups had it: base64 pictures in, `linear|angular` out, port 9091. Shell.
+"""Run a client of the legacy protocol, as in its articles: base64 images in, `linear|angular` out, port 9091. Shell.
 
     python examples/compose/older_client.py ws://127.0.0.1:9091
 

@@ -1,7 +1,7 @@
-"""What a labelled scene consists of, drawn from its seed. Pure.
+"""Define a labeled scene, drawn from its seed. Pure.
 
-A column says what is hard about a scene. Who judges never shows what was trained on: other seeds, other families of
-textures, light from heights in between.
+A column defines the difficulty of a scene. The scored scenes never repeat trained ones: they have other seeds, other
+families of textures, and light from heights in between.
 """
 
 import math
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from sightline.sim.scenario import Color, State
 
 JUDGED_FROM: Final = 900_000
-"""Seeds from here on are for judging only."""
+"""First seed of the scenes for scores only."""
 VALIDATED_FROM: Final = 800_000
 """Seeds from here up to `JUDGED_FROM` choose thresholds; training draws below."""
 LABELS: Final = ("ball", "light-red", "light-yellow", "light-green", "legs")
@@ -27,10 +27,10 @@ STATES: Final[tuple[State, ...]] = ("red", "yellow", "green")
 WIDTH_PX, HEIGHT_PX = 320, 240
 BALL_PX = (8.0, 120.0)
 MOST_HIDDEN = 0.6
-"""A ball that shows less is none that could be asked for."""
+"""Largest hidden share of a ball that counts as an object."""
 MOST_DISTRACTORS = 5
 WITHOUT_BALL_EVERY = 5
-"""Of the judged scenes each fifth has no ball."""
+"""Each fifth scored scene has no ball."""
 LIGHT_SIZES: Final = (0.6, 1.4)  # of a traffic light, by the one in the simulated lane
 
 Random = np.random.Generator
@@ -41,7 +41,7 @@ Point = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """What is hard about a scene: the first four by what is in it, the rest by what the camera does to it."""
+    """The difficulty of a scene: four values for its contents, the others for the camera."""
 
     name: str
     same_colour_boxes: float = 0.0
@@ -101,7 +101,7 @@ class Lens:
         return np.array([[0.0, -sin, cos], [-1.0, 0.0, 0.0], [0.0, -cos, -sin]])
 
     def point(self, u_px: float, v_px: float, ahead_m: float) -> Point:
-        """What a pixel shows at that depth along the axis."""
+        """Return the point of a pixel at a depth along the axis."""
         x, y, z = (self.axes() @ self.ray(u_px, v_px) * ahead_m).tolist()
         return x, y, z
 
@@ -126,7 +126,7 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class Solid:
-    """One thing made of one or several bodies; `label` is empty for what nobody asks for."""
+    """One object of one or more bodies. `label` is empty for an object that is not a target."""
 
     shape: str
     """`ball`, `box`, `cylinder`, `legs`, `light`"""
@@ -175,7 +175,7 @@ class ScenePlan:
 
 @dataclass(frozen=True, slots=True)
 class LabelledBox:
-    """One object that is asked for, in pixels."""
+    """One labeled object, in pixels."""
 
     label: str
     box: Box
@@ -195,14 +195,14 @@ class Scene:
     truths: tuple[LabelledBox, ...]
     others: tuple[Box, ...]
     unclear: tuple[Box, ...]
-    """Things that are asked for, but hardly in view: neither right nor wrong."""
+    """Labeled objects that are hardly in view. A detection of them is neither right nor wrong."""
 
 
 def trained_column(seed: int) -> Column:
-    """What is hard about the scene of that seed when it is trained on."""
+    """Return the column of a training scene."""
     return HARDER if seed >= HARDER_FROM else TRAINED
 
 
 def is_judged(seed: int) -> bool:
-    """Whether a scene is for judging only."""
+    """Return True for a scene that is for scores only."""
     return seed >= JUDGED_FROM

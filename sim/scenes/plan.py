@@ -67,8 +67,8 @@ def plan_scene(seed: int, column: Column) -> ScenePlan:
 
 
 def with_more_of_the_ball(plan: ScenePlan) -> Iterator[ScenePlan]:
-    """What to draw where too much of the ball is hidden, one after the other until enough of it shows: the scene
-    without what is nearer, with its boxes of the ball's colour elsewhere, and at last without those that are nearer."""
+    """Yield simpler scenes for a ball that is hidden too much: first without nearer objects, then with the boxes of its
+    color elsewhere, then without the nearer ones of these."""
     (ball,) = (one for one in plan.solids if one.label == "ball")
     alike = [one for one in plan.solids if one.is_like_ball]
     others = [one for one in plan.solids if one not in alike and (one == ball or not _is_nearer(one, ball))]
@@ -81,12 +81,12 @@ def with_more_of_the_ball(plan: ScenePlan) -> Iterator[ScenePlan]:
 
 
 def _is_nearer(one: Solid, ball: Solid) -> bool:
-    """Whether a part of it may be."""
+    """Return True if a part of it can be nearer than the ball."""
     return math.dist(one.at_m, (0, 0, 0)) <= math.dist(ball.at_m, (0, 0, 0)) + _reach(one)
 
 
 def _width_px(lens: Lens, ball: Solid) -> float:
-    """Of the ball, in the middle of the picture: what `_ball` drew."""
+    """Return the width of the ball at the image center, as `_ball` drew it."""
     radius_m, away_m = ball.size_m[0] / 2, float(np.dot(ball.at_m, lens.axes()[:, 2]))
     return 2 * radius_m * lens.focal_px / math.sqrt(away_m * away_m - radius_m * radius_m)
 
@@ -155,7 +155,7 @@ def _light(draw: Random, lens: Lens, seed: int) -> Solid:
 
 
 def _legs(draw: Random, lens: Lens, floor_m: float) -> Solid:
-    """A person from the knees down, at any moment of a stride, going anywhere."""
+    """Draw legs from the knees down, at any moment of a stride, in any direction."""
     at = _on_floor(draw, lens, floor_m, (0.7, 4.0))
     radius_m, height_m = draw.uniform(0.04, 0.075), draw.uniform(0.3, 0.55)
     return Solid("legs", at, (radius_m, radius_m, height_m), _any_colour(draw), draw.uniform(0, math.tau), "legs",
@@ -201,7 +201,7 @@ def as_seen(scene: Scene) -> bytes:
 
 
 def with_defects(rgb: Picture, column: Column, draw: Random) -> bytes:
-    """`rgb` as JPEG, as bad as the column says."""
+    """Encode `rgb` as JPEG with the defects of the column."""
     gains = draw.uniform(*column.gain) * (1 + draw.uniform(-column.white_balance, column.white_balance, 3))
     steps = np.clip(np.rint(np.arange(256)[:, None] * gains), 0, 255).astype(np.uint8)
     picture: Picture = np.asarray(cv2.LUT(rgb, steps.reshape(1, 256, 3)), np.uint8)

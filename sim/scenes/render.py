@@ -92,8 +92,8 @@ class SceneRenderer:
         pybullet.disconnect(physicsClientId=self._client)
 
     def scene(self, seed: int, column: Column) -> Scene:
-        """The scene of that seed. Where it is to judge or to choose, a ball shows at least what `MOST_HIDDEN` leaves,
-        and boxes of its colour stay.
+        """Return the scene of a seed. In scenes for scores and validation, a ball is hidden by `MOST_HIDDEN` at most,
+        and boxes of its color stay.
 
         In training one that shows less is unclear, and nothing is learned there.
         """
@@ -186,7 +186,7 @@ def _has_ball(ones: Sequence[Solid] | Sequence[LabelledBox]) -> bool:
 
 
 def _projection(lens: Lens) -> list[float]:
-    """As the simulated camera's: TinyRenderer samples at a pixel's left and lower edge, hence the half pixel."""
+    """Return the projection of the simulated camera. TinyRenderer samples at the left and lower edge of a pixel."""
     half_up_rad = math.atan(HEIGHT_PX / 2 / lens.focal_px)
     aspect = WIDTH_PX / HEIGHT_PX
     matrix = list(pybullet.computeProjectionMatrixFOV(math.degrees(2 * half_up_rad), aspect, NEAR_M, FAR_M))

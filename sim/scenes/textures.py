@@ -177,7 +177,7 @@ def ridges(draw: Random) -> Field:
 
 # Floors and walls of scenes: families of tileable textures of any colour. Pure (NumPy, OpenCV).
 #
-# Three lists: what is trained on, what thresholds are chosen on, and what only judges show.
+# Three lists: for training, for the choice of thresholds, and for scores only.
 
 
 _FLOORS = 16  # of the simulated room's own; each takes as long to make as a scene
@@ -271,7 +271,7 @@ def _patchwork(draw: Random) -> Field:
 
 
 def _mosaic(draw: Random) -> Field:
-    """Judged only: small squares of colours around two, with joints."""
+    """Draw small squares of colors around two, with joints. For scores only."""
     count = int(draw.integers(4, 14))
     one, two = rgb(draw), rgb(draw)
     colours = np.stack([near(draw, one if draw.random() < 0.5 else two) for _ in range(count * count)])
@@ -282,7 +282,7 @@ def _mosaic(draw: Random) -> Field:
 
 
 def _stones(draw: Random) -> Field:
-    """Judged only: cells round random points, which wrap."""
+    """Draw cells around random points, which wrap. For scores only."""
     count = int(draw.integers(8, 40))
     points = draw.random((count, 2)).astype(np.float32)
     x, y = grid()
@@ -293,14 +293,14 @@ def _stones(draw: Random) -> Field:
 
 
 def _weave(draw: Random) -> Field:
-    """Judged only: two waves across each other."""
+    """Draw two waves across each other. For scores only."""
     x, y = grid()
     waves = [np.sin(2 * np.pi * int(draw.integers(2, 20)) * side + draw.uniform(0, 6)) for side in (x, y)]
     return mixed(np.asarray(0.5 + 0.25 * (waves[0] + waves[1]), np.float32), rgb(draw), rgb(draw))
 
 
 def _marble(draw: Random) -> Field:
-    """Judged only: veins."""
+    """Draw veins. For scores only."""
     x, y = grid()
     bent = soft(draw, 25) * draw.uniform(1.0, 3.0)
     veins = np.abs(np.sin(np.pi * (int(draw.integers(1, 4)) * x + int(draw.integers(1, 4)) * y + bent)))

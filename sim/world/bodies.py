@@ -15,7 +15,7 @@ _NO_TURN = (0.0, 0.0, 0.0, 1.0)
 
 
 class ThingBodies:
-    """One thing: its bodies, and where its middle is. Legs are two bodies, a mere place is none."""
+    """One thing with its bodies and its center. Legs are two bodies, a place has no body."""
 
     def __init__(self, client: int, thing: Thing, place: Place, way_m: float = 0.0, *, is_target: bool) -> None:
         self.thing = thing
@@ -27,7 +27,7 @@ class ThingBodies:
 
     @property
     def middle(self) -> Vector:
-        """Where its middle is now."""
+        """Return its center now."""
         if len(self.bodies) != 1:
             return self._middle
         return pybullet.getBasePositionAndOrientation(self.bodies[0], physicsClientId=self._client)[0]  # type: ignore[no-any-return]
@@ -134,7 +134,7 @@ _NOTHING = -1
 
 
 class LightBodies:
-    """Housing, pole and lamps, or one box, lit as the schedule says."""
+    """Housing, pole and lamps, or one box, lit by the schedule."""
 
     def __init__(self, client: int, light: Light, begin: float) -> None:
         self._client, self._light, self._begin = client, light, begin
@@ -211,11 +211,11 @@ class PathMover:
         self._begin_m = phase * self._path.length_m
 
     def way_m(self, now_us: int) -> float:
-        """How far along its path it is at `now_us`."""
+        """Return the distance along its path at `now_us`, in m."""
         return self._begin_m + self._thing.speed_mps * max(0.0, now_us / 1e6 - self._thing.waits_s)
 
     def place(self, now_us: int) -> Place:
-        """Where it is at `now_us`."""
+        """Return its place at `now_us`."""
         return self._path.at(self.way_m(now_us))
 
     def move(self, bodies: ThingBodies, now_us: int) -> None:
@@ -275,7 +275,7 @@ def _push(client: int, bodies: ThingBodies, force: Vector) -> None:
 
 
 def begin(client: int, target: Static | OnPath | Pushed | Forced, seed: int) -> tuple[Mover, Place, float]:
-    """What moves the target, where it begins, and how far it has come on its path by then."""
+    """Return the mover of the target, its first place, and its first distance along the path."""
     if isinstance(target, OnPath):
         return _on_path(target, target_phase(target, seed))
     if isinstance(target, Pushed):

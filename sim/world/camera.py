@@ -65,7 +65,7 @@ class WallPainter:
         self._which = np.empty(size, np.uint16)
         self._colours = np.empty((*size, 3), np.uint8)
         self.nearness = np.zeros(size, np.float32)
-        """One over the depth of the wall in each pixel, per metre; 0 where there is none."""
+        """Inverse depth of the wall in each pixel, 1/m; 0 without a wall."""
 
     def paint(self, picture: npt.NDArray[np.uint8], lens: PoseMatrix, seen_axes: PoseMatrix) -> None:
         """Paint into `picture`. `seen_axes`: columns right, down, forward of the camera, in the world."""
@@ -219,7 +219,7 @@ def _projection(model: CameraModel) -> list[float]:
 
 
 def _fading(saturation: float) -> Matrix:
-    """What brings red, green and blue nearer to their brightness, or further from it."""
+    """Return the matrix that moves red, green and blue toward their brightness, or away from it."""
     weights = np.array([0.299, 0.587, 0.114])  # of brightness, as JPEG has them
     return np.asarray(saturation * np.eye(3) + (1 - saturation) * weights)
 
@@ -259,6 +259,6 @@ class Defects:
         return np.asarray(cv2.resize(picture, (size.width_px, size.height_px), interpolation=cv2.INTER_AREA), np.uint8)
 
     def _noise(self, pool: npt.NDArray[np.int16]) -> npt.NDArray[np.int16]:
-        """A randomly placed part of noise drawn beforehand: drawing it anew costs 20 times as much."""
+        """Return a random part of stored noise. New noise costs 20 times as much."""
         down, right = self._draw.integers(0, NOISE_MARGIN_PX, 2).tolist()
         return pool[down : down + self._size[0], right : right + self._size[1]]

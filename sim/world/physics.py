@@ -64,7 +64,7 @@ def add_wall(client: int, wall: Wall) -> int:
 
 
 def add_robot(client: int, robot: RobotModel, at: Place) -> "RobotBody":
-    """The robot with its axle's midpoint at `at`, motors off. Raises ConfigError for a URDF that PyBullet refuses."""
+    """The robot with its axle's midpoint at `at`, motors off. Raises ConfigError for a URDF that PyBullet rejects."""
     body = urdf_body(robot)
     loaded = _load(client, robot, body, at)
     moving = {
@@ -103,7 +103,7 @@ def _load(client: int, robot: RobotModel, body: UrdfBody, at: Place) -> int:
 
 
 def _loosen(client: int, body: int, joints: list[int]) -> None:
-    """A user's casters and levers: PyBullet brakes every joint until it is told not to. And none of it is drawn."""
+    """Release the casters and levers of a URDF, because PyBullet brakes every joint by default. They are not drawn."""
     for joint in joints:
         pybullet.setJointMotorControl2(body, joint, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=client)
     for link in range(-1, pybullet.getNumJoints(body, physicsClientId=client)):
@@ -148,7 +148,7 @@ class RobotBody:
         )
 
     def wheel_angles(self) -> tuple[float, float]:
-        """How far each wheel has rolled, rad."""
+        """Return the angle of each wheel, rad."""
         left, right = pybullet.getJointStates(self.body, self._wheels, physicsClientId=self._client)
         return float(left[0]) * self._signs[0], float(right[0]) * self._signs[1]
 

@@ -46,7 +46,7 @@ class Lidar:
         return self._distances(place, self._angles_rad + yaw_rad, self._model.range_max_m)
 
     def _distances(self, place: Vector, angles_rad: Numbers, reach_m: float) -> Numbers:
-        """How far the rays go, inf where they hit nothing."""
+        """Return the length of each ray in m, inf without a hit."""
         ends = np.empty((len(angles_rad), 3))
         ends[:, 0] = place[0] + reach_m * np.cos(angles_rad)
         ends[:, 1] = place[1] + reach_m * np.sin(angles_rad)
@@ -58,7 +58,7 @@ class Lidar:
         return np.array([hit[2] if hit[0] >= 0 else np.inf for hit in hits]) * reach_m
 
     def _merged(self, place: Vector, yaw_rad: float) -> Numbers:
-        """What all eyes see, from the one place: each echo counts in the ray that is nearest to its direction."""
+        """Merge all single-ray sensors into one scan. Each echo counts in the ray nearest to its direction."""
         model = self._model
         merged = np.full(model.rays, np.inf)
         for eye in model.eyes:
@@ -71,7 +71,7 @@ class Lidar:
         return merged
 
     def _echoes(self, eye: RangeSensorMount, place: Vector, yaw_rad: float) -> tuple[Numbers, Numbers]:
-        """Of one eye: how far its echoes are from the scan's place, and in which direction of the robot."""
+        """Return the echoes of one single-ray sensor: distance from the origin of the scan, and direction."""
         half_rad = math.radians(eye.span_deg) / 2
         angles_rad: Numbers = math.radians(eye.facing_deg) + np.linspace(-half_rad, half_rad, eye.rays)
         ahead_m, left_m = eye.x_m - self._model.x_m, eye.y_m
@@ -92,7 +92,7 @@ class Lidar:
 
 # What the simulation itself labels in a picture: boxes of walking legs, as a perfect detector's. Shell (PyBullet).
 #
-# Reads no clock. A box holds both legs of a person; its score is the share of them that nothing hides.
+# Reads no clock. One box contains both legs. Its score is their visible share.
 
 
 _NEAR_M = 0.1
@@ -131,7 +131,7 @@ def _label(
 def _outline_px(
     client: int, person: ThingBodies, camera: CameraModel, lens: Points, seen_axes: Points
 ) -> Points | None:
-    """Where the legs' upper and lower rims are in the picture; None for a person beside or behind the lens."""
+    """Return the upper and lower rims of the legs in the image, or None next to or behind the lens."""
     thing = person.thing
     ring = np.stack([np.cos(_AROUND_RAD), np.sin(_AROUND_RAD), np.zeros(len(_AROUND_RAD))], axis=-1) * thing.radius_m
     rims = [
@@ -146,7 +146,7 @@ def _outline_px(
 
 
 def _seen_share(client: int, person: ThingBodies, lens: Points) -> float:
-    """Of points up and down both legs, those that the lens sees."""
+    """Return the visible share of points along both legs."""
     seen = looked = 0
     for leg in person.bodies:
         x_m, y_m, _ = _middle(client, leg)

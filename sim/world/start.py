@@ -1,4 +1,4 @@
-"""Where the robot and whatever else may vary begin: drawn from the seed. Pure (NumPy's seeded generators)."""
+"""Draw the start of the robot and of all variable objects from the seed. Pure (NumPy's seeded generators)."""
 
 import math
 
@@ -11,7 +11,7 @@ _PATH, _START, _THING_PATH, _JITTER, _LIGHT = 1, 2, 7, 8, 9
 
 
 def target_phase(target: OnPath, seed: int) -> float:
-    """Where on its path the target begins, as a fraction."""
+    """Return the start of the target on its path, as a fraction."""
     return float(np.random.default_rng([seed, _PATH]).uniform(*target.phase))
 
 
@@ -21,7 +21,7 @@ def thing_phase(thing: OnPath, number: int, seed: int) -> float:
 
 
 def thing_place(thing: Static, number: int, seed: int) -> Place:
-    """Where a thing that does not move stands."""
+    """Return the place of a static thing."""
     x_m, y_m = thing.at_m
     if thing.jitter_m:
         moved = np.random.default_rng([seed, _JITTER, number]).uniform(-thing.jitter_m, thing.jitter_m, 2)
@@ -30,12 +30,12 @@ def thing_place(thing: Static, number: int, seed: int) -> Place:
 
 
 def light_begin(light: Light, seed: int) -> float:
-    """Where in its cycle the light begins, as a fraction."""
+    """Return the start of the light in its cycle, as a fraction."""
     return float(np.random.default_rng([seed, _LIGHT]).uniform(*light.begin))
 
 
 def robot_start(start: Start, target: Place, lens_x_m: float, seed: int) -> Place:
-    """Where the axle's midpoint begins: on the map, or so that the lens sees the target as `start` says."""
+    """Return the start of the axle's midpoint: on the map, or relative to the target as in `start`."""
     draw = np.random.default_rng([seed, _START])
     if start.at_m is not None:
         moved = draw.uniform(-start.jitter_m, start.jitter_m, 2)

@@ -51,13 +51,13 @@ class Motor:
         return self._speed_rad_s * self._kept
 
     def rolled(self, turned_rad: float) -> None:
-        """Tell the encoder how far the wheel has rolled since the beginning, rad."""
+        """Update the encoder with the angle of the wheel since the start, rad."""
         self._shaft_rad += (turned_rad - self._turned_rad) / self._kept
         self._turned_rad = turned_rad
 
     @property
     def angle_rad(self) -> float:
-        """What the encoder counts: turning of the shaft, slip included, in whole encoder steps."""
+        """Return the counted angle of the shaft, including slip, in whole encoder steps."""
         step_rad = math.tau / self._model.encoder_steps
         return math.floor(self._shaft_rad / step_rad) * step_rad
 
@@ -154,7 +154,7 @@ class World:
             self._target_contacts_by_robot += self._is_robots_doing()
 
     def _is_robots_doing(self) -> bool:
-        """Whether the robot moves towards the target faster than the target towards the robot."""
+        """Return True if the robot moves toward the target faster than the target toward the robot."""
         (x_m, y_m, _), _ = self._body.pose()
         ahead_x_m, ahead_y_m = self._target_at[0] - x_m, self._target_at[1] - y_m
         gap_m = math.hypot(ahead_x_m, ahead_y_m)
@@ -165,27 +165,27 @@ class World:
         return mine_mps > max(other_mps, STANDING_MPS)
 
     def wheel_angles(self) -> WheelAngles:
-        """What the encoders count."""
+        """Return the angles that the encoders count."""
         return WheelAngles(self._motors[0].angle_rad, self._motors[1].angle_rad, self.now_us)
 
     def wheels_turned(self) -> tuple[float, float]:
-        """How far each wheel has rolled over the floor, rad; not quantised, for logs."""
+        """Return the angle of each wheel over the floor, rad, not quantized, for logs."""
         return self._body.wheel_angles()
 
     def scan(self) -> Ranges:
-        """What the lidar sees now."""
+        """Return the scan of the lidar now."""
         lidar = self.robot.lidar
         place, turn = self._mounted(lidar.x_m, lidar.z_m)
         return self._lidar.scan(place, _yaw(turn), self.now_us)
 
     def render(self, quality_percent: int = 100, scale_percent: int = 100) -> bytes:
-        """What the camera sees now, as JPEG; shares of the look's quality and of the side lengths."""
+        """Return the camera image now as JPEG, at shares of the configured quality and side lengths."""
         camera = self.robot.camera
         picture = self._scene.draw(*self._mounted(camera.x_m, camera.z_m))
         return self._defects.jpeg(picture, quality_percent, scale_percent)
 
     def labels(self) -> tuple[Label, ...]:
-        """What the simulation labels in a picture drawn now, if the scenario wants it labelled."""
+        """Return the labels of an image now, if the scenario has labels."""
         people = [bodies for _, bodies in self._movers if bodies.thing.shape == self.scenario.labels]
         camera = self.robot.camera
         return leg_labels(self._client, people, self.camera_model, *self._mounted(camera.x_m, camera.z_m))
@@ -195,7 +195,7 @@ class World:
         return pybullet.multiplyTransforms(*self._body.pose(), (x_m, 0, z_m), (0, 0, 0, 1))  # type: ignore[no-any-return]
 
     def truth(self) -> Truth:
-        """What is really so now."""
+        """Return the true state now."""
         place, turn = self._body.pose()
         yaw_rad = _yaw(turn)
         linear, angular = self._body.velocity()
@@ -225,7 +225,7 @@ class World:
         return nearest_m
 
     def _past_line_m(self, place: Vector, yaw_rad: float) -> float | None:
-        """How far the robot's front is beyond the light's stop line."""
+        """Return the distance of the robot's front beyond the stop line of the light, in m."""
         if self.scenario.light is None:
             return None
         front = (place[0] + self._front_m * math.cos(yaw_rad), place[1] + self._front_m * math.sin(yaw_rad))

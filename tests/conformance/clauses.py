@@ -18,7 +18,7 @@ UNTESTED = {
     "13.4 WebSocket": "it sums up 14.2 and 14.3",
     "14.7 Newest only": "what waits for a slow peer lies in two machines' buffers; tests/protocol/transports/websocket",
     "15.4 Options": "an owner's choice; the golden vectors hold the dialects",
-    "15.5 On WebSocket: the older dialect": "the kit does not play an older robot; tests/protocol/test_legacy_text.py",
+    "15.5 On WebSocket: the legacy protocol": "the kit plays no such robot; tests/protocol/test_legacy_text.py",
     "15.6 Boxes": "the golden vectors `older_boxes` hold it",
     "16.1 On Zenoh": "priority and express are not seen at the other end; tests/protocol/transports/zenoh",
     "16.2 On Zenoh": "the session's configuration; tests/protocol/transports/zenoh",

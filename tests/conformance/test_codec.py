@@ -84,7 +84,7 @@ def test_a_broken_codec_fails_its_family_and_no_other(name):
     ("hangs", "no answer within 1 s"),
     ("babbles", r"this line is not JSON: 'Traceback: \x1b[31mno\x1b[0m idea'"),
     ("answers_twice", "an answer has the id 3, which waits for none"),
-    ("answers_nothing", "this answer is not one of ok, refusal, unsupported: '{\"id\": 3}'"),
+    ("answers_nothing", "invalid answer: expected exactly one of ok, refusal, unsupported: '{\"id\": 3}'"),
     ("never_ends_its_line", "an answer is longer than 1048576 bytes: 'xxx"),
 ])
 def test_a_bad_program_is_one_line_and_the_end(name, line, monkeypatch):

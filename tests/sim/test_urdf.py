@@ -89,12 +89,13 @@ def thymio_with(tmp_path: Path, drawing: tuple[str, str] = ("", ""), words: tupl
     ('radius="0.022"', 'radius="inf"', "link 'left_wheel': <cylinder radius='inf'> is not a number"),
     ('xyz="-0.025 0.056 0.022"', 'xyz="-0.025 0.056"', "is not 3 numbers"),
     ('type="continuous"', 'type="fixed"', "joint 'left_wheel_joint' is fixed; a wheel's joint is type=\"continuous\""),
-    ('xyz="-0.025 0.056 0.022"', 'xyz="0.025 0.056 0.022"', "are no pair: give them one radius, one x and opposite y"),
+    ('xyz="-0.025 0.056 0.022"', 'xyz="0.025 0.056 0.022"',
+     "are not a pair; use one radius, one x and opposite y"),
     ('<axis xyz="0 1 0"/>', '<axis xyz="1 0 0"/>', "does not turn about an axle across the robot"),
     ('<cylinder radius="0.022" length="0.015"/>', '<box size="0.1 0.1 0.1"/>', "has no round <collision>"),
     ('<box size="0.11 0.112 0.045"/>', '<mesh filename="body.stl"/>', "collides as a mesh"),
-    ('<parent link="main_body"/>', '<parent link="main_bdy"/>', "is no link, did you mean 'main_body'?"),
-    ('<robot name="thymio">', '<robot name="thymio"', "is no XML"),
+    ('<parent link="main_body"/>', '<parent link="main_bdy"/>', "is not a link, did you mean 'main_body'?"),
+    ('<robot name="thymio">', '<robot name="thymio"', "invalid XML"),
     ('<link name="sensor_front"/>', '<link name="sensor_front"/><link name="loose"/>', "must have one root link"),
 ])
 def test_a_urdf_that_is_no_robot_is_one_line_with_the_fix(tmp_path, old, new, expected):

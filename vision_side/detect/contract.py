@@ -1,6 +1,6 @@
-"""What every detector promises, as checks that any plug-in can run: `sightline detector check NAME`. Shell (a clock).
+"""Check the promises of a detector: `sightline detector check NAME`. Shell (a clock).
 
-The pictures are drawn from a seed: discs and boxes in all colours, noise, black, odd sizes, and bytes that are none.
+A seed defines the images: discs and boxes in all colors, noise, black, odd sizes, and bytes that are not an image.
 """
 
 import math
@@ -24,7 +24,7 @@ from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detectio
 
 SIZES: Final = ((320, 240), (640, 480), (97, 61), (16, 16), (1280, 720), (641, 481))
 LATE_S: Final = 0.25
-"""For an answer to a frame whose deadline is over: nobody waits for it any longer."""
+"""Limit for the answer to a frame after its deadline, when the caller no longer waits for it."""
 _MAX_PIXELS: Final = 1920 * 1080
 _FRAME_US: Final = 33_333
 _QUALITY: Final = 80
@@ -36,7 +36,7 @@ Make = Callable[[], Detector]
 
 @dataclass(frozen=True, slots=True)
 class PromiseResult:
-    """One promise: what it is called, what it says, and what is wrong; empty if it is kept."""
+    """One promise: its name, its text, and the violation, which is empty for a fulfilled promise."""
 
     name: str
     promise: str
@@ -45,7 +45,7 @@ class PromiseResult:
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """How long one picture takes, by the detector's own account, in milliseconds."""
+    """Time for one image as the detector reports it, in milliseconds."""
 
     width_px: int
     height_px: int
@@ -122,21 +122,21 @@ def _keeps_bounds(detector: Detector, _make: Make, seed: int) -> str:
 
 
 def _keeps_silence(detector: Detector, _make: Make, seed: int) -> str:
-    """Bytes that are no picture get no answer, and the next frame gets its own."""
+    """Bytes that are not an image get no answer, and the next frame gets its own."""
     good = list(drawn_frames(seed, 2, SIZES[0]))
     decoder = Decoder(*SIZES[0], _MAX_PIXELS)
     cut, other = good[0].jpeg[: len(good[0].jpeg) // 3], _jpeg(Random(seed), (64, 48))
     for jpeg in (b"", b"\xff\xd8\xff", cut, other, b"\0" * 500):
         bad = DetectFrame("r1", good[0].header, jpeg, decoder)
         if detector.detect([bad], NO_DEADLINE) != [None] and _is_bad(bad):
-            return f"{len(jpeg)} bytes that are no picture get an answer"
+            return f"{len(jpeg)} bytes that are not an image get an answer"
         if detector.detect([good[1]], NO_DEADLINE) == [None]:
             return "no answer to a good frame after a bad one"
     return ""
 
 
 def _keeps_deadline(detector: Detector, _make: Make, seed: int) -> str:
-    """A frame whose deadline is over holds nobody up."""
+    """A frame after its deadline does not delay the caller."""
     (frame,) = drawn_frames(seed, 1, SIZES[0])
     detector.detect([frame], NO_DEADLINE)
     began_s = time.monotonic()
@@ -156,7 +156,7 @@ def _keeps_the_same(detector: Detector, make: Make, seed: int) -> str:
 
 
 def _keeps_robots_apart(detector: Detector, make: Make, seed: int) -> str:
-    """What one robot's frames get does not depend on another robot's."""
+    """The answers to one robot's frames do not depend on another robot's frames."""
     alone = make()
     try:
         expected = _seen(alone, drawn_frames(seed, 8, SIZES[0]))
@@ -169,7 +169,7 @@ def _keeps_robots_apart(detector: Detector, make: Make, seed: int) -> str:
 
 
 def _keeps_its_name(detector: Detector, _make: Make, seed: int) -> str:
-    """Every result says who looked, with which model, on what, and for how long."""
+    """Every result names its detector, model, device and time."""
     for result in _seen(detector, drawn_frames(seed, 2, SIZES[0])):
         if result is None:
             continue
@@ -178,7 +178,7 @@ def _keeps_its_name(detector: Detector, _make: Make, seed: int) -> str:
         if not _HASH.fullmatch(result.model_hash):
             return f"model hash {result.model_hash!r} is not hexadecimal"
         if not isinstance(result.compute_us, int) or result.compute_us < 0:
-            return f"it took {result.compute_us!r} us, which is no whole number"
+            return f"compute_us {result.compute_us!r} is not a whole number"
     return ""
 
 

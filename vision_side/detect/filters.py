@@ -32,7 +32,7 @@ class LabelFilter(DetectorWrapper):
         self._labels = frozenset((*labels, COLOR_LABEL))
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """What the other finds, less what is not meant."""
+        """Return the detections of the inner detector with the configured labels."""
         return [one and self._kept(one) for one in self.inner.detect(frames, deadline_us)]
 
     def _kept(self, result: DetectionResult) -> DetectionResult:
@@ -40,7 +40,7 @@ class LabelFilter(DetectorWrapper):
         return result if len(kept) == len(result.detections) else replace(result, detections=kept)
 
 
-# Combinator: of what a detector finds, only what has the colours: the model says ball, the colour says which. Pure.
+# Combinator: only detections with the configured colors. The model finds balls, the color selects one. Pure.
 
 
 LEAST_SHARE: Final = 0.3
@@ -57,7 +57,7 @@ class ColorFilter(DetectorWrapper):
         self._table = color_table(ranges)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """What the other finds, less what has another colour; no answer where there is no picture to tell by."""
+        """Return the detections of the inner detector with the colors. Without pixels there is no answer."""
         results = self.inner.detect(frames, deadline_us)
         return [one and self._kept(frame, one) for frame, one in zip(frames, results, strict=True)]
 
@@ -70,7 +70,7 @@ class ColorFilter(DetectorWrapper):
         return result if len(kept) == len(result.detections) else replace(result, detections=kept)
 
     def _share(self, picture: DecodedImage, one: Detection) -> float:
-        """How much of the box's middle has the colour."""
+        """Return the share of the box's center that has the color."""
         columns = _middle(one.x1_px, one.x2_px, picture.scale, picture.bgr.shape[1])
         rows = _middle(one.y1_px, one.y2_px, picture.scale, picture.bgr.shape[0])
         part = np.ascontiguousarray(picture.bgr[rows, columns])
@@ -113,7 +113,7 @@ class TrackIds(DetectorWrapper):
         self._memories = PerSession(_Memory)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """What the other finds, with ids."""
+        """Return the detections of the inner detector with track ids."""
         return [one and self._named(one) for one in self.inner.detect(frames, deadline_us)]
 
     def _named(self, result: DetectionResult) -> DetectionResult:

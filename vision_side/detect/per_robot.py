@@ -36,7 +36,7 @@ class PerSession(Generic[Memory]):
         return memory
 
 
-# Frames for who looks on a thread of its own: pixels of another's decoder may be replaced meanwhile. Pure.
+# Frames for a detector on a separate thread. The decoder of the pipeline replaces its pixels meanwhile. Pure.
 
 
 MAX_DECODERS: Final = 64

@@ -1,4 +1,4 @@
-"""The detector port: `Detector`, frames, results, labels, overlap of boxes. Pure."""
+"""Define the detector port: `Detector`, frames, results, labels, overlap of boxes. Pure."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,46 +12,50 @@ from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.decode import DecodedImage, Decoder
 
 LONGEST_LABEL: Final = 64
-"""As on the wire (`DetectedBox.label`), in characters."""
+"""Longest label in characters, as on the wire (`DetectedBox.label`)."""
 Label = Annotated[str, Field(min_length=1, max_length=LONGEST_LABEL)]
-"""One that is configured."""
+"""A label in a configuration."""
 
 
 COLOR_LABEL: Final = "target"
-"""What the colour detectors call what they find, whatever it is. It always counts: one of them may be the fallback."""
+"""Label of every detection of a color detector. It always counts, because a color detector may be the fallback."""
 _NO_TARGETS: Final = ("legs", "light")
-"""What other missions are for; a model that knows balls may know these too."""
+"""Labels for other missions. A model that finds balls may also find these."""
 
 
 def is_followable(label: str, wanted: str) -> bool:
-    """Whether what is called `label` is followed: what is `wanted`, if anything is, and what has the target's colour;
-    else all but lights and legs."""
+    """Return True if the mission follows detections with this label.
+
+    Args:
+        label: label of the detection.
+        wanted: configured label, or "" for any except lights and legs.
+    """
     return label in (wanted, COLOR_LABEL) if wanted else not label.startswith(_NO_TARGETS)
 
 
 def is_label(text: str) -> bool:
-    """Whether it can be said as it is."""
+    """Return True if the wire accepts the label unchanged."""
     return 0 < len(text) <= LONGEST_LABEL and text.isprintable()
 
 
 def clean_label(text: str) -> str:
-    """`text` as the wire allows it: one printable line, bounded; never empty."""
+    """Convert `text` to a valid label: one printable line, bounded, never empty."""
     return "".join(letter for letter in text if letter.isprintable())[:LONGEST_LABEL] or "thing"
 
 
-# The detector port: `Detector`, the frames it is given and what it returns. Pure.
+# The detector port: `Detector`, its frames and its results. Pure.
 #
-# "Saw nothing" is a `DetectionResult` without detections; "no answer" is None in its place. Only the first may start a
-# search; the second goes the way of silence: the robot is not steered by it and holds.
+# A `DetectionResult` without detections means "saw nothing". None means "no answer". Only the first may start a search.
+# After the second, the vision service does not steer, and the robot holds.
 
 
 NO_DEADLINE: Final = 2**63 - 1
-"""For who has all the time there is: replays, judges, tests."""
+"""Deadline for replays, scores and tests, which have no time limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A circle in pixels of the encoded picture."""
+    """A circle in pixels of the encoded image."""
 
     cx_px: float
     cy_px: float
@@ -60,12 +64,18 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class Detection:
-    """One object, in pixels of the encoded picture; (0, 0) is the top-left corner of the top-left pixel.
+    """One object, in pixels of the encoded image. (0, 0) is the top-left corner of the top-left pixel.
 
-    `x2_px` and `y2_px` are exclusive. `score` (0..1) is how sure the detector is; of an outline, the share that is the
-    object's own. `outline_px` (N, 2) is the part of its edge that is in view, where the detector knows it: edges that
-    the picture's border or another object made are left out. `track_id` is the same from frame to frame for one
-    object, from detectors that tell.
+    Args:
+        x1_px: left edge.
+        y1_px: top edge.
+        x2_px: right edge, exclusive.
+        y2_px: bottom edge, exclusive.
+        score: confidence 0..1; with an outline, the share of the outline that belongs to the object.
+        label: class of the object.
+        circle: its circle, for round objects.
+        outline_px: (N, 2), the visible part of its edge, without edges at the image border or at another object.
+        track_id: number of the object, equal in all frames, from detectors with tracking.
     """
 
     x1_px: float
@@ -80,7 +90,7 @@ class Detection:
 
 
 LabelTest = Callable[[str], bool]
-"""Whether a mission may go by what has this label."""
+"""Returns True if a mission may use detections with this label."""
 
 
 def _any_label(_label: str) -> bool:
@@ -88,37 +98,45 @@ def _any_label(_label: str) -> bool:
 
 
 class DetectFrame:
-    """One frame to look at: the JPEG as it came, and its pixels for who asks, decoded once for all who share it."""
+    """One frame for a detector: the received JPEG, and its pixels, decoded once for all detectors."""
 
     __slots__ = ("_decoder", "_picture", "goes_by", "header", "height_px", "jpeg", "robot", "width_px")
 
     def __init__(
         self, robot: str, header: FrameHeader, jpeg: bytes, decoder: Decoder, picture: DecodedImage | None = None
     ) -> None:
-        """`decoder` is the robot's, and `picture` what it made of `jpeg`, if it did; valid until it decodes another."""
+        """Create a frame.
+
+        Args:
+            robot: robot id.
+            header: header of the frame.
+            jpeg: the image as received.
+            decoder: decoder of this robot.
+            picture: pixels of `jpeg`, if already decoded; valid until `decoder` decodes another image.
+        """
         self.robot = robot
         self.header = header
         self.jpeg = jpeg
         self.width_px, self.height_px = decoder.size_px
         self._decoder = decoder
         self._picture = picture
-        self.goes_by: LabelTest = _any_label  # that of the robot's mission, where the pipeline knows one
+        self.goes_by: LabelTest = _any_label  # the pipeline sets the test of the robot's mission
 
     def picture(self) -> DecodedImage:
-        """The pixels. Raises WireError MALFORMED for what is no picture of the camera's size."""
+        """Return the pixels. Raises WireError MALFORMED unless the image has the size of the camera."""
         if self._picture is None:
             self._picture = self._decoder.decode(self.jpeg)
         return self._picture
 
     @property
     def decoded(self) -> DecodedImage | None:
-        """The pixels, if they were decoded already."""
+        """Return the pixels if they are already decoded, otherwise None."""
         return self._picture
 
 
 @dataclass(frozen=True, slots=True)
 class Maker:
-    """Who made a result: the detector's name, the first 16 digits of its model's SHA-256, and what it ran on."""
+    """The origin of a result: name of the detector, first 16 digits of its model's SHA-256, and device."""
 
     detector: str
     model_hash: str = ""
@@ -127,7 +145,7 @@ class Maker:
 
 @dataclass(frozen=True, slots=True)
 class DetectionResult:
-    """What was seen in one frame, best first; it names that frame field for field."""
+    """The detections in one frame, best first. It names that frame field for field."""
 
     robot: str
     session: str
@@ -143,43 +161,58 @@ class DetectionResult:
 
 
 class Detector(Protocol):
-    """Finds objects in frames, of one robot or of several.
+    """Finds objects in frames of one or more robots.
 
-    A class of this kind has a pydantic `Config` and is built as `Plugin(config)`. It may have `notices()`, which
-    returns the few short lines for the operator that it did not return before; `maker`, the `Maker` of its results;
-    `attach(link)`, called with each robot's link before its first frame; `close()`, called once at the end; and, on the
-    class, `waits = True` if it waits for another service: each robot of a fleet then has its own detector and thread.
+    A detector class has a pydantic `Config` and is built as `Plugin(config)`. Optional members:
+
+        notices()     returns new short lines for the operator
+        maker         the `Maker` of its results
+        attach(link)  called with the link of each robot before its first frame
+        close()       called once at the end
+        waits = True  on the class, if it waits for another service; each robot then gets its own detector and thread
     """
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """One result for each frame, in their order; None is "no answer", never "saw nothing".
+        """Detect objects. Raises nothing for any frame: bytes that do not decode get no answer.
 
-        `deadline_us` is on this machine's monotonic clock: a detector that waits for a service gives up by then.
-        Boxes lie in the picture. Raises nothing for any frame: bytes that do not decode get no answer.
+        Args:
+            frames: the frames.
+            deadline_us: end on this machine's monotonic clock, for a detector that waits for a service.
+
+        Returns:
+            One result per frame, in the same order. None means "no answer", never "saw nothing". Boxes are inside the
+            image.
         """
         ...
 
 
 class NoDetector:
-    """The detector where boxes are published by another service: no frame gets an answer here."""
+    """Detects nothing. It is the detector when another service publishes the boxes."""
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
-        """None for each."""
+        """Return None for each frame."""
         return [None] * len(frames)
 
 
 def result_of(
     frame: DetectFrame, detections: Sequence[Detection], maker: Maker, compute_us: int = 0
 ) -> DetectionResult:
-    """`detections` as the result for `frame`."""
+    """Combine detections and frame to a result.
+
+    Args:
+        frame: the examined frame.
+        detections: objects, best first.
+        maker: origin of the result.
+        compute_us: computing time, us.
+    """
     header = frame.header
     return DetectionResult(frame.robot, header.session, header.seq, header.t_us, frame.width_px, frame.height_px,
                            tuple(detections), maker.detector, maker.model_hash, maker.device, compute_us)
 
 
 def clipped(one: Detection, width_px: int, height_px: int) -> Detection | None:
-    """The part of `one` that is in the picture, or None if there is none; for boxes that a model drew beyond it."""
-    # In this order of arguments, what is no number stays none, and fails the comparison.
+    """Clip a box to the image. Returns None for a box outside of it."""
+    # With this order of arguments a nan stays a nan, and fails the comparison below.
     x1, y1 = max(one.x1_px, 0.0), max(one.y1_px, 0.0)
     x2, y2 = min(one.x2_px, float(width_px)), min(one.y2_px, float(height_px))
     if not (x1 < x2 and y1 < y2):
@@ -189,7 +222,7 @@ def clipped(one: Detection, width_px: int, height_px: int) -> Detection | None:
     return replace(one, x1_px=x1, y1_px=y1, x2_px=x2, y2_px=y2)
 
 
-# How much two boxes have in common. Pure.
+# The overlap of two boxes. Pure.
 
 
 Corners = tuple[float, float, float, float]
@@ -197,12 +230,12 @@ Corners = tuple[float, float, float, float]
 
 
 def corners(one: Detection) -> Corners:
-    """Of its box."""
+    """Return the corners of its box."""
     return one.x1_px, one.y1_px, one.x2_px, one.y2_px
 
 
 def overlap(one: Corners, other: Corners) -> float:
-    """Intersection over union, 0 to 1."""
+    """Return the intersection over union of two boxes, 0 to 1."""
     width = min(one[2], other[2]) - max(one[0], other[0])
     height = min(one[3], other[3]) - max(one[1], other[1])
     if width <= 0 or height <= 0:

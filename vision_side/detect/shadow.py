@@ -34,7 +34,7 @@ LEAST_OVERLAP: Final = 0.3
 
 
 class Agreement:
-    """Of one robot's frames, in one session and one mission."""
+    """Agreement of the two detectors on one robot's frames, in one session and one mission."""
 
     def __init__(self) -> None:
         self.compared = self.differed = 0
@@ -43,11 +43,11 @@ class Agreement:
 
     @property
     def share(self) -> float:
-        """Of the newest frames, those in which both saw the same; 1 before there are any."""
+        """Return the share of the newest frames with the same result, 1 without frames."""
         return sum(self._window) / len(self._window) if self._window else 1.0
 
     def add(self, driving: DetectionResult, shadow: DetectionResult, goes_by: LabelTest) -> str:
-        """One frame. Returns the line that tells how they differ, where it is time for one."""
+        """Compare the results of one frame. Returns a line about the difference, if one is due."""
         what = disagreement(driving, shadow, goes_by)
         self.compared += 1
         self.differed += bool(what)
@@ -60,8 +60,8 @@ class Agreement:
 
 
 def disagreement(driving: DetectionResult, shadow: DetectionResult, goes_by: LabelTest) -> str:
-    """What the surest detections of two results of one frame disagree on, of those that a mission may go by; empty if
-    on nothing. What else they are called does not count."""
+    """Describe the difference between the best detections of two results, or return "". Only detections that the
+    mission may use count, and only their place, not their label."""
     mine, other = _surest(driving, goes_by), _surest(shadow, goes_by)
     if mine is None and other is None:
         return ""
@@ -89,7 +89,7 @@ def _where(one: Detection | None) -> str:
 
 
 _PATIENCE_US: Final = 1_000_000
-"""The shadow's own deadline: it holds nobody up."""
+"""Deadline of the shadow detector. It delays no other thread."""
 _END_S: Final = 2.0
 
 
@@ -117,7 +117,7 @@ class ShadowDetector:
         self._thread.start()
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """What the driving detector sees; the shadow gets the frames afterwards."""
+        """Return the results of the driving detector. The shadow detector receives the frames afterwards."""
         results = self._driving.detect(frames, deadline_us)
         for frame, result in zip(frames, results, strict=True):
             counted = (frame.header.session, frame.goes_by)  # counting begins again where one of them changes
@@ -130,12 +130,12 @@ class ShadowDetector:
         attach_detector(self._shadow, link)
 
     def shadow_text(self, robot: str) -> str:
-        """How often the shadow sees the same in the robot's frames."""
+        """Describe the share of the robot's frames with the same result of the shadow detector."""
         agreement = self._agreements.find(robot)
         return f"shadow {agreement.share:.0%} agree" if agreement and agreement.compared else "shadow no answer yet"
 
     def notices(self) -> list[str]:
-        """Where the two disagree, at most every few seconds, and what both have to report."""
+        """Return the notices of both detectors, and their differences at most every few seconds."""
         return [*notices_of(self._driving), *notices_of(self._shadow), *self._notices.take()]
 
     def close(self) -> None:

@@ -43,5 +43,5 @@ def timed_together(
 def timed(
     frame: DetectFrame, maker: Maker, look: Callable[[DecodedImage], Sequence[Detection]]
 ) -> DetectionResult | None:
-    """What `look` finds in the picture of `frame`, and how long it looked; None for what is no picture."""
+    """Return the detections of `look` in `frame` with its time, or None if the bytes are not an image."""
     return timed_together([frame], maker, lambda pictures: [look(one) for one in pictures])[0]

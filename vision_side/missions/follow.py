@@ -1,7 +1,7 @@
 """The default mission: turn towards one target and keep a distance to it; when it is lost, look around. Pure.
 
-Track, predict, steer, search: each is a file of its own. What a detector found is located as a sphere of known size;
-boxes that somebody else found are located by their height or width.
+Track, predict, steer and search are separate files. A detection is located as a sphere of known size. A box from
+another service is located by its height or width.
 """
 
 import math
@@ -66,7 +66,7 @@ class Follow:
             self._steer.unmet(dt_s, -expected[0], -expected[1])
 
     def _places(self, view: View) -> list[Sighting | None]:
-        """Where each detection is: a sphere, or a box that somebody else found or whose size is given."""
+        """Locate each detection: as a sphere, or as a box from another service or with a configured size."""
         otherwise_m, sizes = self._expected_m(view.header.pose), self._config.boxes
         return [
             locate_box(one, self._camera, sizes, otherwise_m) if self._is_box(one, view)
@@ -75,13 +75,13 @@ class Follow:
         ]
 
     def _is_box(self, one: Detection, view: View) -> bool:
-        """Without a picture here all are somebody else's boxes; with one, what has no outline where a size is given."""
+        """Return True for a box: any detection without pixels, or one without an outline if a size is configured."""
         sizes = self._config.boxes
         sized = sizes.height_m is not None or sizes.width_m is not None
         return view.picture is None or (sized and one.outline_px is None)
 
     def _is_meant(self, one: Detection, view: View) -> bool:
-        """By its label. Somebody else's boxes were chosen when they came."""
+        """Return True if the label fits. Boxes from another service were selected on arrival."""
         label = self._config.target.label
         return (view.picture is None and not label) or is_followable(one.label, label)
 
@@ -90,7 +90,7 @@ class Follow:
         return [one for one in places if one and one.x_m**2 + one.y_m**2 <= target.max_range_m**2]
 
     def _expected_m(self, pose: Pose) -> float:
-        """How far from the lens a thing is whose box does not tell: where it was last, or where the robot may stay."""
+        """Return the assumed distance of a box without a known size, in m: its last one, or the stand-off."""
         target, boxes = self._track.target, self._config.boxes
         if target is None or (boxes.height_m is None and boxes.width_m is None):
             return self._config.target.stand_off_m

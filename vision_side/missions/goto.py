@@ -19,7 +19,7 @@ _STILL_MPS = 1e-6
 
 
 class Footprint(Config):
-    """A rectangle about the axle's midpoint: the Thymio's, if nothing else is said."""
+    """A rectangle around the midpoint of the axle. The defaults are those of the Thymio."""
 
     front_m: Annotated[float, Field(ge=0, le=2)] = 0.08
     rear_m: Annotated[float, Field(ge=0, le=2)] = 0.03
@@ -27,7 +27,7 @@ class Footprint(Config):
 
     @property
     def radius_m(self) -> float:
-        """Of the circle about the axle that holds the robot however it turns."""
+        """Return the radius of the circle around the axle that contains the robot in every direction."""
         return math.hypot(max(self.front_m, self.rear_m), self.half_width_m)
 
     def nearest(self, points: Points) -> Points:
@@ -61,7 +61,7 @@ def clear_of(points: Points, body: Footprint, twist: tuple[float, float], keep_m
     return float(min(1.0, (allowed[towards] / closing[towards]).min(initial=1.0)))
 
 
-# When to say "cannot reach": every way seen is closed, or nothing was gained for too long. Pure.
+# The decision "cannot reach": every visible way is closed, or there is no progress for too long. Pure.
 
 
 _GAIN_M = 0.1
@@ -70,10 +70,10 @@ _APPLIED = 1e-3
 
 
 class ProgressCheckerConfig(Config):
-    """How long to wait before giving up."""
+    """Waiting times before the mission ends without success."""
 
     closed_s: Annotated[float, Field(ge=0, le=60)] = 1.5
-    """With every way closed the robot stands still for this long: a ghost in a scan or somebody passing may go."""
+    """Waiting time with every way closed. A false echo or a passer-by may disappear."""
     stuck_s: Annotated[float, Field(gt=0, le=3600)] = 20.0
     """Driving this long without coming nearer by the known way, and without anything new seen, is going round."""
 
@@ -110,7 +110,10 @@ class ProgressChecker:
         return f"no progress in {self._config.stuck_s:.0f} s" if self._stuck_s >= self._config.stuck_s else ""
 
     def _wait(self, view: View, left_m: float) -> None:
-        """A plan that turned out longer has to be driven first: so a few of them are no standstill."""
+        """Wait for progress.
+
+        A few longer plans do not count as a standstill, because the robot must drive them first.
+        """
         if left_m > self._best_m + _DETOUR_M and self._detours < _MAX_DETOURS:
             self._best_m = left_m
             self._detours += 1
@@ -118,18 +121,19 @@ class ProgressChecker:
             self._stuck_s += view.dt_s
 
 
-# Mission `goto`: drive to waypoints, round what short-sighted range sensors find on the way, or say it cannot. Pure.
+# Mission `goto`: drive to waypoints, round what short-sighted range sensors find on the way, or report that it cannot.
+# Pure.
 #
 # Straight to the goal while nothing known is in between; else along the wall, at a clearance, the way that is shortest
-# by all that was seen so far. Speed is bound by sight: whatever stands just beyond the sensors' reach must still leave
+# by all obstacles so far. The range of the sensors limits the speed: an obstacle just beyond it must still leave
 # the clearance. Waypoints are in the odometry frame, in metres.
 
 
 Metres = Annotated[float, Field(ge=-100, le=100)]
 
-_NEAR_M = 0.8  # points further off than this are none of the brakes' business
+_NEAR_M = 0.8  # the brake ignores points beyond this distance
 _BRAKE_SLACK_M = 0.017  # what steering and cells of 0.03 m may be off, and so much that it can turn where it stopped
-_ROOMY_M = 0.03  # more than needed, where that is no long way round: so that the brakes need not act beside a wall
+_ROOMY_M = 0.03  # extra clearance without a long detour, so that the brake does not act next to a wall
 _OUTSIDE_M = 1.2 * CELL_M  # no free cell nearer than this: the robot is where it should not be
 _SHY_RAD_S = 0.4
 _WHEELS_S = 0.03  # so much later than the gate's own ramp the wheels give way
@@ -139,7 +143,7 @@ _SIDE_RAD, _SIDE_M = math.radians(45), 0.15  # to the other side of what is in t
 
 
 class GotoConfig(Config):
-    """Where to, what with, and how far from everything."""
+    """Goal, robot and clearance of a `goto` mission."""
 
     waypoints: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=1, max_length=64)]
     """(x, y) in the odometry frame, one after the other."""
@@ -252,9 +256,9 @@ class Goto:
         return Plan(twist, "backing out" if backs else "going out", self._score())
 
     def _room(self, then: PredictedMotion) -> Point | None:
-        """Where to creep straight to before a turn: away from what the robot's corners would come too near to.
+        """Return the point to approach slowly before a turn, so that the corners of the robot keep their clearance.
 
-        That is judged where the robot could come to rest: one that still rolls towards a wall must not turn yet.
+        It is computed for the place where the robot can stop. A robot that still moves toward a wall must not turn yet.
         """
         rolls_m = then.linear_mps * abs(then.linear_mps) / (2 * self._config.brake_mps2)
         pose: Pose = (*to_odometry(then.pose, rolls_m, 0.0), then.pose[2])
@@ -306,14 +310,14 @@ class Goto:
                     bearing_rad=_bearing(header.pose, route.goal), distance_m=goal_m)
 
     def _speed(self, goal_m: float, bearing_rad: float, sight_mps: float) -> float:
-        """By what is left, by how far off the heading is, and by sight."""
+        """Limit the speed by the remaining distance, the heading error and the sensor range."""
         config = self._config
         fade = max(0.0, 1.0 - (bearing_rad / config.drive_within_rad) ** 2)
         arriving = max(0.03, min(braking_mps(goal_m, 0.1, config.brake_mps2 / 2), 2.0 * goal_m))
         return min(arriving, fade * config.max_linear_mps, fade * max(sight_mps, config.creep_mps))
 
     def _sight_mps(self, then: PredictedMotion) -> float:
-        """What may stand just beyond the sensors' reach must still be left at the clearance.
+        """Limit the speed so that an obstacle just beyond the sensor range still leaves the clearance.
 
         The reach is counted from where the newest scan was taken, so speed gives way when scans are late or lost.
         """

@@ -17,13 +17,13 @@ from sightline.protocol.messages import Pose
 _MAX_BLOCKS = 64
 _SAME_M = 0.20  # two blocks are never this near; one's measured place is off by this much where it is far away
 _SAME_SHARE = 0.12  # ... and by this part of its distance
-_BEHIND_M, _AHEAD_M = 1.2, 2.5  # the part of the row that tells the lane's direction here
-_MIN_SPREAD_M = 0.4  # blocks nearer together than this along the lane tell no direction
+_BEHIND_M, _AHEAD_M = 1.2, 2.5  # the part of the row that defines the lane's direction here
+_MIN_SPREAD_M = 0.4  # blocks nearer together than this along the lane define no direction
 _MOST_WEIGHT = 1e4
 
 
 class LaneConfig(Config):
-    """How the lane lies to its blocks."""
+    """The position of the lane relative to its blocks."""
 
     pass_m: Annotated[float, Field(gt=0.05, le=5)] = 0.5
     """From a block's middle to the middle of the lane."""
@@ -56,11 +56,11 @@ class Line:
     heading_rad: float
 
     def along_m(self, x_m: float, y_m: float) -> float:
-        """How far a point is ahead along the lane."""
+        """Return the distance of a point along the lane, ahead positive, in m."""
         return (x_m - self.x_m) * math.cos(self.heading_rad) + (y_m - self.y_m) * math.sin(self.heading_rad)
 
     def aside_m(self, x_m: float, y_m: float) -> float:
-        """How far a point is left of the lane's middle."""
+        """Return the distance of a point from the center of the lane, left positive, in m."""
         return (y_m - self.y_m) * math.cos(self.heading_rad) - (x_m - self.x_m) * math.sin(self.heading_rad)
 
     def at(self, along_m: float) -> tuple[float, float]:
@@ -77,7 +77,7 @@ class Lane:
         self.line: Line | None = None
 
     def see(self, pose: Pose, places: Iterable[tuple[float, float]]) -> None:
-        """Take in where blocks are, in the odometry frame, as seen from `pose`; then lay the line anew."""
+        """Add the places of blocks in the odometry frame, seen from `pose`, and fit the line again."""
         before = self.line or Line(*pose)
         for x_m, y_m in places:
             if abs(before.aside_m(x_m, y_m)) <= self._config.max_aside_m:
@@ -130,7 +130,7 @@ class Lane:
         return heading_rad + math.atan2(xy, xx) if max(spread, default=0.0) >= _MIN_SPREAD_M else heading_rad
 
     def left_m(self, pose: Pose) -> float:
-        """How much of the lane is left: to the last known block and a little beyond."""
+        """Return the remaining length of the lane, slightly beyond the last known block, in m."""
         line = self.line
         if line is None:
             return 0.0

@@ -1,7 +1,7 @@
-"""Mission `legs`: follow a person who walks on two legs, by boxes of legs and a lidar. Pure.
+"""Mission `legs`: follow two legs that walk, by boxes of legs and a lidar. Pure.
 
-A box, one for both legs, says in which direction; the lidar's echoes within the box's span say how far: the middle
-between the two legs, which stays with the person while the legs swing. Everything after that is as in `follow`.
+A box around both legs gives the direction. The lidar echoes within its span give the distance, at the center between
+the legs, which moves steadily while the legs swing. All further steps are those of `follow`.
 """
 
 import math
@@ -20,12 +20,12 @@ from sightline.vision_side.missions.ranges import Points, PoseMemory, about_robo
 from sightline.vision_side.tracking.locate import Sighting, points_ahead
 from sightline.vision_side.tracking.track import from_odometry
 
-_SPAN_MARGIN_RAD = math.radians(1.5)  # a lidar's rays stand 1 degree apart, and the person walks on meanwhile
+_SPAN_MARGIN_RAD = math.radians(1.5)  # a lidar's rays stand 1 degree apart, and the target walks on meanwhile
 _GAP_M = 0.10  # echoes further apart than this, one after the other, are of two legs
 
 
 class LegsTrack(TrackConfig):
-    """A person changes speed quicker than a ball that rolls, and is measured less exactly."""
+    """Tracking of legs. They change speed faster than a rolling ball, and their position is less exact."""
 
     acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 0.5
     range_noise: Annotated[float, Field(gt=0, le=1)] = 0.03
@@ -79,7 +79,7 @@ class Legs(Follow):
         return [self._place(one, near, view) for one in view.detections if self._legs.label in ("", one.label)]
 
     def _walked(self, view: View) -> tuple[float, float]:
-        """How far the person has walked on since the scan: without it he seems nearer than he is, by up to 7 cm."""
+        """Return the motion of the legs since the scan. Without it the distance is up to 7 cm too short."""
         target = self._track.target
         if target is None or view.scan is None:
             return 0.0, 0.0
@@ -108,7 +108,7 @@ class Legs(Follow):
         return float(np.mean(legs[:2])) + self._legs.leg_radius_m
 
     def _remembered_m(self, view: View) -> float:
-        """How far the person is as far as is known, for a box without an echo."""
+        """Return the last known distance of the legs, for a box without an echo, in m."""
         target = self._track.target
         if target is None:
             return self._config.target.stand_off_m

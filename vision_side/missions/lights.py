@@ -31,7 +31,7 @@ _MOST_TINT = 1.5  # no room's light is more coloured than this; what seems to be
 _PALEST = 0.08  # below it hue is noise; JPEG spreads the colour of a lamp of 5 pixels over 16
 _FLAT = 0.6  # rows of a housing that are narrower than this part of its widest are its pole
 _DISC = 0.85  # of a lamp's radius: its edge is mixed with the housing
-_BRIGHT_SHARE = 0.4  # of a lamp's pixels, the brightest: what tells its colour when it is only a few pixels wide
+_BRIGHT_SHARE = 0.4  # share of a lamp's brightest pixels, which show its color when it is only a few pixels wide
 
 
 class LampConfig(Config):
@@ -55,7 +55,7 @@ class LampConfig(Config):
     contrast: Annotated[float, Field(gt=1, le=10)] = 1.3
     """A lit lamp is so many times brighter than the next brightest."""
     min_height_px: Annotated[float, Field(ge=6, le=500)] = 13.0
-    """Below it three lamps cannot be told apart."""
+    """Below it the three lamps cannot be distinguished."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ class HousingLightReader:
         return float(left), float(top), float(right), float(bottom)
 
     def _is_dark(self, box: Box, dark: NDArray[np.bool_]) -> bool:
-        """Whether enough of it is dark, and what is beside it is not: a housing, and no shadow's corner."""
+        """Return True if the box is dark enough and its surroundings are not, unlike the corner of a shadow."""
         left, top, right, bottom = (round(side) for side in box)
         inside = dark[max(0, top) : bottom, left:right]
         margin = max(2, (right - left) // 3)
@@ -139,7 +139,7 @@ class HousingLightReader:
         return DetectedLight(COLOURS[best] if sure else UNKNOWN, _detection(box, scale, "light"))
 
     def _lamp(self, bgr: Bgr, bright: Bgr, box: Box, place: int) -> tuple[float, NDArray[np.float64]]:
-        """How bright the lamp at `place` (-1 top, 0 middle, 1 bottom) is, and its colour (B, G, R)."""
+        """Return the brightness of the lamp at `place` (-1 top, 0 center, 1 bottom), and its color (B, G, R)."""
         config, height = self._config, box[3] - box[1]
         per_m = height / config.housing_height_m
         cx, cy = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2 + place * config.lamp_pitch_m * per_m
@@ -215,7 +215,10 @@ def _ranges(config: LampConfig) -> dict[str, HsvRange]:
 
 
 def _is(bgr: NDArray[np.float64], one: HsvRange) -> bool:
-    """Whether a colour is of a range's hue; paler than the range where a small lamp's colour ran into the housing."""
+    """Return True if a color has the hue of a range.
+
+    It may be paler, as the edge of a small lamp blends with the housing.
+    """
     pixel = (bgr / 255).astype(np.float32)[None, None]
     hue, saturation, value = cv2.cvtColor(pixel, cv2.COLOR_BGR2HSV)[0, 0].tolist()
     above, below = hue >= one.hue_low_deg, hue <= one.hue_high_deg

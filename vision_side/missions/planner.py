@@ -20,7 +20,7 @@ CELL_M = 0.03
 MAX_CELLS = 20_000
 """Security limit: 18 square metres of solid echoes; beyond it the oldest are forgotten."""
 _ECHO, _SUREST = 3, 6  # one echo counts at once; after two it takes six rays through the cell to give it up
-_SHY_CELLS = 2.5  # a ray says nothing of the cells this near to its echo: a wall at a grazing angle fills several
+_SHY_CELLS = 2.5  # a ray does not clear the cells this near to its echo: a wall at a grazing angle fills several
 _PROGRESS_CELL_M = 0.12  # something new was learned when a cell of this size is seen filled for the first time
 
 
@@ -38,7 +38,7 @@ class Costmap:
         """Take in the echoes that a sensor at `sensor` met.
 
         Only a ray with an echo shows that the floor before it is free: of several sensors merged into one scan, a
-        number without an echo may stand for a ray that nobody sends.
+        number without an echo may stand for a ray that no sensor sends.
         """
         filled = {(int(x), int(y)) for x, y in cells_of(echoes)}
         for cell in _passed(np.array([sensor]), echoes) - filled:
@@ -101,7 +101,7 @@ def _passed(sensor: Points, ends: Points) -> set[tuple[int, int]]:
 # The way to a goal over what is known of the floor; what is not known counts as free. Pure.  From the goal a wave
 # spreads over all cells that the robot's middle may enter; who steps against the wave gets there by a shortest way.
 # Where the wave does not reach the robot, no way is left: everything seen closes it, and what was not seen cannot open
-# it. Each new plan comes from something newly seen, so a robot that obeys them cannot go round for ever.
+# it. Each new plan comes from something newly seen, so a robot that follows them cannot circle forever.
 
 
 Point = tuple[float, float]
@@ -122,8 +122,8 @@ _TRIED_EVERY = 3  # of the way's cells, which are looked at for a straight line 
 class Planner:
     """One plan, good for any place of the robot until `ground` changes.
 
-    `keep_m`: how far from a filled cell's middle the robot's own middle has to stay; `roomy_m`: how far it does where
-    that is no long way round.
+    `keep_m`: smallest distance between the centers of a filled cell and of the robot. `roomy_m`: preferred distance, if
+    it needs no long detour.
     """
 
     def __init__(self, filled: Cells, robot: Point, goal: Point, keep_m: float, roomy_m: float) -> None:
@@ -152,16 +152,16 @@ class Planner:
         return math.floor(point[0] / CELL_M) - self._corner[0], math.floor(point[1] / CELL_M) - self._corner[1]
 
     def covers(self, point: Point) -> bool:
-        """Whether the plan says anything about `point`."""
+        """Return True if `point` is inside the plan."""
         i, j = self._cell(point)
         return 0 <= i < self._size[0] and 0 <= j < self._size[1]
 
     def middle(self, cell: Cell) -> Point:
-        """Where the middle of a cell of the plan is."""
+        """Return the center of a cell of the plan."""
         return (cell[0] + self._corner[0] + 0.5) * CELL_M, (cell[1] + self._corner[1] + 0.5) * CELL_M
 
     def entry(self, robot: Point, within_m: float) -> Cell | None:
-        """The robot's cell, or the nearest one from which a way leads to the goal; None if there is none so near."""
+        """The robot's cell, or the nearest one from which a way leads to the goal, or None."""
         i, j = self._cell(robot)
         if self.covers(robot) and self._steps[i, j] < _UNREACHED:
             return i, j
@@ -209,7 +209,7 @@ class Planner:
         return way
 
     def _after(self, cell: Cell) -> Cell | None:
-        """The neighbor of `cell` that the wave reached first, the one nearer to the goal of two; None at its source."""
+        """Return the neighbor of `cell` that the wave reached first, nearest to the goal, or None at its source."""
         steps = self._steps
         i, j = cell
         near = [(int(steps[i + a, j + b]), (i + a, j + b)) for a, b in _AROUND
@@ -221,8 +221,8 @@ class Planner:
         return best[0] if len(best) == 1 else min(best, key=lambda one: math.dist(self.middle(one), self.goal))
 
     def sees(self, start: Point, end: Point, skip_cells: float = 1.5) -> bool:
-        """Whether a straight line meets no cell that is blocked or tight; the first `skip_cells` and what is off the
-        plan aside. One that begins in a tight place has to keep out of blocked cells only.
+        """Return True if a straight line meets only free cells, apart from the first `skip_cells` and from those
+        outside the plan. One that begins in a tight place has to keep out of blocked cells only.
         """
         count = max(2, math.ceil(2 * math.dist(start, end) / CELL_M))
         first = min(count, math.ceil(2 * skip_cells))
@@ -250,7 +250,7 @@ def _window(filled: Cells, robot: Point, goal: Point, keep_m: float) -> tuple[ND
 
 
 def _away(filled: Cells, size: NDArray[np.int64]) -> NDArray[np.float32]:
-    """How far each cell's middle is from the nearest filled one's, in metres."""
+    """Return the distance of each cell's center from the nearest filled cell, in m."""
     room = np.ones(size, np.uint8)
     inside = ((filled >= 0) & (filled < size)).all(axis=1)
     room[tuple(filled[inside].T)] = 0

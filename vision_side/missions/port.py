@@ -19,8 +19,8 @@ from sightline.vision_side.detect.port import Detection
 class RangeScan:
     """One turn of a range sensor: `ranges_m[i]` at `angle_min_rad + i * angle_increment_rad`, inf = nothing, never NaN.
 
-    Angles about the robot's x axis, counter-clockwise positive; distances from the sensor, whose place the robot does
-    not tell.
+    Angles start at the robot's x axis, counter-clockwise positive. Distances start at the sensor, whose position the
+    robot does not publish.
     """
 
     t_us: int
@@ -33,29 +33,35 @@ class RangeScan:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """All that a mission may go by, at one frame."""
+    """The inputs of a mission at one frame."""
 
     header: FrameHeader
     """Capture time, odometry, measured and applied twist."""
     dt_s: float
-    """Since the frame before, at most 0.5; 0 for the first."""
+    """Time since the previous frame, at most 0.5 s; 0 for the first."""
     latency_s: float
-    """Capture to wheels, estimated."""
+    """Estimated time from capture to wheels, s."""
     camera: CameraModel
     detections: tuple[Detection, ...]
-    """Empty means "saw nothing"."""
+    """Detections, best first. Empty means "saw nothing"."""
     picture: DecodedImage | None = None
-    """Decoded pixels, valid during the step only; None where another service detects."""
+    """Decoded pixels, valid only during the step. None if another service detects."""
     scan: RangeScan | None = None
-    """The newest that came before the frame was answered; its age is `header.t_us - scan.t_us`."""
+    """The newest scan before the answer. Its age is `header.t_us - scan.t_us`."""
 
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a mission answers to one frame. `phase` is one or two words for a person, `note` the rest of the line.
+    """The answer of a mission to one frame.
 
-    `done` ends the mission: the robot stays where it is. `target`, `bearing_rad` (left positive) and `distance_m` tell
-    what it goes by, where there is such a thing.
+    Args:
+        twist: m/s and rad/s.
+        phase: one or two words for the operator.
+        note: the rest of the line for the operator.
+        done: True ends the mission; the robot stays where it is.
+        target: the detection that it follows, if any.
+        bearing_rad: bearing of the target, left positive.
+        distance_m: distance of the target, m.
     """
 
     twist: Twist
@@ -68,12 +74,16 @@ class Plan:
 
 
 class Mission(Protocol):
-    """Decides what the robot does next.
+    """Maps each frame to a plan for the robot.
 
-    Its class may say two things about itself: `wants_scan = True` for who goes by range scans (without it none is
-    subscribed to), and `needs_camera = False` for who goes on unchanged when the robot gets another camera model.
+    A class may set `wants_scan = True` to receive range scans, and `needs_camera = False` to continue unchanged when
+    the camera model changes.
     """
 
     def step(self, view: View) -> Plan:
-        """The plan for one frame. Raises nothing."""
+        """Compute the plan for one frame. Raises nothing.
+
+        Args:
+            view: the frame, the detections and the newest scan.
+        """
         ...

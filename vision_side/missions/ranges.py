@@ -21,7 +21,7 @@ def decode_scan(header: bytes, payload: bytes) -> tuple[ScanHeader, RangeScan]:
     check_sizes(SCAN, header, payload)
     stamp = decode(ScanHeader, header)
     if len(payload) % 4:
-        raise WireError(RejectReason.MALFORMED, f"scan payload of {len(payload)} bytes is no whole number of float32")
+        raise WireError(RejectReason.MALFORMED, f"scan payload of {len(payload)} bytes: not a multiple of 4")
     ranges_m = np.frombuffer(payload, "<f4").astype(np.float32, copy=False)
     if not (ranges_m >= 0).all():  # false for a nan too
         raise WireError(RejectReason.NOT_FINITE, "scan holds a nan or negative range")
@@ -44,7 +44,7 @@ _MAX_AHEAD_S = 0.2  # a scan newer than the newest pose is laid out by dead reck
 
 
 class PoseMemory:
-    """Where the robot was during the last two seconds."""
+    """Stores the poses of the robot of the last two seconds."""
 
     def __init__(self) -> None:
         self._poses: deque[tuple[int, Pose]] = deque(maxlen=_REMEMBERED)
@@ -81,7 +81,7 @@ def _between(one: Pose, other: Pose, share: float) -> Pose:
 
 
 def echoes(scan: RangeScan, sensor_x_m: float) -> Points:
-    """Where the rays of `scan` met something, about the robot; the sensor is `sensor_x_m` ahead of the axle."""
+    """Return the points of `scan` relative to the robot. The sensor is `sensor_x_m` ahead of the axle."""
     ranges = scan.ranges_m.astype(np.float64)
     met = np.flatnonzero((ranges >= scan.range_min_m) & (ranges <= scan.range_max_m))
     angles = scan.angle_min_rad + met * scan.angle_increment_rad

@@ -22,7 +22,7 @@ REGISTRY: Final = PluginRegistry("mission", "sightline.missions")
 
 @dataclass(frozen=True, slots=True)
 class MissionSpec:
-    """A mission that can be built, as often as is needed: for each session of the robot anew."""
+    """A mission that can be built again for each session of the robot."""
 
     name: str
     plugin: Any
@@ -30,16 +30,16 @@ class MissionSpec:
 
     @property
     def wants_scan(self) -> bool:
-        """Whether it goes by range scans."""
+        """Return True if it uses range scans."""
         return bool(getattr(self.plugin, "wants_scan", False))
 
     @property
     def needs_camera(self) -> bool:
-        """Whether another camera model means to begin anew."""
+        """Return True if it must start again with another camera model."""
         return bool(getattr(self.plugin, "needs_camera", True))
 
     def goes_by(self, label: str) -> bool:
-        """Whether it may go by what has this label, as far as its configuration tells: a `label`, or a `target`."""
+        """Return True if it may use detections with this label, by the `label` or `target` of its configuration."""
         own, target = getattr(self.config, "label", None), getattr(self.config, "target", None)
         if isinstance(own, str):
             return own in ("", label)
@@ -57,14 +57,14 @@ def configured_mission(config: VisionConfig) -> MissionSpec:
 
 
 def _own_options(kind: str, config: VisionConfig) -> dict[str, Any]:
-    """What `config` has for this mission."""
+    """Return the options of this mission in `config`."""
     own = config.mission.options if kind == config.mission.kind else {}
     return {**config.missions.get(kind, {}), **own}
 
 
 def check_missions(config: VisionConfig) -> None:
-    """Raise ConfigError, one line, for what is wrong with the configured mission, or with the options that others have
-    for when somebody asks for them: their waypoints come with the request."""
+    """Raise ConfigError for an error in the configured mission, or in the options of missions that can be requested.
+    The waypoints of those come with the request."""
     configured_mission(config)
     for kind, options in config.missions.items():
         settings = config_model(REGISTRY.load(kind))

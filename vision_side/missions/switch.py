@@ -1,6 +1,6 @@
 """The active mission, and the switch to the next one by way of standing still. Pure.
 
-A mission is somebody's plug-in: one that raises, or asks for what no robot does, is over, and the robot stands still.
+A mission can be a third-party plug-in. One that raises, or returns an impossible twist, ends, and the robot stops.
 """
 
 from dataclasses import replace
@@ -20,7 +20,7 @@ MAX_COMMAND: Final = 1000.0
 
 
 class MissionSwitch:
-    """What is to be done. `step` always answers, whatever a mission does."""
+    """Runs the current mission. `step` always answers, even after an error of the mission."""
 
     def __init__(self, chosen: MissionSpec, camera: CameraModel) -> None:
         self.chosen = chosen
@@ -65,7 +65,7 @@ class MissionSwitch:
         try:
             plan = self._mission.step(view)
             if max(abs(plan.twist.linear_mps), abs(plan.twist.angular_rad_s)) > MAX_COMMAND:
-                raise ValueError(f"asks for {plan.twist.linear_mps:g} m/s, {plan.twist.angular_rad_s:g} rad/s")
+                raise ValueError(f"returned {plan.twist.linear_mps:g} m/s, {plan.twist.angular_rad_s:g} rad/s")
         except PLUGIN_ERRORS as error:  # vision goes on, the robot stands still
             plan = _failed(error)
         if plan.done:

@@ -20,11 +20,11 @@ from sightline.vision_side.tracking.track import to_odometry
 _FRAMES = 2  # a colour that lets go must be seen this often, one after the other; one that stops counts at once
 
 
-_CROSSED_M = 0.15  # nobody who stops for a line ends so far beyond it: the robot has crossed, or began there
+_CROSSED_M = 0.15  # a robot that stops for a line never ends so far beyond it: it has crossed, or started there
 
 
 class StopConfig(Config):
-    """How the robot stops and goes."""
+    """Stopping and starting at a light."""
 
     line_m: Annotated[float, Field(ge=0, le=20)] = 0.6
     """The line is this far before the light."""
@@ -43,7 +43,10 @@ class StopConfig(Config):
 
 
 class StopLine:
-    """One light's line. `colour` is what it goes by; `clearing` is set once it is too late to stop, or once across."""
+    """The stop line of one light.
+
+    `colour` is the color in use. `clearing` is set after the line, or too late to stop.
+    """
 
     def __init__(self, config: StopConfig) -> None:
         self._config = config
@@ -66,7 +69,7 @@ class StopLine:
             self.colour = colour
 
     def speed(self, left_m: float, moving_mps: float, cruise_mps: float) -> float:
-        """How fast to go with `left_m` from the robot's front to the line."""
+        """Return the speed for `left_m` from the robot's front to the line."""
         self._decide(left_m, moving_mps)
         if self.clearing or self.colour == "green":
             return cruise_mps
@@ -84,10 +87,11 @@ class StopLine:
         self._was_green = self.colour == "green"
 
 
-# Missions `traffic-light` and `traffic-light-boxes`: drive along a lane of blocks and obey its lights. Pure.  The
-# detector's blocks tell where the lane runs, the picture what the light shows, and the light's own size how far its
-# line is. Nothing is driven at: a block is passed at its side, and what lies in a light's box is no block.  `note`
-# begins with what is shown: `light red`, `light yellow`, `light green`, `light unknown`, or `no light`.
+# Missions `traffic-light` and `traffic-light-boxes`: drive along a lane of blocks and follow its lights. Pure.
+#
+# The detected blocks give the lane, the image gives the color of the light, and the size of the light gives the
+# distance of its line. The robot passes each block at its side. A detection in the box of a light is not a block.
+# `note` begins with the state: `light red`, `light yellow`, `light green`, `light unknown`, or `no light`.
 
 
 Place = tuple[float, float]
@@ -139,7 +143,7 @@ class TrafficLight:
 
     def _plan(self, view: View) -> Plan:
         if view.picture is None:
-            return Plan(STILL, "no picture", "traffic lights are read in the picture, and there is none")
+            return Plan(STILL, "no picture", "traffic lights need an image")
         pose = view.header.pose
         known = [one for one in view.detections if not self._is_light(one, pose)]
         lights = self._reader.read(view.picture, known)
@@ -155,7 +159,7 @@ class TrafficLight:
         return "no light" if self._light is None else f"light {self._stop.colour}"
 
     def _is_light(self, one: Detection, pose: Pose) -> bool:
-        """Whether a detection lies where the light is known to be."""
+        """Return True if a detection is at the place of the known light."""
         place = self._place(one, pose, self._config.block_height_m, None) if self._light else None
         return bool(place and self._light and math.dist(place, self._light) < _SAME_M)
 
@@ -165,7 +169,7 @@ class TrafficLight:
         return [one for one in places if one is not None]
 
     def _place(self, one: Detection, pose: Pose, height_m: float, width_m: float | None) -> Place | None:
-        """Where a thing of that size is, in the odometry frame; None where it is cut off, or too far away."""
+        """Locate an object of known size in the odometry frame. Returns None if it is cut off or too far away."""
         if self._is_cut(one) and width_m is None:
             return None
         sighting = locate_box(one, self._camera, BoxesConfig(height_m=height_m, width_m=width_m), 0.0)
@@ -209,18 +213,18 @@ class TrafficLight:
         return pose[0] + share * (face[0] - pose[0]), pose[1] + share * (face[1] - pose[1])
 
     def _underside(self, box: Detection) -> float:
-        """How much of a light's depth shows below its face: a housing above the lens is seen from below."""
+        """Return the visible depth below the face of a light. A housing above the lens is seen from below."""
         return max(0.0, (self._camera.cy_px - box.y2_px) / self._camera.fy_px + self._camera.pitch_rad)
 
     def _is_known(self, place: Place, pose: Pose) -> bool:
-        """Whether a place is that of the light that is already known."""
+        """Return True if a place is that of the known light."""
         off_m = math.dist(place, self._light) if self._light else math.inf
         return off_m <= _SAME_M + _SAME_SHARE * math.dist(place, pose[:2])
 
     def _meet(self, place: Place, pose: Pose, is_vague: bool) -> None:
         """Know better where the light is, near looks most; or that another one comes first.
 
-        One that is cut off or cannot be read is measured badly: it may tell a colour, but no new place.
+        A light that is cut off or unreadable has an inaccurate place. It may update the color, but not the place.
         """
         if is_vague and self._light:
             return
@@ -279,7 +283,7 @@ class TrafficLightBoxes(TrafficLight):
 
 
 def _inside(one: Detection, box: Detection) -> bool:
-    """Whether the middle of a detection lies in a light's box."""
+    """Return True if the center of a detection is in the box of a light."""
     x, y = (one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2
     return (box.x1_px - _OUTER_PX <= x <= box.x2_px + _OUTER_PX
             and box.y1_px - _OUTER_PX <= y <= box.y2_px + _OUTER_PX)

@@ -47,9 +47,9 @@ class LocalCamera(Protocol):
 
 
 def watch_robot(config: VisionConfig, report: LogLine, seconds: float | None = None) -> int:
-    """Tell what is seen in the robot's pictures, until Ctrl-C or for `seconds`; returns the exit code 0.
+    """Print the detections in the robot's frames until Ctrl-C or for `seconds`. Returns the exit code 0.
 
-    Raises ConfigError for an endpoint that is none, LinkError if the link cannot be opened.
+    Raises ConfigError for an invalid endpoint, LinkError if the link cannot be opened.
     """
     from sightline.protocol.transports.open import open_link
 
@@ -62,7 +62,7 @@ def watch_robot(config: VisionConfig, report: LogLine, seconds: float | None = N
 
 
 def watch_camera(config: VisionConfig, camera: LocalCamera, report: LogLine, seconds: float | None = None) -> int:
-    """Tell what is seen by a camera of this machine, until Ctrl-C or for `seconds`; returns the exit code 0."""
+    """Print the detections of a local camera until Ctrl-C or for `seconds`. Returns the exit code 0."""
     model = camera.model
     lens = "calibrated" if model.calibrated else "not calibrated, so distances are a guess"
     watching = LocalRun(config, camera, report)
@@ -121,7 +121,7 @@ class LocalRun:
         self._fault = ""
 
     def turn(self) -> None:
-        """Look at the next picture; a camera that is gone is said once and tried again."""
+        """Process the next image. The loss of the camera is logged once, and the next turn tries it again."""
         try:
             picture = self._camera.read(_WAIT_S)
         except HardwareError as error:
@@ -168,9 +168,9 @@ class ProgressPrinter:
 
 
 def seen_text(seen: Observation) -> str:
-    """One line for a person: phase, bearing (left positive), distance."""
+    """Format one line for the operator: phase, bearing (left positive), distance."""
     if seen.bearing_rad is None or seen.distance_m is None:
-        return f"{seen.phase}: {seen.note or 'no target in sight'}"
+        return f"{seen.phase}: {seen.note or 'no target'}"
     return f"{seen.phase}: bearing {seen.bearing_rad * _DEGREES:+.1f} degrees, distance {seen.distance_m:.2f} m"
 
 

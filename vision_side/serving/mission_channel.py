@@ -45,7 +45,7 @@ class MissionRequests:
     def take(self, message: Message, frame: FrameHeader) -> MissionSpec | None:
         """The mission from `frame` on; None for a request that came before and for one that is rejected.
 
-        Raises WireError for what is no message of this channel; `rejection` then has it too.
+        Raises WireError for an invalid message; `rejection` then contains it too.
         """
         try:
             header = decode(RequestHeader, message.header)
@@ -66,7 +66,7 @@ class MissionRequests:
 
 
 def _check(header: RequestHeader, source: str, frame: FrameHeader) -> None:
-    """Raise WireError unless it is said by who may, of this session of the robot, and just now."""
+    """Raise WireError unless the source is permitted, the session is current and the status is recent."""
     if header.source != source:
         raise WireError(RejectReason.UNKNOWN_SOURCE, "key and header disagree on the source")
     if source not in MISSION.said_by:
@@ -75,19 +75,19 @@ def _check(header: RequestHeader, source: str, frame: FrameHeader) -> None:
     if echo is None or echo.channel != "status":
         raise WireError(RejectReason.NOT_ALLOWED, "a mission cites the newest status of the robot")
     if echo.session != frame.session:
-        raise WireError(RejectReason.OTHER_SESSION, f"it was asked of session {echo.session}, the robot is in "
-                                               f"{frame.session}: say it again")
+        raise WireError(RejectReason.OTHER_SESSION, f"requested in session {echo.session}, the robot is in "
+                                               f"{frame.session}; repeat the request")
     age_us = frame.t_us - echo.t_us
     if age_us > MAX_AGE_US:
-        raise WireError(RejectReason.STALE, f"it was asked {age_us / 1e6:.1f} s ago: say it again")
+        raise WireError(RejectReason.STALE, f"requested {age_us / 1e6:.1f} s ago; repeat the request")
 
 
-# What vision says of itself, and how often: twice a second, and at once when something changed. Pure.
+# The mission reports and their rate: twice a second, and immediately after a change. Pure.
 
 
 PERIOD_S: Final = 0.5
 LEAST_GAP_S: Final = 0.1
-"""A target that comes and goes with every frame is no reason for more reports than this."""
+"""Shortest time between two reports, even if the target appears and disappears with every frame."""
 _PHASE_LENGTH, _TEXT_LENGTH, _NAME_LENGTH, _DEVICE_LENGTH = 32, 200, 64, 32
 
 
@@ -95,7 +95,7 @@ class Reporter:
     """Makes the reports of one vision for one robot."""
 
     def __init__(self, detector: DetectorConfig) -> None:
-        self._detector = detector.kind.partition(":")[0]  # until there is a result to say more
+        self._detector = detector.kind.partition(":")[0]  # until the first result
         self._device = "cpu" if detector.kind == "hsv" else ""
         self._reported: tuple[object, ...] | None = None
         self._reported_s = 0.0
@@ -104,7 +104,10 @@ class Reporter:
         self, now_s: float, mission: str, seen: Observation, newest: RequestId | None, rejection: str, *,
         result: DetectionResult | None = None, beside: str = "",
     ) -> MissionReport | None:
-        """The report, if it is time for one. `result` is the detector's newest, `beside` tells of the shadow."""
+        """Return a report if one is due.
+
+        `result` is the newest of the detector, `beside` describes the shadow detector.
+        """
         state = (mission, seen.phase, seen.done, newest, rejection)
         gap_s = LEAST_GAP_S if state != self._reported else PERIOD_S
         if self._reported is not None and now_s - self._reported_s < gap_s:
@@ -128,19 +131,19 @@ class Reporter:
 
 
 def _line(text: str, most: int) -> str:
-    """Whatever a mission says, on one line and within the wire's bound."""
+    """Format the text of a mission on one line within the bound of the wire."""
     return " ".join(text.split())[:most]
 
 
-# What vision hears and says about missions on a link: requests, scans, reports. Shell (slots; the clock is given).
+# Mission requests, scans and reports on a link. Shell (slots; the clock is an argument).
 
 
 NO_FRAMES = Observation("no frames")
-_ENDED = "the robot started anew, which ended it: say it again"
+_ENDED = "a new session of the robot ended it; repeat the request"
 
 
 class MissionChannel:
-    """One robot's missions. Scans are subscribed to only once a mission goes by them."""
+    """The missions of one robot. It subscribes to scans only for a mission that uses them."""
 
     def __init__(
         self, config: VisionConfig, link: Link, detector: Detector, log_change: Callable[[str, str], None],

@@ -38,13 +38,13 @@ def ends_on_signal(ending: threading.Event) -> Iterator[None]:
 
 
 def run(config: VisionConfig, observe: Observe | None = None) -> int:
-    """Serve until SIGTERM or SIGINT; returns the exit code 0. `observe` is told how to look at what is done.
+    """Serve until SIGTERM or SIGINT. Returns the exit code 0. `observe` receives a reader of the counters.
 
-    Raises ConfigError for an endpoint or a mission that is none, LinkError if the link cannot be opened.
+    Raises ConfigError for an invalid endpoint or mission, LinkError if the link cannot be opened.
     """
     from sightline.protocol.transports.zenoh.session import report_floods
 
-    configured_mission(config)  # a mission that there is not is said before anything is opened
+    configured_mission(config)  # report an unknown mission before any endpoint is opened
     ending, detector = threading.Event(), configured_detector(config)
     run_it = _run_fleet if set("*?") & set(config.robot) else _run_one
     try:

@@ -27,7 +27,7 @@ from sightline.vision_side.viewing import ViewPublisher
 
 @dataclass(frozen=True, slots=True)
 class ServiceCounts:
-    """Counters only grow. Times are of the newest frame; None where nobody has said any."""
+    """The counters of one robot, which never decrease. Times are those of the newest frame, or None."""
 
     robot: str
     heard: bool
@@ -46,36 +46,37 @@ class ServiceCounts:
 
 CountsNow = Callable[[], list[ServiceCounts]]
 Observe = Callable[[CountsNow], None]
-"""Told, once, how to look at the counts of every robot."""
+"""Receives, once, the reader of all robots' counters."""
 
 
-# Which session of a robot to steer by, when frames of more than one arrive. Pure.  A robot that starts anew begins a
-# session, and is met at once: the newest session is the one. Yet anybody on a plain network can send one frame of a
-# new session, and two robots may have one id. So an earlier session that goes on, while the newer one should be all
-# there is, is taken back: a robot that started anew cannot also be as it was before. From then on it is only replaced
-# when it has fallen silent.
+# The session of a robot to steer, when frames of several sessions arrive. Pure.
+#
+# A robot that restarts begins a new session, and the newest session is used immediately. But on a network without keys
+# any client can send one frame of a new session, and two robots may have one id. Therefore an earlier session that
+# continues is used again, because a restarted robot cannot continue its old session. From then on it is replaced only
+# after silence.
 
 
 GOES_ON_US: Final = 300_000
 """An earlier session is alive if frames of it were captured, and came, over this long: more than a late frame or two
 that the network held back, and as little as a robot without answers can show (it sends one every 120 to 500 ms)."""
 SILENT_US: Final = 1_000_000
-"""A session that is not heard for longer may be replaced: the slowest stream sends twice as often, and no robot starts
-anew so fast."""
+"""Silence after which a session may be replaced. The slowest stream sends twice as often, and no robot restarts so
+fast."""
 KEPT: Final = 8
-"""Earlier sessions remembered, those heard last. One that is forgotten counts as new."""
+"""Number of stored earlier sessions. A forgotten session counts as new."""
 
 
 @dataclass(slots=True)
 class _Earlier:
-    """A session that another replaced: since when it is heard again, by our clock and by its own, and when last."""
+    """A session that another replaced: first frame after that on both clocks, and last frame."""
 
     heard_us: int
     again_us: int = 0
     captured_us: int = 0
 
     def goes_on(self, captured_us: int, now_us: int) -> bool:
-        """Whether, with this frame, it was heard for so long that it cannot be over."""
+        """Return True if its frames continue for so long that the session cannot be over."""
         if not self.again_us or now_us - self.heard_us > SILENT_US:
             self.again_us, self.captured_us = now_us, captured_us
         self.heard_us = now_us
@@ -83,17 +84,17 @@ class _Earlier:
 
 
 class SessionSelector:
-    """Judges every frame by its session. Times are of this machine's clock, but for `captured_us`, the robot's."""
+    """Selects frames by their session. Times are of this machine's clock, except `captured_us` of the robot's."""
 
     def __init__(self) -> None:
         self.current = ""
         self._heard_us = 0
         self._proven = False
-        """Whether the current one was heard beside another: then another is no sign that it is over."""
+        """True if the current session continued next to another one, which is then no sign of its end."""
         self._earlier: dict[str, _Earlier] = {}
 
     def admits(self, session: str, captured_us: int, now_us: int) -> bool:
-        """Whether a frame of `session` is of the robot that is steered; it may become so by this very frame."""
+        """Return True if a frame of `session` is from the steered robot. This frame may change the session."""
         if session != self.current:
             if not self._replaces(session, captured_us, now_us):
                 return False
@@ -127,8 +128,8 @@ class SessionSelector:
 _SILENCE_S = 3.0
 _NO_FRAMES_S = 1.0  # twice what the slowest stream takes between two frames
 _CAMERA_PATIENCE_S = 1.5
-_REPORTED_COUNTS = tuple(10**power for power in range(10))  # a camera gone bad is told at 1, 10, 100 ... pictures
-_REPORTED_PHASES = {"searching": "target not in sight, searching", "lost": "target lost"}
+_REPORTED_COUNTS = tuple(10**power for power in range(10))  # bad images are logged at 1, 10, 100 ...
+_REPORTED_PHASES = {"searching": "no target, searching", "lost": "target lost"}
 LogLine = Callable[[str], None]
 Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
 
@@ -141,7 +142,7 @@ def open_service(config: VisionConfig, link: Link, report: LogLine, detector: De
 
 
 class Service:
-    """What is known of the robot on the other end, and the pipeline that fits it."""
+    """Serves one robot: its camera, its sessions, and the pipeline for them."""
 
     def __init__(self, config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None) -> None:
         self._config, self._link, self._report = config, link, report
@@ -166,7 +167,7 @@ class Service:
         self._viewing = ViewPublisher(config, link, self._log_change)
 
     def _arrivals(self, link: Link) -> LatestSlot[Message]:
-        """Where what is to be answered arrives."""
+        """Return the slot of the frames to answer."""
         return link.latest(FRAME)
 
     def turn(self, wait_s: float) -> None:
@@ -175,7 +176,7 @@ class Service:
         started_ns = time.perf_counter_ns()
         if message is not None and self._pipeline is not None:
             self._frame(message, started_ns)
-            self._look_at_camera()  # afterwards: it says the same twice a second, and frames are in a hurry
+            self._look_at_camera()  # afterwards: the model repeats twice a second, and frames are urgent
             return
         self._look_at_camera()
         if message is not None:
@@ -192,7 +193,7 @@ class Service:
                                "`sightline robot` running there, with this robot id?")
 
     def counts(self) -> ServiceCounts:
-        """What is done so far; from any thread."""
+        """Return the counters. Safe from any thread."""
         heard, (compute_us, latency_us) = time.monotonic() - self._heard_s <= _SILENCE_S, self._newest
         return ServiceCounts(self._config.robot, heard and self.answered > 0, self.answered, self.steered,
                       dict(self.skipped.copy()), self._frames.dropped, compute_us, latency_us)
@@ -221,8 +222,8 @@ class Service:
             return
         if not self._sessions.admits(header.session, header.t_us, monotonic_us()):
             self.skipped["OTHER_SESSION"] += 1
-            self._log_change("other", f"frames of session {header.session} are refused: robot {self._config.robot} is "
-                                f"steered in session {self._sessions.current}; two robots with this id? give each its "
+            self._log_change("other", f"rejecting frames of session {header.session}: robot {self._config.robot} is "
+                                f"steered in session {self._sessions.current}; give each robot its "
                                 "own with --robot")
             return
         self._heard_s = time.monotonic()
@@ -292,7 +293,7 @@ class Service:
             self._log_change("phase", ": ".join(filter(None, (seen.phase, seen.note))), seen.phase)
 
     def _log_change(self, about: str, line: str, state: str = "") -> None:
-        """Print `line` if what it is about changed since it was last told."""
+        """Log `line` if its subject changed since the last line about it."""
         if self._reported.get(about) != (state or line):
             self._reported[about] = state or line
             self._report(f"vision: {line}")
@@ -304,8 +305,8 @@ def endpoints_text(config: VisionConfig) -> str:
 
 # The vision service without a detector of its own: it steers by boxes that another service publishes. Shell.
 #
-# Every frame is acknowledged at once, since nothing here looks at it; boxes are answered with a twist that cites the
-# frame in which they were found, however old that is by now: the robot judges. No boxes, no twist: the robot holds.
+# Every frame is acknowledged immediately, because no detector runs here. Boxes are answered with a twist that cites
+# their frame at any age, because the robot validates the age. Without boxes there is no twist, and the robot holds.
 
 
 _BOXES_SILENCE_S = 2.0
@@ -364,7 +365,7 @@ class BoxesService(Service):
             return
         self._heard_s = time.monotonic()
         self._log_change("link", f"frames from robot {self._config.robot}, session {header.session}")
-        self._publish(header, PipelineAnswer(None, Observation("no picture", note="somebody else looks")), 0)
+        self._publish(header, PipelineAnswer(None, Observation("no picture", note="another service detects")), 0)
         self._viewing.keep(header, message.payload)
         if self._pipeline is None:
             self._wait_for_camera()
@@ -382,7 +383,7 @@ class BoxesService(Service):
             frame, found = self._reader.read(message.header, message.payload, self._camera)
         except WireError as error:
             self.skipped[error.reason] += 1
-            self._log_change("boxes", f"boxes are refused: {error.detail}", f"refused {error.reason}")
+            self._log_change("boxes", f"rejecting boxes: {error.detail}", f"rejected {error.reason}")
             return
         self._log_change("boxes", f"boxes from {self._config.boxes.source}")
         self._mission_channel.prepare(self._pipeline, frame)
@@ -396,7 +397,7 @@ class BoxesService(Service):
         self._viewing.show(frame, answer, self._camera, started_ns=started_ns)
 
     def _remember_frames(self) -> None:
-        """Also those that newer ones replaced before they were taken up."""
+        """Store the headers of all frames, including those that newer ones replaced before use."""
         while self._inbox.headers:
             header = self._decoded(FrameHeader, self._inbox.headers.popleft(), MAX_HEADER_BYTES)
             if header is not None:

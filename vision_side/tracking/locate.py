@@ -26,7 +26,8 @@ Column = NDArray[np.float64]
 
 _MIN_POINTS = 6
 _TRIMS = 3
-_OUTLIER = 4.0  # times the median error: no pixel's stair-step is that far off, the edge of an occluder is
+# Times the median error. The stair-step of a pixel is always nearer, the edge of an occluder is not.
+_OUTLIER = 4.0
 _BOX_ANGLES = np.linspace(0.0, 2 * math.pi, 24, endpoint=False)
 
 
@@ -40,7 +41,18 @@ class Sighting:
 
 
 def locate_sphere(detection: Detection, camera: CameraModel, radius_m: float) -> Sighting | None:
-    """Where a sphere of `radius_m` is, or None if the outline is no sphere's (too few points, no size, behind)."""
+    """Locate a sphere by its outline.
+
+    Args:
+        detection: outline, or box, in px of the encoded image.
+        camera: model of this image.
+        radius_m: radius of the sphere, m.
+
+    Returns:
+        Its center over the floor, or None if the outline does not fit a sphere in front of the camera.
+
+    Source: the outline rays of a sphere form a circular cone, see the module.
+    """
     outline = detection.outline_px if detection.outline_px is not None else _box_outline(detection, camera)
     if len(outline) < _MIN_POINTS:
         return None
@@ -54,7 +66,15 @@ def locate_sphere(detection: Detection, camera: CameraModel, radius_m: float) ->
 
 
 def points_ahead(outline_px: NDArray[np.float64], camera: CameraModel) -> NDArray[np.float64]:
-    """Where the pixels' rays are one metre ahead: right, down, 1, and how far that is (4, N)."""
+    """Convert pixels to rays.
+
+    Args:
+        outline_px: (N, 2), px.
+        camera: intrinsics and distortion.
+
+    Returns:
+        (4, N): right, down, 1 m ahead, and the length of this vector.
+    """
     points = np.ones((4, len(outline_px)))
     if camera.distortion:
         matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]])
@@ -68,7 +88,8 @@ def points_ahead(outline_px: NDArray[np.float64], camera: CameraModel) -> NDArra
 
 @lru_cache(maxsize=64)
 def _pinhole(cx_px: float, cy_px: float, fx_px: float, fy_px: float) -> tuple[Column, Column]:
-    """As columns; kept, since building them costs as much as using them."""
+    """Return principal point and focal lengths as columns."""
+    # Cached: to build them costs as much as to use them.
     return np.array([[cx_px], [cy_px]]), np.array([[fx_px], [fy_px]])
 
 
@@ -85,6 +106,7 @@ def _cone_centre(points: NDArray[np.float64], radius_m: float) -> tuple[float, f
         if w is None:
             return None
         off = np.abs(np.array((*w, -1.0)) @ points)
+        # Points beyond the limit are the edge of another object in front of the sphere.
         limit = _OUTLIER * np.sort(off)[len(off) // 2]
         if np.maximum.reduce(off) <= limit:
             break
@@ -122,15 +144,16 @@ def _box_outline(detection: Detection, camera: CameraModel) -> NDArray[np.float6
     return shown
 
 
-# Boxes that somebody else found: which frame they answer, which of them is meant, and where that is. Pure.
+# Boxes of another service: their frame, the selected box, and its position. Pure.
 #
-# Nothing is taken on trust: boxes count for the one frame that they name, if that frame came here, and what is made of
-# them cites that frame, so that the robot judges their age by its own record. No boxes is not the same as no answer.
+# Boxes count only for the frame that they name, and only if this service received it. The twist cites that frame, so
+# that the robot validates its age by its own record. "No boxes" differs from "no answer".
 
 
 REMEMBERED = 128
 """Frames; at 60 per second twice what any robot would still move for."""
-_EDGE_PX = 1.0  # a box that comes this near to the picture's border may go on beyond it
+# A box this near to the image border may continue beyond it, so its size is unknown.
+_EDGE_PX = 1.0
 
 
 class BoxReader:
@@ -149,8 +172,8 @@ class BoxReader:
     def read(self, header: bytes, payload: bytes, camera: CameraModel) -> tuple[FrameHeader, tuple[Detection, ...]]:
         """The frame that was looked at, and what is meant in it, surest first; empty is "saw nothing".
 
-        Raises WireError: MALFORMED, UNSUPPORTED_VERSION, or UNKNOWN_FRAME for boxes of no frame known here. Whether the
-        frame is newer than the last is for who steers to see: that it is, is all the order there need be.
+        Raises WireError: MALFORMED, UNSUPPORTED_VERSION, or UNKNOWN_FRAME for boxes of no frame known here. The
+        pipeline checks that the frame is newer than the last one.
         """
         stamp = decode(DetectionsHeader, header)
         found = decode(Detections, payload, DETECTIONS.max_payload_bytes)
@@ -180,9 +203,9 @@ def _detection(box: DetectedBox) -> Detection:
 
 
 def locate_box(one: Detection, camera: CameraModel, config: BoxesConfig, otherwise_m: float) -> Sighting | None:
-    """Where the thing in the box is: its bearing, and its range if its size is known and all of it is in view.
+    """Locate the object in a box: its bearing, and its range if its size is known and the box is fully in view.
 
-    `otherwise_m` is its distance from the lens over the floor where the box does not tell. None for an empty box.
+    `otherwise_m` is the assumed distance from the lens otherwise. Returns None for an empty box.
     """
     (left, middle), (right, _), (across, top), (_, bottom) = _edges(one, camera)
     ahead_m = _range(right - left, bottom - top, one, camera, config)
@@ -196,7 +219,7 @@ def locate_box(one: Detection, camera: CameraModel, config: BoxesConfig, otherwi
 
 
 def _edges(one: Detection, camera: CameraModel) -> list[list[float]]:
-    """Where the rays of the middles of left, right, top and bottom edge are one metre ahead: right, down."""
+    """Return the rays (right, down, at 1 m) of the centers of the left, right, top and bottom edges."""
     x, y = (one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2
     pixels = np.array([[one.x1_px, y], [one.x2_px, y], [x, one.y1_px], [x, one.y2_px]])
     rays: list[list[float]] = points_ahead(pixels, camera)[:2].T.tolist()

@@ -1,7 +1,7 @@
 """Latency estimate and Smith predictor: where the robot will be when a command acts. Pure.
 
-A command computed now meets a robot that has meanwhile obeyed the commands sent before it. Steering from the picture
-alone corrects the same error several times over; steering from where the robot will be does not.
+Before a command acts, the robot still carries out the commands in flight. Steering from the image alone corrects the
+same error several times. Steering from the predicted pose does not.
 """
 
 import math
@@ -26,28 +26,34 @@ class PredictedMotion:
 
 
 class LatencyEstimator:
-    """How late a command acts, smoothed."""
+    """Smooths the delay from capture to action."""
 
     def __init__(self, config: LatencyConfig) -> None:
         self._config = config
         self.measured_s = config.first_guess_s
-        """From capture to accepted command."""
+        """Time from capture to accepted command, s."""
 
     @property
     def total_s(self) -> float:
-        """From capture to wheels that follow."""
+        """Return the time from capture to the motion of the wheels, s."""
         return min(self.measured_s, self._config.max_s) + self._config.actuation_s
 
     def measure(self, latency_us: int | None, dt_s: float) -> None:
-        """Take in what the robot measured from capture to accepted command; None changes nothing."""
+        """Update the estimate.
+
+        Args:
+            latency_us: the robot's measurement from capture to accepted command, or None.
+            dt_s: time since the last frame.
+        """
         if latency_us is None:
             return
+        # Smoothing is per elapsed time, so that it does not depend on the frame rate.
         share = min(1.0, dt_s / self._config.smoothing_s)
         self.measured_s += share * (min(latency_us / 1e6, self._config.max_s) - self.measured_s)
 
 
 class MotionPredictor:
-    """Keeps the latency and the commands sent."""
+    """Predicts the robot from its latency and the commands in flight."""
 
     def __init__(self, config: LatencyConfig) -> None:
         self._config = config
@@ -56,11 +62,11 @@ class MotionPredictor:
 
     @property
     def latency_s(self) -> float:
-        """From capture to wheels that follow."""
+        """Return the time from capture to the motion of the wheels, s."""
         return self._latency.total_s
 
     def measure(self, latency_us: int | None, dt_s: float) -> None:
-        """As `Latency.measure`."""
+        """Update the latency, see `LatencyEstimator.measure`."""
         self._latency.measure(latency_us, dt_s)
 
     def sent(self, t_us: int, twist: Twist) -> None:
@@ -68,7 +74,7 @@ class MotionPredictor:
         self._sent.append((t_us, twist.linear_mps, twist.angular_rad_s))
 
     def expected(self, t_us: int) -> tuple[float, float] | None:
-        """The twist that should have been in force at `t_us`; None before the first."""
+        """Return the twist that the robot should apply at `t_us`, (m/s, rad/s), or None before the first one."""
         for sent_us, linear, angular in reversed(self._sent):
             if sent_us + self._latency.measured_s * 1e6 <= t_us:
                 return linear, angular
@@ -77,10 +83,20 @@ class MotionPredictor:
     def motion(
         self, t_us: int, pose: Pose, moving: tuple[float, float], applied: tuple[float, float]
     ) -> PredictedMotion:
-        """The robot at `t_us` plus the latency, if it carries out what is under way.
+        """Predict pose and twist when a command sent now takes effect.
 
-        A robot that is held (applies nothing though it was told to move) is expected to stay where it is.
+        Args:
+            t_us: capture time of the frame.
+            pose: odometry at that time, m, m, rad.
+            moving: measured twist, m/s, rad/s.
+            applied: twist on the wheels, m/s, rad/s.
+
+        Returns:
+            Pose and twist after the latency.
+
+        Source: Smith predictor.
         """
+        # A robot in HOLD applies no command in flight, so it stays where it is.
         if self._is_held(t_us, applied):
             return PredictedMotion(pose, 0.0, 0.0)
         (x, y, yaw), (linear, angular) = pose, moving
@@ -96,7 +112,7 @@ class MotionPredictor:
         return PredictedMotion((x, y, yaw), linear, angular)
 
     def _under_way(self, t_us: int, moving: tuple[float, float]) -> list[tuple[float, tuple[float, float]]]:
-        """(seconds, twist) of what the wheels follow from `t_us` until a command computed now acts, oldest first."""
+        """Return (seconds, twist) of the commands in flight between `t_us` and the effect of a new command."""
         spans: list[tuple[float, tuple[float, float]]] = []
         until_s = latency_s = self.latency_s
         for sent_us, linear, angular in reversed(self._sent):
@@ -112,8 +128,8 @@ class MotionPredictor:
 
     def _is_held(self, t_us: int, applied: tuple[float, float]) -> bool:
         expected = self.expected(t_us)
-        told = expected is not None and max(map(abs, expected)) > _STILL
-        return told and max(map(abs, applied)) <= _STILL
+        should_move = expected is not None and max(map(abs, expected)) > _STILL
+        return should_move and max(map(abs, applied)) <= _STILL
 
 
 def _bounded(value: float, limit: float) -> float:

@@ -1,7 +1,7 @@
-"""Bearing and distance to a twist (feed-forward and PI), and the search turn. Pure.
+"""Map bearing and distance to a twist (feed-forward and PI), and turn to search. Pure.
 
-Each axis is feed-forward (what the target's and the robot's motion ask for) plus PI on what is left. dt comes from
-capture times, gains shrink as latency grows, and integrals give way to whatever the robot did not carry out.
+Each axis is feed-forward from the motion of target and robot, plus PI on the remaining error. The time step comes from
+capture times. Gains shrink as latency grows, and the integrals shrink by the part that the robot did not apply.
 """
 
 import math
@@ -13,9 +13,14 @@ from sightline.vision_side.config import SearchConfig, SteerConfig
 
 @dataclass(frozen=True, slots=True)
 class Aim:
-    """The target about the lens, at the time the command will act; its velocity over the floor, along x and y.
+    """The target relative to the lens at the time when the command acts.
 
-    `lens_x_m` is how far the lens is ahead of the axle: turning carries it sideways.
+    Args:
+        x_m: forward.
+        y_m: left.
+        vx_mps: velocity over the floor, forward.
+        vy_mps: velocity over the floor, left.
+        lens_x_m: distance of the lens ahead of the axle; a turn moves the lens sideways.
     """
 
     x_m: float
@@ -26,17 +31,17 @@ class Aim:
 
     @property
     def bearing_rad(self) -> float:
-        """Left positive."""
+        """Return the bearing, left positive."""
         return math.atan2(self.y_m, self.x_m)
 
     @property
     def distance_m(self) -> float:
-        """Over the floor, from the lens."""
+        """Return the distance over the floor from the lens."""
         return math.hypot(self.x_m, self.y_m)
 
 
 class Steer:
-    """The two controllers and their integrals."""
+    """The controllers of speed and turn rate, with their integrals."""
 
     def __init__(self, config: SteerConfig, stand_off_m: float) -> None:
         self._config = config
@@ -44,16 +49,30 @@ class Steer:
         self._integral = (0.0, 0.0)  # m/s, rad/s
 
     def reset(self) -> None:
-        """Forget the integrals: the target changed or was lost."""
+        """Reset the integrals after the loss or a change of the target."""
         self._integral = (0.0, 0.0)
 
     def unmet(self, dt_s: float, linear_mps: float, angular_rad_s: float) -> None:
-        """Back-calculation: bleed the integrals by what was asked for and not applied (applied less asked)."""
+        """Reduce the integrals by the part of the command that the robot did not apply (anti-windup by
+        back-calculation).
+
+        Args:
+            dt_s: time since the last frame.
+            linear_mps: applied minus commanded speed.
+            angular_rad_s: applied minus commanded turn rate.
+        """
         share = min(1.0, self._config.back_calculation_hz * dt_s)
         self._add(share * linear_mps, share * angular_rad_s)
 
     def step(self, dt_s: float, aim: Aim, latency_s: float, may_drive: bool) -> Twist:
-        """The twist that keeps the target ahead and at the stand-off; only turns unless `may_drive`."""
+        """Compute the twist that keeps the target ahead and at the stand-off.
+
+        Args:
+            dt_s: time since the last frame.
+            aim: predicted target.
+            latency_s: capture to wheels; it limits the gains.
+            may_drive: False to turn only.
+        """
         config, bearing, distance = self._config, aim.bearing_rad, max(aim.distance_m, 0.05)
         cos, sin = aim.x_m / distance, aim.y_m / distance
         kp_distance = _damped(config.distance_kp, latency_s, config.max_gain_latency)
@@ -62,8 +81,10 @@ class Steer:
         receding = aim.vx_mps * cos + aim.vy_mps * sin
         linear = receding + kp_distance * error_m + self._integral[0]
         driven = self._limited(linear * self._fade(bearing)) if may_drive else 0.0
+        # The sideways motion of the target, plus that of the robot's own speed, is the feed-forward of the bearing.
         crossing = aim.vy_mps * cos - aim.vx_mps * sin
         wanted = (crossing + driven * sin) / distance + kp_bearing * bearing + self._integral[1]
+        # A turn moves the lens sideways too, so a smaller turn rate gives the wanted change of bearing.
         angular = wanted / (1 + aim.lens_x_m * cos / distance)
         turned = _bounded(angular, config.max_angular_rad_s)
         self._integrate(dt_s, (error_m if may_drive else 0.0, bearing), (driven - linear if may_drive else 0.0,
@@ -71,7 +92,7 @@ class Steer:
         return Twist(linear_mps=driven, angular_rad_s=turned)
 
     def _integrate(self, dt_s: float, error: tuple[float, float], cut: tuple[float, float]) -> None:
-        """Advance both integrals by their error and, back-calculation, by what the limits cut off."""
+        """Advance both integrals by their error, and by the part that the limits removed (back-calculation)."""
         config = self._config
         self._add(dt_s * (config.distance_ki * error[0] + config.back_calculation_hz * cut[0]),
                   dt_s * (config.bearing_ki * error[1] + config.back_calculation_hz * cut[1]))
@@ -81,7 +102,7 @@ class Steer:
                           _bounded(self._integral[1] + angular_rad_s, self._config.integral_angular_rad_s))
 
     def _fade(self, bearing_rad: float) -> float:
-        """1 straight ahead, 0 from `drive_within_rad` on: first turn, then drive."""
+        """Return the speed share: 1 straight ahead, 0 from `drive_within_rad` on, so that it turns before it drives."""
         return max(0.0, 1.0 - (bearing_rad / self._config.drive_within_rad) ** 2)
 
     def _limited(self, linear_mps: float) -> float:
@@ -89,7 +110,7 @@ class Steer:
 
 
 def _damped(gain: float, latency_s: float, max_gain_latency: float) -> float:
-    """`gain`, or as much of it as the latency allows."""
+    """Limit a gain by the latency, because a high gain with a long delay oscillates."""
     return min(gain, max_gain_latency / max(latency_s, 1e-3))
 
 
@@ -97,14 +118,14 @@ def _bounded(value: float, limit: float) -> float:
     return max(-limit, min(limit, value))
 
 
-# Bounded search: turn on the spot after "saw nothing", towards the side last seen. Pure.
+# The bounded search: turn on the spot after "saw nothing", toward the side where the target was last seen. Pure.
 #
-# Only pictures that were decoded and held nothing are counted; no picture means no search. The budget is spent by
-# turning, as odometry shows it: a disarmed robot keeps its whole search for when it may move.
+# Only decoded images without a target count. The turn in odometry consumes the budget, so that a disarmed robot does
+# not use up its search.
 
 
 class Search:
-    """One search; `reset` when the target was seen."""
+    """One search. Call `reset` when the target is detected."""
 
     def __init__(self, config: SearchConfig) -> None:
         self._config = config
@@ -112,13 +133,22 @@ class Search:
         self.reset(self._side)
 
     def reset(self, side: float) -> None:
-        """Start afresh next time, turning left for a positive `side`."""
+        """Start the next search from the beginning, to the left for a positive `side`."""
         self._side = math.copysign(1.0, side)
         self._nothing_s = self._turning_s = self._turned_rad = 0.0
         self._yaw_rad: float | None = None
 
     def step(self, dt_s: float, pose: Pose, applied: Planar) -> Twist | None:
-        """The twist for one more picture without the target; None when it is too early or the budget is spent."""
+        """Compute the twist for one more image without the target.
+
+        Args:
+            dt_s: time since the last frame.
+            pose: odometry, m, m, rad.
+            applied: twist on the wheels, m/s, rad/s.
+
+        Returns:
+            The turn, or None before the waiting time and after the budget.
+        """
         self._spend(dt_s, pose[2], applied[1])
         config = self._config
         spent = self._turned_rad >= config.max_turn_rad or self._turning_s >= config.max_turning_s

@@ -1,7 +1,7 @@
-"""Tracks one target in the odometry frame with a Kalman filter. Pure.
+"""Track one target in the odometry frame with a Kalman filter. Pure.
 
-There the robot's own motion drops out, and what is left is the target's position and velocity. Both axes share one
-2x2 covariance, since nothing prefers one of them. The clock is the frames' capture time.
+In this frame the state is only the target's position and velocity, without the robot's motion. Both axes share one 2x2
+covariance, because they have the same noise. The clock is the capture time of the frames.
 """
 
 import math
@@ -12,14 +12,15 @@ from sightline.protocol.messages import Pose
 from sightline.vision_side.config import TrackConfig
 from sightline.vision_side.tracking.locate import Sighting
 
-_FIRST_SPEED_MPS = 0.3  # 1 sigma of a target's speed before anything is known of it
-_SURPRISE = 9.0  # a sighting three sigma off means that the target was pushed ...
-_PUSHED_MPS = 0.4  # ... and that its velocity may have changed by this much
+_FIRST_SPEED_MPS = 0.3  # 1 sigma of the speed of a new target
+# A sighting three sigma off means that the target was pushed. Without more variance the filter would lag behind it.
+_SURPRISE = 9.0
+_PUSHED_MPS = 0.4
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Where the target is and how it moves, in the odometry frame, and for how long it was not seen."""
+    """Position and velocity of the target in the odometry frame, and the time since its last detection."""
 
     x_m: float
     y_m: float
@@ -30,7 +31,7 @@ class Target:
 
 
 class Track:
-    """Follows at most one target; `target` is None when there is none."""
+    """Follows at most one target. `target` is None without one."""
 
     def __init__(self, config: TrackConfig) -> None:
         self._config = config
@@ -38,9 +39,15 @@ class Track:
         self._variance = (0.0, 0.0, 0.0)  # of position, both, velocity
 
     def step(self, dt_s: float, pose: Pose, sightings: Sequence[Sighting]) -> Sighting | None:
-        """Advance by `dt_s` and take in what was seen from `pose`. Returns the sighting that is the target.
+        """Advance the track and correct it with the newest sightings.
 
-        `sightings` come best first; the best one starts a track, the nearest one in the gate continues it.
+        Args:
+            dt_s: time since the last frame.
+            pose: odometry at capture, m, m, rad.
+            sightings: candidates, best first. The best one starts a track, the nearest one in the gate continues it.
+
+        Returns:
+            The sighting of the target, or None.
         """
         if self.target is None:
             return self._start(pose, sightings)
@@ -61,7 +68,7 @@ class Track:
         return sightings[0]
 
     def _advance(self, target: Target, dt_s: float) -> None:
-        """Constant velocity, with white acceleration."""
+        """Predict with constant velocity and white acceleration."""
         position, both, velocity = self._variance
         power = self._config.acceleration_mps2**2 * dt_s
         self._variance = (position + dt_s * (2 * both + dt_s * velocity) + power * dt_s**2 / 3,
@@ -70,6 +77,7 @@ class Track:
                              target.vy_mps, target.unseen_us + round(dt_s * 1e6), target.sightings)
 
     def _nearest(self, target: Target, pose: Pose, sightings: Sequence[Sighting]) -> Sighting | None:
+        # The gate grows while the target is hidden, because its position becomes less certain.
         gate = self._config.gate_m + self._config.gate_growth_mps * target.unseen_us / 1e6
         best: Sighting | None = None
         for one in sightings:
@@ -91,19 +99,20 @@ class Track:
                              target.vy_mps + gain_velocity * dy, 0, target.sightings + 1)
 
     def _noise(self, sighting: Sighting) -> float:
-        """Variance of one measured position: range errors grow with its square, and with a hidden outline."""
+        """Return the variance of one position. The range error grows with the square of the range."""
+        # A partly hidden outline (low score) gives a less exact range.
         range_m2 = sighting.x_m**2 + sighting.y_m**2
         return float((self._config.range_noise * max(range_m2, 0.1) / max(sighting.detection.score, 0.2) ** 2) ** 2)
 
 
 def to_odometry(pose: Pose, x_m: float, y_m: float) -> tuple[float, float]:
-    """A point about the robot at `pose`, in the odometry frame."""
+    """Convert a point relative to the robot at `pose` to the odometry frame."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     return pose[0] + cos * x_m - sin * y_m, pose[1] + sin * x_m + cos * y_m
 
 
 def from_odometry(pose: Pose, x_m: float, y_m: float) -> tuple[float, float]:
-    """A point of the odometry frame, about the robot at `pose`."""
+    """Convert a point of the odometry frame to one relative to the robot at `pose`."""
     dx, dy = x_m - pose[0], y_m - pose[1]
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     return cos * dx + sin * dy, cos * dy - sin * dx

@@ -52,14 +52,14 @@ def test_every_scene_that_a_row_names_is_there():
 def test_rows_are_chosen_by_name():
     assert [row.name for row in chosen(["rtt40", "cut"])] == ["rtt40", "cut"]
     assert chosen([]) == CASES
-    with pytest.raises(ConfigError, match="'rtt4' is no row over zenoh; there are: rtt40"):
+    with pytest.raises(ConfigError, match="unknown --only 'rtt4' over zenoh; known: rtt40"):
         chosen(["rtt4"])
 
 
 def test_rows_with_a_router_are_not_offered_over_websocket():
     names = [row.name for row in chosen([], "websocket")]
     assert "radio" in names and "standby" in names and "router" not in names
-    with pytest.raises(ConfigError, match="'router' is no row over websocket"):
+    with pytest.raises(ConfigError, match="unknown --only 'router' over websocket"):
         chosen(["router"], "websocket")
 
 

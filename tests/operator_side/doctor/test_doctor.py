@@ -184,7 +184,7 @@ def test_somebody_else_on_the_port_is_no_robot(capsys):
 def test_what_mends_a_link_stands_apart_from_what_is_wrong():
     (found,) = between.findings("quic/127.0.0.1:1", "r1", "")
     assert found.value == "cannot connect to quic/127.0.0.1:1: a quic/ endpoint needs keys"
-    assert found.fix == "give --secure DIR"
+    assert found.fix == "pass --secure DIR"
 
 
 def test_an_endpoint_that_is_none_is_refused(capsys):

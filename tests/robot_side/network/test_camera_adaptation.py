@@ -161,7 +161,7 @@ def test_a_picture_of_another_size_than_the_model_is_acknowledged_and_never_rang
         pipeline.step(frame(seq, ball(known)))
     answer = pipeline.step(frame(5, ball(shown)))
     assert answer.twist is None and answer.seen.distance_m is None and answer.skipped == "MALFORMED"
-    assert "camera model says" in answer.seen.note
+    assert "camera model has" in answer.seen.note
     assert pipeline.step(frame(6, ball(known))).seen.distance_m is not None, "and nothing else is lost"
 
 

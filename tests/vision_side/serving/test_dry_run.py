@@ -83,8 +83,8 @@ def test_it_tells_at_most_twice_a_second():
     for picture in range(301):
         telling.step(PipelineAnswer(None, Observation("lost")), 100 + picture / 30)
     assert len(said) == 21
-    assert said[0] == "lost: no target in sight"
-    assert said[-1] == "lost: no target in sight (30 pictures/s)"
+    assert said[0] == "lost: no target"
+    assert said[-1] == "lost: no target (30 pictures/s)"
 
 
 def test_the_sign_of_a_bearing_and_what_would_be_driven_are_told():

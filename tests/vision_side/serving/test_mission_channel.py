@@ -110,7 +110,7 @@ def test_what_is_said_again_is_taken_up_once():
     ({"source": "operator", "key_source": "teleop"}, "UNKNOWN_SOURCE: key and header disagree"),
     ({"echo": False}, "NOT_ALLOWED: a mission cites the newest status"),
     ({"session": "0000beef"}, "OTHER_SESSION"),
-    ({"age_us": 2_100_000}, "STALE: it was asked 2.1 s ago: say it again"),
+    ({"age_us": 2_100_000}, "STALE: requested 2.1 s ago; repeat the request"),
 ])
 def test_what_is_not_taken_up_is_said_why_and_changes_nothing(how, words):
     bench = Bench().frames(80).ask(**{"name": "band", **how}).frames(3)
@@ -137,7 +137,7 @@ def test_a_new_session_of_the_robot_ends_what_was_asked_for_and_says_so():
     bench.service._mission_channel._reporter._reported_s = -1e9
     bench.frames(1, session="0000beef")
     report = decode(MissionReport, bench.reports[-1].payload)
-    assert (report.mission, report.asked.id) == ("follow", 3) and "started anew" in report.refused
+    assert (report.mission, report.asked.id) == ("follow", 3) and "a new session" in report.refused
 
 
 def test_only_who_drives_takes_missions():

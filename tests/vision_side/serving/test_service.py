@@ -128,8 +128,8 @@ def test_lines_are_said_per_change_and_never_per_frame(bench: Bench) -> None:
         bench.frame(b"junk", seq)
     assert [line.split(": ", 1)[1].split(" at ")[0] for line in bench.said] == [
         "camera is 320x240, fx 190.7 px, calibrated", "frames from robot r1, session 0000abcd", "target seen",
-        "target lost", "target not in sight, searching",
-        *(f"pictures skipped so far: {count}; this one: image: not a JPEG, no SOI marker at its start"
+        "target lost", "no target, searching",
+        *(f"pictures skipped so far: {count}; this one: image: not a JPEG, no SOI marker"
           for count in (1, 10, 100)),
     ]
 
@@ -195,7 +195,7 @@ def test_frames_of_a_session_that_is_over_are_left_out_and_said_once(bench):
         bench.frame(BALL, seq)
     assert bench.service.answered == answered == 4
     assert bench.service.skipped["OTHER_SESSION"] == 4
-    refused = "frames of session 0000abcd are refused: robot r1 is steered in session 0000beef"
+    refused = "rejecting frames of session 0000abcd: robot r1 is steered in session 0000beef"
     assert sum(refused in line for line in bench.said) == 1
     bench.frame(BALL, 2, session="0000beef")
     assert bench.service.answered == 5
@@ -216,4 +216,4 @@ def test_of_two_robots_with_one_id_the_second_is_refused_and_that_is_said(bench,
     assert answers["0000abcd"] > 75 and answers["0000beef"] < 12
     refused = [line for line in bench.said if "are refused" in line]
     assert len(refused) == 2, refused  # first the old one, for a moment, then the second robot
-    assert "frames of session 0000beef are refused: robot r1 is steered in session 0000abcd" in refused[-1]
+    assert "rejecting frames of session 0000beef: robot r1 is steered in session 0000abcd" in refused[-1]

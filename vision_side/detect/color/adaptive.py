@@ -41,7 +41,7 @@ class ColorModel:
         self._table_middle = self._middle
 
     def distance(self, bgr: NDArray[np.uint8]) -> float:
-        """How far the middle colour of the pixels `bgr` (N, 3) is from this one, in sigmas."""
+        """Return the distance between the mean color of the pixels `bgr` (N, 3) and this one, in sigmas."""
         middle, _ = _cloud(_shares(bgr)[0])
         return math.sqrt(float(self._square(middle[None])[0]))
 
@@ -71,7 +71,7 @@ class ColorModel:
 
 
 def _shares(bgr: NDArray[Any]) -> tuple[Shares, NDArray[np.bool_]]:
-    """Red's and green's share of each pixel, and whether it is bright enough to tell."""
+    """Return the red and green share of each pixel, and True for pixels that are bright enough."""
     colours = bgr.astype(np.float32)
     whole = colours[..., 0] + colours[..., 1] + colours[..., 2]
     shares: Shares = colours[..., 2:0:-1] / np.maximum(whole, 1.0)[..., None]
@@ -120,7 +120,7 @@ class PixelTrack:
 
     @property
     def gate_px(self) -> float:
-        """How far off it may be found."""
+        """Return the largest distance at which the target may reappear, in px."""
         most = _GATE_RADII * self.radius_px + _GATE_WIDTHS * self._width_px
         return min(most, _SIGMAS * math.sqrt(self._variance[0]) + 0.5 * self.radius_px)
 
@@ -129,7 +129,7 @@ class PixelTrack:
         return math.hypot(circle.cx_px - self.cx_px, circle.cy_px - self.cy_px)
 
     def admits(self, circle: Circle) -> bool:
-        """Whether that may be it, by place and size."""
+        """Return True if place and size of a circle fit the target."""
         size = circle.radius_px / self.radius_px
         return self.away_px(circle) <= self.gate_px and _LEAST_SIZE <= size <= _MOST_SIZE
 
@@ -175,9 +175,9 @@ class AdaptiveConfig(Settings):
     lost_after_s: Annotated[float, Field(gt=0, le=5)] = 0.5
     """Not seen for this long, it is lost, and is looked for everywhere again."""
     remembered_s: Annotated[float, Field(ge=0, le=60)] = 5.0
-    """What was lost is only taken up again if it has the learned colour, for this long."""
+    """Time in which a lost target is accepted again only with the learned color."""
     color_sigmas: Annotated[float, Field(gt=1, le=8)] = 4.0
-    """A pixel further than this from the learned colour is none of the thing's."""
+    """Largest distance of a target pixel from the learned color."""
     adapt_s: Annotated[float, Field(gt=0.05, le=60)] = 0.3
     """How slowly the colour goes along with the light. A lamp that turns from warm to cold in 3 s is not lost yet."""
 

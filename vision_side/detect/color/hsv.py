@@ -40,7 +40,7 @@ class ColorMask:
         self._table = color_table(ranges)
 
     def region(self, bgr: NDArray[np.uint8]) -> Region | None:
-        """Where the colour is, speckle removed; None if nowhere."""
+        """Return the region with the color, without speckle, or None."""
         coarse = codes_565(bgr[COARSE // 2 :: COARSE])[:, COARSE // 2 :: COARSE].copy()
         x, y, width, height = cv2.boundingRect(cv2.LUT(coarse, self._table))
         if not width:
@@ -85,9 +85,11 @@ def _read_only(values: NDArray[Any]) -> NDArray[Any]:
     return values
 
 
-# Where exactly the edge of a coloured blob is: half-way between its own colour and what is around it. Pure.  A colour
-# range says which blob it is; its bounds lie anywhere between the two colours, which would make the same ball look 7 %
-# smaller in cold light and larger in warm. Brightness is left out, so neither shade nor a dark floor moves it.
+# The exact edge of a colored blob: half-way between its color and that of its surroundings. Pure.
+#
+# A color range selects the blob. Its bounds lie anywhere between the two colors, so that a mask alone makes the same
+# ball 7 % smaller in cold light and larger in warm light. Brightness is ignored, so that neither shade nor a dark floor
+# moves the edge.
 
 
 _MARGIN_PX = 4
@@ -100,7 +102,7 @@ Box = Sequence[int]
 def sharp_outline(bgr: NDArray[np.uint8], mask: NDArray[Any], box: Box) -> NDArray[Any] | None:
     """The outermost pixels (N, 1, 2) of the blob of `mask` in `box` (x, y, width, height).
 
-    None when the blob's colour differs too little from its surroundings to tell.
+    None if the blob's color differs too little from its surroundings.
     """
     x1, y1 = max(0, box[0] - _MARGIN_PX), max(0, box[1] - _MARGIN_PX)
     rows, columns = slice(y1, box[1] + box[3] + _MARGIN_PX), slice(x1, box[0] + box[2] + _MARGIN_PX)
@@ -113,7 +115,7 @@ def sharp_outline(bgr: NDArray[np.uint8], mask: NDArray[Any], box: Box) -> NDArr
 
 def _blob(bgr: NDArray[np.uint8], inside: NDArray[Any]) -> NDArray[Any] | None:
     """Not zero where a pixel is more like the colour inside the mask than like the one outside, brightness left out."""
-    inside = inside[::2]  # every second row tells a mean as well as every row
+    inside = inside[::2]  # every second row gives the same mean
     return blob_between(bgr, bgr[::2], inside, cv2.bitwise_not(cv2.dilate(inside, _AROUND)))
 
 
@@ -176,7 +178,7 @@ def fit_round_part(outline: NDArray[Any], min_radius_px: float, max_roughness: f
         circle, rough_px = _fit(terms)
     if terms.shape[1] < MIN_POINTS or circle[2] < min_radius_px:
         return None
-    # Half a pixel of stair-steps is no roughness: without this allowance, distant discs would be refused.
+    # The stair-steps of pixels are up to half a pixel. Without this allowance, distant discs would be rejected.
     return (circle, terms[:2].T) if rough_px <= max_roughness * circle[2] + 0.5 else None
 
 
@@ -218,7 +220,7 @@ def _off(terms: Terms, circle: Fit) -> Outline:
     return away
 
 
-# Detector of things of one colour, round ones unless told otherwise: mask, outlines, sharp edge, circle fit. Pure.
+# Detector of objects of one color, by default round ones: mask, outlines, sharp edge, circle fit. Pure.
 
 
 Pixels = NDArray[Any]
@@ -236,12 +238,12 @@ class HsvDetector:
         self._mask = ColorMask(config.ranges)
 
     def detect(self, picture: DecodedImage) -> tuple[Detection, ...]:
-        """What has the colour, and the shape if one is asked for, largest first."""
+        """Return the objects with the color and the configured shape, largest first."""
         region = self._mask.region(picture.bgr)
         return () if region is None else self.measure(picture, region)
 
     def measure(self, picture: DecodedImage, region: Region) -> tuple[Detection, ...]:
-        """What is in `region` of `picture`, whoever marked it, and has the shape; largest first."""
+        """Return the objects in `region` of `picture` with the configured shape, largest first."""
         outlines, _ = cv2.findContours(region.mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         longest = sorted(outlines, key=len, reverse=True)[: self._config.max_contours]
         look = self._disc if self._config.shape == "disc" else self._thing
@@ -303,5 +305,5 @@ def own_edge(pixels: Pixels, box: Box, origin_px: tuple[int, int], shape: tuple[
 
 
 def _radius(detection: Detection) -> float:
-    """Of its circle; of what has none, half its height."""
+    """Return the radius of its circle, or half its height without one, in px."""
     return detection.circle.radius_px if detection.circle else (detection.y2_px - detection.y1_px) / 2

@@ -91,7 +91,7 @@ def _ellipse(part: NDArray[np.uint8], box: NDArray[np.float64], share: float) ->
 
 
 def _fits(circle: Circle, one: Detection) -> bool:
-    """Whether the circle is of what the model drew its box around."""
+    """Return True if the circle belongs to the object in the model's box."""
     radius = max(one.x2_px - one.x1_px, one.y2_px - one.y1_px) / 2
     limit = _OFF * radius
     return (abs(circle.cx_px - (one.x1_px + one.x2_px) / 2) <= limit

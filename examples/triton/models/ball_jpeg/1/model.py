@@ -1,6 +1,6 @@
 """A model for Triton's Python backend: finds the yellow things in a JPEG. Shell (Triton calls it).
 
-Put your own network into `look`. Rows that are not used have the score 0, which is no box to any client.
+Put your own network into `look`. Unused rows have the score 0, which is not a box for any client.
 """
 
 from typing import Any
@@ -24,7 +24,7 @@ def look(bgr: Any) -> list[tuple[int, int, int, int]]:
 
 
 class TritonPythonModel:
-    """What Triton asks for."""
+    """The class that Triton loads."""
 
     def execute(self, requests: list[Any]) -> list[Any]:
         """One response for each request; a request holds a batch of one or more pictures."""

@@ -13,7 +13,7 @@ BALL = 0
 
 
 class TritonPythonModel:
-    """What Triton asks for."""
+    """The class that Triton loads."""
 
     def execute(self, requests: list[Any]) -> list[Any]:
         """One response for each request; a request holds a batch of one or more pictures."""
