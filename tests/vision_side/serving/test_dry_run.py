@@ -109,7 +109,7 @@ def test_a_local_camera_is_opened_by_kind_and_options_and_closed(tmp_path):
 
 @pytest.mark.parametrize("text", ["path", "=3", " =3"])
 def test_an_option_that_is_none_is_said(text):
-    with pytest.raises(ConfigError, match="write key=value"), local_camera("still", [text]):
+    with pytest.raises(ConfigError, match="expected KEY=VALUE"), local_camera("still", [text]):
         pass
 
 

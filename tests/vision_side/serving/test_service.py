@@ -214,6 +214,6 @@ def test_of_two_robots_with_one_id_the_second_is_refused_and_that_is_said(bench,
             bench.frame(BALL, seq, session=session)
             answers[session] += bench.service.answered - before
     assert answers["0000abcd"] > 75 and answers["0000beef"] < 12
-    refused = [line for line in bench.said if "are refused" in line]
+    refused = [line for line in bench.said if "rejecting frames" in line]
     assert len(refused) == 2, refused  # first the old one, for a moment, then the second robot
     assert "rejecting frames of session 0000beef: robot r1 is steered in session 0000abcd" in refused[-1]
