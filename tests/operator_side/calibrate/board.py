@@ -1,6 +1,7 @@
 """Draws a chessboard as a known camera sees it, lens distortion included, to compare a calibration with the truth."""
 
 import math
+from functools import cache
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ TRUTH = CameraModel(width_px=480, height_px=360, fx_px=402.0, fy_px=405.0, cx_px
 _FINE = 3  # samples per pixel, each way
 
 
+@cache
 def rays(model: CameraModel) -> np.ndarray:
     """(x, y) at depth 1 of every sample, rows by columns."""
     rows, columns = np.mgrid[0 : model.height_px * _FINE, 0 : model.width_px * _FINE]
@@ -25,15 +27,18 @@ def rays(model: CameraModel) -> np.ndarray:
 
 def draw_board(seen: np.ndarray, rotation: np.ndarray, centre_m: np.ndarray, board: Board = BOARD) -> bytes:
     """JPEG of the board, its middle at `centre_m`, turned by `rotation`; `seen` are the camera's `rays`."""
-    directions = np.concatenate([seen, np.ones((*seen.shape[:2], 1))], -1)
-    normal = rotation[:, 2]
-    depth = (normal @ centre_m) / (directions @ normal)
-    on_board = ((directions * depth[..., None] - centre_m) @ rotation)[..., :2] / board.square_m
-    column, row = np.moveaxis(on_board + np.array([(board.columns - 1) / 2, (board.rows - 1) / 2]), -1, 0)
+    x, y = (np.ascontiguousarray(seen[..., axis], np.float32) for axis in (0, 1))
+    across, down, away = (x * a + y * b + c for a, b, c in rotation.T.astype(np.float32).tolist())
+    at_m = (centre_m @ rotation).tolist()
+    depth = at_m[2] / away
+    column, row = ((each * depth - at) / board.square_m + (count - 1) / 2
+                   for each, at, count in ((across, at_m[0], board.columns), (down, at_m[1], board.rows)))
     inside = (column > -1) & (column < board.columns) & (row > -1) & (row < board.rows)
-    black = inside & ((np.floor(column) + np.floor(row)) % 2 == 0)
-    grey = np.where(black, 25.0, np.where(inside | _margin(column, row, board), 230.0, 110.0))
-    small = cv2.resize(grey.astype(np.uint8), None, fx=1 / _FINE, fy=1 / _FINE, interpolation=cv2.INTER_AREA)
+    black = inside & ((np.floor(column) + np.floor(row)).astype(np.int16) % 2 == 0)
+    grey = np.full(black.shape, 110, np.uint8)
+    grey[inside | _margin(column, row, board)] = 230
+    grey[black] = 25
+    small = cv2.resize(grey, None, fx=1 / _FINE, fy=1 / _FINE, interpolation=cv2.INTER_AREA)
     return jpeg_of(np.repeat(small[..., None], 3, axis=2), 92)
 
 
