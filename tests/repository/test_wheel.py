@@ -30,6 +30,7 @@ def wheel(tmp_path_factory) -> Path:
     return found
 
 
+@pytest.mark.slow
 def test_the_wheel_has_one_package_at_its_top_with_its_data(wheel):
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     folders = [folder.name for folder in (ROOT / ".import/sightline").iterdir() if folder.is_dir()]

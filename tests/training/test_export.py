@@ -169,6 +169,7 @@ def test_scenes_are_drawn_once(tmp_path):
     assert all(picture.std() > 1 for picture in first.pictures) and any(first.truths)
 
 
+@pytest.mark.slow
 def test_scenes_are_drawn_again_when_they_would_be_others_now_or_were_cut(tmp_path, monkeypatch):
     first = drawn_scenes(tmp_path, 3, 1, lambda _: None)
     (tmp_path / "scenes.json").unlink()  # as a run leaves it that is cut while it draws

@@ -4,6 +4,8 @@ import hashlib
 from contextlib import contextmanager
 from functools import partial
 
+import pytest
+
 from tests.fixtures import demanded
 
 demanded.module("pybullet", "sim")
@@ -26,6 +28,7 @@ def told(counts, total, what):
     yield counts[what].append
 
 
+@pytest.mark.slow
 def test_weights_become_a_file_with_thresholds_and_a_card_that_is_true_of_it(tmp_path):
     counts = {}
     thresholds = chosen_thresholds(tmp_path / "unchosen.onnx", weights(), 5, 2, partial(told, counts))

@@ -60,8 +60,9 @@ def test_one_bad_run_of_three_fails_its_figure_and_no_other(at, bad):
     assert "FAIL" in score_text(ScoreReport(runs, judged))
 
 
-def test_runs_on_several_processes_are_those_of_one():
-    wanted = cases(["static", "behind"], [301], [50], [0.1], 1.5)
+@pytest.mark.parametrize("names", [["static"], pytest.param(["static", "behind"], marks=pytest.mark.slow)])
+def test_runs_on_other_processes_are_those_of_this_one(names):
+    wanted = cases(names, [301], [50], [0.1], 1.5)
     done = []
     report = run_cases(wanted, 2, done.append)
     assert sorted(done, key=str) == sorted(wanted, key=str)
@@ -78,7 +79,7 @@ def test_another_detector_looks_in_place_of_the_scenarios_own():
 
 
 def test_a_detector_that_nobody_answers_for_is_said_with_its_reason(capsys):
-    options = ["--scenario", "static", "--seeds", "1,2", "--seconds", "1", "--detector", "oip+http://127.0.0.1:9/ball"]
+    options = ["--scenario", "static", "--seeds", "1,2", "--jobs", "1", "--seconds", "1", "--detector", "oip+http://127.0.0.1:9/ball"]
     assert cli.run(["score", *options]) == 5
     told = capsys.readouterr().out
     said = [line for line in told.splitlines() if line.startswith("  detector")]

@@ -1,5 +1,6 @@
 """The gate against a model that knows only the promises: arrivals, ticks and requests in any order and at any time."""
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
@@ -254,7 +255,10 @@ class Gate(RuleBasedStateMachine):
 STATES, TAKEN = set(), set()
 
 
-def test_the_gate_keeps_its_promises_and_every_state_and_transition_was_visited(monkeypatch):
+@pytest.mark.parametrize("examples", [100, pytest.param(250, marks=pytest.mark.slow)])
+def test_the_gate_keeps_its_promises_and_every_state_and_transition_was_visited(examples, monkeypatch):
+    STATES.clear()
+    TAKEN.clear()
     real = safety.next_state
 
     def recorded(state, event):
@@ -264,7 +268,7 @@ def test_the_gate_keeps_its_promises_and_every_state_and_transition_was_visited(
     monkeypatch.setattr(safety, "next_state", recorded)
     run_state_machine_as_test(
         Gate,
-        settings=settings(max_examples=250, stateful_step_count=40, deadline=None, derandomize=True, database=None),
+        settings=settings(max_examples=examples, stateful_step_count=40, deadline=None, derandomize=True, database=None),
     )
     assert set(State) == STATES
     assert set(TRANSITIONS) <= TAKEN, sorted(map(str, set(TRANSITIONS) - TAKEN))

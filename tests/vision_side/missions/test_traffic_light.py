@@ -167,7 +167,9 @@ def drive(begin_s: float, is_box: bool = False, seed: int = 1, look: str = "plai
 
 
 @pytest.mark.parametrize("is_box", [False, True], ids=["lamps", "box"])
-@pytest.mark.parametrize("begin_s", [0.0, 2.5, 3.6, 4.0, 7.0, 9.0])
+@pytest.mark.parametrize("begin_s", [
+    0.0, 3.6, 4.0, 9.0, pytest.param(2.5, marks=pytest.mark.slow), pytest.param(7.0, marks=pytest.mark.slow),
+])
 def test_the_line_is_never_crossed_on_red_and_the_lane_is_driven_to_its_end(begin_s: float, is_box: bool) -> None:
     run = drive(begin_s, is_box, seed=int(10 * begin_s) + 1)
     state = state_at(begin_s)
