@@ -207,10 +207,12 @@ def test_every_caption_fits_the_image():
 
 def test_chase_camera_shows_robot_and_ball(scene):
     with ChaseCamera(*scene, 160, 120) as camera:
-        ahead = camera.draw(truth(0)).astype(int)
-        left = camera.draw(truth(20_000, target_y_m=0.3)).astype(int)
+        ahead = camera.draw(truth(0, x_m=-1.5, target_x_m=-0.9)).astype(int)
+        left = camera.draw(truth(20_000, x_m=-1.5, target_x_m=-0.9, target_y_m=0.3)).astype(int)
     blue = (ahead[..., 2] > ahead[..., 0] + 60).nonzero()
     assert blue[1].mean() == pytest.approx(80, abs=4), "the robot is in the middle"
+    wheels = (ahead.max(axis=2) < 60).nonzero()[1]
+    assert (wheels < blue[1].min()).any() and (wheels > blue[1].max()).any(), "a wheel on either side"
     columns = [((one[..., 0] > one[..., 2] + 80).nonzero()[1]).mean() for one in (ahead, left)]
     assert columns[0] == pytest.approx(80, abs=4)
     assert columns[1] < columns[0] - 10, "a ball to the left is drawn on the left"
@@ -330,6 +332,7 @@ def test_invalid_command_changes_nothing():
 def test_relay_passes_bytes_and_the_end():
     outer, inner = socket.socketpair()
     far, near = socket.socketpair()
+    far.settimeout(5.0)
     passing = threading.Thread(target=pump, args=(inner, near), name="pump", daemon=True)
     passing.start()
     outer.sendall(b"frame")
