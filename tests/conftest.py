@@ -47,3 +47,11 @@ def no_log_of_an_earlier_command():
     logging.getLogger("sightline").setLevel(logging.NOTSET)
     logging.captureWarnings(False)
     threading.excepthook = hook
+
+
+@pytest.fixture
+def no_gpu(monkeypatch):
+    """Hide the GPU: messages about a missing device are the same on a machine that has one."""
+    from tests.fixtures.vision.onnx import without_gpu
+
+    without_gpu(monkeypatch)

@@ -15,6 +15,7 @@ from sightline.evaluation.processes import Processes
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector
+from tests.fixtures.commands import sightline
 from tests.fixtures.links import START_S, until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.onnx import brightness_model
@@ -46,16 +47,6 @@ class VisionProcess:
 
     def output(self) -> str:
         return Path(self._log.name).read_text()
-
-
-def sightline(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
 
 
 def turning(robot: RobotProcess) -> float:

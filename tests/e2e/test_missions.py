@@ -3,8 +3,6 @@
 import array
 import json
 import math
-import subprocess
-import sys
 import threading
 import time
 
@@ -16,6 +14,7 @@ from sightline.protocol.transports.open import open_link
 from sightline.robot_side.ports import Ranges
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.process import serve
+from tests.fixtures.commands import sightline
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
@@ -50,17 +49,6 @@ def grey_camera(folder):
     path.mkdir()
     (path / "0.jpg").write_bytes(jpeg_of(np.full((48, 64, 3), 140, np.uint8)))
     return {"kind": "folder", "options": {"path": str(path)}}
-
-
-def sightline(*arguments):
-    """One command as a person gives it."""
-    return subprocess.run(
-        [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
 
 
 @pytest.mark.slow

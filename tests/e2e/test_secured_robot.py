@@ -2,8 +2,6 @@
 
 import re
 import secrets
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -15,6 +13,7 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
 from sightline.protocol.transports.zenoh.link import open_zenoh
+from tests.fixtures.commands import sightline
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
@@ -29,22 +28,17 @@ def robot(tmp_path):
         yield running
 
 
-def _sightline(*arguments):
-    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
-
-
 def test_vision_drives_an_operator_stops_it_and_a_viewer_sees_that(robot, tmp_path):
     folder = robot.config["secure"]
     with Vision(robot.endpoint, secure=folder):
         assert driving(robot)
-        stopped = _sightline("stop", "r1", "--connect", robot.endpoint, "--secure", folder)
+        stopped = sightline("stop", "r1", "--connect", robot.endpoint, "--secure", folder)
         assert stopped.returncode == 0 and "STOPPED" in stopped.stdout, stopped
         assert until(lambda: robot.speed() == 0.0)
     (tmp_path / "viewer").mkdir()
     for name in ("ca.pem", "viewer.pem", "viewer.key"):
         (tmp_path / "viewer" / name).write_bytes(Path(folder, name).read_bytes())
-    looked = _sightline("status", "r1", "--connect", robot.endpoint, "--secure", str(tmp_path / "viewer"))
+    looked = sightline("status", "r1", "--connect", robot.endpoint, "--secure", str(tmp_path / "viewer"))
     assert "STOPPED" in looked.stdout, "to look, a viewer's keys are enough"
 
 
@@ -71,7 +65,7 @@ def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, ro
 def test_without_keys_nobody_even_watches(robot):
     with pytest.raises(LinkError, match="accepts only TLS"):
         open_zenoh("r1", connect=[robot.endpoint.replace("tls/", "tcp/")], role="vision", timeout_s=1.0)
-    asked = _sightline("status", "r1", "--connect", robot.endpoint)
+    asked = sightline("status", "r1", "--connect", robot.endpoint)
     assert asked.returncode == 4
     assert asked.stderr == f"error: cannot connect to {robot.endpoint}: a tls/ endpoint needs keys; pass --secure DIR\n"
 
@@ -103,7 +97,7 @@ def test_rejected_peer_receives_the_reason_and_its_robot_goes_on(robot, name, tm
     endpoint = robot.endpoint if secure else robot.endpoint.replace("tls/", "tcp/")
     with pytest.raises(LinkError, match=re.escape(words)):
         open_zenoh("r1", connect=[endpoint], role="vision", secure=secure, timeout_s=0.3)
-    assert _sightline("status", "r1", "--connect", robot.endpoint, "--secure", robot.config["secure"]).returncode == 0
+    assert sightline("status", "r1", "--connect", robot.endpoint, "--secure", robot.config["secure"]).returncode == 0
 
 
 def test_robot_with_a_certificate_for_another_name_is_rejected(tmp_path, monkeypatch):

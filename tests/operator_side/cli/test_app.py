@@ -17,6 +17,7 @@ from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError, HardwareError, LinkError, SightlineError
+from tests.fixtures.commands import run
 
 
 def commands(group=None, path=()):
@@ -30,12 +31,6 @@ def commands(group=None, path=()):
 
 COMMANDS = dict(commands())
 COMMANDS_AND_GROUPS = typer.main.get_command(cli.app).commands
-
-
-def run(capsys, *arguments):
-    code = cli.run(arguments)
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
 
 
 def test_the_commands_of_this_version_exist():

@@ -7,15 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import detector as cli_detector
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.onnx import detector as onnx_detector
 from sightline.vision_side.serving import detector_service
-from tests.fixtures.vision.onnx import brightness_model, without_gpu
+from tests.fixtures.commands import run
+from tests.fixtures.vision.onnx import brightness_model
 
 BROKEN = '''
 from sightline.vision_side.detect.color.detectors import Hsv
+
+pytestmark = pytest.mark.usefixtures("no_gpu")
 
 
 class Late(Hsv):
@@ -35,18 +37,6 @@ class Leaves(Hsv):
 
     def __init__(self, config: object) -> None:
         sys.exit(7)
-
-
-@pytest.fixture(autouse=True)
-def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is said of a missing device is the same on a machine that has one."""
-    without_gpu(monkeypatch)
-
-
-def run(capsys, *arguments: str) -> tuple[int, str, str]:
-    code = cli.run(arguments)
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
 
 
 def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from sightline.operator_side.cli import app as cli
 from sightline.operator_side.config.context import (
     Context,
     clear_context,
@@ -22,6 +21,7 @@ from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import Stamp, State, Status
 from sightline.protocol.transports.open import open_link
+from tests.fixtures.commands import run
 from tests.fixtures.links import free_endpoint
 
 ADDRESS = "tcp/192.168.1.20:7447"
@@ -32,12 +32,6 @@ def home(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     monkeypatch.delenv("SIGHTLINE_CONNECT", raising=False)
     return tmp_path
-
-
-def run(capsys, *arguments):
-    code = cli.run(arguments)
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
 
 
 def target(robot=None, connect=None, secure="", **variables):

@@ -5,6 +5,7 @@ import signal
 import statistics
 import threading
 import time
+from contextlib import ExitStack, closing
 
 import pytest
 
@@ -73,17 +74,13 @@ class Recorder:
 class Seat:
     """A robot, an operator's terminal, and a recorder."""
 
-    def __init__(self, folder):
-        self.robot = RobotProcess(folder, safety={"auto_arm": False}).__enter__()
+    def __init__(self, folder, ending):
+        """`ending` closes what is open, also where a later part does not open."""
+        self.robot = ending.enter_context(RobotProcess(folder, safety={"auto_arm": False}))
         self.robot.wait_until_on("on tcp/")
-        self.recorder = Recorder(self.robot.endpoint)
-        self.terminal = Terminal("teleop", "r1", "--connect", self.robot.endpoint)
+        self.recorder = ending.enter_context(closing(Recorder(self.robot.endpoint)))
+        self.terminal = ending.enter_context(closing(Terminal("teleop", "r1", "--connect", self.robot.endpoint)))
         self.fingers = Fingers(self.terminal)
-
-    def close(self):
-        self.terminal.close()
-        self.recorder.close()
-        self.robot.__exit__()
 
     def sit(self):
         """Drive a little, so that the robot is armed and the terminal's repeats are learned."""
@@ -104,9 +101,8 @@ class Seat:
 
 @pytest.fixture
 def seat(tmp_path):
-    opened = Seat(tmp_path)
-    yield opened
-    opened.close()
+    with ExitStack() as ending:
+        yield Seat(tmp_path, ending)
 
 
 @pytest.mark.alone

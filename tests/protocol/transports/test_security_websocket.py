@@ -35,13 +35,6 @@ from tests.fixtures.websocket import V1
 TOKENS = {"vision": "vision-0123456789abcdef", "operator": "operator_0123456789abc", "viewer": "viewerviewerviewer"}
 
 
-@pytest.fixture
-def keys(tmp_path):
-    for role, token in TOKENS.items():
-        (tmp_path / f"{role}.token").write_text(token + "\n")
-    return str(tmp_path)
-
-
 def everywhere(scheme: str = "ws") -> tuple[str, str]:
     """An endpoint on all addresses of this machine, and how it is reached from here."""
     here = free_endpoint(f"{scheme}://")

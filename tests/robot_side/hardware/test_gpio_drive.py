@@ -27,22 +27,6 @@ ROOT = Path(__file__).parent.parent.parent.parent
 ROWS = ((0.4, 0.08), (0.6, 0.12), (1.0, 0.19))
 
 
-@pytest.fixture
-def board(monkeypatch):
-    """A factory of mock pins in gpiozero's own place; `events` is what happened to them, in order."""
-    factory = MockFactory(pin_class=NotingPin)
-    factory.events = []
-    monkeypatch.setattr(Device, "pin_factory", factory)
-    return factory
-
-
-@pytest.fixture
-def drive(board):
-    opened = GpioDrive(config())
-    yield opened
-    opened.close()
-
-
 def duties(board):
     """Of all pins that were ever touched, but for those that are low."""
     return {number: value for number, value in dict(board.events).items() if value}

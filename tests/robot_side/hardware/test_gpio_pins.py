@@ -25,22 +25,6 @@ from tests.fixtures.gpio import NotingPin, config
 ROOT = Path(__file__).parent.parent.parent.parent
 
 
-@pytest.fixture
-def board(monkeypatch):
-    """A factory of mock pins in gpiozero's own place; `events` is what happened to them, in order."""
-    factory = MockFactory(pin_class=NotingPin)
-    factory.events = []
-    monkeypatch.setattr(Device, "pin_factory", factory)
-    return factory
-
-
-@pytest.fixture
-def drive(board):
-    opened = GpioDrive(config())
-    yield opened
-    opened.close()
-
-
 @pytest.mark.parametrize("module", ["gpiozero", "lgpio"])
 def test_a_missing_package_names_its_extra(monkeypatch, module):
     monkeypatch.setattr(Device, "pin_factory", None)

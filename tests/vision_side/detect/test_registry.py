@@ -26,13 +26,9 @@ from sightline.vision_side.detect.registry import (
 )
 from sightline.vision_side.detect.shadow import ShadowDetector
 from tests.fixtures.plugins import with_entries
-from tests.fixtures.vision.onnx import brightness_model, without_gpu
+from tests.fixtures.vision.onnx import brightness_model
 
-
-@pytest.fixture(autouse=True)
-def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is said of a missing device is the same on a machine that has one."""
-    without_gpu(monkeypatch)
+pytestmark = pytest.mark.usefixtures("no_gpu")
 
 
 class Mine:

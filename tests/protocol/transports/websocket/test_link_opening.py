@@ -20,15 +20,6 @@ from sightline.protocol.transports.websocket.framing import OTHER_ROBOT
 from sightline.protocol.transports.websocket.link import open_websocket
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint, free_port
-from tests.fixtures.websocket import Robot
-
-
-@pytest.fixture
-def robot():
-    robot = Robot()
-    yield robot
-    robot.close()
-
 
 NO_ENDPOINTS = (
     "", "foo", "ws", "ws://", "ws://127.0.0.1", "ws://:9090", "ws://127.0.0.1:0", "ws://127.0.0.1:65536", "wss://h:0",

@@ -16,14 +16,7 @@ from sightline.protocol.transports.link import OVERSIZE, Message
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING, BAD_HELLO, OTHER_ROBOT
 from sightline.protocol.transports.websocket.link import open_websocket
 from tests.fixtures.links import claim, hail, until
-from tests.fixtures.websocket import HELLO, TWIST_KEY, V1, Robot, bare_client, closed_with, received
-
-
-@pytest.fixture
-def robot():
-    robot = Robot()
-    yield robot
-    robot.close()
+from tests.fixtures.websocket import HELLO, TWIST_KEY, V1, bare_client, closed_with, received
 
 
 def test_who_says_no_hello_is_sent_away_and_told_why(robot):
@@ -78,7 +71,6 @@ def test_a_later_hello_changes_what_a_peer_wants(robot):
     viewer.close()
 
 
-
 BAD_MESSAGES = (
     ("0.1|0", 1008, "invalid hello", BAD_HELLO),
     (json.dumps(HELLO | {"robot": "r2"}), 1008, "this is robot r1, not r2", OTHER_ROBOT),
@@ -129,8 +121,6 @@ def test_a_frame_over_a_smaller_bound_is_counted_and_the_peer_stays(robot):
         assert until(lambda: peer.rejected == {OVERSIZE: 1})
         robot.link.publish(FRAME, b"", bytes(999))
         assert len(frames.take(2).payload) == 999
-
-
 
 
 def test_a_frame_costs_at_most_320_bytes_more_than_its_picture(robot):

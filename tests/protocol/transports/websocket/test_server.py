@@ -20,13 +20,6 @@ from tests.fixtures.links import hail, until
 from tests.fixtures.websocket import V1, Robot, upgrade
 
 
-@pytest.fixture
-def robot():
-    robot = Robot()
-    yield robot
-    robot.close()
-
-
 @pytest.mark.parametrize("offer", [None, ["sightline.v2"], ["chat", "graphql-ws"]])
 def test_without_the_sub_protocol_nobody_comes_in(robot, offer):
     with pytest.raises(InvalidStatus) as refusal:

@@ -27,24 +27,10 @@ from sightline.protocol.transports.websocket.server import (
 )
 from tests.fixtures.links import hail, until
 from tests.fixtures.ports import free_endpoint, port_of
-from tests.fixtures.websocket import HELLO, V1, Robot, closed_with
+from tests.fixtures.websocket import HELLO, V1, closed_with
 
 WATCHERS = MAX_CLIENTS - RESERVED_SLOTS
 TOKENS = {"operator": "operator_0123456789abc", "viewer": "viewerviewerviewer"}
-
-
-@pytest.fixture
-def robot():
-    robot = Robot()
-    yield robot
-    robot.close()
-
-
-@pytest.fixture
-def keys(tmp_path):
-    for role, token in TOKENS.items():
-        (tmp_path / f"{role}.token").write_text(token + "\n")
-    return str(tmp_path)
 
 
 def settled(places: ConnectionLimits, acts: bool) -> str:

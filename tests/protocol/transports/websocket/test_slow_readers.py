@@ -13,16 +13,9 @@ from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.peer import SILENT
 from tests.fixtures.links import claim, until
 from tests.fixtures.ports import free_endpoint
-from tests.fixtures.websocket import Robot, bare_client, never_reads, pause_until, resident_kib
+from tests.fixtures.websocket import bare_client, never_reads, pause_until, resident_kib
 
 FPS = 30
-
-
-@pytest.fixture
-def robot():
-    robot = Robot()
-    yield robot
-    robot.close()
 
 
 @pytest.mark.own_process

@@ -19,17 +19,13 @@ from sightline.vision_side.detect.onnx.self_test import difference, golden_pictu
 from sightline.vision_side.detect.onnx.tensors import Letterbox, ModelFormat, fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection
 from tests.contracts.detectors import assert_kept
-from tests.fixtures.vision.onnx import brightness_model, model, node, part, tensor, value, without_gpu, yolo_model
+from tests.fixtures.vision.onnx import brightness_model, model, node, part, tensor, value, yolo_model
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
+
+pytestmark = pytest.mark.usefixtures("no_gpu")
 
 BOXES = [[10.0, 20.0, 60.0, 90.0], [200.0, 40.0, 400.0, 300.0]]
 PICTURE = DecodedImage(np.full((240, 320, 3), 128, np.uint8), 1)
-
-
-@pytest.fixture(autouse=True)
-def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is said of a missing device is the same on a machine that has one."""
-    without_gpu(monkeypatch)
 
 
 def frame(bgr: np.ndarray, seq: int = 1) -> DetectFrame:
