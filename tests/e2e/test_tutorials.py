@@ -1,0 +1,122 @@
+"""The commands of the tutorials and of the README, executed as the pages show them.
+
+`<!-- run: NAME -->` before a block of shell commands makes this module run the block. `tests/docs/test_pages.py` requires
+that comment, or a reason, before each one. Own ports and folders come from the environment, never from the commands.
+"""
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parent.parent.parent
+BLOCK = re.compile(r"<!-- run: (\w+) -->\n```sh\n(.*?)```", re.DOTALL)
+READY = {"sim": "simulation ready", "robot": "robot r1: on", "vision": "vision: frames from robot r1"}
+
+
+def blocks(page: str) -> dict[str, list[list[str]]]:
+    """Return the commands of each marked block of a page, without `sightline`, comments and empty lines."""
+    found = {}
+    for name, text in BLOCK.findall((ROOT / page).read_text("utf-8")):
+        lines = [shlex.split(line, comments=True) for line in text.splitlines()]
+        assert all(words[0] == "sightline" for words in lines if words), lines
+        found[name] = [words[1:] for words in lines if words]
+    return found
+
+
+class Terminals:
+    """Run commands in the folder of the repository, as a reader does; services stay until the end."""
+
+    def __init__(self, folder: Path, ending: ExitStack) -> None:
+        self._folder, self._ending = folder, ending
+        endpoint = free_endpoint()
+        (folder / "tmp").mkdir()
+        self._env = {
+            **os.environ, "TMPDIR": str(folder / "tmp"), "HOME": str(folder), "XDG_RUNTIME_DIR": str(folder),
+            "XDG_CONFIG_HOME": str(folder / "config"), "PYTHONUNBUFFERED": "1", "SIGHTLINE_CONNECT": endpoint,
+            "SIGHTLINE_ROBOT__STATE_DIR": str(folder / "state"),
+            "SIGHTLINE_ROBOT__LISTEN": f'["{endpoint}"]', "SIGHTLINE_VISION__CONNECT": f'["{endpoint}"]',
+        }  # fmt: skip
+
+    def run(self, commands: list[list[str]]) -> str:
+        """Run each command in turn; return the output of the last one."""
+        output = ""
+        for words in commands:
+            if words[0] in READY:
+                self._ending.enter_context(self._service(words))
+            else:
+                output = self._once(words)
+        return output
+
+    def _command(self, words: list[str]) -> list[str]:
+        return [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *words]
+
+    def _once(self, words: list[str]) -> str:
+        done = subprocess.run(self._command(words), cwd=ROOT, env=self._env, capture_output=True, text=True,
+                              timeout=240, check=False)
+        assert done.returncode == 0, (words, done.stdout, done.stderr)
+        return done.stdout
+
+    @contextmanager
+    def _service(self, words: list[str]):
+        log = self._folder / f"{words[0]}-{time.monotonic_ns()}.log"
+        with log.open("wb") as out:
+            process = subprocess.Popen(self._command(words), cwd=ROOT, env=self._env, stdout=out, stderr=out)
+        try:
+            assert until(lambda: READY[words[0]] in log.read_text(), 40), (words, log.read_text())
+            yield
+        finally:
+            process.send_signal(signal.SIGTERM)
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                raise
+
+
+@pytest.fixture
+def terminals(tmp_path):
+    with ExitStack() as ending:
+        yield Terminals(tmp_path, ending)
+
+
+def test_first_drive_starts_arms_drives_stops_and_drives_again(terminals):
+    page = blocks("docs/tutorials/first-drive.md")
+    assert list(page) == ["services", "arm", "drive", "stop", "again", "harder"]
+    terminals.run(page["services"])
+    assert "armed" in terminals.run(page["arm"])
+    assert until(lambda: "ACTIVE" in terminals.run(page["drive"]), 30)
+    assert "STOPPED" in terminals.run(page["stop"])
+    assert "armed" in terminals.run(page["again"])
+
+
+def test_first_drive_drives_over_a_harder_link(terminals, tmp_path):
+    [words] = blocks("docs/tutorials/first-drive.md")["harder"]
+    assert "acquired_s" in terminals.run([[*words, "--out", str(tmp_path / "run")]])
+
+
+def test_readme_starts_three_services_and_the_operator_commands(terminals):
+    page = blocks("README.md")
+    assert list(page) == ["services", "arm"]
+    terminals.run(page["services"])
+    assert "reset" in terminals.run(page["arm"])
+
+
+def test_own_model_is_checked_scored_and_drives(terminals, tmp_path):
+    page = blocks("docs/tutorials/your-own-model.md")
+    assert list(page) == ["check", "score", "demo"]
+    assert "sightline.onnx" in terminals.run(page["check"])
+    assert "nominal" in terminals.run(page["score"])
+    [words] = page["demo"]
+    assert "acquired_s" in terminals.run([[*words, "--out", str(tmp_path / "run")]])
