@@ -24,7 +24,8 @@ LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 SHELL = ("sh", "bash", "console", "shell")
 BANNED = tuple(re.compile(pattern, re.IGNORECASE) for pattern in (
     r"(?-i:\b(is|are|was|be) none\b)", r"(?<!there )\b(is|are|was) no (?!longer|more|less|older|newer|later)[a-z]",
-    r"\bwho(so)?ever\b|\b(for|of|to|by|than|lets) who\b", r"\b(some|no|any|every)body\b", r"\b(says?|said|tells?|told)\b",
+    r"\bwho(so)?ever\b|\b(for|of|to|by|than|lets) who\b", r"\b(some|no|any|every)body\b",
+    r"\b(says?|said|tells?|told)\b",
     r"\b(hears?|heard)\b", r"\b(asks?|asked|asking)\b", r"\bobey(s|ed)?\b", r"\bjudg(e[sd]?|ing)\b|\bverdicts?\b",
     r"(?<!onnection )\brefus(e[sd]?|als?)\b", r"\beyes?\b|(?<!line of )\bsight\b",
     r"\bmend(s|ed)?\b|\bstrangers?\b|\banew\b", r"\b(kept to|goes by|taken up)\b",
@@ -102,7 +103,8 @@ def test_guide_states_its_result_and_how_to_continue(page):
     text = page.read_text("utf-8")
     lines = text.splitlines()
     assert lines[0].startswith("# ") and lines[2].startswith("You "), lines[:3]
-    assert "## Before you start" in text and "## Next" in text or page.stem == "troubleshooting"
+    assert "## Before you start" in text
+    assert "## Next" in text or page.stem == "troubleshooting"
     assert "## If it fails" in text or page.stem in ("write-a-mission", "troubleshooting")
 
 
@@ -143,7 +145,7 @@ def test_page_for_newcomers_reads_easily(page):
 
 def test_reading_ease_separates_plain_from_heavy_text():
     assert reading_ease("The robot stops. You start it again. It drives to the ball.\n") > 90
-    heavy = "Instantaneous synchronization considerations necessitate comprehensive authorization procedures everywhere.\n"
+    heavy = "Instantaneous synchronization considerations necessitate comprehensive authorization procedures.\n"
     assert reading_ease(heavy) < 0
 
 

@@ -1,7 +1,7 @@
 """The commands of the tutorials and of the README, executed as the pages show them.
 
-`<!-- run: NAME -->` before a block of shell commands makes this module run the block. `tests/docs/test_pages.py` requires
-that comment, or a reason, before each one. Own ports and folders come from the environment, never from the commands.
+`<!-- run: NAME -->` before a block of shell commands makes this module run the block. `tests/docs/test_pages.py`
+requires that comment, or a reason, before each one. Own ports and folders come from the environment, never from the commands.
 """
 
 import os
