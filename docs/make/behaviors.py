@@ -102,29 +102,30 @@ ROWS: Final = (
 )  # fmt: skip
 
 CHARACTER: Final = {
-    "band": "Straight on at 0.1 m/s, and no turn before the ball is 30 % of the picture's width off the middle. The "
-    "ball is quicker: soon it looks too small for the band, so the robot stands, and the ball leaves the picture.",
-    "pixel-pi": "It does not turn within 20 pixels of the middle, so the target hangs some degrees to one side and "
-    "swings there, ever more as the sum of all corrections grows. And 200 / area is a speed for one distance: the one "
-    "at which it happens to be the target's.",
-    "pixel-p": "It decides five times a second, by pixels: forward until the ball's radius is 50 of them, then not at "
-    "all. So it keeps another distance than it should, by runs and stops; to a ball that rolls straight ahead it "
-    "points well.",
-    "legs-baseline": "Sums of errors without time and clamp, and a field that is not the same to the left and to the "
-    "right: the person swings from edge to edge of the picture, and out of it.",
-    "goto-baseline": "Its sensors reach 0.2 m, it comes at up to 0.5 m/s and turns by the clock. With this delay it is "
-    "so near when it turns that the range guard lets no corner come nearer; it never backs away, and cannot say that "
-    "there is no way. With none it goes round the cylinder.",
+    "band": "It drives straight at 0.1 m/s and does not turn before the ball is 30 % of the image width off "
+        "center. The ball is faster: soon it looks too small for the band, so the robot stands, and the ball "
+        "leaves the image.",
+    "pixel-pi": "It does not turn within 20 pixels of the center. So the target stays some degrees to one side and "
+        "swings there, more and more as the sum of all corrections grows. The speed 200 / area fits one "
+        "distance only.",
+    "pixel-p": "It decides five times a second, by pixels: forward until the radius of the ball is 50 pixels, then "
+        "not at all. So it holds the wrong distance, by runs and stops. It points well at a ball that rolls "
+        "straight ahead.",
+    "legs-baseline": "It sums errors without time and clamp, and its field differs to the left and right. The human "
+        "swings from edge to edge of the image, and out of it.",
+    "goto-baseline": "Its sensors reach 0.2 m. It arrives at up to 0.5 m/s and turns by the clock. With this delay it "
+        "is so near when it turns that the range guard lets no corner approach. It never drives back, and cannot "
+        "report that the way is closed. Without delay it drives around the cylinder.",
 }
-"""What an older law is like, and why it fails where it does."""
+"""The character of each legacy controller, and the reason of its failures."""
 
 
-# How the Thymio speeds up and slows down on a free way, by the default law and by the older one. Pure.
+# How the Thymio speeds up and slows down on a free way, by the default mission and by the legacy one. Pure.
 
 
 LAWS: Final = ("goto", "goto-baseline")
 GOALS_M: Final = (0.2, 2.0, 10.0)
-"""Those of the older write-up's plots."""
+"""The waypoints of the legacy plots."""
 _SLOWEST_MPS: Final = 0.2  # what either law keeps up on a free way, and then some time to settle
 _SETTLES_S: Final = 8.0
 _ACROSS: Final = 5  # samples to either side: an acceleration over 0.2 s, for the physics' own steps are noise
@@ -255,19 +256,19 @@ def page_lines(
 ) -> Iterator[str]:
     """The page, block by block; pictures lie in `folder`."""
     names = ",".join(map(str, seeds))
-    yield "# Behaviours\n"
+    yield "# Behaviors\n"
     yield (
-        f"Every behaviour by name, in lockstep on {len(seeds)} starts (seeds {names}), +{LATENCY_MS:g} ms latency, "
-        f"{LOSS:.0%} loss on each leg, judged from\nworld truth: the median over the starts, then the worst. A "
-        "baseline is an older write-up's law with its own numbers, beside what drives\nby default; nothing is "
-        "demanded of it. [Robots and scenarios](../robots-and-scenarios.md) says "
-        "what each robot and scenario is, and whose it was.\n"
+        f"Each scenario by name, in lockstep on {len(seeds)} starts (seeds {names}), +{LATENCY_MS:g} ms latency, "
+        f"{LOSS:.0%} loss on each leg, scored from the\nworld's own record: the median over the starts, then "
+        "the worst. A baseline is a legacy controller with its own numbers, next to the default\nmission. It has no "
+        "bounds. "
+        "[Robots and scenarios](../robots-and-scenarios.md) describes each robot and scenario.\n"
     )
     yield (
-        f"Written by `python -m docs.make.behaviors --seeds {names}`. See one with `sightline demo\n"
-        "--scenario NAME`, judge one with `sightline score --scenario NAME`. Times count from the start, shares and "
-        "errors from the first\nacquisition to the end; a `least_` figure must not fall below its bound, every other "
-        "must not exceed it; contacts are physics\nsteps of 4 ms.\n"
+        f"Written by `python -m docs.make.behaviors --seeds {names}`. Watch one with `sightline demo\n"
+        "--scenario NAME`, score one with `sightline score --scenario NAME`. Times count from the start. Shares and "
+        "errors count from the\nfirst acquisition to the end. A `least_` figure must not fall below its bound, the "
+        "others must not exceed it. Contacts are\nphysics steps of 4 ms.\n"
     )
     yield from _overview(rows, results, seeds)
     for row in rows:
@@ -277,7 +278,7 @@ def page_lines(
 
 
 def _overview(rows: Sequence[Row], results: Results, seeds: Sequence[int]) -> Iterator[str]:
-    yield "| scenario | law | starts that kept every bound | most of a bound that was used |\n|---|---|---:|---|"
+    yield "| scenario | mission | starts within all bounds | figure nearest to its bound |\n|---|---|---:|---|"
     for row in (row for row in rows if not row.baseline):
         cases = row.all_cases(seeds)
         judged = [_checks(row, results[case]) for case in cases]
@@ -309,8 +310,8 @@ def _checks(row: Row, result: Score) -> list[Check]:
 def _head(row: Row) -> Iterator[str]:
     scenario = load_scenario(row.scenario)
     yield f"## {row.title}\n"
-    yield (f"{scenario.summary[0].upper()}{scenario.summary[1:]}. Robot `{row.robot or scenario.robot}`, law "
-           f"`{row.law}`.\n")
+    yield (f"{scenario.summary[0].upper()}{scenario.summary[1:]}. Robot `{row.robot or scenario.robot}`, "
+           f"mission `{row.law}`.\n")
 
 
 def _behaviour(row: Row, results: Results, seeds: Sequence[int], folder: str) -> Iterator[str]:
@@ -330,8 +331,8 @@ def _in_other_light(row: Row, results: Results, seeds: Sequence[int]) -> Iterato
     """The same starts in each light of `looks`: the worst of each figure."""
     yield (
         f"\nIn other light (`--look`), the worst of {len(seeds)} starts each. A frame is misread if it does not name "
-        f"the lit colour, from\n{SETTLED_S:g} s after each change and from {READ_WITHIN_M:g} m before the line on; "
-        f"late is who crosses on yellow and could have stopped with {HARDEST_MPS2:g} m/s2.\n"
+        f"the lit color, from\n{SETTLED_S:g} s after each change and from {READ_WITHIN_M:g} m before the line. A "
+        f"crossing is late if it is on yellow and a stop with {HARDEST_MPS2:g} m/s2 was possible.\n"
     )
     yield f"| look | {' | '.join(_IN_LIGHT)} | |\n|---|{'---:|' * len(_IN_LIGHT)}---|"
     for look in row.looks:
@@ -355,32 +356,32 @@ def _baseline(row: Row, results: Results, seeds: Sequence[int], folder: str) -> 
 
 def _shown(row: Row, seeds: Sequence[int], folder: str) -> str:
     about = row.title.replace("`", "")
-    return f"\n![{about}: the ways and the figures over time]({folder}/{picture_name(row.cases(seeds)[0])})\n"
+    return f"\n![{about}: the paths and the figures over time]({folder}/{picture_name(row.cases(seeds)[0])})\n"
 
 
 def _failures(row: Row, results: Results, seeds: Sequence[int]) -> str:
     """Which of the bounds it would break, and how often."""
     judged = [_checks(row, results[case]) for case in row.cases(seeds)]
     broken = [(same[0].name, sum(not check.ok for check in same)) for same in zip(*judged, strict=True)]
-    said = ", ".join(f"{name} ({count})" for name, count in broken if count)
-    if not said:
-        return f"It keeps every bound of `{row.default.law}` here."
-    return f"Of the bounds of `{row.default.law}` it breaks, on so many of {len(seeds)} starts: {said}."
+    text = ", ".join(f"{name} ({count})" for name, count in broken if count)
+    if not text:
+        return f"It stays within all bounds of `{row.default.law}` here."
+    return f"It breaks these bounds of `{row.default.law}`, with the number of {len(seeds)} starts: {text}."
 
 
 def _speeds(speeds: Sequence[SpeedRun], folder: str) -> Iterator[str]:
     yield "### Speed and acceleration\n"
-    yield ("The same robot to a waypoint straight ahead, with nothing in the way. `goto` is as slow as its sensors are "
-           "short-sighted: whatever\nstands just beyond their 0.2 m must still be left its clearance. The older law "
-           "drives as if it saw further.\n")
-    yield ("| law | waypoint | arrived | top speed | most acceleration | hardest braking | off at the end |\n"
+    yield ("The same robot to a waypoint straight ahead, with nothing in the way. `goto` is slow because its sensors "
+           "reach only\n0.2 m: it must keep its clearance to objects just beyond. The legacy controller "
+           "drives as if it had a longer range.\n")
+    yield ("| mission | waypoint | arrived | top speed | largest acceleration | hardest braking | distance at end |\n"
            "|---|---:|---:|---:|---:|---:|---:|")
     for run in speeds:
         arrived = "never" if run.arrived_s is None else f"{run.arrived_s:.1f} s"
         yield (f"| `{run.wish.law}` | {run.wish.goal_m:g} m | {arrived} | {run.top_mps:.2f} m/s | "
                f"{max(run.accelerations_mps2):.2f} m/s2 | {-min(run.accelerations_mps2):.2f} m/s2 | "
                f"{run.off_m * 100:.1f} cm |")
-    yield f"\n![speed and acceleration of both laws on three ways]({folder}/{SPEEDS})\n"
+    yield f"\n![speed and acceleration of both missions to three waypoints]({folder}/{SPEEDS})\n"
 
 
 def _both(runs: Sequence[Score], name: str) -> str:
@@ -394,7 +395,7 @@ def _figure(value: float | None, unit: str) -> str:
 
 # docs/reference/results/behaviors.md: every behaviour and its baseline in lockstep. Shell (files).
 #
-# A picture is of the first seed. The page says which command wrote it; no figure in it is typed by hand.
+# An image is of the first seed. The page names the command that wrote it; no figure in it is typed by hand.
 
 
 def write_page(page: Path, seeds: Sequence[int], jobs: int, rows: Sequence[Row] = ROWS) -> bool:

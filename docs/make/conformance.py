@@ -35,21 +35,21 @@ choices leave nothing to test in (no guests, no scan, no port of the legacy prot
 counts as not applicable. Clauses are those of [protocol/README.md](https://github.com/sightline-robot/sightline/blob/main/protocol/README.md)."""
 
 LISTED_ELSEWHERE = ("codec",)
-"""Sides without a table of every case: a codec's are the golden vectors, each of which says what it is for."""
+"""Sides without a table of each case. The cases of a codec are the golden vectors, and each describes itself."""
 
 
 def end_at(scheme: str) -> str:
-    """An endpoint on loopback that nobody listens on."""
+    """Return a free endpoint on loopback."""
     return free_endpoint(scheme)
 
 
 @contextmanager
-def started(*arguments: str, says: str = "") -> Iterator[None]:
-    """A command of ours, once it has said a line with `says`; ended at the end."""
+def started(*arguments: str, prints: str = "") -> Iterator[None]:
+    """Run a command of Sightline. The block starts when it printed `prints`; the command ends with the block."""
     with tempfile.NamedTemporaryFile("w+") as log:
         process = subprocess.Popen([*SIGHTLINE, *arguments], stdout=log, stderr=log)
         try:
-            assert until(lambda: says in Path(log.name).read_text(), START_S), Path(log.name).read_text()
+            assert until(lambda: prints in Path(log.name).read_text(), START_S), Path(log.name).read_text()
             yield
         finally:
             process.terminate()
@@ -57,7 +57,7 @@ def started(*arguments: str, says: str = "") -> Iterator[None]:
 
 
 def conform(name: str, *arguments: str) -> None:
-    """One run of the kit; what it finds is kept."""
+    """Run the kit once and store its result."""
     KEPT.mkdir(parents=True, exist_ok=True)
     side, *rest = arguments
     options = ["--save", str(file_of(name)), "--name", name]
@@ -76,7 +76,8 @@ def our_robot(name: str, scheme: str, guarded: bool = False) -> None:
         folder = Path(ending.enter_context(tempfile.TemporaryDirectory()))
         sockets = folder / "sim"
         ending.enter_context(
-            started("sim", "--scenario", "static", "--seed", "5", "--socket-dir", str(sockets), says="simulation ready")
+            started("sim", "--scenario", "static", "--seed", "5", "--socket-dir", str(sockets),
+                    prints="simulation ready")
         )
         endpoint, older = end_at(scheme), end_at("ws-legacy://")
         secure = str(folder / "keys") if guarded else ""
@@ -92,7 +93,7 @@ def our_robot(name: str, scheme: str, guarded: bool = False) -> None:
 
 
 def our_vision(name: str, scheme: str) -> None:
-    """Our vision as a person starts it, with a token where there is one to show."""
+    """Test the vision service as an operator starts it, with a token if there is one."""
     with tempfile.TemporaryDirectory() as folder:
         endpoint, token = end_at(scheme), Path(folder) / "vision.token"
         token.write_text(TOKEN)
@@ -152,11 +153,11 @@ def to_page(runs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def remarks(run: Mapping[str, Any]) -> list[str]:
-    told = [check for check in run["checks"] if check["reason"]]
-    if not told:
+    noted = [check for check in run["checks"] if check["reason"]]
+    if not noted:
         return []
     alike: dict[tuple[str, str], list[str]] = {}
-    for one in told:
+    for one in noted:
         alike.setdefault((one["value"], one["reason"]), []).append(one["name"])
     lines = ["", f"## {run['peer']}: what did not pass at once", "", "| cases | outcome | why |", "|---|---|---|"]
     return lines + [f"| {', '.join(names)} | {what} | {cell(why)} |" for (what, why), names in alike.items()]

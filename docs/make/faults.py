@@ -25,20 +25,20 @@ RESULTS: Final = Path("reference", "results")
 SAFETY: Final = Path("reference", "safety-limits.md")
 PACKAGES: Final = ("eclipse-zenoh", "pybullet", "opencv-python-headless", "pydantic")
 _SHOWN_IF_WRONG: Final = ("on old sight", "drives again", "reset refused", "exit code", "last speed told")
-"""Yes or no: in the table they are in what was demanded."""
+"""Yes or no: the table shows them in the requirement."""
 _MARKS: Final = re.compile(r"(<!-- worst values[^\n]*-->\n).*?(<!-- /worst values -->)", re.DOTALL)
 _FIGURES: Final = {"falls": "ms", "zero": "ms", "distance": "m", "memory": "MB"}
 _STOP_BOUND: Final = re.compile(r"falls <= [0-9.]+ ms, zero <= [0-9.]+ ms, <= [0-9.]+ m")
-_HEAD: Final = "| what broke | rows | a stop demanded within | " + " | ".join(
+_HEAD: Final = "| what broke | rows | required stop | " + " | ".join(
     f"{name}, {unit}" for name, unit in _FIGURES.items()
 ) + " | rows passed |"
 _LEGEND: Final = (
-    "Real processes, one fault each, injected at 0.3 m/s or more (vision follows a ball) or at 0.5 m/s (a scripted",
-    "driver), and judged from the simulated motors' own log. Times count from the last valid command. *Falls*: the",
-    "wheels leave their highest speed for good. *Zero*: they are told zero and really roll slower than 0.01 m/s.",
-    "*Injected*: how often the fault was done; a row that injected nothing fails. In every row, besides that:",
-    "no motion that no frame younger than 400 ms allows, and no process of Sightline grows by 5 MB. A row during which",
-    "this machine stood still for over 20 ms is run again, three times at most.",
+    "Real processes, one fault each, injected at 0.3 m/s or more (the vision service follows a ball) or at 0.5 m/s (a",
+    "scripted driver), and scored from the log of the simulated motors. Times count from the last valid command.",
+    "*Falls*: the wheels leave their highest speed for good. *Zero*: their command is zero and they roll slower than",
+    "0.01 m/s. *Injected*: the number of times that the fault occurred; a row that injected nothing fails. Two more",
+    "rules apply to each row: no motion without a frame younger than 400 ms, and no process grows by 5 MB.",
+    "A row during which this machine stood still for over 20 ms runs again, three times at most.",
 )
 
 Record = Mapping[str, Any]
@@ -79,7 +79,7 @@ def report_page(record: Record) -> str:
     ran = _ran(record)
     again = [f"run again by `{one['command']}`: {'; '.join(one['rows'])}" for one in record["again"]]
     return "\n".join([
-        "# What the robot did when things broke",
+        "# Fault results",
         "",
         f"Written by `{record['command']}`; do not edit. {_passed(ran)} of {len(ran)} rows passed.",
         "",
@@ -87,7 +87,7 @@ def report_page(record: Record) -> str:
         "",
         *(f"- {line}" for line in [*record["machine"], *again]),
         "",
-        f"| fault | demanded | worst of {max(row['runs'] for row in record['rows'])} | pass |",
+        f"| fault | required | worst of {max(row['runs'] for row in record['rows'])} | pass |",
         "|---|---|---|---|",
         *(_table_row(row, _checks(record, row)) for row in record["rows"]),
         "",

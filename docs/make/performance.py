@@ -49,48 +49,49 @@ SECTIONS: Final = (
     Section(
         "following",
         "Following, in virtual time",
-        "The services' own logic in lockstep with the simulated world; scored from world truth, judged by the worst "
-        "run. Seeds that nothing was tuned on; loss is on each leg.",
+        "The logic of the services in lockstep with the simulated world, scored from the world's own record by the "
+        "worst run. Nothing was tuned on these seeds. Loss is on each leg.",
         ("score", "--scenario", _BALLS, "--seeds", _SEEDS, "--latency-ms", "50", "--loss", "0.1"),
     ),
     Section(
         "eight",
         "A figure of eight under latency",
-        "Added latency from capture to command, half on each leg. At 400 ms no frame is young enough: the robot is to "
-        "stand still.",
+        "Added latency from capture to command, half on each leg. At 400 ms no frame is young enough, so the robot "
+        "must stand still.",
         ("score", "--scenario", "eight", "--seeds", _SEEDS, "--latency-ms", "0,100,200,400", "--loss", "0.1"),
     ),
     Section(
         "demo",
         "The same in real time",
-        "`sightline demo`: real processes over Zenoh. The median of six seeds is held against the bounds above x 1.5; "
-        "every run's recorded frames, replayed through a fresh pipeline, must give the twists that were on the wire.",
+        "`sightline demo`: real processes over Zenoh. The median of six seeds must stay within 1.5 times the bounds "
+        "above. The recorded frames of each run, replayed through a fresh pipeline, must give the twists that were "
+        "on the wire.",
         ("bench", "demo", "--scenario", _BALLS, "--seeds", _SEEDS, "--seconds", "12"),
     ),
     Section(
         "killed",
         "Killed at speed",
-        "Vision and the network process, killed with -9 while driving at 0.3 m/s or more, ten times each; judged "
-        "from the simulated motors' own log. [faults.md](faults.md) has more faults.",
+        "The vision service and the network process, killed with -9 while driving at 0.3 m/s or more, ten times "
+        "each, scored from the log of the simulated motors. [Fault results](faults.md) has more faults.",
         ("faults", "--only", "vision.kill", "--only", "network.kill", "--only", "vision.restart", "--repeat", "10"),
     ),
-    Section("gate", "Gate", "One command judged and one step decided.", ("bench", "gate")),
+    Section("gate", "Gate", "One command validated and one step decided.", ("bench", "gate")),
     Section("messages", "Messages", "Encode and decode, hot.", ("bench", "codec")),
     Section(
         "vision",
         "Vision",
-        "`Pipeline.step`, decoding included, and the learned detector's network: hot, one thread. Medians are judged; "
-        "the best round of a dozen frames is what it takes when a shared machine is least disturbed.",
+        "`Pipeline.step` with decoding, and the network of the learned detector: hot, one thread. Medians count. The "
+        "best round of a dozen frames is the time while a shared machine is least disturbed.",
         ("bench", "pipeline"),
     ),
     Section(
         "loop",
         "The whole loop",
-        "Capture to the driver's verdict over Zenoh, robot and vision in their own processes on this machine, beside "
-        "the floor (the same pipeline in one process, paced the same), bare TCP, and what others build, on the same "
-        "pictures in the same run. On loopback transports tie: what is compared is what a user gets. Peers see as the "
-        "older write-ups do, with OpenCV's whole-picture pipeline; `+our detector` shows its transport alone, with "
-        "Sightline's pipeline in it and without credit, age or a gate, and is not judged.",
+        "Capture to the result of the driver process over Zenoh. Robot and vision service run in their own processes "
+        "on this machine, next to the floor (the same pipeline in one process at the same pace), plain TCP, and "
+        "other stacks, on the same images in the same run. On loopback the transports tie: this compares what a user "
+        "gets. The peers detect as the legacy programs do, with OpenCV on the whole image. Rows with `+` show the "
+        "transport of a peer alone, with Sightline's pipeline and without credit, age or gate. They have no bound.",
         ("bench", "loop", "--seconds", "15"),
         "loop-zenoh.png",
     ),
@@ -104,24 +105,24 @@ SECTIONS: Final = (
     Section(
         "loop-slow",
         "A detector of 80 ms",
-        "Every detector waits 80 ms longer, as for an accelerator, while 30 pictures a second come. Age must stay "
-        "flat.",
+        "Each detector waits 80 ms longer, as for an accelerator, while 30 images per second arrive. The age must "
+        "stay flat.",
         ("bench", "loop", "--detector-delay-ms", "80", "--seconds", "60"),
         "loop-slow.png",
     ),
     Section(
         "loop-overload",
-        "A colour detector, overloaded twice by the frame rate",
-        "60 pictures a second for detectors that work 33.3 ms on each: the robot takes at most 240 a second, which the "
-        "pipeline as it is keeps up with, so that every detector repeats its own work instead.",
+        "A color detector, overloaded twice by the frame rate",
+        "60 images per second for detectors that need 33.3 ms for each one. The robot sends at most 240 per second, "
+        "which the unchanged pipeline can process, so each detector repeats its own work instead.",
         ("bench", "loop", "--overload", "2", "--fps", "60", "--seconds", "60"),
         "loop-overload.png",
     ),
     Section(
         "watchers",
         "Viewers",
-        "Ten viewers of the control stream itself, one of whom never reads and one reads once a second, and what they "
-        "cost whoever drives.",
+        "Ten viewers of the control stream itself, one that never reads and one that reads once a second, and what "
+        "they cost the driver.",
         ("bench", "watchers", "--viewers", "10", "--seconds", "60"),
     ),
     Section(
@@ -133,30 +134,31 @@ SECTIONS: Final = (
     Section(
         "network",
         "Slow and lossy networks",
-        "Robot and vision, as two machines would have them, in two network namespaces; every packet goes over a wire "
-        "that loses and slows it. Ages are from capture to the accepted command. Where packets are lost, five seeds, "
-        "each demand as the worst of them fared.",
+        "Robot and vision service in two network namespaces, as on two machines. Each packet crosses a wire that "
+        "loses and delays it. Ages count from capture to the accepted command. Where packets are lost, five seeds "
+        "run, and each bound applies to the worst.",
         _rows("radio", "bursts", "thin", "through", "step", "rise", extra=("--seeds", "1,2,3,4,5")),
     ),
     Section(
         "network-far",
         "Far and broken networks",
-        "The same wire with nothing lost: a round trip of 2, 40 and 200 ms, five seconds without a wire, and one.",
+        "The same wire without loss: a round trip of 2, 40 and 200 ms, five seconds without a wire, and one.",
         _rows("near", "rtt40", "rtt200", "cut", "nothing", seconds=30),
     ),
     Section(
         "network-sites",
         "Several machines",
-        "The same wire. A robot stands and turns again in `standby`, `router` and `moved`, judged from what its wheels "
-        "were told. In `fleet` one process plays the twenty robots, with sessions, headers and credit of their own: "
+        "The same wire. A robot stands and turns again in `standby`, `router` and `moved`, scored from its wheel "
+        "commands. In `fleet` one process plays the twenty robots, with sessions, headers and credit of their own: "
         "forty robot processes on two cores would measure themselves.",
         _rows("uplink", "standby", "router", "moved", "fleet"),
     ),
     Section(
         "network-stop",
         "STOP through a full medium",
-        "One medium of 1 Mbit/s that both directions share, packet after packet, video offered at 4 Mbit/s, and a "
-        "person beyond it who says STOP, resets and says it again. From the word to the simulated motors' own log.",
+        "One medium of 1 Mbit/s that both directions share, packet after packet, with video offered at 4 Mbit/s. "
+        "Behind it an operator sends STOP, resets and sends it again. Times count from the request to the log of the "
+        "simulated motors.",
         ("bench", "network", "--only", "medium", "--seconds", "120"),
     ),
     Section(
@@ -178,15 +180,15 @@ CHECK_FAILED: Final = 5
 PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "performance.md"
 _HEADING: Final = "## "
 _HEAD: Final = (
-    "# Performance\n\nWritten by `python -m docs.make.performance`, section by section; each says when and on what "
-    "machine it was measured. Shared machines are noisy: read medians and ratios, not third digits."
+    "# Performance\n\nWritten by `python -m docs.make.performance`, section by section. Each section states when and "
+    "on which machine it was measured. Shared machines are noisy: read medians and ratios, not third digits."
 )
 _PACKAGES: Final = ("eclipse-zenoh", "pydantic", "numpy", "opencv-python-headless", "simplejpeg", "onnxruntime",
                     "pybullet")
 
 
 def sections_named(names: Sequence[str]) -> tuple[Section, ...]:
-    """Those of `names`, in the page's order; all for none. Raises ConfigError for a name that is none."""
+    """Return the sections of `names` in the order of the page, or all. Raises ConfigError for an unknown name."""
     known = [section.name for section in SECTIONS]
     for name in names:
         if name not in known:
@@ -258,7 +260,7 @@ def _section(section: Section, result: dict[str, Any]) -> str:
     rows = [_row(check, with_median) for check in result["checks"]]
     rule = "|---" * (head.count("|") - 1) + "|"
     command = f"`sightline {' '.join(section.arguments)}`"
-    shown = [f"![Age at the verdict](img/{section.picture})\n"] if section.picture else []
+    shown = [f"![Age of the frames at validation](img/{section.picture})\n"] if section.picture else []
     race = [*_race(result["contestants"]), ""] if "contestants" in result else []
     intro = [f"{_HEADING}{section.title}\n", f"{section.why}\n", f"{command}\n", f"Measured {_machine()}\n"]
     return "\n".join([*intro, *race, *shown, head, rule, *rows])

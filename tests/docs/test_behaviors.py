@@ -57,10 +57,11 @@ def test_a_baseline_stands_beside_the_default_and_says_in_what_it_fails():
     lost = replace(GOOD, acquired_s=None, bearing_rms_deg=None, lost_percent=None, unseen_percent=72.0)
     text, ok = page(Row("ball", "pixel-pi"), lost, GOOD)
     assert ok, "nothing is demanded of it"
-    assert "breaks, on so many of 2 starts: acquired_s (1), bearing_rms_deg (1), lost_percent (1)." in text
+    assert ("It breaks these bounds of `follow`, with the number of 2 starts: acquired_s (1), bearing_rms_deg (1), "
+            "lost_percent (1).") in text
     assert "| bearing_rms_deg | 0.2 deg | never | 0.2 deg | 0.2 deg |" in text
     assert "| unseen_percent | 36 % | 72 % | 0 % | 0 % |" in text
-    assert "keeps every bound of `follow` here" in page(Row("ball", "pixel-pi"), GOOD, GOOD)[0]
+    assert "stays within all bounds of `follow` here" in page(Row("ball", "pixel-pi"), GOOD, GOOD)[0]
 
 
 def test_each_light_has_its_line_and_one_that_is_misread_fails_the_row():

@@ -1,7 +1,7 @@
 """The commands of the tutorials and of the README, executed as the pages show them.
 
 `<!-- run: NAME -->` before a block of shell commands makes this module run the block. `tests/docs/test_pages.py`
-requires that comment, or a reason, before each one. Own ports and folders come from the environment, never from the commands.
+requires that comment, or a reason, before each one. Ports and folders come from the environment, not from the commands.
 """
 
 import os
@@ -10,6 +10,7 @@ import shlex
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -41,9 +42,9 @@ class Terminals:
     def __init__(self, folder: Path, ending: ExitStack) -> None:
         self._folder, self._ending = folder, ending
         endpoint = free_endpoint()
-        (folder / "tmp").mkdir()
+        sockets = ending.enter_context(tempfile.TemporaryDirectory(prefix="tutorial-", dir="/tmp"))  # short enough
         self._env = {
-            **os.environ, "TMPDIR": str(folder / "tmp"), "HOME": str(folder), "XDG_RUNTIME_DIR": str(folder),
+            **os.environ, "TMPDIR": sockets, "HOME": str(folder), "XDG_RUNTIME_DIR": str(folder),
             "XDG_CONFIG_HOME": str(folder / "config"), "PYTHONUNBUFFERED": "1", "SIGHTLINE_CONNECT": endpoint,
             "SIGHTLINE_ROBOT__STATE_DIR": str(folder / "state"),
             "SIGHTLINE_ROBOT__LISTEN": f'["{endpoint}"]', "SIGHTLINE_VISION__CONNECT": f'["{endpoint}"]',
