@@ -76,7 +76,7 @@ def test_it_is_the_boxes_that_lead_it_astray():
     assert samples[-1].distance_m == pytest.approx(SCENARIO.stand_off_m, abs=0.05)
 
 
-@pytest.mark.parametrize("seconds", [5.0, pytest.param(PAST_TWO_S, marks=pytest.mark.slow)], ids=["turning", "past two"])
+@pytest.mark.parametrize("seconds", [5.0, pytest.param(PAST_TWO_S, marks=pytest.mark.slow)])
 def test_the_learned_detector_follows_the_ball_past_them(seconds):
     samples, result = driven("onnx", 313, seconds)
     assert not any(map(faces_a_box, samples))

@@ -268,7 +268,9 @@ def test_the_gate_keeps_its_promises_and_every_state_and_transition_was_visited(
     monkeypatch.setattr(safety, "next_state", recorded)
     run_state_machine_as_test(
         Gate,
-        settings=settings(max_examples=examples, stateful_step_count=40, deadline=None, derandomize=True, database=None),
+        settings=settings(
+            max_examples=examples, stateful_step_count=40, deadline=None, derandomize=True, database=None
+        ),
     )
     assert set(State) == STATES
     assert set(TRANSITIONS) <= TAKEN, sorted(map(str, set(TRANSITIONS) - TAKEN))
