@@ -63,6 +63,14 @@ def venv(tmp_path, calls) -> Path:
     return folder
 
 
+@pytest.fixture
+def stored(environment, calls) -> None:
+    """A compiled PyBullet in the cache, so that a Python without a wheel of PyBullet has nothing to compile."""
+    wheel = environment.stored_wheel(DEMO)
+    wheel.parent.mkdir(parents=True)
+    wheel.touch()
+
+
 def executable(path: Path, text: str) -> Path:
     path.write_text(text)
     path.chmod(0o755)
@@ -126,7 +134,7 @@ def test_two_goals_with_args_give_one_line(venv):
     assert code == 2 and "ARGS is for one goal, but there are 2 (demo test): run `make` once for each" in line
 
 
-def test_environment_is_set_up_once(venv, calls):
+def test_environment_is_set_up_once(stored, venv, calls):
     first, again = set_up("demo", venv), set_up("demo", venv)
     assert (first.returncode, again.returncode, again.stdout, again.stderr) == (0, 0, "", "")
     head = first.stdout.splitlines()[0]
@@ -136,7 +144,7 @@ def test_environment_is_set_up_once(venv, calls):
     assert set_up("test", venv).returncode == 0 and (venv / ".test").exists()
 
 
-def test_interrupted_set_up_leaves_no_stamp_and_no_process(venv, calls, monkeypatch):
+def test_interrupted_set_up_leaves_no_stamp_and_no_process(stored, venv, calls, monkeypatch):
     monkeypatch.setenv("FAKE_PIP", f"echo $$ > {venv}/pid; exec sleep 60")
     process = subprocess.Popen([sys.executable, "environment.py", "demo", venv], cwd=ROOT, stderr=subprocess.PIPE,
                                stdout=subprocess.DEVNULL, text=True)
@@ -157,7 +165,7 @@ def test_interrupted_set_up_leaves_no_stamp_and_no_process(venv, calls, monkeypa
     ("ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE.", "does not match its hash"),
     ("ERROR: Something else\\n\\n[notice] a new release of pip", "installing packages: Something else; full output"),
 ])
-def test_failed_pip_gives_one_line_and_no_stamp(venv, monkeypatch, output, expected):
+def test_failed_pip_gives_one_line_and_no_stamp(stored, venv, monkeypatch, output, expected):
     monkeypatch.setenv("FAKE_PIP", f"printf '{output}'; exit 1")
     done = set_up("demo", venv)
     (line,) = done.stderr.splitlines()
