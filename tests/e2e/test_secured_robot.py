@@ -13,7 +13,7 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from tests.fixtures.commands import sightline
+from tests.fixtures.commands import run, sightline
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
@@ -28,18 +28,18 @@ def robot(tmp_path):
         yield running
 
 
-def test_vision_drives_an_operator_stops_it_and_a_viewer_sees_that(robot, tmp_path):
+def test_vision_drives_an_operator_stops_it_and_a_viewer_sees_that(robot, tmp_path, capsys):
     folder = robot.config["secure"]
     with Vision(robot.endpoint, secure=folder):
         assert driving(robot)
-        stopped = sightline("stop", "r1", "--connect", robot.endpoint, "--secure", folder)
-        assert stopped.returncode == 0 and "STOPPED" in stopped.stdout, stopped
+        stopped = run(capsys, "stop", "r1", "--connect", robot.endpoint, "--secure", folder)
+        assert stopped[0] == 0 and "STOPPED" in stopped[1], stopped
         assert until(lambda: robot.speed() == 0.0)
     (tmp_path / "viewer").mkdir()
     for name in ("ca.pem", "viewer.pem", "viewer.key"):
         (tmp_path / "viewer" / name).write_bytes(Path(folder, name).read_bytes())
-    looked = sightline("status", "r1", "--connect", robot.endpoint, "--secure", str(tmp_path / "viewer"))
-    assert "STOPPED" in looked.stdout, "to look, a viewer's keys are enough"
+    looked = run(capsys, "status", "r1", "--connect", robot.endpoint, "--secure", str(tmp_path / "viewer"))
+    assert "STOPPED" in looked[1], "to look, a viewer's keys are enough"
 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])
@@ -90,14 +90,14 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("name", REFUSALS)
-def test_rejected_peer_receives_the_reason_and_its_robot_goes_on(robot, name, tmp_path):
+def test_rejected_peer_receives_the_reason_and_its_robot_goes_on(robot, name, tmp_path, capsys):
     spoil, words = REFUSALS[name]
     (tmp_path / "spoilt").mkdir()
     secure = str(spoil(Path(robot.config["secure"]), tmp_path / "spoilt")) if spoil else ""
     endpoint = robot.endpoint if secure else robot.endpoint.replace("tls/", "tcp/")
     with pytest.raises(LinkError, match=re.escape(words)):
         open_zenoh("r1", connect=[endpoint], role="vision", secure=secure, timeout_s=0.3)
-    assert sightline("status", "r1", "--connect", robot.endpoint, "--secure", robot.config["secure"]).returncode == 0
+    assert run(capsys, "status", "r1", "--connect", robot.endpoint, "--secure", robot.config["secure"])[0] == 0
 
 
 def test_robot_with_a_certificate_for_another_name_is_rejected(tmp_path, monkeypatch):

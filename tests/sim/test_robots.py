@@ -1,6 +1,7 @@
 """The shipped robots in the simulated world: odometry against truth, guards against walls; none sees itself."""
 
 import math
+from itertools import product
 
 import pytest
 
@@ -56,11 +57,11 @@ def test_odometry_by_the_robots_own_configuration_agrees_with_truth(name, curve)
     assert way_m > 0.5 or abs(turned_rad) > 1.0, "it did drive"
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("aside_deg", [0.0, 30.0])
+@pytest.mark.parametrize(("name", "aside_deg"), [
+    (name, aside_deg) for name, aside_deg in product(ROBOTS, (0.0, 30.0))
+    if not (name == "gazebo-raspi" and aside_deg)  # its five rays look straight ahead only
+])  # fmt: skip
 def test_the_guard_stops_every_robot_before_a_wall(name, aside_deg):
-    if name == "gazebo-raspi" and aside_deg:
-        pytest.skip("its five rays look straight ahead only")
     model, wall = load_robot(name), Wall(start_m=(1.5, -3.0), end_m=(1.5, 3.0))
     config = robot_config(model)
     world_of = alone(wall).model_copy(update={"start": Start(at_m=(0.0, 0.0), heading_deg=(aside_deg, aside_deg))})
