@@ -347,7 +347,7 @@ class Driver:
         return True
 
     def _log_rejection(self, rejection: LastRejection, times: int = 1) -> None:
-        # A driver sends commands before it is armed: a normal state, and one line says how it ends.
+        # A driver sends commands before it is armed: a normal state, and one line shows how it ends.
         if rejection.reason == RejectReason.DISARMED:
             if not self._is_waiting_logged:
                 self._is_waiting_logged, robot = True, self._driver_core.config.robot

@@ -80,7 +80,7 @@ def color_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
 
 
 def _read_only(values: NDArray[Any]) -> NDArray[Any]:
-    """Of a result that is stored and shared."""
+    """Return a result that is stored and shared."""
     values.flags.writeable = False
     return values
 
