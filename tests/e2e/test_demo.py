@@ -143,7 +143,7 @@ def test_a_process_that_fails_is_quoted_and_the_others_end(tmp_path, environment
 def test_a_process_that_never_says_it_is_ready_is_given_up(tmp_path):
     with Processes(tmp_path) as processes:
         processes.start("sim", ["sim", "--socket-dir", str(tmp_path / "s")])
-        with pytest.raises(SightlineError, match=r"not ready within 0\.1 s"):
+        with pytest.raises(SightlineError, match=r"is not ready after 0\.1 s"):
             processes.wait_line("sim", "something else", 0.1)
         pid = processes.pid("sim")
     with pytest.raises(ProcessLookupError):

@@ -17,13 +17,21 @@ QUIET_S = 0.4
 
 
 @pytest.fixture(scope="module")
-def peers(tmp_path_factory):
-    """Two peers on each transport of one robot, and what each has heard."""
-    ends = [free_endpoint(), free_endpoint("ws://")]
-    with RobotProcess(tmp_path_factory.mktemp("robot"), listen=ends) as robot, ExitStack() as ending:
-        robot.wait_until_on(ends[1])
+def ends(tmp_path_factory):
+    """Where a robot listens, on both transports."""
+    ends = {"zenoh": free_endpoint(), "web": free_endpoint("ws://")}
+    with RobotProcess(tmp_path_factory.mktemp("robot"), listen=[*ends.values()]) as robot:
+        robot.wait_until_on(ends["web"])
+        yield ends
+
+
+@pytest.fixture(scope="module")
+def peers(ends):
+    """Two peers on each transport of the robot, and what each has heard."""
+    with ExitStack() as ending:
         found = {}
-        for name, end in (("zenoh 1", ends[0]), ("zenoh 2", ends[0]), ("web 1", ends[1]), ("web 2", ends[1])):
+        for name in ("zenoh 1", "zenoh 2", "web 1", "web 2"):
+            end = ends[name.partition(" ")[0]]
             link = ending.enter_context(open_link("r1", connect=[end], role="operator", timeout_s=10))
             heard = []
             for channel in (DETECTIONS, MISSION):
@@ -68,15 +76,6 @@ def test_it_comes_once_to_every_other_peer(peers, speaker, channel):
 
 
 JPEG = b"\xff\xd8" + bytes(100_000)
-
-
-@pytest.fixture(scope="module")
-def ends(tmp_path_factory):
-    """Where a robot listens, on both transports."""
-    ends = {"zenoh": free_endpoint(), "web": free_endpoint("ws://")}
-    with RobotProcess(tmp_path_factory.mktemp("robot"), listen=[*ends.values()]) as robot:
-        robot.wait_until_on(ends["web"])
-        yield ends
 
 
 @pytest.mark.parametrize("far", ["zenoh", "web"])

@@ -167,10 +167,10 @@ def test_a_drive_is_calibrated_at_a_terminal(tmp_path, opened, monkeypatch):
     for duty, answers in (("0.3", ["0"]), ("0.4", ["much", "0,05"]), ("0.8", ["0.1"])):
         assert terminal.shows(f"duty {duty} for 0.5 s"), terminal.text()
         terminal.types("\n")
-        assert terminal.shows(f"duty {duty}: how far"), terminal.text()
+        assert terminal.shows(f"duty {duty}: distance in meters"), terminal.text()
         for answer in answers:
             terminal.types(f"{answer}\n")
-            assert answer != "much" or terminal.shows("'much' is no distance")
+            assert answer != "much" or terminal.shows("invalid distance 'much'")
     assert terminal.process.wait(10) == 0, terminal.text()
     assert tomllib.loads(out.read_text())["table"] == [[0.4, 0.1], [0.8, 0.2]]
     events = (tmp_path / "board.csv").read_text()
