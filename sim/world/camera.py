@@ -119,6 +119,7 @@ def clipped(corners: PoseMatrix, near_m: float) -> PoseMatrix:
 
 
 NEAR_M, FAR_M = 0.02, 20.0
+WALL_NEAR_M = 0.002  # the lens of a robot that pushes against a wall is nearer to it than `NEAR_M`
 NOTHING_DEPTH = 0.99999  # TinyRenderer leaves 1 where it drew nothing
 FLOOR_SEEN_TO_M = 8.0  # beyond it the floor would only flicker
 TEXELS_PER_M = 128
@@ -152,7 +153,7 @@ class SceneCamera:
     ) -> None:
         """`tile` is the floor, `TILE_TEXELS` square, in place of the boards that robots see."""
         self._client, self._model = client, model
-        self._walls = WallPainter(walls, model, LIGHT_FROM, NEAR_M) if walls else None
+        self._walls = WallPainter(walls, model, LIGHT_FROM, WALL_NEAR_M) if walls else None
         self._tile = floor_tile(seed) if tile is None else tile
         size = (model.height_px, model.width_px)
         self._picture = np.empty((*size, 3), np.uint8)

@@ -87,6 +87,19 @@ def test_a_wall_meets_the_floor_where_the_pinhole_model_has_it():
     assert rows.max() + 1 == pytest.approx(model.cy_px + model.fy_px * model.z_m, abs=1.5)
 
 
+def test_lens_against_a_wall_sees_only_the_wall():
+    scenario = seen_at(20.0, 180.0)
+    with World(scenario, robot_with(), 1) as world:
+        model, truth = world.camera_model, world.truth()
+    ahead, across = truth.yaw_rad, truth.yaw_rad + math.pi / 2
+    middle_m = model.x_m + 0.005 + 0.05  # 5 mm in front of the lens, and half of the wall
+    middle = (truth.x_m + middle_m * math.cos(ahead), truth.y_m + middle_m * math.sin(ahead))
+    ends = [(middle[0] + s * math.cos(across), middle[1] + s * math.sin(across)) for s in (-3, 3)]
+    wall = Wall(start_m=ends[0], end_m=ends[1], thickness_m=0.1, height_m=0.3, color=(0.0, 0.0, 0.2))
+    with World(scenario.model_copy(update={"walls": (wall,)}), robot_with(), 1) as world:
+        assert (picture(world)[..., 0] < 60).all()
+
+
 def test_image_with_pybullet_without_numpy_is_the_same(monkeypatch):
     scenario = seen_at(1.0, 0.0)
     with World(scenario, robot_with(), 1) as world:
