@@ -29,9 +29,9 @@ def _advice(package: str, extra: str, version: tuple[int, int]) -> str:
     if package == "pybullet" and version > _PYBULLET_UP_TO:
         return (
             f"PyBullet has no ready-made package for Python {version[0]}.{version[1]}: use Python 3.11, or "
-            "`docker compose up`, or let pip compile it (minutes): pip install 'sightline-robot[sim]'"
+            "`docker compose up`, or let pip compile it (minutes): pip install '.[sim]'"
         )
-    return f"{package} is not installed: pip install 'sightline-robot[{extra}]'"
+    return f"{package} is not installed: pip install '.[{extra}]'"
 
 
 # Whether a result can be written where it is to go, looked at before the work that makes it. Shell.

@@ -407,6 +407,6 @@ def _world_class() -> type[World]:
         from sightline.sim.world.world import World
     except ImportError as error:
         raise ConfigError(
-            f"the simulation needs {error.name}; install it with: pip install 'sightline-robot[sim]'"
+            f"the simulation needs {error.name}; install it with: pip install '.[sim]'"
         ) from None
     return World

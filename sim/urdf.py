@@ -373,7 +373,7 @@ def _expanded(path: Path) -> str:
     try:
         from xacrodoc import XacroDoc
     except ImportError:
-        raise ConfigError(f"{path}: a xacro file needs xacrodoc; install it with: pip install 'sightline-robot[xacro]'"
+        raise ConfigError(f"{path}: a xacro file needs xacrodoc; install it with: pip install '.[xacro]'"
                           ) from None
     try:
         return str(XacroDoc.from_file(str(path)).to_urdf_string())

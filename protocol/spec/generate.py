@@ -109,7 +109,7 @@ def _model_table(name: str, schema: Schema) -> str:
     rows.append("|---" * 5 + "|")
     required = schema.get("required", [])
     for field, definition in schema["properties"].items():
-        default = "refused" if field in required else _default_of(definition)
+        default = "rejected" if field in required else _default_of(definition)
         words = f"{unit_of(field)} | {default} | {definition.get('description', '')}"
         rows.append(f"| `{field}` | {_type_of(definition)} | {words} |")
     return "\n".join(rows) + "\n"

@@ -106,7 +106,7 @@ def table_text(rows: Sequence[tuple[float, float]], head: str) -> str:
 
 _SPI_DEVICE: Final = Path("/dev/spidev0.0")
 _SPI_PINS: Final = frozenset(range(7, 12))
-_INSTALL: Final = "pip install 'sightline-robot[robot-pi]', or sudo apt install python3-gpiozero python3-lgpio"
+_INSTALL: Final = "pip install '.[robot-pi]', or sudo apt install python3-gpiozero python3-lgpio"
 
 
 class Pins(Protocol):

@@ -193,7 +193,7 @@ def test_training_without_pytorch_says_what_to_install(monkeypatch, capsys, tmp_
     monkeypatch.setitem(__import__("sys").modules, "torch", None)
     assert cli.run(["train", "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err.strip()
-    assert "sightline-robot[train]" in error and "torch" in error and "\n" not in error
+    assert "pip install '.[train]'" in error and "torch" in error and "\n" not in error
 
 
 @pytest.mark.parametrize("arguments", [["--steps", "0"], ["--device", "tpu"], ["--scenes", "3"], ["--batch", "1"]])

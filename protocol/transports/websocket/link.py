@@ -142,7 +142,7 @@ def open_websocket(
     try:
         import websockets  # noqa: F401
     except ImportError:
-        raise ConfigError("websockets is not installed: pip install 'sightline-robot[websocket]'") from None
+        raise ConfigError("websockets is not installed: pip install '.[websocket]'") from None
     link = WebSocketLink(rules)
     try:
         link.open(near, far, secure)

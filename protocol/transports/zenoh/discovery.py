@@ -130,7 +130,7 @@ def find_listeners(seconds: float) -> list[str]:
     try:
         import zenoh
     except ImportError:
-        raise ConfigError("Zenoh is not installed: pip install 'sightline-robot[zenoh]'") from None
+        raise ConfigError("Zenoh is not installed: pip install '.[zenoh]'") from None
     logging.getLogger("zenoh").addHandler(logging.NullHandler())
     answers: zenoh.handlers.RingChannel[zenoh.Hello] = zenoh.handlers.RingChannel(MAX_LISTENERS)
     config = {"scouting": {"multicast": {"enabled": True, "address": multicast_address()}}}

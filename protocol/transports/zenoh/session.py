@@ -102,7 +102,7 @@ def open_session(
     try:
         import zenoh
     except ImportError:
-        raise ConfigError("Zenoh is not installed: pip install 'sightline-robot[zenoh]'") from None
+        raise ConfigError("Zenoh is not installed: pip install '.[zenoh]'") from None
     zenoh.init_log_from_env_or("off")  # RUST_LOG, see docs/how-to/secure-the-link.md
     logging.getLogger("zenoh").addHandler(logging.NullHandler())  # otherwise Python prints its warnings to the terminal
     try:

@@ -225,5 +225,5 @@ def _packages() -> tuple[Any, Any]:
         import cv2
         import simplejpeg
     except ImportError:
-        raise ConfigError("camera video needs OpenCV and simplejpeg: pip install 'sightline-robot[camera]'") from None
+        raise ConfigError("camera video needs OpenCV and simplejpeg: pip install '.[camera]'") from None
     return simplejpeg.encode_jpeg, cv2

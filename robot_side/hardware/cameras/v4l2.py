@@ -128,7 +128,7 @@ def _opencv() -> Any:
     try:
         import cv2
     except ImportError:
-        raise ConfigError("camera v4l2 needs OpenCV: pip install 'sightline-robot[camera]'") from None
+        raise ConfigError("camera v4l2 needs OpenCV: pip install '.[camera]'") from None
     return cv2
 
 

@@ -159,7 +159,7 @@ def test_certificates_that_cannot_be_read_here_are_told_with_the_extra(capsys, t
     for name in [one for one in sys.modules if one.partition(".")[0] == "cryptography"]:
         monkeypatch.setitem(sys.modules, name, None)
     check = _checks(capsys, "--secure", str(tmp_path / "k"))["certificates"]
-    assert not check["ok"] and "pip install 'sightline-robot[secure]'" in str(check)
+    assert not check["ok"] and "pip install '.[secure]'" in str(check)
 
 
 def test_nobody_listening_is_told_apart_from_no_such_name(capsys, monkeypatch):

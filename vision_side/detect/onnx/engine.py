@@ -23,7 +23,7 @@ _TYPES: Final = {"tensor(float)": "float32", "tensor(uint8)": "uint8", "tensor(i
 _DEVICES: Final = {provider: device for device, provider in PROVIDERS.items()}
 _BEHIND: Final = {"tensorrt": ("tensorrt", "cuda", "cpu"), "cuda": ("cuda", "cpu"), "cpu": ("cpu",)}
 """Providers that a session for a device may fall back on for single operations."""
-_MISSING: Final = ("onnxruntime is not installed: pip install 'sightline-robot[vision]', or [vision-gpu] for an NVIDIA "
+_MISSING: Final = ("onnxruntime is not installed: pip install '.[vision]', or [vision-gpu] for an NVIDIA "
                    "GPU; it has no wheel for 32-bit ARM")
 _FIX: Final = ("install onnxruntime-gpu in place of onnxruntime (never both), see that `nvidia-smi` shows the GPU, or "
                "take --device auto")
