@@ -155,7 +155,7 @@ def test_answers_are_compared_by_value(one, other, where):
 @pytest.mark.parametrize(
     "line", [b"", b"[]", b"[" * 100_000, b'{"id":true,"ok":1}', b'{"id":1,"ok":1,"refusal":"x"}', b"1"]
 )
-def test_what_is_no_answer_is_one_error(line):
+def test_invalid_answer_gives_one_error(line):
     with pytest.raises(ProgramError, match=r"^[^\n]{1,300}$"):
         read_answer(line)
 

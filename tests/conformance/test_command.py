@@ -50,7 +50,7 @@ def test_a_real_robot_conforms(capsys, tmp_path, scheme):
     assert json.loads((tmp_path / "r.json").read_text()) == report
 
 
-def test_a_broken_robot_does_not_and_every_report_says_why(capsys, tmp_path):
+def test_broken_robot_fails_and_every_report_names_the_cause(capsys, tmp_path):
     files = {name: tmp_path / f"r.{name}" for name in ("junit", "save")}
     with SmallServer({"compresses"}) as server:
         options = [part for name, path in files.items() for part in (f"--{name}", path)]
@@ -80,7 +80,7 @@ def test_a_robot_behind_keys_conforms(capsys, tmp_path, scheme):
 # --- mistakes --------------------------------------------------------------------------------------------------------
 
 
-def test_nobody_there_is_exit_code_4(capsys):
+def test_missing_robot_exits_with_4(capsys):
     code, out, err = run(capsys, "robot", free_endpoint("ws://"), "--only", "R-CAUS-02")
     assert (code, out) == (4, "")
     assert err.startswith("error: no answer from ws://127.0.0.1:") and err.count("\n") == 1
@@ -91,17 +91,17 @@ def test_nobody_there_is_exit_code_4(capsys):
     [
         (["robot", "ws://127.0.0.1:1", "--only", "R-NONE"], "no case begins so"),
         (["robot", "ws://127.0.0.1:1", "--group", "leases"], "no such group"),
-        (["robot", "http://127.0.0.1:1"], "write ws://"),
+        (["robot", "http://127.0.0.1:1"], "expected ws://"),
         (["robot", "ws://127.0.0.1:1", "--save", "/nowhere/r.json"], "there is no folder /nowhere"),
         (["robot"], "ENDPOINT"),
         (["vision"], "ENDPOINT"),
-        (["robot", "tcp/127.0.0.1"], "write <protocol>/<host>:<port>"),
-        (["robot", "ws://127.0.0.1:1", "--token", "/nowhere/token"], "--token /nowhere/token cannot be read"),
-        (["robot", "ws://127.0.0.1:1", "--token", __file__], "holds no token"),
-        (["robot", "ws://127.0.0.1:1", "--token", "driver=x"], "there is no role 'driver' here"),
-        (["robot", "wss://127.0.0.1:1", "--secure", "/nowhere"], "there is no such folder"),
+        (["robot", "tcp/127.0.0.1"], "expected <protocol>/<host>:<port>"),
+        (["robot", "ws://127.0.0.1:1", "--token", "/nowhere/token"], "cannot read --token /nowhere/token"),
+        (["robot", "ws://127.0.0.1:1", "--token", __file__], "invalid token"),
+        (["robot", "ws://127.0.0.1:1", "--token", "driver=x"], "unknown role 'driver'"),
+        (["robot", "wss://127.0.0.1:1", "--secure", "/nowhere"], "folder not found"),
         (["robot", "ws://127.0.0.1:1", "--robot", "../x"], "robot id"),
-        (["vision", "ws://0.0.0.0:1"], "anybody could drive"),
+        (["vision", "ws://0.0.0.0:1"], "without a token"),
         (["codec"], "no command"),
         (["codec", "--", "/nowhere/codec"], "cannot start"),
     ],
@@ -138,7 +138,7 @@ def test_no_vision_is_exit_code_4(capsys, monkeypatch):
         (["true"], "it ended with 0 before it had answered"),
     ],
 )
-def test_a_program_that_is_no_codec_is_told_once(capsys, program, reason):
+def test_a_program_that_is_not_a_codec_is_reported_once(capsys, program, reason):
     code, out, err = run(capsys, "codec", "--", *program)
     assert code == 5
     assert err.count("\n") == 1 and reason in err
@@ -215,7 +215,7 @@ def test_the_summary_counts_each_kind():
     assert summary([]) == "does NOT conform: 0 passed, of 0 cases"
 
 
-def test_the_json_has_the_shape_of_all_that_judge():
+def test_json_has_the_shape_of_all_checking_commands():
     report = to_dict(RUN, "robot", "x")
     assert report["ok"] is False
     assert [(check["name"], check["value"], check["ok"]) for check in report["checks"]] == [
@@ -228,7 +228,7 @@ def test_the_json_has_the_shape_of_all_that_judge():
     assert report["ok"] == all(check["ok"] for check in report["checks"])
 
 
-def test_junit_can_be_read_whatever_a_peer_said():
+def test_junit_is_valid_for_any_text_of_a_peer():
     suite = ET.fromstring(to_junit(RUN, "robot", NASTY))
     assert (suite.get("tests"), suite.get("failures"), suite.get("skipped")) == ("4", "1", "2")
     failure = suite.find(".//failure")

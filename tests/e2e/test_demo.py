@@ -45,7 +45,7 @@ def driven(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_it_drives_and_says_so_to_a_script(driven):
+def test_demo_drives_and_prints_json_for_a_script(driven):
     folder, result = driven
     said = json.loads(result.stdout)
     assert result.returncode == (0 if said["ok"] else 5), result.stderr
@@ -140,7 +140,7 @@ def test_a_process_that_fails_is_quoted_and_the_others_end(tmp_path, environment
     assert running_in(folder) == []
 
 
-def test_a_process_that_never_says_it_is_ready_is_given_up(tmp_path):
+def test_process_that_never_becomes_ready_times_out(tmp_path):
     with Processes(tmp_path) as processes:
         processes.start("sim", ["sim", "--socket-dir", str(tmp_path / "s")])
         with pytest.raises(SightlineError, match=r"is not ready after 0\.1 s"):
@@ -158,7 +158,7 @@ def test_the_last_word_of_a_process_and_its_exit_code_are_passed_on(tmp_path):
     assert error.value.exit_code == 3
 
 
-def test_what_they_print_is_text_whatever_the_shell_says(tmp_path, monkeypatch):
+def test_output_is_text_for_any_shell_locale(tmp_path, monkeypatch):
     """Who starts them reads it: a line as JSON would be an error inside an error."""
     monkeypatch.setenv("SIGHTLINE_LOG", "json")
     with Processes(tmp_path) as processes:

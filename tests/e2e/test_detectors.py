@@ -156,7 +156,7 @@ def test_a_killed_detector_is_silence_the_robot_holds_and_drives_again_within_th
 
 
 @pytest.mark.slow
-def test_with_own_eyes_to_fall_back_on_it_drives_on_without_a_stop_and_goes_back(tmp_path):
+def test_local_fallback_continues_without_a_stop_and_returns(tmp_path):
     with Server(_answer) as server, _driving(tmp_path, _at(server), "--set", "detector.fallback=hsv") as (robot, log):
         port, killed_us = server.port, time.monotonic_ns() // 1000
         server.kill()

@@ -53,7 +53,7 @@ def grey_camera(folder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("transport", ["zenoh", "websocket"])
-def test_a_person_sends_a_robot_somewhere_and_calls_it_off(tmp_path, transport):
+def test_operator_sends_a_robot_to_a_goal_and_cancels(tmp_path, transport):
     zenoh, web = free_endpoint(), free_endpoint("ws://")
     of_vision = zenoh if transport == "zenoh" else web
     ending, said = threading.Event(), []
@@ -94,7 +94,7 @@ def _course(robot, connect, said):
 
 
 @pytest.mark.slow
-def test_without_a_vision_nobody_is_left_waiting(tmp_path):
+def test_requests_without_a_vision_service_do_not_wait(tmp_path):
     with RobotProcess(tmp_path) as robot:
         robot.wait_until_on()
         told = sightline("goto", "r1", "1", "1", "--connect", robot.endpoint)

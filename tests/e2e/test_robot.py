@@ -98,7 +98,7 @@ def test_the_stop_latch_survives_a_restart(tmp_path):
         assert robot.speed() == 0.0
 
 
-def test_refused_twists_say_why_and_move_nothing(tmp_path):
+def test_rejected_twists_have_a_reason_and_move_nothing(tmp_path):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint, twist=b"nan|0") as vision:
         assert until(lambda: vision.status().refused.get("NOT_FINITE", 0) > 5)
         status = vision.status()

@@ -62,7 +62,7 @@ def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, ro
 
 
 @pytest.mark.slow
-def test_without_keys_nobody_even_watches(robot):
+def test_secured_robot_rejects_viewers_without_keys(robot):
     with pytest.raises(LinkError, match="accepts only TLS"):
         open_zenoh("r1", connect=[robot.endpoint.replace("tls/", "tcp/")], role="vision", timeout_s=1.0)
     asked = sightline("status", "r1", "--connect", robot.endpoint)
@@ -110,7 +110,7 @@ def test_robot_with_a_certificate_for_another_name_is_rejected(tmp_path, monkeyp
             open_zenoh("r1", connect=[endpoint], role="vision", secure=str(tmp_path / "keys"), timeout_s=0.3)
 
 
-def test_on_a_plain_network_a_rogue_gets_nothing_accepted_while_another_drives_and_that_is_said_at_once(tmp_path):
+def test_rogue_client_on_a_plain_network_is_rejected_and_logged_while_another_drives(tmp_path):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as driver:
         robot.wait_until_on()
         assert driving(robot)

@@ -20,7 +20,7 @@ def test_what_is_shown_is_what_it_is_within_half_a_percent(value):
     assert "e" not in number(value) and float(number(value)) == pytest.approx(value, rel=5.1e-3)
 
 
-def test_a_check_says_what_how_much_and_whether_it_is_enough():
+def test_check_names_its_figure_value_and_result():
     (line,) = check_lines([Check("step", 1048.7, "us", 800.0, ok=False)])
     assert line.split() == ["step", "1049", "us", "bound", "800", "FAIL"]
 

@@ -63,7 +63,7 @@ def test_band_steering_hardly_turns_and_then_stands():
     assert "too far" in phases and phases[-1] == "no target"
 
 
-def test_pixels_are_no_metres_for_the_integral_law():
+def test_integral_law_treats_pixels_and_meters_differently():
     """200 / area is a speed for one distance, whichever that is; and the target hangs at the edge of the dead band."""
     run = drive("ball", 811, 7.0, "pixel-pi")
     truths = last(run, 3.0)
@@ -84,7 +84,7 @@ def test_the_older_legs_law_swings_from_edge_to_edge():
     assert max(abs(math.degrees(truth.bearing_rad)) for truth in last(run, 3.0)) > 30
 
 
-def test_the_older_waypoint_law_stands_before_the_cylinder_and_never_says_so():
+def test_legacy_waypoint_law_stops_at_the_cylinder_without_a_report():
     """Its sensors reach 0.2 m and it comes at 0.5 m/s: once so near, the guard lets no corner turn nearer."""
     run = drive("thymio", 811, 6.0, "goto-baseline")
     assert len({(round(truth.x_m, 2), round(truth.y_m, 2)) for truth in last(run, 2.0)}) == 1

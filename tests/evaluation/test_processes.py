@@ -31,7 +31,7 @@ def test_ctrl_c_ends_what_has_begun_and_what_was_to_be_next():
                 one.result(timeout=10)
 
 
-def test_a_process_that_something_else_ended_is_one_line_that_says_what_helps():
+def test_process_ended_from_outside_gives_one_line_with_the_fix():
     with pytest.raises(HardwareError, match=r"of 2\) was ended .*--jobs 1"), worker_pool(2) as pool:
         pool.submit(signal.raise_signal, signal.SIGTERM).result(timeout=10)
 

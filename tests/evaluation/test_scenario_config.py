@@ -14,21 +14,21 @@ from sightline.vision_side.missions.registry import configured_mission
 
 
 @pytest.mark.parametrize("name", scenario_names())
-def test_every_scenario_configures_a_vision_with_its_mission(name):
+def test_every_scenario_configures_a_vision_service_with_its_mission(name):
     scenario = load_scenario(name)
     config = vision_config(scenario, robot_of(scenario), 3)
     assert configured_mission(config).name == scenario.mission
     assert config.target.stand_off_m == scenario.stand_off_m
 
 
-def test_all_that_has_to_run_is_told(tmp_path, capsys):
+def test_all_required_services_are_listed(tmp_path, capsys):
     assert cli.run(["scenarios", "circle", "--out", str(tmp_path)]) == 0
     assert "labels" not in capsys.readouterr().out
     assert cli.run(["scenarios", "legs", "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().out.endswith("sightline labels r1\n")
 
 
-def test_the_plain_scenarios_are_seen_with_plain_eyes():
+def test_plain_scenarios_use_the_plain_detector():
     for name in ("static", "circle", "eight", "pushed", "behind", "walls", "occluder"):
         config = vision_config(load_scenario(name), load_robot("raspberry"))
         same = config.model_copy(update={"target": VisionConfig().target})
@@ -80,7 +80,7 @@ def test_a_scenario_with_a_wrong_setting_is_one_line(tmp_path, old, new, expecte
     assert "\n" not in str(caught.value)
 
 
-def test_a_robot_whose_settings_would_not_stop_in_time_is_refused():
+def test_a_robot_whose_settings_would_not_stop_in_time_is_rejected():
     model = load_robot("chaser").model_copy(update={"settings": {"safety": {"max_acceleration_mps2": 0.2}}})
     with pytest.raises(ConfigError, match=r"robot chaser: \[settings\].*allowed are 700 ms"):
         robot_config(model)

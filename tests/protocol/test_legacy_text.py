@@ -45,7 +45,7 @@ def test_a_picture_is_read_with_any_line_ends_and_within_its_bound(jpeg, line_en
     "text",
     [b"====", b"AAA", b"AA=A", b"AA AAAA", b"AAAA\0", b"AA==AAAA", "ＡＡＡＡ".encode(), b"AAA_", b"-1|0", b"\xff"],
 )
-def test_what_is_no_base64_is_refused(text):
+def test_invalid_base64_is_rejected(text):
     with pytest.raises(WireError) as refusal:
         decode_picture(text, 1000)
     assert refusal.value.reason is RejectReason.MALFORMED
@@ -89,7 +89,7 @@ def test_negatives_and_exponents_in_dashed_twists(text, linear, angular):
     [b"", b"-", b"1", b"1-", b"-1", b"1-2-3", b"1---2", b"1|2", b"1 - 2", b"nan-1", b"1-inf", b"1_0-2",
      b"1-" + b"0" * 63],
 )  # fmt: skip
-def test_what_is_no_dashed_twist_is_refused(text):
+def test_invalid_dashed_twist_is_rejected(text):
     with pytest.raises(WireError) as refusal:
         parse_dashed(text)
     assert refusal.value.reason is RejectReason.MALFORMED
@@ -117,7 +117,7 @@ def test_boxes_survive_the_way_there_and_back(corners):
     [b"-", b"0,0,1", b"0,0,1,1-", b"0,0,1,1.1", b"0,0,1,-1", b"0.5,0,0.4,1", b"0,1,1,0", b"0,0,1,1e-5", b"nan,0,1,1",
      b"0,0,1,1,1,1", b" 0,0,1,1", b"-".join([b"0,0,1,1"] * (MAX_BOXES + 1)), b"0,0,1,1." + b"0" * 1024],
 )  # fmt: skip
-def test_what_is_no_list_of_boxes_is_refused(text):
+def test_invalid_list_of_boxes_is_rejected(text):
     with pytest.raises(WireError) as refusal:
         parse_boxes(text)
     assert refusal.value.reason is RejectReason.MALFORMED

@@ -61,7 +61,7 @@ def test_an_unknown_form_is_rejected(monkeypatch):
         start_log(None, "robot")
 
 
-def test_a_service_says_its_errors_as_json_too():
+def test_a_service_prints_its_errors_as_json_too():
     command = [
         sys.executable,
         "-P",

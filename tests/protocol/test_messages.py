@@ -125,7 +125,7 @@ def test_any_value_in_any_field_gives_a_message_or_a_wire_error(data, case, valu
 
 
 @given(headers)
-def test_a_header_cut_at_any_byte_is_refused(header):
+def test_a_header_cut_at_any_byte_is_rejected(header):
     data = encode(header)
     for length in range(len(data)):
         with pytest.raises(WireError):
@@ -134,7 +134,7 @@ def test_a_header_cut_at_any_byte_is_refused(header):
 
 @pytest.mark.parametrize("version", [0, 2, -1, "1", 1.5, None, [1], 10**30])
 @pytest.mark.parametrize("model", [Stamp, FrameHeader, ScanHeader, AnswerHeader, RequestHeader])
-def test_another_version_is_named_in_the_refusal(model, version):
+def test_another_version_is_named_in_the_rejection(model, version):
     usual = next(c for c in CASES if c.refuse is None and CHANNELS[c.channel].header is model)
     with pytest.raises(WireError, match="this peer uses 1") as refusal:
         decode(model, json.dumps(json.loads(usual.header) | {"v": version}).encode())
@@ -194,7 +194,7 @@ def test_a_key_is_exact_or_none(key):
 
 
 @pytest.mark.parametrize("robot", ["", "r1/r2", "*", "r*", "-r1", ".", "a" * 33, "r 1", "r1\n", "é", "r1$"])
-def test_a_robot_id_that_is_none_is_refused_in_words(robot):
+def test_a_robot_id_that_is_invalid_is_rejected_in_words(robot):
     with pytest.raises(ConfigError, match="letters, digits") as refusal:
         check_robot_id(robot)
     assert repr(robot) in str(refusal.value)

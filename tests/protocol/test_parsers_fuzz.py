@@ -160,7 +160,7 @@ def changed(draw, name):
 
 
 @pytest.mark.parametrize("name", PARSERS)
-def test_every_parser_has_a_corpus_that_it_both_reads_and_refuses(name):
+def test_every_parser_accepts_and_rejects_parts_of_its_corpus(name):
     outcomes = {read(name, data) for data in SEEDS[name]}
     if name == "key":
         robots = {parse_key(data.decode("utf-8", "surrogateescape")) is None for data in SEEDS[name]}
@@ -174,7 +174,7 @@ def test_every_parser_has_a_corpus_that_it_both_reads_and_refuses(name):
     [(name, path) for name in PARSERS for path in sorted((CORPUS / name).iterdir())],
     ids=lambda value: value if isinstance(value, str) else value.name,
 )
-def test_the_name_of_a_corpus_file_says_what_becomes_of_it(name, path):
+def test_corpus_file_name_states_its_result(name, path):
     stated = path.name.split("-")[0]
     if name == "key":
         assert (parse_key(path.read_bytes().decode("utf-8", "surrogateescape")) is not None) == (stated == "read")
@@ -183,7 +183,7 @@ def test_the_name_of_a_corpus_file_says_what_becomes_of_it(name, path):
 
 
 @pytest.mark.parametrize("name", PARSERS)
-def test_whatever_comes_a_parser_reads_or_refuses(name):
+def test_parser_accepts_or_rejects_any_bytes(name):
     @settings(max_examples=EXAMPLES, deadline=None, derandomize="FUZZ_EXAMPLES" not in os.environ)
     @given(changed(name) | st.binary(max_size=64))
     def target(data):

@@ -105,7 +105,7 @@ def _encoded(encoder: str, pixels: np.ndarray) -> bytes:
     return cv2.imencode(".jpg", pixels, options)[1].tobytes()
 
 
-def test_a_picture_cut_anywhere_before_its_size_is_refused():
+def test_a_picture_cut_anywhere_before_its_size_is_rejected():
     whole = simplejpeg.encode_jpeg(np.zeros((48, 64, 3), np.uint8), quality=80)
     needed = whole.index(b"\xff\xc0") + 10
     for length in range(needed):

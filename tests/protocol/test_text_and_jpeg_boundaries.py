@@ -141,7 +141,7 @@ def test_the_default_bound_is_full_hd(width, height, fits):
     assert read_jpeg_size(data).width_px == width if fits else refusal(read_jpeg_size, data)
 
 
-def test_each_marker_is_a_frame_header_refused_alone_or_a_segment():
+def test_each_marker_is_a_frame_header_rejected_alone_or_a_segment():
     for marker in range(256):
         check_marker(marker)
 
@@ -184,7 +184,7 @@ def test_eight_bits_and_one_or_three_components(bits, components):
 
 
 @pytest.mark.parametrize("ahead", [b"", segment(0xE0, 9)])
-def test_a_picture_cut_anywhere_before_its_size_is_refused(ahead):
+def test_a_picture_cut_anywhere_before_its_size_is_rejected(ahead):
     whole = picture(ahead, frame_header(7, 5))
     for size in range(len(whole)):
         what = refusal(read_jpeg_size, whole[:size]).detail

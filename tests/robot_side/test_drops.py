@@ -51,7 +51,7 @@ def running(link, camera):
     return network, pairs
 
 
-def test_nothing_is_captured_while_nobody_listens():
+def test_camera_without_a_listener_captures_nothing():
     joined, camera = MemoryNetwork(), CountingCamera()
     network, pairs = running(joined.link("r1"), camera)
     assert pairs[0][0].recv(64), "it says that it is ready"
@@ -78,7 +78,7 @@ def test_several_links_count_together():
     assert links.dropped == {"frame": 7} and links.rejected == {"OVERSIZE": 1}
 
 
-def test_a_cameras_slot_counts_what_nobody_took():
+def test_camera_slot_counts_images_that_were_not_taken():
     newest = LatestPicture()
     for number in range(4):
         newest.put(Picture(b"", number))

@@ -65,7 +65,7 @@ def test_a_class_of_the_folder_comes_after_all_that_is_installed(folder, monkeyp
     assert sys.path == [*before, str(folder)]
 
 
-def test_from_a_checkout_that_nobody_installed_both_processes_are_the_checkout_s(tmp_path, monkeypatch):
+def test_both_processes_run_from_an_uninstalled_checkout(tmp_path, monkeypatch):
     checkout = tmp_path / "checkout"
     for package in ("protocol", "robot_side"):
         shutil.copytree(ROOT / package, checkout / "sightline" / package, ignore=shutil.ignore_patterns("__pycache__"))

@@ -150,7 +150,7 @@ def say_stop_once(link):
     time.sleep(0.3)  # until it has arrived: nothing that could be waited for says so while the driver is waiting up
 
 
-def test_a_stop_said_once_arrives_though_the_drivers_socket_is_full(stopped):
+def test_stop_sent_once_arrives_through_a_full_socket(stopped):
     robot, vision, link = stopped
     for _ in range(40):  # in pieces: what a busy machine cannot send at once is dropped before the robot sees it
         for _ in range(50):
@@ -164,7 +164,7 @@ def test_a_stop_said_once_arrives_though_the_drivers_socket_is_full(stopped):
     assert until(lambda: robot.speed() == 0.0, 2)
 
 
-def test_a_stop_said_once_is_obeyed_though_the_network_process_dies_right_after(stopped):
+def test_stop_sent_once_is_applied_after_the_network_process_dies(stopped):
     robot, _, link = stopped
     say_stop_once(link)
     robot.kill_network()

@@ -168,7 +168,7 @@ def test_malformed_motor_packets_change_nothing(sim):
 
 @pytest.mark.alone
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_it_ends_cleanly_within_a_second_and_ports_say_so_and_come_back(sim, number, tmp_path):
+def test_simulation_ends_within_a_second_and_the_ports_recover(sim, number, tmp_path):
     camera, drive, lidar = SimCamera(sim.config()), SimDrive(sim.config()), SimRange(sim.config())
     begin_s = time.monotonic()
     sim.process.send_signal(number)
@@ -200,7 +200,7 @@ def test_a_dead_simulations_sockets_are_replaced_and_a_living_ones_are_not(sim, 
     assert again.process.wait(10) == 0
 
 
-def test_no_simulation_is_one_line_that_says_how_to_start_one(tmp_path):
+def test_missing_simulation_gives_one_line_with_the_command(tmp_path):
     for port in (SimCamera, SimDrive, SimRange):
         with pytest.raises(HardwareError) as caught:
             port(port.Config(socket_dir=str(tmp_path)))

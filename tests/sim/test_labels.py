@@ -83,7 +83,7 @@ def test_labels_become_the_boxes_of_the_frame_they_are_of():
     assert (seen.label, seen.x1_px, seen.y2_px) == ("legs", labels[0].x1_px, labels[0].y2_px)
 
 
-def test_labels_are_no_truth_to_a_reader_of_truth():
+def test_reader_of_truth_ignores_labels():
     message = to_json([Label("legs", 1.0, 1.0, 2.0, 3.0, 4.0)], 17, 320)
     assert b'"t_us"' not in message, "that is what tells truth from the rest"
     assert json.loads(message)["labelled_us"] == 17

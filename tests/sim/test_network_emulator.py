@@ -96,7 +96,7 @@ def test_the_default_is_a_perfect_wire():
 
 
 @pytest.mark.parametrize("loss", [0.05, 0.2, 0.5])
-def test_loss_is_as_asked(loss):
+def test_loss_is_as_requested(loss):
     assert 1 - len(carry(leg(loss=loss), [PACKET] * 4000)) / 4000 == pytest.approx(loss, abs=0.03)
 
 
@@ -178,7 +178,7 @@ def test_a_cut_loses_what_is_under_way():
 
 
 @pytest.mark.parametrize("line", ["", "{", '{"ab": {"loss": 2}}', '{"ac": {}}', '{"ab": {"delay_ms": NaN}}'])
-def test_what_is_no_shape_is_refused_in_one_line(line):
+def test_invalid_shape_is_rejected_in_one_line(line):
     with pytest.raises(ConfigError) as caught:
         _read_shapes(line)
     assert "\n" not in str(caught.value)

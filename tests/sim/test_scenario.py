@@ -32,7 +32,7 @@ def test_everything_shipped_loads():
         (look_named, "dimm", "did you mean 'dim'"),
     ],
 )
-def test_unknown_name_says_the_nearest_and_all(load, name, expected):
+def test_unknown_name_error_lists_the_nearest_and_all(load, name, expected):
     with pytest.raises(ConfigError, match="there are") as caught:
         load(name)
     assert expected in str(caught.value)
@@ -116,7 +116,7 @@ def test_a_motor_reaches_and_keeps_what_it_was_given():
 
 
 @pytest.mark.parametrize("speed", [math.nan, math.inf, -math.inf])
-def test_a_motor_refuses_what_is_no_speed(speed):
+def test_motor_rejects_a_speed_that_is_not_finite(speed):
     with pytest.raises(ValueError, match="wheel speed"):
         Motor(load_robot("raspberry").wheels, STEP_S, "1").set(speed)
 

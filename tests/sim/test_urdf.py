@@ -37,7 +37,7 @@ def test_range_sensors_face_as_their_links_do():
     ]
 
 
-def test_the_raspberrys_urdf_is_what_its_toml_says():
+def test_raspberry_urdf_matches_its_toml():
     drawn = ElementTree.fromstring((ROBOTS / "raspberry.urdf").read_text())
     said = ElementTree.fromstring(urdf_from_model(load_robot("raspberry")))
     said.set("name", "raspberry")
@@ -98,7 +98,7 @@ def thymio_with(tmp_path: Path, drawing: tuple[str, str] = ("", ""), words: tupl
     ('<robot name="thymio">', '<robot name="thymio"', "invalid XML"),
     ('<link name="sensor_front"/>', '<link name="sensor_front"/><link name="loose"/>', "must have one root link"),
 ])
-def test_a_urdf_that_is_no_robot_is_one_line_with_the_fix(tmp_path, old, new, expected):
+def test_a_urdf_that_is_not_a_robot_is_one_line_with_the_fix(tmp_path, old, new, expected):
     with pytest.raises(ConfigError) as caught:
         load_robot(thymio_with(tmp_path, drawing=(old, new)))
     assert expected in str(caught.value)
@@ -123,7 +123,7 @@ def test_a_toml_that_does_not_fit_its_urdf_is_one_line_too(tmp_path, old, new, e
     assert "\n" not in str(caught.value)
 
 
-def test_without_its_extra_a_xacro_file_says_how_to_get_it(tmp_path, monkeypatch):
+def test_xacro_file_without_the_extra_prints_the_install_command(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "xacrodoc", None)
     (tmp_path / "mine.urdf.xacro").write_text("<robot/>")
     path = thymio_with(tmp_path, words=('urdf = "thymio.urdf"', 'urdf = "mine.urdf.xacro"'))

@@ -141,7 +141,7 @@ def test_what_is_unclear_in_a_scene_is_not_learned():
     assert not one.heat.any() and 90 < np.count_nonzero(one.counts == 0) < 150
 
 
-def test_what_nobody_asks_for_is_taught_on_a_map_of_its_own():
+def test_unlabeled_objects_have_a_separate_map():
     box = (40.0, 60.0, 90.0, 100.0)
     alone, beside = (shown(one_scene(truths, (), [box]), 5, 0, 1, WHOLE_PX) for truths in ((), (BALL,)))
     assert np.unique(np.argwhere(alone.heat > 0)[:, 0]).tolist() == [len(LABELS)] and (alone.heat[-1] == 1).sum() == 1
@@ -189,7 +189,7 @@ def test_no_scene_of_another_purpose_is_trained_on(tmp_path):
         drawn_scenes(tmp_path, 800_001, 1, lambda _: None)
 
 
-def test_training_without_pytorch_says_what_to_install(monkeypatch, capsys, tmp_path):
+def test_training_without_pytorch_prints_the_install_command(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(__import__("sys").modules, "torch", None)
     assert cli.run(["train", "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err.strip()
@@ -226,7 +226,7 @@ class TestGraph:
     def picture(self, seed=3):
         return np.random.default_rng(seed).integers(0, 256, (1, HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
 
-    def test_the_file_is_opset_17_and_says_what_it_finds(self, made):
+    def test_the_file_is_opset_17_and_reports_what_it_finds(self, made):
         import onnx
 
         model = onnx.load(made)

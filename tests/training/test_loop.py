@@ -163,7 +163,7 @@ def test_the_last_round_alone_is_trained_from_a_file(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no model", "other", "not finite"])
-def test_a_start_that_is_no_model_of_this_network_is_one_line(content, tmp_path, capsys):
+def test_start_from_another_network_gives_one_error_line(content, tmp_path, capsys):
     path = tmp_path / "begin.onnx"
     if content == "other":
         content = onnx.ModelProto(graph=onnx.GraphProto(name="another")).SerializeToString()
@@ -187,7 +187,7 @@ def test_a_gpu_takes_each_batch_whole(tmp_path, monkeypatch):
         assert (asked[-1].training.jobs, asked[-1].jobs) == (jobs, 4)
 
 
-def test_thresholds_are_not_chosen_on_scenes_of_the_judges(tmp_path, capsys):
+def test_thresholds_are_not_chosen_on_scenes_for_scores(tmp_path, capsys):
     assert cli.run(["train", "--out", str(tmp_path), "--validated", str(JUDGED_FROM - VALIDATED_FROM + 1)]) == 2
     assert "--validated" in capsys.readouterr().err and not list(tmp_path.iterdir())
 

@@ -48,7 +48,7 @@ def test_opencv_runs_it():
     cv2.dnn.readNetFromONNX(str(SHIPPED))
 
 
-def test_it_finds_balls_here_as_often_as_its_card_says():
+def test_model_finds_as_many_balls_as_its_card_states():
     """Few scenes, so four standard deviations of room."""
     promised = columns_of_the_card()["nominal"][0] / 100
     one = score_scenes(subjects(["onnx"]), 15, SEED, columns=["nominal"]).columns["nominal"]["onnx"]

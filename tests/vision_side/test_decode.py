@@ -63,12 +63,12 @@ def test_grey_pictures_decode() -> None:
     b"", b"\xff", b"\xff\xd8", b"\x89PNG\r\n", GOOD[:100], GOOD[: len(GOOD) // 2], GOOD[:-200], GOOD[2:],
     jpeg_of(np.zeros((241, 320, 3), np.uint8)), cv2.imencode(".png", np.zeros((240, 320, 3), np.uint8))[1].tobytes(),
 ], ids=["empty", "one", "soi", "png-magic", "header", "half", "no-end", "no-soi", "other-size", "png"])
-def test_what_is_no_picture_of_the_camera_is_refused(data: bytes) -> None:
+def test_image_of_another_camera_is_rejected(data: bytes) -> None:
     with pytest.raises(WireError):
         decoder().decode(data)
 
 
-def test_progressive_bomb_is_refused_before_it_costs() -> None:
+def test_progressive_bomb_is_rejected_before_decoding() -> None:
     progressive = cv2.imencode(".jpg", scene(camera(), 1, 0), [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
     decoder().decode(progressive)
     scan = progressive[progressive.rfind(b"\xff\xda") : -2]
@@ -102,7 +102,7 @@ def test_baseline_scans_one_component_each_are_counted() -> None:
 
 @settings(max_examples=150, deadline=None)
 @given(at=st.integers(0, len(GOOD) - 1), junk=st.binary(min_size=1, max_size=8), cut=st.integers(0, 200))
-def test_damaged_pictures_decode_or_are_refused(at: int, junk: bytes, cut: int) -> None:
+def test_damaged_pictures_decode_or_are_rejected(at: int, junk: bytes, cut: int) -> None:
     damaged = GOOD[:at] + junk + GOOD[at + len(junk) : len(GOOD) - cut]
     try:
         assert decoder().decode(damaged).bgr.shape == (240, 320, 3)

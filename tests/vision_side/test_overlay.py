@@ -66,7 +66,7 @@ def test_the_target_has_outline_circle_raw_and_filtered_centroid():
     assert not near(draw_overlay(GREY, shown(target), 640), FILTERED, 380, 180 - 15)
 
 
-def test_what_is_no_target_is_told_apart():
+def test_objects_that_are_not_targets_are_distinguished():
     box = Detection(40, 50, 80, 110, 0.5, "box")
     canvas = draw_overlay(GREY, shown(ball(), [box]), 640)
     assert near(canvas, OTHER, 80, 150, 1) and not near(canvas, TARGET, 80, 150, 3)
@@ -107,7 +107,7 @@ def test_a_box_without_a_circle_has_its_middle_and_a_radius_of_like_area():
     Detection(1, 1, 2, 2, math.nan, "日本\x07" * 40, Circle(math.nan, math.nan, 3)),
     Detection(1, 1, 2, 2, 1.0, "x", None, np.empty((0, 2))),
 ])
-def test_nothing_that_a_detector_says_breaks_it(odd):
+def test_any_text_of_a_detector_is_drawn(odd):
     for one in (shown(odd, bearing_rad=1e9, distance_m=1e-9), shown(ball(), [odd], note="wörter\n" * 100)):
         assert draw_overlay(GREY, one, 640).shape == (480, 640, 3)
 
@@ -119,7 +119,7 @@ def test_any_width_keeps_the_cameras_shape(width_px):
         round(width_px * 180 / 320), width_px, 3)
 
 
-def test_no_command_is_said_as_such():
+def test_missing_command_is_reported():
     told = shown(ball())
     none = OverlayData(told.header, told.seen, None, "follow", MODEL, 0.1)
     still = OverlayData(told.header, told.seen, STILL, "follow", MODEL, 0.1)

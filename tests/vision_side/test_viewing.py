@@ -61,7 +61,7 @@ def pixels(message):
     return cv2.imdecode(np.frombuffer(message.payload, np.uint8), cv2.IMREAD_COLOR)
 
 
-def test_nobody_watches_so_nothing_is_drawn(site):
+def test_overlay_without_a_viewer_is_not_drawn(site):
     for _ in range(5):
         site.frame()
     assert not site.link.has_listener(OVERLAY) and not site.link.has_listener(PREVIEW)
@@ -85,7 +85,7 @@ def test_who_watches_sees_the_answered_frame_with_what_was_seen(site):
     assert not site.link.has_listener(PREVIEW)
 
 
-def test_it_ends_when_nobody_watches_any_more(site, monkeypatch):
+def test_viewing_ends_without_viewers(site, monkeypatch):
     monkeypatch.setattr(viewing, "IDLE_S", 0.1)
     overlays, previews = site.viewer.latest(OVERLAY), site.viewer.latest(PREVIEW)
     assert until(lambda: site.link.has_listener(OVERLAY) and site.link.has_listener(PREVIEW))
@@ -114,7 +114,7 @@ def test_the_twist_is_out_before_its_picture_and_pictures_keep_their_pace(site):
     assert arrivals.count("overlay") <= 15.0 * lasted_s + 2
 
 
-def test_a_picture_that_vision_refuses_is_not_shown(site):
+def test_a_picture_that_vision_rejects_is_not_shown(site):
     overlays = site.viewer.latest(OVERLAY)
     assert until(lambda: site.link.has_listener(OVERLAY))
     site.frame(BAD)
@@ -123,7 +123,7 @@ def test_a_picture_that_vision_refuses_is_not_shown(site):
     assert overlays.take(5.0) is not None
 
 
-def test_what_cannot_be_drawn_is_said_once_and_the_robot_is_driven_on(site, monkeypatch):
+def test_image_that_cannot_be_drawn_is_logged_once_and_driving_continues(site, monkeypatch):
     def fail(*_):
         raise RuntimeError("no paint")
 
@@ -154,7 +154,7 @@ def test_any_zenoh_tool_sees_the_overlay_as_a_jpeg():
         assert cv2.imdecode(np.frombuffer(seen[0].payload.to_bytes(), np.uint8), 1).shape == (480, 640, 3)
 
 
-def test_with_keys_a_viewer_sees_it_and_only_vision_may_say_it(tmp_path):
+def test_with_keys_a_viewer_sees_it_and_only_vision_may_publish_it(tmp_path):
     keys.make(tmp_path / "k", ["robot.local"])
     end, folder = free_endpoint("tls/"), str(tmp_path / "k")
     with ExitStack() as ending:
@@ -170,7 +170,7 @@ def test_with_keys_a_viewer_sees_it_and_only_vision_may_say_it(tmp_path):
 
 
 @pytest.mark.parametrize("transport", ["tcp", "ws"])
-def test_somebody_elses_boxes_are_drawn_over_the_frame_that_they_name(transport):
+def test_remote_boxes_are_drawn_over_their_frame(transport):
     end = free_endpoint("ws://") if transport == "ws" else free_endpoint()
     with ExitStack() as ending:
         site = Site(ending, end, detector={"kind": "boxes"})

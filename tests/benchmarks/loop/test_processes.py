@@ -40,7 +40,7 @@ def test_the_pictures_are_those_of_the_camera_and_every_one_is_answered(tmp_path
     assert len(answers) > 20  # the ball goes round, and the command with it
 
 
-def test_a_users_own_eyes_see_the_same_ball(tmp_path):
+def test_user_detector_finds_the_same_ball(tmp_path):
     write_pictures(tmp_path, 640, 480)
     turned = 0
     for number, path in enumerate(sorted(tmp_path.iterdir())):
@@ -51,7 +51,7 @@ def test_a_users_own_eyes_see_the_same_ball(tmp_path):
     assert turned > COUNT // 2
 
 
-def test_a_users_own_eyes_see_nothing_where_nothing_is_and_say_what_does_not_decode(tmp_path):
+def test_user_detector_finds_nothing_in_an_empty_image_and_reports_invalid_bytes(tmp_path):
     import cv2
     import numpy as np
 
@@ -144,7 +144,7 @@ run_race(LoopSetting(Path(), 160, 120, seconds=60.0, peers=(), tries=1), print)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_process_that_cannot_start_is_said_in_its_own_words(monkeypatch):
+def test_process_that_cannot_start_reports_its_own_error(monkeypatch):
     monkeypatch.setattr("sightline.benchmarks.loop.race._MODULE", "benchmarks.no_such_module")
     with pytest.raises(HardwareError, match="No module named"):
         run_race(replace(SMALL, peers=()), lambda _: None)

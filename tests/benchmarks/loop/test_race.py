@@ -89,7 +89,7 @@ def statuses(rows, refused=()):
 
 
 @given(st.sets(st.integers(5, 85), max_size=30))
-def test_of_headers_the_commands_that_were_refused_are_missing(refused):
+def test_of_headers_the_commands_that_were_rejected_are_missing(refused):
     rows = header_rows(100, refused)
     course = course_of_headers(rows, list(statuses(rows, refused)), 0, rows[-1][1] + 1)
     assert course.captured == 100
@@ -170,7 +170,7 @@ def test_overload_by_rate_has_the_ages_of_an_80_ms_detector():
     assert not judged(over, **beaten)["p50 behind tcp"]
 
 
-def test_transports_with_our_eyes_are_shown_and_not_judged():
+def test_transports_with_our_detector_are_shown_and_not_scored():
     samples = {FLOOR: sample(FLOOR, [1.0] * 100), OURS: sample(OURS, [2.0] * 100)}
     alone = {name + OUR_DETECTOR: sample(name + OUR_DETECTOR, [1.5] * 100) for name in WITH_OUR_DETECTOR}
     assert judged(**samples, **alone) == judged(**samples)
@@ -199,7 +199,7 @@ def test_time_of_others_is_what_neither_we_nor_idleness_had(monkeypatch):
 
 
 @pytest.mark.parametrize("text", ["640", "x480", "640x", "a640x480", "640x480x3", "６４０x480", "-1x4", ""])
-def test_a_size_that_is_none_is_refused(text):
+def test_a_size_that_is_invalid_is_rejected(text):
     with pytest.raises(ConfigError, match="WIDTHxHEIGHT"):
         size_of(text)
 
@@ -211,7 +211,7 @@ def test_sizes_and_peers_are_read():
         peers_of("older,zmqq")
 
 
-def test_a_peer_that_is_quick_also_runs_with_our_eyes():
+def test_fast_peer_also_runs_with_our_detector():
     assert replace(SMALL, peers=()).contestants == (FLOOR, OURS)
     assert replace(SMALL, peers=("older", "callback")).contestants == (
         FLOOR, OURS, TCP, "older", "callback", "callback" + OUR_DETECTOR
@@ -240,11 +240,11 @@ def test_small_pictures_are_overloaded_by_a_slower_detector(tmp_path):
     [{"fps": 0.5}, {"seconds": 1}, {"detector_delay_ms": 301}, {"width_px": 63}, {"overload": 1.0}, {"overload": 11.0},
      {"overload": 2.0, "detector_delay_ms": 80.0}],
 )
-def test_what_cannot_be_run_is_refused(change):
+def test_impossible_setting_is_rejected(change):
     with pytest.raises(ConfigError):
         replace(SMALL, **change)
 
 
-def test_an_unknown_transport_is_refused_before_anything_starts():
+def test_an_unknown_transport_is_rejected_before_anything_starts():
     with pytest.raises(ConfigError, match="carrier"):
         run_race(replace(SMALL, transport="carrier"), print)

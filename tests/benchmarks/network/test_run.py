@@ -73,7 +73,7 @@ def test_time_is_shared_among_phases_without_a_length_of_their_own():
 
 
 @pytest.mark.parametrize("changes", [{"transport": "smoke"}, {"seconds": 1.0}, {"seeds": ()}])
-def test_a_setting_that_cannot_be_run_is_refused(changes):
+def test_a_setting_that_cannot_be_run_is_rejected(changes):
     with pytest.raises(ConfigError):
         NetworkSetting(**changes)
 
@@ -100,12 +100,12 @@ def test_ages_are_those_of_accepted_commands_and_what_came_too_late_is_infinitel
     assert seen(rows[:1], [status(0), status(10)]).p50_ms is None
 
 
-def test_a_latency_that_stays_the_same_is_no_news():
+def test_constant_latency_changes_nothing():
     same = [[number, number * 33_333, 40_000, 1] for number in range(10)]
     assert seen(same).p50_ms is None
 
 
-def test_rate_and_oldest_executed_are_of_the_judged_time_only():
+def test_rate_and_oldest_executed_are_of_the_scored_time_only():
     statuses = [status(1, accepted=10, age_ms=900), *(status(2 + n / 10, accepted=100 + n * 2) for n in range(81))]
     figures = seen((), statuses, judged_s=2.0)
     assert figures.fps == pytest.approx(20, rel=0.05) and figures.executed_ms == 50
@@ -164,10 +164,10 @@ def test_the_film_is_recorded_pictures(tmp_path):
 
 def test_an_unknown_row_is_one_line(tmp_path):
     done = subprocess.run([*COMMAND, "--only", "moon"], capture_output=True, text=True, check=False)
-    assert done.returncode == 2 and "there are: rtt40" in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and "known: rtt40" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_without_root_it_says_what_it_needs():
+def test_network_bench_without_root_names_its_requirements():
     # A root that becomes another user keeps root's access to files, since the checkout may lie in root's home.
     drop = (
         "import ctypes, os, sys; "

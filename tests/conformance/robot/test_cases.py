@@ -150,7 +150,7 @@ def test_whatever_a_case_raises_is_a_result():
     assert outcome(lambda _bench: {}["x"]).reason == "KeyError: 'x'"
 
 
-def test_a_case_may_be_tried_again_and_says_so():
+def test_case_with_a_second_try_reports_the_number_of_tries():
     bench, _robot = virtual_robot()
     runs = []
 

@@ -66,12 +66,12 @@ def test_any_pixels_come_back(random, progressive):
     assert np.abs(seen.astype(int) - drawn).mean() < 4
 
 
-def test_no_whole_blocks_are_refused():
+def test_partial_blocks_are_rejected():
     with pytest.raises(ValueError, match="17x8"):
         encode_jpeg(17, 8, lambda x, y: (0, 0, 0))
 
 
-def test_a_picture_that_is_none_is_a_key_error():
+def test_missing_image_is_a_key_error():
     with pytest.raises(KeyError):
         picture("../left")
 
@@ -80,7 +80,7 @@ def test_the_half_camera_sees_the_same_angles():
     assert CAMERA.width_px / CAMERA.fx_px == HALF_CAMERA.width_px / HALF_CAMERA.fx_px
 
 
-def test_what_is_no_picture_is_what_it_says():
+def test_invalid_image_has_its_stated_defect():
     assert len(claiming(65_500, 65_500)) == 21
     with pytest.raises(WireError, match="65500x65500"):
         read_jpeg_size(claiming(65_500, 65_500))

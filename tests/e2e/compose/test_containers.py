@@ -66,7 +66,7 @@ def test_every_robot_follows_its_ball(running):
         assert sum(linear_mps > 0.05 for _, _, linear_mps in rows) > 200
 
 
-def test_every_container_says_that_it_is_well(running):
+def test_every_container_reports_healthy(running):
     asked = {name for name in running.profile.services if "healthcheck" in SERVICES[name]}
     assert until(lambda: running.health() == dict.fromkeys(asked, "healthy"), 40), running.health()
     for service in [name for name in running.profile.services if "status" in name]:
@@ -100,7 +100,7 @@ def test_keys_of_one_role_are_with_that_role_alone(running):
         assert {file.rpartition("/")[2] for file in files} == names
 
 
-def test_who_has_no_keys_is_refused_and_told(running):
+def test_client_without_keys_is_rejected_with_the_cause(running):
     only(running, "secure")
     assert running.sightline("status", "r1").returncode == 0
     plain = f"tcp/127.0.0.1:{running.ports['7447']}"
@@ -117,7 +117,7 @@ def test_a_robot_whose_detector_is_gone_holds(running):
     assert running.drives("r1")
 
 
-def test_the_older_dialect_is_spoken_on_its_port(running):
+def test_legacy_protocol_works_on_its_port(running):
     only(running, "legacy")
     with connect(f"ws://127.0.0.1:{running.ports['9091']}", compression=None) as client:
         assert base64.b64decode(client.recv(5)).startswith(b"\xff\xd8")

@@ -46,7 +46,7 @@ def test_the_detector_boxes_the_ball(x_px):
     assert all(abs(edge - true) <= 1 for edge, true in zip(edges, (x_px - 20, 110, x_px + 21, 151), strict=True))
 
 
-def test_nothing_and_a_speck_are_no_ball_but_an_answer():
+def test_empty_image_and_speck_give_an_answer_without_a_ball():
     for seen in (picture(), picture(100, 2)):
         assert look(seen) == ()
     found = boxes_of(jpeg())
@@ -54,7 +54,7 @@ def test_nothing_and_a_speck_are_no_ball_but_an_answer():
 
 
 @pytest.mark.parametrize("bytes_", [b"", b"no picture", jpeg(100)[:400], b"\xff\xd8" + b"\xff" * 500])
-def test_what_is_no_picture_is_refused_in_words(bytes_):
+def test_invalid_image_is_rejected_with_its_cause(bytes_):
     with pytest.raises(WireError, match="MALFORMED"):
         boxes_of(bytes_)
 
@@ -93,7 +93,7 @@ def wait_for(robot):
 
 
 @pytest.mark.slow
-def test_boxes_reach_whoever_wants_them_and_name_a_frame_of_the_robot(tmp_path):
+def test_boxes_reach_subscribers_and_name_a_frame_of_the_robot(tmp_path):
     robot = RobotProcess(tmp_path)
     (tmp_path / "pictures" / "0.jpg").write_bytes(jpeg(160))
     with robot, program("detector_service.py", wait_for(robot)) as detector:
@@ -108,7 +108,7 @@ def test_boxes_reach_whoever_wants_them_and_name_a_frame_of_the_robot(tmp_path):
             assert until(lambda: decode(DetectionsHeader, heard.take(2.0).header).seq > header.seq)
 
 
-def test_programs_without_a_robot_say_so():
+def test_programs_without_a_robot_print_an_error():
     with (
         program("detector_service.py", free_endpoint()) as detector,
         program("compose/older_client.py", free_endpoint("ws://")) as client,
@@ -119,6 +119,6 @@ def test_programs_without_a_robot_say_so():
 
 
 @pytest.mark.parametrize("name", ["detector_service.py", "compose/older_client.py"])
-def test_a_program_that_is_told_no_endpoint_says_so(name):
+def test_program_without_an_endpoint_prints_an_error(name):
     with program(name) as process:
         assert process.stderr.read().startswith("error: which robot?")

@@ -93,7 +93,7 @@ OF_A_KIND = {test[3]: name for name, test in reversed(CHECKS.items())}
 
 
 @pytest.mark.parametrize("name", CHECKS)
-def test_health_checks_ask_by_the_service_s_own_link(name):
+def test_health_checks_use_the_link_of_the_service(name):
     command, program, minus_c, _, *arguments = CHECKS[name]
     assert (command, program, minus_c) == ("CMD", "python", "-c")
     if not name.startswith("sim"):
@@ -155,7 +155,7 @@ def test_a_profile_is_whole_and_opens_no_port_twice(profile):
         assert set(service.get("depends_on", ())) <= set(services), "depends on what this profile does not start"
 
 
-def test_only_the_profile_that_is_for_it_speaks_the_older_dialect():
+def test_only_its_profile_serves_the_legacy_protocol():
     spoken = {name for name, service in SERVICES.items() if "ws-legacy" in str(service["command"])}
     assert spoken == {name for name, service in SERVICES.items() if "guests=true" in str(service)} == {"legacy-robot"}
     assert SERVICES["legacy-robot"]["profiles"] == ["legacy"]
@@ -173,7 +173,7 @@ def test_every_link_of_the_secure_profile_is_secured():
 # --- what must hold for each ------------------------------------------------------------------------------------------
 
 
-def test_each_service_with_something_to_ask_is_asked():
+def test_each_service_with_a_health_check_is_queried():
     asks_others = {profile.status for profile in PROFILES} | {"status-r2", "status-r3", "keys", "legacy-client"}
     assert {name for name in SERVICES if "healthcheck" in SERVICES[name]} == set(SERVICES) - asks_others
     for name, service in SERVICES.items():
@@ -221,7 +221,7 @@ def mounts(name: str) -> dict[str, str]:
     return dict(one.removesuffix(":ro").split(":") for one in SERVICES[name].get("volumes", ()))
 
 
-def test_simulation_and_robot_share_their_sockets_and_nobody_else_has_them():
+def test_simulation_and_robot_share_private_sockets():
     pairs = {pair for profile in PROFILES for pair in profile.robots.values()}
     for robot, sim in pairs:
         shared = set(mounts(sim)) & set(mounts(robot))
@@ -249,5 +249,5 @@ def test_the_stop_mark_is_kept_on_a_volume_of_each_robots_own():
 
 
 @pytest.mark.parametrize("name", sorted(ROBOTS))
-def test_nobody_kills_a_driver_before_its_wheels_are_at_zero(name):
+def test_driver_is_not_killed_before_its_wheels_are_at_zero(name):
     assert float(SERVICES[name]["stop_grace_period"].removesuffix("s")) > _SHUTDOWN_US / 1e6 + _END_S

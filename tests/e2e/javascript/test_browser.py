@@ -118,7 +118,7 @@ def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer
 
 
 @pytest.mark.slow
-def test_a_page_whose_robot_is_gone_says_so_and_finds_it_again(tmp_path: Path) -> None:
+def test_page_reports_a_lost_robot_and_finds_it_again(tmp_path: Path) -> None:
     port = free_port()
     with JsRobot(tmp_path, port=port) as robot, Browser(tmp_path, f"http://127.0.0.1:{port}/") as page:
         assert until(lambda: answered(page) > 10, START_S), page.text("pictures")

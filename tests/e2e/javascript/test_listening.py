@@ -33,7 +33,7 @@ def quiet_robot(tmp_path_factory):
         ("x" * 2000, 1009, "over"),
     ],
 )
-def test_who_says_no_hello_is_told_why(quiet_robot, first, code, reason):
+def test_peer_without_a_hello_receives_the_reason(quiet_robot, first, code, reason):
     with connect(quiet_robot.endpoint, subprotocols=["sightline.v1"]) as stranger:
         stranger.send(first)
         with pytest.raises(ConnectionClosed) as closed:
@@ -41,7 +41,7 @@ def test_who_says_no_hello_is_told_why(quiet_robot, first, code, reason):
     assert closed.value.rcvd.code == code and reason in closed.value.rcvd.reason
 
 
-def test_who_says_nothing_is_dropped_after_two_seconds(quiet_robot):
+def test_silent_client_is_dropped_after_two_seconds(quiet_robot):
     with (
         connect(quiet_robot.endpoint, subprotocols=["sightline.v1"]) as stranger,
         pytest.raises(ConnectionClosed) as closed,
@@ -58,7 +58,7 @@ def test_who_says_nothing_is_dropped_after_two_seconds(quiet_robot):
         ({}, 400),
     ],
 )
-def test_who_may_not_come_in_is_told_by_http(quiet_robot, options, status_code):
+def test_rejected_client_receives_the_reason_by_http(quiet_robot, options, status_code):
     with pytest.raises(InvalidStatus) as refused:
         connect(quiet_robot.endpoint, **options)
     assert refused.value.response.status_code == status_code

@@ -26,7 +26,7 @@ def test_their_own_unit_tests_pass():
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.name)
-def test_files_are_short_and_say_what_they_are_for(path):
+def test_files_are_short_and_state_their_purpose(path):
     source = path.read_text("utf-8")
     assert source.count("\n") <= 300
     if path.suffix == ".mjs":
@@ -128,7 +128,7 @@ def test_both_codecs_read_mutated_messages_alike(seed):
     assert 100 < accepted < 2900
 
 
-def test_the_adapter_says_what_it_does_not_know():
+def test_adapter_reports_unsupported_cases():
     asked = ({"id": 3, "kind": "poem"}, {"id": 4, "kind": "write_twist", "linear_mps": 0.2, "angular_rad_s": -1e-5})
     run = subprocess.run(
         [node(), str(EXAMPLES / "codec_adapter.mjs")], input="\n".join(map(json.dumps, asked)) + "\n",

@@ -106,7 +106,7 @@ def _rate_fps(log: Path, seconds: float) -> float:
 
 
 @pytest.mark.slow
-def test_the_older_vision_sees_the_pictures_and_is_obeyed_within_a_guests_limits(tmp_path, pictures):
+def test_legacy_vision_receives_images_and_drives_within_guest_limits(tmp_path, pictures):
     with old_vision_drives(tmp_path, pictures) as (robot, _, log, _):
         assert best_rate_fps(log, 0.4 * FPS) >= 0.4 * FPS, "on any machine; on a quiet one see below"
         size = statistics.mean(path.stat().st_size for path in pictures.glob("*.jpg"))

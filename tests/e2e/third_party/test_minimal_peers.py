@@ -107,7 +107,7 @@ JUNK = {"deep": "[" * 2_000, "list": "[]", "empty": "{}", "twist": "0.1|0", "byt
 
 
 @pytest.mark.parametrize("junk", JUNK.values(), ids=JUNK)
-def test_junk_keeps_nobody_out_of_the_minimal_robot(junk):
+def test_junk_does_not_block_clients_of_the_minimal_robot(junk):
     port = str(free_port())
     url = SCHEMES["ws"].format(port)
     options = {"subprotocols": ["sightline.v1"], "compression": None}

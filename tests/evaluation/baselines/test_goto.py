@@ -81,7 +81,7 @@ def test_it_turns_away_from_a_wall_by_the_clock() -> None:
 
 
 @pytest.mark.parametrize(("front_m", "approaches"), [(0.16, True), (0.14, True), (0.12, False)])
-def test_it_goes_by_what_its_sensors_see_themselves(front_m: float, approaches: bool) -> None:
+def test_baseline_uses_the_readings_of_each_sensor(front_m: float, approaches: bool) -> None:
     """It turns 0.13 m before a wall, seen from the sensor at its front; from the axle that is 0.21 m."""
     wall = {angle: front_m / math.cos(angle) for angle in np.arange(-0.7, 0.7, 0.04)}
     plan = steps(mission((1.0, 0.0)), *(view((0, 0, 0), at * 100_000, wall) for at in range(3)))
@@ -95,7 +95,7 @@ def test_it_goes_round_a_cylinder_when_nothing_delays_it() -> None:
     assert {row.plan.phase for row in run if row.plan} >= {"to goal", "left contour"}
 
 
-def test_in_a_closed_room_it_never_says_that_it_cannot() -> None:
+def test_closed_room_without_a_report_fails() -> None:
     corners = ((-0.6, -0.5), (0.7, -0.5), (0.7, 0.6), (-0.6, 0.6), (-0.6, -0.5))
     run = drive(Course(walls=tuple((*one, *other) for one, other in pairwise(corners))), (3.0, 0.4), 60)
     assert run[-1].t_s > 59 and not any(row.plan and row.plan.done for row in run)

@@ -44,7 +44,7 @@ def misread(run: DemoRun):
     return next((check.value, check.ok) for check in judged.checks if check.name == "wrong_states_percent")
 
 
-def test_whether_the_light_is_read_right_is_judged_from_the_recording(lights, monkeypatch):
+def test_color_of_the_light_is_scored_from_the_recording(lights, monkeypatch):
     monkeypatch.setattr(demo_report, "_draw", lambda *_given: None)
     assert misread(lights) == (0.0, True)
     assert misread(replace(lights, samples=[replace(one, light="off") for one in lights.samples])) == (100.0, False)
@@ -95,6 +95,6 @@ def figure(name: str, bound: float, *values: float | None):
     ("least_crossings", 1.0, (1, 2, 0), 1, 0, False), ("least_crossings", 1.0, (1, 2, 1), 1, 1, True),
     ("reached_s", 22.5, (12.0, None, 13.0), None, None, False),
 ])  # fmt: skip
-def test_the_median_is_judged_and_where_no_room_is_left_every_run(name, bound, values, middle, worst, ok):
+def test_median_is_checked_and_exact_figures_in_every_run(name, bound, values, middle, worst, ok):
     judged = figure(name, bound, *values)
     assert (judged.median, judged.worst, judged.ok) == (middle, worst, ok)

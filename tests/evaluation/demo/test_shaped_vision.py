@@ -36,7 +36,7 @@ def test_what_is_not_lost_is_due_after_the_delay_and_in_order(steps_us, delay_us
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.5, 1.0])
-def test_the_share_lost_is_the_share_asked_for_and_repeats(loss):
+def test_the_share_lost_is_the_share_requested_and_repeats(loss):
     counts = []
     for _ in range(2):
         line = DelayLine(Leg(0, loss=loss), "7")
@@ -77,7 +77,7 @@ def test_half_the_latency_is_on_each_leg():
         assert {leg: count.sent for leg, count in shaped.counts.items()} == {"from_robot": 1, "to_robot": 1}
 
 
-def test_a_shape_reads_what_it_writes_and_refuses_the_rest():
+def test_a_shape_reads_what_it_writes_and_rejects_the_rest():
     shape = Shape(50.5, 0.1, 3)
     assert Shape.parse(shape.text()) == shape
     for text in ("", "1,2", "a,b,c", "1,2,3,4"):

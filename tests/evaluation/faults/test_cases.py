@@ -81,7 +81,7 @@ def test_wheels_that_only_coast_are_not_at_zero():
     assert measure_stop(rows, 0).zero_ms is None
 
 
-def test_speed_that_comes_back_is_no_stop():
+def test_speed_that_returns_fails_the_stop_check():
     rows = log([*drive_and_stop(), 0.1, 0.1])
     assert measure_stop(rows, 0).zero_ms is None
     assert not all(check.ok for check in stop_checks(measure_stop(rows, 0)))
@@ -133,7 +133,7 @@ def test_gaining_speed_on_an_old_frame_is_not_even_within_the_ramp():
     assert moved_on_old_sight(log(speeds), commands(last_us, age_us=0), None) == 1
 
 
-def test_commands_while_blind_allow_nothing_until_sight_is_back():
+def test_commands_while_blind_permit_nothing_until_frames_are_fresh():
     rows, sent = log([0.5] * 150), commands(3_000_000)
     assert moved_on_old_sight(rows, sent, None) == 0
     assert moved_on_old_sight(rows, sent, Blind(1_000_000)) > 60
@@ -220,7 +220,7 @@ def outcome(row=CASES[0], value=1.0, bound=2.0, **changes):
     return FaultOutcome(row, **{"checks": (check,), **changes})
 
 
-def test_rows_are_told_apart_and_say_what_they_demand():
+def test_rows_have_unique_names_and_state_their_bounds():
     assert len({row.id for row in CASES}) == len(CASES) == len({row.what for row in CASES})
     assert all(row.demanded and row.id.count(".") == 1 and "|" not in row.what + row.demanded for row in CASES)
     assert all(row.setup.fault in ATTACKS for row in CASES if row.setup.driver == "driver" and row.setup.fault)
@@ -248,7 +248,7 @@ def record(results):
     return {"command": "sightline faults", "machine": ["CPU: one"], "again": [], **to_dict(results)}
 
 
-def test_rows_that_cannot_run_are_told_and_are_not_a_pass():
+def test_skipped_rows_are_listed_and_do_not_pass():
     skipped = outcome(skipped="needs root", checks=())
     assert passed([[skipped], [outcome()]]) and not passed([[skipped]])
     assert "needs root" in run_line(skipped) and "needs root" in report_page(record([[skipped]]))

@@ -54,6 +54,6 @@ def test_a_lateness_that_the_robot_does_not_publish_fails():
     assert honest["unpublished lateness"].ok and honest["tick p99.9"].ok and honest["ticks"].ok
 
 
-def test_too_few_ticks_are_no_measurement():
+def test_too_few_ticks_give_no_measurement():
     assert not checks(motors(range(0, 10_000_000, 20_000)))["ticks"].ok
     assert not checks([])["ticks"].ok

@@ -46,7 +46,7 @@ def overlaps(one, other):
     return one[0] < other[1] and other[0] < one[1]
 
 
-def test_the_results_stand_in_the_order_of_the_rows_and_each_run_is_told(bench):
+def test_the_results_stand_in_the_order_of_the_rows_and_each_run_is_reported(bench):
     told = []
     rows = [row("a"), row("b"), row("c")]
     results = run_cases(rows, 2, bench, 2, lambda outcome, progress: told.append((outcome.row.id, progress)))
@@ -55,7 +55,7 @@ def test_the_results_stand_in_the_order_of_the_rows_and_each_run_is_told(bench):
     assert told[-1][1].left_s == 0 and 0 < told[2][1].left_s < 5
 
 
-def test_as_many_run_at_once_as_was_said(bench):
+def test_number_of_parallel_runs_equals_jobs(bench):
     run_cases([row("a"), row("b")], 2, bench, 2, lambda *_: None)
     everything = spans(bench, "a") + spans(bench, "b")
     beside = [sum(overlaps(one, other) for other in everything) - 1 for one in everything]
@@ -70,7 +70,7 @@ def test_a_row_that_wants_the_machine_alone_gets_it_last(bench):
     assert not overlaps(first, second) and first[0] > max(end for _, end in others)
 
 
-def test_what_is_skipped_is_told_but_not_repeated(bench):
+def test_skipped_frame_is_logged_once(bench):
     told = []
     (outcomes,) = run_cases([row("skips")], 5, bench, 1, lambda outcome, progress: told.append(progress.done))
     assert [one.skipped for one in outcomes] == ["needs root"] and len(spans(bench, "skips")) == 1
@@ -82,7 +82,7 @@ def test_a_row_whose_own_process_dies_fails_and_ends_nothing_else(bench):
     assert "ended" in died[0].trouble and not died[0].ok and well[0].ok
 
 
-def test_whoever_interrupts_the_bench_interrupts_its_rows(bench):
+def test_interrupt_of_the_bench_interrupts_its_rows(bench):
     def interrupt(outcome, progress):
         raise KeyboardInterrupt
 
@@ -95,6 +95,6 @@ def test_whoever_interrupts_the_bench_interrupts_its_rows(bench):
 @pytest.mark.parametrize(
     ("left_s", "says"), [(0.0, "0 s left"), (89.0, "89 s left"), (90.0, "2 min left"), (3000.0, "50 min left")]
 )
-def test_a_run_is_told_with_how_long_the_rest_takes(left_s, says):
+def test_finished_run_reports_the_remaining_time(left_s, says):
     line = progress_line(FaultOutcome(row("a"), GOOD), 3, 520, left_s)
     assert line.startswith("  3/520 (") and says in line and "made.a" in line

@@ -34,7 +34,7 @@ def failed(name, run, said=(), called=None):
     return {check.name for check in checks if not check.ok}
 
 
-def test_every_shipped_scenario_is_judged_by_figures_that_have_units():
+def test_every_shipped_scenario_is_scored_by_figures_that_have_units():
     assert set(BOUNDS) == set(scenario_names())
     assert {name for bounds in BOUNDS.values() for name in bounds} <= set(UNITS)
 
@@ -52,7 +52,7 @@ def test_crossings_count_by_what_the_light_showed_and_whether_it_could_stop(ligh
     assert (found["least_crossings"], found["crossed_on_red"], found["crossed_late"]) == figures
 
 
-def test_never_crossing_is_no_way_to_obey():
+def test_run_without_a_crossing_fails():
     run = drive(lambda _s: "green", lambda _s: -0.1, lambda _s: 0.0)
     assert "least_crossings" in failed("traffic-light", run)
 
@@ -71,7 +71,7 @@ def test_one_that_never_starts_is_timed_to_the_end_of_green():
 
 
 @pytest.mark.parametrize(("shift_s", "wrong"), [(0.0, 0.0), (0.3, 0.0), (1.0, None)])
-def test_a_colour_that_is_told_late_is_wrong(shift_s, wrong):
+def test_a_color_that_is_reported_late_is_wrong(shift_s, wrong):
     def light(at_s):
         return "red" if at_s < 5 else "green"
 
@@ -90,7 +90,7 @@ def test_a_frame_between_two_samples_of_different_light_is_of_neither(told):
     assert light_figures(run, wrong)["wrong_states_percent"] > 0
 
 
-def test_unknown_is_not_right_and_far_away_is_not_asked():
+def test_unknown_color_is_wrong_and_a_far_light_is_not_scored():
     near, far = drive(lambda _s: "red", lambda _s: -1.0), drive(lambda _s: "red", lambda _s: -3.0)
     said = [(round(at * 2e4), "driving", "light unknown") for at in range(600)]
     assert light_figures(near, said)["wrong_states_percent"] == 100
@@ -112,14 +112,14 @@ def test_waypoints_count_in_their_order():
     assert back["reached_s"] == pytest.approx((202 - 7) / 50, abs=0.03)
 
 
-def test_the_nearest_it_came_is_judged_as_a_least():
+def test_smallest_distance_is_checked_as_a_minimum():
     there = [(1.5 * at / 100, 1.5 * at / 100) for at in range(101)]
     assert failed("thymio", on_the_way(there, clearance_m=0.11)) == set()
     assert failed("thymio", on_the_way(there, clearance_m=0.09)) == {"least_clearance_m"}
     assert failed("thymio", on_the_way(there[:50])) == {"reached_s"}
 
 
-def test_a_closed_room_asks_for_the_answer_that_there_is_no_way():
+def test_closed_room_requires_the_report_that_no_way_exists():
     run = on_the_way([(0.0, 0.0)] * 100)
     assert failed("thymio-closed", run) == {"given_up_s"}
     assert failed("thymio-closed", run, [(1_000_000, "cannot reach", "waypoint 1")]) == set()
@@ -151,7 +151,7 @@ def test_the_worst_of_a_least_is_the_smallest():
 
 
 @pytest.mark.parametrize("mine", ["my-course", "./mine.toml"])
-def test_a_scenario_of_ones_own_is_judged_by_what_its_kind_demands(mine):
+def test_user_scenario_is_scored_by_the_bounds_of_its_kind(mine):
     """Not by a ball that is not in it."""
     there = [replace(truth(index / 50, x_m=min(2.0, index / 50)), clearance_m=0.5) for index in range(300)]
     scenario = load_scenario("thymio").model_copy(update={"goals_m": ((1.0, 0.0), (2.0, 0.0))})

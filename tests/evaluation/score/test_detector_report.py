@@ -66,13 +66,13 @@ def test_a_figure_beyond_its_bound_fails_alone(column, worse, name):
     assert failed(of) == [f"{name}, {column}"]
 
 
-def test_the_centre_is_judged_on_clean_pictures_and_has_to_be_there():
+def test_the_centre_is_scored_on_clean_pictures_and_has_to_be_there():
     assert failed(report(blur=replace(GOOD, centre_p50_px=4.0))) == []
     assert failed(report(nominal=replace(GOOD, centre_p50_px=1.01))) == ["centre p50, nominal"]
     assert failed(report(nominal=replace(GOOD, centre_p50_px=None))) == ["centre p50, nominal"]
 
 
-def test_each_label_is_demanded_of_enough_objects_and_of_who_never_found_one():
+def test_each_label_needs_enough_objects_also_without_detections():
     assert failed(report({**EVERY, "legs": (300, 0.79)})) == ["least AP50, legs"]
     assert failed(report({**EVERY, "light-red": (299, 0.9)})) == ["least objects, light-red"]
     assert failed(report({})) == [f"least AP50, {label}" for label in LABELLED]
@@ -94,7 +94,7 @@ def told(capsys, *arguments):
     return code, *capsys.readouterr()
 
 
-def test_only_who_asks_for_it_is_judged(capsys):
+def test_only_detectors_with_the_bound_are_checked(capsys):
     code, out, err = told(capsys, "hsv", "--json")
     assert (code, err) == (0, "") and not {"ok", "checks"} & set(json.loads(out))
     code, out, _ = told(capsys, "hsv", "--demand", "--json")
@@ -155,7 +155,7 @@ def eyes(monkeypatch):
 NAME = "eyes_of_a_test:Eyes"
 
 
-def test_a_plug_in_that_gives_no_answer_is_scored_and_said_in_one_line(capsys, eyes):
+def test_a_plug_in_that_gives_no_answer_is_scored_and_reported_in_one_line(capsys, eyes):
     code, out, err = told(capsys, NAME, *(f"eyes_of_a_test:{name}" for name in FAULTS), "--json")
     judged, lines = json.loads(out), err.splitlines()
     assert code == 0 and len(lines) == len(FAULTS) == len(judged["silent"])
@@ -166,7 +166,7 @@ def test_a_plug_in_that_gives_no_answer_is_scored_and_said_in_one_line(capsys, e
         assert getattr(eyes, name).closed == 1
 
 
-def test_who_calls_a_ball_something_else_is_told_why_it_has_no_hits(capsys, eyes, monkeypatch):
+def test_detector_with_another_label_for_balls_is_reported(capsys, eyes, monkeypatch):
     def named(frame):
         return result_of(frame, [Detection(1, 1, 9, 9, 0.9, f"cup {n}") for n in range(5)], Maker("eyes"))
 
@@ -180,7 +180,7 @@ def test_who_calls_a_ball_something_else_is_told_why_it_has_no_hits(capsys, eyes
     assert "cup 3" not in err and json.loads(out)["columns"]["nominal"][NAME]["missed"] == 0
 
 
-def test_who_cannot_be_asked_here_says_why(capsys):
+def test_unavailable_detector_reports_its_reason(capsys):
     assert "127.0.0.1:1: Connection refused" in told(capsys, "http+jpeg://127.0.0.1:1/eyes")[2]
 
 
@@ -208,7 +208,7 @@ def built(*names, file=None, sets=()):
     return cli_score_detectors._subjects(names, file, sets, None)
 
 
-def test_a_calibrated_range_is_judged(tmp_path, capsys):
+def test_a_calibrated_range_is_checked(tmp_path, capsys):
     (tmp_path / "vision.toml").write_text(f"[hsv]\nranges = {BLUE}\n")
     hits = [json.loads(told(capsys, "hsv", "--json", *more)[1])["columns"]["nominal"]["hsv"]["hits"]
             for more in ((), ("--config", str(tmp_path / "vision.toml")))]

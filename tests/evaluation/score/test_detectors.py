@@ -50,7 +50,7 @@ def test_overlap_is_intersection_by_union():
     ([found(*OTHER), found(100, 100, 140, 140)], "wrong object"),  # the first is the answer
     ([found(100, 100, 140, 140, label="target")], "hit"),  # what the colour detectors call it
 ])
-def test_the_first_answer_gives_the_verdict(detections, verdict):
+def test_first_answer_decides(detections, verdict):
     assert frame_result(detections, scene()).verdict == verdict
 
 
@@ -109,7 +109,7 @@ def test_each_object_is_found_once_and_what_is_unclear_counts_for_nothing():
     assert one.objects == 1 and one.marks == [(0.9, True), (0.8, False)]
 
 
-def test_what_is_never_found_is_said_to_be_never_found():
+def test_label_that_is_never_found_is_reported():
     legs = LabelledBox("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
     seen = [found(10, 100, 60, 200, 0.9, "light-red")]
     marks = {label: LabelMatches() for label in ("legs", "light-red")}
@@ -137,11 +137,11 @@ def test_a_labels_threshold_balances_what_is_found_and_what_is_right():
     assert label_threshold(LabelMatches()) == pytest.approx(0.3)
 
 
-def test_the_command_line_begins_where_judging_begins():
+def test_command_line_starts_at_the_first_scored_seed():
     assert cli_score_detectors.FROM == JUDGED_FROM
 
 
-def test_detectors_are_judged_on_the_same_pictures():
+def test_detectors_are_scored_on_the_same_pictures():
     asked = subjects(["hsv", "adaptive"])
     report = score_scenes(asked, 10, looks=4, columns=["nominal", "same-colour boxes"])
     assert set(report.columns) == {"nominal", "same-colour boxes"}

@@ -32,7 +32,7 @@ def test_every_combination_is_a_case_and_groups_lie_together():
                for name in groups)
 
 
-def test_losses_that_differ_a_little_are_not_judged_as_one():
+def test_different_losses_are_scored_separately():
     assert len({case.group for case in cases(["static"], [1], [0], [0.001, 0.004, 0.101, 0.104, 0.1], None)}) == 5
     assert cases(["static"], [1], [50], [0.1], None)[0].group == "static +50 ms 10% loss"
 
@@ -42,7 +42,7 @@ def test_losses_that_differ_a_little_are_not_judged_as_one():
     [(["cirle"], [1], [0], [0]), (["circle"], [], [0], [0]), (["circle"], [-1], [0], [0]),
      (["circle"], [1], [-1], [0]), (["circle"], [1], [0], [1.0]), (["circle"], [1], [0], [float("nan")])],
 )
-def test_what_cannot_be_run_is_refused_before_anything_runs(arguments):
+def test_impossible_setting_is_rejected_before_any_run(arguments):
     with pytest.raises(ConfigError):
         cases(*arguments, None)
 
@@ -78,7 +78,7 @@ def test_another_detector_looks_in_place_of_the_scenarios_own():
     assert yellow in cases(["static"], [1], [0], [0], None, detector=yellow)[0].group
 
 
-def test_a_detector_that_nobody_answers_for_is_said_with_its_reason(capsys):
+def test_detector_without_an_answer_is_reported_with_its_reason(capsys):
     options = ["--scenario", "static", "--seeds", "1,2", "--jobs", "1", "--seconds", "1", "--detector", "oip+http://127.0.0.1:9/ball"]
     assert cli.run(["score", *options]) == 5
     told = capsys.readouterr().out

@@ -22,7 +22,7 @@ README = (Path(schema.__file__).parent.parent / "README.md").read_text("utf-8")
 
 
 @pytest.mark.parametrize("path", sorted(VECTORS.rglob("*.json")), ids=lambda path: f"{path.parent.name}/{path.stem}")
-def test_a_vector_is_read_as_it_says(path):
+def test_vector_gives_its_stated_result(path):
     """From the file alone, as a peer in another language would run it."""
     vector = json.loads(path.read_text("utf-8"))
     got = golden.read_again(path.parent.name, vector)
@@ -34,20 +34,20 @@ def test_generated_files_are_up_to_date():
     assert schema.differing() == []
 
 
-def test_every_channel_has_vectors_that_are_accepted_and_refused():
+def test_every_channel_has_vectors_that_are_accepted_and_rejected():
     outcomes = Counter((case.channel, case.refuse is None) for case in CASES)
     assert set(outcomes) == {(channel, accepted) for channel in CHANNELS for accepted in (True, False)}
     assert len(CASES) == len({(case.channel, case.name) for case in CASES})
 
 
-def test_every_transport_and_dialect_has_vectors_that_are_accepted_and_refused():
+def test_every_transport_and_protocol_has_vectors_that_are_accepted_and_rejected():
     outcomes = {(case.folder, case.refuse is None) for case in FRAMING_CASES}
     assert outcomes == {(folder, accepted) for folder in READERS for accepted in (True, False)}
     assert not set(READERS) & set(CHANNELS)
     assert len(golden.files()) == len(CASES) + len(FRAMING_CASES) >= 200
 
 
-def test_a_case_that_the_decoders_contradict_is_no_vector():
+def test_case_that_contradicts_the_decoders_raises():
     good = CASES[0]
     with pytest.raises(ValueError, match="stated MALFORMED"):
         golden.vector(MessageCase(good.channel, good.name, "", good.key, good.header, good.payload, "MALFORMED"))
@@ -76,12 +76,12 @@ def test_the_specification_holds_every_generated_table_once():
         assert f"<!-- generated: {name} -->\n{text()}<!-- /generated -->" in README
 
 
-def test_the_specification_names_every_refusal_and_bound():
+def test_the_specification_names_every_rejection_and_bound():
     assert all(f"`{reason}`" in README for reason in RejectReason)
     assert f"{MAX_TWIST_BYTES} bytes" in README
 
 
-def test_every_field_has_a_meaning_and_what_has_a_unit_says_it():
+def test_every_field_has_a_meaning_and_its_unit():
     models = schema.json_schema()["$defs"].items()
     fields = [(name, *field) for name, model in models for field in model.get("properties", {}).items()]
     assert len(fields) > 80

@@ -126,7 +126,7 @@ WRONG_KEYS = (
 )
 
 
-def test_only_the_exact_key_reaches_anybody(rig):
+def test_only_the_exact_key_is_delivered(rig):
     robot, _, frames, twists = _pair(rig)
     for key in WRONG_KEYS:
         rig.stranger_puts(key, b"", b"1|1")
@@ -137,7 +137,7 @@ def test_only_the_exact_key_reaches_anybody(rig):
     assert robot.rejected[INEXACT_KEY] >= 5
 
 
-def test_oversize_is_refused_at_both_ends(rig):
+def test_oversize_is_rejected_at_both_ends(rig):
     robot, peer, _, twists = _pair(rig)
     for header, payload in ((bytes(MAX_HEADER_BYTES + 1), b"0|0"), (b"", bytes(TWIST.max_payload_bytes + 1))):
         with pytest.raises(ValueError, match="at most"):
@@ -158,7 +158,7 @@ def test_has_listener_follows_who_subscribes(rig):
     assert rig.until(lambda: not robot.has_listener(FRAME))
 
 
-def test_what_is_ignored_is_heard_no_more_and_may_be_heard_again(rig):
+def test_ignored_channel_ends_and_can_be_subscribed_again(rig):
     robot, peer, frames, _ = _pair(rig)
     second = peer.latest(FRAME)
     peer.unsubscribe(FRAME)
@@ -173,7 +173,7 @@ def test_what_is_ignored_is_heard_no_more_and_may_be_heard_again(rig):
     assert _take(rig, again).payload == b"2" and frames.take() is None
 
 
-def test_a_link_does_not_hear_itself(rig):
+def test_link_does_not_receive_its_own_messages(rig):
     robot, _, frames, _ = _pair(rig)
     own = robot.latest(FRAME)
     robot.publish(FRAME, b"", b"1")
@@ -181,7 +181,7 @@ def test_a_link_does_not_hear_itself(rig):
     assert own.take() is None
 
 
-def test_every_peer_hears_and_no_other_robot(rig):
+def test_every_peer_receives_and_other_robots_do_not(rig):
     robot, _, frames, _ = _pair(rig)
     viewer, stranger = rig.peer("viewer"), rig.peer("viewer", robot="r2")
     seen, foreign = viewer.latest(FRAME), stranger.latest(FRAME)
@@ -190,7 +190,7 @@ def test_every_peer_hears_and_no_other_robot(rig):
     assert foreign.take() is None
 
 
-def test_a_peer_that_restarts_is_heard_and_hears_again(rig):
+def test_restarted_peer_sends_and_receives_again(rig):
     robot, peer, _, twists = _pair(rig)
     for round_number in range(3):
         peer.close()
@@ -204,7 +204,7 @@ def test_a_peer_that_restarts_is_heard_and_hears_again(rig):
         assert _take(rig, twists).payload == b"%d|0" % round_number
 
 
-def test_a_robot_that_restarts_is_heard_and_hears_again(rig):
+def test_restarted_robot_sends_and_receives_again(rig):
     robot, peer, frames, _ = _pair(rig)
     for round_number in range(2):
         robot.close()
@@ -248,7 +248,7 @@ def test_close_inside_a_callback_does_not_hang(rig):
     robot.publish(FRAME, b"", b"1")
 
 
-def test_nobody_connected_is_told_to_the_sender(rig):
+def test_publish_without_a_peer_returns_false(rig):
     robot = rig.robot()
     peer = rig.peer()
     assert rig.until(lambda: robot.connected and peer.connected)
@@ -258,7 +258,7 @@ def test_nobody_connected_is_told_to_the_sender(rig):
 
 
 @pytest.mark.parametrize("key", ["sightline/r2/twist/vision", "sightline/r1/ack/vision", "sightline/r1/twist/*", ""])
-def test_the_rules_refuse_a_key_that_is_not_of_the_robot_and_channel(key):
+def test_the_rules_reject_a_key_that_is_not_of_the_robot_and_channel(key):
     """Directly, because a transport's own matching may already keep such keys away."""
     rules, got = LinkRules("r1"), []
     rules.deliver(TWIST, key, b"", b"0|0", got.append)

@@ -69,7 +69,7 @@ def test_jitter_stays_in_its_bounds_and_keeps_the_order(seed, delay_us, jitter_u
 
 @pytest.mark.parametrize("burst", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize("loss", [0.02, 0.1, 0.4])
-def test_loss_and_bursts_are_what_was_asked_for(loss, burst):
+def test_loss_and_bursts_are_what_was_requested(loss, burst):
     network = MemoryNetwork(3, loss=loss, burst=burst)
     numbers = [number for _, number, channel in _run(network, 20_000) if channel == "frame"]
     gaps = [after - before - 1 for before, after in pairwise(numbers) if after - before > 1]
@@ -102,7 +102,7 @@ def test_each_direction_may_have_its_own_leg():
     assert network.dropped == {"TO_ROBOT": 20}
 
 
-def test_what_is_under_way_is_bounded_and_the_sender_is_told():
+def test_messages_in_flight_are_bounded_and_overflow_returns_false():
     network = MemoryNetwork(delay_us=2_000_000)
     robot, _ = network.link("r1"), network.link("r1").subscribe(FRAME, lambda message: None)
     sent = [robot.publish(FRAME, b"", b"x") for _ in range(MAX_IN_FLIGHT + 10)]
@@ -140,6 +140,6 @@ def test_next_due_and_time_that_goes_back():
     [{"delay_us": -1}, {"jitter_us": -1}, {"loss": -0.1}, {"loss": 1.1}, {"loss": float("nan")}, {"burst": 0.5},
      {"burst": float("nan")}, {"loss": 0.7, "burst": 2.0}],
 )  # fmt: skip
-def test_a_leg_that_no_network_could_be_is_refused(leg):
+def test_impossible_leg_is_rejected(leg):
     with pytest.raises(ValueError):
         Leg(**leg)

@@ -11,7 +11,7 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 
 
-def test_peers_of_both_kinds_hear_and_are_heard():
+def test_peers_of_both_kinds_send_and_receive():
     zenoh, web = free_endpoint(), free_endpoint("ws://")
     with open_link("r1", listen=[zenoh, web], role="robot") as robot:
         twists = robot.latest(TWIST)
@@ -34,7 +34,7 @@ def test_a_failure_on_one_endpoint_leaves_none_open():
 
 
 @pytest.mark.parametrize("endpoint", ["ws:/127.0.0.1:1", "http://127.0.0.1:80", "wss//x:1", "ws://127.0.0.1:99999"])
-def test_an_endpoint_that_is_none_is_named(endpoint):
+def test_an_endpoint_that_is_invalid_is_named(endpoint):
     with pytest.raises(ConfigError, match="invalid endpoint"):
         open_link("r1", connect=[endpoint])
 

@@ -68,7 +68,7 @@ def test_a_hundred_frames_while_many_twists_come_in(secured):
         assert robot.rejected == vision.rejected == {}
 
 
-def test_who_reads_nothing_over_tls_stays_and_delays_nobody(secured):
+def test_tls_client_that_never_reads_stays_and_delays_no_peer(secured):
     robot, endpoint, folder = secured
     trust = ssl.create_default_context(cafile=f"{folder}/ca.pem")
     token = {"Authorization": "Bearer 0123456789abcdef"}
@@ -88,7 +88,7 @@ def test_who_reads_nothing_over_tls_stays_and_delays_nobody(secured):
         stalled.socket.close()
 
 
-def test_a_robot_whose_authority_is_not_trusted_is_refused_in_one_line(secured, tmp_path):
+def test_a_robot_whose_authority_is_not_trusted_is_rejected_in_one_line(secured, tmp_path):
     robot, endpoint, _ = secured
     other = folder_of(tmp_path / "other", STRANGER)
     for folder in (other, ""):
@@ -98,7 +98,7 @@ def test_a_robot_whose_authority_is_not_trusted_is_refused_in_one_line(secured, 
     assert until(lambda: robot.rejected[NO_TLS] >= 2)
 
 
-def test_a_certificate_of_another_host_is_refused(tmp_path):
+def test_a_certificate_of_another_host_is_rejected(tmp_path):
     endpoint, folder = free_endpoint("wss://"), folder_of(tmp_path / "keys", host="192.0.2.9")
     with (
         open_websocket("r1", listen=endpoint, role="robot", secure=folder),

@@ -48,7 +48,7 @@ BEYOND = ("ws://0.0.0.0:9090", "ws://[::]:9090", "wss://192.168.1.7:9090", "ws:/
 
 
 @pytest.mark.parametrize("text", LOOPBACK)
-def test_on_loopback_nothing_is_asked_for(text):
+def test_loopback_endpoint_needs_no_token(text):
     check_listening(parse_websocket_endpoint(text), {})
 
 
@@ -61,7 +61,7 @@ def test_beyond_loopback_a_token_is_demanded_in_one_line(text):
     check_listening(parse_websocket_endpoint(text), {"a" * 16: "vision"})
 
 
-def test_beyond_loopback_the_older_dialect_demands_a_list_in_one_line():
+def test_beyond_loopback_the_legacy_protocol_demands_a_list_in_one_line():
     here = "ws-legacy://0.0.0.0:9091?oneline"
     with pytest.raises(ConfigError, match="network clients without a token") as why:
         open_websocket("r1", listen=here)
@@ -106,12 +106,12 @@ def test_a_robots_list_is_written_into_its_endpoints():
 @pytest.mark.parametrize(
     "text", ["from=", "from=robot", "from=1.2.3", "from=10.0.0.0/33", "from=1.2.3.4,", "swapped", "loud"]
 )
-def test_a_bad_option_is_refused(text):
+def test_a_bad_option_is_rejected(text):
     with pytest.raises(ConfigError):
         parse_websocket_endpoint(f"ws-legacy://127.0.0.1:9091?{text}")
 
 
-def test_who_is_not_listed_is_told_why_and_the_log_tells_of_few(caplog):
+def test_unlisted_client_receives_the_reason_and_the_log_is_limited(caplog):
     endpoint, here = everywhere("ws-legacy")
     plain = here.replace("ws-legacy", "ws")
     with open_websocket("r1", listen=f"{endpoint}?from=10.1.2.3") as robot:
@@ -167,7 +167,7 @@ def test_tokens_are_read_from_a_folder_and_each_role_has_its_own(keys, tmp_path)
 
 
 @pytest.mark.parametrize("text", ["", "short", "a" * 15, "a" * 129, "a b" * 9, "ü" * 16, "a" * 16 + "\nb"])
-def test_what_is_no_token_is_refused_with_its_file(keys, tmp_path, text):
+def test_invalid_token_is_rejected_with_its_file(keys, tmp_path, text):
     (tmp_path / "vision.token").write_text(text)
     with pytest.raises(ConfigError, match=r"vision\.token"):
         read_tokens(keys)

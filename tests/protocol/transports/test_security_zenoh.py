@@ -70,20 +70,20 @@ def test_only_the_listed_may_publish():
     }
 
 
-def test_what_is_said_towards_the_robot_is_heard_by_the_robot_alone():
+def test_message_toward_the_robot_reaches_only_the_robot():
     assert all(key.endswith("/*") for key in may_subscribe("robot"))
     assert not any("twist" in key for role in SOURCES_OF_ROLE for key in may_subscribe(role))
     for passed_on in ("detections", "mission", "report", "overlay", "preview"):
         assert all(f"sightline/*/{passed_on}/*" in may_subscribe(role) for role in (*SOURCES_OF_ROLE, "robot"))
 
 
-def test_a_role_that_is_none_is_a_viewer():
+def test_a_role_that_is_invalid_is_a_viewer():
     assert [certificate_role(name) for name in ("vision", "teleop", "operator", "robot", "detector", "guest", "")] == [
         "vision", "operator", "operator", "robot", "detector", "viewer", "viewer",
     ]  # fmt: skip
 
 
-def test_each_role_says_what_it_may_and_nothing_else(folder, endpoint):
+def test_each_role_publishes_only_its_channels(folder, endpoint):
     heard = []
     with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)) as robot:
         for channel in SAID:
@@ -158,7 +158,7 @@ def _refusal(endpoint, robot_keys, peer_keys, plain_robot=False):
     return str(refusal.value)
 
 
-def test_keys_of_another_authority_are_refused_with_the_cause(folder, endpoint, tmp_path):
+def test_keys_of_another_authority_are_rejected_with_the_cause(folder, endpoint, tmp_path):
     keys.make(tmp_path / "other", [])
     assert "of another authority" in _refusal(endpoint, folder, tmp_path / "other")
 
@@ -179,7 +179,7 @@ def test_a_certificate_of_another_host_is_named(folder, endpoint, broken, monkey
     assert "names other addresses" in _refusal(endpoint, broken, folder)
 
 
-def test_plain_to_secured_and_secured_to_plain_are_refused_with_the_cause(folder, endpoint):
+def test_plain_to_secured_and_secured_to_plain_are_rejected_with_the_cause(folder, endpoint):
     assert "accepts only TLS" in _refusal(endpoint, folder, None)
     assert "plain link, not TLS" in _refusal(endpoint, folder, folder, plain_robot=True)
 
@@ -189,7 +189,7 @@ def test_there_is_no_silent_way_back_to_a_plain_link(folder):
         open_zenoh("r1", connect=["tcp/127.0.0.1:7447"], role="vision", secure=str(folder))
 
 
-def test_a_machine_without_its_keys_is_told_which(broken):
+def test_missing_keys_are_named(broken):
     (broken / "vision.key").unlink()
     with pytest.raises(ConfigError, match=r"vision\.key is missing in .*copy ca\.pem, vision\.pem and vision\.key"):
         open_zenoh("r1", connect=["tls/127.0.0.1:7447"], role="vision", secure=str(broken))
@@ -228,19 +228,19 @@ def test_a_new_token_is_another_and_is_read_as_its_role(broken):
     assert len(set(before) & set(after)) == len(ROLES) - 1
 
 
-def test_certificates_are_told_with_their_hosts_and_end(folder):
+def test_certificates_are_listed_with_hosts_and_expiry(folder):
     shown = {certificate.role: certificate for certificate in keys.look(folder)}
     assert set(shown) == {"sightline authority", *ROLES}
     assert shown["robot"].hosts == ("localhost", "127.0.0.1", "robot.local")
 
 
 @pytest.mark.parametrize("host", ["a b", "röbot", "http://x", ""])
-def test_a_host_that_is_none_is_refused(folder, host):
+def test_a_host_that_is_invalid_is_rejected(folder, host):
     with pytest.raises(ConfigError, match="no name or address"):
         keys.add(folder, "viewer", [host])
 
 
-def test_a_host_that_is_none_leaves_nothing_behind(tmp_path):
+def test_a_host_that_is_invalid_leaves_nothing_behind(tmp_path):
     with pytest.raises(ConfigError):
         keys.make(tmp_path / "new", ["a b"])
     assert not (tmp_path / "new").exists()

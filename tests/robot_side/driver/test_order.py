@@ -69,7 +69,7 @@ def answer(session, seq=SEQ, t_us=T_US):
     return Message(TWIST, "vision", encode(header), b"0.1|0")
 
 
-def test_a_frame_that_is_told_after_its_answer_is_still_read_before_it(ends):
+def test_frame_announced_after_its_answer_is_still_read_first(ends):
     child, parent = ends
     parent.forward(answer("0a0a0a0a"))
     parent.send_aside(ipc.pack_issued(SEQ, T_US, 0))
@@ -103,7 +103,7 @@ def test_a_tick_does_not_wake_the_network_process_and_the_newest_motion_is_what_
     assert parent.motion(ipc.RobotMotion(latency_us=4)).latency_us == 4, "nothing new: the last stays"
 
 
-def test_motions_that_nobody_reads_hold_nobody_up_and_the_next_are_heard(ends):
+def test_unread_motions_do_not_block_and_the_next_are_received(ends):
     child, parent = ends
     for latency_us in range(5000):
         child.send_aside(ipc.pack_motion(ipc.RobotMotion(latency_us=latency_us)))
@@ -112,7 +112,7 @@ def test_motions_that_nobody_reads_hold_nobody_up_and_the_next_are_heard(ends):
     assert parent.motion(ipc.RobotMotion()).latency_us == 5001
 
 
-def test_the_frame_that_a_verdict_permits_carries_the_latency_of_that_verdict(driver, ends, monkeypatch):
+def test_frame_permitted_by_a_result_carries_its_latency(driver, ends, monkeypatch):
     _, parent = ends
     driver._driver_core.gate.arms_itself = False
     told = []
@@ -129,7 +129,7 @@ def test_the_frame_that_a_verdict_permits_carries_the_latency_of_that_verdict(dr
     assert motion.latency_us == 4_000 and judged.seq == SEQ and judged.compute_us == 900
 
 
-def test_a_verdict_is_told_though_the_next_tick_is_not_due(driver, ends):
+def test_command_result_is_sent_before_the_next_tick(driver, ends):
     _, parent = ends
     parent.send_aside(ipc.pack_issued(SEQ, T_US, 0))
     parent.forward(answer(driver._driver_core.session))

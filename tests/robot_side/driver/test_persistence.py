@@ -45,7 +45,7 @@ def test_a_mark_that_is_removed_stays_removed(tmp_path, synced):
     assert not latch.is_set()
 
 
-def test_a_disk_that_fails_is_no_mark_kept(tmp_path, monkeypatch):
+def test_failed_disk_write_leaves_the_latch_unset(tmp_path, monkeypatch):
     latch = StopLatch(tmp_path, "r1")
 
     def fails(_descriptor: int) -> None:

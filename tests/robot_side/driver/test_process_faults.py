@@ -72,7 +72,7 @@ def driver(tmp_path):
         WheelAngles(1e9, -1e9, 50_000),
     ],
 )
-def test_a_reading_that_is_no_number_stops_the_robot_not_the_loop(driver, reading):
+def test_a_reading_that_is_not_a_number_stops_the_robot_not_the_loop(driver, reading):
     BrokenDrive.reading = WheelAngles(0.0, 0.0, 0)
     driver._tick(20_000, punctual=False)
     BrokenDrive.reading = reading
@@ -110,12 +110,12 @@ def test_a_drive_that_raises_anything_is_a_fault(driver, error):
 
 
 @pytest.mark.parametrize("packet", [b"\xff", b"\x01", b"\x02", b"\x03{", bytes([ipc.PacketKind.RAW]) + b"x" * 40])
-def test_a_packet_that_is_none_is_dropped(driver, packet):
+def test_a_packet_that_is_invalid_is_dropped(driver, packet):
     driver.driver_end.packets = lambda: iter([packet])
     assert driver._drain() is False
 
 
-def test_however_the_loop_ends_the_motors_are_told_zero(tmp_path, monkeypatch):
+def test_however_the_loop_ends_the_motors_are_set_to_zero(tmp_path, monkeypatch):
     config = RobotConfig(
         drive=PluginChoice(kind=f"{__name__}:BrokenDrive"), listen=(free_endpoint(),), state_dir=tmp_path
     )

@@ -9,7 +9,7 @@ from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision
 
 
-def test_a_flood_of_refused_commands_is_a_few_lines_in_the_log_and_readable_in_the_status(tmp_path):
+def test_flood_of_rejected_commands_writes_few_lines_and_shows_in_status(tmp_path):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint, twist=b"nan|0") as vision:
         assert until(lambda: vision.status().refused.get("NOT_FINITE", 0) > 60, 10)
 
@@ -26,7 +26,7 @@ def test_a_flood_of_refused_commands_is_a_few_lines_in_the_log_and_readable_in_t
         assert sum("MALFORMED" in line for line in lines) <= 4 and sum("NOT_FINITE" in line for line in lines) <= 5
 
 
-def test_what_the_transport_turned_away_is_readable_in_the_status_and_told(tmp_path):
+def test_transport_rejections_show_in_the_status_and_the_log(tmp_path):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
         with open_session((), [robot.endpoint], 5.0) as stranger:
             stranger.put(key_for("r1", TWIST, "vision"), b"0" * 300)

@@ -26,7 +26,7 @@ def test_the_unit_watches_restarts_and_zeroes():
     assert float(service["TimeoutStopSec"]) > 2, "the driver may take 2 s to bring the wheels to zero"
 
 
-def test_the_driver_says_ready_and_feeds_the_watchdog_from_its_loop(tmp_path, monkeypatch):
+def test_the_driver_reports_ready_and_feeds_the_watchdog_from_its_loop(tmp_path, monkeypatch):
     address = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(address)
@@ -39,7 +39,7 @@ def test_the_driver_says_ready_and_feeds_the_watchdog_from_its_loop(tmp_path, mo
             assert robot.process.wait(3) == 0
 
 
-def test_without_a_manager_nothing_is_told(monkeypatch):
+def test_supervision_without_a_manager_sends_nothing(monkeypatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     manager = SystemdNotifier()
     manager.notify("READY=1")

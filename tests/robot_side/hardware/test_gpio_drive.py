@@ -71,7 +71,7 @@ def test_a_broken_table_is_one_line_with_its_file(text, says):
     assert str(error.value).startswith("my.toml: ") and says in str(error.value) and "\n" not in str(error.value)
 
 
-def test_a_table_file_takes_the_tables_place_and_one_that_is_not_there_is_said(board, tmp_path):
+def test_table_file_replaces_the_table_and_a_missing_file_is_reported(board, tmp_path):
     path = tmp_path / "drive.toml"
     path.write_text("table = [[0.5, 0.2]]")
     drive = GpioDrive(config(table_file=path))
@@ -91,7 +91,7 @@ def test_a_table_file_takes_the_tables_place_and_one_that_is_not_there_is_said(b
     ({"pwm_hz": 20}, "400"), ({"trim": 0.5}, "0.3"), ({"table_file": "x", "table": [[0.5, 0.2]]}, "keep one"),
     ({"left_forwad_pin": 10}, "left_forwad_pin"), ({"odometry": "encoders"}, "'table' or 'none'"),
 ])  # fmt: skip
-def test_wrong_pins_and_options_are_refused(options, says):
+def test_wrong_pins_and_options_are_rejected(options, says):
     with pytest.raises(ValidationError) as error:
         config(**options)
     assert says in str(error.value)
@@ -179,7 +179,7 @@ def test_unchanged_speeds_write_nothing(board, drive):
 
 
 @pytest.mark.parametrize("speeds", [(float("nan"), 1.0), (1.0, float("inf"))])
-def test_a_speed_that_is_no_number_leaves_all_low(board, drive, speeds):
+def test_speed_that_is_not_finite_sets_all_pins_low(board, drive, speeds):
     drive.set(4.0, 4.0)
     with pytest.raises(HardwareError, match="not finite"):
         drive.set(*speeds)
@@ -234,7 +234,7 @@ def test_the_end_leaves_no_output(board):
         drive.set(1.0, 1.0)
 
 
-def test_the_end_is_low_before_the_pins_are_given_back_whoever_gives_them():
+def test_pins_are_low_before_their_release():
     calls = []
     pins = SimpleNamespace(
         write=lambda number, duty: calls.append((number, duty)), enable=calls.append,
@@ -248,7 +248,7 @@ def test_the_end_is_low_before_the_pins_are_given_back_whoever_gives_them():
     assert calls == [False, *((number, 0.0) for number in (*LEFT, *RIGHT)), "close"]
 
 
-def test_the_expected_wheels_turn_as_the_table_says(drive, monkeypatch):
+def test_the_expected_wheels_turn_as_the_table_states(drive, monkeypatch):
     clock = SimpleNamespace(us=1_000_000)
     monkeypatch.setattr("sightline.robot_side.hardware.gpio.monotonic_us", lambda: clock.us)
     drive.set(0.0, 0.0)

@@ -34,7 +34,7 @@ def test_a_missing_package_names_its_extra(monkeypatch, module):
         GpioDrive(config())
 
 
-def test_a_machine_without_pins_says_so(monkeypatch):
+def test_machine_without_pins_gives_one_error_line(monkeypatch):
     monkeypatch.setattr(Device, "pin_factory", None)
     fake = SimpleNamespace(LGPIOFactory=lambda: 1 / 0)
     monkeypatch.setitem(sys.modules, "gpiozero.pins.lgpio", fake)
@@ -42,7 +42,7 @@ def test_a_machine_without_pins_says_so(monkeypatch):
         GpioDrive(config())
 
 
-def test_pins_that_another_holds_are_said(board, drive):
+def test_pins_of_another_process_are_reported(board, drive):
     with pytest.raises(HardwareError, match="already in use"):
         GpioDrive(config())
     assert board.pin("GPIO10").function == "output", "the first one still has it"
@@ -108,7 +108,7 @@ def test_the_end_of_a_real_factory_leaves_the_pins_pulled_down(monkeypatch):
     assert Device.pin_factory is None
 
 
-def test_lgpio_leaves_no_pipe_where_it_is_imported_and_nobody_is_moved(tmp_path):
+def test_lgpio_import_leaves_no_pipe_and_keeps_the_folder(tmp_path):
     """The real one, in a process of its own: in a service's working directory it could not even be imported."""
     demanded.module("lgpio", "robot-pi")
     code = (

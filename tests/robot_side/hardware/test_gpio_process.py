@@ -94,7 +94,7 @@ def test_a_network_process_that_dies_or_hangs_leaves_no_pin_high(tmp_path, board
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_every_asked_for_end_is_low(tmp_path, board, number):
+def test_every_requested_end_leaves_the_pins_low(tmp_path, board, number):
     with RobotProcess(tmp_path, drive=DRIVE) as robot, Vision(robot.endpoint):
         assert rolling(board)
         robot.process.send_signal(number)

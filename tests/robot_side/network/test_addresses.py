@@ -15,7 +15,7 @@ from tests.fixtures.ports import free_port
     (["tcp/127.0.0.1:7447", "ws://0.0.0.0:9091"], ["ws://10.0.0.7:9091", "ws://192.168.1.20:9091"]),
     (["tcp/127.0.0.1:7447", "tcp/10.0.0.7:7447"], []), ([], []),
 ])  # fmt: skip
-def test_only_what_listens_everywhere_is_told_address_by_address(endpoints, said, monkeypatch):
+def test_only_wildcard_endpoints_are_listed_by_address(endpoints, said, monkeypatch):
     monkeypatch.setattr(addresses, "own_addresses", lambda: ["10.0.0.7", "192.168.1.20"])
     assert reachable_endpoints(endpoints) == said
 
@@ -27,6 +27,6 @@ def test_they_are_this_machines_own():
             probe.bind((address, free_port()))  # only an address of this machine can be bound
 
 
-def test_a_machine_with_loopback_alone_says_nothing(monkeypatch):
+def test_machine_with_loopback_alone_lists_no_address(monkeypatch):
     monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "nothing0")])
     assert own_addresses() == [] == reachable_endpoints(["tcp/0.0.0.0:7447"])

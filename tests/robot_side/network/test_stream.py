@@ -70,7 +70,7 @@ def test_loss_costs_credit_only_until_the_timeout(seed):
     assert stream.credit_timeouts > 0
 
 
-def test_nobody_listening_means_no_capture_and_no_answer_means_a_trickle():
+def test_stream_without_a_listener_captures_nothing_and_without_answers_few():
     stream = Stream(StreamConfig())
     assert not stream.may_capture(0, listening=False)
     sent = 0
@@ -87,7 +87,7 @@ def test_a_link_longer_than_the_first_timeout_is_still_measured():
     assert stream.window == 10 and len(ages) >= 10 * 28 * 0.85
 
 
-def test_credit_belongs_to_who_drives():
+def test_credit_belongs_to_the_driver():
     stream = Stream(StreamConfig())
     stream.on_sent(0, 0, 0)
     assert stream.on_answer(VIEWER, 0, 0, 1000), "with no driver, the first that acknowledges"

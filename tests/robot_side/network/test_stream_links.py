@@ -141,13 +141,13 @@ def test_1_mbit_that_both_directions_share(seed):
 
 @pytest.mark.parametrize("compute_us", [80_000, 200_000])
 @pytest.mark.parametrize("leg_us", [500, 20_000])
-def test_a_slow_detector_is_no_reason_for_worse_pictures(compute_us, leg_us):
+def test_slow_detector_does_not_reduce_image_quality(compute_us, leg_us):
     seen = run(*legs(leg_us), compute_us=compute_us)
     assert seen.stream.encoding_target == (100, 100)
     assert seen.p(95) <= compute_us / 1000 + 2 * leg_us / 1000 + 45
 
 
-def test_a_way_that_becomes_longer_is_no_reason_for_worse_pictures_for_long():
+def test_longer_link_reduces_image_quality_only_briefly():
     out, back = legs(5_000, 5e7)
     near = run(out, back, seconds=5.0)
     assert near.stream.encoding_target == (100, 100)
@@ -174,7 +174,7 @@ def test_the_wish_stays_within_what_cameras_are_promised():
     assert stream.encoding_target.scale_percent == SCALES_PERCENT[-1] and stream.window == 1
 
 
-def test_not_adapted_where_the_owner_said_so():
+def test_adaptation_switched_off_changes_nothing():
     stream = run(*legs(5_000, 1e6), config=StreamConfig(adapt=False)).stream
     assert stream.encoding_target == (100, 100)
 

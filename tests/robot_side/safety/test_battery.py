@@ -76,7 +76,7 @@ def test_battery_without_any_reading_is_silent():
 
 
 @pytest.mark.parametrize("volts", [math.nan, math.inf, -math.inf])
-def test_reading_that_is_not_a_number_is_no_reading(volts):
+def test_reading_that_is_not_finite_is_ignored(volts):
     assert after(volts).level(0) is SILENT
     monitor = after(8.0)
     monitor.see(volts, 5_000_001)

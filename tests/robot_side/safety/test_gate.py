@@ -32,7 +32,7 @@ def test_a_command_is_as_old_as_its_frame(age_ms, reason):
 
 
 @pytest.mark.parametrize(("ahead_us", "reason"), [(0, None), (1, RejectReason.FROM_FUTURE)])
-def test_a_frame_of_the_future_is_refused(ahead_us, reason):
+def test_a_frame_of_the_future_is_rejected(ahead_us, reason):
     rig = Rig().armed()
     assert rig.offer(age_ms=-ahead_us / MS).reason == reason
 
@@ -44,7 +44,7 @@ def test_the_limit_falls_linearly_with_age(age_ms, factor):
     assert age_factor(SafetyConfig(), round(age_ms * MS)) == pytest.approx(factor, abs=1e-7)
 
 
-def test_age_is_judged_again_at_every_step():
+def test_age_is_checked_again_at_every_step():
     rig = Rig(silence_ms=399).armed().drive(600)
     assert rig.gate.applied.linear_mps == 0.5
     speeds = [rig.step().twist.linear_mps for _ in range(25)]
@@ -106,7 +106,7 @@ def test_a_restarted_vision_starts_its_numbers_over():
     assert rig.offer(header=rig.header(session=OTHER, seq=0)).accepted
 
 
-def test_refused_commands_refresh_nothing():
+def test_rejected_commands_refresh_nothing():
     rig = Rig().armed().drive(600)
     stale = rig.frame()
     for _ in range(100):
@@ -195,7 +195,7 @@ def test_arming_needs_five_live_commands(commands, armed):
     assert is_armed(rig.gate.state) == armed
 
 
-def test_commands_before_arming_are_not_obeyed_after_it():
+def test_commands_before_arming_are_not_applied_after_it():
     rig = Rig()
     for _ in range(5):
         rig.offer(0.5)
@@ -209,7 +209,7 @@ def test_motion_ramps_from_zero_after_arming():
     assert 0 < rig.step().twist.linear_mps <= 0.5 * 20 * 0.02**2 * 2 + 1e-9
 
 
-def test_auto_arm_is_off_by_default_and_does_not_undo_a_person():
+def test_auto_arm_is_off_by_default_and_does_not_undo_an_operator():
     assert Rig().armed is not None and not SafetyConfig().auto_arm
     rig = Rig().drive(400)
     assert rig.gate.state is State.DISARMED

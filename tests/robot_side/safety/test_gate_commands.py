@@ -88,7 +88,7 @@ def test_either_axis_must_be_finite(axis, value):
     assert (verdict.reason, verdict.accepted, verdict.age_us) == (RejectReason.NOT_FINITE, False, None)
 
 
-def test_a_refusal_is_counted_and_kept_in_words_and_an_acceptance_has_its_age():
+def test_rejection_is_counted_with_detail_and_acceptance_has_its_age():
     rig = driving()
     accepted = rig.gate.accepted
     verdict = rig.offer(age_ms=12)
@@ -103,7 +103,7 @@ def test_a_refusal_is_counted_and_kept_in_words_and_an_acceptance_has_its_age():
 
 
 @pytest.mark.parametrize("size", [31, 32, 33, 199, 200, 201])
-def test_the_last_refusal_is_cut_to_what_a_status_holds(size):
+def test_last_rejection_is_cut_to_the_bounds_of_a_status(size):
     rig = Rig()
     verdict = rig.gate.reject("s" * size, WireError(RejectReason.MALFORMED, "d" * size))
     assert rig.gate.last_rejection == LastRejection(
@@ -113,14 +113,14 @@ def test_the_last_refusal_is_cut_to_what_a_status_holds(size):
 
 
 @pytest.mark.parametrize("state", [S, F])
-def test_nothing_drives_in_stopped_and_fault_and_nobody_gets_the_lease(state):
+def test_stopped_and_fault_permit_no_motion_and_no_lease(state):
     rig = driving(state)
     verdict = rig.offer()
     assert (verdict.reason, verdict.detail) == (RejectReason(str(state)), rig.gate.reason)
     assert rig.gate.holder(rig.now_us) is None
 
 
-def test_disarmed_commands_are_judged_and_form_the_lease():
+def test_disarmed_commands_are_validated_and_form_the_lease():
     rig = Rig()
     verdict = rig.offer()
     assert (verdict.reason, verdict.detail) == (RejectReason.DISARMED, "not armed")
@@ -129,7 +129,7 @@ def test_disarmed_commands_are_judged_and_form_the_lease():
     assert rig.offer(age_ms=401).reason is RejectReason.STALE
 
 
-def test_the_loser_is_told_who_drives():
+def test_rejected_driver_receives_holder():
     rig = driving()
     assert rig.offer(session=OTHER).detail == f"vision {VISION} drives"
     rig.drive(20, source="teleop", session=HUMAN)
@@ -156,7 +156,7 @@ def test_key_and_header_name_one_known_driver():
     assert off.reason is RejectReason.UNKNOWN_SOURCE and "safety.guests" in off.detail
 
 
-def test_a_status_is_no_frame_and_a_repeated_number_no_command():
+def test_twist_that_cites_a_status_or_repeats_a_number_is_rejected():
     rig = driving()
     rig.gate.issued.add("status", 1, rig.now_us)
     status = Echo(channel="status", session=ROBOT, seq=1, t_us=rig.now_us)
@@ -199,7 +199,7 @@ def test_a_command_is_cut_to_the_limits_and_counted(asked, goal, clamped):
         ({"guest_max_linear_mps": 3.0, "guest_max_angular_rad_s": 9.0}, 0.5, 2.5),
     ],
 )
-def test_a_guest_is_slower_and_never_faster_than_anybody(config, linear_mps, angular_rad_s):
+def test_guest_has_the_lowest_speed_limit(config, linear_mps, angular_rad_s):
     assert guest_driving(linear=9.0, **config).gate.applied.linear_mps == pytest.approx(linear_mps)
     assert guest_driving(linear=0.0, angular=-9.0, **config).gate.applied.angular_rad_s == pytest.approx(-angular_rad_s)
 

@@ -62,7 +62,7 @@ def test_who_acquires_is_not_driven_by_the_one_before():
 
 @pytest.mark.parametrize("verb", [Verb.ARM, Verb.RESET, Verb.ACQUIRE])
 @pytest.mark.parametrize("denial", ["stop", "disarm"])
-def test_what_was_asked_before_a_stop_or_disarm_does_not_undo_it(verb, denial):
+def test_request_from_before_a_stop_or_disarm_does_not_undo_it(verb, denial):
     rig = Rig().armed()
     rig.gate.issued.add("status", 70, rig.now_us)
     getattr(rig.gate, denial)()

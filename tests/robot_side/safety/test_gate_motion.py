@@ -101,7 +101,7 @@ def test_the_default_configuration_keeps_its_bound_with_room():
         {"max_jerk_mps3": 0.5},
     ],
 )
-def test_configuration_that_breaks_the_bound_is_refused(broken):
+def test_configuration_that_breaks_the_bound_is_rejected(broken):
     with pytest.raises(ValueError, match=r"700 ms|must be below"):
         SafetyConfig(**broken)
 

@@ -40,7 +40,7 @@ def test_other_requests_cite_something_young(verb, age_us, reason):
         assert reason is None
 
 
-def test_each_verb_says_what_it_did():
+def test_each_verb_returns_its_result():
     rig = Rig().armed()
     assert rig.gate.reason == "armed by operator" and rig.gate.state is H
     assert rig.request(Verb.ARM) == "already armed"
@@ -147,7 +147,7 @@ def test_the_five_are_live_as_long_as_the_lease(gap_us, granted):
     assert (granted and rig.request(Verb.ARM) == "armed") or "1 of 5" in refused(rig, Verb.ARM).detail
 
 
-def test_the_five_are_asked_for_again_after_disarming():
+def test_five_live_commands_are_required_again_after_disarming():
     rig = Rig().armed()
     rig.request(Verb.DISARM)
     assert "0 of 5" in refused(rig, Verb.ARM).detail
@@ -192,7 +192,7 @@ def test_auto_arm_arms_with_the_fifth_command(commands, state):
     assert off.step().state is D
 
 
-def test_auto_arm_says_so_and_waits_for_a_command():
+def test_auto_arm_reports_itself_and_waits_for_a_command():
     rig = Rig(auto_arm=True)
     for _ in range(5):
         rig.offer()
@@ -239,7 +239,7 @@ def test_disarming_a_disarmed_gate_ends_auto_arm():
     assert rig.drive(400).gate.state is D
 
 
-def test_arming_by_a_person_does_not_switch_auto_arm_on():
+def test_arming_by_an_operator_does_not_switch_auto_arm_on():
     rig = Rig().armed().drive(100)
     rig.silence(10_400)
     assert rig.gate.state is D
@@ -264,7 +264,7 @@ def stale(rig, asked):
 
 
 @pytest.mark.parametrize("how", LEAVING)
-def test_what_was_asked_before_a_person_ended_it_does_not_arm_again(how):
+def test_request_from_before_the_loss_of_an_operator_does_not_arm(how):
     rig = Rig().armed().drive(100, 0.2)
     asked = ask(rig)
     assert rig.gate.request(*asked, rig.now_us) == "already armed"

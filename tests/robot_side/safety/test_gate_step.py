@@ -185,7 +185,7 @@ def test_the_guard_cuts_last_and_the_ramp_goes_on_from_there():
     assert decision.reason == "driving"
 
 
-def test_a_silent_sensor_stops_at_once_and_says_so():
+def test_a_silent_sensor_stops_at_once_and_reports_it():
     rig = guarded()
     rig.gate._guard.see(Ranges(rig.now_us - 5_000_001, 0.0, 0.0, 0.05, 8.0, array.array("f", [math.inf])))
     rig.offer(0.5)
@@ -199,7 +199,7 @@ def test_the_guard_does_not_explain_a_gate_that_is_off():
     assert rig.step() == Decision(STILL, S, "STOP by test")
 
 
-def test_a_guard_that_cuts_nothing_says_nothing():
+def test_a_guard_that_cuts_nothing_reports_nothing():
     rig = guarded()
     rig.offer(0.5)
     assert rig.step() == Decision(twist(0.5), A, "driving")

@@ -227,7 +227,7 @@ def test_what_is_too_close_to_measure_is_as_far_as_the_least_range(range_m):
 
 
 @pytest.mark.parametrize("ranges_m", [[], [0.0], [0.0, -0.0, 0.0], [0.71], [0.0, 0.71]])
-def test_a_scan_in_which_no_ray_says_anything_is_not_taken(ranges_m):
+def test_scan_without_any_echo_is_ignored(ranges_m):
     guard = box(max_scan_age_ms=50)
     guard.see(scan([0.65], least_m=0.6, most_m=0.7))
     guard.see(scan(ranges_m, t_us=10_000, least_m=0.6, most_m=0.7))
@@ -236,7 +236,7 @@ def test_a_scan_in_which_no_ray_says_anything_is_not_taken(ranges_m):
 
 
 @pytest.mark.parametrize("range_m", [0.3, 0.6, 0.7, math.inf])
-def test_one_ray_that_says_something_is_a_scan(range_m):
+def test_scan_with_one_echo_is_accepted(range_m):
     guard = box(max_scan_age_ms=50)
     guard.see(scan([0.0, range_m, 0.71], least_m=0.6, most_m=0.7))
     assert guard.is_fresh(50_000)
@@ -370,24 +370,24 @@ def test_a_scan_without_rays_has_no_blind_zone():
 @pytest.mark.parametrize(("first_rad", "each_rad", "refused"), [
     (-math.pi, math.pi / 2, True), (-math.pi, math.pi, False), (math.pi / 4, math.pi / 4, True),
 ])  # fmt: skip
-def test_it_is_judged_only_where_the_sensor_looks(first_rad, each_rad, refused):
+def test_blind_zone_is_checked_only_in_sensor_directions(first_rad, each_rad, refused):
     """0.6 is too much to the sides, not ahead and behind."""
     assert is_refused(blind_scan(0.6, first_rad, each_rad, rays=2), stop_m=0.3) == refused
 
 
 @pytest.mark.parametrize("least_m", [math.nan, math.inf])
-def test_a_minimum_that_is_no_number_is_a_bad_reading(least_m):
+def test_a_minimum_that_is_not_a_number_is_a_bad_reading(least_m):
     with pytest.raises(ValueError, match="not finite") as caught:
         check_blind_zone(GuardConfig(**BLIND_BOX), blind_scan(least_m))
     assert not isinstance(caught.value, BlindZoneError)
 
 
-def test_the_words_say_what_to_set():
+def test_error_names_the_setting():
     with pytest.raises(BlindZoneError, match=r"guard.stop_m = 0.25: .* below 1 m, .* 0.500 m beyond .* outline"):
         check_blind_zone(GuardConfig(**BLIND_BOX), blind_scan(1.0))
 
 
-def test_a_simulated_robot_is_refused_with_its_name():
+def test_a_simulated_robot_is_rejected_with_its_name():
     model = load_robot("gazebo-raspi").model_copy(update={"settings": {"guard": {"stop_m": 0.08}}})
     with pytest.raises(ConfigError, match=r"^robot gazebo-raspi: \[settings\] guard.stop_m = 0.08: .* below 0.1 m.*$"):
         robot_config(model)

@@ -35,7 +35,7 @@ def test_a_lease_lives_its_time(who, now_us, held):
     assert lease.may_take(OTHER_VISION, now_us) == (not held or who is GUEST)
 
 
-def test_a_new_lease_is_held_by_nobody():
+def test_new_lease_has_no_holder():
     lease = Lease(500)
     assert lease == Lease(500, None, 0)
     for now_us in (-1, 0, 1):
@@ -65,5 +65,5 @@ def test_taking_again_renews():
         (GUEST, GUEST, True), (GUEST, VISION, True), (GUEST, HUMAN, True),
     ],
 )  # fmt: skip
-def test_the_holder_and_whoever_outranks_it_may_take_the_lease(holder, who, may):
+def test_holder_and_higher_rank_may_take_the_lease(holder, who, may):
     assert held_by(holder).may_take(who, 1_200) == may

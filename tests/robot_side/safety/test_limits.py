@@ -64,7 +64,7 @@ def test_the_limit_falls_over_a_time(full_ms, zero_ms, allowed):
         assert allowed
 
 
-def test_a_configuration_that_stops_late_is_refused_with_its_bound():
+def test_a_configuration_that_stops_late_is_rejected_with_its_bound():
     late = config(max_acceleration_mps2=0.5)
     bound = stop_bound(late)
     with pytest.raises(ValidationError) as caught:
@@ -226,7 +226,7 @@ def test_the_stop_bound_of_the_defaults():
     {"max_linear_mps": 0.6, "max_acceleration_mps2": 3.0, "max_jerk_mps3": 10.0},  # 0.277 m
     {"max_angular_rad_s": 10.0, "max_acceleration_rad_s2": 28.0},  # 708 ms until it does not turn
 ])
-def test_a_stop_that_is_too_long_step_by_short_step_or_in_turning_is_refused(changes):
+def test_stop_bound_exceeded_in_short_steps_or_in_turning_is_rejected(changes):
     with pytest.raises(ValidationError, match=r"after its last command.* full_speed_age_ms .* jerks"):
         SafetyConfig(**changes)
 

@@ -25,7 +25,7 @@ def refusal(judge, *args):
 # --- verdict -----------------------------------------------------------------------------------------------------
 
 
-def test_a_verdict_is_accepted_when_it_has_no_reason():
+def test_result_without_a_reason_is_accepted():
     assert CommandResult(None).accepted and CommandResult(None) == CommandResult(None, "", None)
     assert not CommandResult(RejectReason.STALE).accepted
 
@@ -52,7 +52,7 @@ def test_age_is_from_now_up_to_the_limit(age_us, reason):
         assert refusal(record.age_us, echo(), 1_000 + age_us, 400).reason is reason
 
 
-def test_the_refusal_of_an_age_says_the_milliseconds():
+def test_rejection_of_an_age_contains_the_milliseconds():
     record = issued((7, 1_000_000))
     assert refusal(record.age_us, echo(t_us=1_000_000), 999_000 - 1_000_000 + 1_000, 400).detail == (
         "cites frame 7, 1000 ms in the future"
@@ -108,7 +108,7 @@ def test_a_request_cites_a_status(cited):
 @pytest.mark.parametrize(
     ("now_us", "reason"), [(0, None), (100, None), (101, RejectReason.STALE), (-1, RejectReason.FROM_FUTURE)]
 )
-def test_a_requests_status_is_judged_as_a_frame_is(now_us, reason):
+def test_status_of_a_request_is_validated_like_a_frame(now_us, reason):
     record = IssuedRecord(ROBOT)
     record.add("status", 0, 0)
     try:
@@ -213,7 +213,7 @@ def test_sequence_numbers_only_grow(first, then, accepted):
         assert error.detail == f"seq {then} of vision is not newer than {first}"
 
 
-def test_a_refused_number_is_not_kept():
+def test_rejected_number_is_not_stored():
     record = SequenceRecord()
     record.check(header(5))
     refusal(record.check, header(3))

@@ -77,7 +77,7 @@ def test_scene_with_pybullet_without_numpy_is_the_same(renderer, monkeypatch):
     assert np.array_equal(scene.rgb, again.rgb) and (scene.truths, scene.unclear) == (again.truths, again.unclear)
 
 
-def test_the_judged_scenes_are_those_that_figures_were_published_of(monkeypatch):
+def test_scored_scenes_are_those_of_the_published_figures(monkeypatch):
     then = judged_scenes.kept()
     for now, before in zip(judged_scenes.drawn(), then, strict=True):
         assert (now["column"], now["seed"]) == (before["column"], before["seed"])
@@ -97,7 +97,7 @@ def test_a_ball_is_as_large_as_agreed_and_stands_in_view():
                     assert 0 < (x1 + x2) / 2 < WIDTH_PX and 0 < (y1 + y2) / 2 < HEIGHT_PX
 
 
-def test_what_is_judged_was_never_trained_on():
+def test_scored_scenes_were_never_trained_on():
     purposes = {0: TRAINED, LATER_FROM: TRAINED_LATER, HARDER_FROM: TRAINED_HARDER, VALIDATED_FROM: VALIDATED,
                 JUDGED_FROM: JUDGED}
     trained = {*TRAINED, *TRAINED_LATER, *TRAINED_HARDER}
@@ -121,7 +121,7 @@ def test_what_is_trained_last_has_more_boxes_of_the_balls_colour_and_more_legs()
     assert share(HARDER_FROM, "legs") > share(0, "legs") + 0.2 and share(HARDER_FROM, "box") > share(0, "box")
 
 
-def test_columns_have_what_their_names_say():
+def test_columns_match_their_names():
     boxes = judged_plans(COLUMNS["same-colour boxes"])
     for plan in boxes:
         near = [one for one in plan.solids if one.shape == "box"]
@@ -135,7 +135,7 @@ def test_columns_have_what_their_names_say():
     assert 4 <= most <= MOST_DISTRACTORS + 4  # the ball, a light, legs, one thing in front of it
 
 
-def test_each_fifth_judged_scene_has_no_ball():
+def test_each_fifth_scored_scene_has_no_ball():
     for start in (JUDGED_FROM, VALIDATED_FROM):
         has = [any(one.label == "ball" for one in plan_scene(start + n, COLUMNS["nominal"]).solids) for n in range(20)]
         assert has == [n % 5 != 0 for n in range(20)]
@@ -182,7 +182,7 @@ def test_textures_are_tiles_of_their_seed(family):
     assert np.array_equal(one, texture(family, 5)) and not np.array_equal(one, texture(family, 6))
 
 
-def test_light_and_quality_do_what_they_say(renderer):
+def test_light_and_quality_have_their_effects(renderer):
     scene = renderer.scene(JUDGED_FROM + 2, COLUMNS["nominal"])
     nominal, light = COLUMNS["nominal"], replace(COLUMNS["changed light"], gain=(0.25, 0.25))
     means = [simplejpeg.decode_jpeg(with_defects(scene.rgb, one, np.random.default_rng(4)), "RGB").mean()
@@ -203,7 +203,7 @@ def test_blur_takes_detail_away_and_keeps_the_light(renderer):
 
 
 @pytest.mark.parametrize("angle_deg", [0, 30, 90, 135])
-def test_a_streak_is_as_long_as_it_says_and_keeps_the_light(angle_deg):
+def test_streak_has_the_configured_length_and_brightness(angle_deg):
     kernel = streak(15.0, math.radians(angle_deg))
     rows, columns = np.nonzero(kernel)
     assert kernel.sum() == pytest.approx(1.0)

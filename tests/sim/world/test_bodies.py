@@ -109,7 +109,7 @@ def test_only_the_lit_lamp_is_bright():
 
 
 @pytest.mark.parametrize("name", ["traffic-light", "traffic-light-boxes"])
-def test_the_picture_shows_what_truth_says_is_lit(name):
+def test_image_shows_the_lamp_of_the_truth(name):
     scenario = load_scenario(name)
     near = scenario.start.model_copy(update={"at_m": (2.0, -0.4), "heading_deg": (0.0, 0.0), "jitter_m": 0.0})
     with World(scenario.model_copy(update={"start": near}), robot_with(), 5) as world:
@@ -125,7 +125,7 @@ def test_the_picture_shows_what_truth_says_is_lit(name):
 # --- extending ---------------------------------------------------------------------------------------------------
 
 
-def test_a_file_says_only_what_differs():
+def test_file_contains_only_differences_from_the_defaults():
     ball, eight = load_scenario("ball"), load_scenario("ball-eight")
     assert (eight.seconds, len(eight.target.path)) == (60.0, 2)
     assert (eight.target.color, eight.vision, eight.start) == (ball.target.color, ball.vision, ball.start)
@@ -159,7 +159,7 @@ def test_what_cannot_be_extended_so_is_one_line(tmp_path, text, expected):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 7])
-def test_waypoints_are_told_as_the_robot_counts(seed):
+def test_waypoints_are_numbered_as_the_robot_counts(seed):
     scenario = load_scenario("thymio")
     with World(scenario, load_robot("thymio"), seed) as world:
         truth = world.truth()

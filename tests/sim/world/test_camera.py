@@ -125,7 +125,7 @@ def test_nothing_but_the_ball_is_strongly_coloured(look):
         assert np.quantile(spread, 0.999) < 0.55
 
 
-def test_looks_do_what_they_say():
+def test_looks_have_their_effects():
     def seen(look: str) -> np.ndarray:
         with World(seen_at(0.8, 0.0, look=look), robot_with(), 1) as world:
             return simplejpeg.decode_jpeg(world.render(), "RGB").astype(float)

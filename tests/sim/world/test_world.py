@@ -102,7 +102,7 @@ def test_motors_latch():
         assert world.truth().linear_mps == pytest.approx(8 * RADIUS_M, rel=0.01)
 
 
-def test_a_stop_from_half_a_metre_per_second_takes_what_the_limits_say():
+def test_stop_from_half_a_meter_per_second_matches_the_bound():
     with World(empty(), robot_with(), 1) as world:
         odometry = DeadReckoning(world)
         odometry.drive(0.5 / RADIUS_M, 0.5 / RADIUS_M, 2)
@@ -120,7 +120,7 @@ ON_THE_MAP = [name for name in scenario_names() if name not in SEEN]
 
 @pytest.mark.parametrize("name", ON_THE_MAP)
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_run_begins_where_the_map_says_and_rests(name, seed):
+def test_run_starts_at_the_configured_place_and_rests(name, seed):
     scenario = load_scenario(name)
     start = scenario.start
     with World(scenario, load_robot(scenario.robot), seed) as world:
@@ -137,7 +137,7 @@ def test_a_run_begins_where_the_map_says_and_rests(name, seed):
 
 @pytest.mark.parametrize("name", SEEN)
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_run_begins_as_the_scenario_says_and_rests(name, seed):
+def test_run_starts_as_configured_and_rests(name, seed):
     scenario = load_scenario(name)
     with World(scenario, load_robot(scenario.robot), seed) as world:
         truth = world.truth()

@@ -44,7 +44,7 @@ def test_only_the_labels_that_are_meant_count() -> None:
 
 
 @pytest.mark.parametrize("scale", [1, 2])
-def test_the_model_says_ball_and_the_colour_says_which(scale: int) -> None:
+def test_model_finds_balls_and_color_selects_one(scale: int) -> None:
     picture = np.full((240 * scale, 320 * scale, 3), 140, np.uint8)
     for x, colour in ((60, YELLOW_BGR), (160, (200, 60, 30)), (260, (140, 140, 140))):
         cv2.circle(picture, (x * scale, 120 * scale), 20 * scale, colour, -1)

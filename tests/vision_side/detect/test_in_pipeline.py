@@ -86,7 +86,7 @@ class Strange:
         lambda one: [], lambda one: [one, one], lambda one: None, lambda one: ["boxes"], lambda one: 1 / 0,
     ],
 )  # fmt: skip
-def test_nonsense_is_no_answer_and_counted(change) -> None:
+def test_invalid_reply_counts_as_no_answer(change) -> None:
     strange = pipeline(Strange(change))
     answer = strange.step(frame(1))
     assert answer.twist is None and answer.seen.phase == "no answer" and answer.seen.note
@@ -135,7 +135,7 @@ def test_what_fails_for_one_robots_frame_costs_no_other_robot_its_answer() -> No
     assert (first.robot, second.robot) == ("r1", "r2") and "an odd picture" in odd
 
 
-def test_nobody_is_asked_frame_by_frame_once_the_time_is_over() -> None:
+def test_remote_detector_is_skipped_after_the_deadline() -> None:
     class Slow(OfOneOdd):
         calls = 0
 
@@ -173,7 +173,7 @@ def test_a_picture_is_decoded_once_for_all_who_share_it() -> None:
     assert Counting.count == 1
 
 
-def test_what_is_followed_is_neither_a_light_nor_legs_unless_asked_for() -> None:
+def test_lights_and_legs_are_followed_only_on_request() -> None:
     seen = [box(20, 100, label="legs"), box(260, 100, label="light red")]
     assert pipeline(Told(seen)).step(frame(1)).seen.target is None
     asked = pipeline(Told(seen), target=TargetConfig(label="legs")).step(frame(1)).seen
@@ -196,7 +196,7 @@ def test_the_service_gives_credit_back_where_there_is_no_answer() -> None:
     assert any("no answer" in line for line in bench.said)
 
 
-def test_the_report_says_who_looks_on_what_and_how_fast() -> None:
+def test_report_names_detector_device_and_time() -> None:
     class Timed(Told):
         def detect(self, frames, deadline_us):
             return [replace(one, detector="onnx:ball.onnx", model_hash="ab12", device="cuda", compute_us=1234)
@@ -217,7 +217,7 @@ def test_the_colour_detector_reports_how_long_it_took() -> None:
     assert report.inference_us is not None and 0 < report.inference_us < 1_000_000
 
 
-def test_until_when_a_detector_may_take_is_said() -> None:
+def test_detector_deadline_is_passed() -> None:
     heard: list[int] = []
 
     class Listening(Told):

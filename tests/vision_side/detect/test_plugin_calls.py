@@ -19,7 +19,7 @@ class Failing:
     attach = close = notices = _fail
 
 
-def test_what_a_plug_in_raises_is_one_line_that_says_where() -> None:
+def test_error_of_a_plug_in_gives_one_line_with_its_place() -> None:
     bad = Failing(RuntimeError("two\nlines"))
     for what, ask in (("attach", lambda: attach_detector(bad, None)), ("close", lambda: close_detector(bad))):
         with pytest.raises(ConfigError, match=rf"{what}\(\) raises RuntimeError: two lines; fix the plug-in"):

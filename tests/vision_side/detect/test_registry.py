@@ -167,7 +167,7 @@ def test_an_installed_package_brings_its_detectors_by_name(monkeypatch: pytest.M
         build_detector("lense", {}, config())
 
 
-def test_a_device_is_handed_to_who_can_have_one(tmp_path: Path) -> None:
+def test_device_is_passed_only_to_plugins_that_accept_one(tmp_path: Path) -> None:
     path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
     assert isinstance(configured_detector(config(kind=f"onnx:{path}", device="cpu")), OnnxDetector)
     with pytest.raises(HardwareError, match="--device cuda"):

@@ -55,7 +55,7 @@ MISSIONS = {
     ("legs", "legs", (("legs", AWAY),), False), ("whatever", "legs", (("ball", AWAY),), False),
     ("band", "ball", (("light-red", NEAR),), True),
 ])  # fmt: skip
-def test_what_the_mission_does_not_go_by_is_no_disagreement(mission: str, mine: str, boxes: tuple, agree: bool) -> None:
+def test_detections_outside_the_mission_do_not_disagree(mission: str, mine: str, boxes: tuple, agree: bool) -> None:
     goes_by = configured_mission(MISSIONS[mission]).goes_by
     found = tuple(Detection(*box, 0.9, label) for label, box in boxes)
     driving = replace(result(1), detections=(Detection(*HERE, 0.9, mine),))
@@ -67,7 +67,7 @@ def test_what_a_mission_does_not_go_by_counts_as_nothing() -> None:
     assert disagreement(result(1), legs, configured_mission(VisionConfig()).goes_by) == ""
 
 
-def test_disagreement_is_told_now_and_then_only() -> None:
+def test_disagreement_is_logged_at_a_limited_rate() -> None:
     agreement, lines = Agreement(), []
     for index in range(600):  # 20 s
         other = () if index % 2 else (HERE,)
@@ -151,7 +151,7 @@ def test_both_are_closed_whichever_fails_to(pair) -> None:
     assert closed == ["two"]
 
 
-def test_a_shadow_that_raises_is_told_and_goes_on(pair) -> None:
+def test_shadow_that_raises_is_reported_and_continues(pair) -> None:
     _, shadow, both = pair
     shadow.detect, good = None, shadow.detect  # calling None raises
     both.detect([frame(1)], NO_DEADLINE)

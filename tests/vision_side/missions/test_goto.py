@@ -89,7 +89,7 @@ def test_a_trap_deeper_than_the_robot_sees_is_left_again() -> None:
 @pytest.mark.parametrize("seed", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("course", "goal"), [(CLOSED, (1.5, 1.5)), (SHUT_IN, (3.0, 0.4)), (SHUT_IN, (40.0, -30.0))],
                          ids=["goal shut in", "robot shut in", "robot shut in, goal far"])
-def test_a_closed_room_is_said_to_be_closed(course: Course, goal: tuple[float, float], seed: int) -> None:
+def test_a_closed_room_is_reported_as_closed(course: Course, goal: tuple[float, float], seed: int) -> None:
     run = drive(course, goal, seconds=90, start=(0, 0, seed * 2.0), seed=seed)
     assert end_of(run).done and end_of(run).phase == "cannot reach"
     assert end_of(run).note == "reached 0 of 1: cannot reach waypoint 1: every way that was seen is closed"
@@ -130,7 +130,7 @@ def test_a_free_way_is_driven_straight_and_ends_on_the_spot(distance_m: float) -
     assert max(row.moving[0] for row in run) <= 0.5
 
 
-def test_an_eye_that_sees_far_lets_the_robot_drive_at_full_speed() -> None:
+def test_far_ray_sensor_permits_full_speed() -> None:
     run = drive(Course(), (4.0, 0.0), sensor=Lidar(), options={"sight_m": 3.0, "sensor_x_m": 0.055})
     assert max(row.moving[0] for row in run) > 0.45
     assert run[-1].t_s < 12.0
@@ -182,7 +182,7 @@ def test_ranges_that_end_stop_the_robot() -> None:
     assert all(row.moving[0] == 0.0 for row in run if row.t_s > 3.5)
 
 
-def test_time_in_which_the_robot_is_held_is_no_lack_of_progress() -> None:
+def test_time_in_hold_does_not_count_as_missing_progress() -> None:
     run = drive(Course(), (0.5, 0.0), held_until_s=40.0, seconds=60)
     assert end_of(run).note == "reached 1 of 1"
 
@@ -209,6 +209,6 @@ def test_the_same_frames_give_the_same_plans() -> None:
 
 @pytest.mark.parametrize("waypoints", [[], [[1.0, math.nan]], [[1.0, math.inf]], [[101.0, 0.0]], [["a", 0.0]], [[1.0]],
                                        [[0.0, 0.0]] * 65])
-def test_waypoints_out_of_the_world_are_refused(waypoints: list) -> None:
+def test_waypoints_out_of_the_world_are_rejected(waypoints: list) -> None:
     with pytest.raises(ValidationError):
         Goto.Config.model_validate({"waypoints": waypoints})

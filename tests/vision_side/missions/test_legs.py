@@ -80,7 +80,7 @@ def errors(run: list[Row], walk: Walk, from_s: float) -> tuple[float, float, flo
 
 @pytest.mark.parametrize("speed_mps", [0.2, 0.35, 0.45])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_person_who_walks_is_followed_at_eight_tenths_of_a_metre(speed_mps: float, seed: int) -> None:
+def test_walking_legs_are_followed_at_eight_tenths_of_a_meter(speed_mps: float, seed: int) -> None:
     run = follow(circle(speed_mps), speed_mps, 20, seed)
     bearing_deg, least_m, most_m = errors(run, circle(speed_mps), 4.0)
     assert bearing_deg < 3
@@ -88,7 +88,7 @@ def test_a_person_who_walks_is_followed_at_eight_tenths_of_a_metre(speed_mps: fl
     assert all(row.plan is None or row.plan.phase != "lost" for row in run)
 
 
-def test_a_person_who_comes_nearer_is_backed_away_from() -> None:
+def test_robot_backs_away_from_legs_that_approach() -> None:
     def walk(t_s: float) -> tuple[float, float, float]:
         return max(0.9, 1.6 - 0.2 * t_s), 0.0, math.pi
     run = follow(walk, 0.2, 10)
@@ -126,7 +126,7 @@ def test_the_field_is_symmetric_and_metric(bearing_deg: float, away_m: float) ->
     assert plan.distance_m == pytest.approx(away_m, abs=0.04)
 
 
-def test_legs_are_told_apart_by_the_gap_between_them() -> None:
+def test_legs_are_distinguished_by_the_gap_between_them() -> None:
     points = np.array([[1.0, 0.2], [0.99, 0.18], [1.1, 0.0], [1.09, 0.02], [3.0, -0.1]])
     assert nearest_legs(points, np.hypot(*points.T), 0.6) == pytest.approx([1.006, 1.090], abs=0.01)
 

@@ -128,7 +128,7 @@ def test_the_way_round_a_wall_keeps_its_distance(keep: float, half: float, shift
     assert carrot == (2.0, 0.0)
 
 
-def test_a_gap_that_is_too_narrow_is_no_way_and_one_wide_enough_is() -> None:
+def test_narrow_gap_is_closed_and_wide_gap_is_open() -> None:
     room = np.vstack([wall(1.0, -3.0, -0.2), wall(1.0, 0.2, 3.0), wall(-1.0, -3.0, 3.0),
                       wall(1.0, -3.0, -3.0)])
     ends = [cells_of(np.column_stack([np.linspace(-1, 1, 200), np.full(200, y)])) for y in (-3.0, 3.0)]

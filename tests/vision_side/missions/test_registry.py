@@ -65,7 +65,7 @@ def test_the_contract_finds_what_is_broken():
     ("follow", {"target": 3}, "option 'target'"),
     ("goto", {}, "option 'waypoints' is missing"),
 ])
-def test_what_cannot_be_chosen_is_one_line_that_says_why(kind, options, words):
+def test_invalid_choice_gives_one_line_with_the_reason(kind, options, words):
     with pytest.raises(ConfigError) as error:
         mission_spec(kind, options, CONFIG)
     assert words in str(error.value) and len(str(error.value).splitlines()) == 1
@@ -91,7 +91,7 @@ def test_a_mission_begins_with_the_sections_of_vision_and_its_options_lie_over_t
     assert made.track == config.track
 
 
-def test_what_is_asked_for_lies_over_what_is_configured_for_the_same_mission():
+def test_requested_options_override_the_configured_ones():
     config = VisionConfig.model_validate({"mission": {"kind": "band", "options": {"averaged": 3, "linear_mps": 0.3}}})
     asked = requested_mission(MissionRequest(id=1, name="band", options={"linear_mps": 0.2}), config)
     assert (asked.config.averaged, asked.config.linear_mps) == (3, 0.2)

@@ -125,7 +125,7 @@ def frame(seq, session="0000abcd"):
     return Frame(FrameHeader(session=session, seq=seq, t_us=seq * FRAME_US), BALL)
 
 
-def test_an_answer_names_the_mission_that_was_asked_for_and_a_new_session_ends_it():
+def test_an_answer_names_the_mission_that_was_requested_and_a_new_session_ends_it():
     pipeline = Pipeline(CONFIG, CAMERA, configured_detector(CONFIG))
     first = pipeline.step(frame(1))
     assert (first.mission, first.request) == ("follow", None)
@@ -145,7 +145,7 @@ def test_a_request_that_comes_twice_is_applied_once():
     assert answer.seen.phase == "driving"
 
 
-def test_what_was_asked_for_goes_on_with_another_camera_and_without_one_needed_as_it_is():
+def test_requested_mission_continues_with_another_camera():
     pipeline = Pipeline(CONFIG, CAMERA, configured_detector(CONFIG))
     pipeline.step(frame(1))
     pipeline.set_camera(CAMERA.model_copy(update={"width_px": 640, "height_px": 480}))
@@ -168,6 +168,6 @@ def test_what_was_asked_for_goes_on_with_another_camera_and_without_one_needed_a
     assert int(pipeline.step(frame(12)).seen.note.split()[0]) == int(before.split()[0]) + 1
 
 
-def test_a_pipeline_of_no_mission_is_refused_in_words():
+def test_pipeline_with_an_unknown_mission_is_rejected():
     with pytest.raises(ConfigError, match="did you mean 'goto'"):
         Pipeline(VisionConfig(mission=MissionConfig(kind="gotto")), CAMERA, NoDetector())

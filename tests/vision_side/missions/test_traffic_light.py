@@ -44,7 +44,7 @@ def test_every_state_is_read_right_in_every_look(look: str, is_box: bool) -> Non
     assert read >= 34
 
 
-def test_no_light_is_read_where_there_is_none() -> None:
+def test_image_without_a_light_gives_no_light() -> None:
     world = LaneWorld(light=(-5.0, 0.0))
     for number in range(12):
         blocks, picture = world.sight((0.25 * number, 0.0, 0.05 * math.sin(number)), 0.0)
@@ -52,7 +52,7 @@ def test_no_light_is_read_where_there_is_none() -> None:
         assert BoxLightReader(LampConfig()).read(picture, blocks) == []
 
 
-def test_noise_is_no_light_and_breaks_nothing() -> None:
+def test_noise_gives_no_light_and_raises_nothing() -> None:
     draw = np.random.default_rng(3)
     for reader in (HousingLightReader(LampConfig()), BoxLightReader(LampConfig())):
         for picture in (draw.integers(0, 256, (120, 160, 3)), np.zeros((120, 160, 3)), np.full((120, 160, 3), 255)):

@@ -196,7 +196,7 @@ def test_a_known_size_gives_the_place_and_none_only_the_direction(x_m, y_m, pitc
     assert math.atan2(place.y_m, place.x_m - model.x_m) == pytest.approx(math.atan2(y_m, x_m - model.x_m))
 
 
-def test_a_box_cut_by_the_border_tells_no_range_and_an_empty_one_nothing():
+def test_box_cut_by_the_border_has_no_range_and_an_empty_box_no_position():
     cut = Detection(100.0, 150.0, 140.0, 240.0, 0.9, "person")
     tall = CONFIG.boxes.model_copy(update={"height_m": 1.7})
     place = locate_box(cut, MODEL, tall, 1.5)
@@ -265,7 +265,7 @@ class Eyes:
         self._link.publish(DETECTIONS, encode(header), encode(Detections(width_px=16, height_px=16, boxes=(box,))))
 
 
-def test_over_a_real_link_the_robot_judges_boxes_by_the_frame_they_answer(tmp_path):
+def test_over_a_real_link_the_robot_validates_boxes_by_the_frame_they_answer(tmp_path):
     """A real robot process, our service, and a detector that answers fresh frames first and then old ones."""
     config = VisionConfig.model_validate({"detector": {"kind": "boxes"}, "boxes": {"width_m": 1.0}})
     ending, said = threading.Event(), []

@@ -72,7 +72,7 @@ class Bench:
         return self.service.counters()["r1"]
 
 
-def test_what_is_refused_is_no_load_and_each_reason_is_told_once():
+def test_rejected_request_adds_no_load_and_each_reason_is_logged_once():
     says = Says(GOOD)
     bench = Bench(says)
     assert bench.look() is not None
@@ -111,7 +111,7 @@ def test_an_answer_that_is_too_long_for_the_wire_loses_its_last_boxes_and_ends_n
     (Says(GOOD, device="d" * 33), "device"), (Says(GOOD, model_hash="h" * 65), "model"),
     (Says(*[GOOD] * 65), "65 boxes"), (Says(RuntimeError("out of memory")), "out of memory"),
 ])
-def test_what_the_wire_cannot_say_is_counted_and_said_once_with_what_is_wrong(detector, why):
+def test_value_beyond_the_wire_is_counted_and_logged_once(detector, why):
     bench = Bench(detector)
     assert bench.look() is None and bench.look() is None
     assert (bench.tally().rejected, bench.tally().served) == (2, 0)
@@ -119,7 +119,7 @@ def test_what_the_wire_cannot_say_is_counted_and_said_once_with_what_is_wrong(de
     assert why in line and line.startswith("detector: ") and "\n" not in line
 
 
-def test_news_of_the_detector_are_told_at_the_start_and_whenever_there_are_any():
+def test_notices_of_the_detector_are_logged_at_the_start_and_on_change():
     detector = Says(GOOD)
     detector.lines = ["m.onnx runs on cpu: no GPU runtime is installed"]
     bench = Bench(LabelFilter(detector, ("ball",)))
@@ -151,7 +151,7 @@ class Late:
 
 
 @pytest.mark.parametrize("answers", [True, False])
-def test_what_comes_after_the_deadline_is_late_and_not_refused(answers):
+def test_answer_after_the_deadline_is_late_and_not_rejected(answers):
     bench = Bench(Late(answers), deadline_us=5_000)
     assert bench.look() is None
     assert (bench.tally().late, bench.tally().rejected) == (1, 0)

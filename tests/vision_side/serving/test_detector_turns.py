@@ -26,7 +26,7 @@ def test_whatever_waits_is_one_batch_up_to_its_bound():
     assert [turn.robot for turn in turns.take(1)] == ["d", "e"]
 
 
-def test_whoever_was_served_last_is_last_however_much_it_sends():
+def test_last_served_robot_is_last_at_any_rate():
     turns = FairQueue(1, DEADLINE_US)
     served = []
     for step in range(30):

@@ -70,14 +70,14 @@ def test_a_camera_needs_no_robot():
     assert "distance 0.96 m; would steer" in said[1]
 
 
-def test_a_camera_that_is_unplugged_is_said_once_and_waited_for(monkeypatch):
+def test_unplugged_camera_is_logged_once_and_awaited(monkeypatch):
     monkeypatch.setattr("sightline.vision_side.serving.dry_run._RETRY_S", 0.0)
     gone = HardwareError("camera /dev/video0 was unplugged; plug it in again")
     said = watch([BALL, gone, gone, None, BALL])
     assert said[2:] == ["camera: camera /dev/video0 was unplugged; plug it in again", "camera: back"]
 
 
-def test_it_tells_at_most_twice_a_second():
+def test_reports_are_limited_to_two_per_second():
     said = []
     telling = ProgressPrinter(said.append)
     for picture in range(301):
@@ -87,7 +87,7 @@ def test_it_tells_at_most_twice_a_second():
     assert said[-1] == "lost: no target (30 pictures/s)"
 
 
-def test_the_sign_of_a_bearing_and_what_would_be_driven_are_told():
+def test_dry_run_prints_the_sign_of_a_bearing_and_the_twist():
     said = []
     seen = Observation("tracking", bearing_rad=-0.1, distance_m=1.234)
     ProgressPrinter(said.append).step(PipelineAnswer(Twist(linear_mps=0.2, angular_rad_s=-0.5), seen), 0.0)
@@ -108,12 +108,12 @@ def test_a_local_camera_is_opened_by_kind_and_options_and_closed(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["path", "=3", " =3"])
-def test_an_option_that_is_none_is_said(text):
+def test_an_option_that_is_invalid_is_reported(text):
     with pytest.raises(ConfigError, match="expected KEY=VALUE"), local_camera("still", [text]):
         pass
 
 
-def test_a_real_robot_that_would_obey_does_not_move(tmp_path):
+def test_dry_run_does_not_move_an_armed_robot(tmp_path):
     (tmp_path / "a.jpg").write_bytes(BALL)
     camera = {"kind": "still", "options": {"path": str(tmp_path / "a.jpg"), "hfov_deg": 80}}
     said = []

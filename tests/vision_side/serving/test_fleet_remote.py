@@ -170,7 +170,7 @@ class Hanging:
         time.sleep(1.0)
 
 
-def test_eyes_that_hang_at_the_end_hang_beside_one_another():
+def test_detectors_that_hang_at_the_end_hang_in_parallel():
     kind, over = f"{__name__}:Hanging", threading.Event()
     fleet = Fleet(VisionConfig(robot="r*", detector=DetectorConfig(kind=kind)), Quiet(8), lambda line: None)
     thread = threading.Thread(target=fleet.serve, args=(over,), daemon=True)

@@ -78,7 +78,7 @@ class Bench:
         return decode(MissionReport, self.reports[-1].payload, REPORT.max_payload_bytes)
 
 
-def test_a_mission_that_is_asked_for_is_taken_up_cited_and_reported():
+def test_requested_mission_is_applied_cited_and_reported():
     bench = Bench().frames(5)
     assert bench.answer().mission is None
     bench.ask("band", 7, options={"linear_mps": 0.2})
@@ -91,7 +91,7 @@ def test_a_mission_that_is_asked_for_is_taken_up_cited_and_reported():
     assert any("mission band, requested by operator" in line for line in bench.said)
 
 
-def test_what_is_said_again_is_taken_up_once():
+def test_repeated_request_is_applied_once():
     bench = Bench().frames(5).ask("band", 1).frames(6)
     for _ in range(4):
         bench.ask("band", 1).frames()
@@ -112,7 +112,7 @@ def test_what_is_said_again_is_taken_up_once():
     ({"session": "0000beef"}, "OTHER_SESSION"),
     ({"age_us": 2_100_000}, "STALE: requested 2.1 s ago; repeat the request"),
 ])
-def test_what_is_not_taken_up_is_said_why_and_changes_nothing(how, words):
+def test_rejected_mission_is_reported_and_changes_nothing(how, words):
     bench = Bench().frames(80).ask(**{"name": "band", **how}).frames(3)
     assert bench.answer().mission is None and bench.service._pipeline.mission.name == "follow"
     report = bench.report()
@@ -131,7 +131,7 @@ def test_a_broken_mission_is_counted_and_ends_nothing(payload):
     assert "MALFORMED" in bench.report().refused
 
 
-def test_a_new_session_of_the_robot_ends_what_was_asked_for_and_says_so():
+def test_new_robot_session_ends_the_requested_mission_and_reports_it():
     bench = Bench().frames(5).ask("band", 3).frames(6)
     bench.frames(2, session="0000beef")
     bench.service._mission_channel._reporter._reported_s = -1e9
@@ -160,7 +160,7 @@ def test_reports_come_twice_a_second_and_at_once_on_a_change_but_not_with_every_
     assert 8 <= len(late) <= 1 / LEAST_GAP_S + 1
 
 
-def test_a_report_says_what_a_mission_says_on_one_line_and_within_bounds():
+def test_report_contains_the_mission_text_on_one_bounded_line():
     report = Reporter(DetectorConfig()).due(
         0.0, "m" * 90, Observation("two\nlines" + "x" * 90, note="a\n" * 300), None, ""
     )
@@ -179,7 +179,7 @@ def scan(seq, payload=None, session=SESSION, t_us=None):
     return encode(header), encode_ranges(array.array("f", [0.1] * 11)) if payload is None else payload
 
 
-def test_a_mission_that_goes_by_scans_is_given_the_newest_and_cites_it():
+def test_a_mission_that_uses_scans_is_given_the_newest_and_cites_it():
     bench = Bench(config=GOTO)
     assert bench.answer().scan is None
     for seq in (3, 4, 5):
@@ -191,7 +191,7 @@ def test_a_mission_that_goes_by_scans_is_given_the_newest_and_cites_it():
     assert bench.answer().scan == 10
 
 
-def test_nobody_else_subscribes_to_scans_until_a_mission_asks_for_them():
+def test_scans_are_subscribed_only_for_a_mission_that_uses_them():
     bench = Bench().frames(5)
     assert not bench.robot.has_listener(SCAN)
     bench.ask("goto", waypoints=((1.0, 1.0),)).frames(6)
@@ -205,7 +205,7 @@ def test_nobody_else_subscribes_to_scans_until_a_mission_asks_for_them():
     (struct.pack("<f", -0.5), "NOT_FINITE"),
     (bytes(6), "MALFORMED"),
 ])
-def test_a_scan_that_is_none_is_refused_counted_and_said_once(payload, reason):
+def test_a_scan_that_is_invalid_is_rejected_counted_and_logged_once(payload, reason):
     bench = Bench(config=GOTO).frames(2)
     bench.robot.publish(SCAN, *scan(1))
     bench.frames()

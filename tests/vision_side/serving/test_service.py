@@ -98,7 +98,7 @@ def test_broken_headers_are_counted_and_end_nothing(bench: Bench, header: bytes)
     assert bench.twists.take() is not None
 
 
-def test_a_robot_of_another_version_is_told_once(bench: Bench) -> None:
+def test_robot_of_another_version_is_logged_once(bench: Bench) -> None:
     bench.camera()
     for _ in range(5):
         bench.raw(b'{"v":2,"session":"0000abcd","seq":1,"t_us":1}', BALL)
@@ -118,7 +118,7 @@ def test_another_camera_is_taken_over(bench: Bench) -> None:
     assert any("640x480" in line for line in bench.said)
 
 
-def test_lines_are_said_per_change_and_never_per_frame(bench: Bench) -> None:
+def test_lines_are_logged_per_change_and_never_per_frame(bench: Bench) -> None:
     bench.camera()
     for seq in range(1, 50):
         bench.frame(BALL, seq)
@@ -152,7 +152,7 @@ def test_the_process_ends_within_a_second_of_a_signal(number: signal.Signals) ->
         assert time.monotonic() - started < 1.0
 
 
-def test_serve_ends_when_asked(bench: Bench) -> None:
+def test_serve_ends_on_request(bench: Bench) -> None:
     ending, said = threading.Event(), list[str]()
     link = bench.network.link("r1", role="vision")
     running = threading.Thread(target=serve, args=(VisionConfig(), link, ending, said.append), daemon=True)
@@ -163,7 +163,7 @@ def test_serve_ends_when_asked(bench: Bench) -> None:
     assert said[-1].startswith("vision: ended after 0 frames")
 
 
-def test_frames_that_come_again_after_a_silence_are_told_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_after_a_silence_are_reported_again(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     bench.camera()
     bench.frame(BALL, 1)
     monkeypatch.setattr("sightline.vision_side.serving.service._SILENCE_S", -1.0)
@@ -184,7 +184,7 @@ def test_what_was_skipped_is_counted_over_every_camera(bench: Bench) -> None:
     assert bench.service.skipped == {"MALFORMED": 5}
 
 
-def test_frames_of_a_session_that_is_over_are_left_out_and_said_once(bench):
+def test_frames_of_an_ended_session_are_skipped_and_logged_once(bench):
     """A late frame of before a restart, or two robots of one id: it steers for the newer one alone."""
     bench.camera()
     for seq in range(1, 4):
@@ -201,7 +201,7 @@ def test_frames_of_a_session_that_is_over_are_left_out_and_said_once(bench):
     assert bench.service.answered == 5
 
 
-def test_of_two_robots_with_one_id_the_second_is_refused_and_that_is_said(bench, monkeypatch):
+def test_second_robot_with_one_id_is_rejected_and_logged(bench, monkeypatch):
     """Where they cannot meet, nobody but vision can see that they are two."""
     monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: bench.now_us)
     bench.camera()

@@ -35,7 +35,7 @@ def watch():
     return Watch()
 
 
-def test_a_robot_that_starts_anew_is_met_at_once(watch):
+def test_restarted_robot_is_used_immediately(watch):
     assert watch.film(A) == [1.0]
     assert watch.film(B) == [1.0]
     assert watch.film(C) == [1.0]
@@ -108,7 +108,7 @@ def test_when_the_first_of_two_ends_the_second_is_steered(watch, share):
     assert watch.film(B, seconds=share) == [1.0]
 
 
-def test_a_robot_that_starts_anew_after_a_dispute_waits_for_the_silence(watch):
+def test_restarted_robot_after_a_dispute_waits_for_silence(watch):
     watch.film(A)
     watch.film(A, B, seconds=2)
     assert not watch.frame(C)

@@ -51,7 +51,7 @@ def test_velocity_is_learned_within_a_second(vx: float, vy: float) -> None:
     assert (track.target.vx_mps, track.target.vy_mps) == pytest.approx((vx, vy), abs=0.05)
 
 
-def test_lost_is_lost_and_a_new_sighting_starts_anew() -> None:
+def test_lost_track_ends_and_a_new_sighting_starts_again() -> None:
     config = TrackConfig()
     track = Track(config)
     for _ in range(10):
@@ -166,7 +166,7 @@ def test_integrals_are_bounded_and_bled_by_what_was_not_carried_out() -> None:
 
 
 @given(dt=st.floats(0.005, 0.2))
-def test_the_integral_goes_by_time_not_by_frames(dt: float) -> None:
+def test_integral_depends_on_time_not_on_frames(dt: float) -> None:
     steer, aim = Steer(SteerConfig(), 0.8), Aim(0.8, 0.008, 0, 0)
     steps = round(1.0 / dt)
     for _ in range(steps):

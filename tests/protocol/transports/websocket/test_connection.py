@@ -44,7 +44,7 @@ def test_silence_with_a_clear_way_out_is_two_seconds_to_the_microsecond():
     assert life.is_over(6 + SILENCE_US, lambda: CLEAR)
 
 
-def test_who_is_heard_is_not_looked_at():
+def test_send_path_of_an_active_peer_is_not_read():
     life = Keepalive(0)
     for now_us in range(0, 20_000_000, 100_000):
         life.hear(now_us)
@@ -145,7 +145,7 @@ def test_any_bytes_are_read_alike_in_one_piece_and_in_two(text, at):
     assert read([text], 30) == read([text[:at], text[at:]], 30)
 
 
-def test_a_masked_frame_from_a_server_and_an_unmasked_one_from_a_client_are_refused():
+def test_a_masked_frame_from_a_server_and_an_unmasked_one_from_a_client_are_rejected():
     masked = Frame(Opcode.BINARY, b"data").serialize(mask=True)
     assert read([masked]) == ([], 1002)
     protocol = Protocol(SERVER, max_size=100)

@@ -57,7 +57,7 @@ def test_a_source_in_the_header_of_what_comes_from_a_robot_means_nothing():
     assert unpack(framed(b'{"channel":"frame","v":1,"source":"vision"}'), "r1", "").key == "sightline/r1/frame"
 
 
-def test_a_header_that_cannot_be_read_is_for_the_receiver_to_refuse():
+def test_unreadable_header_is_passed_to_the_receiver():
     packet = unpack(framed(b'{"channel":"twist","v":1,'), "r1", "vision")
     assert packet == IncomingMessage("sightline/r1/twist/vision", b'{"v":1,', b"0|0")
 
@@ -68,7 +68,7 @@ def test_a_header_that_cannot_be_read_is_for_the_receiver_to_refuse():
      framed(b"\xff"), framed(b'{"v":1}'), framed(b"[" * 500),
      framed(b'{"channel":"twist","x":"' + b"a" * MAX_BLOCK_BYTES + b'"}')],
 )  # fmt: skip
-def test_broken_framing_is_refused(message):
+def test_broken_framing_is_rejected(message):
     with pytest.raises(WireError) as refusal:
         unpack(message, "r1", "vision")
     assert refusal.value.reason is RejectReason.MALFORMED
@@ -97,7 +97,7 @@ def test_any_bytes_are_a_packet_or_a_wire_error(message):
         ("\ud800", "MALFORMED"),
     ],
 )
-def test_what_is_no_hello_is_refused_with_the_field(text, said):
+def test_invalid_hello_is_rejected_with_the_field(text, said):
     with pytest.raises(WireError, match=said):
         parse_hello(text)
 

@@ -60,7 +60,7 @@ def round_trips_s(link, slot, seconds: float, ends=lambda: False) -> list[float]
 
 @pytest.mark.alone
 @pytest.mark.parametrize(("dialect", "seed"), [("v1", 1), ("older", 3), pytest.param("v1", 2, marks=pytest.mark.long)])
-def test_ten_thousand_hostile_messages_harm_nobody(tmp_path, dialect, seed):
+def test_ten_thousand_hostile_messages_do_no_harm(tmp_path, dialect, seed):
     with (tmp_path / "robot.log").open("w") as log:
         robot = EchoingRobot(log)
         host, port = address_of(robot.endpoints[dialect])

@@ -95,7 +95,7 @@ def test_swapped_axes_are_another_option():
             assert twists.take(2).payload == got
 
 
-def test_boxes_come_in_as_a_guests_detections_of_the_picture_it_was_sent_and_go_on_to_who_wants_them():
+def test_boxes_become_guest_detections_of_the_sent_image_and_are_passed_on():
     modern, older = free_endpoint("ws://"), free_endpoint("ws-legacy://") + "?boxes"
     with open_websocket("r1", listen=[modern, older]) as robot, open_websocket("r1", connect=modern) as vision:
         found, passed_on = robot.latest(DETECTIONS), vision.latest(DETECTIONS)
@@ -131,7 +131,7 @@ def test_boxes_come_in_as_a_guests_detections_of_the_picture_it_was_sent_and_go_
             assert twists.take(2).payload == b"0.1|0"
 
 
-def test_boxes_are_not_taken_where_nobody_asked_for_them():
+def test_boxes_without_the_option_are_rejected():
     with robot_and_client() as (robot, client):
         twists, found = robot.latest(TWIST), robot.latest(DETECTIONS)
         robot.publish(FRAME, encode(header_of(1)), SMALL_JPEG)
@@ -180,7 +180,7 @@ def test_a_frame_without_a_header_is_answered_by_a_twist_alone():
         (bytes(10_000_000), 1009, "", OVERSIZE),
     ],
 )
-def test_what_is_no_short_text_ends_that_client_only(message, code, said, counted):
+def test_long_or_binary_message_ends_only_its_client(message, code, said, counted):
     with robot_and_client() as (robot, client), connect(plain(endpoint_of(client)), **OLD) as other:
         twists = robot.latest(TWIST)
         with pytest.raises(ConnectionClosed) as closed:
@@ -199,7 +199,7 @@ def endpoint_of(client) -> str:
 
 
 @pytest.mark.parametrize("text", ["nan|inf", "1|2|3", "1_0|2", "stop", "", "\u0661|0", "\0"])
-def test_nonsense_reaches_the_robot_that_says_why_it_is_refused(text):
+def test_invalid_text_reaches_the_robot_which_reports_the_reason(text):
     with robot_and_client() as (robot, client):
         twists = robot.latest(TWIST)
         client.send(text)
@@ -236,7 +236,7 @@ def test_another_sites_page_cannot_drive_through_the_older_port():
         connect(plain(endpoint), origin=plain(endpoint).replace("ws:", "http:"), **OLD).close()
 
 
-def test_both_dialects_may_be_listened_for_at_once():
+def test_both_protocols_can_be_served_at_once():
     modern, older = free_endpoint("ws://"), free_endpoint("ws-legacy://")
     with open_websocket("r1", listen=[modern, older]) as robot, open_websocket("r1", connect=modern) as peer:
         frames = peer.latest(FRAME)
@@ -319,7 +319,7 @@ def test_dashed_twists_go_out_dashed(options, said):
     ("message", "code", "counted"),
     [(JPEG, 1003, BAD_FRAMING), ("A" * 10_000_000, 1009, OVERSIZE)],
 )
-def test_what_is_no_picture_ends_the_connection_which_comes_back_by_itself(message, code, counted):
+def test_invalid_image_ends_the_connection_which_recovers(message, code, counted):
     with old_robot_and_vision() as (robot, vision):
         frames = vision.latest(FRAME)
         with suppress(ConnectionClosed):  # 10 MB may break on a socket that is closed already
@@ -330,7 +330,7 @@ def test_what_is_no_picture_ends_the_connection_which_comes_back_by_itself(messa
 
 
 @pytest.mark.parametrize("text", ["no base64", "AAA", "0|0", base64.b64encode(bytes(20_001)).decode("ascii")])
-def test_a_text_that_is_no_picture_is_counted_and_skipped(text):
+def test_a_text_that_is_not_a_picture_is_counted_and_skipped(text):
     with old_robot_and_vision() as (robot, vision):
         frames = vision.latest(FRAME)
         robot.send(text)

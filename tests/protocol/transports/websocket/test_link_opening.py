@@ -31,7 +31,7 @@ NO_ENDPOINTS = (
 
 @pytest.mark.parametrize("endpoint", NO_ENDPOINTS)
 @pytest.mark.parametrize("end", ["listen", "connect"])
-def test_an_endpoint_that_is_none_is_refused_with_the_right_form(endpoint, end):
+def test_an_endpoint_that_is_invalid_is_rejected_with_the_right_form(endpoint, end):
     with pytest.raises(ConfigError, match=re.escape("e.g. ws://127.0.0.1:9090")) as refusal:
         open_websocket("r1", **{end: [endpoint]})
     assert repr(endpoint) in str(refusal.value)
@@ -45,7 +45,7 @@ def test_an_endpoint_that_is_none_is_refused_with_the_right_form(endpoint, end):
         ({"robot": "r1", "listen": "ws://127.0.0.1:9090", "max_frame_bytes": 0}, "max_frame_bytes 0"),
     ],
 )
-def test_bad_arguments_are_refused_before_anything_is_opened(arguments, said):
+def test_bad_arguments_are_rejected_before_anything_is_opened(arguments, said):
     with pytest.raises(ConfigError, match=said):
         open_websocket(arguments.pop("robot"), **arguments)
 
@@ -79,7 +79,7 @@ def test_who_hangs_up_unheard_is_tried_again(kind, other, tmp_path):
     assert len(tried) >= 3
 
 
-def test_nobody_answering_is_said_in_time():
+def test_missing_answer_raises_in_time():
     endpoint, begin_s = free_endpoint("ws://"), time.monotonic()
     said = f"no answer from {endpoint} after 0.4 s; start the robot or check the address"
     with pytest.raises(LinkError, match=re.escape(said)):
@@ -93,13 +93,13 @@ def test_an_address_of_another_machine_cannot_be_listened_on(tmp_path):
         open_websocket("r1", listen="ws://192.0.2.1:9090", secure=str(tmp_path))
 
 
-def test_a_port_in_use_is_said_with_who_has_it(robot):
+def test_port_in_use_names_its_owner(robot):
     said = rf"cannot listen on {robot.endpoint}: port \d+ is in use by .*\(pid {os.getpid()}\); end it or choose"
     with pytest.raises(LinkError, match=said):
         open_websocket("r1", listen=robot.endpoint)
 
 
-def test_who_answers_but_is_no_websocket_is_said():
+def test_peer_that_is_not_a_websocket_is_reported():
     with socket.create_server(("127.0.0.1", free_port())) as door:
         threading.Thread(target=_answer_with, args=(door, b"SSH-2.0-something\r\n"), daemon=True).start()
         with pytest.raises(LinkError, match="the service there is not a Sightline WebSocket"):
@@ -113,7 +113,7 @@ def _answer_with(door: socket.socket, text: bytes) -> None:
     client.close()
 
 
-def test_another_robots_listener_is_an_error_for_who_opens(robot):
+def test_listener_of_another_robot_raises_for_the_opening_client(robot):
     with pytest.raises(LinkError, match=f"cannot connect to {robot.endpoint}: this is robot r1, not r2"):
         open_websocket("r2", connect=robot.endpoint)
     assert robot.rejected == {OTHER_ROBOT: 1}

@@ -19,7 +19,7 @@ from tests.fixtures.links import claim, hail, until
 from tests.fixtures.websocket import HELLO, TWIST_KEY, V1, bare_client, closed_with, received
 
 
-def test_who_says_no_hello_is_sent_away_and_told_why(robot):
+def test_client_without_a_hello_is_closed_with_the_reason(robot):
     stranger, begin_s = connect(robot.endpoint, **V1), time.monotonic()
     assert closed_with(stranger) == (1008, "no hello within 2 s")
     assert 1.5 < time.monotonic() - begin_s < 3
@@ -37,7 +37,7 @@ BAD_HELLOS = (
 
 
 @pytest.mark.parametrize(("first", "code", "reason", "counted"), BAD_HELLOS)
-def test_a_bad_hello_is_refused_with_a_reason(robot, first, code, reason, counted):
+def test_a_bad_hello_is_rejected_with_a_reason(robot, first, code, reason, counted):
     stranger = connect(robot.endpoint, **V1)
     stranger.send(first)
     got = closed_with(stranger)

@@ -87,7 +87,7 @@ def test_requests_that_cannot_be_read_share_one_place():
 
 
 @pytest.mark.parametrize("channel", [one for one in CHANNELS.values() if one.passed_on], ids=lambda one: one.name)
-def test_whoever_makes_up_sources_gets_few_places_and_takes_none_of_the_roles(channel):
+def test_invented_sources_get_few_places_and_none_of_a_role(channel):
     queue = OutgoingQueue()
     for number in range(1000):
         put(queue, Publication(Message(channel, f"s{number}", b"", b"old")))
@@ -122,7 +122,7 @@ def test_a_publication_is_written_once_for_all_who_are_sent_the_same():
     assert post.written(lines) is post.written(LegacyToVision("r1", LegacyOptions(), int, client))
 
 
-def test_a_stop_reaches_a_robot_that_was_not_reading_whatever_was_asked_after_it():
+def test_stop_reaches_a_robot_that_was_not_reading_despite_later_requests():
     endpoint, go_on, asked = free_endpoint("ws://"), threading.Event(), []
     with open_websocket("r1", listen=endpoint) as robot, open_websocket("r1", connect=endpoint, role="teleop") as peer:
         robot.subscribe(STATUS, lambda _message: None)

@@ -21,7 +21,7 @@ from tests.fixtures.websocket import V1, Robot, upgrade
 
 
 @pytest.mark.parametrize("offer", [None, ["sightline.v2"], ["chat", "graphql-ws"]])
-def test_without_the_sub_protocol_nobody_comes_in(robot, offer):
+def test_client_without_the_sub_protocol_is_rejected(robot, offer):
     with pytest.raises(InvalidStatus) as refusal:
         connect(robot.endpoint, subprotocols=offer, legacy=True)
     assert refusal.value.response.status_code == 400
@@ -89,7 +89,7 @@ def _comes_in(robot: Robot) -> bool:
     return True
 
 
-def test_connections_that_say_nothing_are_few_and_short_lived(robot):
+def test_silent_connections_are_few_and_short_lived(robot):
     silent = [socket.create_connection(robot.address) for _ in range(MAX_CLIENTS + MAX_HANDSHAKES + 8)]
     robot.still_serves()
     assert until(lambda: robot.rejected[TOO_MANY_CLIENTS] >= 8)

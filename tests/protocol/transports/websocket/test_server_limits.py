@@ -45,11 +45,11 @@ def settled(places: ConnectionLimits, acts: bool) -> str:
 # --- the places ------------------------------------------------------------------------------------------------------
 
 
-def test_who_steers_asks_or_is_the_robot_does_more_than_watch():
+def test_drivers_operators_and_robots_may_control():
     assert {role for role in ROLES if may_control(grants_of_role(role))} == {"robot", "vision", "operator"}
 
 
-def test_the_last_places_are_kept_for_who_may_act():
+def test_last_places_are_reserved_for_clients_that_control():
     places = ConnectionLimits()
     assert [settled(places, False) for _ in range(WATCHERS)] == [""] * WATCHERS
     assert "12 clients watch, which is the limit" in settled(places, False)
@@ -64,7 +64,7 @@ def test_who_may_act_takes_any_place():
     assert places.problem(True) == places.problem(False) != ""
 
 
-def test_an_address_has_few_strangers_and_all_together_not_many():
+def test_unidentified_clients_are_limited_per_address_and_in_total():
     places, given = ConnectionLimits(), []
     for number in range(MAX_HANDSHAKES // MAX_HANDSHAKES_PER_ADDRESS):
         given += [places.admit(f"10.0.0.{number}") for _ in range(MAX_HANDSHAKES_PER_ADDRESS)]
@@ -75,7 +75,7 @@ def test_an_address_has_few_strangers_and_all_together_not_many():
     assert places.admit("10.0.0.99") is not None
 
 
-def test_a_client_is_no_stranger_any_more():
+def test_promoted_client_frees_its_unidentified_place():
     places = ConnectionLimits()
     assert [settled(places, True) for _ in range(2 * MAX_HANDSHAKES_PER_ADDRESS)] == [
         ""
@@ -86,7 +86,7 @@ def test_a_client_is_no_stranger_any_more():
 # --- over sockets ----------------------------------------------------------------------------------------------------
 
 
-def test_viewers_without_number_leave_room_for_who_says_stop(robot):
+def test_any_number_of_viewers_leaves_room_for_a_stop(robot):
     asked = robot.link.latest(REQUEST)
     with ExitStack() as ending:
         for _ in range(WATCHERS):
@@ -102,7 +102,7 @@ def test_viewers_without_number_leave_room_for_who_says_stop(robot):
         robot.still_serves()
 
 
-def test_a_guest_may_steer_and_is_no_viewer(robot):
+def test_a_guest_may_steer_and_is_not_a_viewer(robot):
     with ExitStack() as ending:
         for _ in range(WATCHERS):
             ending.enter_context(hail(robot.endpoint, role="viewer", wants=["status"]))
@@ -122,7 +122,7 @@ def test_who_is_closed_unheard_for_idle_connections_beside_it_tries_again(robot)
             gone.join()
 
 
-def test_a_log_that_nobody_reads_shuts_nobody_out(robot, monkeypatch):
+def test_unread_log_does_not_block_clients(robot, monkeypatch):
     address = ("127.0.0.1", port_of(robot.endpoint))
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
@@ -139,7 +139,7 @@ def test_a_log_that_nobody_reads_shuts_nobody_out(robot, monkeypatch):
         open_websocket("r1", connect=robot.endpoint, role="operator", timeout_s=5).close()
 
 
-def test_a_viewer_for_whom_there_is_no_place_is_told_and_tries_again(robot):
+def test_viewer_without_a_place_receives_the_reason_and_tries_again(robot):
     with ExitStack() as ending:
         viewers = [ending.enter_context(hail(robot.endpoint)) for _ in range(WATCHERS)]
         with pytest.raises(LinkError, match="12 clients watch, which is the limit"):
@@ -149,7 +149,7 @@ def test_a_viewer_for_whom_there_is_no_place_is_told_and_tries_again(robot):
         open_websocket("r1", connect=robot.endpoint, role="viewer").close()
 
 
-def test_where_tokens_are_shown_a_viewer_too_many_is_told_by_http(keys):
+def test_viewer_above_the_limit_with_a_token_is_rejected_by_http(keys):
     endpoint = free_endpoint("ws://")
     shown = {role: {"Authorization": f"Bearer {token}"} for role, token in TOKENS.items()}
     with open_websocket("r1", listen=endpoint, secure=keys) as robot, ExitStack() as ending:
@@ -165,7 +165,7 @@ def test_where_tokens_are_shown_a_viewer_too_many_is_told_by_http(keys):
         open_websocket("r1", connect=endpoint, role="operator", secure=keys).close()
 
 
-def test_idle_strangers_take_only_the_places_of_their_own_address(robot):
+def test_idle_unidentified_clients_take_only_the_places_of_their_own_address(robot):
     with ExitStack() as ending:
         for _ in range(MAX_CLIENTS + MAX_HANDSHAKES):
             ending.enter_context(socket.create_connection(robot.address, source_address=("127.0.0.2", 0)))

@@ -43,7 +43,7 @@ def test_who_comes_later_finds_viewers_there(site):
     assert until(lambda: vision.has_listener(PREVIEW)) and not vision.has_listener(OVERLAY)
 
 
-def test_vision_that_watches_itself_does_not_hear_itself(site):
+def test_vision_that_subscribes_to_itself_receives_nothing(site):
     _, opened, _ = site
     vision = opened("vision")
     own = vision.latest(OVERLAY)
@@ -52,7 +52,7 @@ def test_vision_that_watches_itself_does_not_hear_itself(site):
     assert own.take(0.3) is None
 
 
-def test_large_messages_are_taken_only_while_somebody_wants_them(site):
+def test_large_messages_are_accepted_only_while_subscribed(site):
     robot, opened, end = site
     large = claim("sightline/r1/overlay/vision", b"{}", bytes(OVERLAY.max_payload_bytes))
     stranger = hail(end, role="vision", wants=["status"])
@@ -72,7 +72,7 @@ def test_large_messages_are_taken_only_while_somebody_wants_them(site):
             stranger.recv(5)
 
 
-def test_a_hello_is_said_again_only_when_wants_change(site):
+def test_a_hello_is_sent_again_only_when_wants_change(site):
     robot, opened, end = site
     viewer = opened("viewer")
     stranger = hail(end, role="vision", wants=["status"])

@@ -51,7 +51,7 @@ def test_who_listens_on_loopback_only_is_not_to_be_found(listen):
 
 
 @pytest.mark.parametrize("listen", [("tcp/0.0.0.0:7447",), ("tcp/127.0.0.1:1", "quic/192.168.1.20:2"), ("tcp/[::]:1",)])
-def test_who_listens_beyond_answers_in_a_group_of_our_own_and_connects_to_nobody(listen):
+def test_network_listener_answers_in_its_own_group_and_never_connects(listen):
     section = multicast_section(listen)
     assert section["enabled"] and section["listen"]
     assert section["address"] == "224.0.0.224:7449"  # Zenoh's own is 7446
@@ -59,7 +59,7 @@ def test_who_listens_beyond_answers_in_a_group_of_our_own_and_connects_to_nobody
     assert session_config(listen, (), 1.0)["scouting"]["multicast"] == section
 
 
-def test_nobody_is_found_where_nobody_is():
+def test_empty_network_has_no_listeners():
     assert [one for one in find_listeners(0.1) if one.startswith("tcp/127.")] == []
 
 
@@ -69,7 +69,7 @@ def _can_have_a_network_of_its_own():
 
 @pytest.mark.slow
 @pytest.mark.skipif(not _can_have_a_network_of_its_own(), reason="no network namespaces; run the tests as root")
-def test_in_a_network_of_two_robots_both_are_found_and_a_taken_group_port_hinders_nobody():
+def test_two_robots_on_a_network_are_found_despite_a_used_group_port():
     """A namespace with an address: two robots listen on it, one on loopback; then a stranger has the group's port."""
     command = ["unshare", "-n", "--kill-child", sys.executable, "-c", INSIDE]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)

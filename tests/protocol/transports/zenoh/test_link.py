@@ -33,7 +33,7 @@ NO_ENDPOINTS = (
 
 @pytest.mark.parametrize("endpoint", NO_ENDPOINTS)
 @pytest.mark.parametrize("end", ["listen", "connect"])
-def test_an_endpoint_that_is_none_is_refused_with_the_right_form(endpoint, end):
+def test_an_endpoint_that_is_invalid_is_rejected_with_the_right_form(endpoint, end):
     with pytest.raises(ConfigError, match=re.escape("e.g. tcp/127.0.0.1:7447")) as refusal:
         open_zenoh("r1", **{end: [endpoint]})
     assert repr(endpoint) in str(refusal.value)
@@ -47,11 +47,11 @@ def test_well_formed_endpoints_and_their_send_buffer():
     assert with_send_buffer("udp/h:1") == "udp/h:1"
 
 
-def test_the_owner_of_a_free_port_is_nobody():
+def test_free_port_has_no_owner():
     assert port_owner(parse_zenoh_endpoint(free_endpoint())[2]) == ""
 
 
-def test_nobody_answering_is_said_in_time():
+def test_missing_answer_raises_in_time():
     endpoint, begin_s = free_endpoint(), time.monotonic()
     said = f"no answer from {endpoint} after 0.4 s; start the robot or router, or check the address"
     with pytest.raises(LinkError, match=re.escape(said)):
@@ -78,7 +78,7 @@ def test_an_address_of_another_machine_cannot_be_listened_on():
         ({"robot": "r1", "listen": ["tcp/127.0.0.1:7447"], "max_frame_bytes": 0}, "max_frame_bytes 0"),
     ],
 )
-def test_bad_arguments_are_refused_before_anything_is_opened(arguments, said):
+def test_bad_arguments_are_rejected_before_anything_is_opened(arguments, said):
     with pytest.raises(ConfigError, match=said):
         open_zenoh(arguments.pop("robot"), **arguments)
 
@@ -143,7 +143,7 @@ def test_a_frame_costs_at_most_320_bytes_more_than_its_picture():
     assert len(encode(header)) < overhead <= 320
 
 
-def test_a_delete_is_no_message():
+def test_delete_is_rejected_as_not_a_put():
     endpoint = free_endpoint()
     with open_zenoh("r1", listen=[endpoint]) as robot, open_session((), [endpoint], 5.0) as stranger:
         twists = robot.latest(TWIST)
@@ -152,7 +152,7 @@ def test_a_delete_is_no_message():
         assert twists.take() is None
 
 
-def test_whoever_makes_up_sources_is_passed_on_and_leaves_little_behind():
+def test_invented_sources_are_passed_on_and_leave_little_behind():
     endpoint, heard = free_endpoint(), []
     with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as peer:
         peer.subscribe(DETECTIONS, lambda message: heard.append(message.source))
@@ -182,7 +182,7 @@ def test_list_robots_gives_the_newest_status_of_each():
     assert all(int(message.payload[2:]) > 5 for message in found.values())
 
 
-def test_list_robots_says_when_nobody_answers():
+def test_list_robots_without_an_answer_raises():
     with pytest.raises(LinkError, match="no answer from"):
         list_robots([free_endpoint()], 0.3)
 

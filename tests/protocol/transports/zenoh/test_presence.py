@@ -47,12 +47,12 @@ def test_an_answer_gives_who_how_far_and_how_much_its_clock_is_ahead():
     b"", b"{}", b"\xff", b"[1]", encode(ROBOT) + b" " * 600, encode(ROBOT).replace(b'"shed"', b'"a\\u001b[2J"'),
     encode(ROBOT).replace(b"0000abcd", b"0000ABCD"), encode(ROBOT).replace(b'"r1"', b'"a/b"'),
 ])  # fmt: skip
-def test_what_is_no_presence_is_nobody(payload):
+def test_invalid_presence_is_ignored(payload):
     assert parse_presence_reply(presence_key("robot", "0000abcd"), payload, 0, 1, 2) is None
 
 
 @pytest.mark.parametrize("role", ["vision", "operator", "teleop", "viewer"])
-def test_who_answers_under_another_role_than_its_own_is_nobody(role):
+def test_presence_with_another_role_is_ignored(role):
     assert parse_presence_reply(presence_key(role, "0000abcd"), encode(ROBOT), 0, 1, 2) is None
 
 
@@ -78,7 +78,7 @@ def test_an_id_is_taken_by_another_robot_that_was_there_before(other, is_taken):
     assert (taken is not None) is is_taken
 
 
-def test_a_person_reads_state_version_machine_and_round_trip():
+def test_operator_reads_state_version_machine_and_round_trip():
     status = encode(Status(state=State.DISARMED, reason="waiting"))
     heard = {"r1": Message(STATUS, "", encode(Stamp(session="0000abcd", seq=1, t_us=1)), status),
              "js9": Message(STATUS, "", b"{", b"")}
@@ -105,7 +105,7 @@ def router():
     session.close()
 
 
-def test_everybody_at_a_router_is_listed_within_two_seconds(router):
+def test_every_peer_at_a_router_is_listed_within_two_seconds(router):
     with (
         open_zenoh("r1", connect=[router], role="robot") as robot,
         open_zenoh("r1", connect=[router], role="vision"),
@@ -126,7 +126,7 @@ def test_everybody_at_a_router_is_listed_within_two_seconds(router):
 
 
 @pytest.mark.parametrize("role", ["Vision", "a b", "x" * 17, "r/1"])
-def test_a_role_that_is_none_is_refused_and_nothing_stays_open(router, role):
+def test_a_role_that_is_invalid_is_rejected_and_nothing_stays_open(router, role):
     with pytest.raises(ConfigError, match="expected 1 to 16 lower-case letters"):
         open_zenoh("r1", connect=[router], role=role)
 
@@ -137,14 +137,14 @@ def test_who_has_gone_is_not_listed(router):
     assert peers_at([router], 0.6) == []
 
 
-def test_a_robot_that_listens_is_listed_by_whoever_connects():
+def test_listening_robot_is_listed_by_a_connecting_client():
     endpoint = free_endpoint()
     with open_zenoh("r1", listen=[endpoint], role="robot"):
         around = discover([endpoint], 0.4)
     assert [peer.presence.robot for peer in around.peers] == ["r1"] and around.statuses == {}
 
 
-def test_a_second_robot_of_one_id_is_refused_with_who_has_it(router):
+def test_second_robot_with_one_id_is_rejected_with_the_first(router):
     with (
         open_zenoh("r1", connect=[router], role="robot", session="0000abcd"),
         pytest.raises(LinkError, match=r"^robot id 'r1' is in use on host \S+ \(.* s, session 0000abcd\)"
@@ -164,7 +164,7 @@ def test_a_robot_of_another_id_and_its_own_restarted_self_are_welcome(router):
         assert len(peers_at([router], 0.6)) == 2
 
 
-def test_a_robot_that_ends_while_its_successor_looks_is_no_namesake(router, monkeypatch):
+def test_robot_that_ends_during_the_check_does_not_block_its_successor(router, monkeypatch):
     first = open_zenoh("r1", connect=[router], role="robot")
     monkeypatch.setattr("sightline.protocol.transports.zenoh.presence._SECOND_LOOK_S", 0.0)
     monkeypatch.setattr("sightline.protocol.transports.zenoh.presence.time.sleep", lambda _seconds: first.close())
@@ -172,7 +172,7 @@ def test_a_robot_that_ends_while_its_successor_looks_is_no_namesake(router, monk
         assert second.connected
 
 
-def test_when_secured_each_role_is_listed_as_what_its_certificate_says(tmp_path):
+def test_secured_peers_are_listed_by_their_certificate(tmp_path):
     folder, endpoint = tmp_path / "keys", free_endpoint("tls/")
     keys.make(folder, [])
     roles = ["vision", "operator", "teleop", "detector", "viewer3"]
@@ -187,7 +187,7 @@ def test_when_secured_each_role_is_listed_as_what_its_certificate_says(tmp_path)
     assert {certificate_role(role) for role in listed} == {"robot", *SOURCES_OF_ROLE}
 
 
-def test_when_secured_nobody_is_believed_to_be_a_robot_by_another_certificate(tmp_path):
+def test_secured_peer_with_another_certificate_is_not_listed_as_robot(tmp_path):
     """A viewer answers as robot r1, under a robot's key and under its own: neither is listed."""
     folder, endpoint = tmp_path / "keys", free_endpoint("tls/")
     keys.make(folder, [])
@@ -217,11 +217,11 @@ def test_the_command_lists_them_for_people_and_scripts(router, capsys):
     assert [peer["role"] for peer in found["peers"]] == ["robot", "vision"] and found["places"] == [router]
 
 
-def test_nobody_at_a_router_is_said(router, capsys):
+def test_empty_router_is_reported(router, capsys):
     assert cli.run(["robots", "--connect", router, "--seconds", "0.3"]) == 4
     assert capsys.readouterr().err.startswith(f"error: no robot is heard at {router} within 0.3 s")
 
 
-def test_an_endpoint_of_one_robot_is_told_from_a_place(capsys):
+def test_endpoint_of_one_robot_differs_from_a_router(capsys):
     assert cli.run(["robots", "--connect", "ws://127.0.0.1:9090"]) == 2
     assert "sightline status --connect ws://127.0.0.1:9090" in capsys.readouterr().err

@@ -30,7 +30,7 @@ def folder(tmp_path_factory):
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
-def test_a_link_is_what_its_endpoint_says(transport, folder):
+def test_link_has_the_transport_of_its_endpoint(transport, folder):
     endpoint, secure = free_endpoint(f"{transport}/"), folder if transport in ("tls", "quic") else ""
     with (
         open_zenoh("r1", listen=[endpoint], role="robot", secure=secure) as robot,
@@ -46,7 +46,7 @@ def test_a_link_is_what_its_endpoint_says(transport, folder):
 
 
 @pytest.mark.parametrize("transport", TRANSPORTS)
-def test_nobody_there_is_said_in_time_with_what_was_tried(transport, folder):
+def test_missing_peer_raises_in_time_with_the_endpoint(transport, folder):
     endpoint, secure = free_endpoint(f"{transport}/"), folder if transport in ("tls", "quic") else ""
     began_s = time.monotonic()
     with pytest.raises(LinkError) as refusal:
@@ -63,7 +63,7 @@ def test_with_keys_no_other_transport_is_taken(transport, folder):
         open_zenoh("r1", connect=[free_endpoint(f"{transport}/")], role="vision", secure=folder)
 
 
-def test_several_robots_and_visions_at_one_router_never_cross(tmp_path):
+def test_several_robots_and_vision_services_at_one_router_never_cross(tmp_path):
     endpoint, robots = free_endpoint(), ("r1", "r2", "r10")
     heard = {robot: [] for robot in robots}
     with ExitStack() as ending:
@@ -135,7 +135,7 @@ def test_a_robot_is_driven_again_when_its_router_comes_back(tmp_path, how):
 
 
 @pytest.mark.slow
-def test_a_second_robot_of_one_id_does_not_start_and_says_who_has_it(tmp_path):
+def test_second_robot_with_one_id_does_not_start_and_names_the_first(tmp_path):
     endpoint = free_endpoint()
     with _router(endpoint):
         (tmp_path / "a").mkdir()

@@ -72,7 +72,7 @@ def test_only_what_can_change_by_itself_is_live(tmp_path):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_option_that_is_none_is_named(kind):
+def test_an_option_that_is_invalid_is_named(kind):
     with pytest.raises(ConfigError, match=r"option 'colour'"):
         CAMERAS.build(PluginChoice(kind=kind, options={"path": ".", "colour": "red"} if kind in KINDS[:3]
                                       else {"colour": "red"}))

@@ -52,14 +52,14 @@ def test_a_looped_video_begins_again(tmp_path):
     assert any(later < earlier for earlier, later in pairwise(shades))
 
 
-def test_the_end_of_a_video_that_is_not_looped_is_said(tmp_path):
+def test_the_end_of_a_video_that_is_not_looped_is_reported(tmp_path):
     camera = VideoCamera(VideoCamera.Config(path=video(tmp_path / "film.avi", pictures=4), loop=False, fps=120))
     with pytest.raises(HardwareError, match=r"ended after 4 pictures; set camera.options.loop = true"):
         for _ in range(10):
             next_picture(camera)
 
 
-def test_a_video_that_breaks_off_is_said(tmp_path):
+def test_a_video_that_breaks_off_is_reported(tmp_path):
     path = video(tmp_path / "film.avi", pictures=20, size=(320, 240))
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     camera = VideoCamera(VideoCamera.Config(path=path, fps=120))
@@ -71,13 +71,13 @@ def test_a_video_that_breaks_off_is_said(tmp_path):
 @pytest.mark.parametrize(("name", "content"), [
     ("film.mp4", b""), ("film.mp4", b"no film at all" * 100), ("film.jpg", b"hello"),
 ])  # fmt: skip
-def test_what_is_no_video_is_said(tmp_path, name, content):
+def test_invalid_video_is_reported(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(HardwareError, match="cannot be played"):
         VideoCamera(VideoCamera.Config(path=tmp_path / name))
 
 
-def test_a_video_that_is_not_there_is_said(tmp_path):
+def test_a_video_that_is_not_there_is_reported(tmp_path):
     with pytest.raises(HardwareError, match="is not there"):
         VideoCamera(VideoCamera.Config(path=tmp_path / "film.mp4"))
 
@@ -92,7 +92,7 @@ def test_a_folder_is_played_in_name_order_and_looped(tmp_path):
     assert [shade_of(next_picture(camera)) for _ in range(5)] == [30, 60, 90, 30, 60]
 
 
-def test_pictures_of_several_sizes_are_refused(tmp_path):
+def test_pictures_of_several_sizes_are_rejected(tmp_path):
     (tmp_path / "a.jpg").write_bytes(jpeg(64, 48))
     (tmp_path / "b.jpg").write_bytes(jpeg(48, 64))
     with pytest.raises(HardwareError, match="differ in size"):
@@ -100,7 +100,7 @@ def test_pictures_of_several_sizes_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize(("content", "said"), [(None, "cannot be read"), (b"GIF89a", "not a JPEG")])
-def test_a_still_that_is_none_is_said(tmp_path, content, said):
+def test_a_still_that_is_invalid_is_reported(tmp_path, content, said):
     if content is not None:
         (tmp_path / "a.jpg").write_bytes(content)
     with pytest.raises(HardwareError, match=said):
@@ -130,7 +130,7 @@ def test_every_file_camera_publishes_the_model_it_is_given(tmp_path):
 
 
 @given(st.integers(16, 4000), st.integers(16, 4000), st.floats(5.1, 174.0))
-def test_a_guessed_lens_is_as_wide_as_it_says_and_not_calibrated(width_px, height_px, hfov_deg):
+def test_guessed_lens_has_the_configured_width_and_is_not_calibrated(width_px, height_px, hfov_deg):
     model = camera_model(LensConfig(hfov_deg=hfov_deg), JpegSize(width_px, height_px, 3))
     seen_deg = 2 * np.degrees(np.arctan(width_px / 2 / model.fx_px))
     assert seen_deg == pytest.approx(hfov_deg)
@@ -147,7 +147,7 @@ def test_a_guessed_lens_is_as_wide_as_it_says_and_not_calibrated(width_px, heigh
         ({"distortion": [0.0] * 9}, "distortion"),
     ],
 )
-def test_a_wrong_model_is_refused_by_name(changes, said):
+def test_a_wrong_model_is_rejected_by_name(changes, said):
     with pytest.raises(ConfigError, match=said):
         camera_model(LensConfig(model=MODEL | changes), SIZE)
 
@@ -156,14 +156,14 @@ WRONG_FILES = [(None, "cannot be read"), ("= 3", "invalid TOML"), ("fx_px = 3.0"
 
 
 @pytest.mark.parametrize(("text", "said"), WRONG_FILES)
-def test_a_model_file_that_is_none_is_said(tmp_path, text, said):
+def test_a_model_file_that_is_invalid_is_reported(tmp_path, text, said):
     if text is not None:
         (tmp_path / "camera.toml").write_text(text)
     with pytest.raises(ConfigError, match=said):
         camera_model(LensConfig(model_file=tmp_path / "camera.toml"), SIZE)
 
 
-def test_two_models_at_once_are_refused(tmp_path):
+def test_two_models_at_once_are_rejected(tmp_path):
     with pytest.raises(ConfigError, match="keep one"):
         camera_model(LensConfig(model_file=tmp_path / "camera.toml", model=MODEL), SIZE)
 

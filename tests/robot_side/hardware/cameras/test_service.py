@@ -8,7 +8,7 @@ from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
 
 @pytest.mark.slow
-def test_a_video_that_ends_is_said_once_and_the_service_stays(tmp_path):
+def test_end_of_a_video_is_logged_once_and_the_service_stays(tmp_path):
     film = video(tmp_path / "film.avi", pictures=120)
     camera = {"kind": "video", "options": {"path": str(film), "loop": False}}
     with RobotProcess(tmp_path, camera=camera) as robot, Vision(robot.endpoint):

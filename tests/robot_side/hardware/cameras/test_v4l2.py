@@ -87,11 +87,11 @@ def test_a_damaged_picture_is_left_out(opened):
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff\xd8", b"\xff\xd9", jpeg()[1:], jpeg()[:-2], bytes(100)])
-def test_what_lacks_its_beginning_or_end_is_no_picture(data):
+def test_image_without_its_beginning_or_end_is_invalid(data):
     assert whole_jpeg(data) is None
 
 
-def test_when_nobody_asks_nothing_is_copied(opened):
+def test_images_are_copied_only_for_a_reader(opened):
     device = FakeDevice()
     camera = opened(device)
     next_picture(camera)
@@ -105,7 +105,7 @@ def test_when_nobody_asks_nothing_is_copied(opened):
 # --- formats -----------------------------------------------------------------------------------------------------
 
 
-def test_yuyv_is_refused_unless_asked_for(opened):
+def test_yuyv_is_rejected_unless_requested(opened):
     device = FakeDevice(formats=["YUYV"])
     with pytest.raises(HardwareError, match=r'gives YUYV, not MJPG: set camera\.options\.format = "YUYV"'):
         opened(device)
@@ -123,7 +123,7 @@ def test_a_size_that_the_camera_does_not_have_is_named(opened):
         opened(FakeDevice(), width_px=800, height_px=600)
 
 
-def test_a_model_of_another_size_is_refused_and_the_device_given_back(opened):
+def test_model_of_another_size_is_rejected_and_the_device_released(opened):
     device = FakeDevice()
     model = {"width_px": 320, "height_px": 240, "fx_px": 200.0, "fy_px": 200.0, "cx_px": 160.0, "cy_px": 120.0}
     with pytest.raises(ConfigError, match="320x240 pictures, the camera gives 640x480"):
@@ -138,7 +138,7 @@ NOW = Clocks(monotonic_us=10_000_000, boot_us=500_000_000, day_us=1_700_000_000_
 
 
 @pytest.mark.parametrize("clock", [time.monotonic, time.time, lambda: time.clock_gettime(time.CLOCK_BOOTTIME)])
-def test_the_buffers_time_is_told_on_the_monotonic_clock(opened, clock):
+def test_buffer_time_is_converted_to_the_monotonic_clock(opened, clock):
     camera = opened(FakeDevice(clock=lambda: clock() - 0.040))
     age_s = age_of(next_picture(camera))
     assert 0.040 <= age_s < 0.140
@@ -169,14 +169,14 @@ def test_a_stamp_is_read_on_the_clock_it_was_taken_from(stamp_us, expected_us):
 
 @pytest.mark.parametrize("clock_us", [NOW.monotonic_us, NOW.boot_us, NOW.day_us])
 @pytest.mark.parametrize("age_us", [0, 2_000_000, 2_000_001, 9_000_000])
-def test_once_a_stamp_has_told_the_clock_it_is_believed_however_old(clock_us, age_us):
+def test_later_stamps_of_a_known_clock_are_accepted_at_any_age(clock_us, age_us):
     stamps = CaptureClock(30_000)
     stamps.captured_us(clock_us - 10_000, NOW)
     assert stamps.captured_us(clock_us - age_us, NOW) == NOW.monotonic_us - age_us
     assert stamps.captured_us(clock_us - 10_000, NOW) == NOW.monotonic_us - 10_000, "and is not forgotten"
 
 
-def test_a_stamp_from_the_future_of_its_clock_is_of_another_or_tells_nothing():
+def test_future_stamp_counts_as_another_clock_or_is_ignored():
     """Monotonic time and time since boot are one until the machine is first put to sleep."""
     stamps = CaptureClock(30_000)
     awake = Clocks(monotonic_us=9_000_000, boot_us=9_000_000, day_us=1_700_000_000_000_000)
@@ -218,7 +218,7 @@ def fault_free(camera):
         return None
 
 
-def test_a_frozen_camera_is_told_and_recovers(opened):
+def test_a_frozen_camera_is_reported_and_recovers(opened):
     device = FakeDevice()
     camera = opened(device)
     next_picture(camera)
@@ -228,7 +228,7 @@ def test_a_frozen_camera_is_told_and_recovers(opened):
     eventually(lambda: fault_free(camera))
 
 
-def test_what_opencv_raises_is_told_and_ends_nothing(opened):
+def test_error_of_opencv_is_logged_and_ends_nothing(opened):
     device = FakeDevice()
     camera = opened(device)
 
@@ -241,7 +241,7 @@ def test_what_opencv_raises_is_told_and_ends_nothing(opened):
     eventually(lambda: fault_free(camera))
 
 
-def test_a_camera_that_sends_only_rubbish_is_told(opened):
+def test_camera_with_invalid_data_is_reported(opened):
     device = FakeDevice()
     camera = opened(device, frozen_after_s=0.3)
     device.damage = lambda data: bytes(100)
@@ -252,7 +252,7 @@ def test_a_camera_that_starts_slowly_is_waited_for(opened):
     assert age_of(next_picture(opened(FakeDevice(starting_s=1.5)))) < 0.15
 
 
-def test_a_camera_frozen_from_the_start_is_no_camera(opened):
+def test_camera_frozen_from_the_start_does_not_open(opened):
     device = FakeDevice(frozen=True)
     with pytest.raises(HardwareError, match="gives no picture"):
         opened(device)
@@ -267,13 +267,13 @@ def test_absent_device_lists_what_there_is(tmp_path):
         CAMERAS.build(PluginChoice(kind="v4l2", options={"device": str(tmp_path / "video9")}))
 
 
-def test_a_plain_file_is_no_camera(tmp_path):
+def test_a_plain_file_is_not_a_camera(tmp_path):
     (tmp_path / "video0").write_bytes(b"x")
     with pytest.raises(HardwareError, match="is not a camera device"):
         check_device(tmp_path / "video0")
 
 
-def test_a_device_that_is_no_camera_does_not_open():
+def test_a_device_that_is_not_a_camera_does_not_open():
     with pytest.raises(HardwareError, match=r"/dev/full does not open"):
         CAMERAS.build(PluginChoice(kind="v4l2", options={"device": "/dev/full"}))
 

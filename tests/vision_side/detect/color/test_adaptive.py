@@ -83,7 +83,7 @@ def test_the_nearer_of_two_is_the_one_whichever_is_larger() -> None:
         assert circle is not None and circle.cx_px == pytest.approx(100.5 + step, abs=2)
 
 
-def test_what_was_lost_is_taken_up_again_elsewhere_after_a_while() -> None:
+def test_lost_target_is_found_again_elsewhere_after_a_while() -> None:
     course = Course()
     course.acquire(80, 120)
     found = [course.see(room((260, 120, 20), seed=seed)) for seed in range(30)]
@@ -117,7 +117,7 @@ def test_no_picture_makes_it_raise(seed: int) -> None:
         course.see(room((160, 120, 20)))
 
 
-def test_colour_does_not_depend_on_exposure_and_tells_yellow_from_orange() -> None:
+def test_color_is_independent_of_exposure_and_separates_yellow_from_orange() -> None:
     pixels = np.random.default_rng(1).normal(YELLOW, 3, (300, 3)).clip(0, 255).astype(np.uint8)
     chroma = ColorModel(pixels)
     assert chroma.distance((pixels * 0.35).astype(np.uint8)) < 2

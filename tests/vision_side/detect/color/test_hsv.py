@@ -100,7 +100,7 @@ def test_balls_of_other_colours_are_not_the_target(colour: tuple[int, int, int])
     ],
     ids=["square", "bar", "triangle"],
 )
-def test_things_of_the_colour_that_are_not_round_are_refused(corners: list[tuple[int, int]]) -> None:
+def test_things_of_the_color_that_are_not_round_are_rejected(corners: list[tuple[int, int]]) -> None:
     picture = np.full((240, 320, 3), 140, np.uint8)
     cv2.fillPoly(picture, [np.array(corners)], (13, 199, 242))
     assert detect(camera(), picture) == ()

@@ -38,7 +38,7 @@ def test_several_pictures_are_one_run_with_the_answers_that_each_gets_alone(tmp_
     assert [one.seq for one in together] == [0, 1, 2] and all(one.compute_us is not None for one in together)
 
 
-def test_what_is_no_picture_is_left_out_and_no_run_is_too_large(tmp_path: Path, monkeypatch) -> None:
+def test_invalid_image_is_skipped_and_runs_are_bounded(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("sightline.vision_side.detect.onnx.detector._MAX_BATCH", 2)
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1, refine=())
     runs = counted(eye, monkeypatch)
@@ -64,7 +64,7 @@ def test_a_model_that_cannot_do_with_many_pictures_is_given_fewer(tmp_path: Path
     assert all(eye.detect(frames, NO_DEADLINE)) and runs[4:] == [2, 2, 1] and not eye.notices()
 
 
-def test_an_engine_that_fails_on_every_picture_is_told_of_and_gives_no_answer(tmp_path: Path, monkeypatch) -> None:
+def test_engine_that_fails_on_every_image_is_reported_and_gives_no_answer(tmp_path: Path, monkeypatch) -> None:
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1)
     eye.notices()
     monkeypatch.setattr(eye._engine, "run", None, raising=False)

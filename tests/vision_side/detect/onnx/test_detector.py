@@ -41,7 +41,7 @@ def header_of(path: Path) -> OnnxHeader:
     return open_engine(path, "cpu", 1).header
 
 
-def test_a_file_says_what_it_takes_and_gives(tmp_path: Path) -> None:
+def test_model_file_names_its_inputs_and_outputs(tmp_path: Path) -> None:
     path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], min_score="0.4")
     header = header_of(path)
     assert header.inputs == (Tensor("image", "uint8", (1, 240, 320, 3)),)
@@ -49,7 +49,7 @@ def test_a_file_says_what_it_takes_and_gives(tmp_path: Path) -> None:
     assert header.metadata == {"labels": '["ball", "legs"]', "min_score": "0.4"}
 
 
-def test_an_input_that_is_a_constant_is_none(tmp_path: Path) -> None:
+def test_constant_input_is_not_an_input(tmp_path: Path) -> None:
     path = model(tmp_path / "old.onnx", [node("Identity", ["x"], ["y"])], [tensor("w", np.ones(3, np.float32))],
                  [value("w", "float32", (3,)), value("x", "float32", (1, 3, None, None))],
                  [value("y", "float32", (1, 3, None, None))])
@@ -58,7 +58,7 @@ def test_an_input_that_is_a_constant_is_none(tmp_path: Path) -> None:
 
 @settings(deadline=None)
 @given(data=st.binary(min_size=1, max_size=200))
-def test_bytes_that_are_no_model_are_one_error(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
+def test_bytes_that_are_not_a_model_give_one_error(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.mktemp("bytes") / "m.onnx"
     path.write_bytes(data)
     with pytest.raises(ConfigError):
@@ -128,7 +128,7 @@ def test_the_time_is_over(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["cuda", "tensorrt"])
-def test_a_device_that_is_not_there_is_refused_with_the_fix(tmp_path: Path, kind: str) -> None:
+def test_missing_device_is_rejected_with_the_fix(tmp_path: Path, kind: str) -> None:
     path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1])
     with pytest.raises(HardwareError, match=r"--device .*onnxruntime-gpu") as refused:
         detector(path, device=kind)
@@ -136,7 +136,7 @@ def test_a_device_that_is_not_there_is_refused_with_the_fix(tmp_path: Path, kind
     assert "\n" not in str(refused.value)
 
 
-def test_auto_says_once_that_it_runs_on_the_cpu(tmp_path: Path) -> None:
+def test_auto_device_logs_once_that_it_runs_on_the_cpu(tmp_path: Path) -> None:
     eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
     assert len(told := eye.notices()) == 1 and "cpu" in told[0]
     eye.detect([frame(PICTURE.bgr)], NO_DEADLINE)
@@ -208,7 +208,7 @@ def test_a_listed_gpu_that_the_model_did_not_get_is_not_believed(
     [(None, "No such file"), (b"", "0 bytes"), (b"no model", "cannot be opened"),
      (part(7, part(2, "empty")), "cannot be opened")],
 )
-def test_a_file_that_is_no_model_is_one_line(tmp_path: Path, content: bytes | None, words: str) -> None:
+def test_file_that_is_not_a_model_gives_one_error_line(tmp_path: Path, content: bytes | None, words: str) -> None:
     path = tmp_path / "bad.onnx"
     if content is not None:
         path.write_bytes(content)
@@ -224,7 +224,7 @@ def test_without_the_runtime_one_line_names_what_to_install(tmp_path: Path, monk
     assert "\n" not in str(missing.value)
 
 
-def test_a_model_of_another_kind_says_what_it_should_be() -> None:
+def test_model_of_another_kind_names_the_expected_kind() -> None:
     image = Tensor("x", "float32", (1, 3, 64, 64))
     with pytest.raises(ValueError, match=r"gives y \(1, 1000\)"):
         model_format(OnnxHeader((image,), (Tensor("y", "float32", (1, 1000)),)), (), "auto")
@@ -247,7 +247,7 @@ def _found_beside_a_good_one(box: float, score: float, label: float) -> tuple[De
 @pytest.mark.parametrize(("box", "score", "label"), [
     (np.nan, 0.9, 0), (-np.inf, 0.9, 0), (9, np.nan, 0), (9, np.inf, 0), (9, 1.01, 0), (9, 7, 0), (9, 0.9, np.nan),
 ])  # fmt: skip
-def test_numbers_that_are_none_are_no_answer(box: float, score: float, label: float) -> None:
+def test_invalid_numbers_count_as_no_answer(box: float, score: float, label: float) -> None:
     """Who took them for "saw nothing" would begin to search."""
     with pytest.raises(ValueError, match=r"nan or infinite|between 0 and 1"):
         _found_beside_a_good_one(box, score, label)
@@ -259,7 +259,7 @@ def test_what_does_not_count_may_hold_anything(box: float, score: float, count: 
     assert len(found) == count and all(0 <= one.x1_px < one.x2_px <= 320 for one in found)
 
 
-def test_a_million_boxes_and_other_shapes_are_refused() -> None:
+def test_a_million_boxes_and_other_shapes_are_rejected() -> None:
     many = {"boxes": np.zeros((200_000, 4)), "scores": np.ones(200_000), "labels": np.zeros(200_000)}
     with pytest.raises(ValueError, match="boxes"):
         read_outputs(many, FORM, STRAIGHT, PICTURE, 0.1)
@@ -308,7 +308,7 @@ def test_a_golden_output_that_differs_ends_it(tmp_path: Path) -> None:
         detector(brightness_model(tmp_path / "b.onnx", BOXES, [0, 1], golden="[1]"))
 
 
-def test_golden_text_comes_back_and_tells_apart() -> None:
+def test_golden_text_round_trips_and_distinguishes() -> None:
     found = [Detection(10, 20, 60, 90, 0.9, "ball"), Detection(100, 20, 160, 90, 0.3, "legs")]
     back = read_golden(golden_text(found))
     assert difference(found, back, 0.25) == ""

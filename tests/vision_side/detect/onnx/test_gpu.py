@@ -49,7 +49,7 @@ def _seen(eyes):
     return [eyes.detect([one], NO_DEADLINE)[0] for one in frames]
 
 
-def test_every_result_says_what_it_ran_on(on_gpu):
+def test_every_result_names_its_device(on_gpu):
     assert [one.device for one in _seen(on_gpu)] == [GPU] * len(JPEGS) and on_gpu.notices() == []
 
 

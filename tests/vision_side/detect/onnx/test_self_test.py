@@ -57,7 +57,7 @@ class _Dying:
         return ["CUDAExecutionProvider", "CPUExecutionProvider"]
 
 
-def test_a_gpu_that_is_lost_is_no_answer_and_not_the_cpu_under_its_name(tmp_path: Path, monkeypatch) -> None:
+def test_lost_gpu_gives_no_answer_and_never_uses_the_cpu(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "onnxruntime", _Dying)
     eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]), device="cuda", refine=())
     assert eye.detect([frame(GREY)], NO_DEADLINE)[0].device == "cuda" and eye.notices() == []
@@ -66,7 +66,7 @@ def test_a_gpu_that_is_lost_is_no_answer_and_not_the_cpu_under_its_name(tmp_path
     assert "CUDA failure" in eye.notices()[0]
 
 
-def test_the_real_runtime_can_be_told_to_stay_where_it_is(tmp_path: Path) -> None:
+def test_real_runtime_can_stay_on_its_device(tmp_path: Path) -> None:
     eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
     assert eye._engine._session._enable_fallback is False
 

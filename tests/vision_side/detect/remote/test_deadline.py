@@ -88,7 +88,7 @@ def test_only_the_newest_waits_and_an_answer_that_is_late_is_nobodys(by_deadline
     assert by_deadline.overtaken >= 3
 
 
-def test_what_raises_is_no_answer_and_the_next_is_one(by_deadline, held):
+def test_detector_error_counts_as_no_answer_and_the_next_frame_is_answered(by_deadline, held):
     held.raises = True
     assert by_deadline.detect([frame(1)], within(2)) == [None]
     held.raises = False
@@ -98,7 +98,7 @@ def test_what_raises_is_no_answer_and_the_next_is_one(by_deadline, held):
     assert "RuntimeError: a plug-in's fault" in line
 
 
-def test_nonsense_is_no_answer_and_the_first_is_told():
+def test_invalid_reply_counts_as_no_answer_and_the_first_is_logged():
     class Strange:
         def detect(self, frames, deadline_us):
             beyond = (Detection(1, 2, math.nan, 4, 0.9, "ball"),)
@@ -112,7 +112,7 @@ def test_nonsense_is_no_answer_and_the_first_is_told():
     fallback.close()
 
 
-def test_pixels_of_a_frame_nobody_waits_for_any_more_do_not_get_into_the_next():
+def test_pixels_of_an_abandoned_frame_do_not_reach_the_next():
     """The one who asks decodes its next frame while the other still looks at the last."""
     looking, go_on, seen = threading.Event(), threading.Event(), []
 
@@ -142,7 +142,7 @@ def test_ever_new_robots_leave_no_more_decoders_than_there_may_be():
     assert len(decoders._decoders) == MAX_DECODERS
 
 
-def test_what_fails_to_close_is_told_by_who_closes_it(held, monkeypatch):
+def test_failed_close_is_reported_by_the_caller(held, monkeypatch):
     monkeypatch.setattr(type(held), "close", lambda _self: 1 / 0)
     with pytest.raises(ConfigError, match=r"close\(\) raises ZeroDivisionError"):
         DeadlineDetector(held).close()
@@ -198,7 +198,7 @@ def _who(fallback, seq, count=1, robot="r1"):
     return [one and one.detector for one in results]
 
 
-def test_late_once_and_own_eyes_drive_on_in_that_very_frame():
+def test_late_remote_answer_is_replaced_by_the_local_detector_in_the_same_frame():
     remote, own = FakeRemote(), Held("own")
     fallback = Fallback(remote, own)
     assert _who(fallback, 1) == ["remote"] and own.asked == []
@@ -209,7 +209,7 @@ def test_late_once_and_own_eyes_drive_on_in_that_very_frame():
     assert "the fallback drives on" in fallback.notices()[0] and fallback.switched == 1
 
 
-def test_asked_beside_the_remote_has_no_more_time_than_when_it_drives():
+def test_shadow_of_a_remote_detector_has_the_same_deadline():
     """Or one that takes most of the deadline would be good beside, late when it drives, and change each second."""
     remote = FakeRemote()
     fallback = Fallback(remote, Held("own"))
@@ -251,7 +251,7 @@ def test_an_answer_under_way_is_waited_for_by_later_frames_not_by_this_one():
     assert all(_who(fallback, seq) == ["own"] for seq in range(2, 30)) and len(remote.asked) == before
 
 
-def test_of_a_batch_only_what_the_remote_left_out_is_looked_at_by_own_eyes():
+def test_local_detector_examines_only_frames_without_a_remote_answer():
     class Half(FakeRemote):
         def detect(self, frames, deadline_us):
             results = super().detect(frames, deadline_us)
@@ -261,7 +261,7 @@ def test_of_a_batch_only_what_the_remote_left_out_is_looked_at_by_own_eyes():
     assert _who(Fallback(Half(), own), 1, 4) == ["remote", "own", "remote", "own"] and own.asked == [[2, 4]]
 
 
-def test_a_detector_that_can_only_be_waited_for_is_asked_on_its_own_thread(held):
+def test_detector_that_blocks_runs_on_its_own_thread(held):
     fallback = Fallback(held, Hsv(Hsv.Config(hsv=HsvConfig())))
     held.free.clear()
     began_s = time.monotonic()

@@ -54,7 +54,7 @@ def test_of_a_batch_of_several_robots_each_has_its_own():
     assert [one.detector for one in results] == ["remote", "remote", "remote", "own"]
 
 
-def test_what_nobody_looked_at_is_no_bad_answer():
+def test_unexamined_frame_does_not_count_as_a_bad_answer():
     remote = FakeRemote()
     fallback = Fallback(remote, Held("own"))
     remote.state = "none"

@@ -41,7 +41,7 @@ def test_a_jpeg_goes_out_as_it_came_and_boxes_come_back():
     assert (result.width_px, result.height_px, result.device) == (320, 240, "remote") and not detector.rejected
 
 
-def test_saw_nothing_is_an_answer_and_the_server_may_say_who_it_is():
+def test_empty_result_is_an_answer_and_the_server_may_name_itself():
     words = {"detector": "my-net", "model_hash": "ab" * 20, "device": "cuda", "session": "0000abcd", "seq": 1}
     with Server(lambda request: http_reply(said(**words))) as server:
         result = _ask(_asking(server))
@@ -97,7 +97,7 @@ def test_a_name_whose_first_address_is_of_a_family_that_this_machine_lacks_is_re
         assert _ask(_asking(server))
 
 
-def test_what_a_server_says_unasked_answers_no_later_frame():
+def test_unsolicited_reply_answers_no_later_frame():
     second_sent = threading.Event()
 
     def twice(request):
@@ -157,7 +157,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_answer_is_refused_and_counted_and_ends_nothing(name):
+def test_a_hostile_answer_is_rejected_and_counted_and_ends_nothing(name):
     reply, reason = HOSTILE[name]
     deadline_s = 0.3 if reason == "LATE" else 3.0  # what is rejected for its content must be read in time
     with Server(lambda request: reply() if callable(reply) else reply) as server:
@@ -183,7 +183,7 @@ def test_a_gzip_bomb_and_a_million_boxes_take_no_memory():
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kb < 32_000
 
 
-def test_what_is_no_picture_is_not_sent():
+def test_invalid_image_is_not_sent():
     with Server(lambda request: GOOD) as server:
         detector = _asking(server)
         for jpeg in (b"", b"\xff\xd8", b"GIF89a", GREY_JPEG[:100]):
@@ -192,7 +192,7 @@ def test_what_is_no_picture_is_not_sent():
         assert detector.rejected == {"BAD_PICTURE": 5} and not server.requests
 
 
-def test_nobody_there_costs_no_time_and_is_tried_again_soon():
+def test_missing_server_costs_no_time_and_is_tried_again():
     with Server(lambda request: GOOD) as server:
         port = server.port
         server.kill()
@@ -205,7 +205,7 @@ def test_nobody_there_costs_no_time_and_is_tried_again_soon():
         assert until(lambda: _ask(detector), 3 * RETRY_US / 1e6)
 
 
-def test_a_killed_server_is_no_answer_by_the_deadline_and_back_by_itself():
+def test_killed_server_gives_no_answer_by_the_deadline_and_recovers():
     before = set(threading.enumerate())
     with Server(lambda request: GOOD) as server:
         port = server.port
@@ -223,7 +223,7 @@ def test_a_killed_server_is_no_answer_by_the_deadline_and_back_by_itself():
     assert not [one for one in set(threading.enumerate()) - before if one.name == "detector"]
 
 
-def test_a_server_that_hangs_while_connecting_is_no_answer_by_the_deadline():
+def test_server_that_hangs_while_connecting_gives_no_answer_by_the_deadline():
     import socket
 
     with socket.create_server(("127.0.0.1", free_port()), backlog=0) as listener:  # full at once: nobody accepts
@@ -246,7 +246,7 @@ def test_a_server_that_hangs_while_connecting_is_no_answer_by_the_deadline():
     ("oip+http://host", "names no model"), ("oip+http://host/a/b", "names no model"),
     ("oip+http://host/a b", "8000/ball"),
 ])
-def test_an_address_that_is_none_is_one_line_with_the_right_form(address, hint):
+def test_invalid_address_gives_one_line_with_the_correct_form(address, hint):
     with pytest.raises(ConfigError) as error:
         parse_address(address)
     assert hint in str(error.value) and "\n" not in str(error.value)

@@ -47,7 +47,7 @@ def _found(answer, **settings):
 # --- models ----------------------------------------------------------------------------------------------------------
 
 
-def test_metadata_tells_what_to_send():
+def test_metadata_defines_the_request():
     model = read_metadata(_metadata([JPEG_INPUT], OUTPUTS))
     assert model == OipModel("ball", "3", JPEG_INPUT, ("boxes", "scores", "labels")) and model.takes_jpeg
     assert not read_metadata(_metadata([PIXELS], OUTPUTS[:2])).takes_jpeg
@@ -61,7 +61,7 @@ def test_metadata_tells_what_to_send():
     ([TensorSlot("image", "UINT8", (1, 240, 320, 4))], OUTPUTS, "not a picture"),
     ([TensorSlot("image", "BYTES", (1, 1, 1))], OUTPUTS, "not one JPEG"),
 ])  # fmt: skip
-def test_a_model_that_does_not_fit_is_said_in_words(inputs, outputs, why):
+def test_model_that_does_not_fit_gives_a_readable_error(inputs, outputs, why):
     with pytest.raises(NoAnswerError, match=why) as error:
         read_metadata(_metadata(inputs, outputs))
     assert error.value.reason is NoAnswerReason.UNFIT and "docs/how-to/remote-detectors.md" in error.value.detail
@@ -115,7 +115,7 @@ def test_binary_and_json_answers_are_the_same():
     (np.zeros((1, 1, 3, 4)), np.zeros((3, 1)), np.zeros(3)), (np.zeros((0, 4)), np.zeros(0), np.zeros(0)),
     (np.zeros((1, 0, 4)), np.zeros((1, 0)), np.zeros((1, 0))),
 ])
-def test_padded_rows_are_no_boxes_whatever_the_batch_dimension(boxes, scores, labels):
+def test_padded_rows_give_no_boxes_for_any_batch_dimension(boxes, scores, labels):
     assert _found(read_infer(*_binary(boxes, scores, labels), ASKED)) == ()
 
 
@@ -149,7 +149,7 @@ ANSWERS = {
 
 
 @pytest.mark.parametrize("name", ANSWERS)
-def test_a_hostile_answer_is_refused_with_its_reason(name):
+def test_a_hostile_answer_is_rejected_with_its_reason(name):
     (body, length), reason = ANSWERS[name]
     with pytest.raises(NoAnswerError) as error:
         _found(read_infer(body, length, ASKED))
@@ -161,7 +161,7 @@ def test_a_hostile_answer_is_refused_with_its_reason(name):
     {"data": [[1, 2, 3]]}, {"data": "text"}, {"data": [[1, 2, 3, "x"]]}, {"data": None}, {"data": [10**400, 1, 1, 1]},
     {"data": {"a": 1}}, {"parameters": {"binary_data_size": -1}}, {"parameters": {"binary_data_size": 1 << 60}},
 ])  # fmt: skip
-def test_a_misshapen_tensor_is_refused(output):
+def test_a_misshapen_tensor_is_rejected(output):
     usual = {"name": "boxes", "datatype": "FP32", "shape": [1, 4], "data": [1, 2, 3, 4]} | output
     body = json.dumps({"outputs": [usual, {"name": "scores", "datatype": "FP32", "shape": [1], "data": [1]}]}).encode()
     with pytest.raises(NoAnswerError):

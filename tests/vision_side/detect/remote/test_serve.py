@@ -31,12 +31,12 @@ def test_what_cannot_be_served_is_one_line_and_exit_code_2(capsys, arguments, wh
     assert what in error and error.count("\n") == 1 and error.startswith("error: ")
 
 
-def test_nobody_at_the_endpoint_is_exit_code_4(capsys):
+def test_endpoint_without_a_peer_exits_with_4(capsys):
     assert cli.run(["detector", "--serve", "hsv", "--connect", free_endpoint()]) == 4
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_a_process_that_serves_is_found_answers_and_ends_when_it_is_told_to(tmp_path, capsys):
+def test_detector_process_is_found_answers_and_ends_on_request(tmp_path, capsys):
     endpoint = free_endpoint()
     robot = Robot("r1", endpoint, listens=True)
     with robot.link, Processes(tmp_path) as processes, open_zenoh("r1", connect=[endpoint]) as link:

@@ -81,7 +81,7 @@ def test_a_real_asgi_server_answers(uvicorn):
         assert detector.detect([frame()], within(1.0))[0].detector == "yellow"
 
 
-def test_a_killed_asgi_server_is_no_answer_and_back_within_three_seconds_of_its_return(uvicorn):
+def test_killed_asgi_server_gives_no_answer_and_recovers_within_three_seconds(uvicorn):
     with _closing(_detector(f"http+jpeg://127.0.0.1:{uvicorn.port}/detect")) as detector:
         assert until(lambda: detector.detect([frame()], within(1.0))[0], 15)
         uvicorn.kill()
@@ -130,7 +130,7 @@ def test_triton_finds_the_ball_from_jpegs_and_from_pixels(triton, model):
 
 
 @pytest.mark.slow
-def test_triton_says_no_to_a_model_it_has_not_and_that_is_counted(triton):
+def test_unknown_model_of_triton_is_counted(triton):
     with _closing(_triton_detector(triton, "cat")) as detector:
         assert until(lambda: not detector.detect([frame()], within(1.0))[0] and detector.rejected["REJECTED"])
         assert "cat" in " ".join(detector.notices())
@@ -143,7 +143,7 @@ def test_a_detector_over_triton_keeps_the_contract(triton):
 
 
 @pytest.mark.slow
-def test_a_killed_triton_is_no_answer_by_the_deadline_and_back_within_three_seconds_of_its_return(triton):
+def test_killed_triton_gives_no_answer_by_the_deadline_and_recovers_within_three_seconds(triton):
     with _closing(_triton_detector(triton, "ball_jpeg")) as detector:
         assert until(lambda: detector.detect([frame()], within(1.0))[0], 10)
         triton.kill()

@@ -35,7 +35,7 @@ def _tally_after(answered, refused, good):
 
 
 @pytest.mark.parametrize("between", [NoAnswerReason.REJECTED, None])
-def test_a_refusal_is_told_at_the_1st_10th_100th_of_its_kind(between):
+def test_rejection_is_logged_at_the_1st_10th_100th_of_its_kind(between):
     tally, told = ErrorCounters("far"), []
     for count in range(1, 1001):
         tally.reject(NoAnswerError(NoAnswerReason.LATE, "nothing by the deadline"))
@@ -47,7 +47,7 @@ def test_a_refusal_is_told_at_the_1st_10th_100th_of_its_kind(between):
 
 
 @pytest.mark.parametrize(("good", "bad"), [(10, 1), (3, 10), (500, 1)])
-def test_what_goes_bad_again_is_told_again(good, bad):
+def test_repeated_failure_is_reported_again(good, bad):
     tally = _tally_after(1, 12, good)
     tally.notices.take()
     _refuse(tally, bad - 1)
@@ -93,7 +93,7 @@ def _column(name):
 
 
 @pytest.mark.parametrize("closes", [False, True])
-def test_a_model_is_asked_for_once_and_again_after_an_error(closes):
+def test_a_model_is_requested_once_and_again_after_an_error(closes):
     with ModelServer(closes) as server:
         address = f"oip+http://127.0.0.1:{server.port}/ball"
         settings = OipSettings(address=address, labels=("ball", "box"))
@@ -116,7 +116,7 @@ def test_a_model_is_asked_for_once_and_again_after_an_error(closes):
         detector.close()
 
 
-def test_a_server_that_was_late_once_is_not_made_later_by_asking_for_its_model_again():
+def test_late_server_is_not_delayed_by_another_model_query():
     """60 ms for each request of 100: once the model is known that is enough, with its metadata asked for it is not."""
     with ModelServer(closes=False) as server:
         settings = OipSettings(address=f"oip+http://127.0.0.1:{server.port}/ball", labels=("b",))
@@ -140,7 +140,7 @@ def test_numbers_of_labels_may_be_written_as_floats(kind):
 
 
 @pytest.mark.parametrize("bad", [0.5, float("nan"), float("inf"), -1e300])
-def test_what_is_no_whole_number_is_no_label(bad):
+def test_label_that_is_not_a_whole_number_is_ignored(bad):
     outputs = {"boxes": np.float32([[10, 20, 30, 40]]), "scores": np.float32([0.9]), "labels": np.float64([bad])}
     with pytest.raises(NoAnswerError) as error:
         detections_of(Inferred(outputs), OipSettings(address="", labels=("ball",)), (1.0, 1.0), (320, 240))

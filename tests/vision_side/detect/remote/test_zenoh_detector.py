@@ -140,7 +140,7 @@ def test_one_detector_serves_every_robot_of_a_fleet(bench):
         assert (result := _result(robot, detector)).robot == robot.name and result.session == robot.session
 
 
-def test_without_a_link_it_says_so():
+def test_missing_link_is_reported():
     alone = ZenohDetector(ZenohDetector.Config())
     assert alone.detect([frame()], within(0.1)) == [None] and alone.rejected == {"UNREACHABLE": 1}
     assert "no link to robot r1" in alone.notices()[0]
@@ -159,7 +159,7 @@ def test_a_bad_picture_and_a_bad_header_get_no_answer_and_are_counted(bench):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (15, 400), (8200, 16)])
-def test_a_picture_of_no_cameras_size_is_refused_before_any_detector_sees_it(bench, size):
+def test_image_of_another_size_is_rejected_before_detection(bench, size):
     robot, odd = bench.robot("r1"), bench.robot("r2")
     detector = bench.detector("r1")
     odd.frame(jpeg_of(np.full((size[1], size[0], 3), 128, np.uint8)))
@@ -197,7 +197,7 @@ def test_a_detector_that_fails_gives_no_answer_and_the_service_goes_on():
         assert len(bench.words) == 4, "each reason once"
 
 
-def test_it_is_seen_by_who_asks_who_is_there_with_its_model_device_and_health(bench):
+def test_presence_shows_model_device_and_health_of_a_service(bench):
     robot = bench.robot("r1")
     detector = bench.detector("r1")
     assert until(lambda: _result(robot, detector))
@@ -207,7 +207,7 @@ def test_it_is_seen_by_who_asks_who_is_there_with_its_model_device_and_health(be
     assert "hsv on cpu" in next(one["about"] for one in as_object({}, peers)["peers"] if one["role"] == "detector")
 
 
-def test_a_service_that_is_gone_is_no_answer_by_the_deadline_and_back_by_itself():
+def test_lost_service_gives_no_answer_by_the_deadline_and_recovers():
     endpoint = free_endpoint()
     with ExitStack() as ending:
         robot = Robot("r1", endpoint, listens=True)
@@ -251,7 +251,7 @@ def pair():
     ({"session": "0000ffff"}, "OTHER_FRAME"), ({"t_us": 1}, "OTHER_FRAME"), ({"seq": 0, "t_us": 10**9}, "OTHER_FRAME"),
     ({"seq": 9, "t_us": 1}, "OTHER_FRAME"), ({"channel": "status"}, "OTHER_FRAME"), ({"width_px": 640}, "OTHER_SIZE"),
 ])  # fmt: skip
-def test_boxes_of_another_frame_or_size_are_refused_and_counted(pair, changes, reason):
+def test_boxes_of_another_frame_or_size_are_rejected_and_counted(pair, changes, reason):
     robot, waiting = pair
     asked = frame(3)
     robot.say(asked, BOX, **changes)
@@ -272,7 +272,7 @@ def test_boxes_of_another_frame_or_size_are_refused_and_counted(pair, changes, r
     b"", b"{", b"<html>", b"[" * 9_000, b'{"width_px":320,"height_px":240,"boxes":[{}]}', b"\xff" * 32_768,
     b'{"width_px":320,"height_px":240,"boxes":[NaN]}',
 ])  # fmt: skip
-def test_what_is_no_detections_message_is_refused_and_counted(pair, payload):
+def test_invalid_detections_message_is_rejected_and_counted(pair, payload):
     robot, waiting = pair
     asked = frame(3)
     echo = Echo(channel="frame", session=asked.header.session, seq=3, t_us=asked.header.t_us)
@@ -289,7 +289,7 @@ def test_boxes_of_an_older_frame_are_nobodys_and_no_news(pair):
     assert waiting.detect([frame(9)], within(0.1)) == [None] and waiting.rejected == {"LATE": 1}
 
 
-def test_of_two_services_one_is_kept_to_until_it_is_silent(pair):
+def test_first_of_two_services_is_used_until_it_is_silent(pair):
     """Two trackers' identities, or two models' boxes in turns, would steer by neither."""
     robot, waiting = pair
     other = DetectedBox(label="box", score=0.9, x1_px=50.0, y1_px=10.0, x2_px=90.0, y2_px=30.0)
