@@ -1,4 +1,4 @@
-"""What a command checks before its work: the extra that it needs is installed, its result can be written. Shell
+"""Checks before the work of a command: the extra that it needs is installed, its result can be written. Shell
 (files).
 """
 
@@ -15,7 +15,7 @@ _PYBULLET_UP_TO = (3, 11)
 
 @contextmanager
 def needs(extra: str, version: tuple[int, int] = sys.version_info[:2]) -> Iterator[None]:
-    """Imports inside that fail become a ConfigError that names the extra; ours are faults and stay as they are."""
+    """Turn a failed import into a ConfigError that names the extra; a failed import of Sightline stays as it is."""
     try:
         yield
     except ImportError as error:
@@ -28,24 +28,24 @@ def needs(extra: str, version: tuple[int, int] = sys.version_info[:2]) -> Iterat
 def _advice(package: str, extra: str, version: tuple[int, int]) -> str:
     if package == "pybullet" and version > _PYBULLET_UP_TO:
         return (
-            f"PyBullet has no ready-made package for Python {version[0]}.{version[1]}: use Python 3.11, or "
-            "`docker compose up`, or let pip compile it (minutes): pip install '.[sim]'"
+            f"PyBullet has no wheel for Python {version[0]}.{version[1]}: use Python 3.11, or "
+            "`docker compose up`, or compile it (minutes): pip install '.[sim]'"
         )
     return f"{package} is not installed: pip install '.[{extra}]'"
 
 
-# Whether a result can be written where it is to go, looked at before the work that makes it. Shell.
+# --- the place of a result, checked before the work that makes it ------------------------------------------------
 
 
 def check_out_file(path: Path) -> None:
-    """Raise ConfigError where no file of that name can be made or changed."""
+    """Raise ConfigError if the file cannot be created or changed."""
     try:
         if not path.parent.is_dir():
-            raise ConfigError(f"{path}: there is no folder {path.parent}; name a file in one that exists")
+            raise ConfigError(f"cannot write {path}: no folder {path.parent}; name a file in an existing folder")
         if path.is_dir():
-            raise ConfigError(f"{path}: is a folder; name a file in it")
+            raise ConfigError(f"cannot write {path}: it is a folder; name a file in it")
         may = os.access(path if path.exists() else path.parent, os.W_OK)
-    except OSError:  # a folder on the way is somebody else's
+    except OSError:  # a folder of the path belongs to another user
         may = False
     if not may:
-        raise ConfigError(f"{path}: cannot be written; name a file in a folder of yours")
+        raise ConfigError(f"cannot write {path}: permission denied; name a file in a folder that you may write")

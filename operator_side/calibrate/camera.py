@@ -1,6 +1,6 @@
-"""A camera's model from pictures of a chessboard or a ball, and where the pictures come from. Shell (files, a link).
+"""Fits a camera model to images of a chessboard or a ball from a folder, a camera or a robot. Shell (files, a link).
 
-OpenCV counts pixels from the middle of the top-left one, `CameraModel` from its corner: half a pixel is added.
+OpenCV counts pixels from the center of the top-left one, `CameraModel` from its corner: half a pixel is added.
 """
 
 import itertools
@@ -38,14 +38,14 @@ TILT_RAD, MIN_TILTED = math.radians(15), 3
 """Boards that all face the camera fit any focal length, even with a small standard deviation."""
 MAX_BALL_SPREAD = 0.05
 MAX_PIXELS = 4096 * 4096
-_FOCAL_RANGE = (0.2, 8.0)  # focal length in picture widths: 136 degrees to 7 degrees
-_NEW_VIEW = 0.03  # corners moved by this part of the picture's width, on average
-_FLAGS = cv2.CALIB_FIX_K3  # k3 needs corners in every edge of the picture; without them it bends what it never saw
+_FOCAL_RANGE = (0.2, 8.0)  # focal length in image widths: 136 degrees to 7 degrees
+_NEW_VIEW = 0.03  # average movement of the corners in image widths
+_FLAGS = cv2.CALIB_FIX_K3  # k3 needs corners at every edge of the image; without them it distorts the rest
 
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """Where the lens is on the robot, as `CameraModel` says it."""
+    """The position of the lens on the robot, as in `CameraModel`."""
 
     x_m: float = 0.0
     y_m: float = 0.0
@@ -62,14 +62,14 @@ class Board:
     square_m: float
 
     def points_m(self) -> NDArray[np.float32]:
-        """The corners on the board, row by row."""
+        """Return the corners on the board, row by row."""
         grid = [(column, row, 0.0) for row in range(self.rows) for column in range(self.columns)]
         return np.array(grid, np.float32) * self.square_m
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """A model and how well it fits: `used` of `given` pictures, `error` in `error_unit`."""
+    """A model and its fit: `used` of `given` images, `error` in `error_unit`."""
 
     model: CameraModel
     used: int
@@ -82,20 +82,20 @@ Corners = NDArray[np.float32]
 
 
 def find_board(jpeg: bytes, board: Board) -> Corners | None:
-    """The board's inner corners (N, 1, 2) in OpenCV's pixels; None if the whole board is not in the picture."""
+    """Find the board's inner corners (N, 1, 2) in OpenCV's pixels; None unless the whole board is in the image."""
     try:
         read_jpeg_size(jpeg, MAX_PIXELS)
     except WireError:
         return None
-    grey = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if grey is None:
+    gray = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    if gray is None:
         return None
-    found, corners = cv2.findChessboardCornersSB(grey, (board.columns, board.rows), flags=cv2.CALIB_CB_ACCURACY)
+    found, corners = cv2.findChessboardCornersSB(gray, (board.columns, board.rows), flags=cv2.CALIB_CB_ACCURACY)
     return np.asarray(corners, np.float32) if found else None
 
 
 def is_new_view(corners: Corners, earlier: Sequence[Corners], size: JpegSize) -> bool:
-    """Whether a board is so far from where it was seen before that it says something new."""
+    """Return whether a board is far enough from its earlier positions to add information."""
     apart_px = _NEW_VIEW * size.width_px
     return all(float(np.abs(corners - one).mean()) >= apart_px for one in earlier)
 
@@ -103,9 +103,10 @@ def is_new_view(corners: Corners, earlier: Sequence[Corners], size: JpegSize) ->
 def from_boards(
     found: Sequence[Corners], board: Board, size: JpegSize, given: int, mounting: Mounting
 ) -> Calibration:
-    """Focal length, centre and distortion from `found`, the boards seen in `given` pictures of `size`.
+    """Fit focal length, center and distortion to `found`, the boards in `given` images of `size`.
 
-    Raises ConfigError with what to do when there are too few, or the fit is poor.
+    Raises:
+        ConfigError: too few boards or a poor fit; the error names the remedy.
     """
     if len(found) < MIN_BOARDS:
         raise ConfigError(_too_few(len(found), given, board))
@@ -122,24 +123,24 @@ def _too_few(found: int, given: int, board: Board) -> str:
     what = f"a chessboard of {board.columns} x {board.rows} inner corners"
     if not found:
         return (
-            f"no board found in {given} pictures: {what} must be whole in them, flat and evenly lit; "
-            "--board says how many inner corners yours has"
+            f"no board in {given} images: they must show {what} completely, flat and evenly lit; "
+            "set --board to the number of inner corners"
         )
-    return f"{what} is in {found} of {given} pictures, at least {MIN_BOARDS} are needed; take more from other angles"
+    return f"{what} is in {found} of {given} images, at least {MIN_BOARDS} are necessary; take more from other angles"
 
 
 def _tilt_rad(turn: Any) -> float:
-    """How far a board of this rotation vector is turned away from facing the camera."""
+    """Return the tilt of a board with this rotation vector, relative to one that faces the camera."""
     return math.acos(min(1.0, abs(float(cv2.Rodrigues(turn)[0][2, 2]))))
 
 
 def _check_fit(rms_px: float, focal_sigma: float, tilted: int) -> None:
     if not rms_px <= MAX_RMS_PX:
-        raise ConfigError(f"the fit is off by {rms_px:.2f} px RMS, at most {MAX_RMS_PX:g}: is the board flat, are the "
-                          "pictures sharp and all of one camera at one zoom?")
+        raise ConfigError(f"the error of the fit is {rms_px:.2f} px RMS, at most {MAX_RMS_PX:g}; use a flat board and "
+                          "sharp images of one camera at one zoom")
     if tilted < MIN_TILTED or not focal_sigma <= MAX_FOCAL_SIGMA:
-        raise ConfigError(f"{tilted} boards were tilted by more than 15 degrees, the focal length is known to "
-                          f"{focal_sigma:.1%}: take pictures with the board tilted by 20 to 40 degrees, both ways, and "
+        raise ConfigError(f"{tilted} boards have a tilt above 15 degrees, the focal length is known to "
+                          f"{focal_sigma:.1%}; take images with the board tilted by 20 to 40 degrees, both ways, and "
                           "in the corners")
 
 
@@ -165,14 +166,14 @@ def _model(size: JpegSize, matrix: Any, distortion: Sequence[float], mounting: M
 
 @dataclass(frozen=True, slots=True)
 class Ball:
-    """A ball of the target's colour; `distance_m` is over the floor, from below the lens to below its centre."""
+    """A ball of the target's color; `distance_m` is along the floor, from below the lens to below its center."""
 
     radius_m: float
     distance_m: float
 
 
 def ball_finder(size: JpegSize, hsv: HsvConfig) -> Callable[[bytes], Detection | None]:
-    """A function that gives the largest ball in a JPEG of `size`, None if there is none."""
+    """Make a function that returns the largest ball in a JPEG of `size`, or None."""
     decoder, detector = Decoder(size.width_px, size.height_px, MAX_PIXELS), HsvDetector(hsv)
 
     def find(jpeg: bytes) -> Detection | None:
@@ -187,48 +188,49 @@ def ball_finder(size: JpegSize, hsv: HsvConfig) -> Callable[[bytes], Detection |
 def from_balls(
     found: Sequence[Detection], ball: Ball, size: JpegSize, given: int, mounting: Mounting
 ) -> Calibration:
-    """The focal length at which `found` are `ball`; the centre is taken to be the picture's, distortion none.
+    """Fit the focal length to `found`; the center is that of the image, without distortion.
 
-    Raises ConfigError with what to do when no ball is found or the pictures disagree.
+    Raises:
+        ConfigError: no ball, or the images disagree; the error names the remedy.
     """
     each_px = [focal for one in found if (focal := _focal_px(one, ball, size, mounting)) is not None]
     if not each_px:
         raise ConfigError(
-            f"no ball found in {given} pictures that could be {ball.distance_m:g} m away; check its colour (hsv.ranges "
-            "in --config), --ball-radius-m and --distance-m"
+            f"no ball in {given} images fits a distance of {ball.distance_m:g} m; check its color (hsv.ranges in "
+            "--config), --ball-radius-m and --distance-m"
         )
     focal_px = statistics.median(each_px)
     spread = max(abs(one - focal_px) for one in each_px) / focal_px
     if spread > MAX_BALL_SPREAD:
-        raise ConfigError(f"the focal length differs by {spread:.0%} between pictures; keep ball and camera still")
+        raise ConfigError(f"the focal length differs by {spread:.0%} between images; keep ball and camera still")
     matrix = [[focal_px, 0, size.width_px / 2 - 0.5], [0, focal_px, size.height_px / 2 - 0.5]]
     return Calibration(_model(size, matrix, (), mounting), len(each_px), given, 100 * spread, "% spread")
 
 
 def _focal_px(detection: Detection, ball: Ball, size: JpegSize, mounting: Mounting) -> float | None:
-    """By bisection: a longer lens makes the same outline a ball further away."""
+    """Find the focal length by bisection: with a longer lens, the same outline is a ball further away."""
     low, high = (size.width_px * factor for factor in _FOCAL_RANGE)
     if not _away_m(detection, ball, size, mounting, low) < ball.distance_m < _away_m(
         detection, ball, size, mounting, high
     ):
         return None
     for _ in range(40):
-        middle = (low + high) / 2
-        if _away_m(detection, ball, size, mounting, middle) < ball.distance_m:
-            low = middle
+        center = (low + high) / 2
+        if _away_m(detection, ball, size, mounting, center) < ball.distance_m:
+            low = center
         else:
-            high = middle
+            high = center
     return (low + high) / 2
 
 
 def _away_m(detection: Detection, ball: Ball, size: JpegSize, mounting: Mounting, focal_px: float) -> float:
-    """How far over the floor the ball would be with this lens; nan if it would be none."""
+    """Return the distance of the ball along the floor with this lens; nan if impossible."""
     matrix = [[focal_px, 0, size.width_px / 2 - 0.5], [0, focal_px, size.height_px / 2 - 0.5]]
     sighting = locate_sphere(detection, _model(size, matrix, (), mounting), ball.radius_m)
     return math.hypot(sighting.x_m - mounting.x_m, sighting.y_m - mounting.y_m) if sighting else math.nan
 
 
-# Where pictures for a calibration come from: a folder, a camera of this machine, a robot. Shell (waits, files).
+# --- images from a folder, a camera of this machine, or a robot --------------------------------------------------
 
 
 ROLE = "calibrate"
@@ -240,7 +242,7 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, slots=True)
 class Collected(Generic[Found]):
-    """What was found in `given` pictures of one size."""
+    """The results in `given` images of one size."""
 
     size: JpegSize
     found: list[Found]
@@ -248,13 +250,13 @@ class Collected(Generic[Found]):
 
 
 def folder_pictures(folder: Path) -> Iterator[bytes]:
-    """The JPEGs of `folder` in name order. Raises HardwareError if there is none."""
+    """Yield the JPEGs of `folder` in name order. Raises HardwareError without one."""
     for path in jpegs_in(folder):
         yield path.read_bytes()
 
 
 def camera_pictures(camera: Camera, seconds: float) -> Iterator[bytes]:
-    """What a local camera sees for `seconds`. Raises HardwareError as the camera does."""
+    """Yield the images of a local camera for `seconds`. Raises HardwareError as the camera does."""
     ends_s = time.monotonic() + seconds
     while time.monotonic() < ends_s:
         picture = camera.read(_WAIT_S)
@@ -263,32 +265,33 @@ def camera_pictures(camera: Camera, seconds: float) -> Iterator[bytes]:
 
 
 def robot_pictures(link: Link, seconds: float, role: str = ROLE, secure: str = "") -> Iterator[bytes]:
-    """What a robot's camera sees for `seconds`; frames are acknowledged by who may, so that it goes on sending.
+    """Yield a robot's images for `seconds`; acknowledge them where permitted, so that it continues to send.
 
-    Raises LinkError when no frame comes for five seconds.
+    Raises:
+        LinkError: no frame for five seconds.
     """
     frames, viewer = link.latest(FRAME), FrameViewer(link, role, secure)
-    heard_s = time.monotonic()
-    ends_s = heard_s + seconds
+    received_s = time.monotonic()
+    ends_s = received_s + seconds
     while time.monotonic() < ends_s:
         message = frames.take(_WAIT_S)
         if message is not None and viewer.acknowledge(message):
-            heard_s = time.monotonic()
+            received_s = time.monotonic()
             yield message.payload
-        if time.monotonic() - heard_s > _SILENCE_S:
-            raise LinkError(f"no frames from robot {link.robot!r} within {_SILENCE_S:g} s; is `sightline robot` "
-                            "running there, with this id, and its camera working?")
+        if time.monotonic() - received_s > _SILENCE_S:
+            raise LinkError(f"no frames from robot '{link.robot}' after {_SILENCE_S:g} s; check its id and camera with "
+                            "`sightline status`")
 
 
 def robot_model(link: Link, timeout_s: float = 3.0) -> CameraModel:
-    """The model that a robot publishes now. Raises LinkError when none comes."""
+    """Return the model that a robot publishes. Raises LinkError without one."""
     message = link.latest(CAMERA).take(timeout_s)
     try:
         if message is not None:
             return decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
     except WireError as error:
-        raise LinkError(f"robot {link.robot!r} speaks another version: {error.detail}") from None
-    raise LinkError(f"robot {link.robot!r} is not heard within {timeout_s:g} s; `sightline robots` lists who is")
+        raise LinkError(f"robot '{link.robot}' uses another protocol version: {error.detail}") from None
+    raise LinkError(f"no camera model from robot '{link.robot}' after {timeout_s:g} s; run `sightline robots`")
 
 
 def collect(
@@ -296,16 +299,19 @@ def collect(
     finder: Callable[[JpegSize], Callable[[bytes], Found | None]],
     is_new: Callable[[Found, Sequence[Found], JpegSize], bool],
     enough: int,
-    say: Callable[[str], None],
+    report: Callable[[str], None],
 ) -> Collected[Found]:
-    """Look through `pictures` until `enough` were found that are new, or there are no more; `say` each.
+    """Search `pictures` until `enough` new results, or to their end; report each.
 
-    `finder` makes, for a size, the function that looks at one picture.
-    Raises ConfigError when there is no picture at all, or their sizes differ.
+    Args:
+        finder: makes, for a size, the function that searches one image.
+
+    Raises:
+        ConfigError: there is no image, or their sizes differ.
     """
     first = next(pictures, None)
     if first is None:
-        raise ConfigError("no picture came; is the camera working?")
+        raise ConfigError("no image from the camera; run `sightline doctor --camera v4l2`")
     size = _size_of(first, None)
     find = finder(size)
     found: list[Found] = []
@@ -316,7 +322,7 @@ def collect(
         one = find(jpeg)
         if one is not None and is_new(one, found, size):
             found.append(one)
-            say(f"{len(found)} of {enough}")
+            report(f"{len(found)} of {enough}")
         if len(found) >= enough:
             break
     return Collected(size, found, given)
@@ -326,8 +332,8 @@ def _size_of(jpeg: bytes, size: JpegSize | None) -> JpegSize:
     try:
         own = read_jpeg_size(jpeg, _MAX_PIXELS)
     except WireError as error:
-        raise ConfigError(f"a picture is no plain JPEG: {error.detail}; remove or convert it") from None
+        raise ConfigError(f"invalid JPEG: {error.detail}; remove or convert it") from None
     if size is not None and (own.width_px, own.height_px) != (size.width_px, size.height_px):
-        raise ConfigError(f"pictures of {own.width_px}x{own.height_px} and {size.width_px}x{size.height_px} are mixed; "
-                          "a camera is calibrated at one size")
+        raise ConfigError(f"images of {own.width_px}x{own.height_px} and {size.width_px}x{size.height_px} are mixed; "
+                          "use images of one size")
     return own

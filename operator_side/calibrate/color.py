@@ -1,7 +1,7 @@
-"""A color range from a place in a picture, and how well it separates. Pure.
+"""Derives a color range from a place in an image, and tests it. Pure.
 
-One range, or two for a colour on both sides of red. Margins are for what changes by itself: shade moves the value by a
-factor, haze and warm light take saturation, JPEG and noise blur the hue.
+It gives one range, or two for a color on both sides of red. The margins cover normal changes: shade scales the value,
+haze and warm light lower the saturation, JPEG and noise blur the hue.
 """
 
 from collections.abc import Sequence
@@ -21,15 +21,15 @@ Numbers = NDArray[np.float32]
 Ranges = tuple[HsvRange, ...]
 
 CLICK_PX: Final = 5
-"""A click takes the middle colour of a square of this side, and then all of that colour around it."""
+"""A click takes the median color of a square of this side, and then all of that color around it."""
 MIN_SATURATION: Final = 0.2
 MIN_VALUE: Final = 0.1
-"""Below these a pixel has no hue to speak of."""
+"""Below these, a pixel has no meaningful hue."""
 MIN_BOX_SHARE: Final = 0.3
-"""So much of a box must be of one colour; a disc fills 79 % of the box around it."""
+"""Least share of one color in a box; a disc fills 79 % of the box around it."""
 MOST_MARKED: Final = 0.5
-"""A range that marks this share of a picture is the background's, not the target's."""
-_ALIKE_DEG: Final = 20.0  # from the strongest hue: what still belongs to the same thing, shaded side included
+"""A range that marks this share of an image belongs to the background."""
+_ALIKE_DEG: Final = 20.0  # from the strongest hue: the same object with its shaded side
 _HUE_MARGIN_DEG: Final = 5.0
 _NARROWEST_DEG: Final = 8.0  # to either side: the table of the detector has steps of up to 4 degrees
 _SATURATION_KEPT: Final = 0.6
@@ -39,7 +39,7 @@ _HUE_BIN_DEG: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A part of a picture in its pixels; a click is a box of no size."""
+    """A part of an image in pixels; a click is a box without size."""
 
     x_px: int
     y_px: int
@@ -49,7 +49,7 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What a range marks in several pictures: shares of all pixels (0..1), and blobs, after the detector's opening."""
+    """The marks of a range in several images: shares of all pixels (0..1), and blobs, after the detector's opening."""
 
     pictures: int
     mean_share: float
@@ -57,21 +57,21 @@ class Trial:
     least_blobs: int
     most_blobs: int
     with_any: int
-    """Pictures in which it marks anything."""
+    """Number of images with a mark."""
 
 
 def pick(picture: Image, box: Box) -> Ranges:
-    """The range of the colour there. Raises ConfigError for a place outside, without colour, or with several."""
+    """Return the range of the color there. Raises ConfigError for a place outside, without color, or with several."""
     height, width = picture.shape[:2]
     inside = 0 <= box.x_px < width and 0 <= box.y_px < height
     if not inside or box.x_px + box.width_px > width or box.y_px + box.height_px > height:
-        raise ConfigError(f"{_where(box)} is outside the picture, which is {width}x{height}")
+        raise ConfigError(f"{_where(box)} is outside the image of {width}x{height}; pick inside")
     hsv = _hsv(picture)
     return _range_of(_sample(hsv, box))
 
 
 def try_out(ranges: Ranges, pictures: Sequence[Image]) -> Trial:
-    """What `ranges` mark in `pictures`, of which there is at least one."""
+    """Measure the marks of `ranges` in `pictures`, of which there is at least one."""
     masks = [mask_of(ranges, one) for one in pictures]
     shares = [cv2.countNonZero(mask) / mask.size for mask in masks]
     blobs = [cv2.connectedComponents(mask)[0] - 1 for mask in masks]
@@ -80,16 +80,16 @@ def try_out(ranges: Ranges, pictures: Sequence[Image]) -> Trial:
 
 
 def check_trial(trial: Trial) -> None:
-    """Raise ConfigError for a range that marks half of a picture, or nothing at all."""
+    """Raise ConfigError for a range that marks half of an image, or nothing."""
     if trial.most_share >= MOST_MARKED:
-        raise ConfigError(f"this range marks {trial.most_share:.0%} of a picture: it is the background's colour too; "
-                          "pick the target itself, or put something of another colour behind it")
+        raise ConfigError(f"this range marks {trial.most_share:.0%} of an image: the background has the same color; "
+                          "pick the target itself, or change the background")
     if trial.with_any == 0:
-        raise ConfigError("this range marks nothing that is larger than speckle; pick the middle of a larger patch")
+        raise ConfigError("this range marks only speckle; pick the center of a larger patch")
 
 
 def mask_of(ranges: Ranges, picture: Image) -> Image:
-    """255 where the detector would see the colour, 0 elsewhere."""
+    """Return 255 where the detector finds the color, 0 elsewhere."""
     mask = np.zeros(picture.shape[:2], np.uint8)
     region = ColorMask(ranges).region(picture)
     if region is not None:
@@ -100,7 +100,7 @@ def mask_of(ranges: Ranges, picture: Image) -> Image:
 
 
 def mask_picture(ranges: Ranges, picture: Image) -> Image:
-    """The picture with all that is not marked darkened, beside the mask itself."""
+    """Return the image with unmarked parts darkened, next to the mask."""
     mask = mask_of(ranges, picture)
     shaded: Any = cv2.convertScaleAbs(cv2.cvtColor(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR),
                                       alpha=0.35)
@@ -109,7 +109,7 @@ def mask_picture(ranges: Ranges, picture: Image) -> Image:
 
 
 def ranges_text(ranges: Ranges) -> str:
-    """For a person."""
+    """Format ranges as text."""
     return " and ".join(
         f"hue {one.hue_low_deg:g} to {one.hue_high_deg:g} degrees, saturation from {one.saturation_low:g}, "
         f"value from {one.value_low:g}" for one in ranges
@@ -117,23 +117,23 @@ def ranges_text(ranges: Ranges) -> str:
 
 
 def trial_text(trial: Trial) -> str:
-    """For a person."""
+    """Format a trial as text."""
     least, most = trial.least_blobs, trial.most_blobs
     blobs = f"{most} blob{'' if most == 1 else 's'}" if least == most else f"{least} to {most} blobs"
-    return (f"marks {trial.mean_share:.2%} of the picture in the mean, {trial.most_share:.2%} at most, in {blobs}; "
-            f"something in {trial.with_any} of {trial.pictures} pictures")
+    return (f"marks {trial.mean_share:.2%} of the image on average, {trial.most_share:.2%} at most, in {blobs}; "
+            f"marks in {trial.with_any} of {trial.pictures} images")
 
 
 # --- from pixels to a range ----------------------------------------------------------------------------------------
 
 
 def _hsv(picture: Image) -> Numbers:
-    """Hue in degrees (0..360), saturation and value (0..1), as the detector's table has them."""
+    """Return hue in degrees (0..360), saturation and value (0..1), as in the detector's table."""
     return np.asarray(cv2.cvtColor(picture.astype(np.float32) / 255, cv2.COLOR_BGR2HSV), np.float32)
 
 
 def _sample(hsv: Numbers, box: Box) -> Numbers:
-    """The pixels (N, 3) of the one colour there. Raises ConfigError if there is none."""
+    """Return the pixels (N, 3) of the color there. Raises ConfigError without a single color."""
     if box.width_px and box.height_px:
         part = hsv[box.y_px : box.y_px + box.height_px, box.x_px : box.x_px + box.width_px].reshape(-1, 3)
         return _of_one_hue(part, box)
@@ -144,21 +144,21 @@ def _sample(hsv: Numbers, box: Box) -> Numbers:
 
 
 def _of_one_hue(pixels: Numbers, box: Box) -> Numbers:
-    """Those near the strongest hue. Raises ConfigError where there is no colour, or no one colour."""
-    coloured = pixels[_has_hue(pixels)]
-    if len(coloured) < MIN_BOX_SHARE * len(pixels):
+    """Return the pixels near the strongest hue. Raises ConfigError without a single color."""
+    colored = pixels[_has_hue(pixels)]
+    if len(colored) < MIN_BOX_SHARE * len(pixels):
         _, saturation, value = (float(one) for one in np.median(pixels, axis=0))
-        why = f"too dark (value {value:.2f})" if value < MIN_VALUE else f"grey (saturation {saturation:.2f})"
-        raise ConfigError(f"there is no colour at {_where(box)}: it is {why}; pick something coloured")
-    near = coloured[_off_deg(coloured[:, 0], _strongest_hue_deg(coloured)) <= _ALIKE_DEG]
+        why = f"too dark (value {value:.2f})" if value < MIN_VALUE else f"gray (saturation {saturation:.2f})"
+        raise ConfigError(f"no color at {_where(box)}: it is {why}; pick a colored place")
+    near = colored[_off_deg(colored[:, 0], _strongest_hue_deg(colored)) <= _ALIKE_DEG]
     if len(near) < MIN_BOX_SHARE * len(pixels):
-        raise ConfigError(f"there is no one colour at {_where(box)}: the commonest covers "
+        raise ConfigError(f"several colors at {_where(box)}: the most common covers "
                           f"{len(near) / len(pixels):.0%} of it; box a smaller part")
     return near
 
 
 def _grown(hsv: Numbers, box: Box, hue_deg: float) -> Numbers:
-    """The pixels of like hue that hang together with the clicked one."""
+    """Return the pixels of similar hue that are connected with the clicked one."""
     alike = (_off_deg(hsv[..., 0], hue_deg) <= _ALIKE_DEG) & _has_hue(hsv)
     _, labels = cv2.connectedComponents(alike.astype(np.uint8))
     own = labels[box.y_px, box.x_px]
@@ -170,9 +170,9 @@ def _has_hue(hsv: Numbers) -> NDArray[np.bool_]:
 
 
 def _strongest_hue_deg(pixels: Numbers) -> float:
-    """The fullest of the bins and its neighbours, by how much colour the pixels have."""
-    colour = pixels[:, 1] * pixels[:, 2]
-    weights, _ = np.histogram(pixels[:, 0], bins=360 // _HUE_BIN_DEG, range=(0, 360), weights=colour)
+    """Return the hue of the bin with the most color, together with its neighbors."""
+    color = pixels[:, 1] * pixels[:, 2]
+    weights, _ = np.histogram(pixels[:, 0], bins=360 // _HUE_BIN_DEG, range=(0, 360), weights=color)
     smooth = weights + np.roll(weights, 1) + np.roll(weights, -1)
     return float(np.argmax(smooth)) * _HUE_BIN_DEG + _HUE_BIN_DEG / 2
 

@@ -1,7 +1,7 @@
-"""Writes color ranges into a vision configuration and leaves everything else as it was. Shell (files).
+"""Writes color ranges into a configuration of vision and leaves everything else as it was. Shell (files).
 
-tomlkit edits the text, since the standard library reads TOML and writes none. Python's TOML reader then reads the
-result; unless it gives what was meant, nothing is changed.
+tomlkit edits the text, since the standard library only reads TOML. Python's TOML reader then checks the result; unless
+it is as intended, nothing is changed.
 """
 
 import re
@@ -24,17 +24,17 @@ _FIELDS: Final = ("hue_low_deg", "hue_high_deg", "saturation_low", "value_low")
 
 
 def ranges_toml(ranges: Ranges) -> str:
-    """The value as TOML, one range a line; what is a default of the range is left out."""
+    """Format ranges as TOML, one range per line, without defaults."""
     rows = [", ".join(f"{name} = {getattr(one, name):g}" for name in _FIELDS) for one in ranges]
     return "[\n" + "".join(f"  {{ {row} }},\n" for row in rows) + "]"
 
 
 def with_ranges(text: str, ranges: Ranges) -> str:
-    """`text` with `hsv.ranges` set. Raises ConfigError for what is no TOML, or where it cannot be put in safely."""
+    """Return `text` with `hsv.ranges` set. Raises ConfigError for invalid TOML, or if it cannot be set safely."""
     try:
         before = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is no TOML: {error}") from None
+        raise ConfigError(f"invalid TOML: {error}") from None
     try:
         after = _edited(text, ranges)
         right = tomllib.loads(after) == _meant(before, ranges)
@@ -42,7 +42,7 @@ def with_ranges(text: str, ranges: Ranges) -> str:
         right = False
     if not right:
         lines = " ".join(f"ranges = {ranges_toml(ranges)}".split())
-        raise ConfigError(f"its [hsv] is written in a way that cannot be changed safely; put in by hand: {lines}")
+        raise ConfigError(f"cannot change its [hsv] safely; insert by hand: {lines}")
     return after
 
 
@@ -61,7 +61,7 @@ def _edited(text: str, ranges: Ranges) -> str:
 
 
 def _item(ranges: Ranges, old: Item | None) -> Any:
-    """The ranges as an array, or as blocks where `old` is such; comments inside `old` come first."""
+    """Return the ranges as an array, or as blocks like `old`; comments inside `old` come first."""
     comments = "".join(f"{line.rstrip()}\n" for line in re.findall("#.*", old.as_string() if old else ""))
     if isinstance(old, AoT):
         blocks = ["".join(f"{name} = {getattr(one, name):g}\n" for name in _FIELDS) for one in ranges]
@@ -70,19 +70,19 @@ def _item(ranges: Ranges, old: Item | None) -> Any:
     return tomlkit.parse(f"ranges = {array}")["ranges"]
 
 
-# Writes colour ranges into a vision configuration, and mask pictures. Shell (files).
+# --- files: the configuration and the mask -----------------------------------------------------------------------
 
 
 def check_config(path: Path) -> None:
-    """Raise ConfigError for a configuration that vision would refuse, or one that cannot be there."""
+    """Raise ConfigError for an invalid configuration of vision, or one that cannot be written."""
     if path.exists():
         load_service("vision", file=str(path), environ={})
     elif not path.parent.is_dir():
-        raise ConfigError(f"{path}: there is no folder {path.parent}")
+        raise ConfigError(f"cannot write {path}: no folder {path.parent}; create it first")
 
 
 def write_ranges(path: Path, ranges: Ranges) -> None:
-    """Set `hsv.ranges` in the file, or begin a new one; it is changed whole or not at all. Raises ConfigError."""
+    """Set `hsv.ranges` in the file, or create it; it changes as a whole or not at all. Raises ConfigError."""
     unfinished = path.with_name(f".{path.name}.part")
     try:
         before = path.read_text("utf-8") if path.exists() else ""
@@ -90,10 +90,11 @@ def write_ranges(path: Path, ranges: Ranges) -> None:
         unfinished.write_text(after, "utf-8")
         if path.exists():
             shutil.copymode(path, unfinished)
-        load_service("vision", file=str(unfinished), environ={})  # what vision would refuse is not written
+        load_service("vision", file=str(unfinished), environ={})  # an invalid configuration is not written
         unfinished.replace(path)
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or 'is no text'}") from None
+        why = getattr(error, "strerror", None) or "not a text file"
+        raise ConfigError(f"cannot write {path}: {why}; choose another file") from None
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     finally:
@@ -101,13 +102,13 @@ def write_ranges(path: Path, ranges: Ranges) -> None:
 
 
 def write_mask(path: Path, ranges: Ranges, picture: Image) -> None:
-    """The mask picture as PNG. Raises ConfigError where it cannot be written."""
+    """Write the mask as PNG. Raises ConfigError if it cannot be written."""
     try:
         path.write_bytes(mask_png(ranges, picture))
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+        raise ConfigError(f"cannot write {path}: {error.strerror}; choose another file") from None
 
 
 def mask_png(ranges: Ranges, picture: Image) -> bytes:
-    """What the ranges mark, beside the mask, as PNG."""
+    """Return the marked image next to the mask, as PNG."""
     return bytes(cv2.imencode(".png", mask_picture(ranges, picture))[1])

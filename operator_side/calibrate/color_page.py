@@ -1,4 +1,4 @@
-"""The page of `sightline pick-color`, and the pictures that it shows. Shell (threads, files)."""
+"""The page of `sightline pick-color`, and its images. Shell (threads, files)."""
 
 import json
 import threading
@@ -30,32 +30,32 @@ from sightline.protocol.errors import ConfigError, LinkError, WireError
 
 MAX_FILE_BYTES: Final = 50_000_000
 MAX_PIXELS: Final = 25_000_000
-"""Of a picture from a file: a large photograph; a camera's frames are bounded by vision's own limits."""
+"""Limit of an image file, a large photograph; the limits of the vision service bound a camera's frames."""
 MAX_FRAMES: Final = 200
 PATIENCE_S: Final = 5.0
 _PAGE_QUALITY: Final = 92
 
 
 class Gallery(Protocol):
-    """Where a page's pictures come from."""
+    """The images of a page."""
 
     live: bool
 
     def pixels(self, number: int) -> Image:
-        """The picture of that number. Raises ConfigError for one that is not kept."""
+        """Return the image of that number. Raises ConfigError if it is gone."""
         ...
 
     def recent(self) -> Sequence[Image]:
-        """The last pictures, to try a range on."""
+        """Return the newest images, for the test of a range."""
         ...
 
     def route(self, request: PageRequest, body: bytes) -> HttpAnswer:
-        """`GET /picture`."""
+        """Answer `GET /picture`."""
         ...
 
 
 class StillGallery:
-    """Pictures that are all there."""
+    """Images of a file."""
 
     live = False
 
@@ -63,17 +63,17 @@ class StillGallery:
         self._pictures = list(pictures)
 
     def pixels(self, number: int) -> Image:
-        """Numbered from 1."""
+        """Return an image, numbered from 1."""
         if not 1 <= number <= len(self._pictures):
-            raise ConfigError(f"there is no picture {number}; there are {len(self._pictures)}")
+            raise ConfigError(f"no image {number}; there are {len(self._pictures)}")
         return self._pictures[number - 1]
 
     def recent(self) -> Sequence[Image]:
-        """All of them."""
+        """Return all images."""
         return self._pictures
 
     def route(self, request: PageRequest, _body: bytes) -> HttpAnswer:
-        """`?number=N`, else the last."""
+        """Answer with image `?number=N`, else the last."""
         number = int(request.get("number", len(self._pictures)))
         done, data = cv2.imencode(".jpg", self.pixels(number), [cv2.IMWRITE_JPEG_QUALITY, _PAGE_QUALITY])
         if not done:
@@ -83,7 +83,7 @@ class StillGallery:
 
 
 class LiveGallery:
-    """A robot's newest pictures, taken while the page asks for them."""
+    """A robot's newest images, taken while the page requests them."""
 
     live = True
 
@@ -92,41 +92,41 @@ class LiveGallery:
         self.route = buffer.route
 
     def pixels(self, number: int) -> Image:
-        """Of the buffer."""
+        """Return an image of the buffer."""
         shot = self._buffer.of(number)
         if shot is None:
-            raise ConfigError("that picture is gone by now; pick in a newer one")
+            raise ConfigError("that image is gone; pick in a newer one")
         return _decoded(shot.jpeg)
 
     def recent(self) -> Sequence[Image]:
-        """All that are kept."""
+        """Return all images of the buffer."""
         return [_decoded(one.shot.jpeg) for one in self._buffer.shots]
 
 
 def of_picture(path: Path) -> list[Image]:
-    """The picture in a file. Raises ConfigError for what is none."""
+    """Read an image file. Raises ConfigError for an invalid one."""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
-            raise ConfigError(f"{path}: is larger than {MAX_FILE_BYTES // 1_000_000} MB")
+            raise ConfigError(f"{path} is larger than {MAX_FILE_BYTES // 1_000_000} MB; use a smaller image")
         data = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"cannot read {path}: {error.strerror}; choose another file") from None
     try:
         picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
     except cv2.error:
         picture = None
     if picture is None:
-        raise ConfigError(f"{path}: is no picture that can be read (PNG, JPEG ...)")
+        raise ConfigError(f"invalid image {path}; use a PNG or JPEG")
     if picture.shape[0] * picture.shape[1] > MAX_PIXELS:
         size = f"{picture.shape[1]}x{picture.shape[0]}"
-        raise ConfigError(f"{path}: is {size}, at most {MAX_PIXELS // 1_000_000} megapixels")
+        raise ConfigError(f"{path} has {size}, at most {MAX_PIXELS // 1_000_000} megapixels; use a smaller image")
     return [np.asarray(picture, np.uint8)]
 
 
 def of_video(path: Path, frames: int) -> list[Image]:
-    """`frames` pictures spread evenly over a video, or all if it has fewer. Raises ConfigError for what is none."""
+    """Read `frames` images spread evenly over a video, or all of fewer. Raises ConfigError for an invalid one."""
     if not path.is_file():
-        raise ConfigError(f"{path}: is no file; name a video")
+        raise ConfigError(f"{path} is not a file; name a video")
     capture = cv2.VideoCapture(str(path))
     try:
         count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -136,7 +136,7 @@ def of_video(path: Path, frames: int) -> list[Image]:
     finally:
         capture.release()
     if not pictures:
-        raise ConfigError(f"{path}: is no video that can be read")
+        raise ConfigError(f"invalid video {path}; use another file")
     return pictures
 
 
@@ -146,7 +146,7 @@ def _read(capture: Any) -> Iterator[Image]:
 
 
 def of_robot(pictures: Pictures, frames: int) -> list[Image]:
-    """The next `frames` pictures of a robot. Raises LinkError if none comes."""
+    """Return the next `frames` images of a robot. Raises LinkError without one."""
     found: list[Image] = []
     ends_s = time.monotonic() + PATIENCE_S
     while len(found) < frames and time.monotonic() < ends_s:
@@ -154,7 +154,7 @@ def of_robot(pictures: Pictures, frames: int) -> list[Image]:
         if shot is not None:
             found.append(_decoded(shot.jpeg))
     if not found:
-        raise LinkError(f"no picture of robot {pictures.robot!r} within {PATIENCE_S:g} s; does its camera deliver?")
+        raise LinkError(f"no image from robot '{pictures.robot}' after {PATIENCE_S:g} s; run `sightline status`")
     return found
 
 
@@ -162,17 +162,17 @@ def _decoded(jpeg: bytes) -> Image:
     try:
         return jpeg_pixels(jpeg)
     except WireError as error:
-        raise ConfigError(f"the robot's picture cannot be used: {error.detail}") from None
+        raise ConfigError(f"invalid image from the robot: {error.detail}") from None
 
 
-# The page of `sightline pick-color`: click or box in a picture, see what the range marks, use it. Shell (threads).
+# --- the page: click or box in an image, check the marks of the range, use it ------------------------------------
 
 
 _FIELDS = ("x_px", "y_px", "width_px", "height_px")
 
 
 class PickPage:
-    """One person's picking. `use` takes the ranges and says what became of them."""
+    """The picking of one operator. `use` takes the ranges and returns a note."""
 
     def __init__(self, gallery: Gallery, title: str, use: Callable[[Ranges], str]) -> None:
         self._gallery, self._title, self._use = gallery, title, use
@@ -183,7 +183,7 @@ class PickPage:
 
     @property
     def routes(self) -> Mapping[str, Route]:
-        """For `served`."""
+        """Return the routes for `served`."""
         return {
             "GET /": lambda _request, _body: page("pick.html", title=self._title, live=str(self._gallery.live).lower()),
             "GET /pick.mjs": lambda _request, _body: page("pick.mjs"),
@@ -201,14 +201,14 @@ class PickPage:
             ranges = pick(picture, Box(*(int(picked[name]) for name in _FIELDS)))
             self._picked = ranges, picture
             trial = try_out(ranges, self._gallery.recent())
-            said: dict[str, Any] = {"ranges": ranges_text(ranges), "toml": f"ranges = {ranges_toml(ranges)}",
+            found: dict[str, Any] = {"ranges": ranges_text(ranges), "toml": f"ranges = {ranges_toml(ranges)}",
                                     "trial": trial_text(trial), **asdict(trial)}
             try:
                 check_trial(trial)
             except ConfigError as error:
-                return as_json({**said, "error": str(error)})
+                return as_json({**found, "error": str(error)})
             self._good = ranges
-            return as_json(said)
+            return as_json(found)
 
     def _mask(self, _request: PageRequest, _body: bytes) -> HttpAnswer:
         with self._lock:
@@ -217,7 +217,7 @@ class PickPage:
     def _take(self, _request: PageRequest, _body: bytes) -> HttpAnswer:
         with self._lock:
             if self._good is None:
-                raise ConfigError("pick a colour first")
-            said = self._use(self._good)
+                raise ConfigError("pick a color first")
+            note = self._use(self._good)
         self.done.set()
-        return as_json({"said": said})
+        return as_json({"note": note})

@@ -14,9 +14,11 @@ from sightline.robot_side.ports import Camera
 
 @contextmanager
 def local_camera(kind: str, sets: Sequence[str]) -> Iterator[Camera]:
-    """The camera plug-in `kind` with the options of `sets` (`key=value`), closed at the end.
+    """Open the camera plug-in `kind` with the options `sets` (`key=value`); close it at the end.
 
-    Raises ConfigError for a bad kind or option, HardwareError when there is no such camera.
+    Raises:
+        ConfigError: the kind or an option is invalid.
+        HardwareError: the camera is missing.
     """
     options = options_of(sets, "--camera-set", "device=/dev/video2")
     camera = CAMERAS.build(PluginChoice(kind=kind, options=options))

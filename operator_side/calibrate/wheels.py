@@ -1,7 +1,7 @@
-"""Turns one wheel at a time, off the ground, and asks the operator what was seen. Shell.
+"""Turns one wheel at a time, off the ground, and compares it with the operator's answers. Shell.
 
-It goes round the gate, as nothing else does: no network and no camera is needed, and nothing turns before a person, who
-stands beside the robot, has said that its wheels are off the ground.
+It bypasses the gate, as no other command does: it needs no network and no camera. Nothing turns before an operator next
+to the robot confirms that its wheels are off the ground.
 """
 
 import signal
@@ -20,14 +20,14 @@ from sightline.robot_side.ports import Drive
 
 TURN_S: Final = 1.0
 _SHARE: Final = 0.5
-"""Of the robot's top speed: slow enough to see which way a wheel turns."""
+"""Share of the robot's top speed, slow enough to recognize the direction of a wheel."""
 Prompt = Callable[[str], str]
 Print = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """One wheel, one way."""
+    """One wheel and one direction."""
 
     side: str
     way: str
@@ -35,11 +35,11 @@ class Turn:
 
     @property
     def name(self) -> str:
-        """In words."""
+        """Return the name of the test."""
         return f"{self.side} wheel, {self.way}"
 
     def speeds(self, speed_rad_s: float) -> tuple[float, float]:
-        """(left, right) rad/s."""
+        """Return (left, right) in rad/s."""
         signed = speed_rad_s if self.way == "forward" else -speed_rad_s
         return (signed, 0.0) if self.side == "left" else (0.0, signed)
 
@@ -49,34 +49,39 @@ TURNS: Final = tuple(Turn(side, way, seen) for side in ("left", "right") for way
 _WRONG: Final = {"w": "the wrong way", "o": "the other wheel", "b": "both wheels", "n": "nothing"}
 
 
-def try_wheels(config: RobotConfig, ask: Prompt | None, say: Print) -> bool:
-    """Turn each wheel each way and compare with what should be seen; True if all is as it should be, or nobody says.
+def try_wheels(config: RobotConfig, prompt: Prompt | None, show: Print) -> bool:
+    """Turn each wheel in each direction and compare it with the operator's answers.
 
-    Without `ask` nothing is asked: whoever calls has confirmed that the wheels are off the ground.
+    Args:
+        prompt: shows a question and returns the answer; None if the wheels are confirmed to be off the ground.
+        show: prints a line.
+
+    Returns:
+        True if all answers are right, or without `prompt`.
     """
-    say("stand behind the robot; its wheels must be off the ground and free to turn, your hand near the motors' switch")
-    if ask is not None and not _is_yes(ask("are its wheels off the ground? y/n")):
-        say("nothing has moved")
+    show("stand behind the robot; its wheels must be off the ground and free, your hand near the motors' switch")
+    if prompt is not None and not _is_yes(prompt("are its wheels off the ground? y/n")):
+        show("nothing moved")
         return False
     speed_rad_s = _SHARE * config.safety.max_linear_mps / config.wheels.wheel_radius_m
     advice: list[str] = []
     with opened_drive(config) as drive:
         for turn in TURNS:
-            say(f"{turn.name}: {turn.seen}, for {TURN_S:g} s")
+            show(f"{turn.name}: {turn.seen}, for {TURN_S:g} s")
             turn_for(drive.set, turn.speeds(speed_rad_s), TURN_S)
-            if ask is not None and not _is_yes(ask("was it so? y/n")):
-                advice.append(f"{turn.name}: {_advice(config.motors, turn, _what_instead(ask))}")
+            if prompt is not None and not _is_yes(prompt("is that right? y/n")):
+                advice.append(f"{turn.name}: {_advice(config.motors, turn, _what_instead(prompt))}")
     for line in dict.fromkeys(advice):
-        say(line)
-    say("all as it should be" if ask is not None and not advice else "put right what is not, and test again")
+        show(line)
+    show("all wheels turn as expected" if prompt is not None and not advice else "correct the errors and test again")
     return not advice
 
 
 @contextmanager
 def opened_drive(config: RobotConfig) -> Iterator[Drive]:
-    """The robot's drive, at zero and closed at the end, be it Ctrl-C, Ctrl-Z, a signal, a hung-up terminal or a fault.
+    """Open the robot's drive; set it to zero and close it at any end: Ctrl-C, Ctrl-Z, a signal, hang-up or an error.
 
-    Motors keep their last speed when a program just dies, so whatever can be caught is.
+    Motors continue at their last speed when a program is killed, so every signal that can be caught is.
     """
 
     def end(_number: int, _frame: FrameType | None) -> None:
@@ -98,7 +103,7 @@ def opened_drive(config: RobotConfig) -> Iterator[Drive]:
 
 
 def turn_for(give: Callable[[float, float], None], values: tuple[float, float], seconds: float) -> None:
-    """Give both values, and zero after that time or at the first trouble."""
+    """Set both values, and zero after that time or at an error."""
     try:
         give(*values)
         time.sleep(seconds)
@@ -110,15 +115,15 @@ def _is_yes(answer: str) -> bool:
     return answer.strip().lower() in ("y", "yes")
 
 
-def _what_instead(ask: Prompt) -> str:
+def _what_instead(prompt: Prompt) -> str:
     question = "what turned? w = it, the wrong way; o = the other wheel; b = both; n = nothing"
-    while (answer := ask(question).strip().lower()[:1]) not in _WRONG:
+    while (answer := prompt(question).strip().lower()[:1]) not in _WRONG:
         question = "one of w, o, b, n"
     return answer
 
 
 def _advice(drive: PluginChoice, turn: Turn, wrong: str) -> str:
-    """What to change. A drive with options for it is told so; any other is wired differently."""
+    """Return the necessary change: an option if the drive has one, else the wiring."""
     plugin, options = DRIVES.load(drive)
     known = plugin.Config.model_fields
     if wrong == "w" and "left_reversed" in known:
@@ -130,17 +135,17 @@ def _advice(drive: PluginChoice, turn: Turn, wrong: str) -> str:
         "w": f"it turned the wrong way: exchange the two wires of the {turn.side} motor",
         "o": "the other wheel turned: exchange the motors' plugs",
         "b": "both wheels turned: two wires of different motors touch, or share an input of the bridge",
-        "n": "nothing turned: is the motors' supply on, the bridge enabled, ground shared, the least duty high enough?",
+        "n": "nothing turned: check the motors' supply, the bridge's enable pin, the shared ground and the least duty",
     }[wrong]
 
 
 def _pins_of(options: object, side: str) -> str:
-    """The side that the pins are named for."""
+    """Return the side in the names of the pins."""
     other = {"left": "right", "right": "left"}[side]
     return other if getattr(options, "swapped", False) else side
 
 
 def check_confirmed(confirmed: bool, is_terminal: bool, what: str) -> None:
-    """Raise ConfigError where nobody could be asked and nobody has confirmed."""
+    """Raise ConfigError without a confirmation and without a terminal to prompt on."""
     if not confirmed and not is_terminal:
-        raise ConfigError(f"{what} turns the wheels and there is no terminal to ask at: lift the robot, then add --yes")
+        raise ConfigError(f"{what} turns the wheels and has no terminal to confirm on; lift the robot, then add --yes")

@@ -168,7 +168,7 @@ def reset(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_
 def stop(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_json: Json = False) -> None:
     """STOP a robot and latch the stop until reset
 
-    The wheels go to zero and stay there until `sightline reset`. STOP needs the network: it is no emergency stop.
+    The wheels go to zero and stay there until `sightline reset`. It needs the network: never use it as emergency stop.
     """
 
     def on_slow() -> None:

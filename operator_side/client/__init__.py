@@ -1,5 +1,5 @@
-"""A robot and its vision service as an operator reaches them, over any link.
+"""Clients of a robot and its vision service, over any link.
 
 May import: `protocol`, `operator_side`.
-Interface: `requests` (arm, STOP ...), `missions`, `status`, `discovery`, and frames to look at.
+Interface: `requests` (arm, STOP ...), `missions`, `status`, `discovery`, and the images of a robot.
 """

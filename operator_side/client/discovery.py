@@ -1,4 +1,4 @@
-"""Which robots and visions are online: at given endpoints, on this machine, or by multicast. Shell."""
+"""Finds robots and vision services: at given endpoints, on this machine, or by multicast. Shell."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _ROLE_WIDTH = 9
 
 
 def lines(statuses: dict[str, Message], peers: list[PeerInfo]) -> Iterator[str]:
-    """A line for each: robots first, then who sees, steers or looks on."""
+    """Format a line for each: robots first, then the other peers."""
     robots = {peer.presence.robot: peer for peer in peers if peer.presence.role == ROBOT_ROLE}
     for robot in sorted({*statuses, *robots}):
-        said = _status_words(robot, statuses[robot]) if robot in statuses else f"{robot}: says nothing of its state"
-        yield f"{ROBOT_ROLE:{_ROLE_WIDTH}} {said}{_about(robots.get(robot))}"
+        state = _status_words(robot, statuses[robot]) if robot in statuses else f"{robot}: no status"
+        yield f"{ROBOT_ROLE:{_ROLE_WIDTH}} {state}{_about(robots.get(robot))}"
     for peer in peers:
         if peer.presence.role != ROBOT_ROLE:
             yield f"{peer.presence.role:{_ROLE_WIDTH}} of {peer.presence.robot}{_about(peer)}"
 
 
 def as_object(statuses: dict[str, Message], peers: list[PeerInfo]) -> dict[str, Any]:
-    """The same for scripts."""
+    """Return the same for scripts."""
     return {
         "robots": [_status_object(name, statuses[name]) for name in sorted(statuses)],
         "peers": [_peer_object(peer) for peer in peers],
@@ -41,18 +41,18 @@ def as_object(statuses: dict[str, Message], peers: list[PeerInfo]) -> dict[str, 
 
 def _about(peer: PeerInfo | None) -> str:
     if peer is None:
-        return "  (does not say what it is)"
-    said = peer.presence
-    where = f"  {said.software} on {said.host or 'an unnamed machine'}, round trip {peer.round_trip_us / 1000:.1f} ms"
-    return f"{where}; {said.about}" if said.about else where
+        return "  (no version reported)"
+    one = peer.presence
+    where = f"  {one.software} on {one.host or 'an unnamed machine'}, round trip {peer.round_trip_us / 1000:.1f} ms"
+    return f"{where}; {one.about}" if one.about else where
 
 
 def _peer_object(peer: PeerInfo) -> dict[str, Any]:
-    said = peer.presence
+    one = peer.presence
     return {
-        "role": said.role, "robot": said.robot, "session": said.session, "software": said.software, "host": said.host,
-        "up_s": round(said.up_us / 1e6, 1), "round_trip_ms": round(peer.round_trip_us / 1000, 3),
-        "clock_ahead_ms": round(peer.ahead_us / 1000, 3), **({"about": said.about} if said.about else {}),
+        "role": one.role, "robot": one.robot, "session": one.session, "software": one.software, "host": one.host,
+        "up_s": round(one.up_us / 1e6, 1), "round_trip_ms": round(peer.round_trip_us / 1000, 3),
+        "clock_ahead_ms": round(peer.ahead_us / 1000, 3), **({"about": one.about} if one.about else {}),
     }
 
 
@@ -60,7 +60,7 @@ def _status_words(robot: str, message: Message) -> str:
     try:
         return status_line(robot, read_report(message).status)
     except WireError as error:
-        return f"{robot}: not understood: {error.detail}"
+        return f"{robot}: invalid status: {error.detail}"
 
 
 def _status_object(robot: str, message: Message) -> dict[str, Any]:
@@ -70,78 +70,80 @@ def _status_object(robot: str, message: Message) -> dict[str, Any]:
         return {"robot": robot, "error": error.detail}
 
 
-# Who is there: at the endpoints that a person names, on this machine, or wherever the network answers. Shell.
+# --- at given endpoints, on this machine, or on the network ------------------------------------------------------
 
 
 SCOUT_S: Final = 0.4
-"""Who hears a multicast answers within some milliseconds; one is repeated within this, since Wi-Fi loses many."""
+"""A peer answers a multicast within milliseconds. It is repeated within this time, since Wi-Fi loses many."""
 _PROBE_S: Final = 0.2
 _PLACES: Final = 16
-"""Security limit: no more places are looked at, however many answer."""
+"""Security limit: the most places that are queried, however many answer."""
 
 
 @dataclass(frozen=True, slots=True)
 class DiscoveryReport:
-    """What each place gave: those around it, or why not."""
+    """The robots and peers of each place, or its error."""
 
     places: dict[str, Discovered | SightlineError]
 
     def lines(self) -> Iterator[str]:
-        """For a person; the place is said where there is a choice."""
-        for place, around in self.places.items():
-            if isinstance(around, SightlineError):
-                yield f"{place}: {around}"
+        """Format lines for the terminal, with the place if there are several."""
+        for place, found in self.places.items():
+            if isinstance(found, SightlineError):
+                yield f"{place}: {found}"
                 continue
-            for line in lines(around.statuses, around.peers):
+            for line in lines(found.statuses, found.peers):
                 yield line if len(self.places) == 1 else f"{place}: {line}"
 
     def as_object(self) -> dict[str, Any]:
-        """For scripts: what all places gave together, and what each could not."""
+        """Return for scripts what all places gave, and the error of each that failed."""
         whole: dict[str, Any] = {"robots": [], "peers": [], "places": list(self.places), "errors": {}}
-        for place, around in self.places.items():
-            if isinstance(around, SightlineError):
-                whole["errors"][place] = str(around)
+        for place, found in self.places.items():
+            if isinstance(found, SightlineError):
+                whole["errors"][place] = str(found)
                 continue
-            for name, rows in as_object(around.statuses, around.peers).items():
+            for name, rows in as_object(found.statuses, found.peers).items():
                 whole[name] += [{**row, "at": place} for row in rows]
         return whole
 
 
 def discover_all(connect: Sequence[str] | None, seconds: float, secure: str) -> DiscoveryReport:
-    """Explicit endpoints first; without them this machine, and then whoever answers a multicast.
+    """Query the given endpoints; without them this machine, else the peers that answer a multicast.
 
-    Raises ConfigError for an endpoint that is none, LinkError if nobody is there, with what was tried.
+    Raises:
+        ConfigError: an endpoint is invalid.
+        LinkError: no robot found; the error names the places.
     """
     if connect:
-        return _someone(DiscoveryReport({", ".join(connect): discover(_of_zenoh(connect), seconds, secure)}), seconds)
+        return _checked(DiscoveryReport({", ".join(connect): discover(_of_zenoh(connect), seconds, secure)}), seconds)
     if _listens(DEFAULT_ENDPOINT):
         endpoint = DEFAULT_ENDPOINT.replace("tcp/", "tls/") if secure else DEFAULT_ENDPOINT
-        return _someone(DiscoveryReport({endpoint: discover([endpoint], seconds, secure)}), seconds)
+        return _checked(DiscoveryReport({endpoint: discover([endpoint], seconds, secure)}), seconds)
     places = find_listeners(SCOUT_S)[:_PLACES]
     if not places:
-        raise LinkError(f"nobody listens at {DEFAULT_ENDPOINT}, and nobody answers a multicast within {SCOUT_S:g} s; "
-                        "name where one listens: sightline robots --connect tcp/ROBOT:7447")
+        raise LinkError(f"no robot at {DEFAULT_ENDPOINT}, and no answer to a multicast after {SCOUT_S:g} s; "
+                        "give the address: sightline robots --connect tcp/ROBOT:7447")
     with ThreadPoolExecutor(len(places), "discovery") as pool:
         return DiscoveryReport(
-            dict(zip(places, pool.map(lambda place: _looked(place, seconds, secure), places), strict=True))
+            dict(zip(places, pool.map(lambda place: _queried(place, seconds, secure), places), strict=True))
         )
 
 
-def _someone(found: DiscoveryReport, seconds: float) -> DiscoveryReport:
-    for place, around in found.places.items():
-        if isinstance(around, Discovered) and not around.statuses and not around.peers:
-            raise LinkError(f"no robot is heard at {place} within {seconds:g} s; start one: sightline robot")
-    return found
+def _checked(report: DiscoveryReport, seconds: float) -> DiscoveryReport:
+    for place, found in report.places.items():
+        if isinstance(found, Discovered) and not found.statuses and not found.peers:
+            raise LinkError(f"no robot at {place} after {seconds:g} s; start one: sightline robot")
+    return report
 
 
 def _of_zenoh(connect: Sequence[str]) -> Sequence[str]:
     for endpoint in connect:
         if "://" in endpoint:
-            raise ConfigError(f"{endpoint} leads to one robot and nobody else: sightline status --connect {endpoint}")
+            raise ConfigError(f"{endpoint} is the address of one robot; run: sightline status --connect {endpoint}")
     return connect
 
 
-def _looked(place: str, seconds: float, secure: str) -> Discovered | SightlineError:
+def _queried(place: str, seconds: float, secure: str) -> Discovered | SightlineError:
     try:
         return discover([place], seconds, secure)
     except SightlineError as error:

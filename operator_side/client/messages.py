@@ -1,5 +1,6 @@
 """The messages of one channel as lines of text or JSON objects. Shell (a queue)."""
 
+import json
 import math
 import queue
 from collections.abc import Mapping
@@ -15,35 +16,35 @@ from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 
 MAX_WAITING: Final = 64
-"""Words that wait to be printed; what comes while they do is dropped and counted."""
+"""The most messages that wait for printing; further ones are dropped and counted."""
 
 
 class ChannelInbox:
-    """Hears `channel` from its making on."""
+    """Receives the messages of `channel` from its construction on."""
 
     def __init__(self, link: Link, role: str, channel: Channel, secure: str = "") -> None:
-        self._words: queue.Queue[Message] = queue.Queue(MAX_WAITING)
+        self._waiting: queue.Queue[Message] = queue.Queue(MAX_WAITING)
         self._picture: LatestSlot[Message] | None = LatestSlot() if channel.encoding == JPEG else None
         self._viewer = FrameViewer(link, role, secure) if channel is FRAME else None
         self.robot, self.channel = link.robot, channel
-        self._refused = 0
+        self._overflow = 0
         link.subscribe(channel, self._put)
 
     @property
     def dropped(self) -> int:
-        """What was not printed."""
-        return self._refused + (self._picture.dropped if self._picture else 0)
+        """Return the number of messages that were not printed."""
+        return self._overflow + (self._picture.dropped if self._picture else 0)
 
     def take(self, timeout_s: float) -> Message | None:
-        """The next message, None if none comes in time."""
-        message = self._picture.take(timeout_s) if self._picture else self._next_words(timeout_s)
+        """Return the next message, or None at `timeout_s`."""
+        message = self._picture.take(timeout_s) if self._picture else self._next_text(timeout_s)
         if message is not None and self._viewer is not None:
             self._viewer.acknowledge(message)
         return message
 
-    def _next_words(self, timeout_s: float) -> Message | None:
+    def _next_text(self, timeout_s: float) -> Message | None:
         try:
-            return self._words.get(timeout=timeout_s)
+            return self._waiting.get(timeout=timeout_s)
         except queue.Empty:
             return None
 
@@ -52,12 +53,12 @@ class ChannelInbox:
             self._picture.put(message)
             return
         try:
-            self._words.put_nowait(message)
+            self._waiting.put_nowait(message)
         except queue.Full:
-            self._refused += 1
+            self._overflow += 1
 
 
-# Any message of any channel as one line for a person, or as one object for a script. Pure.
+# --- any message as one line, or as one object for a script ------------------------------------------------------
 
 
 _LEFT_OUT: Final = ("v",)
@@ -65,7 +66,7 @@ _EMPTY: Final[tuple[Any, ...]] = (None, "", {}, [], ())
 
 
 def message_object(message: Message) -> dict[str, Any]:
-    """Header and payload, decoded, in full; what cannot be read is said in `error`. JSON types only."""
+    """Return header and payload, decoded, in JSON types; `error` describes an invalid message."""
     read: dict[str, Any] = {"channel": message.channel.name}
     if message.source:
         read["source"] = message.source
@@ -76,11 +77,11 @@ def message_object(message: Message) -> dict[str, Any]:
 
 
 def message_line(message: Message) -> str:
-    """One line: who, which, and what matters of it; pictures and scans only as their measures."""
+    """Format a message as one line; of images and scans only their size."""
     read = message_object(message)
     name = message.channel.name + (f"/{message.source}" if message.source else "")
     if "error" in read:
-        return f"{name}: refused: {read['error']}"
+        return f"{name}: invalid: {read['error']}"
     header, payload = read["header"] or {}, read["payload"]
     number = f" #{header['seq']}" if "seq" in header else " (no header)"
     rest = _words({key: value for key, value in header.items() if key not in ("seq", *_LEFT_OUT)})
@@ -126,11 +127,11 @@ def _payload_text(channel: Channel, payload: Any) -> str:
 def _scan_text(ranges_m: list[float | None]) -> str:
     seen = [one for one in ranges_m if one is not None]
     nearest = f"nearest {min(seen):.2f} m" if seen else "nothing near"
-    return f"{len(ranges_m)} rays, {len(seen)} see something, {nearest}"
+    return f"{len(ranges_m)} rays, {len(seen)} detect something, {nearest}"
 
 
 def _words(values: Mapping[str, Any]) -> str:
-    """`name=value`, what is empty left out."""
+    """Format as `name=value`, without empty values."""
     return " ".join(f"{name}={_word(value)}" for name, value in values.items()
                     if name not in _LEFT_OUT and value not in _EMPTY)
 
@@ -143,5 +144,5 @@ def _word(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.1f}"
     if isinstance(value, str):
-        return value if value.isprintable() and value and " " not in value else repr(value)
+        return value if value.isprintable() and value and " " not in value else json.dumps(value)
     return str(value).lower() if isinstance(value, bool) else str(value)

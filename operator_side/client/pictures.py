@@ -1,4 +1,4 @@
-"""A robot's pictures for a viewer: the overlay of its vision, or acknowledged frames. Shell (waits)."""
+"""A robot's images for a viewer: the overlay of its vision service, or acknowledged frames. Shell (waits)."""
 
 import secrets
 import threading
@@ -19,7 +19,7 @@ from sightline.protocol.transports.security import certificate_role
 
 
 class FrameViewer:
-    """One viewer's session; `role` names it on the wire. Keys in `secure` may be of a role that has nothing to say."""
+    """The session of one viewer; `role` names it on the wire. The keys in `secure` may permit no messages at all."""
 
     def __init__(self, link: Link, role: str, secure: str = "") -> None:
         self._link, self._role = link, role
@@ -28,7 +28,7 @@ class FrameViewer:
         self._seq = 0
 
     def acknowledge(self, message: Message) -> bool:
-        """Answer one frame, where that is allowed; False for what is none."""
+        """Acknowledge a frame, where that is permitted. Returns False for an invalid one."""
         try:
             frame = decode(FrameHeader, message.header)
         except WireError:
@@ -41,7 +41,7 @@ class FrameViewer:
         return True
 
 
-# A robot's pictures as a person sees them: its vision's overlay, or its frames, acknowledged. Shell (waits).
+# Take the overlay of the vision service, or acknowledged frames:
 #
 # with open_link("r1", connect=[...], role=viewer_role("")) as link:
 #     shot = Pictures(link, "viewer").take(1.0)
@@ -49,14 +49,14 @@ class FrameViewer:
 
 VIEWER: Final = "viewer"
 PATIENCE_S: Final = 1.5
-"""Without an overlay for this long there is no vision to draw one, and frames are shown."""
+"""Without an overlay for this time no vision service draws one, and frames are shown."""
 SILENT_S: Final = 1.0
-"""Ten times as long as a robot is silent between two words."""
+"""Ten times the period of a robot's status."""
 
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One picture; `session`, `seq` and `t_us` (robot clock, capture) are of the frame that it shows."""
+    """One image; `session`, `seq` and `t_us` (robot clock, capture) are those of its frame."""
 
     channel: Channel
     jpeg: bytes
@@ -68,33 +68,37 @@ class Shot:
 
 
 def viewer_role(secure: str) -> str:
-    """Who watches: an operator where `secure` has the keys of one, for a viewer may not even acknowledge."""
+    """Return the role of a viewer: operator if `secure` has its keys, since a viewer may not even acknowledge."""
     folder = Path(secure).expanduser()
     is_operator = secure and any((folder / f"operator.{kind}").is_file() for kind in ("key", "token"))
     return OPERATOR if is_operator else VIEWER
 
 
 class Pictures:
-    """The newest picture, taken by one thread at a time. Nothing is subscribed to before the first `take`."""
+    """The newest image, taken by one thread at a time. The first `take` subscribes."""
 
     def __init__(self, link: Link, role: str, first: Channel = OVERLAY, secure: str = "") -> None:
-        """`first` is what is wanted: vision's own pictures, with frames in their absence, or FRAME. `role` and the keys
-        in `secure` are those of `link`."""
+        """Args:
+            link: link to the robot.
+            role: role of `link`.
+            first: OVERLAY, replaced by frames while it is missing, or FRAME.
+            secure: folder of the keys of `link`, or "".
+        """
         self.robot = link.robot
         self._link, self._first = link, first
         self._viewer = FrameViewer(link, role, secure)
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._newest: Message | None = None
-        self._heard: set[str] = set()
-        self._heard_s = 0.0
+        self._subscribed: set[str] = set()
+        self._received_s = 0.0
         self._status_s = float("-inf")
         self.clock = RobotClock()
-        self.refused = 0
-        """Pictures that are none."""
+        self.rejected = 0
+        """Number of invalid images."""
         link.subscribe(STATUS, self._on_status)
 
     def take(self, timeout_s: float) -> Shot | None:
-        """The next picture; None if none came in time. Frames are acknowledged as they are taken."""
+        """Return the next image, or None at `timeout_s`. Taking a frame acknowledges it."""
         ends_s = time.monotonic() + timeout_s
         while True:
             self._choose()
@@ -106,48 +110,48 @@ class Pictures:
                 return shot
 
     def pause(self) -> None:
-        """Nobody looks: hear no pictures until the next `take`."""
-        for name in tuple(self._heard):
+        """Unsubscribe from images until the next `take`."""
+        for name in tuple(self._subscribed):
             self._link.unsubscribe(FRAME if name == FRAME.name else self._first)
-        self._heard.clear()
-        with self._news:
+        self._subscribed.clear()
+        with self._changed:
             self._newest = None
 
     def age_us(self, shot: Shot) -> int | None:
-        """How old the picture is at the least, by the robot's clock."""
+        """Return the least possible age of the image, by the robot's clock."""
         return self.clock.age_us(shot.session, shot.t_us, monotonic_us())
 
     @property
-    def is_heard(self) -> bool:
-        """Whether the robot says its status."""
+    def is_online(self) -> bool:
+        """Return whether the robot publishes its status."""
         return time.monotonic() - self._status_s < SILENT_S
 
     def _choose(self) -> None:
-        """Hear what is wanted; frames too while it does not come, and no longer than that."""
-        if self._first.name not in self._heard:
-            self._heard_s = time.monotonic()
-            self._hear(self._first)
+        """Subscribe to the wanted channel, and to frames while it is silent."""
+        if self._first.name not in self._subscribed:
+            self._received_s = time.monotonic()
+            self._subscribe(self._first)
         if self._first is FRAME:
             return
-        if time.monotonic() - self._heard_s > PATIENCE_S:
-            self._hear(FRAME)
-        elif FRAME.name in self._heard:  # which it is only once what is wanted did not come
-            self._heard.discard(FRAME.name)
+        if time.monotonic() - self._received_s > PATIENCE_S:
+            self._subscribe(FRAME)
+        elif FRAME.name in self._subscribed:  # only after the wanted channel was silent
+            self._subscribed.discard(FRAME.name)
             self._link.unsubscribe(FRAME)
 
-    def _hear(self, channel: Channel) -> None:
-        if channel.name not in self._heard:
-            self._heard.add(channel.name)
+    def _subscribe(self, channel: Channel) -> None:
+        if channel.name not in self._subscribed:
+            self._subscribed.add(channel.name)
             self._link.subscribe(channel, self._on_picture)
 
     def _wait(self, until_s: float) -> Message | None:
-        with self._news:
-            self._news.wait_for(lambda: self._newest, max(0.0, until_s - time.monotonic()))
+        with self._changed:
+            self._changed.wait_for(lambda: self._newest, max(0.0, until_s - time.monotonic()))
             message, self._newest = self._newest, None
             return message
 
     def _shot(self, message: Message) -> Shot | None:
-        """The picture, if it is one, and its header says of which frame."""
+        """Return the image if it is valid and its header names a frame."""
         try:
             size = read_jpeg_size(message.payload)
             if message.channel is FRAME:
@@ -157,18 +161,18 @@ class Pictures:
                 echo = decode(DetectionsHeader, message.header).echo
                 named = (echo.session, echo.seq, echo.t_us) if echo else ("", 0, 0)
         except WireError:
-            self.refused += 1
+            self.rejected += 1
             return None
         return Shot(message.channel, message.payload, *named, size.width_px, size.height_px)
 
     # --- on the transport's thread: store and return -----------------------------------------------------------------
 
     def _on_picture(self, message: Message) -> None:
-        with self._news:
+        with self._changed:
             if message.channel is self._first:
-                self._heard_s = time.monotonic()
+                self._received_s = time.monotonic()
             self._newest = message
-            self._news.notify_all()
+            self._changed.notify_all()
 
     def _on_status(self, message: Message) -> None:
         try:

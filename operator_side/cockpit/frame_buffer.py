@@ -1,6 +1,6 @@
-"""The last pictures of a robot, numbered, fetched only while a page asks for them. Shell (a thread).
+"""The newest images of a robot, numbered, fetched only while a page requests them. Shell (a thread).
 
-A page asks for the next one when it has drawn the last: so a slow page gets fewer pictures, never older ones.
+A page requests the next image after it drew the last: a slow page gets fewer images, never older ones.
 """
 
 import threading
@@ -14,67 +14,67 @@ from sightline.operator_side.client.pictures import Pictures, Shot
 from sightline.operator_side.cockpit.http_server import HttpAnswer, PageRequest
 
 IDLE_S: Final = 3.0
-"""A page that asks for nothing for this long is closed: nobody watches."""
+"""A page without a request for this time is closed."""
 WAIT_S: Final = 1.0
-"""How long a page waits for one picture before it asks again."""
+"""The longest wait for an image before a page repeats its request."""
 _TAKE_S: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Numbered:
-    """One picture of the buffer."""
+    """One image of the buffer."""
 
     number: int
     shot: Shot
 
 
 class FrameBuffer:
-    """The newest `kept` pictures."""
+    """The newest `kept` images."""
 
     def __init__(self, kept: int, age_us: Callable[[Shot], int | None] = lambda _shot: None) -> None:
         self._shots: deque[Numbered] = deque(maxlen=kept)
         self._age_us = age_us
-        self._news = threading.Condition()
+        self._changed = threading.Condition()
         self._wanted = -1
         self._requested_s = 0.0
 
     def add(self, shot: Shot) -> None:
-        """One more."""
-        with self._news:
+        """Append an image."""
+        with self._changed:
             self._shots.append(Numbered(self._number + 1, shot))
-            self._news.notify_all()
+            self._changed.notify_all()
 
     @property
     def shots(self) -> Sequence[Numbered]:
-        """All that are kept, the oldest first."""
-        with self._news:
+        """Return all images, the oldest first."""
+        with self._changed:
             return tuple(self._shots)
 
     def of(self, number: int) -> Shot | None:
-        """The picture of that number, if it is still kept."""
+        """Return the image of that number, or None if it is gone."""
         return next((one.shot for one in self.shots if one.number == number), None)
 
     def is_wanted(self, timeout_s: float) -> bool:
-        """Wait until somebody wants a picture that is not there yet; False if nobody does."""
-        with self._news:
-            return bool(self._news.wait_for(lambda: self._wanted >= self._number and not self.is_idle, timeout_s))
+        """Wait until a page requests an image that is missing. Returns False at `timeout_s`."""
+        with self._changed:
+            return bool(self._changed.wait_for(lambda: self._wanted >= self._number and not self.is_idle, timeout_s))
 
     @property
     def is_idle(self) -> bool:
-        """Whether nobody asked for a while."""
+        """Return whether the last request is long ago."""
         return time.monotonic() - self._requested_s > IDLE_S
 
     def next(self, after: int, timeout_s: float = WAIT_S) -> Numbered | None:
-        """The newest, if its number is above `after` or comes to be in time."""
-        with self._news:
+        """Wait for an image with a number above `after`; return the newest, or None at `timeout_s`."""
+        with self._changed:
             after = after if after <= self._number else 0  # a page of an earlier run
             self._wanted, self._requested_s = max(self._wanted, after), time.monotonic()
-            self._news.notify_all()
-            self._news.wait_for(lambda: self._number > after, timeout_s)
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._number > after, timeout_s)
             return self._shots[-1] if self._number > after else None
 
     def route(self, request: PageRequest, _body: bytes) -> HttpAnswer:
-        """`GET /picture?after=N`, the next one, or `?number=N`, that one; 204 if there is none."""
+        """Answer `GET /picture?after=N` with the next image, `?number=N` with that one; 204 without one."""
         if "number" in request:
             shot = self.of(int(request["number"]))
             found = Numbered(int(request["number"]), shot) if shot else None
@@ -93,7 +93,7 @@ class FrameBuffer:
 
 
 def fill(buffer: FrameBuffer, pictures: Pictures, ending: threading.Event) -> None:
-    """Take pictures as they are wanted, until `ending`; while nobody looks, nothing is subscribed to."""
+    """Take images on request until `ending`; without requests, unsubscribe."""
     while not ending.is_set():
         if not buffer.is_wanted(_TAKE_S):
             if buffer.is_idle:

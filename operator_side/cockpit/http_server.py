@@ -1,7 +1,7 @@
-"""A bounded HTTP server: pages for the operator on loopback, metrics where the user wants them. Shell (threads).
+"""A bounded HTTP server: pages for the operator on loopback, metrics at a chosen address. Shell (threads).
 
-Foreign sites are kept out of a page: a request must name this machine as its host, and what changes something must come
-from the page itself.
+It rejects requests of foreign sites: a request must name this machine as its host, and a request that changes
+something must come from the page itself.
 """
 
 import json
@@ -22,12 +22,12 @@ from sightline.protocol.errors import LinkError, SightlineError
 from sightline.protocol.transports.diagnosis import port_owner
 
 MAX_CONNECTIONS: Final = 32
-"""Security limit: one more is closed at once. A browser holds six."""
+"""Security limit: a further connection is closed immediately. A browser opens six."""
 HOST: Final = "127.0.0.1"
 MAX_BODY_BYTES: Final = 4096
-"""Security limit: what a page posts."""
+"""Security limit of the body of a POST."""
 SILENCE_S: Final = 20.0
-"""Security limit: a connection that says nothing for this long is closed."""
+"""Security limit: a connection without a byte for this time is closed."""
 _MAX_FIELDS: Final = 16
 _NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
 _POLICY: Final = "default-src 'self'; style-src 'unsafe-inline'; frame-ancestors 'none'"
@@ -36,7 +36,7 @@ _KINDS: Final = {".html": "text/html; charset=utf-8", ".mjs": "text/javascript; 
 
 @dataclass(frozen=True, slots=True)
 class HttpAnswer:
-    """What is sent back."""
+    """An HTTP response."""
 
     body: bytes = b""
     kind: str = "application/json"
@@ -49,12 +49,12 @@ Route = Callable[[PageRequest, bytes], HttpAnswer]
 
 
 def as_json(value: Any, status: int = 200) -> HttpAnswer:
-    """`value` as an answer."""
+    """Make a response of `value` as JSON."""
     return HttpAnswer(json.dumps(value).encode(), status=status)
 
 
 def page(name: str, **words: str) -> HttpAnswer:
-    """A file of `operator_side/cockpit/pages`, with `{{word}}` filled in; what the words say is text, never HTML."""
+    """Make a response of a file in `operator_side/cockpit/pages`, with each `{{word}}` replaced by escaped text."""
     text = files(__package__).joinpath("pages", name).read_text("utf-8")
     for word, value in words.items():
         text = text.replace("{{" + word + "}}", escape(value))
@@ -63,10 +63,13 @@ def page(name: str, **words: str) -> HttpAnswer:
 
 @contextmanager
 def served(routes: Mapping[str, Route], port: int, host: str = HOST, *, names: Sequence[str] = _NAMES) -> Iterator[str]:
-    """Serve `routes` ("GET /", "POST /pick" ...) while inside; gives the address. Port 0 is any that is free.
+    """Serve `routes` ("GET /", "POST /pick" ...) while the block runs; yields the address. Port 0 takes a free one.
 
-    Args: names: the names of this server that a request may use; none permits any, for what is public.
-    Raises: LinkError: for a port in use.
+    Args:
+        names: host names that a request may use; none permits any, for public content.
+
+    Raises:
+        LinkError: the port is in use.
     """
     handler = type("Handler", (_Handler,), {"routes": dict(routes), "names": names})
     try:
@@ -85,17 +88,17 @@ def served(routes: Mapping[str, Route], port: int, host: str = HOST, *, names: S
 
 
 def _answered(route: Route, query: str, body: bytes) -> HttpAnswer:
-    """What the route says; what was asked in a wrong way is said as such."""
+    """Call the route; turn an invalid request into an error response."""
     try:
         return route(dict(parse_qsl(query, max_num_fields=_MAX_FIELDS)), body)
     except SightlineError as error:
         return as_json({"error": str(error)}, 400)
     except (ValueError, KeyError, TypeError) as error:
-        return as_json({"error": f"this is not asked rightly: {error}"}, 400)
+        return as_json({"error": f"invalid request: {error}"}, 400)
 
 
 class _Server(ThreadingMixIn, HTTPServer):
-    """A connection has a thread while there is a place; a silent one delays neither the others nor the end."""
+    """Runs each connection in a thread, up to a limit; a silent one delays neither the others nor the end."""
 
     daemon_threads = True
     block_on_close = False
@@ -119,13 +122,13 @@ class _Server(ThreadingMixIn, HTTPServer):
             self._places.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that goes away in the middle, or sends nothing, is not an error."""
+        """Ignore a client that disconnects or sends nothing."""
         if not isinstance(sys.exception(), OSError):
             super().handle_error(request, client_address)
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One connection. Its class carries what is served."""
+    """One connection. Its class has the routes."""
 
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "sightline", ""
@@ -140,29 +143,29 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer("POST")
 
     def log_message(self, format: str, *arguments: Any) -> None:
-        """Never a line per request."""
+        """Log no requests."""
 
     def _answer(self, method: str) -> None:
-        refusal = self._refusal(method)
-        if refusal is not None:
+        rejection = self._rejection(method)
+        if rejection is not None:
             self.close_connection = True  # the body, if any, is not read
-            self._send(refusal)
+            self._send(rejection)
             return
         target = urlsplit(self.path)
         route = self.routes.get(f"{method} {target.path}")
         body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         if route is None:
-            self._send(as_json({"error": "no such page"}, 404))
+            self._send(as_json({"error": "unknown page"}, 404))
         else:
             self._send(_answered(route, target.query, body))
 
-    def _refusal(self, method: str) -> HttpAnswer | None:
+    def _rejection(self, method: str) -> HttpAnswer | None:
         host = self.headers.get("Host", "")
         if self.names and host.rpartition(":")[0] not in self.names and host not in self.names:
-            return as_json({"error": "this page is for this machine alone"}, 403)
+            return as_json({"error": "this page is for this machine only"}, 403)
         if method == "POST" and (self.headers.get("Origin", f"http://{host}") != f"http://{host}"
                                  or self.headers.get("Content-Type") != "application/json"):
-            return as_json({"error": "this is not the page itself"}, 403)
+            return as_json({"error": "the request is not from the page itself"}, 403)
         length = self.headers.get("Content-Length") or "0"
         if not (length.isascii() and length.isdigit() and len(length) < 8 and int(length) <= MAX_BODY_BYTES):
             return as_json({"error": f"at most {MAX_BODY_BYTES} bytes"}, 413)

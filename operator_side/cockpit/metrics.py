@@ -1,6 +1,6 @@
 """A robot's status as Prometheus metrics, served at /metrics and /health. Shell (HTTP, a link).
 
-`prometheus_client` writes the format: it is the one that Prometheus itself maintains.
+`prometheus_client` writes the format, since the Prometheus project maintains it.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
 
 
 class Exposed(Protocol):
-    """What is served."""
+    """A source of metrics."""
 
     def collect(self) -> Iterator[Family]:
-        """All that is known now."""
+        """Yield the present metrics."""
         ...
 
-    def is_heard(self) -> bool:
-        """Whether all is well, for a health check."""
+    def is_healthy(self) -> bool:
+        """Return the result of the health check."""
         ...
 
 
 def gauge(name: str, about: str, values: dict[tuple[str, ...], float], *labels: str) -> GaugeMetricFamily:
-    """A value that goes up and down, by what its labels say."""
+    """Make a gauge with a value for each combination of labels."""
     from prometheus_client.core import GaugeMetricFamily
 
     family = GaugeMetricFamily(f"sightline_{name}", about, labels=labels)
@@ -49,7 +49,7 @@ def gauge(name: str, about: str, values: dict[tuple[str, ...], float], *labels: 
 
 
 def counter(name: str, about: str, values: dict[tuple[str, ...], float], *labels: str) -> CounterMetricFamily:
-    """A count that only goes up, by what its labels say."""
+    """Make a counter with a value for each combination of labels."""
     from prometheus_client.core import CounterMetricFamily
 
     family = CounterMetricFamily(f"sightline_{name}", about, labels=labels)
@@ -60,7 +60,7 @@ def counter(name: str, about: str, values: dict[tuple[str, ...], float], *labels
 
 @contextmanager
 def serving(exposed: Exposed, host: str, port: int) -> Iterator[str]:
-    """Serve `/metrics` and `/health` while inside; gives the address. Raises LinkError for a port in use."""
+    """Serve `/metrics` and `/health` while the block runs; yields the address. Raises LinkError for a port in use."""
     from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 
     registry = CollectorRegistry()
@@ -68,9 +68,9 @@ def serving(exposed: Exposed, host: str, port: int) -> Iterator[str]:
 
     def health(_request: PageRequest, _body: bytes) -> HttpAnswer:
         return (
-            HttpAnswer(b"heard\n", "text/plain")
-            if exposed.is_heard()
-            else HttpAnswer(b"not heard\n", "text/plain", 503)
+            HttpAnswer(b"ok\n", "text/plain")
+            if exposed.is_healthy()
+            else HttpAnswer(b"no data\n", "text/plain", 503)
         )
 
     routes: dict[str, Route] = {
@@ -81,11 +81,11 @@ def serving(exposed: Exposed, host: str, port: int) -> Iterator[str]:
         yield address
 
 
-# A robot's status for Prometheus. Shell (a link).
+# --- a robot's status --------------------------------------------------------------------------------------------
 
 
 FRESH_S: Final = 2.0
-"""A robot that was not heard for longer is down."""
+"""A robot without a status for this time is down."""
 
 
 _COUNTERS: Final = {
@@ -106,7 +106,7 @@ _GAUGES: Final = {"fps": "stream_fps", "window": "stream_window"}
 
 
 class Watched:
-    """The newest status of one robot, and when it came. A Prometheus collector."""
+    """Collects the newest status of one robot for Prometheus."""
 
     def __init__(self, link: Link) -> None:
         self._robot = link.robot
@@ -125,18 +125,18 @@ class Watched:
         self._newest = (status, time.monotonic())
 
     def fresh(self) -> Status | None:
-        """The status, unless it is too old."""
+        """Return the status, or None if it is too old."""
         newest = self._newest
         return newest[0] if newest is not None and time.monotonic() - newest[1] <= FRESH_S else None
 
-    def is_heard(self) -> bool:
-        """Whether the robot is heard."""
+    def is_healthy(self) -> bool:
+        """Return whether the robot publishes its status."""
         return self.fresh() is not None
 
     def collect(self) -> Iterator[Family]:
-        """All that is known now; only `sightline_up` of a robot that is not heard."""
+        """Yield the present metrics; of a silent robot only `sightline_up`."""
         status = self.fresh()
-        yield self._gauge("up", "whether the robot is heard", float(status is not None))
+        yield self._gauge("up", "whether the robot publishes its status", float(status is not None))
         if status is not None:
             yield from self._of(status)
             yield from self._round_trip()
@@ -147,11 +147,11 @@ class Watched:
         yield self._gauge("linear_mps", "forward speed applied", status.applied[0])
         yield self._gauge("angular_rad_s", "turning speed applied, left positive", status.applied[1])
         yield from self._fields(status)
-        yield self._counter("holds", "times it was seen to begin to hold, at ten looks a second",
+        yield self._counter("holds", "transitions to HOLD, observed at ten statuses per second",
                             {(): self._entered[State.HOLD.value]})
 
     def _fields(self, part: Status | StreamStatus) -> Iterator[Family]:
-        """Every number in `part`, explained as its field is; times in seconds."""
+        """Yield every number in `part` with the description of its field; times in seconds."""
         for field, info in type(part).model_fields.items():
             value, about = getattr(part, field), info.description or ""
             if isinstance(value, StreamStatus):
@@ -167,7 +167,7 @@ class Watched:
                 yield self._gauge(_GAUGES.get(field, field), about, float(value))
 
     def _round_trip(self) -> Iterator[Family]:
-        """Asked of the robot's network process at every look; nothing where that cannot be asked."""
+        """Query the robot's network process at each collection; yield nothing on a link without queries."""
         for peer in self._peers():
             if peer.presence.role == ROBOT_ROLE and peer.presence.robot == self._robot:
                 yield self._gauge("round_trip_seconds", "there and back on the link", peer.round_trip_us / 1e6)

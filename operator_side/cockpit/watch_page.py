@@ -1,4 +1,4 @@
-"""The page of `sightline watch`: the view, the robot's state and its reasons. Shell (threads)."""
+"""The page of `sightline watch`: image, state and reasons of a robot. Shell (threads)."""
 
 import threading
 from collections.abc import Iterator
@@ -14,17 +14,17 @@ from sightline.protocol.channels import Channel
 from sightline.protocol.messages import Status
 from sightline.protocol.transports.link import Link
 
-_SHOWN_PICTURES = 2  # the newest, and the one before, which a second page may be about to fetch
+_SHOWN_PICTURES = 2  # the newest, and the one before for a second page
 
 
 @contextmanager
 def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) -> Iterator[str]:
-    """Serve the page while inside; gives its address. Raises LinkError for a port in use."""
+    """Serve the page while the block runs; yields its address. Raises LinkError for a port in use."""
     pictures, missions, ending = Pictures(link, role, first, secure), MissionClient(link), threading.Event()
     buffer = FrameBuffer(_SHOWN_PICTURES, pictures.age_us)
 
     def state(_request: PageRequest, _body: bytes) -> HttpAnswer:
-        return as_json(state_of(link.robot, missions, pictures.is_heard))
+        return as_json(state_of(link.robot, missions, pictures.is_online))
 
     routes = {
         "GET /": lambda _request, _body: page("watch.html", robot=link.robot),
@@ -42,8 +42,8 @@ def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) ->
             filling.join(2.0)
 
 
-def state_of(robot: str, missions: MissionClient, heard: bool) -> dict[str, Any]:
-    """What the page says beside the picture; `heard` is false for a robot that is silent."""
+def state_of(robot: str, missions: MissionClient, is_online: bool) -> dict[str, Any]:
+    """Return the text next to the image; `is_online` is False for a silent robot."""
     report = missions.operator.report
     lines = _robot_lines(report.status) if report is not None else []
     mission = missions.newest(0.0)
@@ -52,20 +52,20 @@ def state_of(robot: str, missions: MissionClient, heard: bool) -> dict[str, Any]
         if mission.detector:
             lines.append(("detector", detector_line(mission)))
     return {
-        "robot": robot, "heard": heard, "state": str(report.status.state) if report else "",
+        "robot": robot, "online": is_online, "state": str(report.status.state) if report else "",
         "reason": report.status.reason if report else "", "lines": lines,
     }
 
 
 def _robot_lines(status: Status) -> list[tuple[str, str]]:
     stream = status.stream
-    driver = f"{status.holder.source} {status.holder.session}" if status.holder else "nobody"
-    sight = f"{millis(status.frame_age_us)} old, capture to command {millis(status.latency_us)}"
+    driver = f"{status.holder.source} {status.holder.session}" if status.holder else "none"
+    age = f"{millis(status.frame_age_us)} old, capture to command {millis(status.latency_us)}"
     return [
         ("driver", driver),
         ("wheels", twist_text(status.applied)),
-        ("obeyed sight", sight if status.frame_age_us is not None else "none now"),
-        ("stream", f"{stream.fps:.0f} frames/s, {encoding_text(stream)}"),
+        ("frame age", age if status.frame_age_us is not None else "no command in force"),
+        ("stream", f"{stream.fps:.0f} frames per second, {encoding_text(stream)}"),
         ("dropped", drops_text(stream)),
         ("commands", f"{status.accepted} accepted, {rejections_text(status)}"),
     ]

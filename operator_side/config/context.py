@@ -99,7 +99,7 @@ def shown(path: Path | None) -> str:
 
 
 def read_context(path: Path) -> Context | None:
-    """Read the context file; None if there is none. Raises ConfigError for a damaged or unreadable one."""
+    """Read the context file; None if it is missing. Raises ConfigError for a damaged or unreadable one."""
     import tomllib
 
     try:
@@ -158,7 +158,7 @@ def write_context(path: Path, context: Context) -> None:
 
 
 def clear_context(path: Path) -> bool:
-    """Remove the context file. Returns False if there was none. Raises ConfigError if it cannot be removed."""
+    """Remove the context file. Returns False if it was missing. Raises ConfigError if it cannot be removed."""
     try:
         path.unlink()
     except FileNotFoundError:

@@ -10,7 +10,7 @@ from sightline.protocol.errors import SightlineError
 
 @dataclass(frozen=True)
 class Finding:
-    """`value` is what was found; `ok` None for what is only said. `fix` is the exact line that mends it."""
+    """`value` is the result, `ok` is None for plain information, `fix` is the exact line that fixes it."""
 
     name: str
     ok: bool | None
@@ -21,7 +21,7 @@ class Finding:
 
     @property
     def line(self) -> str:
-        """One line for a person."""
+        """Format the finding as one line, with its fix on the next."""
         sign = {True: "ok  ", False: "BAD ", None: "    "}[self.ok]
         fix = f"\n{'':25}fix: {self.fix}" if self.fix and self.ok is not True else ""
         unit = f" {self.unit}" if self.unit else ""
@@ -29,13 +29,13 @@ class Finding:
 
     @property
     def check(self) -> dict[str, Any]:
-        """For scripts: what has a unit is a number; what is well needs no mending."""
+        """Return the finding for scripts: a value with a unit is a number; a good one has no fix."""
         numbers = {name: _number(getattr(self, name)) for name in ("value", "bound") if self.unit}
         return {**asdict(self), **numbers, "fix": "" if self.ok is True else self.fix}
 
 
 def trouble(name: str, error: SightlineError) -> Finding:
-    """What an error says; by our own habit the fix stands behind its last semicolon."""
+    """Make a finding of an error, whose fix follows its last semicolon."""
     what, _, fix = str(error).rpartition("; ")
     return Finding(name, False, what or fix, fix if what else "")
 
@@ -48,12 +48,12 @@ def _number(text: str) -> float | str | None:
 
 
 def as_object(findings: list[Finding]) -> dict[str, Any]:
-    """The shape that everything that judges prints with --json."""
+    """Return the object of every command with checks for --json."""
     return {"ok": all(one.ok is not False for one in findings), "checks": [one.check for one in findings]}
 
 
 def histogram(values_ms: list[float], bins: int = 8, width: int = 40) -> list[str]:
-    """`values_ms` as lines of text: the bin's lower end, a bar, the count. Nothing for no values."""
+    """Draw `values_ms` as lines of text: lower end of the bin, bar, count. No values give no lines."""
     if not values_ms:
         return []
     low, high = min(values_ms), max(values_ms)

@@ -1,4 +1,4 @@
-"""What is wrong on this machine: Python, packages, clock, ports, keys, cameras. Shell (reads the system; Linux)."""
+"""Finds problems of this machine: Python, packages, clock, ports, keys, cameras. Shell (reads the system; Linux)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sightline.protocol.errors import SightlineError
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.session import MULTICAST_GROUP
 
-PORTS = {7447: "Zenoh", 9090: "sightline.v1", 9091: "the older dialect"}
+PORTS = {7447: "Zenoh", 9090: "sightline.v1", 9091: "the legacy protocol"}
 _HOT_C = 80.0
 _STOLEN_PERCENT = 2.0
 CPUS = Path("/sys/devices/system/cpu")
@@ -37,7 +37,7 @@ _EXTRAS = {"zenoh": "eclipse-zenoh", "websocket": "websockets", "vision": "openc
 
 
 def findings(keys_folder: str) -> Iterator[Finding]:
-    """Everything about this machine alone."""
+    """Yield the findings about this machine."""
     yield _versions()
     yield _collision()
     yield from (_port(port, what) for port, what in PORTS.items())
@@ -68,10 +68,10 @@ def _version(distribution: str) -> str:
 
 
 def _collision() -> Finding:
-    """Another distribution may install a package of our name (`sightline` on the package index is another project)."""
+    """Check for another distribution with our package name: `sightline` on the index is another project."""
     owners = metadata.packages_distributions().get("sightline", ())
     others = sorted(set(owners) - {"sightline-robot"})
-    fix = f"pip uninstall {' '.join(others)}, or give Sightline an environment of its own: python3 -m venv .venv"
+    fix = f"pip uninstall {' '.join(others)}, or install Sightline in a separate environment: python3 -m venv .venv"
     return Finding("package names", not others, f"taken by {', '.join(others)}" if others else "no collision", fix)
 
 
@@ -85,13 +85,13 @@ def _port(port: int, what: str) -> Finding:
 
 
 def _real_time() -> Finding:
-    """Tried for real, and taken back: limits and capabilities differ from system to system."""
+    """Request real-time priority and return it, since limits and capabilities differ between systems."""
     before = os.sched_getscheduler(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
         os.sched_setscheduler(0, before, os.sched_param(0))
     except (OSError, AttributeError):
-        fix = "echo \"$USER - rtprio 60\" | sudo tee /etc/security/limits.d/sightline.conf, then log in anew"
+        fix = "echo \"$USER - rtprio 60\" | sudo tee /etc/security/limits.d/sightline.conf, then log in again"
         return Finding("real-time", False, "not permitted: under load the driver may tick late", fix)
     return Finding("real-time", True, "permitted")
 
@@ -99,7 +99,7 @@ def _real_time() -> Finding:
 def _memory_lock() -> Finding:
     soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     ok = soft == resource.RLIM_INFINITY or soft >= 256 << 20 or os.geteuid() == 0
-    fix = "echo \"$USER - memlock unlimited\" | sudo tee -a /etc/security/limits.d/sightline.conf, then log in anew"
+    fix = "echo \"$USER - memlock unlimited\" | sudo tee -a /etc/security/limits.d/sightline.conf, then log in again"
     return Finding("memory lock", ok, "permitted" if ok else f"at most {soft >> 10} kB", fix)
 
 
@@ -114,30 +114,30 @@ def _temperature() -> Iterator[Finding]:
     zones = [_text(file) for file in Path("/sys/class/thermal").glob("thermal_zone*/temp")]
     degrees = [int(text) / 1000 for text in zones if text.lstrip("-").isdigit()]
     if degrees:
-        fix = "a heat sink or a fan: a hot processor is slowed down"
+        fix = "fit a heat sink or a fan: a hot processor slows down"
         yield Finding("temperature", max(degrees) < _HOT_C, f"{max(degrees):.0f}", fix, "C", f"{_HOT_C:.0f}")
     printed = _output_of("vcgencmd", "get_throttled")
     if printed:
-        fix = "a stronger power supply, or cooling; sudo reboot clears the mark"
+        fix = "use a stronger power supply or cooling; sudo reboot clears the flag"
         yield Finding("throttled", printed.endswith("0x0"), printed, fix)
 
 
 def _slowed_down() -> Iterator[Finding]:
-    """Time that the processor, or who owns it, has taken from this machine since its start."""
+    """Yield the time that heat, a quota or a host took from this machine since its start."""
     counts = [_text(file) for file in CPUS.glob("cpu[0-9]*/thermal_throttle/core_throttle_count")]
     hot = sum(int(text) for text in counts if text.isdigit())
     if counts:
-        yield Finding("throttled by heat", hot == 0, f"{hot} times since its start", "a heat sink or a fan")
+        yield Finding("throttled by heat", hot == 0, f"{hot} times since its start", "fit a heat sink or a fan")
     limited = dict(line.split() for line in _text(CGROUP / "cpu.stat").splitlines() if len(line.split()) == 2)
     if "nr_throttled" in limited:
         times, ms = int(limited["nr_throttled"]), int(limited.get("throttled_usec", 0)) // 1000
-        fix = "a larger share: docker run --cpus, CPUQuota= in the unit"
+        fix = "give it a larger share: docker run --cpus, CPUQuota= in the unit"
         yield Finding("throttled by quota", times == 0, f"{times} times, {ms} ms in all", fix)
     ticks = [int(count) for count in _text(PROC_STAT).partition("\n")[0].split()[1:]]
     if len(ticks) > 7 and sum(ticks) > 0:
         share = 100 * ticks[7] / sum(ticks)
         yield Finding("stolen time", share < _STOLEN_PERCENT, f"{share:.1f}",
-                      "a machine of your own: other virtual machines take this one's processor", "%",
+                      "use a dedicated machine: other virtual machines take this one's processor", "%",
                       f"{_STOLEN_PERCENT:.0f}")
 
 
@@ -147,29 +147,29 @@ def _power_save() -> Iterator[Finding]:
         printed = _output_of("iw", "dev", name, "get", "power_save")
         fix = f"sudo iw dev {name} set power_save off"
         yield Finding(f"power save {name}", "on" not in printed.lower().split() if printed else None,
-                      printed or "cannot be read: apt install iw", fix)
+                      printed or "unknown: apt install iw", fix)
 
 
 def _multicast() -> Finding:
-    """Whether a multicast datagram of ours comes back to us; discovery needs it, explicit endpoints do not."""
+    """Check that a multicast datagram returns to its sender; discovery needs it, explicit endpoints do not."""
     try:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
-            heard.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            heard.bind(("", MULTICAST_GROUP[1]))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+            receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            receiver.bind(("", MULTICAST_GROUP[1]))
             group = socket.inet_aton(MULTICAST_GROUP[0]) + socket.inet_aton("0.0.0.0")
-            heard.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
-            heard.settimeout(0.3)
-            heard.sendto(b"sightline doctor", MULTICAST_GROUP)
-            heard.recv(64)
+            receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group)
+            receiver.settimeout(0.3)
+            receiver.sendto(b"sightline doctor", MULTICAST_GROUP)
+            receiver.recv(64)
     except OSError as error:
-        fix = "nothing: name the endpoint with --connect, which is surer anyway"
-        return Finding("multicast", None, f"does not work here ({error.strerror or 'nothing came back'})", fix)
-    return Finding("multicast", None, "works on this machine; an access point may still keep it")
+        fix = "none needed: give the endpoint with --connect, which is more reliable"
+        return Finding("multicast", None, f"does not work here ({error.strerror or 'no answer'})", fix)
+    return Finding("multicast", None, "works on this machine; an access point may still drop it")
 
 
 def _clock() -> Finding:
     printed = _output_of("timedatectl", "show", "--property=NTPSynchronized", "--value")
-    words = {"yes": "synchronised", "no": "not synchronised"}.get(printed, "unknown")
+    words = {"yes": "synchronized", "no": "not synchronized"}.get(printed, "unknown")
     return Finding("clock", None, f"{words}; only certificates and logs need it, no frame or command does")
 
 
@@ -184,12 +184,12 @@ def _certificates(folder: str) -> Iterator[Finding]:
         return
     now = datetime.datetime.now(datetime.UTC)
     for one in certificates:
-        anew = f"sightline keys add {folder} {one.role}" if one.hosts else f"sightline keys init {folder}-new"
-        yield Finding(f"key {one.file.stem}", one.ends - now > _EXPIRES_SOON, f"until {one.ends:%Y-%m-%d}", anew)
+        renewal = f"sightline keys add {folder} {one.role}" if one.hosts else f"sightline keys init {folder}-new"
+        yield Finding(f"key {one.file.stem}", one.ends - now > _EXPIRES_SOON, f"until {one.ends:%Y-%m-%d}", renewal)
 
 
 def _output_of(*command: str) -> str:
-    """What a tool of the system says; "" where it is not there or fails."""
+    """Return the output of a system tool; "" if it is missing or fails."""
     if shutil.which(command[0]) is None:
         return ""
     try:
@@ -205,7 +205,7 @@ def _text(file: Path) -> str:
         return ""
 
 
-# What the doctor finds about cameras: the formats they offer, the rate they deliver. Shell (devices; Linux).
+# --- cameras: the formats that they offer, the rate that they deliver --------------------------------------------
 
 
 DEVICES: Final = Path("/dev")
@@ -218,19 +218,19 @@ _FORMAT: Final = struct.Struct("III32sII12x")
 _CAPTURE: Final = 1
 _MOST_FORMATS: Final = 64
 _UNOPENED: Final = {
-    errno.EACCES: "sudo usermod -aG video $USER, then log in anew",
-    errno.EBUSY: "end the other program that has it: sudo fuser -v",
+    errno.EACCES: "sudo usermod -aG video $USER, then log in again",
+    errno.EBUSY: "end the other program that uses it: sudo fuser -v",
 }
 
 
 def modes() -> Iterator[Finding]:
-    """The formats of every camera device of this machine; those that give none are no cameras."""
+    """Yield the formats of each camera device of this machine; a device without formats is skipped."""
     for device in sorted(DEVICES.glob("video[0-9]*")):
         try:
             offered = formats(device)
         except OSError as error:
-            fix = _UNOPENED.get(error.errno or 0, "plug it in anew")
-            yield Finding(f"modes {device.name}", False, f"cannot be opened: {error.strerror}",
+            fix = _UNOPENED.get(error.errno or 0, "connect it again")
+            yield Finding(f"modes {device.name}", False, f"cannot open it: {error.strerror}",
                           f"{fix} {device}" if "fuser" in fix else fix)
             continue
         if offered:
@@ -240,15 +240,15 @@ def modes() -> Iterator[Finding]:
 def _finding(device: Path, offered: list[str]) -> Finding:
     formats, option = ", ".join(offered), f"--set camera.kind=v4l2 --set camera.options.device={device}"
     if "MJPG" in offered or "JPEG" in offered:
-        return Finding(f"modes {device.name}", True, f"{formats}; its own JPEG is passed through (MJPG, the default)")
+        return Finding(f"modes {device.name}", True, f"{formats}; its JPEG passes unchanged (MJPG, the default)")
     if "YUYV" in offered:
-        return Finding(f"modes {device.name}", None, f"{formats}; no JPEG of its own: each picture is encoded here",
+        return Finding(f"modes {device.name}", None, f"{formats}; no JPEG: this machine encodes each image",
                        f"sightline robot {option} --set camera.options.format=YUYV")
     return Finding(f"modes {device.name}", False, f"{formats}; neither MJPG nor YUYV", "use another camera")
 
 
 def formats(device: Path) -> list[str]:
-    """The four-letter codes of what `device` captures, its default first. Raises OSError where it cannot be asked."""
+    """Return the four-letter codes of the formats of `device`, its default first. Raises OSError without an answer."""
     handle = os.open(device, os.O_RDWR | os.O_NONBLOCK)
     try:
         return [code for index in range(_MOST_FORMATS) if (code := _format(handle, index))]
@@ -257,22 +257,22 @@ def formats(device: Path) -> list[str]:
 
 
 def _format(handle: int, index: int) -> str:
-    asked = _FORMAT.pack(index, _CAPTURE, 0, b"", 0, 0)
+    query = _FORMAT.pack(index, _CAPTURE, 0, b"", 0, 0)
     try:
-        answer = fcntl.ioctl(handle, _ENUM_FMT, asked)
-    except OSError:  # no more of them, or no camera at all
+        answer = fcntl.ioctl(handle, _ENUM_FMT, query)
+    except OSError:  # the end of the list, or not a camera
         return ""
     return read_format(answer)
 
 
 def read_format(answer: bytes) -> str:
-    """The code in the kernel's answer."""
+    """Return the format code in the kernel's answer."""
     code: int = _FORMAT.unpack(answer)[4]
     return code.to_bytes(4, "little").decode("ascii", "replace").strip()
 
 
 def delivered(kind: str, sets: list[str]) -> Finding:
-    """The rate that a camera really delivers; what it cannot do at all, it says itself."""
+    """Measure the rate that a camera delivers, or report its error."""
     from sightline.operator_side.calibrate.local_camera import local_camera
 
     try:
@@ -284,8 +284,8 @@ def delivered(kind: str, sets: list[str]) -> Finding:
     except SightlineError as error:
         return trouble(f"camera {kind}", error)
     if len(stamps_us) < 2:
-        return Finding(f"camera {kind}", False, "no pictures", "plug it in anew; another program may have it")
+        return Finding(f"camera {kind}", False, "no images", "connect it again, or end the program that uses it")
     fps = (len(stamps_us) - 1) / (stamps_us[-1] - stamps_us[0]) * 1e6
-    asked = next((float(one.partition("=")[2]) for one in sets if one.startswith("fps=")), 0.0)
-    fix = "more light (a camera exposes longer in the dark), a smaller size, or another USB port"
-    return Finding(f"camera {kind}", fps >= _ENOUGH * asked, f"{fps:.1f}", fix, "fps", f"{asked:g}")
+    wanted = next((float(one.partition("=")[2]) for one in sets if one.startswith("fps=")), 0.0)
+    fix = "use more light (a camera exposes longer in the dark), a smaller size or another USB port"
+    return Finding(f"camera {kind}", fps >= _ENOUGH * wanted, f"{fps:.1f}", fix, "fps", f"{wanted:g}")

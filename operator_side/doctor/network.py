@@ -1,4 +1,4 @@
-"""What is wrong between this machine and a robot or router. Shell (sockets, a link)."""
+"""Finds problems between this machine and a robot or router. Shell (sockets, a link)."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ _LISTEN_S = 3.0
 _QUICK_MS = 60.0
 """A round trip above this takes speed from a robot: its full limit ends at 150 ms of frame age."""
 _UNREACHED = {
-    errno.ECONNREFUSED: "the machine is there, nobody listens on the port: start `sightline robot` there with --listen",
-    errno.EHOSTUNREACH: "no way there: another network, or the access point keeps its clients apart (client isolation)",
-    errno.ENETUNREACH: "no way there: this machine is on no such network",
+    errno.ECONNREFUSED: "the machine answers, but the port is closed: start `sightline robot` there with --listen",
+    errno.EHOSTUNREACH: "no route: another network, or the access point isolates its clients (client isolation)",
+    errno.ENETUNREACH: "no route: this machine has no connection to that network",
 }
 
 
 def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
-    """Everything about the way to `endpoint` and, if it is a robot's, its stream."""
+    """Yield the findings about the link to `endpoint`, and about the stream of a robot there."""
     transport, host, port = _address(endpoint)
     if transport not in _OVER_UDP:
         knocks_ms, why = _probe(host, port)
@@ -57,7 +57,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
         role = viewer_role(secure) if secure else ROLE  # an operator's keys may acknowledge frames
         with open_link(robot, connect=[endpoint], role=role, secure=secure) as link:
             if transport in _OVER_UDP:
-                yield from _round_trip(_answer_ms(link), "questions")
+                yield from _round_trip(_answer_ms(link), "queries")
             yield from _peers(link, robot)
             yield from _robot(link, robot, FrameViewer(link, role, secure))
     except SightlineError as error:
@@ -65,7 +65,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
 
 
 def _no_link(error: SightlineError, endpoint: str) -> Finding:
-    """Nobody there at all, which a handshake would have shown, or somebody who does not speak as the endpoint says."""
+    """Make a finding of a link that did not open. A handshake worked before, so another program may listen there."""
     found = trouble("link", error)
     if not found.value.startswith("no answer from"):
         return found
@@ -78,7 +78,7 @@ def _no_link(error: SightlineError, endpoint: str) -> Finding:
 
 
 def _found_by_multicast(host: str) -> Finding:
-    """Discovery is a comfort: only said."""
+    """Report whether discovery finds the machine; it is a convenience, so it never fails."""
     try:
         there = socket.gethostbyname(host) in {
             endpoints.parse_zenoh_endpoint(one)[1] for one in find_listeners(_SCOUT_S)
@@ -86,32 +86,32 @@ def _found_by_multicast(host: str) -> Finding:
     except OSError:
         there = False
     words = "it answers: `sightline robots` finds it" if there else "no answer, as on many networks"
-    return Finding("multicast there", None, words, "" if there else "none needed: name the endpoint with --connect")
+    return Finding("multicast there", None, words, "" if there else "none needed: give the endpoint with --connect")
 
 
 def _answer_ms(link: Link) -> list[float]:
-    """Round trips of questions on the link itself, for what has no handshake of its own."""
+    """Measure round trips by queries on the link, for transports without a TCP handshake."""
     rounds = [_peers_of(link) for _ in range(_PROBES)]
     return [min(one.round_trip_us for one in peers) / 1000 for peers in rounds if peers]
 
 
 def _peers_of(link: Link) -> list[PeerInfo]:
-    """Who answers on `link`; nobody on one that cannot be asked."""
-    ask: Callable[[], list[PeerInfo]] = getattr(link, "peers", list)
-    return ask()
+    """Return the peers on `link`; none on a link without queries."""
+    query: Callable[[], list[PeerInfo]] = getattr(link, "peers", list)
+    return query()
 
 
 def _peers(link: Link, robot: str) -> Iterator[Finding]:
-    """Versions at both ends, and how far their clocks are apart; a WebSocket does not tell."""
+    """Yield the versions of both ends and the difference of their clocks; a WebSocket does not report them."""
     ours = software_version()
     for peer in best_round_trips([_peers_of(link) for _ in range(QUERY_ROUNDS)]):
-        said = peer.presence
-        if said.role == ROBOT_ROLE and said.robot != robot:
+        presence = peer.presence
+        if presence.role == ROBOT_ROLE and presence.robot != robot:
             continue
-        same = True if said.software == ours else None
-        fix = f"the same version on both machines; this one has {ours}"
-        yield Finding(f"version of {said.role}", same, f"{said.software} on {said.host}", fix)
-        if said.role == ROBOT_ROLE:
+        same = True if presence.software == ours else None
+        fix = f"install the same version on both machines; this one has {ours}"
+        yield Finding(f"version of {presence.role}", same, f"{presence.software} on {presence.host}", fix)
+        if presence.role == ROBOT_ROLE:
             ahead_ms = peer.ahead_us / 1000
             yield Finding("clock skew", None, f"the robot's clock is {abs(ahead_ms):.0f} ms "
                           f"{'ahead' if ahead_ms > 0 else 'behind'}; only certificates and logs need it, no frame or "
@@ -119,7 +119,7 @@ def _peers(link: Link, robot: str) -> Iterator[Finding]:
 
 
 def _address(endpoint: str) -> tuple[str, str, int]:
-    """Transport, host and port. Raises ConfigError for an endpoint that is none."""
+    """Return transport, host and port. Raises ConfigError for an invalid endpoint."""
     if "://" in endpoint:
         web = websocket_endpoints.parse_websocket_endpoint(endpoint)
         return "ws", web.host, web.port
@@ -127,14 +127,14 @@ def _address(endpoint: str) -> tuple[str, str, int]:
 
 
 def _probe(host: str, port: int) -> tuple[list[float], str]:
-    """Times of TCP handshakes, one round trip each, in ms; or why there is none."""
+    """Measure TCP handshakes, one round trip each, in ms; also return the reason if one fails."""
     times_ms: list[float] = []
     for _ in range(_PROBES):
         begun_ns = time.monotonic_ns()
         try:
             socket.create_connection((host, port), _PATIENCE_S).close()
         except TimeoutError:
-            why = "nothing comes back: firewall, wrong address, or client isolation on the access point"
+            why = "no reply: firewall, wrong address, or client isolation on the access point"
             return times_ms, why + neighbour(host)
         except socket.gaierror:
             return times_ms, f"host '{host}' does not resolve: check the name or use its IP address"
@@ -147,7 +147,7 @@ def _probe(host: str, port: int) -> tuple[list[float], str]:
 
 
 def neighbour(host: str, table: Path = ARP_TABLE) -> str:
-    """What the kernel knows of a machine on the same network that does not answer: whether it is there at all."""
+    """Return what the kernel knows of a silent machine on the same network: whether it exists at all."""
     try:
         rows = [line.split() for line in table.read_text().splitlines()[1:]]
         address = socket.gethostbyname(host)
@@ -157,17 +157,17 @@ def neighbour(host: str, table: Path = ARP_TABLE) -> str:
     if address not in flags:
         return ""
     if flags[address] & _ARP_COMPLETE:
-        return f"; {address} is there on this network, so it is a firewall: sudo ufw allow 7447/tcp on that machine"
-    return (f"; nobody on this network has {address}: the machine is off, or the access point keeps its clients apart "
+        return f"; {address} is on this network, so a firewall blocks it: sudo ufw allow 7447/tcp on that machine"
+    return (f"; no machine on this network has {address}: it is off, or the access point isolates its clients "
             "(switch off client isolation, or leave the guest network)")
 
 
 def _round_trip(knocks_ms: list[float], what: str) -> Iterator[Finding]:
     if len(knocks_ms) < 2:
-        yield Finding("round trip p50", None, "cannot be measured: nobody answers questions here")
+        yield Finding("round trip p50", None, "unknown: no peer answers queries here")
         return
     p50, p95 = median(knocks_ms), quantiles(knocks_ms, n=20)[-1]
-    fix = "a nearer access point, 5 GHz, Wi-Fi power save off on both ends"
+    fix = "use a nearer access point, 5 GHz, and Wi-Fi power save off on both ends"
     yield Finding("round trip p50", p50 <= _QUICK_MS, f"{p50:.2f}", fix, "ms", f"{_QUICK_MS:.0f}")
     yield Finding("round trip p95", p95 <= 2 * _QUICK_MS, f"{p95:.2f}", fix, "ms", f"{2 * _QUICK_MS:.0f}")
     lines = "".join(f"\n{'':25}{line}" for line in histogram(knocks_ms))
@@ -177,25 +177,25 @@ def _round_trip(knocks_ms: list[float], what: str) -> Iterator[Finding]:
 def _robot(link: Link, robot: str, viewer: FrameViewer) -> Iterator[Finding]:
     status = Operator(link).wait_report().status
     yield Finding("robot", None, f"{robot} is {status.state}: {status.reason}")
-    yield from _refusals(status)
+    yield from _rejections(status)
     fps, kilobytes = _watch(link, viewer)
-    asked = status.stream.fps
-    enough = fps >= 0.8 * asked if asked else fps > 0
-    fix = "smaller pictures or fewer, on the robot: --set camera.options.width_px=320 --set stream.max_fps=15"
+    wanted = status.stream.fps
+    enough = fps >= 0.8 * wanted if wanted else fps > 0
+    fix = "send smaller or fewer images from the robot: --set camera.options.width_px=320 --set stream.max_fps=15"
     rate = f"{fps:.1f} per second, {kilobytes:.0f} kB each, {fps * kilobytes / 125:.2f} Mbit/s"
     yield Finding("frames", enough, rate, fix)
     whole = stream_is_whole(status.stream)
     yield Finding("stream", whole, encoding_text(status.stream),
-                  "a nearer access point or 5 GHz; or ask for less: --set stream.max_fps=15 on the robot")
+                  "use a nearer access point or 5 GHz, or a lower rate: --set stream.max_fps=15 on the robot")
 
 
-def _refusals(status: Status) -> Iterator[Finding]:
+def _rejections(status: Status) -> Iterator[Finding]:
     for reason, count in sorted(status.refused.items(), key=lambda row: -row[1])[:3]:
-        yield Finding(f"refused {reason}", None, f"{count} times since its start")
+        yield Finding(f"rejected {reason}", None, f"{count} times since its start")
 
 
 def _watch(link: Link, viewer: FrameViewer) -> tuple[float, float]:
-    """Frames per second and kB a frame over a few seconds; each is acknowledged, as any viewer does."""
+    """Measure frames per second and kB per frame for a few seconds; acknowledge each, as a viewer does."""
     slot, begun_s = link.latest(FRAME), time.monotonic()
     sizes: list[int] = []
     while time.monotonic() - begun_s < _LISTEN_S:

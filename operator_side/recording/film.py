@@ -1,4 +1,4 @@
-"""Snapshots and H.264 films of what a robot sees. Shell (waits, writes files)."""
+"""Snapshots and H.264 films of a robot's images. Shell (waits, writes files)."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from sightline.vision_side.decode import Decoder
 
 
 def jpeg_pixels(jpeg: bytes) -> NDArray[np.uint8]:
-    """BGR in full size. Raises WireError MALFORMED for what is no plain JPEG within the bounds."""
+    """Decode a JPEG to BGR in full size. Raises WireError MALFORMED for an invalid or too large one."""
     size = read_jpeg_size(jpeg)
     _checker(size.width_px, size.height_px).check(jpeg)
     try:
         pixels: NDArray[np.uint8] = simplejpeg.decode_jpeg(jpeg, "BGR")
     except ValueError as error:
-        raise WireError(RejectReason.MALFORMED, f"picture does not decode: {error}"[:160]) from None
+        raise WireError(RejectReason.MALFORMED, f"image does not decode: {error}"[:160]) from None
     return pixels
 
 
@@ -41,33 +41,33 @@ def _checker(width_px: int, height_px: int) -> Decoder:
     return Decoder(width_px, height_px, VisionConfig().max_pixels)
 
 
-# A film on disk, H.264 in MP4, each picture at its own time. Shell (writes a file).
+# --- a film: H.264 in MP4, each image at its own time ------------------------------------------------------------
 
 
 Image = NDArray[np.uint8]
-_TICKS_PER_S: Final = 90_000  # what players expect of H.264
+_TICKS_PER_S: Final = 90_000  # usual for H.264
 _TIME_BASE: Final = Fraction(1, _TICKS_PER_S)
 _ENCODING: Final = {"preset": "veryfast", "crf": "23"}
 
 
 class Film:
-    """`with Film(path, fps) as film: film.add(picture, t_us)`. Pictures of another size are made to fit the first."""
+    """`with Film(path, fps) as film: film.add(picture, t_us)`. Images of another size are fitted to the first."""
 
     def __init__(self, path: Path, fps: int) -> None:
-        """`fps` is only told to the encoder. Raises ConfigError without PyAV or for a place that cannot be written."""
+        """Open the file; `fps` is a hint for the encoder. Raises ConfigError without PyAV or for a bad path."""
         with needs("report"):
             import av
         try:
             self._container = av.open(str(path), "w", options={"movflags": "+faststart"})
         except OSError as error:
-            raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from None
+            raise ConfigError(f"cannot write {path}: {error.strerror or error}; choose another file") from None
         self._av, self._fps = av, fps
         self._stream: Any = None
         self._first_us = self._last_ticks = -1
         self.frames = 0
 
     def add(self, picture: Image, t_us: int) -> bool:
-        """One more picture (BGR); False, and left out, if it is not later than the last."""
+        """Append an image (BGR). Returns False and skips it unless it is later than the last."""
         if self._stream is None:
             self._first_us = t_us
             self._stream = self._opened(picture)
@@ -83,11 +83,11 @@ class Film:
 
     @property
     def seconds(self) -> float:
-        """From the first picture to the last."""
+        """Return the time from the first image to the last."""
         return max(0, self._last_ticks) / _TICKS_PER_S
 
     def close(self) -> None:
-        """Write what the encoder still holds, and the index."""
+        """Write the rest of the encoder's data and the index."""
         if self._stream is not None:
             self._container.mux(self._stream.encode(None))
         self._container.close()
@@ -104,7 +104,7 @@ class Film:
         stream = self._container.add_stream("libx264", rate=self._fps)
         height, width = picture.shape[:2]
         stream.width, stream.height = max(2, width - width % 2), max(2, height - height % 2)
-        stream.pix_fmt = "yuv420p"  # what every player shows; it wants even sides
+        stream.pix_fmt = "yuv420p"  # every player shows it; it needs even sides
         stream.time_base = stream.codec_context.time_base = _TIME_BASE
         stream.options = dict(_ENCODING)
         return stream
@@ -118,7 +118,7 @@ class Film:
         return np.ascontiguousarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-# Takes a snapshot or a video of what a robot sees. Shell (waits, writes files).
+# --- a snapshot or a video of a robot ----------------------------------------------------------------------------
 
 
 PICTURES: Final = (".png", ".jpg", ".jpeg")
@@ -130,7 +130,7 @@ _FPS: Final = 30
 
 @dataclass(frozen=True, slots=True)
 class Captured:
-    """What was written."""
+    """The written file."""
 
     path: Path
     frames: int
@@ -140,20 +140,20 @@ class Captured:
 
 
 def check_target(path: Path, seconds: float | None) -> None:
-    """Raise ConfigError for a file that is neither picture nor video, or that cannot be there."""
+    """Raise ConfigError for a file that is neither image nor video, or that cannot be written."""
     kind = path.suffix.lower()
     if kind not in (*PICTURES, VIDEO):
-        raise ConfigError(f"{path}: a snapshot ends in .png or .jpg, a video in .mp4")
+        raise ConfigError(f"invalid file {path}: a snapshot ends in .png or .jpg, a video in .mp4")
     if kind in PICTURES and seconds is not None:
-        raise ConfigError(f"--seconds is for a video, and {path} is a picture: write --out NAME.mp4")
+        raise ConfigError(f"--seconds needs a video, and {path} is an image; use --out NAME.mp4")
     check_out_file(path)
 
 
 def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
-    """Write the next picture to `path`: as PNG, or as the JPEG that came. Raises LinkError if none comes."""
+    """Write the next image to `path`, as PNG or as received JPEG. Raises LinkError if none arrives."""
     ends_s = time.monotonic() + PATIENCE_S
     while (shot := _wanted(pictures, wanted, ends_s)) is not None:
-        with suppress(WireError):  # the next one may be whole
+        with suppress(WireError):  # the next one may be valid
             data = shot.jpeg if path.suffix.lower() != ".png" else cv2.imencode(".png", jpeg_pixels(shot.jpeg))[1]
             _write(path, bytes(data))
             return Captured(path, 1, 0.0, shot.width_px, shot.height_px)
@@ -161,16 +161,16 @@ def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
 
 
 def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Captured:
-    """Write what is seen for `seconds`, or until Ctrl-C, to `path`. Raises LinkError if no picture comes."""
+    """Write the images of `seconds`, or until Ctrl-C, to `path`. Raises LinkError if none arrives."""
     unfinished = path.with_name(f".{path.name}.part.mp4")
     size = (0, 0)
     try:
         with Film(unfinished, _FPS) as made, suppress(KeyboardInterrupt):
-            ends_s = 0.0  # from the first picture on
+            ends_s = 0.0  # counted from the first image
             while (shot := _wanted(pictures, wanted, ends_s or time.monotonic() + PATIENCE_S)) is not None:
                 ends_s = ends_s or time.monotonic() + seconds
                 size = size if any(size) else (shot.width_px, shot.height_px)
-                with suppress(WireError):  # one lost picture
+                with suppress(WireError):  # an invalid image
                     made.add(jpeg_pixels(shot.jpeg), shot.t_us)
         if not made.frames:
             raise LinkError(_silence(pictures, wanted))
@@ -181,7 +181,7 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
 
 
 def _wanted(pictures: Pictures, wanted: Channel, ends_s: float) -> Shot | None:
-    """The next picture of that channel; None at the end."""
+    """Return the next image of that channel, or None at the end."""
     while (left_s := ends_s - time.monotonic()) > 0:
         shot = pictures.take(min(left_s, _WAIT_S))
         if shot is not None and shot.channel is wanted:
@@ -191,11 +191,11 @@ def _wanted(pictures: Pictures, wanted: Channel, ends_s: float) -> Shot | None:
 
 def _silence(pictures: Pictures, wanted: Channel) -> str:
     robot = pictures.robot
-    if not pictures.is_heard:
-        return f"robot {robot!r} is not heard within {PATIENCE_S:g} s; `sightline robots` lists who is"
+    if not pictures.is_online:
+        return f"no status from robot '{robot}' after {PATIENCE_S:g} s; run `sightline robots`"
     if wanted is OVERLAY:
-        return f"no overlay of robot {robot!r} within {PATIENCE_S:g} s; does `sightline vision` run for it?"
-    return f"no picture of robot {robot!r} within {PATIENCE_S:g} s; does its camera deliver? see `sightline status`"
+        return f"no overlay of robot '{robot}' after {PATIENCE_S:g} s; run `sightline vision`"
+    return f"no image from robot '{robot}' after {PATIENCE_S:g} s; run `sightline status {robot}`"
 
 
 def _write(path: Path, data: bytes) -> None:
@@ -205,4 +205,4 @@ def _write(path: Path, data: bytes) -> None:
         unfinished.replace(path)
     except OSError as error:
         unfinished.unlink(missing_ok=True)
-        raise ConfigError(f"{path}: cannot be written: {error.strerror}") from None
+        raise ConfigError(f"cannot write {path}: {error.strerror}; choose another file") from None

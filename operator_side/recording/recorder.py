@@ -41,7 +41,7 @@ ENCODING: Final = "sightline.v1"
 METADATA: Final = "sightline"
 RECORDED: Final = (FRAME, TWIST, ACK, STATUS, CAMERA, SCAN, MISSION, REPORT, DETECTIONS)
 MAX_WAITING: Final = 256
-"""Messages that wait for the disk; while it is slower than that, new ones are dropped and counted."""
+"""The most messages that wait for the disk; further ones are dropped and counted."""
 CHUNK_BYTES: Final = 256 * 1024  # a kill loses at most one chunk
 _LENGTH = struct.Struct(">H")
 
@@ -50,7 +50,7 @@ _log: Final = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """A message and when it was received (Unix time)."""
+    """A message and its time of arrival (Unix time)."""
 
     log_time_ns: int
     message: Message
@@ -62,16 +62,16 @@ class Recorder:
     def __init__(
         self, link: Link, path: Path, about: Mapping[str, str], channels: Iterable[Channel] = RECORDED
     ) -> None:
-        """`about` is kept in the file as metadata. Raises ConfigError for a path that cannot be written."""
+        """Open the file and store `about` in it as metadata. Raises ConfigError for a path that cannot be written."""
         self._queue: queue.Queue[tuple[int, Message] | None] = queue.Queue(MAX_WAITING)
         self._path, self._file = path, _open_new(path)
         self._writer = _writer(self._file, about)
         self._ids: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self.dropped = 0
-        """For want of time to write them."""
+        """Number of messages that the disk was too slow for."""
         self.failed = ""
-        """Why nothing more could be written, if so."""
+        """The error that ended the recording, or ""."""
         self._closed = False
         self._writing = threading.Thread(target=self._write_all, name="recorder", daemon=True)
         self._writing.start()
@@ -80,7 +80,7 @@ class Recorder:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Messages written, by topic."""
+        """Return the number of written messages of each topic."""
         return dict(self._counts)
 
     def _take(self, message: Message) -> None:
@@ -94,18 +94,18 @@ class Recorder:
     def _write_all(self) -> None:
         while (item := self._queue.get()) is not None:
             if not self.failed:
-                with self._telling():
+                with self._reporting():
                     self._write(*item)
 
     @contextmanager
-    def _telling(self) -> Iterator[None]:
-        """A disk that takes no more ends the recording with one line, and nothing else."""
+    def _reporting(self) -> Iterator[None]:
+        """Turn a failed write into one log line and the end of the recording."""
         try:
             yield
         except OSError as error:
             if not self.failed:
                 self.failed = error.strerror or str(error)
-                _log.warning("recording %s: %s; nothing more is recorded", self._path, self.failed)
+                _log.warning("recording %s: %s; the recording ends", self._path, self.failed)
 
     def _write(self, log_time_ns: int, message: Message) -> None:
         topic = message.channel.name + (f"/{message.source}" if message.source else "")
@@ -116,15 +116,15 @@ class Recorder:
         self._writer.add_message(self._ids[topic], log_time_ns, data, publish_time=log_time_ns, sequence=count)
 
     def close(self) -> None:
-        """Write what waits and finish the file; idempotent."""
+        """Write the waiting messages and finish the file; a second call does nothing."""
         if self._closed:
             return
         self._closed = True
         self._queue.put(None)
         self._writing.join()
-        with self._telling():
+        with self._reporting():
             self._writer.finish()  # type: ignore[no-untyped-call]
-        with self._telling():
+        with self._reporting():
             self._file.close()
 
     def __enter__(self) -> Self:
@@ -140,13 +140,13 @@ def _open_new(path: Path) -> IO[bytes]:
     try:
         return path.open("wb")
     except OSError as error:
-        raise ConfigError(f"recording {path}: {error.strerror}; choose a folder that can be written") from None
+        raise ConfigError(f"recording {path}: {error.strerror}; choose a folder that you may write") from None
 
 
 def _writer(file: IO[bytes], about: Mapping[str, str]) -> "Writer":
     with needs("report"):
         from mcap.writer import CompressionType, Writer
-    # JPEG does not compress; what is left is not worth the time on the machine that drives.
+    # JPEG does not compress; the rest is not worth the time on the machine that drives.
     writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
     writer.start(profile="", library="sightline")
     writer.add_metadata(METADATA, dict(about))
@@ -154,7 +154,7 @@ def _writer(file: IO[bytes], about: Mapping[str, str]) -> "Writer":
 
 
 def read_recording(path: Path) -> Iterator[Recorded]:
-    """Every message in the order it was received, up to where the file ends. Raises ConfigError if it is none."""
+    """Yield every message in the order of arrival, to the end of the file. Raises ConfigError for another file."""
     with _reading(path) as reader:
         for _schema, channel, message in reader.iter_messages(log_time_order=False):
             parsed = _parse(channel.topic, message.data)
@@ -163,17 +163,17 @@ def read_recording(path: Path) -> Iterator[Recorded]:
 
 
 def read_about(path: Path) -> dict[str, str]:
-    """The metadata that the recorder was given. Raises ConfigError if the file is no recording of Sightline."""
+    """Return the metadata of the recorder. Raises ConfigError if the file is not a recording of Sightline."""
     with _reading(path) as reader:
         for record in reader.iter_metadata():
             if record.name == METADATA:
                 return dict(record.metadata)
-    raise ConfigError(f"{path} is no recording of Sightline")
+    raise ConfigError(f"{path} is not a recording of Sightline; choose a run.mcap")
 
 
 @contextmanager
 def _reading(path: Path) -> Iterator[Any]:
-    """An MCAP reader; a file cut short simply ends."""
+    """Open an MCAP reader; a truncated file ends early."""
     with needs("report"):
         from mcap.exceptions import EndOfFile, McapError
         from mcap.reader import NonSeekingReader
@@ -183,9 +183,9 @@ def _reading(path: Path) -> Iterator[Any]:
     except EndOfFile:
         return
     except OSError as error:
-        raise ConfigError(f"recording {path}: {error.strerror}") from None
+        raise ConfigError(f"cannot read recording {path}: {error.strerror}") from None
     except McapError as error:
-        raise ConfigError(f"{path} is no recording: {type(error).__name__}") from None
+        raise ConfigError(f"invalid recording {path}: {type(error).__name__}") from None
 
 
 def _parse(topic: str, data: bytes) -> Message | None:

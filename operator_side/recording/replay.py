@@ -1,7 +1,7 @@
 """Replays a recording through a fresh pipeline; the twists must be the same, byte for byte. Shell (reads files).
 
-Frames that were answered go in again in the order they were answered, one pipeline per vision session; with each go the
-scan and the mission that its answer cites.
+It feeds the answered frames again in the order of their answers, with one pipeline per session of the vision service,
+and with the scan and the mission that each answer cites.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -32,14 +32,14 @@ from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnsw
 from sightline.vision_side.tracking.locate import BoxReader
 
 VISION_CONFIG = "vision_config"
-"""Key of the recording's metadata that holds the configuration of vision, as JSON."""
+"""Key of the recording's metadata that has the configuration of the vision service, as JSON."""
 
 _FrameId = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One answered frame: what was on the wire (None: an acknowledgement) and what the pipeline says now."""
+    """One answered frame: the recorded answer (None: an acknowledgement) and the answer of the pipeline now."""
 
     frame: Frame
     sent: bytes | None
@@ -47,41 +47,41 @@ class Step:
 
     @property
     def now(self) -> bytes | None:
-        """What the pipeline would send."""
+        """Return the payload of the pipeline's answer."""
         return format_twist(self.answer.twist) if self.answer.twist is not None else None
 
 
 @dataclass(slots=True)
 class Replayed:
-    """What a replay found. With answers lost on the way or frames not recorded, later twists may differ."""
+    """The result of a replay. After a lost answer or an unrecorded frame, later twists may differ."""
 
     total: int = 0
     equal: int = 0
     missing_frames: int = 0
     gaps: int = 0
-    """Answers that vision numbered, and scans and missions that they cite, which nobody recorded."""
+    """Number of answers, and of scans and missions that they cite, that are not in the recording."""
     first_difference: str = ""
 
     @property
     def ok(self) -> bool:
-        """Whether every answer was there and equal."""
+        """Return whether every answer is recorded and equal."""
         return 0 < self.total == self.equal and not self.missing_frames and not self.gaps
 
 
 @dataclass(slots=True)
 class _Answers:
-    """Answers of the recording, by the frame they cite; and what else they cite: scans, missions."""
+    """The recorded answers by the frame that they cite, with the scans and missions that they cite."""
 
     by_frame: dict[_FrameId, list[tuple[AnswerHeader, bytes | None]]] = field(default_factory=dict)
     gaps: int = 0
     scans: dict[_FrameId, Message] = field(default_factory=dict)
     missions: dict[RequestId, MissionRequest] = field(default_factory=dict)
     boxes: dict[_FrameId, Message] = field(default_factory=dict)
-    """What somebody else found in each frame, for a vision without eyes of its own."""
+    """Detections of another publisher in each frame, for a vision service without a detector."""
 
 
 def replay(path: Path, on_step: Callable[[Step], None] = lambda _step: None) -> Replayed:
-    """Replay the recording at `path`; `on_step` is told each answered frame. Raises ConfigError if it is none."""
+    """Replay the recording at `path`; calls `on_step` for each answered frame. Raises ConfigError for another file."""
     answers = _answers(path)
     missing = _gather_cited(path, answers)
     result = Replayed(gaps=answers.gaps + missing)
@@ -90,20 +90,20 @@ def replay(path: Path, on_step: Callable[[Step], None] = lambda _step: None) -> 
         result.total += 1
         result.equal += step.sent == step.now
         if step.sent != step.now and not result.first_difference:
-            result.first_difference = f"frame {step.frame.header.seq}: sent {step.sent!r}, now {step.now!r}"
+            result.first_difference = f"frame {step.frame.header.seq}: sent {_text(step.sent)}, now {_text(step.now)}"
     result.missing_frames = sum(len(some) for some in answers.by_frame.values())
     return result
 
 
 def replay_steps(path: Path) -> Iterator[Step]:
-    """Every answered frame with its answer, in order. Raises ConfigError if `path` is no recording."""
+    """Yield every answered frame with its answer, in order. Raises ConfigError if `path` is not a recording."""
     answers = _answers(path)
     _gather_cited(path, answers)
     return _steps(path, answers)
 
 
 def _newest_camera(message: Message, camera: CameraModel, pipelines: Iterable[Pipeline]) -> CameraModel:
-    """The model in `message`; if it is another one, the pipelines continue with it."""
+    """Return the camera model in `message`; the pipelines continue with a new one."""
     model = decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
     for pipeline in pipelines if model != camera else ():
         pipeline.set_camera(model)
@@ -111,7 +111,7 @@ def _newest_camera(message: Message, camera: CameraModel, pipelines: Iterable[Pi
 
 
 def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
-    """Takes out of `answers` what it uses; what is left cites frames that were not recorded."""
+    """Remove each used answer from `answers`; the rest cite frames that are not in the recording."""
     config = _vision_config(path)
     camera, detector = _first_camera(path), configured_detector(config)
     pipelines: dict[str, Pipeline] = {}
@@ -124,14 +124,14 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
         frame = Frame(decode(FrameHeader, message.header), message.payload)
         for header, sent in answers.by_frame.pop((frame.header.session, frame.header.seq), ()):
             if sent is None and header.session not in pipelines:
-                continue  # before its first twist vision may not have had the camera's model: it only acknowledged
+                continue  # before its first twist the vision service may lack the camera model: it only acknowledged
             if header.session not in pipelines:
                 pipelines[header.session] = Pipeline(config, camera, detector)
             pipeline = pipelines[header.session]
             _give(pipeline, header, answers, config)
             if config.detector.kind == "boxes":
                 found = answers.boxes.get((frame.header.session, frame.header.seq))
-                if sent is not None and found is not None:  # what only acknowledges tells that the frame arrived
+                if sent is not None and found is not None:  # an acknowledgement shows that the frame arrived
                     yield Step(frame, sent, _by_boxes(pipeline, frame, found, camera, config))
             else:
                 yield Step(frame, sent, pipeline.step(frame))
@@ -140,14 +140,14 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
 def _by_boxes(
     pipeline: Pipeline, frame: Frame, found: Message, camera: CameraModel, config: VisionConfig
 ) -> PipelineAnswer:
-    """What the pipeline answers to what somebody else found in `frame`."""
+    """Return the answer of the pipeline to another publisher's detections in `frame`."""
     reader = BoxReader(config.boxes)
     reader.remember(frame.header)
     return pipeline.follow(*reader.read(found.header, found.payload, camera))
 
 
 def _give(pipeline: Pipeline, header: AnswerHeader, answers: _Answers, config: VisionConfig) -> None:
-    """What the answer of `header` went by besides its frame, if that is in the recording."""
+    """Return the scan and mission that the answer of `header` cites, if they are in the recording."""
     scan = answers.scans.get((header.echo.session, header.scan)) if header.scan is not None else None
     if scan is not None:
         pipeline.put_scan(*decode_scan(scan.header, scan.payload))
@@ -157,7 +157,7 @@ def _give(pipeline: Pipeline, header: AnswerHeader, answers: _Answers, config: V
 
 
 def _gather_cited(path: Path, answers: _Answers) -> int:
-    """Fill in the scans and missions that answers cite; returns how many are not in the recording."""
+    """Add the scans and missions that answers cite. Returns how many are not in the recording."""
     headers = [header for some in answers.by_frame.values() for header, _ in some]
     scans = {(one.echo.session, one.scan) for one in headers if one.scan is not None}
     missions = {one.mission for one in headers if one.mission is not None}
@@ -193,7 +193,7 @@ def _answers(path: Path) -> _Answers:
 
 
 def _answer_header(message: Message) -> AnswerHeader | None:
-    """The header of an answer of vision to a frame; None for everything else."""
+    """Return the header of a vision service's answer to a frame; None for another message."""
     if message.channel not in (TWIST, ACK) or message.source != SOURCE:
         return None
     try:
@@ -206,7 +206,7 @@ def _answer_header(message: Message) -> AnswerHeader | None:
 def _vision_config(path: Path) -> VisionConfig:
     text = read_about(path).get(VISION_CONFIG)
     if text is None:
-        raise ConfigError(f"{path} does not say how vision was configured, so it cannot be replayed")
+        raise ConfigError(f"{path} lacks the configuration of the vision service; record it again")
     return VisionConfig.model_validate_json(text)
 
 
@@ -214,4 +214,8 @@ def _first_camera(path: Path) -> CameraModel:
     for recorded in read_recording(path):
         if recorded.message.channel is CAMERA:
             return decode(CameraModel, recorded.message.payload, CAMERA.max_payload_bytes)
-    raise ConfigError(f"{path} holds no camera model")
+    raise ConfigError(f"{path} has no camera model; record it again")
+
+
+def _text(payload: bytes | None) -> str:
+    return "an acknowledgement" if payload is None else payload.decode("ascii", "replace")

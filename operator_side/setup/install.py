@@ -1,6 +1,6 @@
 """Writes systemd units for a robot or a vision service. Shell (files).
 
-The units are files that a person can read (`robot_side/systemd`, `vision_side/systemd`); paths, user and pins change.
+The units are readable files (`robot_side/systemd`, `vision_side/systemd`); only paths, user and pins change.
 """
 
 import os
@@ -19,12 +19,12 @@ _PROGRAM = "/opt/sightline/bin/sightline"
 _PYTHON = "/opt/sightline/bin/python"
 _DROP_IN = "gpio-low.conf"
 _DROP_INS_PINS = "gpio_low 10 9 8 7 17"
-"""As the file in `robot_side/systemd` has them: those of the example car."""
+"""The pins in the file of `robot_side/systemd`: those of the example car."""
 
 
 @dataclass(frozen=True)
 class InstallPlan:
-    """One file of systemd: where it goes and what it says."""
+    """One systemd file: its path and text."""
 
     service: str
     path: Path
@@ -32,15 +32,16 @@ class InstallPlan:
 
 
 def plan(service: str, program: Path, config: Path, user: str, unit_dir: Path = UNIT_DIR) -> InstallPlan:
-    """The unit of `service`, for this machine's paths.
+    """Make the unit of `service` for this machine's paths.
 
-    Raises ConfigError for a service that has none, or for a path or user that systemd would misread.
+    Raises:
+        ConfigError: the service has no unit, or systemd cannot read the path or user.
     """
     if service not in SERVICES:
-        raise ConfigError(f"service {service!r} has no unit: {' or '.join(SERVICES)}")
+        raise ConfigError(f"unknown service '{service}'; expected {' or '.join(SERVICES)}")
     for what, text in (("program", str(program)), ("config", str(config)), ("user", user)):
         if not text or any(letter.isspace() or letter in "%\"'\\" for letter in text):
-            raise ConfigError(f"{what} {text!r} cannot stand in a unit: no spaces, quotes or %")
+            raise ConfigError(f"invalid {what} '{text}' for a unit; remove spaces, quotes and %")
     name = f"sightline-{service}.service"
     unit = files(f"sightline.{service}_side").joinpath("systemd", name).read_text()
     unit = unit.replace("User=sightline", f"User={user}")
@@ -48,9 +49,10 @@ def plan(service: str, program: Path, config: Path, user: str, unit_dir: Path = 
 
 
 def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UNIT_DIR) -> InstallPlan | None:
-    """What puts the pins of a robot whose drive is `gpio` low, beside its unit; None for another drive.
+    """Make the file that sets the pins of a `gpio` drive low; None for another drive.
 
-    Raises ConfigError where the drive's own options are wrong.
+    Raises:
+        ConfigError: the options of the drive are invalid.
     """
     if robot.motors.kind != "gpio":
         return None
@@ -66,12 +68,12 @@ def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UN
 
 
 def drop_in_path(unit_dir: Path = UNIT_DIR) -> Path:
-    """Where it lies, or lay."""
+    """Return the path of the second file."""
     return unit_dir / "sightline-robot.service.d" / _DROP_IN
 
 
 def _fitted(unit: str, service: str, program: Path, config: Path) -> str:
-    """With this machine's paths, and without the comments for who reads the file as it comes."""
+    """Insert this machine's paths and remove the comments, which describe the packaged file."""
     fitted = (
         unit.replace(_PROGRAM, str(program)).replace(_PYTHON, str(program.with_name("python")))
         .replace(f"/etc/sightline/{service}.toml", str(config))
@@ -81,10 +83,12 @@ def _fitted(unit: str, service: str, program: Path, config: Path) -> str:
 
 
 def write(planned: InstallPlan, beside: InstallPlan | None = None) -> None:
-    """Put the unit in place, and what belongs beside it, and begin it, now and at every start of the machine. One that
-    runs already begins anew: with other pins than those that are put low at its end it must not go on.
+    """Write the unit and its second file, and start it now and at boot.
 
-    Raises ConfigError, with nothing begun, where it may not be written or systemd does not run.
+    A running service restarts: otherwise it may drive other pins than those that its end sets low.
+
+    Raises:
+        ConfigError: a file cannot be written, or systemd does not run; nothing is started.
     """
     for one in [planned, *([beside] if beside else [])]:
         _put(one)
@@ -98,17 +102,17 @@ def _put(planned: InstallPlan) -> None:
             planned.path.parent.mkdir(exist_ok=True)
         planned.path.write_text(planned.text)
     except OSError as error:
-        raise ConfigError(f"cannot write {planned.path}: {error.strerror}; try with sudo") from None
+        raise ConfigError(f"cannot write {planned.path}: {error.strerror}; run it with sudo") from None
 
 
 def take_away(path: Path) -> bool:
-    """Remove what another drive left beside the unit; whether there was anything. Raises ConfigError."""
+    """Remove the second file of an earlier drive. Returns whether it existed. Raises ConfigError."""
     try:
         path.unlink()
     except FileNotFoundError:
         return False
     except OSError as error:
-        raise ConfigError(f"cannot remove {path}: {error.strerror}; try with sudo") from None
+        raise ConfigError(f"cannot remove {path}: {error.strerror}; run it with sudo") from None
     return True
 
 
@@ -117,7 +121,7 @@ def _systemctl(arguments: list[str]) -> None:
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, env={**os.environ, "SYSTEMD_COLORS": "0"})
     except FileNotFoundError:
-        raise ConfigError("no systemd here; the unit is written, start the service by your own means") from None
+        raise ConfigError("systemd is missing; the unit is written, start the service in another way") from None
     except subprocess.CalledProcessError as error:
-        said = (error.stderr or error.stdout).strip().splitlines()
-        raise ConfigError(f"{' '.join(command)}: {said[-1] if said else 'failed'}") from None
+        lines = (error.stderr or error.stdout).strip().splitlines()
+        raise ConfigError(f"{' '.join(command)}: {lines[-1] if lines else 'failed'}") from None

@@ -1,7 +1,7 @@
 """A private authority with a certificate and a token for each role. Shell (files).
 
-Written with `cryptography`, which is what Python's own packaging relies on; elliptic-curve keys (P-256) keep the TLS
-handshake short on a small robot. Only `ca.pem` and the files of its own role belong on a machine, and all tokens on a
+It uses `cryptography`, as Python's own packaging does. Elliptic-curve keys (P-256) keep the TLS handshake short on a
+small robot. Only `ca.pem` and the files of its own role belong on a machine, and all tokens on a
 robot that serves WebSocket; `ca.key` belongs on none.
 """
 
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
 DAYS = 825
-"""The longest life that common TLS stacks accept of a certificate."""
+"""The longest validity that common TLS stacks accept."""
 _TOKEN_BYTES = 24  # 192 bits, 32 letters
 LOOPBACK = ("localhost", "127.0.0.1")
-_BEGUN_EARLIER = datetime.timedelta(days=1)  # machines whose clocks differ by hours must still agree
+_BEGUN_EARLIER = datetime.timedelta(days=1)  # for machines whose clocks differ by hours
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a person wants to know of one certificate file."""
+    """The role, hosts and expiry of one certificate file."""
 
     file: Path
     role: str
@@ -40,17 +40,18 @@ class Certificate:
 
 
 def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
-    """A new authority and a certificate for each role, valid for `hosts` besides loopback. Returns the files.
+    """Create an authority and a certificate for each role, valid for `hosts` and loopback. Returns the files.
 
-    Raises ConfigError, and changes nothing, if the folder holds keys already or cannot be written.
+    Raises:
+        ConfigError: the folder already has keys or cannot be written; nothing is changed.
     """
     if (folder / "ca.pem").exists():
-        raise ConfigError(f"{folder} holds keys already; choose another folder, or delete it to begin anew")
+        raise ConfigError(f"{folder} already has keys; choose another folder or delete this one")
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
 
     for host in hosts:
-        _general_name(host)  # a host that is none is refused before anything is written
+        _general_name(host)  # rejects an invalid host before anything is written
     key = ec.generate_private_key(ec.SECP256R1())
     builder = _builder("sightline authority", "sightline authority", key, days)
     builder = builder.add_extension(x509.BasicConstraints(True, 0), True)
@@ -66,12 +67,13 @@ def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
 
 
 def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
-    """A new certificate and WebSocket token of `role`, in place of the old; signed by the authority in `folder`.
+    """Create a new certificate and WebSocket token of `role`, signed by the authority in `folder`.
 
-    Raises ConfigError for a role or host that is none, or without the authority's own key.
+    Raises:
+        ConfigError: the role or a host is invalid, or the key of the authority is missing.
     """
     if role not in ROLES:
-        raise ConfigError(f"role {role!r} is none: {', '.join(ROLES)}")
+        raise ConfigError(f"unknown role '{role}'; expected {', '.join(ROLES)}")
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID as Usage
@@ -90,10 +92,10 @@ def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> li
 
 
 def look(folder: Path) -> list[Certificate]:
-    """The certificates in `folder`. Raises ConfigError if there is none or one cannot be read."""
+    """Read the certificates in `folder`. Raises ConfigError without one or for an invalid one."""
     found = [_read(file) for file in sorted(folder.glob("*.pem"))]
     if not found:
-        raise ConfigError(f"no certificates in {folder}; make them with: sightline keys init {folder}")
+        raise ConfigError(f"no certificates in {folder}; create them with: sightline keys init {folder}")
     return found
 
 
@@ -127,7 +129,9 @@ def _general_name(host: str) -> x509.GeneralName:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
         if not host.isascii() or not all(part.replace("-", "a").isalnum() for part in host.split(".")):
-            raise ConfigError(f"host {host!r} is no name or address, e.g. robot.local or 192.168.1.20") from None
+            raise ConfigError(
+                f"invalid host '{host}'; expected a name or address, e.g. robot.local or 192.168.1.20"
+            ) from None
         return x509.DNSName(host)
 
 
@@ -168,10 +172,10 @@ def _authority_key(folder: Path) -> EllipticCurvePrivateKey:
     try:
         key = load_pem_private_key((folder / "ca.key").read_bytes(), None)
     except (OSError, ValueError):
-        raise ConfigError(f"no authority in {folder}: ca.key is missing or broken; use the folder that "
-                          "`sightline keys init` made") from None
+        raise ConfigError(f"no authority in {folder}: ca.key is missing or damaged; use the folder of "
+                          "`sightline keys init`") from None
     if not isinstance(key, Key):
-        raise ConfigError(f"{folder}/ca.key is not of `sightline keys init`")
+        raise ConfigError(f"{folder}/ca.key has another kind of key; use the folder of `sightline keys init`")
     return key
 
 
@@ -182,7 +186,7 @@ def _read(file: Path) -> Certificate:
     try:
         read = x509.load_pem_x509_certificate(file.read_bytes())
     except (OSError, ValueError):
-        raise ConfigError(f"{file} is no certificate; make new ones with: sightline keys init") from None
+        raise ConfigError(f"invalid certificate {file}; create new ones with: sightline keys init") from None
     names = read.extensions
     try:
         alternative = names.get_extension_for_class(x509.SubjectAlternativeName).value

@@ -1,6 +1,6 @@
-"""Runs a Zenoh router that robots, visions and operators of one site connect to. Shell.
+"""Runs a Zenoh router to which robots, vision services and operators of one site connect. Shell.
 
-It is a Zenoh router and nothing else: a stock `zenohd` does as well, without the access rules of `--secure`.
+A stock `zenohd` also works, without the access rules of `--secure`.
 """
 
 import logging
@@ -20,7 +20,7 @@ _REACH_S = 5.0
 
 
 def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
-    """Serve until SIGTERM or SIGINT. Raises ConfigError, LinkError as `open_session` does."""
+    """Serve until SIGTERM or SIGINT. Raises ConfigError and LinkError as `open_session` does."""
     check_zenoh_endpoints(listen, connect)
     secured = load_role_keys(secure, ROBOT_ROLE)
     ending = threading.Event()
@@ -30,7 +30,7 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
     ):
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: ending.set())
-        rules = f"keys of {secure}, access rules on" if secure else "plain, open to whoever reaches it"
+        rules = f"keys of {secure}, access rules on" if secure else "no keys, every client that reaches it may connect"
         _log.info("router: on %s; %s", ", ".join(listen), rules)
         ending.wait()
     _log.info("router: ended")

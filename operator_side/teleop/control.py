@@ -470,7 +470,7 @@ class Teleop:
             yield self._request(verb)
 
     def _may_request(self, verb: Verb, now_us: int) -> bool:
-        """What lets a robot move cites a status, so one must have come."""
+        """Repeat a request; one that permits motion cites a status, so one must have come."""
         return now_us >= self._request_due_us and (verb is Verb.RELEASE or self.report is not None)
 
     def _repeat_request(self, verb: Verb, now_us: int, for_us: int) -> None:

@@ -13,8 +13,8 @@ def test_a_file_that_can_be_written_passes(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "words"), [
-    ("none/x.toml", "there is no folder"), ("", "is a folder"), ("locked/x.toml", "cannot be written"),
-    ("locked/inner/x.toml", "cannot be written"),
+    ("none/x.toml", "no folder"), ("", "is a folder"), ("locked/x.toml", "cannot write"),
+    ("locked/inner/x.toml", "cannot write"),
 ])  # fmt: skip
 def test_what_cannot_be_is_said(tmp_path, monkeypatch, name, words):
     locked = tmp_path / "locked"

@@ -69,11 +69,11 @@ async function pick(to) {
   const isClick = Math.hypot(to.screenX - from.screenX, to.screenY - from.screenY) < CLICK_PX;
   const [x_px, y_px] = [Math.min(from.x, to.x), Math.min(from.y, to.y)];
   const [width_px, height_px] = isClick ? [0, 0] : [Math.abs(from.x - to.x) + 1, Math.abs(from.y - to.y) + 1];
-  const asked = { number, x_px: isClick ? to.x : x_px, y_px: isClick ? to.y : y_px, width_px, height_px };
-  await show(await ask("pick", asked));
+  const request = { number, x_px: isClick ? to.x : x_px, y_px: isClick ? to.y : y_px, width_px, height_px };
+  await show(await post("pick", request));
 }
 
-async function ask(what, value) {
+async function post(what, value) {
   const answer = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(value) });
   return answer.json();
 }
@@ -120,10 +120,10 @@ canvas.onpointerup = async (event) => {
 };
 part("again").onclick = again;
 part("use").onclick = async () => {
-  const { said, error } = await ask("use", {});
-  write("said", said);
+  const { note, error } = await post("use", {});
+  write("note", note);
   write("error", error);
-  if (said !== undefined) for (const id of ["use", "again"]) part(id).disabled = true;
+  if (note !== undefined) for (const id of ["use", "again"]) part(id).disabled = true;
 };
 part("pictures").oninput = ({ target }) => {
   again();

@@ -1,7 +1,7 @@
 /**
  * @file Shows one robot's pictures and state. Shell.
  *
- * The next picture is asked for when the last was drawn, so nothing queues between the robot's vision and this page.
+ * The page requests the next image after it drew the last, so nothing queues between the vision service and this page.
  */
 
 const OLD_MS = 500; // what is older than this must not look like the present
@@ -11,12 +11,12 @@ const RETRY_MS = 500;
 const part = (id) => document.getElementById(id);
 const canvas = part("picture");
 const drawnAt_ms = []; // of the last second
-let last = 0; // number of the picture that came last, drawn or not: none is asked for before it is known to have come
+let last = 0; // number of the last image, drawn or not: the page requests the next one only after its arrival
 let newest = { channel: "", size: "", age_ms: null };
 
 const pause = (time_ms) => new Promise((resolve) => setTimeout(resolve, time_ms));
 
-function tell(link) {
+function report(link) {
   part("link").textContent = link;
   part("link").className = link === "connected" ? "" : "lost";
 }
@@ -47,8 +47,8 @@ async function showPictures() {
   }
 }
 
-function showState({ robot, heard, state, reason, lines }) {
-  tell(heard ? "connected" : `nothing is heard from ${robot}`);
+function showState({ robot, online, state, reason, lines }) {
+  report(online ? "connected" : `no status from ${robot}`);
   part("state").textContent = state;
   part("state").className = state;
   part("reason").textContent = reason;
@@ -64,7 +64,7 @@ async function showStates() {
     try {
       showState(await (await fetch("state")).json());
     } catch {
-      tell("`sightline watch` has ended");
+      report("`sightline watch` has ended");
     }
     await pause(STATE_MS);
   }

@@ -80,8 +80,8 @@ def test_vision_follows_by_what_was_picked():
 
 
 @pytest.mark.parametrize(("picture", "words"), [
-    (np.full((240, 320, 3), 140, np.uint8), "there is no colour at 110,112.*: it is grey"),
-    (np.full((240, 320, 3), 255, np.uint8), "grey"),
+    (np.full((240, 320, 3), 140, np.uint8), "no color at 110,112.*: it is gray"),
+    (np.full((240, 320, 3), 255, np.uint8), "gray"),
     (np.full((240, 320, 3), 10, np.uint8), "too dark"),
     (np.zeros((240, 320, 3), np.uint8), "too dark"),
 ])
@@ -94,7 +94,7 @@ def test_where_there_is_no_colour_none_is_picked(picture, words):
 
 @pytest.mark.parametrize("place", [Box(320, 0), Box(0, 240), Box(-1, 5), Box(310, 10, 11, 5), Box(0, 239, 1, 2)])
 def test_a_place_outside_is_refused(place):
-    with pytest.raises(ConfigError, match="is outside the picture, which is 320x240"):
+    with pytest.raises(ConfigError, match="is outside the image of 320x240"):
         pick(ball_picture(60), place)
 
 
@@ -102,7 +102,7 @@ def test_several_colours_in_one_box_are_refused():
     stripes = np.zeros((60, 60, 3), np.uint8)
     for number in range(6):
         stripes[:, number * 10 : number * 10 + 10] = bgr_of(number * 60)
-    with pytest.raises(ConfigError, match="no one colour at 0,0,60,60: the commonest covers 1"):
+    with pytest.raises(ConfigError, match="several colors at 0,0,60,60: the most common covers 1"):
         pick(stripes, Box(0, 0, 60, 60))
 
 
@@ -117,7 +117,7 @@ def test_a_range_that_marks_half_of_a_picture_is_refused():
         if not refused:
             check_trial(trial)
             continue
-        with pytest.raises(ConfigError, match=r"marks 5[0-9]% of a picture: it is the background's colour too"):
+        with pytest.raises(ConfigError, match=r"marks 5[0-9]% of an image: the background has the same color"):
             check_trial(trial)
 
 
@@ -125,7 +125,7 @@ def test_a_range_that_marks_only_speckle_is_refused():
     speckled = np.full((240, 320, 3), 120, np.uint8)
     speckled[112, 110] = bgr_of(20)
     ranges = (HsvRange(hue_low_deg=10, hue_high_deg=30),)
-    with pytest.raises(ConfigError, match="marks nothing that is larger than speckle"):
+    with pytest.raises(ConfigError, match="marks only speckle"):
         check_trial(try_out(ranges, [speckled]))
 
 
@@ -144,5 +144,5 @@ def test_ranges_and_trials_in_words():
     two = ball_picture(0)
     two[:40, :40] = bgr_of(0)
     several = trial_text(try_out(ranges, [two, ball_picture(0), ball_picture(120)]))
-    assert several.endswith("in 0 to 2 blobs; something in 2 of 3 pictures")
-    assert "in 1 blob; something in 1 of 1" in trial_text(try_out(ranges, [ball_picture(0)]))
+    assert several.endswith("in 0 to 2 blobs; marks in 2 of 3 images")
+    assert "in 1 blob; marks in 1 of 1" in trial_text(try_out(ranges, [ball_picture(0)]))

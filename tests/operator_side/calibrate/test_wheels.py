@@ -20,18 +20,18 @@ from tests.fixtures.terminal import Terminal
 GPIO = PluginChoice(kind="sightline.robot_side.hardware.gpio:GpioDrive", options={"wheel_radius_m": 0.0325})
 
 
-class Person:
-    """Answers by what the question contains; keeps all that was said."""
+class Operator:
+    """Answers by the words of the question; stores all printed lines."""
 
     def __init__(self, **answers):
-        self.answers, self.said, self.asked = answers, [], []
+        self.answers, self.lines, self.questions = answers, [], []
 
-    def ask(self, question):
-        self.asked.append(question)
-        known = ("off_the_ground", "was_it_so", "what_turned", "one_of")
+    def answer(self, question):
+        self.questions.append(question)
+        known = ("off_the_ground", "is_that_right", "what_turned", "one_of")
         key = next(key for key in known if key.replace("_", " ") in question)
-        answer = self.answers.get(key, "y")
-        return answer.pop(0) if isinstance(answer, list) else answer
+        given = self.answers.get(key, "y")
+        return given.pop(0) if isinstance(given, list) else given
 
 
 @pytest.fixture
@@ -41,50 +41,50 @@ def robot(tmp_path, monkeypatch):
     return RobotConfig(drive=PluginChoice(kind="log", options={"path": str(log)})), log
 
 
-def told(log):
-    """(left, right) of all that the motors were told."""
+def commanded(log):
+    """Return (left, right) of each motor command."""
     return [tuple(float(cell) for cell in line.split(",")[1:]) for line in log.read_text().splitlines()]
 
 
 def test_each_wheel_turns_by_itself_each_way_and_stops(robot):
     config, log = robot
-    person = Person()
-    assert wheel_test.try_wheels(config, person.ask, person.said.append)
+    operator = Operator()
+    assert wheel_test.try_wheels(config, operator.answer, operator.lines.append)
     speed = 0.25 / 0.035
     turns = [(speed, 0), (-speed, 0), (0, speed), (0, -speed)]
     expected = [pair for turn in turns for pair in (turn, (0, 0))] + [(0, 0)]
-    assert told(log) == [pytest.approx(pair, abs=1e-4) for pair in expected]
-    text = "\n".join(person.said)
-    assert "left wheel, forward: its top moves away from you" in text and text.endswith("all as it should be")
-    assert person.asked[0] == "are its wheels off the ground? y/n" and len(person.asked) == 5
+    assert commanded(log) == [pytest.approx(pair, abs=1e-4) for pair in expected]
+    text = "\n".join(operator.lines)
+    assert "left wheel, forward: its top moves away from you" in text and text.endswith("all wheels turn as expected")
+    assert operator.questions[0] == "are its wheels off the ground? y/n" and len(operator.questions) == 5
 
 
 @pytest.mark.parametrize("answer", ["n", "", "no", "maybe", " "])
 def test_nothing_moves_unless_the_wheels_are_off_the_ground(robot, answer):
     config, log = robot
-    person = Person(off_the_ground=answer)
-    assert not wheel_test.try_wheels(config, person.ask, person.said.append)
+    operator = Operator(off_the_ground=answer)
+    assert not wheel_test.try_wheels(config, operator.answer, operator.lines.append)
     assert not log.exists()
-    assert person.said[-1] == "nothing has moved"
+    assert operator.lines[-1] == "nothing moved"
 
 
-@pytest.mark.parametrize(("options", "turn", "wrong", "says"), [
+@pytest.mark.parametrize(("options", "turn", "wrong", "expected"), [
     ({}, 0, "w", "set drive.options.left_reversed = true"), ({}, 2, "w", "set drive.options.right_reversed = true"),
     ({"left_reversed": True}, 1, "w", "set drive.options.left_reversed = false"),
     ({"swapped": True}, 0, "w", "set drive.options.right_reversed = true"),
     ({}, 0, "o", "set drive.options.swapped = true"), ({"swapped": True}, 3, "o", "set drive.options.swapped = false"),
-    ({}, 0, "b", "two wires of different motors"), ({}, 0, "n", "is the motors' supply on"),
+    ({}, 0, "b", "two wires of different motors"), ({}, 0, "n", "check the motors' supply"),
 ])  # fmt: skip
-def test_a_wheel_that_turned_otherwise_names_what_to_change(options, turn, wrong, says):
+def test_a_wheel_that_turned_otherwise_names_what_to_change(options, turn, wrong, expected):
     choice = PluginChoice(kind=GPIO.kind, options={**GPIO.options, **options})
     assert says in wheel_test._advice(choice, wheel_test.TURNS[turn], wrong)
 
 
 def test_a_drive_without_such_options_is_wired_differently(robot):
     config, _ = robot
-    person = Person(was_it_so=["n", "y", "n", "y"], what_turned=["?", "o"], one_of="w")
-    assert not wheel_test.try_wheels(config, person.ask, person.said.append)
-    text = "\n".join(person.said)
+    operator = Operator(is_that_right=["n", "y", "n", "y"], what_turned=["?", "o"], one_of="w")
+    assert not wheel_test.try_wheels(config, operator.answer, operator.lines.append)
+    text = "\n".join(operator.lines)
     assert "left wheel, forward: it turned the wrong way: exchange the two wires of the left motor" in text
     assert "right wheel, forward: the other wheel turned: exchange the motors' plugs" in text
 
@@ -94,7 +94,7 @@ def test_a_drive_that_fails_in_the_middle_is_told_zero_and_closed(monkeypatch, r
     monkeypatch.setattr(wheel_test.time, "sleep", lambda _s: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         wheel_test.try_wheels(config, None, lambda _line: None)
-    assert told(log)[-1] == (0.0, 0.0) and len(told(log)) == 3
+    assert commanded(log)[-1] == (0.0, 0.0) and len(commanded(log)) == 3
 
 
 @pytest.mark.parametrize("number", EXIT_SIGNALS)
@@ -104,10 +104,10 @@ def test_whatever_a_key_or_a_terminal_sends_ends_with_zero(monkeypatch, robot, n
     monkeypatch.setattr(wheel_test.time, "sleep", lambda _s: signal.raise_signal(number))
     with pytest.raises(KeyboardInterrupt):
         wheel_test.try_wheels(config, None, lambda _line: None)
-    assert told(log)[-1] == (0.0, 0.0) and signal.getsignal(number) is before
+    assert commanded(log)[-1] == (0.0, 0.0) and signal.getsignal(number) is before
 
 
-@pytest.mark.parametrize(("arguments", "says"), [
+@pytest.mark.parametrize(("arguments", "expected"), [
     (["robot", "test-wheels"], "lift the robot, then add --yes"),
     (["robot", "test-wheel"], "unknown task 'test-wheel'; did you mean 'test-wheels'?"),
     (["robot", "r7"], "--robot r7"),
@@ -116,7 +116,7 @@ def test_whatever_a_key_or_a_terminal_sends_ends_with_zero(monkeypatch, robot, n
     (["calibrate", "drive", "--duty", "0.4,x"], "--duty"),
     (["calibrate", "drive", "--duty", "0.4,1.4"], "up to 1"),
     (["calibrate", "drive", "--yes", "--set", "drive.kind=log"], "drive 'log' has no duty to calibrate"),
-    (["calibrate", "drive", "--yes", "--out", "/nowhere/drive.toml"], "there is no folder /nowhere"),
+    (["calibrate", "drive", "--yes", "--out", "/nowhere/drive.toml"], "no folder /nowhere"),
 ])  # fmt: skip
 def test_a_mistake_is_one_line_and_nothing_moves(capsys, monkeypatch, arguments, says):
     monkeypatch.setattr(sys, "stdin", io.StringIO())
@@ -148,12 +148,12 @@ def test_a_signal_in_the_middle_of_a_turn_is_zero_first(tmp_path, opened, number
     log = tmp_path / "drive.csv"
     terminal = opened("robot", "test-wheels", "--set", "drive.kind=log", "--set", f"drive.options.path={log}")
     assert terminal.shows("off the ground? y/n")
-    assert not log.exists() or told(log) == []
+    assert not log.exists() or commanded(log) == []
     terminal.types("y\n")
-    assert until(lambda: log.exists() and told(log) and told(log)[-1][0] > 0)
+    assert until(lambda: log.exists() and commanded(log) and commanded(log)[-1][0] > 0)
     terminal.process.send_signal(number)
     assert terminal.process.wait(3) == 130
-    assert told(log)[-1] == (0.0, 0.0)
+    assert commanded(log)[-1] == (0.0, 0.0)
 
 
 def test_a_drive_is_calibrated_at_a_terminal(tmp_path, opened, monkeypatch):

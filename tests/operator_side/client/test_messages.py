@@ -39,7 +39,7 @@ def test_pictures_are_their_size_and_twists_their_numbers():
 
 def test_a_scan_is_summed_up_and_in_full_as_json():
     message = usual("scan", payload=struct.pack("<4f", 0.5, 1.25, math.inf, 8.0))
-    assert "4 rays, 3 see something, nearest 0.50 m" in message_line(message)
+    assert "4 rays, 3 detect something, nearest 0.50 m" in message_line(message)
     assert message_object(message)["payload"]["ranges_m"] == [0.5, 1.25, None, 8.0]
     assert "nothing near" in message_line(usual("scan", payload=struct.pack("<2f", math.inf, math.inf)))
 
@@ -52,7 +52,7 @@ def test_a_guest_without_a_header_is_shown():
 
 def test_what_is_refused_says_why():
     message = Message(TWIST, "vision", b"", b"nan|0")
-    assert message_line(message) == "twist/vision: refused: NOT_FINITE: " + message_object(message)["error"][12:]
+    assert message_line(message) == "twist/vision: invalid: NOT_FINITE: " + message_object(message)["error"][12:]
     assert message_object(message)["payload_bytes"] == 5
 
 

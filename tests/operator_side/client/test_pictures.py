@@ -93,19 +93,19 @@ def test_nobody_is_listened_to_while_nobody_looks(site):
 
 def test_what_is_no_picture_is_counted_and_waited_past(site):
     pictures = Pictures(site.link, "viewer")
-    assert until(lambda: site.overlay(b"junk") or (pictures.take(0.05) is None and pictures.refused), 5.0)
+    assert until(lambda: site.overlay(b"junk") or (pictures.take(0.05) is None and pictures.rejected), 5.0)
     assert taken(pictures, site.overlay).width_px == 640
 
 
 def test_the_robots_silence_is_noticed(site, monkeypatch):
     monkeypatch.setattr(pictures_module, "SILENT_S", 0.3)
     pictures = Pictures(site.link, "viewer")
-    assert not pictures.is_heard
+    assert not pictures.is_online
     said = encode(Stamp(session="0000abcd", seq=1, t_us=5_000_000))
-    assert until(lambda: site.robot.publish(STATUS, said, b"{}") and pictures.is_heard)
+    assert until(lambda: site.robot.publish(STATUS, said, b"{}") and pictures.is_online)
     shot = taken(pictures, site.overlay)
     assert pictures.age_us(shot) > 4_000_000
-    assert until(lambda: not pictures.is_heard, 2.0)
+    assert until(lambda: not pictures.is_online, 2.0)
 
 
 def test_a_page_gets_the_next_picture_when_it_asks_and_none_is_fetched_for_nobody(site, monkeypatch):

@@ -1,4 +1,4 @@
-"""A small page on loopback: for this machine alone, bounded, and one clear word to who asks wrongly."""
+"""A small page on loopback: for this machine only, bounded, and one clear word to who asks wrongly."""
 
 import http.client
 import json
@@ -67,7 +67,7 @@ def test_this_machine_by_any_name(port, host):
 )
 def test_another_name_is_refused(port, host):
     with asked(port, "GET", "/echo", Host=host.format(port=port)) as (answer, body):
-        assert answer.status == 403 and b"this machine alone" in body
+        assert answer.status == 403 and b"this machine only" in body
 
 
 def test_what_changes_something_comes_from_the_page_itself(port):
@@ -85,8 +85,8 @@ def test_a_body_has_a_bound(port, length):
 
 
 def test_who_asks_wrongly_is_told_and_served_again(port):
-    for path, body, words in (("/refuse", b"{}", "not like this"), ("/number", b"{", "not asked rightly"),
-                              ("/number", b"[]", "not asked rightly"), ("/number", b'{"number":"x"}', "not asked")):
+    for path, body, words in (("/refuse", b"{}", "not like this"), ("/number", b"{", "invalid request"),
+                              ("/number", b"[]", "invalid request"), ("/number", b'{"number":"x"}', "invalid request")):
         with asked(port, "POST", path, body) as (answer, said):
             assert answer.status == 400 and words in json.loads(said)["error"]
     with asked(port, "GET", "/nothing") as (answer, _):

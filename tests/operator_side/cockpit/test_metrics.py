@@ -119,4 +119,4 @@ def _health_if_up(port):
 @pytest.mark.parametrize("where", ["", "x", "0", "70000", "1:2:3", "a b:9"])
 def test_a_place_that_is_none_is_refused(where, capsys):
     assert cli.run(["vision", "--metrics", where]) == 2
-    assert capsys.readouterr().err.startswith(f"error: --metrics {where!r} is no place: write a port")
+    assert capsys.readouterr().err.startswith(f"error: invalid --metrics '{where}'")

@@ -21,7 +21,7 @@ class Nothing:
     def collect(self):
         return iter(())
 
-    def is_heard(self):
+    def is_healthy(self):
         return True
 
 
@@ -42,7 +42,7 @@ def test_a_connection_that_says_nothing_holds_up_neither_others_nor_the_end(said
         idle = [socket.create_connection(("127.0.0.1", port)) for _ in range(3)]
         for one in idle:
             one.sendall(said)
-        assert _health(port) == b"heard\n"
+        assert _health(port) == b"ok\n"
         began_s = time.monotonic()
     assert time.monotonic() - began_s < 3
     for one in idle:
@@ -68,7 +68,7 @@ def _closed_by_server(held):
 
 def _is_served(port):
     try:
-        return _health(port) == b"heard\n"
+        return _health(port) == b"ok\n"
     except OSError:
         return False
 
@@ -81,5 +81,5 @@ def test_a_connection_that_says_nothing_is_let_go_of_in_silence(monkeypatch, cap
         with socket.create_connection(("127.0.0.1", port)) as gone:
             gone.sendall(b"GET /metrics HTTP/1.1\r\n")
             gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
-        assert until(lambda: _health(port) == b"heard\n")
+        assert until(lambda: _health(port) == b"ok\n")
     assert capfd.readouterr().err == ""

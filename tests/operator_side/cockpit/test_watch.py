@@ -129,7 +129,7 @@ def test_a_capture_without_a_robot_leaves_nothing(tmp_path: Path, capsys: pytest
     for arguments, code, words in (
         (["--out", str(tmp_path / "x.gif")], 2, "ends in .png or .jpg, a video in .mp4"),
         (["--out", str(tmp_path / "x.png"), "--seconds", "3"], 2, "--seconds is for a video"),
-        (["--out", str(tmp_path / "none" / "x.png")], 2, "there is no folder"),
+        (["--out", str(tmp_path / "none" / "x.png")], 2, "no folder"),
         (["--out", str(tmp_path / "x.mp4"), *nobody], 4, "tcp/127.0.0.1:1"),
     ):
         assert run(["capture", *arguments]) == code

@@ -84,7 +84,7 @@ _ARP = "IP address HW type Flags HW address Mask Device\n192.168.1.7 0x1 {} aa:b
 
 
 @pytest.mark.parametrize(("flags", "host", "words"), [
-    ("0x0", "192.168.1.7", "client isolation"), ("0x2", "192.168.1.7", "it is a firewall"), ("0x2", "192.168.1.8", ""),
+    ("0x0", "192.168.1.7", "client isolation"), ("0x2", "192.168.1.7", "a firewall blocks it"), ("0x2", "192.168.1.8", ""),
     ("0x0", "no-such-name.invalid", ""),
 ])  # fmt: skip
 def test_a_machine_that_is_kept_apart_is_told_from_a_firewall(tmp_path, flags, host, words):
@@ -95,7 +95,7 @@ def test_a_machine_that_is_kept_apart_is_told_from_a_firewall(tmp_path, flags, h
 
 
 @pytest.mark.parametrize(("offered", "ok", "said"), [
-    (["YUYV", "MJPG"], True, "passed through"), (["YUYV"], None, "each picture is encoded here"),
+    (["YUYV", "MJPG"], True, "passes unchanged"), (["YUYV"], None, "this machine encodes each image"),
     (["GREY"], False, "neither MJPG nor YUYV"),
 ])  # fmt: skip
 def test_the_modes_of_a_camera_are_told_with_what_they_cost(capsys, monkeypatch, tmp_path, offered, ok, said):
@@ -163,11 +163,11 @@ def test_certificates_that_cannot_be_read_here_are_told_with_the_extra(capsys, t
 
 
 def test_nobody_listening_is_told_apart_from_no_such_name(capsys, monkeypatch):
-    monkeypatch.setattr(between, "neighbour", lambda host: "; it is a firewall")
+    monkeypatch.setattr(between, "neighbour", lambda host: "; a firewall blocks it")
     refused = _checks(capsys, "--peer", free_endpoint())["reach"]
     assert "firewall" not in refused["fix"], "who refuses is there"
     unknown = _checks(capsys, "--peer", "tcp/no-such-name.invalid:7447")["reach"]
-    assert "nobody listens" in refused["fix"] and "does not resolve" in unknown["fix"]
+    assert "the port is closed" in refused["fix"] and "does not resolve" in unknown["fix"]
     assert not refused["ok"] and not unknown["ok"]
 
 

@@ -89,7 +89,7 @@ def test_a_service_that_could_not_begin_is_not_installed(capsys, tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_said(tmp_path):
     planned = install.plan("vision", PROGRAM, CONFIG, "pi", tmp_path / "absent")
-    with pytest.raises(ConfigError, match=r"cannot write .*: No such file or directory; try with sudo"):
+    with pytest.raises(ConfigError, match=r"cannot write .*: No such file or directory; run it with sudo"):
         install.write(planned)
 
 
