@@ -1,4 +1,4 @@
-"""Where a result is to go is looked at before the work: every way it cannot be is one line."""
+"""The place of a result is checked before the work; each problem is one line."""
 
 import pytest
 
@@ -16,13 +16,13 @@ def test_a_file_that_can_be_written_passes(tmp_path):
     ("none/x.toml", "no folder"), ("", "is a folder"), ("locked/x.toml", "cannot write"),
     ("locked/inner/x.toml", "cannot write"),
 ])  # fmt: skip
-def test_what_cannot_be_is_said(tmp_path, monkeypatch, name, words):
+def test_unwritable_file_is_reported(tmp_path, monkeypatch, name, words):
     locked = tmp_path / "locked"
     locked.mkdir()
     kind = type(tmp_path)
     is_dir = kind.is_dir
 
-    def refused(path):  # root may look everywhere; others are told so
+    def refused(path):  # root may read everywhere; other users get this
         if locked in path.parents:
             raise PermissionError
         return is_dir(path)

@@ -57,7 +57,7 @@ def turned(about_x_deg: float, about_y_deg: float, about_z_deg: float = 0.0) -> 
 
 
 def tilted_views(model: CameraModel = TRUTH) -> list[bytes]:
-    """Twelve views as a person is asked to take them: tilted both ways, near and far, in the corners."""
+    """Twelve views as the tutorial describes them: tilted both ways, near and far, in the corners."""
     seen = rays(model)
     poses = [
         (about_x, about_y, 7.0 * number, x, y, z)

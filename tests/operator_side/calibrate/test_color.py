@@ -93,12 +93,12 @@ def test_where_there_is_no_colour_none_is_picked(picture, words):
 
 
 @pytest.mark.parametrize("place", [Box(320, 0), Box(0, 240), Box(-1, 5), Box(310, 10, 11, 5), Box(0, 239, 1, 2)])
-def test_a_place_outside_is_refused(place):
+def test_place_outside_is_rejected(place):
     with pytest.raises(ConfigError, match="is outside the image of 320x240"):
         pick(ball_picture(60), place)
 
 
-def test_several_colours_in_one_box_are_refused():
+def test_several_colors_in_one_box_are_rejected():
     stripes = np.zeros((60, 60, 3), np.uint8)
     for number in range(6):
         stripes[:, number * 10 : number * 10 + 10] = bgr_of(number * 60)
@@ -106,7 +106,7 @@ def test_several_colours_in_one_box_are_refused():
         pick(stripes, Box(0, 0, 60, 60))
 
 
-def test_a_range_that_marks_half_of_a_picture_is_refused():
+def test_range_that_marks_half_of_an_image_is_rejected():
     wall = np.full((240, 320, 3), bgr_of(120), np.uint8)
     ranges = pick(wall, BALL)
     assert try_out(ranges, [wall]).most_share == 1.0
@@ -121,7 +121,7 @@ def test_a_range_that_marks_half_of_a_picture_is_refused():
             check_trial(trial)
 
 
-def test_a_range_that_marks_only_speckle_is_refused():
+def test_range_that_marks_only_speckle_is_rejected():
     speckled = np.full((240, 320, 3), 120, np.uint8)
     speckled[112, 110] = bgr_of(20)
     ranges = (HsvRange(hue_low_deg=10, hue_high_deg=30),)

@@ -1,4 +1,4 @@
-"""Colour ranges are written into a vision configuration: every comment stays, all else too, or nothing is changed."""
+"""Color ranges are written into a configuration of vision: all comments and values stay, or nothing changes."""
 
 import json
 import stat

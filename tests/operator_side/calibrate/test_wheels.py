@@ -77,7 +77,7 @@ def test_nothing_moves_unless_the_wheels_are_off_the_ground(robot, answer):
 ])  # fmt: skip
 def test_a_wheel_that_turned_otherwise_names_what_to_change(options, turn, wrong, expected):
     choice = PluginChoice(kind=GPIO.kind, options={**GPIO.options, **options})
-    assert says in wheel_test._advice(choice, wheel_test.TURNS[turn], wrong)
+    assert expected in wheel_test._advice(choice, wheel_test.TURNS[turn], wrong)
 
 
 def test_a_drive_without_such_options_is_wired_differently(robot):
@@ -89,7 +89,7 @@ def test_a_drive_without_such_options_is_wired_differently(robot):
     assert "right wheel, forward: the other wheel turned: exchange the motors' plugs" in text
 
 
-def test_a_drive_that_fails_in_the_middle_is_told_zero_and_closed(monkeypatch, robot):
+def test_drive_that_fails_is_set_to_zero_and_closed(monkeypatch, robot):
     config, log = robot
     monkeypatch.setattr(wheel_test.time, "sleep", lambda _s: 1 / 0)
     with pytest.raises(ZeroDivisionError):
@@ -118,13 +118,13 @@ def test_whatever_a_key_or_a_terminal_sends_ends_with_zero(monkeypatch, robot, n
     (["calibrate", "drive", "--yes", "--set", "drive.kind=log"], "drive 'log' has no duty to calibrate"),
     (["calibrate", "drive", "--yes", "--out", "/nowhere/drive.toml"], "no folder /nowhere"),
 ])  # fmt: skip
-def test_a_mistake_is_one_line_and_nothing_moves(capsys, monkeypatch, arguments, says):
+def test_a_mistake_is_one_line_and_nothing_moves(capsys, monkeypatch, arguments, expected):
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     monkeypatch.setattr(wheel_test, "turn_for", lambda *_given: pytest.fail("it moved"))
     assert cli.run(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.startswith("error: ") and captured.err.count("\n") == 1
-    assert says in captured.err
+    assert expected in captured.err
 
 
 # --- in a terminal ---------------------------------------------------------------------------------------------------

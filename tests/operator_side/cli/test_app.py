@@ -200,7 +200,7 @@ def test_a_mistake_is_one_line_and_its_exit_code(capsys, arguments, code, expect
 
 
 def test_a_robot_may_be_given_by_its_address(capsys, monkeypatch):
-    """As in `vision --robot ws-legacy://HOST:9091`: an older robot has an address and no id."""
+    """A legacy robot has an address and no id: `vision --robot ws-legacy://HOST:9091`."""
     seen = []
     monkeypatch.setattr("sightline.vision_side.serving.process.run", lambda config: seen.append(config) or 0)
     assert run(capsys, "vision", "--robot", "ws-legacy://127.0.0.1:9091")[0] == 0

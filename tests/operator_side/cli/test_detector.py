@@ -27,16 +27,28 @@ class Late(Hsv):
 
 
 class Blind:
-    """A class that is no detector."""
+    """A class without a method detect."""
 
     Config = Hsv.Config
 
 
 class Leaves(Hsv):
-    """What was a program of its own."""
+    """A detector that ends the process."""
 
     def __init__(self, config: object) -> None:
         sys.exit(7)
+
+
+@pytest.fixture(autouse=True)
+def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hide a device of this machine, so that the error of a missing one is the same everywhere."""
+    without_gpu(monkeypatch)
+
+
+def run(capsys, *arguments: str) -> tuple[int, str, str]:
+    code = cli.run(arguments)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
 
 
 def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:
@@ -56,7 +68,7 @@ def test_a_detector_that_keeps_its_promises_passes(capsys) -> None:
     assert all(0 < one["p50_ms"] <= one["p95_ms"] for one in report["times"])
 
 
-def test_a_plug_in_of_ones_own_that_does_not_is_told_where(capsys, tmp_path: Path, monkeypatch) -> None:
+def test_plug_in_that_breaks_the_contract_is_reported(capsys, tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "late_eyes.py").write_text(BROKEN)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
@@ -112,7 +124,7 @@ def test_every_mistake_is_one_line(capsys, arguments: tuple[str, ...], code: int
     assert words in err and err.count("\n") == 1
 
 
-def test_what_a_detector_says_while_it_is_checked_is_shown(capsys) -> None:
+def test_notices_of_a_checked_detector_are_shown(capsys) -> None:
     code, out, _ = run(capsys, "detector", "check", "http+jpeg://127.0.0.1:1/eyes")
     assert code == 5 and "FAIL  Every picture" in out and "note: " in out and "UNREACHABLE" in out
 
@@ -122,7 +134,7 @@ def test_an_option_of_a_section_is_set_by_a_dot() -> None:
     assert cli_detector._nested(given) == {"hsv": {"shape": "any", "max_contours": 3}, "label": "cup"}
 
 
-def test_a_copy_without_a_model_says_so(capsys, monkeypatch, tmp_path: Path) -> None:
+def test_installation_without_a_model_is_reported(capsys, monkeypatch, tmp_path: Path) -> None:
     monkeypatch.setattr(onnx_detector, "SHIPPED", tmp_path / "sightline.onnx")
     code, _, err = run(capsys, "detector", "check", "onnx")
     assert code == 2 and "without a model of its own" in err and err.count("\n") == 1

@@ -50,7 +50,7 @@ def test_a_guest_without_a_header_is_shown():
     assert message_object(message)["header"] is None
 
 
-def test_what_is_refused_says_why():
+def test_invalid_message_is_shown_with_its_reason():
     message = Message(TWIST, "vision", b"", b"nan|0")
     assert message_line(message) == "twist/vision: invalid: NOT_FINITE: " + message_object(message)["error"][12:]
     assert message_object(message)["payload_bytes"] == 5
@@ -66,7 +66,7 @@ def test_what_the_specification_accepts_is_shown(case):
     json.dumps(read, allow_nan=False)
 
 
-def test_what_a_stranger_says_cannot_command_the_terminal():
+def test_message_of_a_peer_cannot_control_the_terminal():
     payload = packed({"state": "HOLD", "reason": "\x1b[2J\x07 gone\u202e"})
     line = message_line(Message(STATUS, "", packed(USUAL["status"][1]), payload))
     assert line.isprintable() and "gone" in line
@@ -79,7 +79,7 @@ def test_any_bytes_give_a_line(channel, header, payload):
     json.dumps(message_object(message), allow_nan=False)
 
 
-def test_ranges_in_scans_that_are_none_are_refused():
+def test_invalid_ranges_in_scans_are_rejected():
     assert "NOT_FINITE" in message_line(usual(SCAN.name, payload=struct.pack("<f", math.nan)))
 
 
@@ -90,7 +90,7 @@ PICTURES = [name for name, one in CHANNELS.items() if one.encoding == JPEG]
 
 
 def heard(name, count):
-    """An inbox in which `count` messages of a channel arrived, told apart by their payloads' last byte."""
+    """An inbox in which `count` messages of a channel arrived, distinguished by the last byte of the payload."""
     network = MemoryNetwork(seed=1)
     inbox = ChannelInbox(network.link("r1", role="operator"), "operator", CHANNELS[name])
     messages = [usual(name, payload=usual(name).payload + bytes([number])) for number in range(count)]

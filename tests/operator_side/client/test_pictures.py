@@ -22,7 +22,7 @@ PATIENCE_S = 0.3
 
 
 class Site:
-    """A robot, a vision that publishes what it is told to, and a viewer."""
+    """A robot, a vision service that publishes given images, and a viewer."""
 
     def __init__(self, ending: ExitStack, end: str) -> None:
         self.robot = ending.enter_context(open_link("r1", listen=[end], role="robot"))
@@ -57,7 +57,7 @@ def taken(pictures, publish, seconds=5.0):
     return found[-1]
 
 
-def test_overlays_are_taken_and_nothing_else_is_asked_for(site):
+def test_overlays_are_taken_without_other_subscriptions(site):
     pictures = Pictures(site.link, "viewer")
     shot = taken(pictures, site.overlay)
     assert (shot.channel, shot.session, shot.seq * 1000, shot.width_px) == (OVERLAY, "0000abcd", shot.t_us, 640)
@@ -82,7 +82,7 @@ def test_who_wants_frames_gets_frames(site):
     assert not site.vision.has_listener(OVERLAY)
 
 
-def test_nobody_is_listened_to_while_nobody_looks(site):
+def test_nothing_is_subscribed_without_a_viewer(site):
     pictures = Pictures(site.link, "viewer")
     assert not site.vision.has_listener(OVERLAY)
     taken(pictures, site.frame)
@@ -91,7 +91,7 @@ def test_nobody_is_listened_to_while_nobody_looks(site):
     assert taken(pictures, site.overlay).channel is OVERLAY
 
 
-def test_what_is_no_picture_is_counted_and_waited_past(site):
+def test_invalid_image_is_counted_and_skipped(site):
     pictures = Pictures(site.link, "viewer")
     assert until(lambda: site.overlay(b"junk") or (pictures.take(0.05) is None and pictures.rejected), 5.0)
     assert taken(pictures, site.overlay).width_px == 640
@@ -108,7 +108,7 @@ def test_the_robots_silence_is_noticed(site, monkeypatch):
     assert until(lambda: not pictures.is_online, 2.0)
 
 
-def test_a_page_gets_the_next_picture_when_it_asks_and_none_is_fetched_for_nobody(site, monkeypatch):
+def test_page_gets_the_next_image_on_request_and_none_is_fetched_without_one(site, monkeypatch):
     monkeypatch.setattr(reel_module, "IDLE_S", 0.4)
     pictures, buffer, ending = Pictures(site.link, "viewer"), FrameBuffer(2), threading.Event()
     filling = threading.Thread(target=fill, args=(buffer, pictures, ending), daemon=True)
@@ -125,7 +125,7 @@ def test_a_page_gets_the_next_picture_when_it_asks_and_none_is_fetched_for_nobod
         assert [one.number for one in buffer.shots] == [4, 5] and buffer.of(3) is None and buffer.of(5) is not None
         site.overlay()
         time.sleep(0.1)
-        assert buffer.next(0, 0.0).number == 5  # nobody asked for a sixth
+        assert buffer.next(0, 0.0).number == 5  # without a request for a sixth
         assert until(lambda: not site.vision.has_listener(OVERLAY), 3.0)
         assert buffer.next(99, 0.0).number == 5  # a page of an earlier run
     finally:
@@ -133,7 +133,7 @@ def test_a_page_gets_the_next_picture_when_it_asks_and_none_is_fetched_for_nobod
         filling.join(3.0)
 
 
-def test_the_reel_over_http_says_which_picture_it_is(site):
+def test_frame_buffer_over_http_numbers_its_images(site):
     pictures, buffer = Pictures(site.link, "viewer"), FrameBuffer(2, lambda shot: 7)
     buffer.add(taken(pictures, site.overlay))
     answer = buffer.route({"after": "0"}, b"")

@@ -1,4 +1,4 @@
-"""A small page on loopback: for this machine only, bounded, and one clear word to who asks wrongly."""
+"""A small page on loopback: for this machine only, bounded, with one clear error for an invalid request."""
 
 import http.client
 import json
@@ -27,7 +27,7 @@ ROUTES = {
     "GET /": lambda ask, body: page("watch.html", robot="<b>r1</b>"),
     "GET /echo": lambda ask, body: as_json(dict(ask)),
     "POST /echo": lambda ask, body: HttpAnswer(body),
-    "POST /refuse": _refuse,
+    "POST /reject": _refuse,
     "POST /number": lambda ask, body: as_json(int(json.loads(body)["number"])),
 }
 
@@ -65,7 +65,7 @@ def test_this_machine_by_any_name(port, host):
 @pytest.mark.parametrize(
     "host", ["evil.example", "evil.example:{port}", "127.0.0.1.evil.example:{port}", "", "192.168.1.7:1"]
 )
-def test_another_name_is_refused(port, host):
+def test_other_host_name_is_rejected(port, host):
     with asked(port, "GET", "/echo", Host=host.format(port=port)) as (answer, body):
         assert answer.status == 403 and b"this machine only" in body
 
@@ -84,8 +84,8 @@ def test_a_body_has_a_bound(port, length):
         assert answer.status == 413
 
 
-def test_who_asks_wrongly_is_told_and_served_again(port):
-    for path, body, words in (("/refuse", b"{}", "not like this"), ("/number", b"{", "invalid request"),
+def test_invalid_request_gets_an_error_and_the_next_is_served(port):
+    for path, body, words in (("/reject", b"{}", "not like this"), ("/number", b"{", "invalid request"),
                               ("/number", b"[]", "invalid request"), ("/number", b'{"number":"x"}', "invalid request")):
         with asked(port, "POST", path, body) as (answer, said):
             assert answer.status == 400 and words in json.loads(said)["error"]
@@ -103,7 +103,7 @@ def test_nonsense_ends_nothing(port):
         assert answer.status == 200
 
 
-def test_more_connections_than_a_person_needs_are_closed_and_places_come_back(port):
+def test_excess_connections_are_closed_and_places_return(port):
     held = [socket.create_connection(("127.0.0.1", port), 5) for _ in range(MAX_CONNECTIONS)]
     assert until(lambda: _is_closed(port), 5.0)
     for one in held:
@@ -120,7 +120,7 @@ def test_more_connections_than_a_person_needs_are_closed_and_places_come_back(po
 
 
 def _is_closed(port):
-    """Whether one more is turned away at once."""
+    """Return whether a further connection is closed immediately."""
     with socket.create_connection(("127.0.0.1", port), 5) as one:
         one.settimeout(0.2)
         try:
@@ -131,7 +131,7 @@ def _is_closed(port):
             return True
 
 
-def test_a_port_in_use_is_said_in_one_line(port):
+def test_port_in_use_is_one_line(port):
     with pytest.raises(LinkError, match=f"port {port} is in use") as why, served(ROUTES, port):
         pass
     assert "\n" not in str(why.value)

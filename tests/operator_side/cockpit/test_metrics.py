@@ -70,7 +70,7 @@ def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_busy_port_is_said_with_its_owner(tmp_path):
+def test_busy_port_is_reported_with_its_owner(tmp_path):
     with RobotProcess(tmp_path) as robot, socket.create_server(("127.0.0.1", free_port())) as taken:
         command = [
             sys.executable,
@@ -90,7 +90,7 @@ def test_a_busy_port_is_said_with_its_owner(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_vision_is_measured_and_its_health_is_whether_it_hears_a_robot(tmp_path):
+def test_vision_service_is_measured_and_healthy_while_frames_arrive(tmp_path):
     port = free_port()
     with RobotProcess(tmp_path) as robot:
         robot.wait_until_on()
@@ -117,6 +117,6 @@ def _health_if_up(port):
 
 
 @pytest.mark.parametrize("where", ["", "x", "0", "70000", "1:2:3", "a b:9"])
-def test_a_place_that_is_none_is_refused(where, capsys):
+def test_invalid_address_is_rejected(where, capsys):
     assert cli.run(["vision", "--metrics", where]) == 2
     assert capsys.readouterr().err.startswith(f"error: invalid --metrics '{where}'")

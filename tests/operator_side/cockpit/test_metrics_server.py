@@ -1,4 +1,4 @@
-"""The little server of `/metrics` and `/health`: connections that say nothing, or go, hold up nobody."""
+"""The small server of `/metrics` and `/health`: silent or closed connections delay no other."""
 
 import select
 import socket
@@ -16,7 +16,7 @@ from tests.fixtures.links import until
 
 
 class Nothing:
-    """What is served: no figure, all well."""
+    """A healthy source without metrics."""
 
     def collect(self):
         return iter(())
@@ -37,7 +37,7 @@ def _health(port):
 
 
 @pytest.mark.parametrize("said", [b"", b"GET /hea"])
-def test_a_connection_that_says_nothing_holds_up_neither_others_nor_the_end(said):
+def test_silent_connection_delays_neither_others_nor_the_end(said):
     with served_port() as port:
         idle = [socket.create_connection(("127.0.0.1", port)) for _ in range(3)]
         for one in idle:
@@ -73,7 +73,7 @@ def _is_served(port):
         return False
 
 
-def test_a_connection_that_says_nothing_is_let_go_of_in_silence(monkeypatch, capfd):
+def test_silent_connection_is_closed_without_a_message(monkeypatch, capfd):
     monkeypatch.setattr(http_server._Handler, "timeout", 0.1)
     with served_port() as port, socket.create_connection(("127.0.0.1", port)) as idle:
         idle.settimeout(5)

@@ -53,7 +53,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 
 def address_of(command: Started) -> str:
-    """Where its page is."""
+    """Return the address of its page."""
     assert command.says(r"http://127\.0\.0\.1:\d+/")
     return str(re.findall(r"http://127\.0\.0\.1:\d+/", Path(command._log.name).read_text())[-1])
 
@@ -186,7 +186,7 @@ def test_the_page_shows_what_vision_sees_and_frames_without_it(tmp_path: Path) -
 def test_a_colour_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) -> None:
     chromium()
     config = tmp_path / "vision.toml"
-    config.write_text("# eyes\n[hsv] # of mine\nshape = 'any'\n")
+    config.write_text("# colors\n[hsv] # of mine\nshape = 'any'\n")
     where = ("--connect", site.zenoh, "--config", str(config))
     with Started(tmp_path, "pick-color", "r1", *where) as picking, Browser(tmp_path, address_of(picking)) as page:
         assert until(lambda: page.run(LEVELS)[2] >= 4, START_S)
@@ -207,7 +207,7 @@ def test_a_colour_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) 
         assert picking.process.wait(10) == 0
         assert page.errors == []
     assert 30 < tomllib.loads(config.read_text())["hsv"]["ranges"][0]["hue_low_deg"] < 60
-    assert "# eyes" in config.read_text() and "# of mine" in config.read_text()
+    assert "# colors" in config.read_text() and "# of mine" in config.read_text()
 
 
 def test_a_colour_is_picked_in_a_video_by_its_box(tmp_path: Path) -> None:

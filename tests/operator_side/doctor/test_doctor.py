@@ -1,4 +1,4 @@
-"""`sightline doctor`: what it says of this machine, of a real robot, and of a way that leads nowhere."""
+"""`sightline doctor`: its findings on this machine, on a real robot, and on a broken link."""
 
 import json
 import os
@@ -33,7 +33,7 @@ def test_a_histogram_counts_every_value_once(values):
     assert sum(int(line.rsplit(" ", 1)[1]) for line in histogram(values)) == len(values)
 
 
-def test_what_is_only_said_is_no_failure():
+def test_plain_information_is_not_a_failure():
     said, good, bad = Finding("a", None, "x", "do"), Finding("b", True, "y", "do"), Finding("c", False, "z", "do this")
     assert as_object([said, good])["ok"] is True
     assert as_object([said, bad])["ok"] is False
@@ -54,7 +54,7 @@ def test_what_has_a_unit_is_a_number_for_scripts():
     ("nr_throttled 0\nthrottled_usec 0", "cpu 100 0 100 1000 0 0 0 5 0 0", True),
     ("nr_throttled 12\nthrottled_usec 34000", "cpu 100 0 100 100 0 0 0 50 0 0", False),
 ])  # fmt: skip
-def test_a_processor_that_is_held_back_is_told(monkeypatch, tmp_path, stat, cpu, ok):
+def test_throttled_processor_is_reported(monkeypatch, tmp_path, stat, cpu, ok):
     (tmp_path / "cpu.stat").write_text(stat)
     (tmp_path / "stat").write_text(f"{cpu}\ncpu0 1")
     throttle = tmp_path / "cpu0" / "thermal_throttle"
@@ -68,7 +68,7 @@ def test_a_processor_that_is_held_back_is_told(monkeypatch, tmp_path, stat, cpu,
 
 
 @pytest.mark.parametrize(("said", "ok"), [("Power save: on", False), ("Power save: off", True), ("", None)])
-def test_a_radio_that_saves_power_is_told_with_the_command_that_stops_it(monkeypatch, tmp_path, said, ok):
+def test_power_save_of_wifi_is_reported_with_its_fix(monkeypatch, tmp_path, said, ok):
     (tmp_path / "wlan0" / "wireless").mkdir(parents=True)
     (tmp_path / "eth0").mkdir()
     (tmp_path / "iw").write_text(f"#!/bin/sh\necho '{said}'\n")
@@ -84,10 +84,10 @@ _ARP = "IP address HW type Flags HW address Mask Device\n192.168.1.7 0x1 {} aa:b
 
 
 @pytest.mark.parametrize(("flags", "host", "words"), [
-    ("0x0", "192.168.1.7", "client isolation"), ("0x2", "192.168.1.7", "a firewall blocks it"), ("0x2", "192.168.1.8", ""),
+    ("0x0", "192.168.1.7", "client isolation"), ("0x2", "192.168.1.7", "a firewall blocks"), ("0x2", "192.168.1.8", ""),
     ("0x0", "no-such-name.invalid", ""),
 ])  # fmt: skip
-def test_a_machine_that_is_kept_apart_is_told_from_a_firewall(tmp_path, flags, host, words):
+def test_isolated_client_and_firewall_are_distinguished(tmp_path, flags, host, words):
     (tmp_path / "arp").write_text(_ARP.format(flags))
     said = between.neighbour(host, tmp_path / "arp")
     assert words in said and bool(said) is bool(words)
@@ -98,16 +98,16 @@ def test_a_machine_that_is_kept_apart_is_told_from_a_firewall(tmp_path, flags, h
     (["YUYV", "MJPG"], True, "passes unchanged"), (["YUYV"], None, "this machine encodes each image"),
     (["GREY"], False, "neither MJPG nor YUYV"),
 ])  # fmt: skip
-def test_the_modes_of_a_camera_are_told_with_what_they_cost(capsys, monkeypatch, tmp_path, offered, ok, said):
+def test_modes_of_a_camera_are_reported_with_their_cost(capsys, monkeypatch, tmp_path, offered, ok, said):
     (tmp_path / "video3").touch()
     monkeypatch.setattr(cameras, "DEVICES", tmp_path)
-    assert list(cameras.modes()) == []  # a file that is no camera
+    assert list(cameras.modes()) == []  # a file, not a camera
     monkeypatch.setattr(cameras, "formats", lambda device: offered)
     check = _checks(capsys)["modes video3"]
     assert check["ok"] is ok and said in check["value"] and (ok or check["fix"])
 
 
-def test_a_camera_that_cannot_be_opened_is_told(monkeypatch, tmp_path):
+def test_camera_that_does_not_open_is_reported(monkeypatch, tmp_path):
     (tmp_path / "video0").mkdir()
     monkeypatch.setattr(cameras, "DEVICES", tmp_path)
     found = next(cameras.modes())
@@ -120,17 +120,17 @@ def test_a_format_is_read_from_the_kernels_answer():
 
 
 @pytest.mark.parametrize("transport", ["tcp", "udp"])
-def test_the_other_end_is_told_with_its_version_clock_and_round_trip(transport):
+def test_other_end_is_reported_with_version_clock_and_round_trip(transport):
     endpoint = free_endpoint(f"{transport}/")
     with open_zenoh("r1", listen=[endpoint], role="robot"):
         found = {one.name: one for one in between.findings(endpoint, "r1", "")}
     assert found["version of robot"].ok and "sightline" in found["version of robot"].value
     assert int(re.match(r"the robot's clock is (\d+) ms", found["clock skew"].value)[1]) < 100  # one machine, one clock
     assert found["round trip p50"].ok and "#" in found["jitter"].value
-    assert found["link"].ok is False and "no status" in found["link"].value  # it says nothing of its state
+    assert found["link"].ok is False and "no status" in found["link"].value  # it publishes no status
 
 
-def test_a_busy_port_is_told_with_its_owner(capsys, monkeypatch):
+def test_busy_port_is_reported_with_its_owner(capsys, monkeypatch):
     with socket.create_server(("127.0.0.1", free_port())) as server:
         monkeypatch.setattr(machine, "PORTS", {server.getsockname()[1]: "mine"})
         check = _checks(capsys)[f"port {server.getsockname()[1]}"]
@@ -138,14 +138,14 @@ def test_a_busy_port_is_told_with_its_owner(capsys, monkeypatch):
     assert f"kill {os.getpid()}," in check["fix"]
 
 
-def test_a_package_of_the_same_name_is_told(capsys, monkeypatch):
+def test_package_of_the_same_name_is_reported(capsys, monkeypatch):
     owners = {"sightline": ["sightline-robot", "sightline"]}
     monkeypatch.setattr(machine.metadata, "packages_distributions", lambda: owners)
     check = _checks(capsys)["package names"]
     assert not check["ok"] and check["fix"].startswith("pip uninstall sightline,")
 
 
-def test_certificates_near_their_end_are_told_with_the_command(capsys, tmp_path):
+def test_certificates_near_expiry_are_reported_with_the_command(capsys, tmp_path):
     keys.make(tmp_path / "k", [])
     keys.add(tmp_path / "k", "vision", [], days=10)
     checks = _checks(capsys, "--secure", str(tmp_path / "k"))
@@ -154,7 +154,7 @@ def test_certificates_near_their_end_are_told_with_the_command(capsys, tmp_path)
     assert checks["key vision"]["fix"] == f"sightline keys add {tmp_path / 'k'} vision"
 
 
-def test_certificates_that_cannot_be_read_here_are_told_with_the_extra(capsys, tmp_path, monkeypatch):
+def test_unreadable_certificates_are_reported_with_the_extra(capsys, tmp_path, monkeypatch):
     keys.make(tmp_path / "k", [])
     for name in [one for one in sys.modules if one.partition(".")[0] == "cryptography"]:
         monkeypatch.setitem(sys.modules, name, None)
@@ -162,16 +162,16 @@ def test_certificates_that_cannot_be_read_here_are_told_with_the_extra(capsys, t
     assert not check["ok"] and "pip install '.[secure]'" in str(check)
 
 
-def test_nobody_listening_is_told_apart_from_no_such_name(capsys, monkeypatch):
+def test_closed_port_and_unknown_host_have_different_fixes(capsys, monkeypatch):
     monkeypatch.setattr(between, "neighbour", lambda host: "; a firewall blocks it")
     refused = _checks(capsys, "--peer", free_endpoint())["reach"]
-    assert "firewall" not in refused["fix"], "who refuses is there"
+    assert "firewall" not in refused["fix"], "a closed port"
     unknown = _checks(capsys, "--peer", "tcp/no-such-name.invalid:7447")["reach"]
     assert "the port is closed" in refused["fix"] and "does not resolve" in unknown["fix"]
     assert not refused["ok"] and not unknown["ok"]
 
 
-def test_somebody_else_on_the_port_is_no_robot(capsys):
+def test_other_program_on_the_port_is_reported(capsys):
     with socket.create_server(("127.0.0.1", free_port())) as server:
         port = server.getsockname()[1]
         checks = _checks(capsys, "--peer", f"tcp/127.0.0.1:{port}")
@@ -181,19 +181,19 @@ def test_somebody_else_on_the_port_is_no_robot(capsys):
     )
 
 
-def test_what_mends_a_link_stands_apart_from_what_is_wrong():
+def test_fix_of_a_link_is_separate_from_its_problem():
     (found,) = between.findings("quic/127.0.0.1:1", "r1", "")
     assert found.value == "cannot connect to quic/127.0.0.1:1: a quic/ endpoint needs keys"
     assert found.fix == "pass --secure DIR"
 
 
-def test_an_endpoint_that_is_none_is_refused(capsys):
+def test_invalid_endpoint_is_rejected(capsys):
     assert cli.run(["doctor", "--json", "--peer", "foo"]) == 2
     said = capsys.readouterr()
     assert "error: invalid endpoint 'foo'" in said.err and said.out == "", "before anything is looked at"
 
 
-def test_a_camera_that_is_not_there_says_so(capsys):
+def test_missing_camera_is_reported(capsys):
     check = _checks(capsys, "--camera", "v4l2", "--camera-set", "device=/dev/video99")["camera v4l2"]
     assert not check["ok"] and "is not there" in check["value"]
 

@@ -1,4 +1,4 @@
-"""Recording and replay: what went over a link comes back, and the pipeline says the same again, byte for byte."""
+"""Recording and replay: the messages of a link return, and the pipeline answers the same, byte for byte."""
 
 import threading
 import time
@@ -29,7 +29,7 @@ MESSAGES = st.builds(
 
 
 class Wire:
-    """A link that gives its subscribers what it is told, at once."""
+    """A link that delivers each given message to its subscribers immediately."""
 
     def __init__(self) -> None:
         self.callbacks = {}
@@ -88,11 +88,11 @@ def test_a_slow_disk_drops_and_counts_and_never_blocks_the_link(tmp_path):
     assert recorder.dropped >= 99
 
 
-def test_what_is_no_recording_is_said(tmp_path):
+def test_other_file_than_a_recording_is_rejected(tmp_path):
     with pytest.raises(ConfigError, match="nothing here"):
         list(read_recording(tmp_path / "nothing here"))
     (tmp_path / "text").write_text("hello, this is a text and no recording at all")
-    with pytest.raises(ConfigError, match="not a recording|invalid recording"):
+    with pytest.raises(ConfigError, match=r"not a recording|invalid recording"):
         read_about(tmp_path / "text")
 
 

@@ -1,4 +1,4 @@
-"""What a vision was given besides frames (scans, missions) comes again from a recording, byte for byte."""
+"""Scans and missions of a vision service return from a recording, byte for byte."""
 
 import pytest
 
@@ -72,7 +72,7 @@ def test_what_was_gone_by_and_not_recorded_is_missed(recorded, tmp_path, channel
     assert not result.ok and result.gaps > 0
 
 
-def test_a_mission_that_goes_by_scans_is_repeated_from_the_whole_line(tmp_path):
+def test_mission_with_scans_is_repeated_exactly(tmp_path):
     scenario, model = load_scenario("circle"), load_robot("raspberry")
     mission = MissionConfig(kind="goto", options={"waypoints": [[0.6, -0.4], [0.0, 0.0]]})
     config = vision_config(scenario, model).model_copy(update={"mission": mission})

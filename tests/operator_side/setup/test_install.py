@@ -52,7 +52,7 @@ def test_a_robots_motors_are_zeroed_however_its_driver_ends(tmp_path):
     ("sim", CONFIG, "pi"), ("robot", Path("/a b.toml"), "pi"), ("robot", CONFIG, ""), ("robot", CONFIG, "p%i"),
     ("vision", Path("/x\nUser=root"), "pi"),
 ])  # fmt: skip
-def test_what_would_make_another_unit_is_refused(service, config, user, tmp_path):
+def test_value_that_changes_the_unit_is_rejected(service, config, user, tmp_path):
     with pytest.raises(ConfigError):
         install.plan(service, PROGRAM, config, user, tmp_path)
 
@@ -66,7 +66,7 @@ def test_it_shows_first_and_writes_nothing(capsys, monkeypatch, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_by_sudo_it_runs_as_who_said_so(capsys, monkeypatch):
+def test_under_sudo_it_runs_as_the_calling_user(capsys, monkeypatch):
     monkeypatch.setenv("SUDO_USER", "pi")
     assert cli.run(["install", "vision", "--config", str(CONFIG)]) == 0
     assert "User=pi\n" in capsys.readouterr().out
@@ -87,7 +87,7 @@ def test_a_service_that_could_not_begin_is_not_installed(capsys, tmp_path):
     assert "nonsense" in capsys.readouterr().err
 
 
-def test_a_folder_that_cannot_be_written_is_said(tmp_path):
+def test_folder_that_cannot_be_written_is_reported(tmp_path):
     planned = install.plan("vision", PROGRAM, CONFIG, "pi", tmp_path / "absent")
     with pytest.raises(ConfigError, match=r"cannot write .*: No such file or directory; run it with sudo"):
         install.write(planned)
@@ -98,7 +98,7 @@ def test_a_folder_that_cannot_be_written_is_said(tmp_path):
 
 @pytest.fixture
 def car(monkeypatch, tmp_path):
-    """(its configuration, where units go, what systemctl was told)."""
+    """Return the configuration, the folder of units, and the calls of systemctl."""
     file, units, told = tmp_path / "car.toml", tmp_path / "units", []
     file.write_text(CAR)
     units.mkdir()
@@ -137,7 +137,7 @@ def test_wrong_pins_are_not_installed(car, capsys):
     assert (list(units.iterdir()), told) == ([], [])
 
 
-def test_both_files_are_shown_first_and_written_when_asked(car, capsys):
+def test_both_files_are_shown_first_and_written_with_yes(car, capsys):
     file, units, told = car
     command = ["install", "robot", "--config", str(file), "--user", "pi"]
     assert cli.run(command) == 0
@@ -162,7 +162,7 @@ def test_the_pins_of_a_drive_that_is_gone_are_left_alone_again(car, capsys):
     assert "the drive of this robot is not gpio" in capsys.readouterr().out
 
 
-def test_a_configuration_that_is_not_there_yet_is_said(car, capsys):
+def test_missing_configuration_is_reported(car, capsys):
     file, _units, _told = car
     file.unlink()
     assert cli.run(["install", "robot", "--config", str(file), "--user", "pi"]) == 0

@@ -1,4 +1,4 @@
-"""`sightline router` as a process: robot and vision meet at it; a busy port and a missing key are said in a line."""
+"""`sightline router` as a process: robot and vision meet at it; a busy port and a missing key are one line."""
 
 import signal
 import subprocess
@@ -26,7 +26,7 @@ def _router(*arguments):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("secured", [False, True])
-def test_robot_and_vision_meet_at_a_router_that_ends_when_told(tmp_path, secured):
+def test_robot_and_vision_meet_at_a_router_that_ends_on_a_signal(tmp_path, secured):
     endpoint, secure = free_endpoint(), ""
     if secured:
         secure = str(tmp_path / "keys")
@@ -53,7 +53,7 @@ def test_robot_and_vision_meet_at_a_router_that_ends_when_told(tmp_path, secured
         assert router.stderr.read() == ""
 
 
-def test_a_router_without_its_keys_says_what_is_missing(tmp_path):
+def test_router_without_its_keys_reports_the_missing_file(tmp_path):
     with _router("--listen", "tls/127.0.0.1:7450", "--secure", str(tmp_path)) as router:
         assert router.wait(10) == 2
         assert router.stderr.read().startswith("error: ca.pem is missing in")

@@ -1,4 +1,4 @@
-"""The gamepad's shell: which device it takes, what it reads, and what is said when it is not there or goes."""
+"""The gamepad's shell: the device that it takes, its events, and its errors when the device is missing or goes."""
 
 import errno
 import sys
@@ -24,7 +24,7 @@ from sightline.protocol.errors import ConfigError, HardwareError
 
 
 class Device:
-    """As much of `evdev.InputDevice` as is used; `events` are given once, then it has gone."""
+    """The used part of `evdev.InputDevice`; it gives `events` once, then it is gone."""
 
     def __init__(self, path, keys=(BTN_SOUTH, BTN_TL), axes=(ABS_X, ABS_Y)):
         self.path, self.name, self.fd = path, f"pad {path}", 7
@@ -94,7 +94,7 @@ def test_without_evdev_the_extra_is_named(monkeypatch):
 
 
 def test_after_events_were_lost_nothing_counts_as_held():
-    """The release may have been among them; what is not pressed anew does not drive."""
+    """The release may have been among them; only a new press drives."""
     pad = Pad({ABS_Y: (0, 255)})
     pad.on_event(EV_KEY, BTN_TL, 1)
     pad.on_event(EV_ABS, ABS_Y, 0)
