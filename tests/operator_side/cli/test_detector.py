@@ -14,11 +14,10 @@ from sightline.vision_side.serving import detector_service
 from tests.fixtures.commands import run
 from tests.fixtures.vision.onnx import brightness_model
 
-BROKEN = '''
-from sightline.vision_side.detect.color.detectors import Hsv
-
 pytestmark = pytest.mark.usefixtures("no_gpu")
 
+BROKEN = '''
+from sightline.vision_side.detect.color.detectors import Hsv
 
 class Late(Hsv):
     def detect(self, frames, deadline_us):
@@ -37,18 +36,6 @@ class Leaves(Hsv):
 
     def __init__(self, config: object) -> None:
         sys.exit(7)
-
-
-@pytest.fixture(autouse=True)
-def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hide a device of this machine, so that the error of a missing one is the same everywhere."""
-    without_gpu(monkeypatch)
-
-
-def run(capsys, *arguments: str) -> tuple[int, str, str]:
-    code = cli.run(arguments)
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
 
 
 def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:
@@ -115,7 +102,7 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("demo", "--detector", "onnx:/nowhere.onnx", "--out", "/nowhere/made"), 2, "/nowhere.onnx: No such file"),
         (("demo", "--mission", "folow", "--out", "/nowhere/made"), 2, "did you mean 'follow'"),
         (("demo", "--mission", "goto", "--out", "/nowhere/made"), 2, "waypoints"),
-        (("demo", "--detector", "boxes", "--out", "/nowhere/made"), 2, "nobody finds boxes in circle"),
+        (("demo", "--detector", "boxes", "--out", "/nowhere/made"), 2, "no service publishes boxes in circle"),
     ],
 )
 def test_every_mistake_is_one_line(capsys, arguments: tuple[str, ...], code: int, words: str) -> None:
