@@ -24,7 +24,7 @@ DOCS: Final = Path(__file__).parents[1]
 RESULTS: Final = Path("reference", "results")
 SAFETY: Final = Path("reference", "safety-limits.md")
 PACKAGES: Final = ("eclipse-zenoh", "pybullet", "opencv-python-headless", "pydantic")
-_SHOWN_IF_WRONG: Final = ("on old sight", "drives again", "reset refused", "exit code", "last speed told")
+_SHOWN_IF_WRONG: Final = ("on an old frame", "drives again", "reset rejected", "exit code", "last speed set")
 """Yes or no: the table shows them in the requirement."""
 _MARKS: Final = re.compile(r"(<!-- worst values[^\n]*-->\n).*?(<!-- /worst values -->)", re.DOTALL)
 _FIGURES: Final = {"falls": "ms", "zero": "ms", "distance": "m", "memory": "MB"}

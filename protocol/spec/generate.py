@@ -169,7 +169,7 @@ def _bounds(schema: Schema) -> Iterator[str]:
 GENERATED: Final = {
     "channels": channel_table,
     "fields": field_tables,
-    "refusals": reject_reason_table,
+    "rejections": reject_reason_table,
     "vectors": golden.vector_table,
     "examples": golden.examples,
 }

@@ -89,7 +89,7 @@ def test_without_a_gamepad_it_is_one_line(plugged, path, says):
 
 def test_without_evdev_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "evdev", None)
-    with pytest.raises(ConfigError, match=r"evdev is not installed: pip install 'sightline-robot\[gamepad\]'"):
+    with pytest.raises(ConfigError, match=r"evdev is not installed: pip install '\.\[gamepad\]'"):
         Gamepad("auto")
 
 

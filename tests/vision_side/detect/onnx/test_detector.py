@@ -219,7 +219,7 @@ def test_file_that_is_not_a_model_gives_one_error_line(tmp_path: Path, content: 
 
 def test_without_the_runtime_one_line_names_what_to_install(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ConfigError, match=r"pip install 'sightline-robot\[vision\]'") as missing:
+    with pytest.raises(ConfigError, match=r"pip install '\.\[vision\]'") as missing:
         detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
     assert "\n" not in str(missing.value)
 
