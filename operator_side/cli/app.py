@@ -187,7 +187,7 @@ def _usage_line(text: str, context: typer.Context | None) -> str:
 
     here = list(getattr(context and context.command, "commands", COMMANDS))
     if path != "sightline" and unknown[1] in COMMANDS:
-        return f"unknown command {unknown[1]!r} in {path}; did you mean 'sightline {unknown[1]}'?; see {path} --help"
+        return f"unknown command '{unknown[1]}' in {path}; did you mean 'sightline {unknown[1]}'?; see {path} --help"
     return no_such_name("command", unknown[1], here) + f"; see {path} --help"
 
 

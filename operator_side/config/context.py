@@ -116,7 +116,7 @@ def read_context(path: Path) -> Context | None:
 def _checked(table: dict[str, Any], path: Path) -> Context:
     for key, value in table.items():
         if key not in _KEYS:
-            raise ConfigError(f"{path}: unknown key {key!r}; {_CLEAR}")
+            raise ConfigError(f"{path}: unknown key '{key}'; {_CLEAR}")
         if not isinstance(value, str):
             raise ConfigError(f"{path}: invalid {key}: expected text; {_CLEAR}")
     if "connect" not in table:

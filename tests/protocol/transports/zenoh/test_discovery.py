@@ -74,7 +74,7 @@ def test_two_robots_on_a_network_are_found_despite_a_used_group_port():
     command = ["unshare", "-n", "--kill-child", sys.executable, "-c", INSIDE]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert [line.partition("  sightline")[0] for line in done.stdout.splitlines()] == [
-        "tcp/10.9.8.1:7701: robot     r1: says nothing of its state",
-        "tcp/10.9.8.1:7702: robot     r2: says nothing of its state",
-        "robot     r4: says nothing of its state",
+        "tcp/10.9.8.1:7701: robot     r1: no status",
+        "tcp/10.9.8.1:7702: robot     r2: no status",
+        "robot     r4: no status",
     ], done

@@ -84,8 +84,8 @@ def test_operator_reads_state_version_machine_and_round_trip():
              "js9": Message(STATUS, "", b"{", b"")}
     peers = [_peer(), _peer(role="vision", session="00000002", robot="r*")]
     assert list(lines(heard, peers)) == [
-        "robot     js9: not understood: Stamp: Invalid JSON: EOF while parsing an object at line 1 column 1"
-        "  (does not say what it is)",
+        "robot     js9: invalid status: Stamp: Invalid JSON: EOF while parsing an object at line 1 column 1"
+        "  (no version reported)",
         "robot     r1: DISARMED (waiting)  sightline 9 on shed, round trip 2.0 ms",
         "vision    of r*  sightline 9 on shed, round trip 2.0 ms",
     ]
@@ -213,13 +213,13 @@ def test_the_command_lists_them_for_people_and_scripts(router, capsys):
         assert cli.run(["robots", "--connect", router, "--seconds", "0.5", "--json"]) == 0
         found = json.loads(capsys.readouterr().out)
     assert [line.split()[0] for line in said] == ["robot", "vision"]
-    assert "says nothing of its state" in said[0] and "round trip" in said[1]
+    assert "no status" in said[0] and "round trip" in said[1]
     assert [peer["role"] for peer in found["peers"]] == ["robot", "vision"] and found["places"] == [router]
 
 
 def test_empty_router_is_reported(router, capsys):
     assert cli.run(["robots", "--connect", router, "--seconds", "0.3"]) == 4
-    assert capsys.readouterr().err.startswith(f"error: no robot is heard at {router} within 0.3 s")
+    assert capsys.readouterr().err.startswith(f"error: no robot at {router} after 0.3 s")
 
 
 def test_endpoint_of_one_robot_differs_from_a_router(capsys):

@@ -1,0 +1,73 @@
+"""`sightline status` in a terminal and in a pipe: short, in full, and live."""
+
+import json
+import subprocess
+import sys
+import threading
+
+import pytest
+
+from sightline.protocol.channels import STATUS
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import Stamp, State, Status
+from sightline.protocol.transports.open import open_link
+from tests.fixtures.commands import run
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
+from tests.fixtures.terminal import Terminal
+
+
+@pytest.fixture
+def endpoint():
+    """The address of a robot that publishes its status at 20 Hz."""
+    ending, address = threading.Event(), free_endpoint()
+
+    def publish():
+        seq = 0
+        while not ending.wait(0.05):
+            seq += 1
+            robot.publish(STATUS, encode(Stamp(session="0000abcd", seq=seq, t_us=seq)),
+                          encode(Status(state=State.STOPPED, reason="test")))
+
+    with open_link("r1", listen=[address]) as robot:
+        thread = threading.Thread(target=publish, daemon=True)
+        thread.start()
+        yield address
+        ending.set()
+        thread.join()
+
+
+def test_status_is_short_and_verbose_shows_every_field(capsys, endpoint):
+    code, short, err = run(capsys, "status", "--connect", endpoint)
+    assert (code, err) == (0, "") and len(short.splitlines()) <= 7
+    assert "state     STOPPED: test\n" in short and "next      sightline reset r1\n" in short
+    code, full, _ = run(capsys, "status", "--verbose", "--connect", endpoint)
+    assert "network restarts" in full and len(full.splitlines()) > len(short.splitlines())
+
+
+@pytest.mark.parametrize(("no_color", "colored"), [("", True), ("1", False)])
+def test_watch_redraws_in_place_with_colors_unless_no_color(endpoint, monkeypatch, no_color, colored):
+    monkeypatch.setenv("NO_COLOR", no_color)
+    monkeypatch.setenv("TERM", "xterm")
+    terminal = Terminal("status", "--watch", "--connect", endpoint)
+    try:
+        assert until(lambda: terminal.text().count("robot     r1") >= 3, 15), terminal.text()
+        assert "\x1b[1A" in terminal.text(), "up, to draw over the last block"
+        assert ("\x1b[31mSTOPPED" in terminal.text()) is colored
+        terminal.types("\x03")
+        assert terminal.process.wait(5) == 130
+        assert terminal.text().endswith("\x1b[?25h"), "the cursor is visible again"
+    finally:
+        terminal.close()
+
+
+@pytest.mark.parametrize("arguments", [(), ("--json",)])
+def test_watch_in_a_pipe_prints_plain_lines(endpoint, arguments):
+    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "status", "--watch", *arguments]
+    with subprocess.Popen([*command, "--connect", endpoint], stdout=subprocess.PIPE, text=True) as process:
+        lines = [process.stdout.readline().rstrip() for _ in range(2 if arguments else 8)]
+        process.terminate()
+    if arguments:
+        assert [json.loads(line)["state"] for line in lines] == ["STOPPED", "STOPPED"]
+    else:
+        assert lines.count("robot     r1") == 2 and "\x1b" not in "".join(lines)
