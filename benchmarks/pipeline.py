@@ -1,7 +1,4 @@
-"""Measure one `Pipeline.step` hot, at the pace of a camera, and the decode alone; and the detectors `hsv` and `onnx`.
-
-Shell (a clock).
-"""
+"""Measure one `Pipeline.step` hot, paced, and its decode; and the detectors `hsv` and `onnx`. Shell (a clock)."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator

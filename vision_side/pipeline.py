@@ -120,6 +120,7 @@ class Pipeline:
             session: session id of the robot.
         """
         self._use_session(session)
+        # Requests are repeated on a lossy link. A repetition must not restart the mission.
         if request != self._request:
             self._request = request
             self._mission_switch.switch(chosen)
@@ -139,6 +140,7 @@ class Pipeline:
         """Use another camera model from the next frame on. A requested mission continues."""
         self._camera = camera
         self._decoder = Decoder(camera.width_px, camera.height_px, self._config.max_pixels)
+        # Tracks of another camera model do not fit the new one, so the first mission starts again.
         if self._request is None:
             self._forget()
             return
@@ -155,16 +157,20 @@ class Pipeline:
         Returns:
             The answer. Its `skipped` names the reason if the frame cannot be used.
         """
+        # An older frame would move the clock of the mission back.
         if not self._is_new(frame.header):
             return self._skip("OUT_OF_ORDER", "frame is not newer than the last")
         try:
             picture = self._decoder.decode(frame.jpeg)
         except WireError as error:
+            # An invalid image is acknowledged too. Otherwise the robot waits for its credit until the timeout.
             return self._skip(error.reason, error.detail)
         shown = DetectFrame(self._config.robot, frame.header, frame.jpeg, self._decoder, picture)
         shown.goes_by = self.mission.goes_by
+        # A result that does not fit its frame counts as no answer: a plug-in must not steer by another frame.
         (result,) = checked_results(self._detector, [shown], frame.deadline_us)
         if isinstance(result, str):
+            # No twist, so that the robot holds. Only "saw nothing" may start a search.
             return self._skip(NO_ANSWER, result, "no answer")
         return self._answer(frame.header, result.detections, picture, result)
 
@@ -204,6 +210,7 @@ class Pipeline:
 
     def _tick(self, header: FrameHeader) -> float:
         """Return the seconds since the last frame, and update the latency from the robot's measurement."""
+        # The clock is the capture time, so that a replayed recording produces the same twists, byte for byte.
         dt_s = min((header.t_us - self._last_us) / 1e6, _MAX_DT_S) if self._last_us is not None else 0.0
         self._last_us = header.t_us
         self._latency.measure(header.latency_us, dt_s)

@@ -15,8 +15,8 @@ from sightline.protocol.transports.security import RoleKeys
 if TYPE_CHECKING:
     import ssl  # takes 4 MB, so functions import it when something is wrong
 
+# Linux's lists of TCP sockets.
 TABLES: Final = Path("/proc/net")
-"""Linux's lists of TCP sockets."""
 _LISTEN: Final = "0A"
 
 

@@ -8,13 +8,13 @@ from typing import Final
 
 from sightline.protocol.errors import ConfigError
 
+# Endpoint of a robot and its peers when none is configured.
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
-"""Endpoint of a robot and its peers when none is configured."""
 
+# A bounded socket buffer keeps frames young, because data in the socket can no longer be dropped. It holds the data
+# in flight over 200 ms. With a quarter of it, images over such a link had 16 kB instead of 34, and an age of 351 ms
+# at p95 instead of 219 (`bench network --only rtt200`).
 SEND_BUFFER_BYTES: Final = 262_144
-"""A bounded socket buffer keeps frames young, because data in the socket can no longer be dropped. It holds the data in
-flight over 200 ms. With a quarter of it, images over such a link had 16 kB instead of 34, and an age of 351 ms at p95
-instead of 219 (`bench network --only rtt200`)."""
 
 _ZENOH_ENDPOINT = re.compile(
     r"(tcp|tls|quic|udp|ws)/(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]]+):([0-9]{1,5})(\?[^#\s]*)?(#\S*)?"

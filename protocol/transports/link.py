@@ -78,8 +78,8 @@ class LatestSlot(Generic[Item]):
             return item
 
 
+# Security limit: queued items of one channel from sources without a role.
 MAX_UNKNOWN_SOURCES: Final = 16
-"""Security limit: queued items of one channel from sources without a role."""
 _RANKS: Final = {priority: rank for rank, priority in enumerate(Priority, start=1)}
 _FIRST_RANK: Final = -1
 
@@ -301,12 +301,12 @@ class LinkWrapper(Link):
 # A bad message, or an error in a callback, is counted and dropped. Neither ends a link.
 
 
+# Counted for a key that differs from that of the robot and channel: a wildcard, another robot, a bad role.
 INEXACT_KEY = "INEXACT_KEY"
-"""Counted for a key that differs from that of the robot and channel: a wildcard, another robot, a bad role."""
+# Counted for a header or payload above the bound of the channel.
 OVERSIZE = "OVERSIZE"
-"""Counted for a header or payload above the bound of the channel."""
+# Counted for a sample that is not a publication, e.g. Zenoh's delete.
 NOT_A_PUT = "NOT_A_PUT"
-"""Counted for a sample that is not a publication, e.g. Zenoh's delete."""
 
 
 class LinkRules:

@@ -19,8 +19,8 @@ from typing import Final, NamedTuple
 from sightline.protocol.channels import FRAME, Channel, Direction, parse_key, pattern_for
 from sightline.protocol.transports.link import BaseLink, LinkRules, Message
 
+# Messages in flight in one network. A further message is dropped and counted as `overflow`.
 MAX_IN_FLIGHT: Final = 4096
-"""Messages in flight in one network. A further message is dropped and counted as `overflow`."""
 
 
 @dataclass(frozen=True, slots=True)

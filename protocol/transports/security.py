@@ -28,8 +28,8 @@ from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_zen
 
 ROBOT_ROLE: Final = "robot"
 ROLES: Final = (ROBOT_ROLE, *SOURCES_OF_ROLE)
+# Prefix of the keys of presence (`transports/zenoh/presence.py`), next to `sightline/`, the prefix of channels.
 PRESENCE_PREFIX: Final = "sightline-presence"
-"""Prefix of the keys of presence (`transports/zenoh/presence.py`), next to `sightline/`, the prefix of channels."""
 _TLS: Final = ("tls", "quic")
 
 
@@ -205,10 +205,10 @@ def _read(file: Path) -> str:
 # Access to a WebSocket endpoint: by token, or for the legacy protocol by address. Pure.
 
 
+# Counted for a client of the legacy protocol from an address that the owner did not list.
 NOT_LISTED: Final = "NOT_LISTED"
-"""Counted for a client of the legacy protocol from an address that the owner did not list."""
+# Counted for a client without a valid token.
 NO_TOKEN: Final = "NO_TOKEN"
-"""Counted for a client without a valid token."""
 
 _BEARER: Final = "bearer "
 _ENTRY: Final = "sightline.token."

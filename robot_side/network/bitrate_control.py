@@ -1,36 +1,36 @@
-"""Quality and size of the pictures, so that each passes the link in time. Pure.
+"""Choose quality and size of the images, so that each passes the link in time. Pure.
 
-Down by a factor when the link shows that it is full, up by a little while it is calm. Only cameras that encode
-themselves can follow (`sightline.robot_side.ports.Adjustable`); the others ignore the target.
+The bytes per image fall by a factor on a full link, and rise slowly on a free one. Only cameras that encode their
+images can follow (`sightline.robot_side.ports.Adjustable`). Other cameras ignore the target.
 """
 
 from typing import Final, NamedTuple
 
 from sightline.robot_side.network.congestion_window import LinkCapacity
 
+# Time for which an image may occupy the link. Its age grows by the same time. Thirty images a second pass with reserve.
 PICTURE_US: Final = 28_000
-"""For how long a picture may occupy the link: its age grows by as much, and thirty a second pass with room to spare."""
+# Side lengths. Half of them loses nothing, because the vision service decodes large images at half scale.
 SCALES_PERCENT: Final = (100, 50)
-"""Side lengths. A half costs nothing that vision looks at: it decodes large pictures at half scale anyway."""
+# Share of the configured quality. Below it JPEG blocks hide small targets, and fewer pixels lose less.
 LEAST_QUALITY_PERCENT: Final = 25
-"""Of the configured quality; below it blocks hide small targets, and fewer pixels are the better loss."""
 
 _LEAST_BYTES: Final = 2_000
 _STEP_BYTES: Final = 1_500
 _STEP_US: Final = 250_000
+# Delay above the lowest recent one that reduces the bytes. Below half of it they may grow.
 _EXCESS_US: Final = 40_000
-"""Delay above the lowest of late, from which on less is sent; below half of it more may be."""
 _FACTOR: Final = 0.8
 _OVERDUE_FACTOR: Final = 0.5
+# Length of each of the two periods with a stored lowest delay. After the second, a longer link counts as normal.
 _FLOOR_US: Final = 5_000_000
-"""Each of the two spans whose lowest delay is kept: a link that has become longer is believed after the second."""
+# Images that were already captured when the target changed.
 _LAG_FRAMES: Final = 2
-"""Pictures that were already taken when the target changed."""
+# Number of delays that show the effect of fewer bytes.
 _CHECKED_BY: Final = 3
-"""Delays that show whether sending less helped."""
 _IN_VAIN: Final = 1.05
+# A new size restarts the pipeline of the vision service, so it must not change more often.
 _FROM_SCALE_US: Final = 3_000_000
-"""A new size makes the vision service begin again, so it is not changed more often."""
 
 
 class EncodingTarget(NamedTuple):
@@ -41,7 +41,7 @@ class EncodingTarget(NamedTuple):
 
 
 class _Cut(NamedTuple):
-    """Why less is sent: pictures of so many bytes took so long, and each byte seemed to take its share of that."""
+    """The cause of a cut: the delay and size of the images, and the estimated time per byte."""
 
     delay_us: int
     size_bytes: float
@@ -49,7 +49,7 @@ class _Cut(NamedTuple):
 
 
 class BitrateControl:
-    """Follows what was sent and how it fared; `target` is what the camera should do next."""
+    """Follows the sent frames and their delays. `target` is the encoding for the camera."""
 
     def __init__(self) -> None:
         self.target = EncodingTarget()
@@ -66,7 +66,12 @@ class BitrateControl:
     # --- what arrives ------------------------------------------------------------------------------------------
 
     def on_sent(self, size_bytes: int, now_us: int) -> None:
-        """A picture of this size left; 0 for an unknown size, from which nothing is learnt."""
+        """Note a sent image.
+
+        Args:
+            size_bytes: size of the JPEG, or 0 if unknown, which changes nothing.
+            now_us: monotonic clock.
+        """
         self._frames += 1
         if self._frames <= _LAG_FRAMES or not size_bytes:
             return
@@ -74,7 +79,12 @@ class BitrateControl:
         self._choose(now_us)
 
     def on_delay(self, delay_us: int, now_us: int) -> None:
-        """A frame took so long, the peer's computing apart, and did not wait behind another."""
+        """Note the delay of a frame that did not wait behind another.
+
+        Args:
+            delay_us: time to the answer without the computing of the peer.
+            now_us: monotonic clock.
+        """
         self._check_cut(delay_us)
         excess_us = delay_us - self._floor(delay_us, now_us)
         if now_us < self._step_at_us:
@@ -87,12 +97,12 @@ class BitrateControl:
             self._step_at_us = now_us + _STEP_US
 
     def on_full(self, full: LinkCapacity, now_us: int) -> None:
-        """No more than this gets through."""
+        """Cut the bytes to the measured capacity of a full link."""
         self._cut(full.bytes_per_s * PICTURE_US / 1e6, full.delay_us, 1e6 / max(1.0, full.bytes_per_s))
         self._step_at_us = now_us + _STEP_US
 
     def on_overdue(self, now_us: int) -> None:
-        """Several answers in a row did not come in time."""
+        """Cut the bytes after several late answers in a row."""
         self._cut(self._current() * _OVERDUE_FACTOR)
         self._step_at_us = now_us + _STEP_US
 
@@ -110,7 +120,9 @@ class BitrateControl:
             self._since_us.clear()
 
     def _check_cut(self, delay_us: int) -> None:
-        """Had bytes been what took so long, then as many as before would now take no longer than they did."""
+        """Undo a cut that did not shorten the delay."""
+        # If the bytes were the cause, the delay plus the saved time of the bytes is at most the delay before the cut.
+        # A larger sum shows a longer link. Fewer bytes do not help there.
         if self._made is None or not self._bytes or self._frames < _LAG_FRAMES + _CHECKED_BY:
             return
         self._since_us.append(delay_us)
@@ -131,7 +143,7 @@ class BitrateControl:
         return min(one for one in self._floors_us if one is not None)
 
     def _choose(self, now_us: int) -> None:
-        """Nearer to the budget, by what the last pictures weighed."""
+        """Move quality and size toward the budget, by the size of the last images."""
         if self._budget_bytes is None:
             return
         quality, scale = self.target

@@ -1,9 +1,9 @@
 """Estimate from delays alone how many frames may be in flight. Pure.
 
-A frame sent while nothing is in flight shows the link's own delay. One sent behind another shows the same where the
-link is long, and waits where the link is thin or the peer slow. So the window grows while no frame waits, and what gets
-through while one does is what the link carries. Of a link whose rate two tries have shown, no third is made before
-long: a camera's own JPEG of 46 kB takes 184 ms at 2 Mbit/s, and one behind it is twice as old.
+A frame sent alone shows the delay of the link. A frame sent behind another has the same delay on a long link, and waits
+on a slow link or behind a slow peer. The window therefore grows while no frame waits. The data rate while a frame waits
+is the capacity of the link. After two attempts have measured the same capacity, the next attempt comes much later: a
+camera's own JPEG of 46 kB takes 184 ms at 2 Mbit/s, and a frame behind it is twice as old.
 """
 
 from collections import deque
@@ -11,34 +11,34 @@ from dataclasses import dataclass
 from typing import Final
 
 _ALONE_KEPT: Final = 3
+# Three waiting frames in a row are a queue. Fewer can be an effect of the radio.
 _BEHIND_KEPT: Final = 3
-"""Three waiting frames in a row are a queue; fewer are an accident of the radio."""
+# At this multiple of the link's own delay, two frames in a row are a queue.
 _GROSS: Final = 1.75
-"""So many times the link's own delay: two in a row are enough."""
 _JITTER_US: Final = 5_000
+# A change by a sixth of the delay is not a queue.
 _JITTER_SHARE: Final = 6
-"""A sixth of the delay may come and go without being a queue."""
 _FIRST_PAUSE_US: Final = 500_000
+# Pause after a window that was too wide. An attempt costs age, so the pause doubles each time ...
 _LONGEST_PAUSE_US: Final = 4_000_000
-"""After a window that was too wide: trying it again costs age, so each time in a row it is waited twice as long ..."""
+# ... unless a wider window worked for this long and this many answers. On a lossy link the width is not the cause.
 _HELD_US: Final = 1_000_000
 _HELD_ANSWERS: Final = 12
-"""... unless a wider one did well for so long and so many: on a lossy link it is not the width that fails."""
+# Time for which a measured rate bounds the width. An attempt beyond it only makes a few frames twice as old ...
 _THIN_US: Final = 30_000_000
-"""For so long a measured rate bounds the width: each try beyond it makes a few frames twice as old for nothing ..."""
+# ... if the last attempt measured the same rate within this factor. The effect of losses seldom repeats ...
 _ALIKE: Final = 1.15
-"""... if the try before measured the same, to this factor: what losses make of a rate is seldom the same twice ..."""
+# ... unless a frame alone takes less than this share of its former time. The link is then faster than before.
 _THINNER: Final = 0.8
-"""... unless a frame by itself takes less than this share of what it did: then the link carries more than it did."""
+# Share of a frame's time at the measured rate, which is inaccurate. A frame cannot pass in less time.
 _LEAST: Final = 0.6
-"""Of the time that a frame takes at the rate, which a few frames show only roughly; in less it cannot be through."""
+# Intervals for which a large frame occupies the link. Behind a smaller one the next frame may wait briefly.
 _LARGE: Final = 2
-"""Intervals for which a frame occupies the link: of smaller ones the next may wait, its age grows by less than that."""
+# Share of the time between answers. A peer that computes for longer is the bottleneck, not the link.
 _PEER_BOUND_SHARE: Final = 0.7
-"""Of the time between answers: a peer that computes for longer than this is what they wait for, not the link."""
 
+# Intervals per frame. A link that carries nearly the camera's rate is not full, even with jitter.
 _KEEPS_UP: Final = 1.05
-"""Intervals a frame: a link that carries the camera's rate, near enough, is not full, whatever jitters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class AckSample:
 
 @dataclass(frozen=True, slots=True)
 class LinkCapacity:
-    """The link carries no more than this; a frame took `delay_us` behind others."""
+    """The capacity of a full link. A frame took `delay_us` behind others."""
 
     bytes_per_s: float
     delay_us: int
@@ -105,7 +105,15 @@ class CongestionWindow:
         return min(self._alone_us, default=None)
 
     def on_answer(self, answered: AckSample, now_us: int) -> LinkCapacity | None:
-        """Learn from an answer. Returns what the link carries where it falls behind the camera."""
+        """Adapt the window to an answer.
+
+        Args:
+            answered: the measurements of one answer.
+            now_us: monotonic clock.
+
+        Returns:
+            The capacity of a link that is slower than the camera, otherwise None.
+        """
         self._since_change += 1
         self._compute_us += 0.3 * (answered.compute_us - self._compute_us)
         each_bytes = answered.gap_bytes / answered.gap_frames
@@ -124,7 +132,7 @@ class CongestionWindow:
         return None
 
     def _lower_own_delay(self, delay_us: int) -> None:
-        """A frame that was not alone and yet quicker: the link has become shorter."""
+        """Note a shorter link: a frame that was not alone, and still faster."""
         own_us = self.own_delay_us
         if own_us is not None and delay_us < own_us:
             self._alone_us.append(delay_us)
@@ -173,7 +181,7 @@ class CongestionWindow:
         return LinkCapacity(sum(one.gap_bytes for one in self._behind) * 1e6 / gap_us, self._waited_us())
 
     def _widen(self, now_us: int) -> None:
-        """More, once no frame waits; by doubling until it was once too much."""
+        """Widen the window if no frame waits, by doubling until the first failure."""
         own_us = self.own_delay_us
         if own_us is None or self._since_change < max(2, self.frames) or now_us < self._grow_at_us:
             return
@@ -185,17 +193,15 @@ class CongestionWindow:
             self._set(min(useful, wider), now_us)
 
     def _useful(self, own_us: int) -> int:
-        """Frames that are made, and looked at, while one is under way.
-
-        With half an interval to spare, so that an answer that late costs no capture; but never for a peer that
-        is slower than the camera: what is spare then waits for the peer.
-        """
+        """Return the number of frames that are captured and processed while one is in flight."""
+        # A reserve of half an interval, so that a slightly late answer costs no capture. Not for a peer that is slower
+        # than the camera: the additional frame would only wait for the peer.
         if self._compute_us > self._interval_us:
             return 1 + int(own_us / self._compute_us)
         return 1 + (own_us + self._interval_us // 2) // self._interval_us
 
     def _fitting(self, own_us: int, now_us: int) -> int:
-        """Frames that the link carries side by side, as far as its rate is known."""
+        """Return the number of frames that the link carries in parallel at its measured rate."""
         thin = self._thin
         frame_us = thin.frame_us(self._frame_bytes) if thin else 0.0
         if thin is None or now_us >= thin.until_us or own_us < max(_THINNER * thin.own_us, _LEAST * frame_us):
@@ -204,7 +210,7 @@ class CongestionWindow:
         return self._most if frame_us < _LARGE * self._interval_us else max(1, round(own_us / frame_us))
 
     def on_timeout(self, now_us: int) -> None:
-        """An answer is overdue: whatever is under way has to come out first."""
+        """Narrow the window to one frame after an overdue answer, until the frames in flight have left the link."""
         self._grow_at_us = max(self._grow_at_us, now_us + (self.own_delay_us or 0))
         self._set(1, now_us)
 

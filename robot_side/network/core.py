@@ -1,4 +1,4 @@
-"""Logic of the network process: pictures in, frames out, credit, camera adaptation. Pure."""
+"""Implement the logic of the network process: images in, frames out, credit, camera adaptation. Pure."""
 
 from collections.abc import Mapping
 
@@ -26,7 +26,14 @@ _CAMERA_PERIOD_US = 500_000
 
 
 class NetworkCore:
-    """One network process of one robot session; `first_seq` continues where an earlier process ended."""
+    """The logic of one network process.
+
+    Args:
+        config: flow of frames.
+        session: session id of the robot.
+        first_seq: first sequence number, the next one after an earlier process of this session.
+        max_frame_bytes: limit for one image.
+    """
 
     def __init__(self, config: StreamConfig, session: str, first_seq: int, max_frame_bytes: int) -> None:
         self.motion = RobotMotion()
@@ -42,7 +49,7 @@ class NetworkCore:
         self._scale_percent = 100
         self._requested = EncodingTarget()
         self._applied = EncodingTarget()
-        """What the camera does: unchanged where it passes its own JPEGs through."""
+        """Encoding of the camera. It does not change for a camera with its own JPEGs."""
 
     def may_capture(self, now_us: int, listening: bool) -> bool:
         """Return True if the camera may capture now."""
@@ -53,7 +60,15 @@ class NetworkCore:
         return self._stream.wait_us(now_us)
 
     def on_camera(self, picture: Picture, now_us: int) -> tuple[FrameHeader, Message] | None:
-        """The frame to publish; None, counted, for a picture too large or not newer than the last."""
+        """Make the frame of an image.
+
+        Args:
+            picture: the newest image.
+            now_us: monotonic clock.
+
+        Returns:
+            Header and message, or None for an image that is too large or not newer than the last, which is counted.
+        """
         if picture.t_us <= self._last_t_us or len(picture.jpeg) > self._max_frame_bytes:
             self._rejected_pictures += 1
             return None
@@ -77,12 +92,12 @@ class NetworkCore:
         )
 
     def on_command_ack(self, ack: CommandAck, now_us: int) -> None:
-        """The driver process validated a twist: credit comes back, and goes to the holder of the lease."""
+        """Return the credit of a validated twist to the holder of the lease."""
         self._stream.on_holder(ack.holder, now_us)
         self._answer(ack.sender, ack.seq, ack.compute_us, now_us)
 
     def on_ack(self, message: Message, now_us: int) -> None:
-        """An acknowledgement: credit comes back. Raises WireError for an invalid one."""
+        """Return the credit of an acknowledgement. Raises WireError for an invalid one."""
         header = decode(AnswerHeader, message.header)
         if header.source == message.source and header.echo.session == self._session:
             who = Holder(source=header.source, session=header.session)
@@ -93,7 +108,7 @@ class NetworkCore:
             self._stream.on_answer(who, seq, compute_us, now_us)
 
     def adapt(self, camera: Camera) -> None:
-        """Pass a new encoding target on to a camera that can follow it; retry while the camera is gone."""
+        """Pass a new encoding target to a camera that can follow it. Repeat it while the camera is gone."""
         target = self._stream.encoding_target
         if target == self._requested or not isinstance(camera, Adjustable):
             return
@@ -106,10 +121,11 @@ class NetworkCore:
             self._applied = target
 
     def announce_camera(self, full_model: CameraModel, now_us: int) -> Message | None:
-        """The model of the newest image: twice a second, and before the first frame of another model.
+        """Return the model of the newest image, twice a second, and before the first frame of another model.
 
         Args:
-            full_model: of the camera's images at full size.
+            full_model: model of the camera at full size.
+            now_us: monotonic clock.
         """
         model = scaled_model(full_model, self._scale_percent)
         if now_us < self._camera_due_us and (model is self._announced or model == self._announced):
@@ -123,7 +139,7 @@ class NetworkCore:
     def status(
         self, now_us: int, dropped_commands: int = 0, dropped: Mapping[str, int] | None = None, missed_captures: int = 0
     ) -> StreamStatus:
-        """Counters of the stream, and what the camera does.
+        """Return the counters of the stream and of the camera.
 
         Args:
             dropped: by channel, what the slots of the link dropped.

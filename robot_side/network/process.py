@@ -36,14 +36,14 @@ _ANYWHERE: Final = ("/0.0.0.0:", "/[::]:")
 
 
 def reachable_endpoints(endpoints: Sequence[str]) -> list[str]:
-    """Those of `endpoints` that listen on every address, with each address in place of none."""
+    """List the addresses of endpoints that listen on every interface."""
     open_ends = [(endpoint, anywhere) for endpoint in endpoints for anywhere in _ANYWHERE if anywhere in endpoint]
     here = own_addresses() if open_ends else []
     return [endpoint.replace(anywhere, f"/{address}:") for endpoint, anywhere in open_ends for address in here]
 
 
 def own_addresses() -> list[str]:
-    """The IPv4 address of every interface that has one, loopback left out."""
+    """List the IPv4 address of every interface, without loopback."""
     found: list[str] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as query:
         for _, name in socket.if_nameindex():
@@ -67,7 +67,7 @@ _KEYS = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP)  # Ctrl-C, Ctrl-\ and Ct
 
 
 class NetworkProcess:
-    """The camera loop (main thread), the driver's packets (a thread), the link's callbacks (its thread)."""
+    """Runs the camera loop (main thread), the driver's packets (a thread) and the link's callbacks (its thread)."""
 
     def __init__(self, setup: NetworkSetup, driver: NetworkEnd, link: Link, camera: Camera) -> None:
         self._network_end = driver
@@ -83,7 +83,7 @@ class NetworkProcess:
         self.running = True
 
     def run(self) -> None:
-        """Until the driver closes its end."""
+        """Stream frames until the driver process closes its end."""
         self._network_end.send(bytes([ipc.PacketKind.READY]))
         self._link.subscribe(TWIST, self._network_end.forward)
         self._link.subscribe(REQUEST, self._network_end.forward)
@@ -127,7 +127,7 @@ class NetworkProcess:
         return due
 
     def _read_camera(self) -> Picture | None:
-        """An image, or None; a camera that is gone is logged once and tried again."""
+        """Return an image or None. A lost camera is logged once and opened again."""
         self._network_core.adapt(self._camera)
         try:
             picture = self._camera.read(_CAMERA_TIMEOUT_S)
@@ -145,7 +145,7 @@ class NetworkProcess:
     # --- the driver ----------------------------------------------------------------------------------------------
 
     def _read_driver(self) -> None:
-        """Until the driver closes its end; then the camera loop ends, or the whole process if it hangs."""
+        """Read the pipe until the driver process closes it. Then end the camera loop, or the process if it hangs."""
         status_due_us = 0
         try:
             while packet := self._network_end.receive():
@@ -173,7 +173,7 @@ class NetworkProcess:
             self._link.publish(message.channel, message.header, message.payload)
 
     def _report(self, now_us: int) -> None:
-        """Report to the driver how the stream does, and what was rejected before it."""
+        """Send the driver process the state of the stream, and the rejections before the gate."""
         missed = getattr(self._camera, "missed_captures", None)  # of cameras that capture by themselves
         with self._lock:
             status = self._network_core.status(
@@ -222,7 +222,7 @@ def _run(driver: NetworkEnd) -> None:
 
 
 def main() -> None:
-    """Entry of the child process: argv[1] and argv[2] are the sockets' descriptors."""
+    """Run the network process. argv[1] and argv[2] are the descriptors of its sockets."""
     start_log(None, "robot")
     for number in _KEYS:  # they reach the whole group; the driver ends us, after zero
         signal.signal(number, signal.SIG_IGN)

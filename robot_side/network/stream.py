@@ -1,9 +1,9 @@
-"""When to send a frame: credit, timeouts, rate. Pure.
+"""Decide when to send a frame: credit, timeouts, rate. Pure.
 
-A frame is captured only while there is credit, so it is young when it leaves and nothing queues behind it. An answer (a
-twist accepted or rejected, or an ack) returns credit. The window starts at one frame in flight and widens only for the
-link's own delay (`congestion_window`), never for a slow detector: with an 80 ms detector one frame in flight is 81-83
-ms old where two are 141-175. What does not fit through the link in time is encoded smaller (`bitrate_control`).
+A frame is captured only with credit, so that it is young when it leaves and no queue grows. An answer (an accepted or
+rejected twist, or an ack) returns credit. The window starts at one frame in flight, and widens only for the delay of
+the link (`congestion_window`), never for a slow detector. With an 80 ms detector, one frame in flight is 81-83 ms old,
+and two are 141-175 ms old. On a slow link the images become smaller (`bitrate_control`).
 """
 
 from collections import OrderedDict, deque
@@ -21,8 +21,8 @@ _FIRST_TIMEOUT_US = 120_000
 _REMEMBERED = 64
 _TIMEOUT_SLACK_US = 12_000  # with a quick peer, below one interval at 30 fps: a loss then costs one frame, not two
 _PENDING_US = 1_000_000  # a frame that is neither answered nor overtaken for this long was lost
+# One overdue answer can be a loss. A second one, of a frame that was sent after the first timeout, is a queue.
 _OVERDUE_IN_A_ROW = 2
-"""Once may be loss, however many frames it took. Twice is a frame sent after it that is overdue too: a queue."""
 
 
 class StreamConfig(Config):
@@ -30,12 +30,12 @@ class StreamConfig(Config):
 
     max_fps: Annotated[float, Field(gt=0, le=240)] = 30.0
     max_window: Annotated[int, Field(ge=1, le=32)] = 12
-    """Most frames in flight, on a link however long."""
+    """Most frames in flight."""
     max_credit_timeout_ms: Annotated[int, Field(ge=20, le=5_000)] = 500
     owner_life_ms: Annotated[int, Field(ge=100, le=10_000)] = 1_000
     """Silence after which another peer's answers may return credit."""
     adapt: bool = True
-    """Whether a camera that encodes itself is set to lower quality and size where the link is thin."""
+    """True to reduce quality and size of the images on a slow link, if the camera can follow."""
 
 
 @dataclass(slots=True)
@@ -48,7 +48,7 @@ class _Sent:
 
 
 class Stream:
-    """Decides for one camera. The caller checks `may_capture` and reports to `on_sent` and `on_answer`."""
+    """Controls the flow of one camera. The caller checks `may_capture`, and calls `on_sent` and `on_answer`."""
 
     def __init__(self, config: StreamConfig) -> None:
         self._config = config
@@ -71,12 +71,13 @@ class Stream:
 
     @property
     def window(self) -> int:
-        """Frames that may be in flight."""
+        """Return the number of frames that may be in flight."""
         return self._congestion_window.frames
 
     @property
     def _has_credit(self) -> bool:
-        """While answers are overdue, one frame for each time that nothing came back: what is under way comes first."""
+        """Return True if one more frame may be sent."""
+        # While answers are overdue, one frame per timeout tests the link. More frames would only lengthen the queue.
         if self._overdue:
             return self._may_probe or not self._in_flight
         return len(self._in_flight) < self.window
@@ -103,7 +104,14 @@ class Stream:
         return max(0, max(self._next_us, blocked_until_us) - now_us)
 
     def on_sent(self, seq: int, t_us: int, now_us: int, size_bytes: int = 0) -> None:
-        """A frame captured at `t_us` left. The next is due by capture time: a late send costs no rate."""
+        """Note a sent frame.
+
+        Args:
+            seq: its sequence number.
+            t_us: capture time.
+            now_us: monotonic clock.
+            size_bytes: size of the JPEG, or 0 if unknown.
+        """
         self._in_flight[seq] = now_us + self._timeout_us()
         self._may_probe = False
         pending = [one for one in self._sent_frames.values() if now_us - one.at_us <= _PENDING_US]
@@ -113,7 +121,8 @@ class Stream:
         self._held_back = False
         if len(self._sent_frames) > _REMEMBERED:
             self._sent_frames.popitem(last=False)
-        # A tenth of slack: a camera that ticks a hair faster than `max_fps` must not be read one tick too late.
+        # The next frame is due by capture time, so that a late send does not reduce the rate. A tenth of slack: a
+        # camera that is slightly faster than `max_fps` must not be read one tick too late.
         self._next_us = t_us + self._interval_us * 9 // 10
         self.sent += 1
         self._sent_us.append(now_us)
@@ -122,10 +131,20 @@ class Stream:
     # --- answers -------------------------------------------------------------------------------------------------
 
     def on_answer(self, who: Holder, seq: int, compute_us: int, now_us: int) -> bool:
-        """An answer to frame `seq` came. Returns whether it gave credit back: only its owner's answers do."""
+        """Note an answer.
+
+        Args:
+            who: sender of the answer.
+            seq: answered frame.
+            compute_us: computing time of the sender.
+            now_us: monotonic clock.
+
+        Returns:
+            True if it returned credit. Only the owner of the credit can.
+        """
         if not self._owns(who, now_us):
             return False
-        # Newest wins at the peer: whatever is older than the answered frame will never be answered.
+        # The newest frame wins at the peer, so that frames older than the answered one never get an answer.
         passed = {old: self._sent_frames.pop(old) for old in tuple(self._sent_frames) if old <= seq}
         if seq in passed:
             self.overtaken += len(passed) - 1
@@ -136,7 +155,7 @@ class Stream:
         return bool(answered)
 
     def on_holder(self, holder: Holder | None, now_us: int) -> None:
-        """The lease changed hands: credit goes to its holder."""
+        """Pass the credit to a new holder of the lease."""
         if holder is not None and holder != self._owner:
             self._hand_over(holder)
             self._owner_until_us = now_us + self._config.owner_life_ms * 1000
@@ -151,7 +170,8 @@ class Stream:
         return True
 
     def _hand_over(self, owner: Holder) -> None:
-        """A slow successor must not be held to a quick one's times, nor to what the way to that one carried."""
+        """Pass the credit to another peer."""
+        # The times and the capacity of the former peer do not apply to a slower successor on another link.
         self._owner = owner
         self._answer_us, self._spread_us, self._overdue = None, 0.0, 0
         self._congestion_window = CongestionWindow(self._interval_us, self._config.max_window)
@@ -176,7 +196,7 @@ class Stream:
             self._bitrate_control.on_full(full, now_us)
 
     def _remember_answer(self, answer_us: int) -> None:
-        """Mean and spread, as RFC 6298 keeps them for the same purpose."""
+        """Update the mean and the spread of the answer time. Source: RFC 6298."""
         if self._answer_us is None:
             self._answer_us, self._spread_us = float(answer_us), answer_us / 8
             return
@@ -186,7 +206,8 @@ class Stream:
     # --- timeouts ------------------------------------------------------------------------------------------------
 
     def _timeout_us(self) -> int:
-        """Doubled each further time that nothing came back: what is late may be waiting behind what was sent."""
+        """Return the timeout of the next frame in us."""
+        # It doubles with each further timeout, because a late answer can wait behind the frames in flight.
         longest_us = self._config.max_credit_timeout_ms * 1000
         return min(longest_us, round(self._usual_us() * (1 << min(max(0, self._overdue - 1), 8))))
 
@@ -215,5 +236,5 @@ class Stream:
                 self._bitrate_control.on_overdue(now_us)
 
     def fps(self, now_us: int) -> float:
-        """Frames sent in the last second."""
+        """Return the number of frames of the last second."""
         return float(sum(1 for sent_us in self._sent_us if now_us - sent_us <= 1_000_000))

@@ -267,6 +267,7 @@ class SafetyGate:
 
     def stop(self, reason: str = "STOP") -> str:
         """Latch STOPPED. The wheels ramp to zero and stay there until `reset`. Always granted."""
+        # Granted in every state and to every source, because it only removes motion.
         self._end(Event.STOP, reason)
         return "STOPPED"
 
@@ -344,6 +345,7 @@ class SafetyGate:
         return None if self._command is None else max(0, now_us - self._command.echo_us)
 
     def _reject_beside_human(self, who: Holder, now_us: int) -> None:
+        # While a human drives, no other operator may arm or reset.
         holder = self._lease.live_holder(now_us)
         if holder is not None and holder.source in HUMANS and holder != who:
             raise WireError(RejectReason.NOT_ALLOWED, f"{holder.source} {holder.session} drives")

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 from sightline.protocol.messages import Holder
 
+# Roles that may drive. STOP ranks above all of them and is not a role.
 RANKS = {"guest": 0, "vision": 1, "teleop": 2}
-"""Roles that may drive. STOP ranks above all of them and is not a role."""
+# After the loss of one of these drivers, the robot stops and must be armed again.
 HUMANS = frozenset({"teleop"})
 
 

@@ -10,15 +10,15 @@ from pydantic import Field, model_validator
 from sightline.protocol.messages import STILL, Twist
 from sightline.robot_side.safety.battery import BatteryLimits
 
+# The driver's period: 50 Hz.
 TICK_US = 20_000
-"""The driver's period: 50 Hz."""
+# Shortest period. The driver also ticks when a command arrives; a flood of commands must not flood the motors.
 MIN_TICK_US = 2_000
-"""Shortest period. The driver also ticks when a command arrives; a flood of commands must not flood the motors."""
 STOP_TIME_BOUND_US = 700_000
 STOP_DISTANCE_BOUND_M = 0.25
 
+# Share of the top speed below which the robot counts as at rest.
 _AT_REST = 0.02
-"""Share of the top speed below which the robot counts as at rest."""
 _SLICE_US = 20_000
 _LONGEST_STEP_US = 1_000_000
 
@@ -59,6 +59,7 @@ class SafetyConfig(BatteryLimits):
     def _stops_in_time(self) -> Self:
         if self.full_speed_age_ms >= self.zero_speed_age_ms:
             raise ValueError("full_speed_age_ms must be below zero_speed_age_ms")
+        # The bound follows from the values themselves, so that a robot that brakes slowly needs a lower top speed.
         bound = stop_bound(self)
         if bound.zero_us > STOP_TIME_BOUND_US or bound.distance_m > STOP_DISTANCE_BOUND_M:
             raise ValueError(

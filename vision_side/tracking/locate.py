@@ -150,8 +150,8 @@ def _box_outline(detection: Detection, camera: CameraModel) -> NDArray[np.float6
 # that the robot validates its age by its own record. "No boxes" differs from "no answer".
 
 
+# Frames; at 60 per second twice what any robot would still move for.
 REMEMBERED = 128
-"""Frames; at 60 per second twice what any robot would still move for."""
 # A box this near to the image border may continue beyond it, so its size is unknown.
 _EDGE_PX = 1.0
 

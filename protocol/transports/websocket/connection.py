@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from websockets.protocol import Event, Protocol
 
 
+# Interval of pings to a silent peer.
 PING_EVERY_US: Final = 1_000_000
-"""Interval of pings to a silent peer."""
+# One ping interval, and one second for the pong.
 SILENCE_US: Final = 2_000_000
-"""One ping interval, and one second for the pong."""
+# Limit for a full send path without progress, e.g. to a stopped process. It costs one socket buffer and a place.
 STALLED_LIMIT_US: Final = 30_000_000
-"""Limit for a full send path without progress, e.g. to a stopped process. It costs one socket buffer and a place."""
+# Silence after which the send path is observed.
 _LOOK_AFTER_US: Final = 500_000
-"""Silence after which the send path is observed."""
 _LONG_AGO_US: Final = -(10**12)
 
 
@@ -130,8 +130,8 @@ def send_path(near: socket.socket, full: bool) -> SendPath:
 if TYPE_CHECKING:
     Received = str | bytes | Request | Response
 
+# Security limit: pieces of one message; their bytes are bounded by the protocol.
 MAX_FRAGMENTS: Final = 1024
-"""Security limit: pieces of one message; their bytes are bounded by the protocol."""
 
 _TEXT, _BINARY, _FIN, _MASK = 0x01, 0x02, 0x80, 0x80  # RFC 6455, 5.2
 _SHORT, _LONG = 126, 127
@@ -220,8 +220,8 @@ def unmasked_head(size: int, is_text: bool) -> bytes:
 # waits in the queue of the peer, where a newer message can replace it, and the thread continues to read.
 
 
+# Security limit: a connection that is closing is cut off after this.
 CLOSE_S: Final = 1.0
-"""Security limit: a connection that is closing is cut off after this."""
 _CHUNK_BYTES: Final = 65_536
 _SMALL_CHUNK_BYTES: Final = 4_096  # for small messages: a flood of them must not become one large batch of objects
 _MUCH_BYTES: Final = 32_768  # sent since the last data from the other end: so much may wait unread before the ping

@@ -21,10 +21,10 @@ from sightline.protocol.messages import RobotId, SessionId, Version, WireModel
 from sightline.protocol.transports.link import Message
 
 SUBPROTOCOL: Final = "sightline.v1"
+# Security limit: a header with the names before it.
 MAX_BLOCK_BYTES: Final = MAX_HEADER_BYTES + 64
-"""Security limit: a header with the names before it."""
+# Security limit: the text of a hello. Every peer must accept a message of this size.
 MAX_HELLO_BYTES: Final = 1024
-"""Security limit: the text of a hello. Every peer must accept a message of this size."""
 
 _LENGTH_BYTES: Final = 2
 _WITHOUT_SOURCE: Final = frozenset(name.encode("ascii") for name, row in CHANNELS.items() if not row.has_source)
@@ -139,12 +139,12 @@ def _key(robot: str, name: str, source: str) -> str:
 # socket.
 
 
+# Counted for a first message, or a later text, that is not a hello.
 BAD_HELLO: Final = "BAD_HELLO"
-"""Counted for a first message, or a later text, that is not a hello."""
+# Counted for a hello that names another robot.
 OTHER_ROBOT: Final = "OTHER_ROBOT"
-"""Counted for a hello that names another robot."""
+# Counted for a message of the wrong kind, or with broken framing.
 BAD_FRAMING: Final = "BAD_FRAMING"
-"""Counted for a message of the wrong kind, or with broken framing."""
 
 
 class PeerError(Exception):

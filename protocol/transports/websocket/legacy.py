@@ -25,8 +25,8 @@ from sightline.protocol.transports.endpoints import LegacyOptions
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING, IncomingMessage, PeerError
 
+# Time without a valid command after which a driver loses the slot. Equal to the robot's lease.
 DRIVER_SLOT_US: Final = 1_000_000
-"""Time without a valid command after which a driver loses the slot. Equal to the robot's lease."""
 
 
 class DriverSlot:
@@ -52,10 +52,10 @@ class DriverSlot:
 
 
 GUEST: Final = "guest"
+# The session of all clients without headers.
 GUEST_SESSION: Final = "00000000"
-"""The session of all clients without headers."""
+# Security limit: a text toward a robot. A twist above 64 bytes is counted, and does not close the connection.
 MAX_COMMAND_TEXT_BYTES: Final = 256
-"""Security limit: a text toward a robot. A twist above 64 bytes is counted, and does not close the connection."""
 
 
 class LegacyClient(NamedTuple):

@@ -104,8 +104,8 @@ class Subscriptions:
 # Only the channels that the table marks as passed on go from peer to peer.
 
 
+# A close that takes longer is left to daemon threads, so that no process hangs on a dead peer.
 CLOSE_S: Final = 1.5
-"""A close that takes longer is left to daemon threads, so that no process hangs on a dead peer."""
 
 
 def open_websocket(

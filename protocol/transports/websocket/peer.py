@@ -60,21 +60,21 @@ class Publication:
 # One WebSocket peer. The thread that publishes also sends; a separate thread reads. Shell.
 
 
+# Security limit for the handshake, and again for the hello.
 OPEN_S: Final = 2.0
-"""Security limit for the handshake, and again for the hello."""
 _LIBRARY_LOG: Final = logging.getLogger("websockets.sightline")
 # The library writes lines for every connection. A flood of connections must not become a flood of lines.
 _LIBRARY_LOG.setLevel(logging.CRITICAL + 1)
+# No compression: it does not reduce JPEG images, and costs three times the CPU time.
 PROTOCOL_OPTIONS: Final[dict[str, Any]] = {"extensions": None, "logger": _LIBRARY_LOG}
-"""No compression: it does not reduce JPEG images, and costs three times the CPU time."""
+# Counted for a peer that did not answer a ping, or did not read for a long time.
 SILENT: Final = "SILENT"
-"""Counted for a peer that did not answer a ping, or did not read for a long time."""
 
+# Counted for a message that the role of the sender's token does not permit.
 NOT_GRANTED: Final = "NOT_GRANTED"
-"""Counted for a message that the role of the sender's token does not permit."""
 
+# Assigns a place to a client of that role. Raises PeerError without a free place.
 Promote = Callable[[str], None]
-"""Assigns a place to a client of that role. Raises PeerError without a free place."""
 
 _TICK_US: Final = 250_000  # longest delay of a ping and of the detection of silence
 _COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE}

@@ -43,14 +43,14 @@ if TYPE_CHECKING:
     from websockets.typing import Subprotocol
 
 
+# Security limit: identified connections of one endpoint.
 MAX_CLIENTS: Final = 16
-"""Security limit: identified connections of one endpoint."""
+# Security limit: places among these for clients that may drive or send requests.
 RESERVED_SLOTS: Final = 4
-"""Security limit: places among these for clients that may drive or send requests."""
+# Security limit: further, unidentified connections. More are closed without a reply.
 MAX_HANDSHAKES: Final = 16
-"""Security limit: further, unidentified connections. More are closed without a reply."""
+# Security limit: of these, from one address. A browser opens up to six connections to one host.
 MAX_HANDSHAKES_PER_ADDRESS: Final = 8
-"""Security limit: of these, from one address. A browser opens up to six connections to one host."""
 
 _CONTROL_CHANNELS: Final = (TWIST.name, REQUEST.name, FRAME.name)
 
@@ -143,14 +143,14 @@ def _cannot_listen(endpoint: WebSocketEndpoint, error: OSError) -> LinkError:
 # The listening end of WebSocket: access, number of clients, and time limits of the handshake. Shell.
 
 
+# Counted for a browser request from another site, or with a host name of another machine.
 CROSS_SITE: Final = "CROSS_SITE"
-"""Counted for a browser request from another site, or with a host name of another machine."""
+# Counted for a client that does not offer `sightline.v1`.
 WRONG_SUBPROTOCOL: Final = "WRONG_SUBPROTOCOL"
-"""Counted for a client that does not offer `sightline.v1`."""
+# Counted for a client above a limit of `ConnectionLimits`.
 TOO_MANY_CLIENTS: Final = "TOO_MANY_CLIENTS"
-"""Counted for a client above a limit of `ConnectionLimits`."""
+# Counted for a client of wss:// whose TLS handshake fails.
 NO_TLS: Final = "NO_TLS"
-"""Counted for a client of wss:// whose TLS handshake fails."""
 
 _GUEST: Final = "guest"  # has the certificate of a viewer, and may drive without keys
 _PAUSE_S: Final = 0.1  # after an accept that failed, e.g. without descriptors left

@@ -33,8 +33,8 @@ OPERATOR_ROLE: Final = "operator"
 VIEWER_ROLE: Final = "viewer"
 _BETWEEN_QUERIES_S: Final = 0.05
 
+# Security limit: no more answers than this are kept.
 MAX_LISTENERS: Final = 64
-"""Security limit: no more answers than this are kept."""
 
 
 @dataclass(frozen=True, slots=True)

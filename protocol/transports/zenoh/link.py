@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     import zenoh
 
 
+# A close that takes longer is left to a daemon thread, so that no process hangs on a dead peer.
 CLOSE_S: Final = 1.5
-"""A close that takes longer is left to a daemon thread, so that no process hangs on a dead peer."""
+# Messages of channels up to this bound are sent immediately, never in a batch.
 EXPRESS_UP_TO_BYTES: Final = 4096
-"""Messages of channels up to this bound are sent immediately, never in a batch."""
+# Security limit: stored publishers of unknown sources. A peer can invent any number of sources.
 MAX_KEPT_PUBLISHERS: Final = 32
-"""Security limit: stored publishers of unknown sources. A peer can invent any number of sources."""
 
 
 def open_zenoh(
@@ -284,8 +284,8 @@ class _ConnectedPeers:
 #     link = fleet_link.link("r1")
 
 
+# Security limit: robots of one fleet.
 MAX_ROBOTS: Final = 256
-"""Security limit: robots of one fleet."""
 
 
 def open_fleet(

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 PRESENCE_PATTERN: Final = f"{PRESENCE_PREFIX}/**"
 MAX_BYTES: Final = 512
+# Security limit: stored replies of one query.
 MAX_PEERS: Final = 256
-"""Security limit: stored replies of one query."""
+# The first reply also contains the time to set up its route. The best of a few replies shows the link alone.
 QUERY_ROUNDS: Final = 3
-"""The first reply also contains the time to set up its route. The best of a few replies shows the link alone."""
 
 _PRINTED: Final = r"^[^\x00-\x1f\x7f-\x9f]*$"
 _Line = Annotated[str, Field(max_length=64, pattern=_PRINTED)]
@@ -128,10 +128,10 @@ def robot_with_same_id(own: Presence, answers: Iterable[PeerInfo]) -> Presence |
 # process itself replies, so that a process that died or hangs does not appear.
 
 
+# A peer without a reply by then counts as absent.
 REPLY_TIMEOUT_S: Final = 0.5
-"""A peer without a reply by then counts as absent."""
+# Pause before the second query. A robot that has just ended no longer replies then.
 _SECOND_LOOK_S: Final = 1.0
-"""Pause before the second query. A robot that has just ended no longer replies then."""
 _HOST_CHARACTERS: Final = 64
 
 

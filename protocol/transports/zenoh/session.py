@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     import zenoh
 
 
+# The group of Zenoh, with a port three above that of Zenoh.
 MULTICAST_GROUP: Final = ("224.0.0.224", 7449)
-"""The group of Zenoh, with a port three above that of Zenoh."""
 MULTICAST_OFF: Final = {"enabled": False}
 LOOPBACK: Final = ("localhost", "127.", "::1")
 
@@ -51,13 +51,13 @@ def multicast_address() -> str:
 
 
 LEASE_MS: Final = 2000
+# One 40 ms after the last message. TCP detects a lost packet by the packets after it. Without them, after the end of
+# a frame or a twist, it needs its timeout of at least 200 ms.
 KEEP_ALIVES_PER_LEASE: Final = 50
-"""One 40 ms after the last message. TCP detects a lost packet by the packets after it. Without them, after the end of a
-frame or a twist, it needs its timeout of at least 200 ms."""
 MAX_MESSAGE_BYTES: Final = 1_048_576
 HANDSHAKE_MS: Final = 3000
+# Sessions at a listening end: a fleet of twenty robots, their vision services, and viewers.
 MAX_SESSIONS: Final = 64
-"""Sessions at a listening end: a fleet of twenty robots, their vision services, and viewers."""
 _OVER_UDP: Final = ("udp", "quic")
 _FLOOD_CHECK_S: Final = 0.5
 _PROBE_TIMEOUT_S: Final = 0.3
@@ -73,10 +73,10 @@ class _ClosedSession:
         raise zenoh.ZError("the session is closed")
 
 
+# A link drops its reference to a closed session immediately. To free a router's session can block every Python thread
+# for up to 10 s while another session of the process receives data: eclipse-zenoh 1.10.2 waits for a task and holds
+# the lock of the interpreter. In a reference cycle, the garbage collector does that at any later time.
 CLOSED_SESSION: Final[Any] = _ClosedSession()
-"""A link drops its reference to a closed session immediately. To free a router's session can block every Python thread
-for up to 10 s while another session of the process receives data: eclipse-zenoh 1.10.2 waits for a task and holds the
-lock of the interpreter. In a reference cycle, the garbage collector does that at any later time."""
 
 
 def open_session(
