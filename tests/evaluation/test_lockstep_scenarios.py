@@ -72,6 +72,7 @@ def test_integral_law_treats_pixels_and_meters_differently():
     assert fmean(abs(math.degrees(truth.bearing_rad)) for truth in truths) > 3
 
 
+@pytest.mark.slow
 def test_two_speeds_by_the_pixel_never_settle():
     run = drive("chaser", 811, 6.0, "pixel-p")
     distances = [truth.distance_m for truth in last(run, 3.0)]

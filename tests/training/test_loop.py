@@ -40,6 +40,7 @@ def scenes(count=4):
     return DrawnScenes(pictures, tuple(truths), ((),) * count, ((),) * count)
 
 
+@pytest.mark.slow
 def test_the_loss_falls(tmp_path):
     said = []
     train(scenes(), Training((100,), batch=2, rate=3e-3, seed=4), "cpu", tmp_path, said.append)
@@ -71,6 +72,7 @@ def test_a_training_that_was_cut_ends_as_if_it_had_not_been(tmp_path, monkeypatc
             train(others, again, "cpu", cut, said.append)
 
 
+@pytest.mark.slow
 def test_two_processes_train_one_network(tmp_path, capfd):
     """The second's share counts: the same first half alone ends elsewhere; and a cut is gone on from."""
     made = []
@@ -87,6 +89,7 @@ def test_two_processes_train_one_network(tmp_path, capfd):
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_is_one_line(tmp_path):
     def kill(line):
         for one in multiprocessing.active_children():
@@ -146,6 +149,7 @@ def test_a_larger_networks_file_gives_the_layers_that_are_left(monkeypatch):
     assert set(left) == set(given) and all(np.array_equal(left[name], value) for name, value in given.items())
 
 
+@pytest.mark.slow
 def test_the_last_round_alone_is_trained_from_a_file(tmp_path, capsys):
     sizes = {"scenes": 8, "batch": 4, "jobs": 1, "validated": 5, "judged": 5}
     arguments = [part for name, value in sizes.items() for part in (f"--{name}", str(value))]
@@ -196,6 +200,7 @@ def test_cut_outs_halve_as_evenly_as_pictures():
     assert all(side % 16 == 0 for side in CUT_PX)
 
 
+@pytest.mark.slow
 def test_the_whole_command_ends_with_a_model_and_its_card(tmp_path, capsys):
     sizes = {"scenes": 8, "steps": 2, "batch": 4, "jobs": 1, "validated": 5, "judged": 5}
     arguments = [part for name, value in sizes.items() for part in (f"--{name}", str(value))]

@@ -188,8 +188,8 @@ class BoxReader:
         echo = stamp.echo
         frame = self._frames.get((echo.session, echo.seq)) if echo and echo.channel == "frame" else None
         if frame is None or echo is None or frame.t_us != echo.t_us:
-            which = f"frame {echo.seq} of session {echo.session}" if echo else "no frame"
-            raise WireError(RejectReason.UNKNOWN_FRAME, f"boxes answer {which}, which did not come here")
+            which = f"frame {echo.seq} of session {echo.session}, not received here" if echo else "no frame"
+            raise WireError(RejectReason.UNKNOWN_FRAME, f"boxes answer {which}")
         return frame
 
     def _means(self, box: DetectedBox) -> bool:

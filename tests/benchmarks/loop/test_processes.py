@@ -80,6 +80,7 @@ def test_of_several_connections_to_a_port_the_busiest_counts():
     assert carried_between({}, {}) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("transport", ["zenoh", "websocket"])
 def test_a_short_race_of_the_services_over_each_transport(transport):
     race = run_race(replace(SMALL, transport=transport, peers=()), lambda _: None)
@@ -103,12 +104,14 @@ def test_every_peer_answers(tmp_path):
         assert name == FLOOR or one.bytes_per_picture > 1000, name
 
 
+@pytest.mark.slow
 def test_viewers_come_and_stall_and_the_loop_goes_on():
     checks = {check.name: check for check in measure_watchers(replace(SMALL, tries=1), 3, lambda _: None)}
     assert checks["not accepted"].value < 50
     assert checks["memory, more"].value < 50
 
 
+@pytest.mark.slow
 def test_the_command_leaves_its_figures_and_its_picture(tmp_path, capsys, monkeypatch):
     app = typer.Typer()
     register(app)

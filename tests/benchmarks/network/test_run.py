@@ -179,6 +179,7 @@ def test_network_bench_without_root_names_its_requirements():
     assert done.returncode == 2 and "run it as root on Linux" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun")
 def test_a_short_row_is_run_for_real():
     command = [*COMMAND, "--only", "near", "--seconds", "4", "--json"]

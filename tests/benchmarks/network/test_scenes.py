@@ -137,6 +137,7 @@ def test_a_robot_that_is_missing_is_noticed():
 # --- for real ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun")
 def test_a_standby_is_run_for_real():
     command = [

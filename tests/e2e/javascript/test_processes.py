@@ -50,6 +50,7 @@ def our_vision(tmp_path):
         process.wait(5)
 
 
+@pytest.mark.slow
 def test_our_vision_and_operator_drive_and_stop_the_javascript_robot(tmp_path, our_vision):
     with JsRobot(tmp_path) as robot:
         our_vision(robot)
@@ -69,6 +70,7 @@ def test_our_vision_and_operator_drive_and_stop_the_javascript_robot(tmp_path, o
         assert robot.end() == 0
 
 
+@pytest.mark.slow
 def test_the_stop_latch_of_the_javascript_robot_survives_kill_and_restart(tmp_path):
     with JsRobot(tmp_path, "--auto-arm") as robot:
         sightline("stop", "js1", "--connect", robot.endpoint)

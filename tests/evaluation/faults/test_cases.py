@@ -301,7 +301,15 @@ def run_once(row, tmp_path):
     assert all(check.value is not None and math.isfinite(check.value) for check in done.checks)
 
 
-@pytest.mark.parametrize("row", chosen([], short=True), ids=lambda row: row.id)
+def by_tier(rows):
+    """Put the rows that compute for more than 1.5 s into the second tier."""
+    costly = {"command.flood", "command.heartbeat", "command.replay", "camera.frozen", "stop.driving", "wire.cut3",
+              "end.sigterm", "network.kill", "network.gil", "vision.hangs", "vision.kill"}
+    assert costly <= {row.id for row in rows}
+    return [pytest.param(row, marks=pytest.mark.slow if row.id in costly else (), id=row.id) for row in rows]
+
+
+@pytest.mark.parametrize("row", by_tier(chosen([], short=True)))
 def test_the_short_set(row, tmp_path):
     run_once(row, tmp_path)
 

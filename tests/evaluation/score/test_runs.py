@@ -86,6 +86,7 @@ def test_detector_without_an_answer_is_reported_with_its_reason(capsys):
     assert 1 <= len(said) <= 3 and "no answer: UNREACHABLE: 127.0.0.1:9: " in said[0]
 
 
+@pytest.mark.slow
 def test_the_command_prints_one_object_and_exits_5_when_not_ok(capsys):
     options = ["--scenario", "static", "--seeds", "302", "--json", "--seconds"]
     assert cli.run(["score", *options, "4"]) == 0

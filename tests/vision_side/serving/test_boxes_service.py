@@ -129,7 +129,7 @@ def test_boxes_that_answer_no_frame_that_came_here_move_nothing_and_are_counted(
     bench.boxes(9, ball_at(1.0, 0.3))
     bench.boxes(2, ball_at(1.0, 0.3), t_us=2 * FRAME_US + 1)
     assert bench.twist() is None and bench.service.skipped == {"UNKNOWN_FRAME": 3}
-    assert len([line for line in bench.said if "refused" in line]) == 1
+    assert len([line for line in bench.said if "rejecting boxes" in line]) == 1
     bench.boxes(2, ball_at(1.0, 0.3))
     assert bench.twist() is not None
 
