@@ -40,7 +40,7 @@ def test_with_400_ms_the_robot_stands_still():
     result, figures = run("eight", 104, Conditions(latency_ms=400, loss=0.1), 3.0)
     assert all(check.ok for check in checks_of("eight", figures, 400))
     assert State.ACTIVE not in result.states
-    assert len(result.twists) > 5, "vision did answer; the gate refused"
+    assert len(result.twists) > 5, "vision did answer; the gate rejected"
 
 
 def test_a_dead_link_moves_nothing():

@@ -1,6 +1,6 @@
 """A yellow ball among yellow boxes: by its colour a robot goes for a box, a learned detector follows the ball.
 
-Judged from world truth alone: where the robot is, what its camera's axis points at, where the ball is.
+The score uses world truth alone: the robot, the axis of its camera, and the ball.
 """
 
 import math
@@ -38,7 +38,7 @@ def driven(detector, seed, seconds, scenario=SCENARIO):
 
 
 def off_axis_deg(truth, box):
-    """How far a box's middle is from where the camera looks; the camera looks where the robot does."""
+    """Return the distance of a box's center from the axis of the camera, which points in the robot's direction."""
     lens_x, lens_y = (at + ROBOT.camera.x_m * turn(truth.yaw_rad) for at, turn in ((truth.x_m, math.cos),
                                                                                    (truth.y_m, math.sin)))
     bearing_rad = math.atan2(box.at_m[1] - lens_y, box.at_m[0] - lens_x)
@@ -58,7 +58,7 @@ def test_the_scenario_is_what_the_write_up_had():
     assert vision_config(SCENARIO, ROBOT).hsv == HsvConfig(ranges=(one,)), "nothing else of ours is changed"
     assert one == older_range.RANGE
     assert {one.color for one in SCENARIO.things} == {SCENARIO.target.color} and len(SCENARIO.things) == 3
-    assert all(one.jitter_m == 0 for one in SCENARIO.things), "their places are what the truth is judged by"
+    assert all(one.jitter_m == 0 for one in SCENARIO.things), "the score uses their places"
     assert SCENARIO.start.distance_m[1] < SCENARIO.stand_off_m and SCENARIO.start.bearing_deg[0] > ACQUIRED_WITHIN_DEG
 
 

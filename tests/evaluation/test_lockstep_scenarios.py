@@ -1,4 +1,4 @@
-"""Every scenario by name, and every older law, over the real line in virtual time; bounds are in test_lockstep.py."""
+"""Every scenario by name, and every legacy law, over the real line in virtual time; bounds are in test_lockstep.py."""
 
 import math
 from statistics import fmean
@@ -44,7 +44,7 @@ def test_a_target_behind_a_wall_is_not_driven_at_through_it():
     assert run.samples[-1].wall_contacts * STEP_S < 0.1
 
 
-# --- the older laws, which must fail as they did -----------------------------------------------------------------
+# --- the legacy laws, which must fail as they did ----------------------------------------------------------------
 
 
 def test_band_steering_soon_finds_the_ball_too_far():

@@ -1,4 +1,4 @@
-"""What a person would configure for each scenario: it loads, it fits the robot, and another mission starts clean."""
+"""The configuration of each scenario: it loads, it fits the robot, and another mission starts clean."""
 
 import pytest
 
@@ -46,7 +46,7 @@ def test_the_guard_knows_the_robots_outline_and_its_sensors_dead_zone(name):
     assert guard.front_m >= reach.front_m - 1e-9
     assert guard.rear_m >= reach.rear_m - 1e-9
     assert guard.half_width_m >= reach.half_width_m - 1e-9
-    if not model.lidar.eyes:  # what is nearer than a sensor can tell must be nearer than where the robot stands
+    if not model.lidar.eyes:  # the blind zone must end before the stand-off of the robot
         assert guard.stop_m > model.lidar.x_m + model.lidar.range_min_m - guard.front_m + 2 * model.lidar.noise_m
 
 

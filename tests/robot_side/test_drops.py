@@ -1,4 +1,4 @@
-"""What every slot dropped, from where it is counted to the words of `sightline status`; and captures for nobody."""
+"""The drops of every slot, from the counter to the text of `sightline status`; and captures without a reader."""
 
 import socket
 import threading
@@ -23,7 +23,7 @@ OPEN = []
 
 
 class CountingCamera:
-    """A camera that counts how often it is asked."""
+    """A camera that counts its reads."""
 
     model = CameraModel(width_px=64, height_px=64, fx_px=50, fy_px=50, cx_px=32, cy_px=32)
     live = True
@@ -54,7 +54,7 @@ def running(link, camera):
 def test_camera_without_a_listener_captures_nothing():
     joined, camera = MemoryNetwork(), CountingCamera()
     network, pairs = running(joined.link("r1"), camera)
-    assert pairs[0][0].recv(64), "it says that it is ready"
+    assert pairs[0][0].recv(64), "it reports that it is ready"
     time.sleep(0.5)
     assert camera.captures == 0
     viewer = joined.link("r1", "viewer")
@@ -64,7 +64,7 @@ def test_camera_without_a_listener_captures_nothing():
 
 
 class CountingLink:
-    """As far as it counts."""
+    """The counters of the link."""
 
     robot = "r1"
 

@@ -1,4 +1,4 @@
-"""What the network process is made of: the driver's own modules, and a camera of the folder that both start in."""
+"""The parts of the network process: the driver's modules, and a camera from the folder in which both start."""
 
 import os
 import shutil
@@ -30,7 +30,7 @@ class MyCamera(FolderCamera):
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    """Where the robot is started: with modules of its owner's that are called as others that a robot needs."""
+    """The folder of the robot, with modules of its owner that have the names of modules that a robot needs."""
     for name in ("select", "zenoh", "websockets", "json", "pydantic"):
         (tmp_path / f"{name}.py").write_text(STRANGE)
     (tmp_path / "pictures").mkdir()

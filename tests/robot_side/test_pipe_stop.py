@@ -91,7 +91,7 @@ def child(tmp_path):
 
 
 def test_what_a_process_sent_before_it_died_is_read_even_if_it_left_packets_unread(child):
-    """The kernel tells of unread packets ahead of what waits, once."""
+    """The kernel reports unread packets ahead of the waiting ones, once."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setblocking(False)
     child.socket = ours
@@ -135,7 +135,7 @@ def test_a_dead_process_whose_descendant_holds_the_socket_is_started_again_all_t
 
 @pytest.fixture
 def stopped(tmp_path):
-    """A robot at speed, its driver process waiting up, and somebody who may say something to it."""
+    """A robot at speed with a stopped driver process, and an operator that can send to it."""
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
         assert driving(robot)
         with open_zenoh("r1", connect=[robot.endpoint], role="operator", timeout_s=10) as link:
@@ -147,7 +147,7 @@ def stopped(tmp_path):
 def say_stop_once(link):
     stop = request(Verb.STOP)
     link.publish(REQUEST, stop.header, stop.payload)
-    time.sleep(0.3)  # until it has arrived: nothing that could be waited for says so while the driver is waiting up
+    time.sleep(0.3)  # until it has arrived: no event shows it while the driver process is stopped
 
 
 def test_stop_sent_once_arrives_through_a_full_socket(stopped):

@@ -102,7 +102,7 @@ def test_pictures_are_fresh_distinct_and_paced(sim):
         picture = camera.read(1.0)
         assert picture is not None
         assert read_jpeg_size(picture.jpeg).width_px == 320
-        assert picture.t_us > before_us - 8_000  # drawn after it was asked for, but for the step under way
+        assert picture.t_us > before_us - 8_000  # drawn after the request, except for the current step
         ages_us.append(time.monotonic_ns() // 1000 - picture.t_us)
         stamps.append(picture.t_us)
     gaps_us = [later - earlier for earlier, later in pairwise(stamps)]

@@ -85,12 +85,12 @@ def test_labels_become_the_boxes_of_the_frame_they_are_of():
 
 def test_reader_of_truth_ignores_labels():
     message = to_json([Label("legs", 1.0, 1.0, 2.0, 3.0, 4.0)], 17, 320)
-    assert b'"t_us"' not in message, "that is what tells truth from the rest"
+    assert b'"t_us"' not in message, "this field identifies a truth"
     assert json.loads(message)["labelled_us"] == 17
 
 
 def assert_boxes_of_a_smaller_picture(labels, camera) -> None:
-    """What is published for a frame of half the size is in that frame's pixels."""
+    """Labels of a frame at half size are in the pixels of that frame."""
     network, heard = MemoryNetwork(), []
     robot, person = network.link("r1"), network.link("r1", role="guest")
     robot.subscribe(DETECTIONS, heard.append)

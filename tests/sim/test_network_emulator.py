@@ -193,15 +193,15 @@ _PROBE = """
 import json, socket, sys, time
 s, started = socket.socket(), time.monotonic()
 s.settimeout(float(sys.argv[2]))
-try: s.connect((sys.argv[1], 9)); said = "connected"
-except ConnectionRefusedError: said = "refused"
-except OSError: said = "silence"
-print(json.dumps([said, time.monotonic() - started]))
+try: s.connect((sys.argv[1], 9)); outcome = "connected"
+except ConnectionRefusedError: outcome = "closed"
+except OSError: outcome = "silence"
+print(json.dumps([outcome, time.monotonic() - started]))
 """
 
 
 def probe(wire, timeout_s=5.0):
-    """Knock at a closed port over the wire: the refusal is one packet each way."""
+    """Connect to a closed port over the wire: the rejection is one packet each way."""
     command = ["ip", "netns", "exec", wire.far_side, sys.executable, "-c", _PROBE, ADDRESS_A, str(timeout_s)]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
@@ -209,15 +209,15 @@ def probe(wire, timeout_s=5.0):
 @needs_wire
 def test_real_packets_pass_are_late_and_are_cut_in_one_direction(tmp_path):
     with BenchWire(tmp_path / "wire.log") as wire:
-        said, seconds = probe(wire)
-        assert said == "refused" and seconds < 0.05
+        outcome, seconds = probe(wire)
+        assert outcome == "closed" and seconds < 0.05
         wire.shape(LinkShapes(ab=LinkShape(delay_ms=150), ba=LinkShape(delay_ms=100)))
-        said, seconds = probe(wire)
-        assert said == "refused" and 0.25 <= seconds < 0.4
+        outcome, seconds = probe(wire)
+        assert outcome == "closed" and 0.25 <= seconds < 0.4
         before = wire.shape(LinkShapes(ab=LinkShape(cut=True)))
         assert probe(wire, 0.3)[0] == "silence"
         assert wire.shape(LinkShapes()) > before
-        assert probe(wire)[0] == "refused"
+        assert probe(wire)[0] == "closed"
         names = wire.robot_side, wire.far_side
     left = subprocess.run(["ip", "netns", "list"], capture_output=True, text=True, check=True).stdout
     assert not any(name in left for name in names)

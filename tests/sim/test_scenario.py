@@ -1,4 +1,4 @@
-"""Scenario, robot and look files: what loads, what is refused and in which words; paths and motors by themselves."""
+"""Scenario, robot and look files: valid ones, rejected ones with their errors; paths and motors alone."""
 
 import math
 from itertools import pairwise

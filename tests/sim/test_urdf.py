@@ -1,4 +1,4 @@
-"""URDF files as robots: what is measured in them, and what is refused in which words."""
+"""URDF files as robots: their measures, and the errors of rejected ones."""
 
 import math
 from pathlib import Path

@@ -77,14 +77,14 @@ def test_the_same_numbers_give_the_same_sample():
 
 
 def four_scenes():
-    """Each of another label, which says which one was shown."""
+    """Detections with separate labels, which identify the input."""
     pictures = np.full((4, HEIGHT_PX, WIDTH_PX, 3), 120, np.uint8)
     return DrawnScenes(pictures, tuple((LabelledBox(label, BALL.box, 1.0),) for label in LABELS[:4]), ((),) * 4,
                        (((4.0, 180.0, 44.0, 220.0),),) * 4)
 
 
 def times_shown(which, count):
-    """How many times each of the four was."""
+    """Count each of the four."""
     heats = [sample(four_scenes(), which, (1, 0, place), WHOLE_PX).heat for place in range(count)]
     return np.bincount([int(np.argwhere(heat[: len(LABELS)] == 1.0)[0, 0]) for heat in heats], minlength=4).tolist()
 
@@ -109,7 +109,7 @@ def test_a_round_of_harder_pictures_is_cut_around_other_things_too():
 
 
 def test_a_round_of_harder_pictures_has_more_clear_ones_and_more_bad_ones():
-    """Of black and white squares: clear ones are bright with sharp edges, bad ones neither."""
+    """Images of black and white squares: clear ones are bright with sharp edges, bad ones neither."""
     squares = (np.indices((HEIGHT_PX, WIDTH_PX)) // 40).sum(0) % 2 * 255
     scenes = DrawnScenes(np.repeat(squares[None, ..., None], 3, 3).astype(np.uint8), ((),), ((),), ((),))
 

@@ -182,7 +182,7 @@ def test_start_from_another_network_gives_one_error_line(content, tmp_path, caps
 
 
 def test_a_gpu_takes_each_batch_whole(tmp_path, monkeypatch):
-    """Also where a training begins from a file, whose checkpoint says so."""
+    """Also for a training that starts from a file, which its checkpoint names."""
     asked = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(train_run, "run_training", lambda options, *_: asked.append(options) or tmp_path / "m.onnx")

@@ -1,4 +1,4 @@
-"""What changes as a training goes on."""
+"""Values that change during a training."""
 
 import pytest
 
@@ -15,7 +15,7 @@ def test_each_round_has_the_rate_up_and_down_again_half_as_high_but_not_below_a_
         assert rates[: top + 1] == sorted(rates[: top + 1]) and rates[top:] == sorted(rates[top:], reverse=True)
         assert 0 < rates[0] < 0.02 * highest and 0 < rates[-1] < 0.02 * highest
         begin += steps
-    assert 0 < training.rate_at(training.steps) < 0.02, "the optimiser asks for one more than there are"
+    assert 0 < training.rate_at(training.steps) < 0.02, "the optimizer requests one more than there are"
 
 
 @pytest.mark.parametrize(("rounds", "known"), [((10,), [40]), ((10, 5), [20, 40]), ((3, 4, 5), [13, 26, 40])])

@@ -1,4 +1,4 @@
-"""The model that ships: its card is true of it, and it finds what it says on scenes that nothing was trained on."""
+"""The shipped model: its card is correct, and it has the stated figures on scenes without training."""
 
 import hashlib
 

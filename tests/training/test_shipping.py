@@ -23,7 +23,7 @@ from tests.training.fixture import weights
 
 @contextmanager
 def told(counts, total, what):
-    """What progress is told, under its name."""
+    """The progress lines by name."""
     counts[what] = [total]
     yield counts[what].append
 

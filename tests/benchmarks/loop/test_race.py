@@ -1,4 +1,4 @@
-"""`sightline bench loop`: its figures, what it is held against, and what it may be asked to do."""
+"""`sightline bench loop`: its figures, its bounds and its options."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -73,7 +73,7 @@ def test_of_a_tally_every_picture_captured_in_time_counts_once(captured_us, data
 
 
 def header_rows(count, refused=()):
-    """Frames 33 ms apart; each header tells the age of the last command accepted, some of which were not."""
+    """Frames 33 ms apart; each header contains the age of the last command accepted, some of which were not."""
     rows, latency_us = [], None
     for seq in range(count):
         rows.append((seq, seq * 33 * MS, latency_us))
@@ -195,7 +195,7 @@ def test_time_of_others_is_what_neither_we_nor_idleness_had(monkeypatch):
     assert taken_percent(before, after, 10.0) == pytest.approx(100 * (1.0 + 0.5) / 20)
 
 
-# --- what is asked -----------------------------------------------------------------------------------------------
+# --- options -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("text", ["640", "x480", "640x", "a640x480", "640x480x3", "６４０x480", "-1x4", ""])

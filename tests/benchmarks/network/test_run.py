@@ -1,4 +1,4 @@
-"""`sightline bench network`: its rows, its figures, what it says without root; one real row where that can be run."""
+"""`sightline bench network`: its rows, its figures, its error without root; one real row where it can run."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""The rows of `bench network` that are more than one robot and one vision: their judges, and one run for real."""
+"""The rows of `bench network` with more than one robot and one vision service: their checks, and one real run."""
 
 import json
 import subprocess
@@ -80,7 +80,7 @@ FALL = (12.0, 9.0, 6.0, 3.0, 0.0, 0.0, 0.0)
 def test_a_stop_reaches_the_wheels_with_the_first_line_of_the_fall_that_ends_at_zero():
     rows = motors(*[15.0] * 10, 13.0, 15.0, *FALL)
     assert reached_ms(rows[6:], 5 * TICK_US) == pytest.approx(20 * (12 - 5))
-    assert reached_ms(motors(*[15.0] * 10), 0) is None, "a STOP that the wheels never heard of"
+    assert reached_ms(motors(*[15.0] * 10), 0) is None, "a STOP that never reached the wheels"
 
 
 def test_one_failed_stop_gives_no_p99():

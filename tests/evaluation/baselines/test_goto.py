@@ -1,4 +1,4 @@
-"""Mission `goto-baseline`: the write-up's numbers, its three states, and what it cannot do."""
+"""Mission `goto-baseline`: the numbers of the legacy article, its three states, and its limits."""
 
 import math
 from itertools import pairwise

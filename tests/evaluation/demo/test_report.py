@@ -1,4 +1,4 @@
-"""How a demo, and many of them, are judged: by what the mission said too, and each figure by its own kind of bound."""
+"""The score of one demo and of many: also by the reports of the mission, and each figure by its own kind of bound."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def test_color_of_the_light_is_scored_from_the_recording(lights, monkeypatch):
     assert misread(lights) == (0.0, True)
     assert misread(replace(lights, samples=[replace(one, light="off") for one in lights.samples])) == (100.0, False)
     first, late = lights.samples[0], lights.samples[len(lights.samples) // 2 :]
-    assert misread(replace(lights, samples=[replace(first, light="off"), *late])) == (0.0, True), "nobody saw it change"
+    assert misread(replace(lights, samples=[replace(first, light="off"), *late])) == (0.0, True), "no report of the change"
 
 
 class StatusLink:
@@ -79,7 +79,7 @@ def test_state_and_frame_age_come_from_the_recording_in_order(tmp_path):
 
 
 def figure(name: str, bound: float, *values: float | None):
-    """What is made of one figure with these values."""
+    """Return the check of one figure with these values."""
     results = [{"checks": [{"name": name, "value": value, "unit": "", "bound": bound}],
                 "replayed": {"total": 9, "equal": 9}} for value in values]
     return _figures("ball", results, Kinds(AT_LEAST, EXACT))[0]

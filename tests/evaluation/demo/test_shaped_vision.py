@@ -1,4 +1,4 @@
-"""A shaped link delays and loses what it was asked to, keeps order, is bounded, and counts."""
+"""A shaped link has the configured delay and loss, keeps order, is bounded, and counts."""
 
 import threading
 import time

@@ -1,4 +1,4 @@
-"""The fault bench: its judge on made-up logs, its rows and report, and the rows themselves on real processes.
+"""The fault bench: its checks on invented logs, its rows and report, and the rows themselves on real processes.
 
 The short set is marked `slow`, the rest `faults`.
 """
@@ -63,7 +63,7 @@ def commands(until_us, age_us=5_000):
     return [SentCommand(t_us, t_us - age_us) for t_us in range(0, until_us + 1, SENT_EVERY_US)]
 
 
-# --- the judge ---------------------------------------------------------------------------------------------------
+# --- the checks --------------------------------------------------------------------------------------------------
 
 
 @given(st.integers(1, 60), st.integers(1, 30), st.integers(0, 4))
@@ -115,7 +115,7 @@ def test_a_log_is_read_without_its_unfinished_line():
     assert read_motors(text) == [MotorRow(1, 2.0, 3.0, 4.0, 5.0)]
 
 
-# --- old sight ---------------------------------------------------------------------------------------------------
+# --- old frames --------------------------------------------------------------------------------------------------
 
 
 def test_driving_on_young_frames_is_allowed():

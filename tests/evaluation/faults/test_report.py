@@ -1,4 +1,4 @@
-"""Figures of the fault bench beside the stop: ticks told from gaps."""
+"""Figures of the fault bench besides the stop: ticks distinguished from gaps."""
 
 import pytest
 

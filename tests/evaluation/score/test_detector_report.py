@@ -1,4 +1,4 @@
-"""`score detectors --demand`: the bounds of a learned detector; whose options; plug-ins that raise or say nonsense."""
+"""`score detectors --demand`: the bounds of a learned detector; options; plug-ins that raise or return invalid results."""
 
 import json
 import math
@@ -89,7 +89,7 @@ def test_a_line_for_each_check_names_whose_it_is():
 
 
 def told(capsys, *arguments):
-    """Of one scene with a ball, and two of lights and legs."""
+    """The report of one scene with a ball, and two with lights and legs."""
     code = cli.run(["score", "detectors", "--frames", "1", "--seeds", "900001", "--column", "nominal", *arguments])
     return code, *capsys.readouterr()
 

@@ -1,4 +1,4 @@
-"""The judge of detectors: verdicts, figures, average precision, and the command on real scenes."""
+"""The score of detectors: results, figures, average precision, and the command on real scenes."""
 
 import json
 from dataclasses import replace
@@ -46,7 +46,7 @@ def test_overlap_is_intersection_by_union():
     ([found(10, 10, 30, 30)], "nowhere"),
     ([], "none"),
     (None, "none"),
-    ([found(*OTHER, label="legs")], "none"),  # nobody follows what is called otherwise
+    ([found(*OTHER, label="legs")], "none"),  # another label is not followed
     ([found(*OTHER), found(100, 100, 140, 140)], "wrong object"),  # the first is the answer
     ([found(100, 100, 140, 140, label="target")], "hit"),  # what the colour detectors call it
 ])
@@ -116,7 +116,7 @@ def test_label_that_is_never_found_is_reported():
     for label, one in marks.items():
         one.add(label, seen, scene([legs]))
     assert precisions(marks) == {"legs": (1, 0.0), "light-red": (0, None)}
-    assert precisions({"legs": LabelMatches(3)}) == {}, "who looks for balls alone is not asked for legs"
+    assert precisions({"legs": LabelMatches(3)}) == {}, "a detector of balls alone has no figure for legs"
 
 
 def test_thresholds_hold_false_alarms_and_wrong_objects_down():

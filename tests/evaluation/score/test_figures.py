@@ -1,4 +1,4 @@
-"""The score is world truth: what it counts, and what it refuses to flatter."""
+"""The score is world truth: its counts, and its strict cases."""
 
 import math
 

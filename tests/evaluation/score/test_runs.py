@@ -1,4 +1,4 @@
-"""`sightline score`: every combination runs, the worst is what is judged, and the verdict is the exit code."""
+"""`sightline score`: every combination runs, the worst is checked, and the result is the exit code."""
 
 import json
 from dataclasses import replace
@@ -70,7 +70,7 @@ def test_runs_on_other_processes_are_those_of_this_one(names):
 
 
 def test_another_detector_looks_in_place_of_the_scenarios_own():
-    """Eyes that know yellow only never find a blue ball."""
+    """A detector of yellow never finds a blue ball."""
     yellow = "examples.older_range:OlderRange"
     asked = [cases(["blue-sphere"], [303], [50], [0.1], 2.0, detector=kind)[0] for kind in (None, yellow)]
     own, other = (run_case(case)[0] for case in asked)
@@ -92,7 +92,7 @@ def test_the_command_prints_one_object_and_exits_5_when_not_ok(capsys):
     assert cli.run(["score", *options, "4"]) == 0
     good = json.loads(capsys.readouterr().out)
     assert good["ok"] and good["checks"] and len(good["runs"]) == 1
-    assert cli.run(["score", *options, "1", "--latency-ms", "300"]) == 5, "nobody acquires a target in this time"
+    assert cli.run(["score", *options, "1", "--latency-ms", "300"]) == 5, "no run acquires a target in this time"
     bad = json.loads(capsys.readouterr().out)
     assert not bad["ok"]
     assert "acquired_s" in next(check["name"] for check in bad["checks"] if not check["ok"])

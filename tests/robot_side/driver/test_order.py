@@ -1,5 +1,5 @@
-"""What the driver and its network process tell each other, and in which order: issued before judged, motion before
-verdict, and nobody woken by what can wait."""
+"""The order of messages between the driver process and its network process: issued frames before commands, motion
+before results, and no wake-up for a message that can wait."""
 
 import select
 import signal
@@ -26,7 +26,7 @@ SEQ, T_US = 7, 1_000
 
 
 class StillDrive:
-    """Obeys, and has no encoder."""
+    """A drive without an encoder."""
 
     def set(self, left_rad_s, right_rad_s):
         pass

@@ -13,7 +13,7 @@ from tests.fixtures.links import until
 
 @pytest.fixture
 def synced(monkeypatch):
-    """What was synced, in order: "file" or "folder"."""
+    """The synced objects in order: "file" or "folder"."""
     done, fsync = [], os.fsync
 
     def noting(descriptor: int) -> None:
@@ -87,7 +87,7 @@ def latch_writer(latch):
 
 @pytest.mark.parametrize("stopped", [True, False])
 def test_a_mark_that_failed_half_way_is_written_again(latch, latch_writer, monkeypatch, stopped):
-    """The first step, writing or removing it, is done then, and nobody knows it."""
+    """The first step, a write or a removal, is done then, without a notice."""
     latch_writer.want(not stopped)
     assert until(lambda: latch.is_set() is not stopped)
     with monkeypatch.context() as broken:

@@ -23,7 +23,7 @@ from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
 
 class BrokenDrive:
-    """Fails as told; keeps what the motors were told last."""
+    """Fails on request, and stores the last speeds of the motors."""
 
     class Config(Config):
         """Nothing to set."""

@@ -28,7 +28,7 @@ ROWS = ((0.4, 0.08), (0.6, 0.12), (1.0, 0.19))
 
 
 def duties(board):
-    """Of all pins that were ever touched, but for those that are low."""
+    """The duty of every used pin that is not low."""
     return {number: value for number, value in dict(board.events).items() if value}
 
 
@@ -207,7 +207,7 @@ def test_a_pin_that_fails_brings_all_others_down_and_the_enable_line(board, monk
         drive.set(-3.0, 3.0)
     assert set(duties(board)) <= {broken}
     drive.set(0.0, 0.0)
-    assert duties(board) == {}, "what could not be told before is told now"
+    assert duties(board) == {}, "the failed write is repeated now"
     drive.set(4.0, 4.0)
     assert set(duties(board)) == {17, 10, 8}
     drive.close()

@@ -1,4 +1,4 @@
-"""Where the pins come from and how they are left: gpiozero, lgpio, and machines that have neither."""
+"""The source of the pins and their state afterwards: gpiozero, lgpio, and machines without both."""
 
 import os
 import subprocess
@@ -58,7 +58,7 @@ def test_spi_that_is_switched_on_is_warned_of(board, monkeypatch, caplog, tmp_pa
 
 
 class FakeLgpio(SimpleNamespace):
-    """As much of lgpio as `gpio_low` uses; a Raspberry Pi 5 with an early kernel: the header is chip 4."""
+    """The part of lgpio that `gpio_low` uses, on a Raspberry Pi 5 with an early kernel: the header is chip 4."""
 
     SET_PULL_DOWN = 64
 

@@ -1,4 +1,4 @@
-"""A real driver process on mock pins that outlive it: judged from the pins' own events."""
+"""A real driver process on mock pins that outlive it, checked by the events of the pins."""
 
 import os
 import signal
@@ -36,7 +36,7 @@ def rolling(board) -> bool:
 
 
 def stopped(board) -> bool:
-    """Wait until the gate says zero and no pin of a motor is driven."""
+    """Wait until the gate reports zero and no pin of a motor is driven."""
 
     def still() -> bool:
         told = [value for _, what, value in board_events(board) if what == "gate"]

@@ -64,7 +64,7 @@ class Leg:
         wait = 200_000.0
         while at_us < end:
             at_us += wait
-            wait = min(2 * wait, 1_000_000)  # by then a link is made anew
+            wait = min(2 * wait, 1_000_000)  # by then the link is open again
         return at_us
 
     def recovery_us(self, left):
@@ -94,7 +94,7 @@ class Camera:
 
 @dataclass
 class Course:
-    """What came of it: answers (at, age, bytes), and the stream."""
+    """The result: answers (at, age, bytes), and the stream."""
 
     answers: list
     stream: Stream

@@ -1,4 +1,4 @@
-"""What a robot that listens everywhere says of where others reach it."""
+"""The reachable addresses that a robot on every interface logs."""
 
 import socket
 

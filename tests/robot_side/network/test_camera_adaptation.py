@@ -26,7 +26,7 @@ HALF = scaled_model(MODEL, 50)
 
 
 class Eye:
-    """A camera that notes what it was asked."""
+    """A camera that records its encoding requests."""
 
     model, live = MODEL, True
 

@@ -86,7 +86,7 @@ def test_a_second_of_nothing(seed):
 def test_a_camera_that_passes_its_own_jpegs_gets_a_lower_rate_instead(seed, seconds):
     seen = course(5_000, 2e6, seed=seed, camera=Camera(adjustable=False, seed=seed), seconds=seconds)
     assert seen.p(95) <= 250, "46 kB take 184 ms: one at a time, but for a try now and then"
-    assert seen.p(99) <= 420, "refused, not driven on, beyond 400"
+    assert seen.p(99) <= 420, "rejected beyond 400"
     assert seen.fps(2, seconds) >= 4
     assert max(seen.windows[5000:]) <= 2
 

@@ -166,7 +166,7 @@ def test_a_human_outranks_vision_and_losing_the_human_disarms():
     rig.drive(200, source="teleop", session=HUMAN)
     assert rig.offer().reason is RejectReason.NOT_HOLDER
     assert refusal(rig, Verb.ARM, session=OTHER) is RejectReason.NOT_ALLOWED
-    for _ in range(100):  # vision goes on asking; nobody hands the robot back to it
+    for _ in range(100):  # vision continues to send; the robot does not return to it
         rig.offer()
         rig.step()
     assert rig.gate.state is State.DISARMED and rig.gate.applied == STILL

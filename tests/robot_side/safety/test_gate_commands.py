@@ -76,7 +76,7 @@ def test_stopped_before_the_restart_does_not_arm_by_itself_after_the_reset():
     assert rig.drive(400).gate.state is D
 
 
-# --- what is refused ---------------------------------------------------------------------------------------------
+# --- rejections --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])

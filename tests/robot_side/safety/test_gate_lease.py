@@ -1,4 +1,4 @@
-"""Every number and branch of who drives, as the gate sees it: just inside, at it, just outside."""
+"""Every number and branch of the lease in the gate: just inside, at the bound, just outside."""
 
 import pytest
 

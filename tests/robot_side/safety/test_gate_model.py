@@ -21,7 +21,7 @@ OFF = (State.DISARMED, State.STOPPED, State.FAULT)
 
 
 class Promises:
-    """What may happen, from the design's words alone: no ramp, no table of states, no code of the gate's."""
+    """The permitted behavior, from the design alone: no ramp, no table of states, no code of the gate."""
 
     def __init__(self, auto_arm):
         self.off = State.DISARMED  # where the wheels are off, None while armed
@@ -31,7 +31,7 @@ class Promises:
         self.hold_since_us = None
 
     def pass_time(self, now_us):
-        """A human whose lease ran out was lost, and whoever comes next does not simply go on."""
+        """A human with an expired lease is lost, and the next driver does not continue."""
         if self.holder and now_us >= self.until_us:
             human, self.holder = self.holder[0] == "teleop", None
             if human and self.off is None:
@@ -44,7 +44,7 @@ class Promises:
         self.off, self.hold_since_us = off, None
 
     def verdict(self, who, age_us):
-        """The reason that a command by `who` on a frame of `age_us` is refused for, None if it is obeyed."""
+        """The reason to reject a command by `who` on a frame of `age_us`, or None for an applied one."""
         if age_us < 0:
             return RejectReason.FROM_FUTURE
         if age_us > 400_000:
@@ -182,7 +182,7 @@ class Gate(RuleBasedStateMachine):
             self.promises.leave(State.FAULT)
 
     def _expected(self, verb, who):
-        """Whether the request is granted; what it changes."""
+        """Return True for a granted request, and apply its changes."""
         promises, now_us = self.promises, self.rig.now_us
         rolling = self.rig.gate.applied != STILL
         beside_human = promises.holder not in (None, who) and promises.holder[0] == "teleop"

@@ -1,4 +1,4 @@
-"""What the wheels do, case by case: the promised stop, limits per elapsed time, every state and transition."""
+"""The motion of the wheels: the promised stop, limits per elapsed time, every state and transition."""
 
 import math
 
@@ -26,7 +26,7 @@ def refusal(rig, verb, **kwargs):
     return caught.value.reason
 
 
-# --- the stop, as the promises say it ----------------------------------------------------------------------------
+# --- the stop, as promised ---------------------------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)
@@ -63,7 +63,7 @@ TUNED = [
 @pytest.mark.parametrize("step_ms", [2, 20])
 @pytest.mark.parametrize("changes", TUNED, ids=str)
 def test_the_stop_bound_holds_for_motors_that_lag_however_often_the_gate_is_stepped(changes, step_ms):
-    """It is stepped every 2 ms while commands arrive, be they refused."""
+    """The gate is stepped every 2 ms while commands arrive, also rejected ones."""
     rig = Rig(**changes).armed()
     config = rig.gate.config
     rig.drive(1_500, config.max_linear_mps, config.max_angular_rad_s)

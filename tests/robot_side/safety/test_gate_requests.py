@@ -1,4 +1,4 @@
-"""Every number and branch of what people ask of the gate, and of arming: just inside, at it, just outside."""
+"""Every number and branch of requests and arming: just inside, at the bound, just outside."""
 
 import pytest
 
@@ -82,7 +82,7 @@ def test_a_gate_that_cannot_be_stepped_stands_at_once(state, after):
     rig.gate.halt("broken")
     assert (rig.gate.state, rig.gate.reason) == (after, "STOP by test" if state is S else "broken")
     assert rig.gate.applied == STILL
-    assert rig.step().twist == STILL, "nor is the speed of before taken up"
+    assert rig.step().twist == STILL, "nor does the earlier speed return"
     assert rig.request(Verb.RESET) and rig.gate.state is D
 
 
@@ -214,7 +214,7 @@ LEAVING = {
 
 
 @pytest.mark.parametrize("how", LEAVING)
-def test_what_a_person_ended_does_not_arm_by_itself_again(how):
+def test_robot_after_the_end_by_an_operator_does_not_arm_itself(how):
     rig = Rig(auto_arm=True).drive(400)
     assert rig.gate.state is A
     LEAVING[how](rig)
@@ -224,7 +224,7 @@ def test_what_a_person_ended_does_not_arm_by_itself_again(how):
     rig.request(Verb.ARM)
     rig.drive(100).silence(10_400)
     assert rig.gate.state is D
-    assert rig.drive(400).gate.state is A, "a person armed: unattended again"
+    assert rig.drive(400).gate.state is A, "an operator armed: unattended again"
 
 
 def test_a_robot_that_starts_stopped_does_not_arm_by_itself():
@@ -246,7 +246,7 @@ def test_arming_by_an_operator_does_not_switch_auto_arm_on():
     assert rig.drive(400).gate.state is D
 
 
-# --- what was asked before ---------------------------------------------------------------------------------------
+# --- earlier requests --------------------------------------------------------------------------------------------
 
 
 def ask(rig, verb=Verb.ARM):

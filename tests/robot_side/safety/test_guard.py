@@ -318,7 +318,7 @@ def test_without_any_scan_nothing_moves():
     assert guard.limit(STILL, 0) is STILL
 
 
-# A range sensor that is blind beyond the guard's stop zone is refused, in words, and nothing moves.
+# A range sensor that is blind beyond the guard's stop zone is rejected with a readable error, and nothing moves.
 
 
 # Binary fractions: front 0.5, rear 1, half as wide 0.25, so that "just" is just.

@@ -1,7 +1,7 @@
-"""What some of the judged scenes are: their truths, and their pictures made coarse. Kept in `judged_scenes.json`.
+"""Record some of the scored scenes: their truths, and their coarse images. Stored in `judged_scenes.json`.
 
 Seeds alone pin nothing: another PyBullet, or a texture that was changed, would draw other scenes under them, and the
-figures that were published would be of scenes that are no more. Where that is meant, write them anew, and the figures:
+figures that were published would be of scenes that are no more. If that is intended, write them again, and the figures:
 
     python -m tests.sim.scenes.judged_scenes
 """
@@ -18,7 +18,7 @@ from sightline.sim.scenes.render import SceneRenderer
 
 FILE = Path(__file__).parent.parent.parent / "judged_scenes.json"
 PINNED = [(COLUMNS["nominal"], 1), (COLUMNS["same-colour boxes"], 212), (COLUMNS["all at once"], 333), (THINGS, 1204)]
-"""Columns, and how far above the first judged seed; between them every judged family of textures."""
+"""Columns, with the distance above the first scored seed; together they contain every scored family of textures."""
 ACROSS, DOWN = 16, 12
 MOST_PX, MOST_LEVELS = 1.01, 2
 """A box's edge is a whole pixel, and a pixel may be on either side of it; means and deviations are rounded."""
@@ -42,12 +42,12 @@ def outline(scene):
 
 
 def kept():
-    """As they were when figures were published."""
+    """Read the scenes of the published figures."""
     return json.loads(FILE.read_text())
 
 
 def differences(now, then):
-    """Where two outlines of one scene are further apart than a compiler's last bit can make them; empty if nowhere."""
+    """Return the difference of two outlines of one scene beyond the last bit of a compiler, or ""."""
     if [one[0] for one in now["truths"]] != [one[0] for one in then["truths"]]:
         return ["what is in it"]
     edges = [[edge for one in of["truths"] for edge in one[1:]] for of in (now, then)]

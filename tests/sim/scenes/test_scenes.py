@@ -1,4 +1,4 @@
-"""Labelled scenes: their ranges, that a seed is a scene, and that what is judged was never trained on."""
+"""Labeled scenes: their ranges, one scene per seed, and scored scenes that were never trained on."""
 
 import math
 from dataclasses import replace
@@ -145,7 +145,7 @@ def test_boxes_are_exact_and_no_ball_is_hidden_too_far(renderer):
     whole = hidden = 0
     for seed in range(JUDGED_FROM, JUDGED_FROM + 60):
         scene = renderer.scene(seed, COLUMNS["same-colour boxes"])
-        assert sum(one.label == "ball" for one in scene.truths) == (seed % 5 != 0), "an answer here is no false alarm"
+        assert sum(one.label == "ball" for one in scene.truths) == (seed % 5 != 0), "an answer is not a false alarm"
         assert sum(one.is_like_ball for one in scene.plan.solids) == 2, "the column is named for them"
         for one in scene.truths:
             assert one.label in LABELS

@@ -1,4 +1,4 @@
-"""What walks, rolls and lights up in a scenario, and how a scenario extends another."""
+"""Moving and lit bodies of a scenario, and a scenario that extends another."""
 
 import math
 from itertools import pairwise

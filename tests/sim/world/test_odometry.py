@@ -54,7 +54,7 @@ def with_mismatch(robot, mismatch):
 
 
 def wheels_of(robot):
-    """As its robot.toml has them, with all of its motors' speed."""
+    """Return the limits of its robot.toml, with the full speed of its motors."""
     wheels = robot.wheels
     return DiffDriveConfig(
         wheel_radius_m=wheels.radius_m, track_width_m=wheels.track_m, max_wheel_rad_s=wheels.max_rad_s
