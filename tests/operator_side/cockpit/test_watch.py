@@ -128,7 +128,7 @@ def test_a_capture_without_a_robot_leaves_nothing(tmp_path: Path, capsys: pytest
     nobody = ["--connect", "tcp/127.0.0.1:1"]
     for arguments, code, words in (
         (["--out", str(tmp_path / "x.gif")], 2, "ends in .png or .jpg, a video in .mp4"),
-        (["--out", str(tmp_path / "x.png"), "--seconds", "3"], 2, "--seconds is for a video"),
+        (["--out", str(tmp_path / "x.png"), "--seconds", "3"], 2, "--seconds needs a video"),
         (["--out", str(tmp_path / "none" / "x.png")], 2, "no folder"),
         (["--out", str(tmp_path / "x.mp4"), *nobody], 4, "tcp/127.0.0.1:1"),
     ):
@@ -191,7 +191,7 @@ def test_a_colour_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) 
     with Started(tmp_path, "pick-color", "r1", *where) as picking, Browser(tmp_path, address_of(picking)) as page:
         assert until(lambda: page.run(LEVELS)[2] >= 4, START_S)
         drag(page, 5, 5, 5, 5)
-        assert until(lambda: "there is no" in page.text("error") or "marks" in page.text("error"), 5.0)
+        assert until(lambda: "no color" in page.text("error") or "marks" in page.text("error"), 5.0)
         assert page.run("document.getElementById('use').disabled")
         page.click("again")
         x_px, y_px = page.run(MIDDLE_OF_YELLOW)
@@ -199,11 +199,11 @@ def test_a_colour_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) 
         assert until(lambda: page.text("ranges").startswith("hue "), 5.0), page.text("error")
         assert until(lambda: page.run("document.getElementById('mask').naturalWidth") > 0, 5.0)
         # A busy machine's stream is of coarser JPEGs, in some of which an edge of the ball comes apart.
-        assert page.text("error") == "" and re.search(r"in 1 (to 2 )?blobs?; something in (\d+) of \2 ",
+        assert page.text("error") == "" and re.search(r"in 1 (to 2 )?blobs?; marks in (\d+) of \2 ",
                                                       page.text("trial")), page.text("trial")
         page.screenshot(tmp_path / "picked.png")
         page.click("use")
-        assert until(lambda: page.text("said").startswith("written to "), 5.0), page.text("error")
+        assert until(lambda: page.text("note").startswith("written to "), 5.0), page.text("error")
         assert picking.process.wait(10) == 0
         assert page.errors == []
     assert 30 < tomllib.loads(config.read_text())["hsv"]["ranges"][0]["hue_low_deg"] < 60
@@ -224,11 +224,11 @@ def test_a_colour_is_picked_in_a_video_by_its_box(tmp_path: Path) -> None:
         assert until(lambda: "green" in colour_at(page, 110, 112), 5.0), colour_at(page, 110, 112)
         drag(page, 92, 92, 130, 134)
         assert until(lambda: page.text("ranges").startswith("hue 1"), 5.0), page.text("error")
-        assert "something in 6 of 8 pictures" in page.text("trial")
+        assert "marks in 6 of 8 images" in page.text("trial")
         page.run("document.getElementById('trial').scrollIntoView()")
         page.screenshot(tmp_path / "video.png")
         page.click("use")
-        assert until(lambda: page.text("said") == "printed in the terminal", 5.0)
+        assert until(lambda: page.text("note") == "printed in the terminal", 5.0)
         assert picking.process.wait(10) == 0 and picking.says(r"\[hsv\]\nranges = \[")
         assert page.errors == []
 
