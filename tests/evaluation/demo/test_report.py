@@ -49,7 +49,7 @@ def test_color_of_the_light_is_scored_from_the_recording(lights, monkeypatch):
     assert misread(lights) == (0.0, True)
     assert misread(replace(lights, samples=[replace(one, light="off") for one in lights.samples])) == (100.0, False)
     first, late = lights.samples[0], lights.samples[len(lights.samples) // 2 :]
-    assert misread(replace(lights, samples=[replace(first, light="off"), *late])) == (0.0, True), "no report of the change"
+    assert misread(replace(lights, samples=[replace(first, light="off"), *late])) == (0.0, True), "no report"
 
 
 class StatusLink:

@@ -1,4 +1,4 @@
-"""`score detectors --demand`: the bounds of a learned detector; options; plug-ins that raise or return invalid results."""
+"""`score detectors --demand`: bounds of a learned detector; options; plug-ins with errors or invalid results."""
 
 import json
 import math
