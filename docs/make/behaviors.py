@@ -70,12 +70,12 @@ class Row:
 
     @property
     def anchor(self) -> str:
-        """What a link within the page calls that heading."""
+        """The anchor of that heading."""
         return self.title.replace("`", "").replace(",", "").replace(" ", "-")
 
     @property
     def default(self) -> "Row":
-        """What a baseline is compared with."""
+        """The row to which a baseline is compared."""
         return Row(self.scenario, "", self.robot, seconds=self.seconds)
 
     def cases(self, seeds: Sequence[int], look: str | None = None) -> list[ScoreCase]:
@@ -142,7 +142,7 @@ class SpeedCase:
 
 @dataclass(frozen=True, slots=True)
 class SpeedRun:
-    """What came of it, in world truth: one entry of each list per sample."""
+    """The result of one drive, from the world's own record: one entry of each list per sample."""
 
     wish: SpeedCase
     times_s: list[float]
@@ -245,7 +245,7 @@ def picture_name(case: ScoreCase) -> str:
 
 
 def kept(row: Row, results: Results, seeds: Sequence[int]) -> bool:
-    """Whether every run kept every bound; nothing is demanded of a baseline."""
+    """Return True if every run kept every bound. A baseline has no bounds."""
     return bool(row.baseline) or all(
         check.ok for case in row.all_cases(seeds) for check in _checks(row, results[case])
     )
@@ -420,7 +420,7 @@ def write_page(page: Path, seeds: Sequence[int], jobs: int, rows: Sequence[Row] 
 
 
 def _picture(folder: Path, case: ScoreCase, seeds: Sequence[int]) -> Path | None:
-    """Where the picture of this run goes; only the first seed's run in the scenario's own light has one."""
+    """Return the path of the image of this run; only the first seed's run in the scenario's own light has one."""
     return folder / picture_name(case) if case.seed == seeds[0] and case.look is None else None
 
 

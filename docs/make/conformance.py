@@ -66,7 +66,7 @@ def conform(name: str, *arguments: str) -> None:
 
 
 def file_of(name: str) -> Path:
-    """Where a peer's run is kept."""
+    """Return the file with the result of a peer's run."""
     return KEPT / f"{name.replace(', ', '-').replace(' ', '-').lower()}.json"
 
 

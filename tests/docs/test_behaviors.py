@@ -1,4 +1,4 @@
-"""The behaviors page follows from the runs: figures, verdicts, baselines beside defaults, pictures."""
+"""The behaviors page follows from the runs: figures, results, baselines next to defaults, images."""
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -53,7 +53,7 @@ def test_median_and_worst_and_whether_the_bound_was_kept():
     assert "| lost_percent | 0 % | never | 0 % | **not kept** |" in text and "| 1 of 2 |" in text
 
 
-def test_a_baseline_stands_beside_the_default_and_says_in_what_it_fails():
+def test_baseline_is_shown_next_to_the_default_with_its_failures():
     lost = replace(GOOD, acquired_s=None, bearing_rms_deg=None, lost_percent=None, unseen_percent=72.0)
     text, ok = page(Row("ball", "pixel-pi"), lost, GOOD)
     assert ok, "nothing is demanded of it"
@@ -108,7 +108,7 @@ def test_an_acceleration_is_the_slope_of_the_speed(slope_mps2):
 
 
 def test_both_laws_reach_a_near_waypoint():
-    """In the real lockstep, the one that stops; the older law arrives too, for nothing is in the way."""
+    """In the real lockstep, the one that stops; the legacy controller arrives too, because nothing is in the way."""
     for law in LAWS:
         drive = speed_run(SpeedCase(law, 0.2, 901))
         assert drive.arrived_s is not None and drive.arrived_s < 5.0

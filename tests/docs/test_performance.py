@@ -98,7 +98,7 @@ def test_what_was_measured_before_a_failure_is_kept(tmp_path, monkeypatch):
     assert "| offer and step | 13.2 |" in page.read_text()
 
 
-def test_an_unknown_section_is_refused_with_the_names_there_are():
+def test_unknown_section_is_rejected_with_the_known_names():
     assert sections_named([]) == SECTIONS
     with pytest.raises(ConfigError, match=r"'gates'.*gate.*loop-websocket"):
         sections_named(["gates"])
