@@ -24,7 +24,8 @@ UNTESTED = {
     "16.2 On Zenoh": "the session's configuration; tests/protocol/transports/zenoh",
     "16.3 On Zenoh": "it allows nothing and refuses nothing",
     "16.4 On Zenoh": "a courtesy, by which nothing judges; tests/protocol/transports/zenoh/test_presence.py",
-    "18.1 Request": "for a vision service that knows missions, which is optional; tests/vision_side/missions/test_registry.py",
+    "18.1 Request":
+        "for a vision service that knows missions, which is optional; tests/vision_side/missions/test_registry.py",
     "18.2 Freshness": "as 18.1",
     "18.3 Switching": "as 18.1",
     "18.4 Report": "as 18.1",

@@ -1,4 +1,4 @@
-"""What is drawn over a picture: where it is, what it says, and that nothing a detector says can break it."""
+"""The overlay of an image: its places, its text, and its robustness against any text of a detector."""
 
 import math
 
@@ -44,7 +44,7 @@ def shown(target=None, others=(), model=MODEL, **seen):
 
 
 def near(canvas, colour, x_px, y_px, reach_px=4):
-    """Whether a pixel of about that colour is within `reach_px` of the place."""
+    """Return True if a pixel of about that color is within `reach_px` of the place."""
     part = canvas[max(0, y_px - reach_px) : y_px + reach_px + 1, max(0, x_px - reach_px) : x_px + reach_px + 1]
     return bool((np.abs(part.astype(int) - colour).max(axis=2) < 40).any())
 

@@ -104,7 +104,7 @@ class Raising(Broken):
 
 
 class Inventing(Broken):
-    """Says "saw nothing" where it had nothing to look at."""
+    """Returns "saw nothing" for bytes that are not an image."""
 
     def detect(self, frames, deadline_us):
         good = super().detect(frames, deadline_us)

@@ -1,4 +1,4 @@
-"""A plug-in whose code fails beside the looking: one line that says whose fault it is, and what can go on goes on."""
+"""A plug-in whose code fails beside the looking: one line that names the plug-in, and all other work continues."""
 
 import pytest
 

@@ -32,7 +32,7 @@ pytestmark = pytest.mark.usefixtures("no_gpu")
 
 
 class Mine:
-    """A plug-in in a test, as a person's own file would have it."""
+    """A plug-in in a test, as in a user's file."""
 
     class Config(Settings):
         address: str = ""

@@ -1,6 +1,6 @@
-"""Mission `goto`: arrives, keeps clear of everything, and says so when it cannot; in many layouts and from many starts.
+"""Mission `goto`: it arrives, keeps its clearance, and reports failure; in many layouts and from many starts.
 
-Bounds are those that the simulated Thymio is judged by: (1.5, 1.5) with a cylinder in the way in 15 s, 0.10 m clear.
+Bounds are those of the simulated Thymio: (1.5, 1.5) with a cylinder in the way in 15 s, 0.10 m clear.
 """
 
 import math

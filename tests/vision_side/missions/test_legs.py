@@ -1,4 +1,4 @@
-"""Missions `legs` and `legs-baseline`: the middle between two legs, in closed loop; and the write-up's numbers."""
+"""Missions `legs` and `legs-baseline`: the center between two legs, in closed loop; and the legacy numbers."""
 
 import math
 import random
@@ -21,7 +21,7 @@ LENS = camera()
 LEG_M = 0.055
 RASPBERRY = Footprint(front_m=0.07, rear_m=0.10, half_width_m=0.09)
 Walk = Callable[[float], tuple[float, float, float]]
-"""Where a person is at a time, and which way he walks."""
+"""The place and the direction of the walker at a time."""
 
 
 def legs_of(place: tuple[float, float, float], way_m: float) -> tuple[tuple[float, float, float], ...]:
@@ -68,7 +68,7 @@ def circle(speed_mps: float, radius_m: float = 2.5) -> Walk:
 
 
 def errors(run: list[Row], walk: Walk, from_s: float) -> tuple[float, float, float]:
-    """RMS of the bearing in degrees, least and most distance, lens to the person's middle."""
+    """RMS of the bearing in degrees, smallest and largest distance, from the lens to the center of the legs."""
     bearings, distances = [], []
     for row in run:
         if row.t_s >= from_s:

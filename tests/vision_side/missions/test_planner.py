@@ -1,4 +1,4 @@
-"""What `goto` is made of: poses between frames, echoes, the memory of the floor, the plan, the brakes, the patience."""
+"""The parts of `goto`: poses between frames, echoes, the memory of the floor, the plan, the brakes, the patience."""
 
 import math
 

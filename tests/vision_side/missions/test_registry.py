@@ -1,4 +1,4 @@
-"""Missions: the contract over all that there are, how one is chosen, and the older laws with their own numbers."""
+"""Missions: the contract over all that there are, the choice of one, and the legacy laws with their own numbers."""
 
 import math
 import re
@@ -104,7 +104,7 @@ def test_requested_options_override_the_configured_ones():
     assert goto.config.sight_m == 2.0
 
 
-# --- the older laws --------------------------------------------------------------------------------------------------
+# --- the legacy laws -------------------------------------------------------------------------------------------------
 
 
 def ball(x_px: float, radius_px: float) -> Detection:
@@ -161,7 +161,7 @@ def test_pixel_pi_has_the_write_ups_numbers():
     assert twist_of(law, view(ball(180, radius)))[1] == 0.0, "0.1 is within the dead band"
     assert twist_of(law, view(ball(181, radius)))[1] == pytest.approx(-0.105 - 0.007 * 0.605)
     assert twist_of(law, view(ball(200, math.sqrt(40 / math.pi) - 1e-9))) == (0.0, 0.0)
-    assert twist_of(law, view(ball(160, math.sqrt(41 / math.pi))))[0] == pytest.approx(200 / 41), "as fast as it asks"
+    assert twist_of(law, view(ball(160, math.sqrt(41 / math.pi))))[0] == pytest.approx(200 / 41), "as fast as requested"
     assert twist_of(law, view()) == (0.0, 0.0)
 
 

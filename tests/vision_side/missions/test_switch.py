@@ -20,7 +20,7 @@ ASKED = RequestId(session="0000feed", id=1)
 
 
 class Scripted:
-    """Says what its options tell it, and which frame it is in."""
+    """Reports its options and its frame."""
 
     Config = MissionConfig  # any model with free options
 
@@ -62,7 +62,7 @@ def test_a_switch_stands_still_until_the_wheels_do_and_the_new_one_begins_afresh
         plan = duty.step(view(seq, moving=(0.2, 0.0), applied=(0.1, 0.0)))
         assert (plan.twist, plan.phase) == (STILL, "switching")
     assert duty.step(view(8, moving=(0.0, 0.2))).twist == STILL, "it still turns"
-    assert duty.step(view(9, applied=(0.05, 0.0))).twist == STILL, "it is told to move"
+    assert duty.step(view(9, applied=(0.05, 0.0))).twist == STILL, "it has a command to move"
     plan = duty.step(view(10, moving=(0.005, 0.0)))
     assert (plan.twist.linear_mps, plan.note) == (-0.2, "1 after 0.00")
     assert duty.step(view(11)).note == "2 after 0.03"

@@ -1,4 +1,4 @@
-"""Steering by boxes that somebody else found: which are obeyed, what they cite, and what their absence means."""
+"""Steering by boxes of another service: the applied ones, their echo, and their absence."""
 
 import math
 import threading
@@ -46,7 +46,7 @@ def ball_at(x_m: float, y_m: float, score: float = 0.8) -> DetectedBox:
 
 
 class Bench:
-    """A robot's end of a link in memory, somebody who detects, and the service between them."""
+    """A robot's end of a link in memory, a detector, and the service between them."""
 
     def __init__(self, config: VisionConfig = CONFIG) -> None:
         self.network = MemoryNetwork(seed=5)

@@ -1,4 +1,4 @@
-"""The detector service over a link in memory: what it says, drops and counts, whatever the detector answers."""
+"""The detector service over a link in memory: its messages, drops and counts for every answer of the detector."""
 
 from dataclasses import replace
 

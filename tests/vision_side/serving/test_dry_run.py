@@ -1,4 +1,4 @@
-"""The dry run: it tells what it sees, acknowledges, and publishes no twist, whatever it sees."""
+"""The dry run: it prints its detections, acknowledges, and never publishes a twist."""
 
 import pytest
 

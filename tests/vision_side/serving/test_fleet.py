@@ -97,7 +97,7 @@ def test_a_robot_that_floods_takes_no_turn_from_another(fleet):
 
 
 class _NoRobots:
-    """A site where nobody is, until `arrive`."""
+    """A site without robots until `arrive`."""
 
     def __init__(self):
         self._names = []

@@ -1,4 +1,4 @@
-"""Several robots behind one vision whose eyes are elsewhere: none waits for the answer that another is waiting for."""
+"""Several robots and one vision service with a remote detector: no robot waits for the answer to another."""
 
 import threading
 import time
@@ -118,7 +118,7 @@ def shown():
 def test_who_is_not_answered_keeps_no_other_robot_waiting(shown, eyes):
     robots, shares = shown(eyes, "")
     mute = robots[MUTE].heard
-    assert mute[TWIST] == 0 and mute[ACK] >= 3, "no answer is no twist, and is acknowledged"
+    assert mute[TWIST] == 0 and mute[ACK] >= 3, "a frame without an answer is acknowledged without a twist"
     assert shares.pop(MUTE) == 0 and min(shares.values()) > 0.7, shares
 
 

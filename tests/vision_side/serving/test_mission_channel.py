@@ -1,4 +1,4 @@
-"""What a vision takes for a mission and from whom, what it reports, and the scans that a mission goes by."""
+"""The missions that a vision service accepts, its reports, and the scans for a mission."""
 
 import array
 import struct
@@ -186,7 +186,7 @@ def test_a_mission_that_uses_scans_is_given_the_newest_and_cites_it():
         bench.robot.publish(SCAN, *scan(seq))
     assert [bench.answer().scan for _ in range(2)] == [5, 5]
     bench.robot.publish(SCAN, *scan(9, session="0000beef"))
-    assert [bench.answer().scan for _ in range(2)] == [None, None], "another robot's, as far as anybody knows"
+    assert [bench.answer().scan for _ in range(2)] == [None, None], "possibly another robot's"
     bench.robot.publish(SCAN, *scan(10))
     assert bench.answer().scan == 10
 

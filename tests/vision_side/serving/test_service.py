@@ -202,7 +202,7 @@ def test_frames_of_an_ended_session_are_skipped_and_logged_once(bench):
 
 
 def test_second_robot_with_one_id_is_rejected_and_logged(bench, monkeypatch):
-    """Where they cannot meet, nobody but vision can see that they are two."""
+    """Only the vision service can detect two robots that cannot reach each other."""
     monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: bench.now_us)
     bench.camera()
     answers = {"0000abcd": 0, "0000beef": 0}

@@ -180,7 +180,7 @@ def test_integral_depends_on_time_not_on_frames(dt: float) -> None:
 
 
 def turned(config: SearchConfig, side: float, seconds: float, carried_out: float = 1.0) -> float:
-    """How far a robot turns that does what the search asks, all of it or a share."""
+    """Return the turn of a robot that applies the search command, fully or in part."""
     search, yaw, applied = Search(config), 0.0, 0.0
     search.reset(side)
     for _ in range(round(seconds / DT_S)):

@@ -38,7 +38,7 @@ class Course:
 
     def acquire(self, x: float = 160, y: float = 120, radius: float = 20) -> Circle:
         seen = [self.see(room((x, y, radius), seed=seed)) for seed in range(4)]
-        assert seen[:2] == [None, None], "it is not believed at first sight"
+        assert seen[:2] == [None, None], "it is not accepted at its first detection"
         assert seen[-1] is not None
         return seen[-1]
 

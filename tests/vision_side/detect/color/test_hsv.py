@@ -171,7 +171,7 @@ def test_what_cuts_a_disc_off_is_left_out_of_its_circle(cx: float, cy: float, ra
 @pytest.mark.parametrize("size", [(320, 240), (640, 480)])
 @pytest.mark.parametrize("at", range(8))
 def test_the_smallest_disc_is_found_wherever_it_lies(size: tuple[int, int], at: int) -> None:
-    """Where to look is decided on few pixels: none may slip between them."""
+    """A coarse grid of pixels selects the region, and no ball may fall between them."""
     scale, config = size[0] // 320, HsvConfig()
     for row in range(4):
         picture = np.full((size[1], size[0], 3), 140, np.uint8)

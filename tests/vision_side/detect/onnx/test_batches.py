@@ -20,7 +20,7 @@ def grey(level: int, seq: int = 1) -> DetectFrame:
 
 
 def counted(eye: object, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many pictures each run is given."""
+    """Record the number of images of each run."""
     runs: list[int] = []
     run = eye._engine.run
     monkeypatch.setattr(eye._engine, "run", lambda pixels: runs.append(len(pixels)) or run(pixels), raising=False)

@@ -1,4 +1,4 @@
-"""The detector `onnx`: what a file says of itself, what goes in, what comes out, and on what it ran."""
+"""The detector `onnx`: the metadata of a file, its inputs, its outputs, and its device."""
 
 import json
 import sys

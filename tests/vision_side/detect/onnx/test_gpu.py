@@ -1,4 +1,4 @@
-"""The model that ships, on an NVIDIA GPU: it runs there, says so, and sees what it sees on the CPU.
+"""The model that ships, on an NVIDIA GPU: it runs there, reports it, and finds what it finds on the CPU.
 
 Skipped where there is none; `TESTS_DEMAND=cuda` makes that a failure. Needs onnxruntime-gpu in place of onnxruntime.
 """

@@ -19,7 +19,7 @@ from tests.fixtures.vision.remote import GREY_JPEG, frame, within
 
 
 class Held:
-    """Answers when it is let go, and notes what it was asked."""
+    """Answers on release, and records its requests."""
 
     def __init__(self, name="remote"):
         self.name, self.asked, self.deadlines = name, [], []
@@ -107,7 +107,7 @@ def test_invalid_reply_counts_as_no_answer_and_the_first_is_logged():
     own = Held("own")
     fallback = Fallback(Strange(), own)
     assert [_who(fallback, seq) for seq in range(1, 20)] == [["own"]] * 19, "and none of it is a good answer"
-    assert [line for line in fallback.notices() if "nan or infinite" in line], "why is said"
+    assert [line for line in fallback.notices() if "nan or infinite" in line], "the reason is reported"
     assert fallback.notices() == []
     fallback.close()
 
@@ -161,7 +161,7 @@ def test_close_ends_the_thread_and_what_is_inside(held):
 
 
 class Asked:
-    """What `FakeRemote` was asked."""
+    """The requests of `FakeRemote`."""
 
     def __init__(self, results, over, begun=True):
         self._results, self.over, self.begun = results, over, begun

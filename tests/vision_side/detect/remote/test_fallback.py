@@ -1,4 +1,4 @@
-"""What drives while a remote does not answer one robot of several: nothing changes for the others."""
+"""The fallback while a remote does not answer one robot of several: nothing changes for the others."""
 
 import time
 
@@ -94,7 +94,7 @@ def test_both_are_closed_where_the_first_fails_to():
 
 
 class Heard:
-    """A link over which boxes are heard at once."""
+    """A link that delivers boxes immediately."""
 
     def __init__(self, robot):
         self.robot = robot

@@ -1,4 +1,4 @@
-"""`http+jpeg` against real sockets: what is sent, what is understood, and every hostile answer refused and counted."""
+"""`http+jpeg` against real sockets: requests, valid answers, and every hostile answer rejected and counted."""
 
 import gzip
 import resource
@@ -134,7 +134,7 @@ HOSTILE = {
     "control characters": (http_reply(said(box(label="a\x1b[2J"))), "MALFORMED"),
     "sixty-five boxes": (http_reply(said(*[box()] * 65)), "TOO_MANY"),
     "a million boxes": (http_reply(MILLION), "TOO_LARGE"),
-    "longer than it says": (http_reply(bytes(MAX_ANSWER_BYTES), length=10**12), "TOO_LARGE"),
+    "longer than declared": (http_reply(bytes(MAX_ANSWER_BYTES), length=10**12), "TOO_LARGE"),
     "a chunk of -1": ((b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n-1\r\n",
                        *[bytes(1 << 16)] * 64), "TOO_LARGE"),
     "endless": ((b"HTTP/1.1 200 OK\r\n\r\n", *[bytes(1 << 16)] * 64), "TOO_LARGE"),
@@ -226,7 +226,7 @@ def test_killed_server_gives_no_answer_by_the_deadline_and_recovers():
 def test_server_that_hangs_while_connecting_gives_no_answer_by_the_deadline():
     import socket
 
-    with socket.create_server(("127.0.0.1", free_port()), backlog=0) as listener:  # full at once: nobody accepts
+    with socket.create_server(("127.0.0.1", free_port()), backlog=0) as listener:  # always full: no process accepts
         port = listener.getsockname()[1]
         fill = [socket.socket() for _ in range(3)]
         for one in fill:

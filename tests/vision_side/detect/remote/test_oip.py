@@ -1,4 +1,4 @@
-"""The Open Inference Protocol without a network: requests, answers, and whatever a hostile server may say."""
+"""The Open Inference Protocol without a network: requests, answers, and any reply of a hostile server."""
 
 import contextlib
 import json

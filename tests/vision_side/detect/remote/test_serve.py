@@ -23,7 +23,8 @@ from tests.vision_side.detect.remote.test_zenoh_detector import Robot
     (["--serve", "hvs"], "did you mean 'hsv'"), (["--serve", "http+jpeg://"], "http+jpeg://127.0.0.1:8080/detect"),
     (["--serve", "oip+http://127.0.0.1"], "names no model"), (["--serve", "hsv", "--device", "gpu"], "device"),
     (["--serve", "hsv", "--connect", "ws://127.0.0.1:9"], "Zenoh"), (["--serve", "hsv", "--deadline-ms", "0"], "5"),
-    (["--serve", "hsv", "--set", "detector.optoins.x=1"], "options"), (["--serve", "hsv", "check", "hsv"], "exclude each other"),
+    (["--serve", "hsv", "--set", "detector.optoins.x=1"], "options"),
+    (["--serve", "hsv", "check", "hsv"], "exclude each other"),
 ])  # fmt: skip
 def test_what_cannot_be_served_is_one_line_and_exit_code_2(capsys, arguments, what):
     assert cli.run(["detector", *arguments]) == 2

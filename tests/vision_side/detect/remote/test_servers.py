@@ -49,7 +49,7 @@ def _is_the_ball(result):
 
 
 class Uvicorn:
-    """`examples/http_detector.py`, as its first lines say how it is run."""
+    """Start `examples/http_detector.py` as its first lines describe."""
 
     def __init__(self):
         self.port = free_port()

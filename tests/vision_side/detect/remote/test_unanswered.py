@@ -1,4 +1,4 @@
-"""What is told of a remote that is not answered, and when a model server is asked anew what its model is like."""
+"""The reports about a remote without answers, and the repeated query for the model of a server."""
 
 import json
 import time
