@@ -12,7 +12,7 @@ ifneq ($(and $(ARGS),$(word 2,$(MAKECMDGOALS))),)
 $(error ARGS is for one goal, but there are $(words $(MAKECMDGOALS)) ($(MAKECMDGOALS)): run `make` once for each)
 endif
 
-.PHONY: demo test test-all test-long mutation lint lock clean python demo-environment test-environment
+.PHONY: demo test test-all test-long mutation lint docs lock clean python demo-environment test-environment
 
 demo: demo-environment
 	$(BIN)/sightline demo $(ARGS)
@@ -31,6 +31,11 @@ lint: test-environment
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
+docs: test-environment  ## the docs site in site/, with strict links; its generated pages must be those of the code
+	$(BIN)/python -m pip install --quiet --require-hashes -r requirements-docs.lock
+	$(BIN)/python -m docs.make.reference --check
+	$(BIN)/zensical build --strict --clean
+
 python:
 	@[ -n "$(PYTHON)" ] || { echo "error: no Python found: install Python 3.11, or pass PYTHON=/path/to/python3.11"; exit 2; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
@@ -43,12 +48,14 @@ demo-environment test-environment: %-environment: python
 mutation: test-environment
 	$(BIN)/python -m tests.mutation $(ARGS)
 
-lock:  ## pin every dependency of every extra, with hashes, for all platforms; then the demo's part of them
+lock:  ## pin every dependency of every extra, with hashes, for all platforms; then the parts for the demo and the docs
 	@command -v uv >/dev/null || { echo "error: no uv to make the locks with: pip install uv"; exit 2; }
 	uv pip compile pyproject.toml --extra dev --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-header --output-file requirements.lock
 	uv pip compile pyproject.toml --extra demo --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-header --constraints requirements.lock --output-file requirements-demo.lock
+	uv pip compile pyproject.toml --extra docs --universal --python-version 3.11 --generate-hashes \
+	  --no-emit-index-url --no-header --constraints requirements.lock --output-file requirements-docs.lock
 
 clean:
 	rm -rf $(VENV) runs

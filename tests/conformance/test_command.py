@@ -92,7 +92,7 @@ def test_missing_robot_exits_with_4(capsys):
         (["robot", "ws://127.0.0.1:1", "--only", "R-NONE"], "no case begins so"),
         (["robot", "ws://127.0.0.1:1", "--group", "leases"], "no such group"),
         (["robot", "http://127.0.0.1:1"], "expected ws://"),
-        (["robot", "ws://127.0.0.1:1", "--save", "/nowhere/r.json"], "there is no folder /nowhere"),
+        (["robot", "ws://127.0.0.1:1", "--save", "/nowhere/r.json"], "no folder /nowhere"),
         (["robot"], "ENDPOINT"),
         (["vision"], "ENDPOINT"),
         (["robot", "tcp/127.0.0.1"], "expected <protocol>/<host>:<port>"),

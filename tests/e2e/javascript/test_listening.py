@@ -28,7 +28,7 @@ def quiet_robot(tmp_path_factory):
     ("first", "code", "reason"),
     [
         (hello("r2"), 1008, "this is robot js1, not r2"),
-        ("0.2|0.1", 1008, "no hello"),
+        ("0.2|0.1", 1008, "invalid hello"),
         (b"\x00\x02{}", 1003, "as text"),
         ("x" * 2000, 1009, "over"),
     ],
