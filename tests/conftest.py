@@ -5,12 +5,15 @@ import logging
 import os
 import signal
 import threading
+from pathlib import Path
 
 import pytest
 
 from sightline.protocol import log
 from tests.fixtures import own_process
 from tests.fixtures.cpu_times import CpuTimes
+
+SECOND_TIER = Path(__file__).with_name("second_tier.txt")
 
 # A shell that starts the tests in its background has Ctrl-C ignored, and every child would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -36,6 +39,20 @@ def pytest_collection():
 def pytest_xdist_auto_num_workers(config):
     """Three workers for each processor, since most tests wait; one for the second tier, whose tests start several."""
     return (1 if config.option.markexpr.startswith("slow") else 3) * len(os.sched_getaffinity(0))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(session, items):
+    """Mark as slow what `second_tier.txt` lists: single cases of a parametrized test, and tests near the bound."""
+    slow = set(SECOND_TIER.read_text(encoding="utf-8").splitlines())
+    names = {item.nodeid for item in items}
+    for item in items:
+        if item.nodeid in slow:
+            item.add_marker(pytest.mark.slow)
+    files = {name.partition("::")[0] for name in names}
+    unknown = sorted(name for name in slow - names if name.partition("::")[0] in files)
+    if unknown and not any("::" in arg for arg in session.config.args):
+        raise pytest.UsageError(f"{SECOND_TIER.name} lists tests that do not exist: {', '.join(unknown)}")
 
 
 @pytest.fixture(autouse=True)

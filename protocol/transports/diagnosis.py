@@ -46,7 +46,9 @@ def unresolved_host(hosts: Iterable[str]) -> str:
 
 def connections(ports: Collection[int]) -> Counter[str]:
     """Count the TCP connections of each host to `ports` of this machine, including those that are closing."""
-    return Counter(_host(row[2]) for row in _rows(ports) if row[3] != _LISTEN)
+    # The kernel writes the table in pieces, so a row can come twice while other sockets open and close.
+    ends = {(row[1], row[2]) for row in _rows(ports) if row[3] != _LISTEN}
+    return Counter(_host(remote) for _, remote in ends)
 
 
 def _rows(ports: Collection[int]) -> list[list[str]]:

@@ -255,7 +255,8 @@ def test_demo_lock_is_a_part_of_the_whole_lock(environment):
     names = {environment.name_of(entry) for entry in demo}
     assert not names & {"pytest", "mypy", "ruff", "onnx", "hypothesis", "coverage"}
     done = subprocess.run(["make", "--dry-run", "lock"], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert re.findall(r"--output-file (\S+)", done.stdout) == ["requirements.lock", "requirements-demo.lock"]
+    assert re.findall(r"--output-file (\S+)", done.stdout) == [
+        "requirements.lock", "requirements-demo.lock", "requirements-docs.lock"]
 
 
 @pytest.mark.parametrize(("lock", "extra"), [(DEMO, "demo"), (ALL, "dev")])

@@ -26,6 +26,13 @@ def test_a_far_end_is_read_from_the_table(monkeypatch, tmp_path, table, local, r
     assert connections([0x1D18]) == {}
 
 
+def test_row_that_the_table_repeats_counts_once(monkeypatch, tmp_path):
+    row = _ROWS.format(local="0100007F:1D17", remote="0200007F:C001", state="01")
+    (tmp_path / "tcp").write_text(row + row.splitlines()[-1] + "\n")
+    monkeypatch.setattr(diagnosis, "TABLES", tmp_path)
+    assert connections([0x1D17]) == {"127.0.0.2": 1}
+
+
 def test_a_flood_of_connections_is_reported_once_with_its_address():
     reported = []
     with socket.create_server(("127.0.0.1", free_port()), backlog=MAX_SESSIONS * 2) as server, ExitStack() as ending:
@@ -33,7 +40,7 @@ def test_a_flood_of_connections_is_reported_once_with_its_address():
         ending.enter_context(report_floods([f"tls/127.0.0.1:{address[1]}"], reported.append))
         for _ in range(MAX_SESSIONS):
             ending.enter_context(socket.create_connection(address))
-        assert not until(lambda: reported, 1.2), "as many as are accepted are not a flood"
+        assert not until(lambda: reported, 1.2), f"as many as are accepted are not a flood: {reported}"
         for _ in range(3):
             ending.enter_context(socket.create_connection(address))
         assert until(lambda: reported, 3.0)
