@@ -1,4 +1,4 @@
-"""What every test begins with: Ctrl-C as Python has it, and no log of a command that an earlier test ran."""
+"""The state that every test begins with: Python's own Ctrl-C, and no log of a command from an earlier test."""
 
 import gc
 import logging

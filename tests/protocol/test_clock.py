@@ -1,4 +1,4 @@
-"""The age of a robot's stamp, judged against its quickest message: never too old, and anew for each start."""
+"""The age of a robot's stamp, measured against its quickest message: never too old, and separate for each start."""
 
 from random import Random
 

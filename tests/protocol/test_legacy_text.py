@@ -1,4 +1,4 @@
-"""The older write-up's dialects: strict readers, and writers whose text the write-up's own code reads."""
+"""The legacy protocol's text forms: strict readers, and writers whose text the legacy code reads."""
 
 import base64
 

@@ -80,7 +80,7 @@ def test_a_service_prints_its_errors_as_json_too():
 
 
 def test_both_processes_of_a_robot_speak_json(tmp_path, monkeypatch):
-    """The driver says what it does by its command line; the network process by what it finds in its environment."""
+    """The command of the driver process selects its form of log; the network process reads its environment."""
     monkeypatch.setenv(LOG_FORMAT_VARIABLE, "json")
     with RobotProcess(tmp_path) as robot:
         robot.wait_until_on()
@@ -90,7 +90,7 @@ def test_both_processes_of_a_robot_speak_json(tmp_path, monkeypatch):
 
 @pytest.fixture(params=["pipe", "terminal"])
 def unread(request):
-    """Both ends of what somebody may read, or not; the second is a text stream."""
+    """Both ends of a stream that the test may read or leave unread; the second is a text stream."""
     reader, writer = os.pipe() if request.param == "pipe" else pty.openpty()
     if request.param == "pipe":
         fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)

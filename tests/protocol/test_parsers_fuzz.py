@@ -138,7 +138,7 @@ TOKENS = [
 
 
 def read(name, data):
-    """Parse; what is refused is refused with a reason and one line for a person."""
+    """Parse `data`. Assert that a rejection has a reason and one readable line."""
     try:
         PARSERS[name](data)
     except WireError as error:

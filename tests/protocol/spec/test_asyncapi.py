@@ -26,7 +26,7 @@ ALLOWED = {
 
 
 def resolve(reference):
-    """What a local reference names. Fails if it names nothing."""
+    """Return the target of a local reference. Fails if the target is missing."""
     assert reference.startswith("#/")
     node = DOCUMENT
     for part in reference[2:].split("/"):
@@ -47,7 +47,7 @@ def references(node):
 
 
 def known(kind, node):
-    """Whether `node` has only fields that an object of its kind may have."""
+    """Return whether `node` has only fields that an object of its kind may have."""
     return all(name in ALLOWED[kind] or re.fullmatch(r"x-[\w.-]+", name) for name in node)
 
 

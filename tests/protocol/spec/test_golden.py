@@ -1,4 +1,4 @@
-"""Golden vectors and the specification: what lies on disk is what the code does and says."""
+"""Golden vectors and the specification: the files on disk match the behavior and the output of the code."""
 
 import json
 import re

@@ -1,6 +1,6 @@
 """Every accepted golden vector, cut short at every byte and with every bit of its header flipped.
 
-What comes of it is a value within the bounds of the specification or a refusal with one of its reasons; nothing else.
+The result is always a value within the bounds of the specification, or a rejection with one of its reasons.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Who uses a port: the system's table of TCP sockets, and reports of a host with too many connections."""
+"""The hosts connected to a port: the system's table of TCP sockets, and reports of a host with too many connections."""
 
 import socket
 from contextlib import ExitStack

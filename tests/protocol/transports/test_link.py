@@ -1,4 +1,4 @@
-"""What every `Link` promises, run over every transport. A transport joins by a rig in `tests/fixtures/links.py`."""
+"""The promises of every `Link`, over every transport. A transport joins by a rig in `tests/fixtures/links.py`."""
 
 import itertools
 import random
@@ -21,7 +21,7 @@ def rig(request: pytest.FixtureRequest) -> Iterator[MemoryRig]:
 
 
 def _pair(rig):
-    """A robot whose frames a vision peer hears, and that hears its twists."""
+    """Return a robot, its vision peer, and the slots of the frames and twists that they receive."""
     robot, peer = rig.robot(), rig.peer()
     frames, twists = peer.latest(FRAME), robot.latest(TWIST)
     assert rig.until(lambda: robot.has_listener(FRAME) and peer.has_listener(TWIST))

@@ -1,4 +1,4 @@
-"""The network in memory: its delays, losses and bursts are what was asked for, and the same every time."""
+"""The network in memory: its delays, losses and bursts match the settings, and repeat in every run."""
 
 import statistics
 from itertools import pairwise
@@ -14,7 +14,7 @@ FRAME_US = 33_333
 
 
 def _run(network: MemoryNetwork, frames: int, status_every: int = 0) -> list[tuple[int, int, str]]:
-    """(arrival, number, channel) of what a vision peer hears; it answers each frame at once with a twist."""
+    """Return (arrival, number, channel) of each received message; the peer answers each frame with a twist."""
     robot, vision = network.link("r1"), network.link("r1", "vision")
     heard: list[tuple[int, int, str]] = []
 

@@ -1,4 +1,4 @@
-"""`wss://` with real TLS: certificates of a private authority, and everybody who does not agree on them."""
+"""`wss://` with real TLS: certificates of a private authority, and every peer that does not agree on them."""
 
 import socket
 import ssl

@@ -1,4 +1,4 @@
-"""Who may come in by WebSocket beyond loopback: by token and as what, or in the older dialect by address."""
+"""WebSocket clients beyond loopback: admitted by token with its role, or by address in the legacy protocol."""
 
 import itertools
 import json
@@ -245,7 +245,7 @@ def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, caplog):
             allowed = [pair for pair in sent if pair in grants_of_role(role)]
             assert until(lambda: len(heard) == len(allowed) and robot.rejected[NOT_GRANTED] == len(sent) - len(allowed))
             assert heard == allowed
-            assert robot.has_listener(STATUS)  # everybody may watch
+            assert robot.has_listener(STATUS)  # every client may watch
             # Logged once each, at once; an acknowledgement that returns no credit is not worth a word.
             forbidden = {"/".join(pair) for pair in sent if pair not in grants_of_role(role) and pair[0] != "ack"}
             told = [line for line in caplog.messages if line.startswith("rejected ")]
@@ -274,7 +274,7 @@ def test_one_client_drives_and_the_rest_only_watch(caplog):
     plain = endpoint.replace("ws-legacy", "ws")
     with open_websocket("r1", listen=endpoint) as robot, connect(plain) as viewer, connect(plain) as driver:
         twists, got = robot.latest(TWIST), []
-        viewer.send("left")  # not valid: takes no seat, and the robot says why it is refused
+        viewer.send("left")  # invalid: takes no seat, and the robot reports why it rejects it
         assert twists.take(2).payload == b"left"
         for number in range(5):
             driver.send(f"0.1|{number}")

@@ -1,4 +1,4 @@
-"""Secured Zenoh links: who may say and hear what, by certificate; what is wrong between two ends, in words."""
+"""Secured Zenoh links: permissions to send and receive, by certificate, and readable causes of a mismatch."""
 
 import threading
 import time

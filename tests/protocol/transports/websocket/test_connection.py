@@ -1,4 +1,4 @@
-"""Who is given up, by time and by what is known of the way out: tables over `connection.py`, to the microsecond."""
+"""Connections given up, by time and by send path: tables over `connection.py`, exact to the microsecond."""
 
 import random
 
@@ -25,7 +25,7 @@ TICK_US = 250_000
 
 
 def gives_up_at(way, heard_at=(), until_us=60_000_000) -> int | None:
-    """When a connection ends that was heard at 0 and then at `heard_at`; `way` gives the way out at a time."""
+    """Return the end of a connection with data at 0 and at `heard_at`; `way` returns the send path at a time."""
     life, heard = Keepalive(0), sorted(heard_at)
     for now_us in range(0, until_us, TICK_US):
         while heard and heard[0] <= now_us:
@@ -99,7 +99,7 @@ def served(opcode: int, data: bytes, fin: bool = True) -> bytes:
 
 
 def read(pieces, bound: int = BOUND) -> tuple[list, int | None]:
-    """What a client makes of `pieces`, and with which code it hangs up."""
+    """Return the messages that a client reads from `pieces`, and the code with which it hangs up."""
     protocol = Protocol(CLIENT, max_size=bound)
     messages = MessageReader(protocol)
     for piece in pieces:
@@ -136,7 +136,7 @@ def test_any_frames_are_read_alike_however_they_are_cut(frames, dice):
     bytewise = [text[at : at + 1] for at in range(len(text))]
     results = [read(pieces, 200) for pieces in (whole, cut, bytewise, [text])]
     assert results[0][0] == results[1][0] == results[2][0] == results[3][0]
-    # Of two faults that arrive together either may be the one that is told.
+    # Either of two faults that arrive together may be the reported one.
     assert len({code is None for _, code in results}) == 1
 
 

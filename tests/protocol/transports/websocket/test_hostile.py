@@ -1,4 +1,4 @@
-"""Ten thousand random and mutated messages on each dialect: only documented refusals, no growth, nobody disturbed."""
+"""Ten thousand random and mutated messages on each protocol: documented rejections only, no growth, no disturbance."""
 
 import json
 import subprocess

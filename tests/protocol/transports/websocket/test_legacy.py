@@ -1,4 +1,4 @@
-"""The older text dialect over real sockets: the write-up's client, and vision against the write-up's robot."""
+"""The legacy text protocol over real sockets: the legacy client, and the vision service against the legacy robot."""
 
 import base64
 import random
@@ -41,7 +41,7 @@ def header_of(seq: int) -> FrameHeader:
 
 @contextmanager
 def robot_and_client(options: str = ""):
-    """A robot that listens for the older dialect, and one client that offers no sub-protocol."""
+    """Open a robot that listens for the legacy protocol, and one client that offers no sub-protocol."""
     endpoint = free_endpoint("ws-legacy://") + options
     with open_websocket("r1", listen=endpoint, role="robot") as robot, connect(plain(endpoint), **OLD) as client:
         assert until(lambda: robot.connected)
@@ -137,7 +137,7 @@ def test_boxes_without_the_option_are_rejected():
         robot.publish(FRAME, encode(header_of(1)), SMALL_JPEG)
         client.recv(2)
         client.send("0.25,0.5,0.75,1.0")
-        assert twists.take(2).payload == b"0.25,0.5,0.75,1.0"  # the robot refuses it, and says why
+        assert twists.take(2).payload == b"0.25,0.5,0.75,1.0"  # the robot rejects it and reports why
         assert found.take() is None
 
 
@@ -246,11 +246,11 @@ def test_both_protocols_can_be_served_at_once():
             assert base64.b64decode(client.recv(2)) == JPEG
 
 
-# Vision against an older robot, in its own text dialect, over real sockets.
+# The vision service against a legacy robot, in the legacy text protocol, over real sockets.
 
 
 class OldRobot:
-    """The write-up's robot: sends what it is told to each client, keeps what they say."""
+    """The legacy robot: sends given text to each client, and keeps the received messages."""
 
     def __init__(self, endpoint: str) -> None:
         self.said: list[str | bytes] = []

@@ -1,4 +1,4 @@
-"""Opening `sightline.v1` over real sockets: endpoints, errors and what they say, and leaving nothing behind."""
+"""Opening `sightline.v1` over real sockets: endpoints, errors and their messages, and leaving nothing behind."""
 
 import gc
 import os
@@ -58,7 +58,7 @@ def test_websockets_that_is_not_installed_is_one_line_with_the_fix(monkeypatch):
 
 @pytest.mark.parametrize(("kind", "other"), [("ws", "wss"), ("wss", "ws")])
 def test_who_hangs_up_unheard_is_tried_again(kind, other, tmp_path):
-    """As a listener does that has too many at once; over TLS its end may come before our hello or after."""
+    """Hang up like a listener with too many clients; over TLS the end may come before or after the client's hello."""
     keys.make(tmp_path / "keys", [])
     tried = []
 

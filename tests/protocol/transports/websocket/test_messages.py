@@ -1,4 +1,4 @@
-"""`sightline.v1` after the handshake: every bad hello and message is counted, told why and dropped, alone."""
+"""`sightline.v1` after the handshake: each bad hello or message is counted, rejected with the reason and dropped."""
 
 import json
 import re

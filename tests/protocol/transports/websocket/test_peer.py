@@ -1,4 +1,4 @@
-"""What waits for a peer without room: the newest of each place, and never a STOP that another request replaced."""
+"""The queue for a peer without room: it keeps the newest of each place, and no other request replaces a STOP."""
 
 import random
 import threading
@@ -76,7 +76,7 @@ def test_however_requests_come_every_asker_s_stop_is_there(seed):
     got = taken(queue)
     assert {post.message.source for post in got[: len(stopped)]} == stopped
     assert all(b'"stop"' in post.message.payload for post in got[: len(stopped)])
-    assert len(got) <= 3 * len(VERBS)  # bounded, however many are asked
+    assert len(got) <= 3 * len(VERBS)  # bounded for any number of requests
 
 
 def test_requests_that_cannot_be_read_share_one_place():

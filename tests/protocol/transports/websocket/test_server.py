@@ -1,4 +1,4 @@
-"""Who may come in at a robot's WebSocket: sub-protocol, site, number, and how long a stranger is waited for."""
+"""Admission at a robot's WebSocket: sub-protocol, site, number, and the wait for an unidentified client."""
 
 import socket
 import time

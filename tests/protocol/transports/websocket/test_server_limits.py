@@ -1,4 +1,4 @@
-"""Who takes whose place at a robot's WebSocket: no crowd of viewers, and no idle stranger, shuts out who says STOP."""
+"""Places at a robot's WebSocket: viewers and idle unidentified clients never shut out a client that sends STOP."""
 
 import os
 import socket
@@ -34,7 +34,7 @@ TOKENS = {"operator": "operator_0123456789abc", "viewer": "viewerviewerviewer"}
 
 
 def settled(places: ConnectionLimits, acts: bool) -> str:
-    """What becomes of one more client."""
+    """Admit one more client; return the problem, or an empty text."""
     place = places.admit("10.0.0.1")
     problem = places.promote(place, acts)
     if problem:

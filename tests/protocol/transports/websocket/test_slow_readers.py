@@ -1,4 +1,4 @@
-"""Who reads slowly stays, who reads never costs little, and who is gone is noticed: over real sockets."""
+"""Slow readers stay, clients that never read cost little, and missing clients are noticed: over real sockets."""
 
 import statistics
 import threading
@@ -74,7 +74,7 @@ def test_an_end_that_stands_still_is_noticed_within_three_seconds():
         assert until(lambda: robot.has_listener(STATUS))
         begin_s = time.monotonic()
         while robot.connected and time.monotonic() - begin_s < 5:
-            robot.publish(STATUS, b"{}", bytes(500))  # its machine takes these, but nobody reads
+            robot.publish(STATUS, b"{}", bytes(500))  # its machine takes these, but no process reads
             time.sleep(0.1)
         assert 1.5 < time.monotonic() - begin_s < 3
         assert robot.rejected == {SILENT: 1}

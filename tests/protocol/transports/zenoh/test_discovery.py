@@ -1,4 +1,4 @@
-"""Being found by multicast: who listens beyond loopback, nobody else; and it fails nothing."""
+"""Discovery by multicast: it finds only robots that listen beyond loopback, and its failure breaks nothing."""
 
 import os
 import subprocess
@@ -70,7 +70,7 @@ def _can_have_a_network_of_its_own():
 @pytest.mark.slow
 @pytest.mark.skipif(not _can_have_a_network_of_its_own(), reason="no network namespaces; run the tests as root")
 def test_two_robots_on_a_network_are_found_despite_a_used_group_port():
-    """A namespace with an address: two robots listen on it, one on loopback; then a stranger has the group's port."""
+    """Two robots listen on a namespace's address, a third on loopback. Then another socket has the group's port."""
     command = ["unshare", "-n", "--kill-child", sys.executable, "-c", INSIDE]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert [line.partition("  sightline")[0] for line in done.stdout.splitlines()] == [

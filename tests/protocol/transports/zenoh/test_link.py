@@ -188,7 +188,7 @@ def test_list_robots_without_an_answer_raises():
 
 
 class _Publishing:
-    """Publishes a counted `status` on each link until told to stop."""
+    """Publishes a counted `status` on each link until `stop`."""
 
     def __init__(self, links) -> None:
         self._links, self._stop = links, threading.Event()
@@ -230,7 +230,7 @@ def test_no_thread_or_descriptor_is_left_behind():
 
 
 def test_a_close_while_others_publish_is_silent(monkeypatch):
-    """A publisher in use cannot be undeclared; that is no traceback on somebody's terminal."""
+    """A publisher in use cannot be undeclared; this prints no traceback on the terminal."""
     raised, over = [], threading.Event()
     monkeypatch.setattr(threading, "excepthook", lambda args: raised.append(args.exc_value))
     for _ in range(8):

@@ -1,4 +1,4 @@
-"""Presence: what an answer must be, whose id is taken, and who is heard at a real router."""
+"""Presence: the form of an answer, robot ids in use, and the peers that are listed at a real router."""
 
 import time
 

@@ -147,6 +147,6 @@ def test_second_robot_with_one_id_does_not_start_and_names_the_first(tmp_path):
                 assert second.process.wait(15) == 4
                 assert "error: robot id 'r1' is in use on host " in second.output()
             assert driving(first)
-            first.kill_network()  # comes back by itself, and is no namesake of its earlier self
+            first.kill_network()  # comes back by itself, and does not count as a second robot with its id
             assert until(lambda: first.speed() == 0.0, 2.0)
             assert driving(first), first.output()
