@@ -61,7 +61,7 @@ def unmasks_nothing(question, right):
 
 @wrong("C-CODEC-1")
 def reads_base64_its_way(question, right):
-    """The older dialect: whatever a picture's text is."""
+    """Reject each legacy image as MALFORMED, regardless of its text."""
     return {"refusal": "MALFORMED"} if question["kind"] == "older_picture" else right
 
 
@@ -118,7 +118,7 @@ def knows_messages_only(question, right):
 
 
 def main():
-    """As the example's, with the change in between."""
+    """Answer each question like the example, with the change applied to each answer."""
     name = sys.argv[1]
     change = WRONG[name][1] if name in WRONG else globals()[name]
     for line in sys.stdin:

@@ -1,4 +1,4 @@
-"""`sightline conform` as a person and as a CI use it: against a real robot process, over WebSocket and Zenoh."""
+"""Tests of `sightline conform` as users and CI jobs run it: a real robot process, over WebSocket and Zenoh."""
 
 import json
 import xml.etree.ElementTree as ET

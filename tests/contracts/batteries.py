@@ -1,4 +1,4 @@
-"""What every battery plug-in promises. Run it over your own: `check_battery(lambda: YourBattery(config))`."""
+"""Contract of every battery plug-in. Run it over your own: `check_battery(lambda: YourBattery(config))`."""
 
 import math
 import threading
@@ -8,7 +8,7 @@ from collections.abc import Callable
 from sightline.robot_side.ports import Battery
 
 SLOWEST_S = 1.0
-"""For one reading: the battery counts as low when there is none for 5 s."""
+"""Limit for one reading; the battery counts as low after 5 s without a reading."""
 
 
 def check_battery(opened: Callable[[], Battery]) -> None:

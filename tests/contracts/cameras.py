@@ -1,4 +1,4 @@
-"""What every camera plug-in promises. Run it over your own: `check_camera(lambda: YourCamera(config))`."""
+"""Contract of every camera plug-in. Run it over your own: `check_camera(lambda: YourCamera(config))`."""
 
 import time
 from collections.abc import Callable
@@ -27,7 +27,7 @@ def check_camera(opened: Callable[[], Camera]) -> None:
 
 
 def next_picture(camera: Camera) -> Picture:
-    """The next capture, however often `read` has to be asked."""
+    """Return the next capture, after as many calls of `read` as it takes."""
     deadline_s = time.monotonic() + PATIENCE_S
     while time.monotonic() < deadline_s:
         picture = camera.read(0.2)
@@ -70,7 +70,7 @@ def _hands_over_nothing_old(camera: Camera) -> None:
 
 
 def _adjusts_or_says_that_it_does_not(camera: Camera) -> None:
-    """Smaller when asked, each picture with its own scale and of that size; as before when asked back."""
+    """Request smaller images, check that each has its own scale and that size, and request the full size again."""
     if not isinstance(camera, Adjustable):
         return
     full = camera.model
@@ -87,7 +87,7 @@ def _adjusts_or_says_that_it_does_not(camera: Camera) -> None:
 
 
 def _first_of_scale(camera: Camera, scale_percent: int) -> Picture:
-    """Within a few pictures of being asked."""
+    """Return the first image of the scale among the next five images."""
     for _ in range(5):
         picture = next_picture(camera)
         if picture.scale_percent == scale_percent:

@@ -1,4 +1,4 @@
-"""What every detector plug-in promises. Run it over your own: `assert_kept(lambda: Mine(Mine.Config()))`.
+"""Contract of every detector plug-in. Run it over your own: `assert_kept(lambda: Mine(Mine.Config()))`.
 
 The promises themselves ship with vision (vision_side/detect/contract.py): `sightline detector check NAME` runs them.
 """

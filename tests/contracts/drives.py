@@ -1,4 +1,4 @@
-"""What every drive plug-in promises. Run it over your own: `check_drive(lambda: YourDrive(config))`.
+"""Contract of every drive plug-in. Run it over your own: `check_drive(lambda: YourDrive(config))`.
 
 The wheels turn: lift the robot.
 """
@@ -56,7 +56,7 @@ def _is_quick_whatever_it_is_told(drive: Drive, speed_rad_s: float) -> None:
 
 
 def _keeps_the_last_speeds(drive: Drive, speed_rad_s: float) -> None:
-    """Motors latch: nobody repeats a speed."""
+    """Check that the motors latch a speed that no call repeats."""
     drive.set(speed_rad_s, speed_rad_s)
     first = _turned(drive)
     later = _turned(drive)

@@ -1,7 +1,7 @@
-"""What every mission plug-in promises. Run it over your own: `check_mission(choose("my:Mission", {}, VisionConfig()))`.
+"""Contract of every mission plug-in. Run it over your own: `check_mission(choose("my:Mission", {}, VisionConfig()))`.
 
 The frames are drawn from a seed: robots that drive, stand and jump, detections of every shape, no picture, no scan, and
-scans as a broken or hostile robot sends them. Nothing here waits; time is what the frames say.
+scans as a broken or hostile robot sends them. Nothing here waits; time comes from the frames.
 """
 
 import math
@@ -44,7 +44,7 @@ def _check_plan(plan: Plan) -> None:
 
 
 def _plans(chosen: MissionSpec, seen: Iterator[View]) -> list[Plan]:
-    """A mission's plans up to the one that ends it: nobody asks it any further."""
+    """Return a mission's plans up to the plan that ends it; the mission receives no further view."""
     mission, plans = chosen.build(CAMERA), []
     for view in seen:
         plans.append(mission.step(view))
@@ -75,7 +75,7 @@ def _blind(seed: int, frames: int) -> Iterator[View]:
 
 
 def _still(seed: int, frames: int) -> Iterator[View]:
-    """A robot that is held: it never moves, whatever it is told."""
+    """Yield views of a held robot, which never moves on any command."""
     for view in views(seed, frames):
         header = FrameHeader(session="0000abcd", seq=view.header.seq, t_us=view.header.t_us)
         yield View(header, view.dt_s, view.latency_s, view.camera, view.detections, view.picture, view.scan)

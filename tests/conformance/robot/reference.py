@@ -62,7 +62,7 @@ class ReferenceRobot:
     # --- seams ---------------------------------------------------------------------------------------------------
 
     def receive(self, message):
-        """What arrives."""
+        """Pass an incoming message to the handler of its channel."""
         {"twist": self.on_twist, "request": self.on_request, "ack": self.on_ack}[message.channel.name](message)
 
     def on_twist(self, message):
@@ -72,7 +72,7 @@ class ReferenceRobot:
             self.sending.on_command_ack(ack, self.now())
 
     def on_request(self, message):
-        """A person's request; its reply leaves at once."""
+        """Handle an operator's request; its reply leaves immediately."""
         self.driving.on_request(message, self.now())
 
     def on_ack(self, message):
@@ -83,15 +83,15 @@ class ReferenceRobot:
             self.driving.rejected_by_transport[error.reason] += 1
 
     def emit(self, message):
-        """What leaves."""
+        """Send an outgoing message."""
         self.send(message.channel, message.header, message.payload)
 
     def send(self, channel, header, payload, key=None):
-        """Bytes to everybody who listens, past the bounds of a well-behaved link."""
+        """Send bytes to every listener, past the bounds of a well-behaved link."""
         self.network.put(key or key_for("r1", channel), header, payload, self.link)
 
     def listening(self):
-        """Whether anybody wants frames."""
+        """Return whether any peer wants frames."""
         return self.link.has_listener(FRAME)
 
     def film(self, now_us):
@@ -108,7 +108,7 @@ class ReferenceRobot:
             self.emit(message)
 
     def issue(self, header):
-        """The driver learns of a frame before anybody can answer it."""
+        """Announce a frame to the driver before any peer can answer it."""
         self.driving.on_issued(header.seq, header.t_us, 0)
 
     # --- time ----------------------------------------------------------------------------------------------------

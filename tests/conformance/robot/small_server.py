@@ -39,10 +39,10 @@ class EndError(Exception):
 
 
 class SmallServer:
-    """Use it in a `with`: one thread, one robot, `sightline.v1` on `endpoint` and the older dialect on `older`."""
+    """Use it in a `with`: one thread, one robot, `sightline.v1` on `endpoint` and the legacy protocol on `older`."""
 
     def __init__(self, defects=(), tokens=None):
-        """`tokens` are role -> token; with none anybody may come in."""
+        """Create the server; `tokens` are role -> token, and without tokens any client may connect."""
         self.defects, self.tokens = set(defects), tokens or {}
         self.driver, self.driven_s = None, 0.0
         self.network = MemoryNetwork()
@@ -207,7 +207,7 @@ class Client:
             raise EndError(1009, f"{size} bytes, more than this end can want")
 
     def odd(self, defect):
-        """Whether the defect shows: some show to viewers only, since the kit's own link could not speak past them."""
+        """Return whether the defect shows; some show to viewers only, since the kit's link cannot speak past them."""
         return self.has(defect) and self.role == "viewer"
 
     most_bytes = max(1024, MOST_BYTES)
@@ -270,7 +270,7 @@ class Client:
         return 0, ""
 
     granted = ""
-    again = False  # whether this peer has said hello more than once
+    again = False  # whether this peer has sent hello more than once
 
     def role_of(self, headers, offered, first):
         """The role whose token the client shows; "" for none."""
@@ -397,7 +397,7 @@ class Client:
             self.server.network.put(key, header, payload, self.link)
 
     def may_say(self, name, source):
-        """Whether the token's role may publish this."""
+        """Return whether the token's role may publish this message."""
         if self.has("any token for every role"):
             return True
         own = ("operator", "teleop") if self.granted == "operator" else (self.granted,)
@@ -430,7 +430,7 @@ class Client:
 
 
 class OlderClient(Client):
-    """One connection of the older dialect: base64 out, `linear|angular` in."""
+    """One connection of the legacy protocol: base64 out, `linear|angular` in."""
 
     older = True
     most_bytes = 256
@@ -452,7 +452,7 @@ class OlderClient(Client):
     shown = None
 
     def drives(self, message):
-        """Whether this client is the one that drives; another's valid twist is counted as NOT_HOLDER."""
+        """Return whether this client drives; count its valid twist as NOT_HOLDER while another client drives."""
         server, now_s = self.server, time.monotonic()
         other = server.driver not in (None, self) and now_s - server.driven_s < 1.0 and server.driver in server.clients
         if message.count(b"|") != 1:

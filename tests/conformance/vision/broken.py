@@ -1,4 +1,4 @@
-"""Broken visions, one per case: the reference with one step changed. Pure.
+"""Broken vision services, one per case: the reference with one step changed. Pure.
 
 `BROKEN` maps a case's id to (what is wrong, the class). `test_cases.py` demands that it fails that case
 and no other. The steps that a broken one may change, in the order of a frame's way, are the methods of `BrokenVision`.
@@ -15,7 +15,7 @@ from tests.conformance.vision.fixture import COMPUTE_US, VirtualVision
 
 BROKEN = {}
 STANDING = PipelineAnswer(STILL, Observation("broken"))
-"""A twist where there should be none."""
+"""A twist where the answer should have no twist."""
 
 
 def breaks(case, wrong):
@@ -61,7 +61,7 @@ class BrokenVision(VirtualVision):
         """The kit's link is gone."""
 
     def back(self):
-        """It is there again; `gap_us` says after how long."""
+        """The link is up again; `gap_us` shows how long it was down."""
 
     def idle(self):
         """After each turn."""
@@ -70,7 +70,7 @@ class BrokenVision(VirtualVision):
         """Each status as it comes."""
 
     def believes(self, message):
-        """Whether to take the small camera because of this camera message."""
+        """Return whether to use the small camera because of this camera message."""
         return False
 
     def _look_at_camera(self):

@@ -1,4 +1,4 @@
-"""Broken visions: wrong headers, wrong twists, wrong echoes, wrong counts. Pure."""
+"""Broken vision services: wrong headers, wrong twists, wrong echoes, wrong counts. Pure."""
 
 from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import REQUEST, key_for
@@ -101,7 +101,7 @@ class AnotherKey(BrokenVision):
 
 
 class Again(BrokenVision):
-    """Says a twist again."""
+    """Sends a twist again."""
 
     last = None
 

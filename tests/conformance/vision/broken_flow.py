@@ -1,4 +1,4 @@
-"""Broken visions: queues, silences, losses, and robots in states they do not like. Pure."""
+"""Broken vision services: queues, silences, losses, and robots in states they do not like. Pure."""
 
 import json
 from collections import deque
@@ -70,7 +70,7 @@ class Flooded(Queueing):
 
 
 class Gaps(BrokenVision):
-    """Knows how long it heard no frame before this one."""
+    """Measures how long no frame arrived before the current frame."""
 
     last_us = None
 

@@ -1,4 +1,4 @@
-"""Broken visions: too trusting or too strict with headers, pictures and cameras. Pure."""
+"""Broken vision services: too trusting or too strict with headers, pictures and cameras. Pure."""
 
 import json
 from contextlib import suppress
@@ -9,7 +9,7 @@ from tests.conformance.vision.broken import STANDING, BrokenVision, breaks, fram
 
 
 class Guessing(BrokenVision):
-    """Makes a header up from the last good one where it is told to be lenient."""
+    """Makes up a header from the last good header where `lenient` is true."""
 
     good = None
 

@@ -1,4 +1,4 @@
-"""Broken visions: those that steer where they should not. Pure."""
+"""Broken vision services: those that steer where they should not. Pure."""
 
 from sightline.protocol.messages import Twist
 from sightline.vision_side.pipeline import PipelineAnswer
@@ -7,7 +7,7 @@ from tests.conformance.vision.broken_answers import PerSession
 
 
 class Steering(PerSession):
-    """Changes speeds; `saw` says what this session has shown."""
+    """Changes speeds; `saw` holds what this session has shown."""
 
     def starts_anew(self):
         self.saw = set()

@@ -72,7 +72,7 @@ def _table(kind: int, length: int, symbols: Sequence[int]) -> bytes:
 
 
 def _blocks(rows: Sequence[Sequence[Pixel]], which: int) -> Blocks:
-    """One component's blocks. Raises ValueError for a picture that is no whole number of them: the kit has none."""
+    """Split one component into blocks. Raises ValueError for an image without a whole number of blocks."""
     if len(rows) % 8 or len(rows[0]) % 8:
         raise ValueError(f"{len(rows[0])}x{len(rows)} pixels are no whole blocks of 8x8")
     return [
@@ -193,7 +193,7 @@ class Drawing:
 
     @property
     def jpeg(self) -> bytes:
-        """Drawn anew."""
+        """Draw the image again at each access."""
         return encode_jpeg(self.width_px, self.height_px, self.scene(), progressive=self.progressive)
 
     def scene(self) -> Scene:
@@ -204,7 +204,7 @@ class Drawing:
         return lambda x, y: mixed[self._covered(x, y)]
 
     def _covered(self, x: int, y: int) -> int:
-        """How many of the pixel's samples lie on the ball; the centre is a pixel's corner."""
+        """Count the pixel's samples that lie on the ball; the center is a pixel's corner."""
         if not self.radius_px or abs(x - self.x_px) > self.radius_px or abs(y - self.y_px) > self.radius_px:
             return 0
         reach = (2 * _FINE * self.radius_px) ** 2

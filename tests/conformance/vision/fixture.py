@@ -18,13 +18,13 @@ from sightline.vision_side.pipeline import Pipeline, PipelineAnswer
 from sightline.vision_side.serving.service import Service
 
 COMPUTE_US = 2_000
-"""What it says a frame took; virtual answers take a step of 5 ms."""
+"""Compute time that the reference reports for a frame; virtual answers take a step of 5 ms."""
 CONFIG = VisionConfig()
 
 
 @cache
 def _looked_at(width_px, height_px, jpeg):
-    """The detections in a picture, or why it is none."""
+    """Return the detections in an image, or the error that makes it invalid."""
     try:
         picture = Decoder(width_px, height_px, CONFIG.max_pixels).decode(jpeg)
     except WireError as error:
@@ -46,7 +46,7 @@ class RememberingDecoder:
 
 
 class RememberingDetector:
-    """What the decoder has handed on."""
+    """Detector that returns the detections from the decoder."""
 
     def detect(self, frames, deadline_us):
         return [result_of(frame, frame.picture(), Maker("hsv", device="cpu")) for frame in frames]

@@ -1,4 +1,4 @@
-"""Visions over the library `websockets`: a good one, and one broken in each way that a socket can be. Shell.
+"""Vision services over the library `websockets`: a good service, and a broken service per defect. Shell.
 
 They look at nothing: every frame is answered by a twist of zeros. `SOCKETS` maps a case's id to what is wrong.
 """
@@ -108,7 +108,7 @@ class SocketVision:
                 return
 
     def listening(self, link):
-        """When the last bytes came: who never pings can still tell the silent by them, and must, for its one defect."""
+        """Record when bytes arrive, so that a service without pings still detects silence and has only one defect."""
         heard, take = deque([time.monotonic()], maxlen=1), link.protocol.receive_data
         link.protocol.receive_data = lambda data: (heard.append(time.monotonic()), take(data))[1]
         return heard

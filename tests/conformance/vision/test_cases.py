@@ -1,4 +1,4 @@
-"""The kit's cases for visions: ours passes, and each broken one fails its own case and no other."""
+"""Tests of the kit's cases for vision services: ours passes, and each broken service fails only its own case."""
 
 import pytest
 
@@ -17,7 +17,7 @@ from tests.conformance.vision.fixture import VirtualVision, virtual_bench
 
 VIRTUAL = [case for case in CASES if not case.real]
 PENDING: set[str] = set()
-"""What ours does not do yet: forget a session that is over, and refuse a camera whose header is refused."""
+"""Cases that ours does not pass yet: forget a session that is over, and reject a camera with a rejected header."""
 
 
 def result_of(case, vision):

@@ -17,7 +17,7 @@ from tests.conformance.vision.drawing import DRAWINGS, Drawing, encode_jpeg
 
 
 def decoded(jpeg):
-    """As OpenCV sees it: Y, Cb, Cr."""
+    """Decode an image by OpenCV to Y, Cb, Cr."""
     bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2YCrCb)[:, :, [0, 2, 1]].astype(int)
 

@@ -24,7 +24,7 @@ TOKEN = "0123456789abcdefABCDEF_-"
 
 @contextmanager
 def bench_with(vision, endpoint=None):
-    """A kit that listens, and `vision(endpoint)`, a context, that connects; it looks at the token and asks for none."""
+    """A kit that listens, and `vision(endpoint)`, a context that connects; the kit checks a token but requires none."""
     endpoint = endpoint or free_endpoint("ws://")
 
     def open_it(role):
@@ -66,7 +66,7 @@ def test_a_good_vision_passes_them_all(vision):
 
 
 def failed_of(broken, cases):
-    """Each on a bench of its own: a vision that gave up would fail what follows."""
+    """Run each case on its own bench, because a vision service that gives up fails all later cases."""
     found = set()
     for case in cases:
         with bench_with(lambda endpoint: plain_vision(endpoint, broken)) as bench:

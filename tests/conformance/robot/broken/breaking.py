@@ -1,11 +1,11 @@
-"""How a robot is broken on purpose: a table from case to mutation, and ways to bend what goes in and out. Pure."""
+"""Mutations that break a robot on purpose: a table from case to mutation, and ways to bend input and output. Pure."""
 
 import json
 
 from sightline.protocol.transports.link import Message
 
 BROKEN = {}
-"""Case id -> `break_it(robot)`, whose name says what is wrong. Exactly that case must fail."""
+"""Case id -> `break_it(robot)`, whose name shows what is wrong. Exactly that case must fail."""
 
 
 def breaks(case_id):
@@ -20,7 +20,7 @@ def breaks(case_id):
 
 
 def fields_of(data):
-    """A header as a dict, None if it is none."""
+    """Return a header as a dict, or None if it is not a JSON object."""
     try:
         fields = json.loads(data.decode())  # as text: given bytes, it would read past a byte order mark
     except ValueError:

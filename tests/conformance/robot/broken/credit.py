@@ -17,7 +17,7 @@ def stream_of(robot):
 
 
 def owns_too(robot, when):
-    """Anybody's answers return credit `when(now_us)`."""
+    """Let any peer's answer return credit while `when(now_us)` is true."""
     wrap(stream_of(robot), "_owns", lambda inner, who, now_us: when(now_us) or inner(who, now_us))
 
 

@@ -21,7 +21,7 @@ def keeps(robot, change):
 
 
 def goal(robot, change):
-    """`change(twist, asked)` gives the goal of the wheels; `asked` is what the driver asked for last."""
+    """Set the goal of the wheels to `change(twist, asked)`; `asked` is the last twist that the driver requested."""
     gate, asked = robot.driving.gate, [STILL]
     wrap(gate, "_accept", lambda inner, *a: asked.__setitem__(0, a[1]) or inner(*a))
 
@@ -95,14 +95,14 @@ def brakes_slowly(robot):
 
 
 def revive(robot):
-    """The command in force begins anew."""
+    """Restart the command in force at the current time."""
     gate = robot.driving.gate
     if gate._command is not None:
         gate._command = AcceptedCommand(gate._command.twist, robot.now(), robot.now(), gate._command.life_us)
 
 
 def revived_by(robot, reason):
-    """Twists refused for `reason` keep the wheels turning."""
+    """Keep the wheels turning when the robot rejects a twist for `reason`."""
 
     def around(inner, source, error):
         if error.reason == reason:

@@ -1,4 +1,4 @@
-"""Robots that judge in another order, remember too little, or read what lies at a bound wrongly. Pure."""
+"""Robots that validate in another order, remember too little, or read a value at a bound wrongly. Pure."""
 
 import re
 

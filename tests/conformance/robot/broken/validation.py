@@ -1,4 +1,4 @@
-"""Robots that read or judge a twist wrongly: headers, grammar, causality, the sender's sequence. Pure."""
+"""Robots that read or validate a twist wrongly: headers, grammar, causality, the sender's sequence. Pure."""
 
 import json
 import re
@@ -12,12 +12,12 @@ HEX = re.compile(r"[0-9a-f]{8}")
 
 
 def refuse(robot, message, reason="MALFORMED"):
-    """Count a refusal that the reference would not make."""
+    """Count a rejection that the reference does not make."""
     robot.driving.gate.reject(message.source, WireError(RejectReason(reason), "broken on purpose"))
 
 
 def refuses(robot, wrong, reason="MALFORMED"):
-    """Refuse a twist for which `wrong(fields, message)` is true."""
+    """Reject a twist for which `wrong(fields, message)` is true."""
 
     def around(inner, message):
         fields = fields_of(message.header)
@@ -29,7 +29,7 @@ def refuses(robot, wrong, reason="MALFORMED"):
 
 
 def reads(robot, read_header=lambda header: header, read_payload=lambda payload: payload):
-    """Read the bytes of a twist in another way, before they are judged."""
+    """Read the bytes of a twist in another way, before the robot validates them."""
 
     def around(inner, message):
         parts = read_header(message.header), read_payload(message.payload)

@@ -63,5 +63,5 @@ DEFECTS = {
 }
 
 BEHIND_TOKENS = tuple(name for name in DEFECTS if "R-SOCK-34" <= name <= "R-SOCK-40")
-"""These show only where a token is asked for."""
+"""Defects that show only where the server requires a token."""
 
