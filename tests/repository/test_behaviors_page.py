@@ -30,7 +30,7 @@ def test_the_page_is_of_six_starts_and_bounds_were_kept_but_for_those_that_are_k
     assert all(PAGE.count(f"\n| {look} | ") == 2 for look in LOOKS)
 
 
-def test_what_an_older_law_is_like_is_said_as_it_is_now():
+def test_page_describes_every_baseline_as_it_is_now():
     assert [text for text in CHARACTER.values() if text not in PAGE] == []
 
 

@@ -60,8 +60,8 @@ def test_every_option_that_it_names_exists_and_none_is_left_out():
     assert named - {"left_forward_pin", "right_backward_pin"} == own
 
 
-def test_vision_is_told_the_cars_own_limits():
-    """What it asks for beyond them the gate cuts, but it steers better if it knows."""
+def test_vision_example_has_the_cars_own_limits():
+    """The gate cuts requests beyond these limits, but the vision service steers better if it knows them."""
     car, eyes = (load_service(service, file=str(ROOT / "examples" / name), environ={}).config for service, name in (
         ("robot", "raspberry-car.toml"), ("vision", "raspberry-car-vision.toml")))
     assert eyes.steer.max_linear_mps == car.safety.max_linear_mps

@@ -53,7 +53,7 @@ def engine(tmp_path):
     ({"docker": PULLS_NOTHING, "docker-compose": "", "debootstrap": "echo 'E: no mirror'; exit 1"}, {},
      "debootstrap: E: no mirror; is there a network?"),
 ])  # fmt: skip
-def test_why_there_is_no_engine_is_said_in_the_last_line(engine, stand_ins, changes, why):
+def test_missing_engine_prints_the_reason_in_the_last_line(engine, stand_ins, changes, why):
     done = engine(stand_ins, **changes)
     assert (done.returncode, done.stdout.splitlines()[-1]) == (3, f"no engine: {why}"), done
 

@@ -1,4 +1,4 @@
-"""Where the environment demands a tool, its absence fails the tests that need it; elsewhere they skip with the fix."""
+"""A missing tool fails the tests that need it if the environment demands it; otherwise they skip with the fix."""
 
 import re
 import sys

@@ -248,7 +248,7 @@ def test_files_and_functions_stay_small():
 
 
 def folders() -> dict[Path, set[str]]:
-    """What stands in each folder: modules, and folders with modules."""
+    """Return the entries of each folder: modules, and folders with modules."""
     entries = defaultdict(set)
     for path in FILES:
         entry = path if path.name != "__init__.py" else path.parent
@@ -320,7 +320,7 @@ def texts():
 
 
 def exists(dotted: str) -> bool:
-    """Whether a dotted name below `sightline` is a module, or names something in one."""
+    """Return whether a dotted name below `sightline` is a module, or names something in a module."""
     head, _, last = dotted.rpartition(".")
     return dotted in MODULES or (head in MODULES and last in own_names(MODULES[head]))
 

@@ -1,4 +1,4 @@
-"""What people install: one package at the top, and a simulation that drives from it, whatever lies in the folder."""
+"""The wheel that users install: one package at the top, and a simulation that drives from it in any folder."""
 
 import os
 import subprocess

@@ -178,7 +178,8 @@ def test_lights_and_legs_are_followed_only_on_request() -> None:
     assert pipeline(Told(seen)).step(frame(1)).seen.target is None
     asked = pipeline(Told(seen), target=TargetConfig(label="legs")).step(frame(1)).seen
     assert asked.target is not None and asked.target.label == "legs"
-    coloured = [*seen, box(140, 100, label="target")]  # a fallback's, say
+    # A fallback, for example, can add such a box.
+    coloured = [*seen, box(140, 100, label="target")]
     asked = pipeline(Told(coloured), target=TargetConfig(label="ball")).step(frame(1)).seen
     assert asked.target is not None and asked.target.label == "target"
     both = pipeline(Told([*seen, box(140, 100)])).step(frame(1)).seen

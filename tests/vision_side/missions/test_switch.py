@@ -69,7 +69,7 @@ def test_a_switch_stands_still_until_the_wheels_do_and_the_new_one_begins_afresh
 
 
 def test_a_robot_that_stands_is_waited_for_no_longer_than_a_command_takes():
-    """What was told before may still be on its way: standing in one picture is not yet standing."""
+    """An earlier command may still be in flight, so one image of a robot at rest is not enough."""
     duty = MissionSwitch(scripted(), CAMERA)
     duty.step(view(1))
     duty.switch(scripted(speed=0.1))

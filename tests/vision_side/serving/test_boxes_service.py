@@ -218,7 +218,7 @@ def test_without_a_size_the_robot_turns_and_does_not_drive():
 
 @dataclass
 class BoxesRig(Rig):
-    """The closed loop of `Rig`, its eyes elsewhere: what was seen comes as a box, `detect_s` after the frame."""
+    """The closed loop of `Rig` with a remote detector, whose boxes arrive `detect_s` after the frame."""
 
     detect_s: float = 0.08
 

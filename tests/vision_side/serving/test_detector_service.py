@@ -24,7 +24,7 @@ LONGEST = Detection(10.123456789012345, 11.123456789012345, 312.1234567890123, 2
 
 
 class Says:
-    """Answers what it is told to; an exception is raised, and `notices` are given once."""
+    """A detector that returns the detections in `found` or raises its exception, and returns `notices` once."""
 
     def __init__(self, *found, **changes):
         self.found, self.changes, self.lines = found, changes, []
@@ -58,7 +58,7 @@ class Bench:
         return self.network.link(robot, role="detector")
 
     def look(self, jpeg=BALL_JPEG):
-        """What the service says of one more frame; None if it says nothing."""
+        """Return the service's answer to one more frame; None without an answer."""
         self.service.turn()
         self.seq += 1
         self.robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=self.seq, t_us=self.seq)), jpeg)

@@ -57,7 +57,7 @@ def test_a_batch_takes_half_a_deadline_at_most(each_us, batch):
 
 @pytest.mark.parametrize("each_us", [DEADLINE_US + 1, 3_000_000])
 def test_after_one_slow_frame_a_fresh_one_is_looked_at_all_the_same(each_us):
-    """The first of a device that warms up takes seconds: if that ruled out all others, nobody would measure again."""
+    """The first frame on a cold device takes seconds. If that ruled out all others, no new time would be measured."""
     turns = FairQueue(16, DEADLINE_US)
     turns.offer("fresh", 0, 0)
     turns.offer("old", 0, -DEADLINE_US)
@@ -66,7 +66,7 @@ def test_after_one_slow_frame_a_fresh_one_is_looked_at_all_the_same(each_us):
 
 @pytest.mark.parametrize("seed", [21, 22, 23])
 def test_twice_the_load_is_shared_fairly_and_nothing_is_answered_late(seed):
-    """40 streams at 30 per second, each picture 1.7 ms: half of them must go, of everybody the same share."""
+    """Forty streams of 30 images per second, at 1.7 ms per image, lose half of their images in equal shares."""
     rng, turns, now_us, each_us = random.Random(seed), FairQueue(16, DEADLINE_US), 0, 1_667
     due = {f"r{robot}": rng.randrange(33_333) for robot in range(40)}
     served, ages = dict.fromkeys(due, 0), []

@@ -1,4 +1,4 @@
-"""`vision --dry-run` tells what its detector has to say, from the start on: a device that is not what one may think."""
+"""`vision --dry-run` prints the notices of its detector from the start on, for example an unexpected device."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ STARTS, GONE = "m.onnx runs on cpu: no GPU runtime is installed", "detector far:
 
 
 class Talking:
-    """Says what it runs on, and then with each frame that it gave no answer."""
+    """A detector that reports its device at first, and then a missing answer with each frame."""
 
     class Config(Settings):
         """None."""
@@ -36,7 +36,7 @@ CONFIG = VisionConfig(camera=MODEL, detector=DetectorConfig(kind=f"{__name__}:Ta
 
 
 class DryBench(DrivingBench):
-    """The same, with a vision that drives nothing."""
+    """A `DrivingBench` with a vision service that drives nothing."""
 
     def __init__(self, config):
         super().__init__(config, Talking(None))

@@ -20,7 +20,7 @@ from tests.fixtures.robot_process import JPEG
 
 
 class Robot:
-    """Says who it is, sends frames as fast as it is told to, and notes which were answered."""
+    """A robot that publishes its status, sends frames at the pace of the test, and records the answered frames."""
 
     def __init__(self, name, endpoint):
         self.link = open_zenoh(name, connect=[endpoint], role="robot")
@@ -45,7 +45,7 @@ class Robot:
 
 @pytest.fixture
 def fleet():
-    """A vision for `r*` that listens, its endpoint, and all it said."""
+    """A vision service for `r*` that listens, its endpoint, and all lines that it printed."""
     endpoint, said, ending = free_endpoint(), [], threading.Event()
     config = VisionConfig(robot="r*", listen=(endpoint,), connect=())
     with open_fleet("r*", listen=[endpoint], role="vision") as site:

@@ -27,7 +27,7 @@ DEADLINE_S = 0.5
 ROBOTS = {"ra1": "00000001", "rb": "00000002", "ra2": "00000003", "ra3": "00000004"}
 """Each one's session."""
 MUTE = "rb"
-"""Nobody answers about its frames."""
+"""The robot whose frames get no answer."""
 
 
 class Robot:
@@ -61,7 +61,7 @@ def _all_show(robots, seconds=0.0):
 
 
 def _by_http(ending, endpoint):
-    """A server; what vision is told of it."""
+    """Start a server, and return its address for the vision service."""
     over = threading.Event()
     ending.callback(over.set)
 
@@ -94,7 +94,7 @@ def _served(ending, service):
 
 @pytest.fixture
 def shown():
-    """The robots, shown for 3 s to a vision with those eyes, and each one's share of twists."""
+    """The robots after 3 s with a vision service and the given detector, and each robot's share of twists."""
     with ExitStack() as ending:
 
         def show(eyes, fallback):
@@ -129,7 +129,7 @@ def test_with_a_fallback_every_robot_is_steered(shown, eyes):
 
 
 class Quiet:
-    """A site with robots that say nothing."""
+    """A site with robots that send nothing."""
 
     def __init__(self, count):
         self._robots = [f"r{number}" for number in range(count)]
@@ -155,7 +155,7 @@ def test_what_ends_one_robots_thread_ends_the_vision(monkeypatch):
 
 
 class Hanging:
-    """Eyes elsewhere that take their time to end."""
+    """A remote detector that closes slowly."""
 
     Config = Config
     waits = True

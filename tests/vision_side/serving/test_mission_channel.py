@@ -34,7 +34,7 @@ SESSION, ASKER = "0000abcd", "0000feed"
 
 
 class Bench:
-    """A robot, a person and the service; `reports` are all that were heard."""
+    """A robot, an operator and the vision service; `reports` are all received reports."""
 
     def __init__(self, service=Service, config=None):
         self.network = MemoryNetwork(seed=3)

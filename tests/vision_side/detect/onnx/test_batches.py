@@ -51,7 +51,7 @@ def test_invalid_image_is_skipped_and_runs_are_bounded(tmp_path: Path, monkeypat
 
 
 def test_a_model_that_cannot_do_with_many_pictures_is_given_fewer(tmp_path: Path, monkeypatch) -> None:
-    """Its outputs are for two at most, whatever its input says; so it is for what a GPU's memory does not hold."""
+    """The outputs hold at most two images, whatever the input declares. Batches beyond GPU memory split alike."""
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1)
     run = eye._engine.run
     monkeypatch.setattr(eye._engine, "run", lambda pixels: run(pixels[:2]), raising=False)

@@ -180,7 +180,7 @@ class _FakeRuntime:
 
 
 class _FailingRuntime(_FakeRuntime):
-    """One whose GPU cannot even be asked; its own fallback prints that where JSON may be expected."""
+    """A runtime that cannot even query its GPU. Its own fallback prints that where a caller may expect JSON."""
 
     class InferenceSession(_FakeRuntime.InferenceSession):
         def __init__(self, path: str, options: object, providers: list[str], enable_fallback: int) -> None:
@@ -248,7 +248,7 @@ def _found_beside_a_good_one(box: float, score: float, label: float) -> tuple[De
     (np.nan, 0.9, 0), (-np.inf, 0.9, 0), (9, np.nan, 0), (9, np.inf, 0), (9, 1.01, 0), (9, 7, 0), (9, 0.9, np.nan),
 ])  # fmt: skip
 def test_invalid_numbers_count_as_no_answer(box: float, score: float, label: float) -> None:
-    """Who took them for "saw nothing" would begin to search."""
+    """A caller that takes them for "saw nothing" begins to search."""
     with pytest.raises(ValueError, match=r"nan or infinite|between 0 and 1"):
         _found_beside_a_good_one(box, score, label)
 
@@ -289,7 +289,7 @@ def test_a_ball_is_refined_to_less_than_a_pixel(tmp_path: Path) -> None:
 
 
 def _true_centre(picture: np.ndarray) -> tuple[float, float]:
-    """The middle of the yellow pixels; what the drawing itself does not say."""
+    """Return the center of the yellow pixels, which the drawing itself does not report."""
     rows, columns = np.nonzero(picture[..., 0] < 70)
     return float(columns.mean()) + 0.5, float(rows.mean()) + 0.5
 
@@ -301,7 +301,8 @@ def test_a_golden_output_that_differs_ends_it(tmp_path: Path) -> None:
     again = brightness_model(tmp_path / "g.onnx", BOXES, [0, 1], golden=golden_text(found))
     assert detector(again, min_score=0.1).maker.device == "cpu"
     other = golden_text([Detection(1, 1, 9, 9, 0.99, "ball")])
-    for least in (0.1, 0.95):  # what is asked of a picture has nothing to do with what the file should give
+    # The minimum score for an image has no effect on the results that the file requires.
+    for least in (0.1, 0.95):
         with pytest.raises(HardwareError, match="ball at \\(1, 1\\)"):
             detector(brightness_model(tmp_path / "w.onnx", BOXES, [0, 1], golden=other), min_score=least)
     with pytest.raises(ConfigError, match="golden"):

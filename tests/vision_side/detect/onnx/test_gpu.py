@@ -1,6 +1,6 @@
 """The model that ships, on an NVIDIA GPU: it runs there, reports it, and finds what it finds on the CPU.
 
-Skipped where there is none; `TESTS_DEMAND=cuda` makes that a failure. Needs onnxruntime-gpu in place of onnxruntime.
+The tests skip without a GPU; `TESTS_DEMAND=cuda` makes that a failure. Needs onnxruntime-gpu in place of onnxruntime.
 """
 
 import json
@@ -33,7 +33,7 @@ def _eyes(device):
 
 @pytest.fixture(scope="module", autouse=True)
 def on_gpu():
-    """The only place that says whether there is one; opening the model has run its golden check on it."""
+    """The detector on the GPU. Only this fixture checks for a GPU; opening the model runs the golden check on it."""
     try:
         return _eyes(GPU)
     except HardwareError as error:

@@ -113,7 +113,7 @@ def test_invalid_reply_counts_as_no_answer_and_the_first_is_logged():
 
 
 def test_pixels_of_an_abandoned_frame_do_not_reach_the_next():
-    """The one who asks decodes its next frame while the other still looks at the last."""
+    """The caller decodes its next frame while the detector still looks at the last frame."""
     looking, go_on, seen = threading.Event(), threading.Event(), []
 
     class Slow:

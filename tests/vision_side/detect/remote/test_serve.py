@@ -1,4 +1,4 @@
-"""`sightline detector --serve` as people start it: a process that is found, answers, says what is wrong, and ends."""
+"""`sightline detector --serve` as users start it: a process that is found, answers, reports errors, and ends."""
 
 import signal
 import subprocess

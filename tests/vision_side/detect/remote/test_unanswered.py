@@ -117,7 +117,7 @@ def test_a_model_is_requested_once_and_again_after_an_error(closes):
 
 
 def test_late_server_is_not_delayed_by_another_model_query():
-    """60 ms for each request of 100: once the model is known that is enough, with its metadata asked for it is not."""
+    """Each request takes 60 of 100 ms. That is enough for a known model, but not with a metadata request."""
     with ModelServer(closes=False) as server:
         settings = OipSettings(address=f"oip+http://127.0.0.1:{server.port}/ball", labels=("b",))
         detector = ServerDetector("oip", HttpServer(parse_address(settings.address), settings))

@@ -41,7 +41,7 @@ HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
 
 
 class Robot:
-    """A robot that listens, says that it is there, and sends what it is told to."""
+    """A robot that subscribes to boxes, publishes its status, and sends given frames."""
 
     def __init__(self, name, endpoint, listens=False):
         ends = {"listen": [endpoint]} if listens else {"connect": [endpoint]}
@@ -54,14 +54,14 @@ class Robot:
         self.link.publish(STATUS, encode(stamp), encode(Status(state=State.HOLD, reason="test")))
 
     def frame(self, jpeg=BALL_JPEG, header=None):
-        """Send one; the frame as a vision would ask about it."""
+        """Send one frame, and return it as a vision service passes it to a detector."""
         self.seq += 1
         stamp = FrameHeader(session=self.session, seq=self.seq, t_us=self.seq * 33_333)
         self.link.publish(FRAME, encode(stamp) if header is None else header, jpeg)
         return DetectFrame(self.name, stamp, jpeg, Decoder(320, 240, 1920 * 1080))
 
     def say(self, asked, *boxes, source=ROLE, by="00000009", width_px=320, **changes):
-        """Boxes as a service says them, or as a hostile one does."""
+        """Publish boxes as a service does, or as a hostile service does."""
         echo = Echo(channel="frame", session=asked.header.session, seq=asked.header.seq, t_us=asked.header.t_us)
         header = DetectionsHeader(source=ROLE, session=by, seq=1, echo=echo.model_copy(update=changes))
         said = Detections(width_px=width_px, height_px=240, boxes=boxes)
@@ -101,7 +101,7 @@ class Bench:
         return robot
 
     def detector(self, *robots):
-        """As a vision has it: attached to a link of each robot."""
+        """Return a detector as in a vision service, attached to a link of each robot."""
         one = ZenohDetector(ZenohDetector.Config())
         for name in robots:
             one.attach(self._ending.enter_context(open_zenoh(name, connect=[self.endpoint])))
@@ -235,7 +235,8 @@ def pair():
     endpoint = free_endpoint()
     with ExitStack() as ending:
         robot = Robot("r1", endpoint, listens=True)
-        robot.link.unsubscribe(DETECTIONS)  # or the service would take the robot for who waits
+        # Otherwise the service takes the robot for the listener that waits.
+        robot.link.unsubscribe(DETECTIONS)
         service = open_zenoh("r1", connect=[endpoint], role=ROLE)
         link = open_zenoh("r1", connect=[endpoint])
         for one in (robot.link, service, link):
@@ -281,7 +282,7 @@ def test_invalid_detections_message_is_rejected_and_counted(pair, payload):
 
 
 def test_boxes_of_an_older_frame_are_nobodys_and_no_news(pair):
-    """Vision asks about the newest frame and leaves others out; the service looks at all of them."""
+    """The vision service requests only the newest frame's boxes; the detector service looks at all frames."""
     robot, waiting = pair
     for seq in range(4):
         robot.say(frame(seq), BOX)
