@@ -34,7 +34,7 @@ _START_S: Final = 30.0
 
 @dataclass(frozen=True, slots=True)
 class LightRobot:
-    """What was seen. `driving_percent` is the share of statuses that were ACTIVE or DEGRADED."""
+    """Measured values. `driving_percent` is the share of statuses that were ACTIVE or DEGRADED."""
 
     heavy_packages: list[str]
     environment_mb: float

@@ -64,7 +64,7 @@ def test_battery_drains_on_the_way_slows_the_robot_to_half_and_holds_it(sim, tmp
 
 
 class BrokenBattery:
-    """Raises at first, then gives what is no number, then hangs."""
+    """Battery that raises on the first read, returns NaN on the second, and hangs on the third."""
 
     class Config(Config):
         """Nothing to set."""

@@ -1,4 +1,4 @@
-"""The demo as a person runs it: real processes, real files, and nothing left behind however it ends."""
+"""The demo as an operator runs it: real processes, real files, and nothing left behind however it ends."""
 
 import csv
 import json
@@ -159,7 +159,7 @@ def test_the_last_word_of_a_process_and_its_exit_code_are_passed_on(tmp_path):
 
 
 def test_output_is_text_for_any_shell_locale(tmp_path, monkeypatch):
-    """Who starts them reads it: a line as JSON would be an error inside an error."""
+    """The program that starts the processes reads the output; a JSON line would be an error inside an error."""
     monkeypatch.setenv("SIGHTLINE_LOG", "json")
     with Processes(tmp_path) as processes:
         processes.start("robot", ["robot", "--config", str(tmp_path / "absent.toml")])

@@ -64,7 +64,7 @@ def ball_on_the_left(folder: Path) -> dict:
 
 @pytest.mark.slow
 def test_a_shadow_is_compared_and_never_steers(tmp_path: Path) -> None:
-    """Hsv sees the ball, to the left; the model says that there is one to the right."""
+    """The hsv detector finds the ball on the left; the model reports a ball on the right."""
     model = brightness_model(tmp_path / "right.onnx", RIGHT, [0])
     with (
         RobotProcess(tmp_path, camera=ball_on_the_left(tmp_path)) as robot,
@@ -90,7 +90,7 @@ DEADLINE_US = 100_000
 
 
 def _corners():
-    """What a good detector says of the picture."""
+    """Return the corners of the box that a good detector finds in the image."""
     one = HsvDetector(HsvConfig()).detect(Decoder(320, 240, 320 * 240).decode(FAR_BALL))[0]
     return one.x1_px, one.y1_px, one.x2_px, one.y2_px
 
@@ -101,7 +101,7 @@ def _answer(_request):
 
 @contextmanager
 def _driving(tmp_path, detector, *options, beside=None):
-    """The robot and what vision says, once the wheels turn; `beside(endpoint)` starts what else there is."""
+    """Yield the robot and the vision service's log once the wheels turn; `beside(endpoint)` starts anything else."""
     robot = RobotProcess(tmp_path)
     (tmp_path / "pictures" / "0.jpg").write_bytes(FAR_BALL)
     log = tmp_path / "vision.log"

@@ -79,7 +79,8 @@ def _course(robot, connect, said):
     told = sightline("mission", "r1", *connect)
     assert told.returncode == 0 and "r1: follow: lost" in told.stdout and "detector: hsv, on cpu" in told.stdout
     assert robot.speed() == 0.0
-    sent = sightline("goto", "r1", "30", "-10", *connect)  # so far that it still drives when all is said
+    # The goal is so far away that the robot still drives at every request below.
+    sent = sightline("goto", "r1", "30", "-10", *connect)
     assert sent.returncode == 0 and sent.stderr == f"robot r1 at {connect[1]} (from --connect)\n", sent
     assert until(lambda: robot.speed() > 1.0, START_S), "it drives"
     state = json.loads(sightline("status", "r1", "--json", *connect).stdout)

@@ -1,4 +1,4 @@
-"""What peers say to one another goes through the robot once: to every other peer, of either transport, and not back."""
+"""Messages between peers pass through the robot once, to every other peer of either transport, and not back."""
 
 import itertools
 import threading
@@ -18,7 +18,7 @@ QUIET_S = 0.4
 
 @pytest.fixture(scope="module")
 def ends(tmp_path_factory):
-    """Where a robot listens, on both transports."""
+    """Endpoints of a robot that listens on both transports."""
     ends = {"zenoh": free_endpoint(), "web": free_endpoint("ws://")}
     with RobotProcess(tmp_path_factory.mktemp("robot"), listen=[*ends.values()]) as robot:
         robot.wait_until_on(ends["web"])
@@ -27,7 +27,7 @@ def ends(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def peers(ends):
-    """Two peers on each transport of the robot, and what each has heard."""
+    """Two peers on each transport of the robot, and the messages that each peer receives."""
     with ExitStack() as ending:
         found = {}
         for name in ("zenoh 1", "zenoh 2", "web 1", "web 2"):
@@ -72,7 +72,7 @@ def test_it_comes_once_to_every_other_peer(peers, speaker, channel):
     }  # fmt: skip
 
 
-# What is said only while watched crosses a robot with two transports, in both directions, and only while watched.
+# Messages sent only while watched cross a robot with two transports, in both directions, and only while watched.
 
 
 JPEG = b"\xff\xd8" + bytes(100_000)

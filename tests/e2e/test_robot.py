@@ -1,4 +1,4 @@
-"""The robot service as real processes, judged from its motors' own log."""
+"""The robot service as real processes, validated from its motors' own log."""
 
 import json
 import os
@@ -51,7 +51,7 @@ def test_the_wheels_stop_when_the_network_process_dies_or_hangs(tmp_path, number
 
 @pytest.mark.parametrize("number", KEYS)
 def test_a_key_at_the_terminal_does_not_reach_the_network_process(tmp_path, number):
-    """The terminal tells every process of the group; the driver ends its child, after zero."""
+    """The terminal signals every process of the group; the driver process ends its child, after wheels at zero."""
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
         assert driving(robot)
         network, since = robot.network_pid(), monotonic_us()

@@ -13,7 +13,7 @@ from sightline.sim.scenario import Scenario, load_scenario, scenario_names
 from sightline.sim.truth import Truth
 
 IN_EVERY_TEST_RUN = "legs"
-"""It has all that `circle` of test_demo.py has not: range scans, boxes that somebody else finds."""
+"""Scenario with everything that `circle` of test_demo.py lacks: range scans, boxes from a remote detector."""
 
 
 def chosen(names: Iterable[str]) -> list[object]:

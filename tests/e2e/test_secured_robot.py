@@ -1,4 +1,4 @@
-"""A real robot over mutual TLS: its own vision drives it, an operator commands it, strangers move nothing."""
+"""A real robot over mutual TLS: its vision drives it, an operator commands it, unauthorized clients move nothing."""
 
 import re
 import secrets

@@ -36,7 +36,7 @@ def _drives(said):
 
 
 class Machines:
-    """Runs commands where the page says; what is a service goes on until the end."""
+    """Runs each command on the machine that the page names; services continue until the end."""
 
     def __init__(self, folder, wire, ending):
         self._folder, self._ending = folder, ending
@@ -44,7 +44,7 @@ class Machines:
         self._env = {**os.environ, "XDG_RUNTIME_DIR": str(folder), "HOME": str(folder), "PYTHONUNBUFFERED": "1"}
 
     def run(self, section):
-        """Every command of a section in turn; returns what the last one said."""
+        """Run every command of a section in turn and return the output of the last command."""
         said = ""
         for machine, arguments in _commands(section):
             command = self._command(machine, arguments)
@@ -55,7 +55,7 @@ class Machines:
         return said
 
     def again(self, section):
-        """The last command of a section once more; returns what it said."""
+        """Run the last command of a section again and return its output."""
         machine, arguments = _commands(section)[-1]
         return self._once(self._command(machine, arguments))
 
@@ -75,7 +75,8 @@ class Machines:
     def _once(self, command):
         done = subprocess.run(command, cwd=self._folder, env=self._env, capture_output=True, text=True, timeout=40,
                               check=False)
-        judged = 5 if "doctor" in command else 0  # the doctor also judges this machine, as it is; the way must be good
+        # The doctor also checks this machine, as it is; only the path between the machines must be good.
+        judged = 5 if "doctor" in command else 0
         assert done.returncode in (0, judged), (command, done.stdout, done.stderr)
         assert judged == 0 or "ok   frames" in done.stdout, done.stdout
         return done.stdout

@@ -1,7 +1,7 @@
-"""What compose.yaml and the Dockerfile say, and the containers of one profile, run for real.
+"""Content of compose.yaml and the Dockerfile, and the containers of one profile, run for real.
 
 A real run needs an engine (`docker version` answers) and docker-compose or `docker compose`;
-docs/how-to/containers.md says how to have one where no image can be pulled.
+docs/how-to/containers.md shows how to get one where no image can be pulled.
 """
 
 import json
@@ -35,7 +35,7 @@ for _ in range(250):
 
 @dataclass(frozen=True)
 class Profile:
-    """What a profile promises: which service is which robot, in which simulation, and who drives them all."""
+    """Promises of a profile: the service and simulation of each robot, and the service that drives them all."""
 
     name: str
     robots: dict[str, tuple[str, str]]
@@ -74,8 +74,8 @@ def engine_missing() -> str:
 
 
 def changed_for(folder: Path, ports: dict[str, str]) -> dict:
-    """compose.yaml as it stands, but for free ports of this machine, the motors' logs in `folder`, and builds that ask
-    the machine's own name servers."""
+    """Return compose.yaml with free ports of this machine, motor logs in `folder`, and builds that use the name servers
+    of this machine."""
     changed = yaml.safe_load((ROOT / "compose.yaml").read_text())
     for name, service in changed["services"].items():
         service["build"]["network"] = "host"
@@ -127,24 +127,25 @@ class Containers:
 
     def container(self, service: str) -> str:
         """A service's container, ended or not; it stays the same over restarts."""
-        if service not in self._containers:  # asked of the engine, for all at once: docker-compose takes seconds each
+        # One request to the engine lists all containers, because docker-compose takes seconds for each.
+        if service not in self._containers:
             listed = ask("docker", "ps", "--all", "--filter", f"label=com.docker.compose.project={self._project}",
                          "--format", '{{.Label "com.docker.compose.service"}} {{.ID}}')
             self._containers = {line.split()[0]: line.split()[1] for line in listed.stdout.splitlines()}
         return self._containers[service]
 
     def inside(self, service: str, *command: str) -> str:
-        """What a command prints inside a service's container."""
+        """Return the output of a command inside a service's container."""
         done = ask("docker", "exec", self.container(service), *command)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
     def sightline(self, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """A command of a person outside, through the published port."""
+        """Run a command as an outside operator does, through the published port."""
         return ask(sys.executable, "-P", "-m", "sightline.operator_side.cli.app", command, *arguments, *self.reached)
 
     def state(self, robot: str) -> str:
-        """A robot's state; "" if it is not heard."""
+        """Return a robot's state, or "" if no status is received."""
         asked = self.sightline("status", robot, "--json")
         return json.loads(asked.stdout)["state"] if asked.returncode == 0 else ""
 
@@ -157,12 +158,12 @@ class Containers:
         return [[float(word) for word in line.split()] for line in lines]
 
     def speeds(self, sim: str) -> list[tuple[float, float]]:
-        """(left, right) rad/s as the motors were told, oldest first."""
+        """Return the commanded motor speeds as (left, right) in rad/s, oldest first."""
         rows = [line.split(",") for line in (self._folder / sim / "motors.csv").read_text().splitlines()[1:]]
         return [(float(row[1]), float(row[2])) for row in rows]
 
     def health(self) -> dict[str, str]:
-        """What the engine says of every service that has something to ask."""
+        """Return the engine's health status of every service that has a health check."""
         names = [name for name in self.profile.services if "healthcheck" in SERVICES[name]]
         ask_each = ["docker", "inspect", "-f", "{{.State.Health.Status}}", *(self.container(name) for name in names)]
         return dict(zip(names, ask(*ask_each).stdout.split(), strict=False))

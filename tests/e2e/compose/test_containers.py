@@ -1,6 +1,6 @@
 """The containers of every profile, for real: the robot follows the ball, STOP stops it, it ends with wheels at zero.
 
-Asked for with `pytest -m compose`; needs an engine. docs/how-to/containers.md and .ci/engine say how to have one.
+Run by `pytest -m compose`; needs an engine. docs/how-to/containers.md and .ci/engine show how to get one.
 """
 
 import base64

@@ -1,4 +1,4 @@
-"""compose.yaml and Dockerfile say what they must, without an engine; `test_containers.py` runs them."""
+"""Required content of compose.yaml and the Dockerfile, without an engine; `test_containers.py` runs them."""
 
 import ast
 import json
@@ -49,7 +49,7 @@ def built_on(stage: str) -> list[tuple[str, str]]:
 
 
 def requirements(extra: str) -> set[str]:
-    """What an extra installs by name, extras of our own followed."""
+    """Return the names of the packages that an extra installs, with this project's own extras followed."""
     found = set()
     for text in PROJECT["project"]["optional-dependencies"][extra]:
         wanted = Requirement(text)
@@ -177,7 +177,7 @@ def test_each_service_with_a_health_check_is_queried():
     asks_others = {profile.status for profile in PROFILES} | {"status-r2", "status-r3", "keys", "legacy-client"}
     assert {name for name in SERVICES if "healthcheck" in SERVICES[name]} == set(SERVICES) - asks_others
     for name, service in SERVICES.items():
-        # A vision waits for its robot by itself; here it depends on it to be ended before it.
+        # A vision service waits for its robot by itself; `depends_on` makes it end before the robot.
         follows = name in PROGRAMS or "vision" in name
         for other, wanted in service.get("depends_on", {}).items():
             once = "completed_successfully" if other == "keys" else "started" if follows else "healthy"

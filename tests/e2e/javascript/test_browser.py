@@ -43,7 +43,7 @@ class Started:
         self._log.close()
 
     def says(self, pattern: str, seconds: float = START_S) -> bool:
-        """Whether it prints a line like `pattern` in time."""
+        """Return whether the command prints a line that matches `pattern` in time."""
         return until(lambda: re.search(pattern, Path(self._log.name).read_text()), seconds)
 
 
@@ -69,19 +69,19 @@ def our_viewer(tmp_path: Path) -> Iterator[tuple[Browser, Started]]:
 
 
 def answered(page: Browser) -> int:
-    """Frames that the page has drawn and answered, as it says itself."""
+    """Return the number of frames that the page reports as drawn and answered."""
     found = re.search(r"(\d+) answered here", page.text("pictures"))
     return int(found[1]) if found else 0
 
 
 def is_drawn(page: Browser) -> bool:
-    """Whether the canvas shows a picture of some size and not one colour."""
+    """Return whether the canvas shows an image of some size, in more than one color."""
     width, _height, levels = page.run(LEVELS)
     return bool(width >= 160 and levels >= 4)
 
 
 def is_armed(page: Browser) -> bool:
-    """Whether the robot drives; else asks it to, as a person would until it is allowed."""
+    """Return whether the robot drives; if not, request it, as an operator does until it is permitted."""
     driving = page.text("state") == "ACTIVE"
     if not driving:
         page.click("arm")
@@ -89,7 +89,7 @@ def is_armed(page: Browser) -> bool:
 
 
 def is_moving(page: Browser) -> bool:
-    """Whether the page shows wheels that turn."""
+    """Return whether the page shows wheels that turn."""
     return re.search("^-?0.00 m/s.* 0.00 rad/s", page.text("wheels")) is None
 
 
@@ -100,7 +100,8 @@ def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer
     assert until(lambda: is_drawn(page), START_S), page.text("age")
     assert until(lambda: answered(page) > 30, START_S), page.text("pictures")
     assert re.fullmatch(r"\d+ pictures/s, the newest \d+ ms ago", page.text("age"))
-    assert page.text("driver") == "nobody"  # it only watches until asked to
+    # The page only watches until a request to drive.
+    assert page.text("driver") == "nobody"
 
     page.click("drive")
     assert until(lambda: page.text("driver") == "this page", START_S), page.text("driver")

@@ -1,4 +1,4 @@
-"""The conformance kit, as a stranger runs it, on the JavaScript peers: every MUST and SHOULD passes."""
+"""The conformance kit on the JavaScript peers, as a third party runs it; every MUST and SHOULD passes."""
 
 import json
 import subprocess

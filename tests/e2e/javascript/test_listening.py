@@ -1,4 +1,4 @@
-"""Who may come in at the JavaScript robot, what strangers cost it, and how its programs say that an option is wrong."""
+"""Clients that may enter the JavaScript robot, the cost of unknown ones, and its programs' errors for bad options."""
 
 import base64
 import os

@@ -1,4 +1,4 @@
-"""The JavaScript peers: their own unit tests, their size, and their codec beside ours on messages nobody wrote."""
+"""The JavaScript peers: their own unit tests, their size, and their codec next to ours on generated messages."""
 
 import base64
 import json

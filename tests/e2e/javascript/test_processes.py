@@ -19,7 +19,7 @@ SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 
 
 def sightline(*arguments: str, ok: bool = True) -> str:
-    """What the command prints."""
+    """Run the command and return its output."""
     run = subprocess.run([*SIGHTLINE, *arguments], check=False, capture_output=True, text=True, timeout=30)
     assert (run.returncode == 0) == ok, run.stdout + run.stderr
     return run.stdout if ok else run.stdout + run.stderr

@@ -1,6 +1,6 @@
-"""A robot's end of a WebSocket link that says back in `status` each twist of a teleop: `echoing_robot.py V1 OLDER`.
+"""A robot's end of a WebSocket link that returns in `status` each twist of a teleop: `echoing_robot.py V1 OLDER`.
 
-Asked on its input, a line each, it prints what it has counted, how many callbacks raised, and its memory in KiB.
+For each line of its input, it prints its counts of rejections, how many callbacks raised, and its memory in KiB.
 """
 
 import json

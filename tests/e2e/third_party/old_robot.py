@@ -1,4 +1,4 @@
-"""The older write-up's robot server, in our words, with its library SimpleWebSocketServer and a folder as its camera.
+"""The legacy article's robot server, in our words, with its library SimpleWebSocketServer and a folder as its camera.
 
     python old_robot.py PORT PICTURES EVENTS.csv [dashed]
 

@@ -1,4 +1,4 @@
-"""The older write-up's vision program, in our words, with its library `websocket-client`: no windows, else as it was.
+"""The legacy article's vision program, in our words, with its library `websocket-client`: no windows, else as it was.
 
     python old_vision.py ws://127.0.0.1:9091/ FRAMES.csv
 

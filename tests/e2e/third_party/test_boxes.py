@@ -1,4 +1,4 @@
-"""Boxes that an older program sends to port 9091 reach a vision on Zenoh, through a real robot, which lives on."""
+"""Boxes from a legacy program on port 9091 reach a vision service on Zenoh through a real robot, which stays alive."""
 
 import pytest
 from websockets.sync.client import connect

@@ -1,4 +1,4 @@
-"""Real third-party stacks in processes of their own: the older write-up's vision drives our robot, ours drives its."""
+"""Real third-party stacks in their own processes: the legacy vision program drives our robot, ours drives its robot."""
 
 import json
 import os
@@ -38,7 +38,7 @@ def pictures(tmp_path_factory) -> Path:
 
 @pytest.fixture(autouse=True)
 def before_others() -> Iterator[None]:
-    """What is timed here shares the machine with whatever else runs on it, but comes first, where that is allowed."""
+    """Run the timed processes before all others that share the machine, where that is permitted."""
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))  # inherited by the processes that are started
     yield
@@ -142,7 +142,8 @@ def test_who_never_reads_costs_the_robot_little_and_its_driver_nothing(tmp_path,
     with old_vision_drives(tmp_path, pictures) as (robot, _, log, url):
         memory = Path(f"/proc/{robot.network_pid()}/statm")
         before_kib, alone_fps = int(memory.read_text().split()[1]) * 4, _rate_fps(log, 4.0)
-        idle = [websocket.create_connection(url) for _ in range(3)]  # their library reads when it is asked to
+        # The clients' library reads only on request.
+        idle = [websocket.create_connection(url) for _ in range(3)]
         assert any(_rate_fps(log, 4.0) >= 0.9 * alone_fps for _ in range(3))
         assert int(memory.read_text().split()[1]) * 4 - before_kib < 5_000
         for one in idle:
@@ -154,7 +155,7 @@ def test_who_never_reads_costs_the_robot_little_and_its_driver_nothing(tmp_path,
 
 @contextmanager
 def our_vision(folder: Path, endpoint: str):
-    """`sightline vision` for a robot that says nothing of its camera."""
+    """Run `sightline vision` for a robot that reports nothing about its camera."""
     lens = "\n".join(f"{name} = {json.dumps(value)}" for name, value in camera_of(640, 480).model_dump().items())
     (folder / "vision.toml").write_text(f'connect = ["{endpoint}"]\n[camera]\n{lens}\n')
     command = ("-P", "-m", "sightline.operator_side.cli.app", "vision", "--config", folder / "vision.toml")

@@ -46,7 +46,7 @@ class Process:
             self.lines.append(line.strip())
 
     def wheels(self) -> tuple[float, float] | None:
-        """What it last said that its wheels do."""
+        """Return the last motion of the wheels that the program printed, or None."""
         last = next((line for line in reversed(self.lines) if line.startswith("wheels ")), None)
         return last and tuple(map(float, last.split()[1:]))
 
@@ -65,7 +65,7 @@ class Process:
 
 
 def vision(endpoint: str) -> Process:
-    """`sightline vision`, as a person starts it."""
+    """Start `sightline vision` as an operator does."""
     return Process("-P", "-m", "sightline.operator_side.cli.app", "vision", "--connect", endpoint)
 
 
@@ -121,7 +121,7 @@ def test_junk_does_not_block_clients_of_the_minimal_robot(junk):
 
 
 def answers(url: str) -> bool:
-    """Whether a proper hello is answered."""
+    """Return whether the robot answers a valid hello."""
     with suppress(OSError, ConnectionClosed, TimeoutError), connect(url, subprotocols=["sightline.v1"]) as connection:
         connection.send('{"robot": "r1", "session": "0000beef"}')
         return "r1" in str(connection.recv(2))
