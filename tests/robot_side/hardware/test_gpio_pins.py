@@ -38,6 +38,7 @@ def test_machine_without_pins_gives_one_error_line(monkeypatch):
     monkeypatch.setattr(Device, "pin_factory", None)
     fake = SimpleNamespace(LGPIOFactory=lambda: 1 / 0)
     monkeypatch.setitem(sys.modules, "gpiozero.pins.lgpio", fake)
+    monkeypatch.setitem(sys.modules, "lgpio", SimpleNamespace())
     with pytest.raises(HardwareError, match="no GPIO here: division by zero; this drive needs a Raspberry Pi"):
         GpioDrive(config())
 
