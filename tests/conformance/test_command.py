@@ -120,7 +120,7 @@ def test_a_robot_of_another_name_is_exit_code_4(capsys, tmp_path):
         robot.wait_until_on(f"on {endpoint}")
         code, out, err = run(capsys, "robot", endpoint, "--robot", "r9")
     assert (code, out) == (4, "")
-    assert "no robot r9 publishes its status there" in err and err.count("\n") == 1
+    assert "no status from robot 'r9'" in err and err.count("\n") == 1
 
 
 def test_no_vision_is_exit_code_4(capsys, monkeypatch):
