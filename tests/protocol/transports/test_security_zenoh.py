@@ -97,9 +97,10 @@ def test_each_role_publishes_only_its_channels(folder, endpoint):
                 allowed = {key for key in may_publish(role) if CHANNELS[key.split("/")[2]] in SAID}
                 assert until(lambda peer=peer, allowed=allowed: says_all(peer) or said(heard) >= allowed)
                 heard.clear()
-                says_all(peer)  # what is denied comes before the second round of what is allowed
-                says_all(peer)
-                assert until(lambda allowed=allowed: all(count(heard, key) >= 2 for key in allowed))
+                # A full link drops messages, so each round repeats all. What is denied comes before a second round.
+                assert until(
+                    lambda peer=peer, allowed=allowed: says_all(peer) or all(count(heard, key) >= 2 for key in allowed)
+                )
             assert until(lambda: not robot.has_listener(FRAME)), "the link ends after all that was published on it"
             assert said(heard) == allowed
             heard.clear()
