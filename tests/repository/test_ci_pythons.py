@@ -1,6 +1,7 @@
 """The steps of CI for other Pythons and other machines, where they find something and where they find nothing."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -82,3 +83,12 @@ def test_unreachable_index_gives_one_line():
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout == ("aarch64, Python 3.11, [zenoh,websocket]: not checked, since the package index cannot be "
                            "reached\n")
+
+
+def test_no_function_of_ci_hides_a_program_that_it_looks_for():
+    """`command -v` finds functions too, so a program of the same name would never be installed."""
+    for path in [ROOT / ".ci" / name for name in ("run", "engine", "other_python")]:
+        text = path.read_text()
+        functions = set(re.findall(r"^(\w+)\(\)", text, re.MULTILINE))
+        assert functions
+        assert not functions & set(re.findall(r"command -v (\w+)", text)), path
