@@ -8,9 +8,9 @@ import io
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -102,14 +102,6 @@ class ChaseCamera:
     def close(self) -> None:
         """Free the memory of PyBullet."""
         pybullet.disconnect(self._client)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 def checkered_tile() -> Pixels:
@@ -304,7 +296,7 @@ def film_images(
 ) -> "Iterator[Pillow.Image]":
     """Every image of the film in order, without the closing one."""
     page, cut = Page(), scenes(story)
-    with ChaseCamera(scenario, robot, VIEW_PX[0] * _FINE, VIEW_PX[1] * _FINE) as chase:
+    with closing(ChaseCamera(scenario, robot, VIEW_PX[0] * _FINE, VIEW_PX[1] * _FINE)) as chase:
         for number, scene in enumerate(cut, start=1):
             say(f"filming {number} of {len(cut)}: {scene.take.name}")
             for t_us in scene.times_us(fps):

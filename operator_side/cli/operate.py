@@ -162,7 +162,7 @@ def reset(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_
     The robot is disarmed afterwards, and does not move.
     """
     with _operator(target_of(robot, connect, secure, announce=True)) as operator:
-        return _print_reply(operator, Verb.RESET, operator.request(Verb.RESET), as_json)
+        return _print_reply(operator, Verb.RESET, operator.reset(), as_json)
 
 
 def stop(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_json: Json = False) -> None:

@@ -87,8 +87,11 @@ class Operator:
         """Send one request, repeat it until the reply, and return the reply. Raises LinkError at `timeout_s`."""
         if verb in _CITES_STATUS:
             self.wait_report(timeout_s)  # a new one: the stored one may precede a STOP or disarm
+        return self._request(verb, self._report, timeout_s)
+
+    def _request(self, verb: Verb, cited: StatusReport | None, timeout_s: float) -> Reply:
+        """Repeats cite the same status, so that a STOP in between wins."""
         self._id += 1
-        cited = self._report  # repeats cite the same status, so that a STOP in between wins
         deadline_s = time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
             self._send(verb, cited)
@@ -104,6 +107,16 @@ class Operator:
         while not reply.ok and reply.detail.startswith(RejectReason.NOT_ALLOWED) and time.monotonic() < deadline_s:
             self.wait_report()
             reply = self.request(Verb.ARM)
+        return reply
+
+    def reset(self, patience_s: float = 1.5) -> Reply:
+        """Request a reset; repeat while the wheels still turn, citing the same status: a STOP in between wins."""
+        deadline_s = time.monotonic() + patience_s
+        cited = self.wait_report()
+        reply = self._request(Verb.RESET, cited, 2.0)
+        while not reply.ok and reply.detail.startswith(RejectReason.NOT_ALLOWED) and time.monotonic() < deadline_s:
+            self.wait_report()
+            reply = self._request(Verb.RESET, cited, 2.0)
         return reply
 
     def stop(self, on_slow: Callable[[], None], timeout_s: float = 10.0) -> Status:

@@ -7,16 +7,15 @@ requires that comment, or a reason, before each one. Ports and folders come from
 import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
 import tempfile
-import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from tests.fixtures.commands import service
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 
@@ -55,7 +54,9 @@ class Terminals:
         output = ""
         for words in commands:
             if words[0] in READY:
-                self._ending.enter_context(self._service(words))
+                self._ending.enter_context(
+                    service(self._command(words), READY[words[0]], self._folder, 40, cwd=ROOT, env=self._env)
+                )
             else:
                 output = self._once(words)
         return output
@@ -68,22 +69,6 @@ class Terminals:
                               timeout=240, check=False)
         assert done.returncode == 0, (words, done.stdout, done.stderr)
         return done.stdout
-
-    @contextmanager
-    def _service(self, words: list[str]):
-        log = self._folder / f"{words[0]}-{time.monotonic_ns()}.log"
-        with log.open("wb") as out:
-            process = subprocess.Popen(self._command(words), cwd=ROOT, env=self._env, stdout=out, stderr=out)
-        try:
-            assert until(lambda: READY[words[0]] in log.read_text(), 40), (words, log.read_text())
-            yield
-        finally:
-            process.send_signal(signal.SIGTERM)
-            try:
-                process.wait(10)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                raise
 
 
 @pytest.fixture

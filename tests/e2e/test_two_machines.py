@@ -2,11 +2,9 @@
 
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -14,14 +12,19 @@ import pytest
 from sightline.evaluation.faults.fixture import BenchWire
 from sightline.sim.network_emulator import LinkShape, LinkShapes
 from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B, why_impossible
+from tests.fixtures.commands import service
 from tests.fixtures.links import until
 
 pytestmark = [
     pytest.mark.skipif(bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun"),
 ]
 PAGE = (Path(__file__).parent.parent.parent / "docs" / "tutorials" / "two-machines.md").read_text()
-SERVICES = ("sim", "robot", "vision", "router")
-READY = {"sim": "", "robot": "robot r1: on", "vision": "vision: frames from robot r1", "router": "router: on"}
+READY = {
+    "sim": "simulation ready",
+    "robot": "robot r1: on",
+    "vision": "vision: frames from robot r1",
+    "router": "router: on",
+}
 
 
 def _commands(section):
@@ -48,8 +51,9 @@ class Machines:
         said = ""
         for machine, arguments in _commands(section):
             command = self._command(machine, arguments)
-            if arguments.split()[0] in SERVICES:
-                self._ending.enter_context(self._service(arguments.split()[0], command))
+            if arguments.split()[0] in READY:
+                ready = READY[arguments.split()[0]]
+                self._ending.enter_context(service(command, ready, self._folder, 20, cwd=self._folder, env=self._env))
             else:
                 said = self._once(command)
         return said
@@ -80,22 +84,6 @@ class Machines:
         assert done.returncode in (0, judged), (command, done.stdout, done.stderr)
         assert judged == 0 or "ok   frames" in done.stdout, done.stdout
         return done.stdout
-
-    @contextmanager
-    def _service(self, name, command):
-        log = self._folder / f"{name}-{time.monotonic_ns()}.log"
-        with log.open("wb") as out:
-            process = subprocess.Popen(command, cwd=self._folder, env=self._env, stdout=out, stderr=out)
-        try:
-            assert until(lambda: READY[name] in log.read_text() and log.read_text(), 20), (command, log.read_text())
-            yield
-        finally:
-            process.send_signal(signal.SIGTERM)
-            try:
-                process.wait(5)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                raise
 
 
 @pytest.fixture(scope="module")

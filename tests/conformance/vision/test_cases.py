@@ -16,8 +16,6 @@ from tests.conformance.vision.broken import BROKEN, BrokenVision
 from tests.conformance.vision.fixture import VirtualVision, virtual_bench
 
 VIRTUAL = [case for case in CASES if not case.real]
-PENDING: set[str] = set()
-"""Cases that ours does not pass yet: forget a session that is over, and reject a camera with a rejected header."""
 
 
 def result_of(case, vision):
@@ -25,12 +23,7 @@ def result_of(case, vision):
     return run_case(case, virtual_bench(vision), prepare)
 
 
-def or_pending(case):
-    mark = pytest.mark.xfail(strict=True, reason="vision_side/serving/service.py")
-    return pytest.param(case, marks=mark if case.id in PENDING else (), id=case.id)
-
-
-@pytest.mark.parametrize("case", [or_pending(case) for case in VIRTUAL])
+@pytest.mark.parametrize("case", VIRTUAL, ids=lambda case: case.id)
 def test_the_reference_conforms(case):
     result = result_of(case, VirtualVision)
     assert (result.outcome, result.reason) == (Outcome.PASSED, "")
@@ -39,7 +32,7 @@ def test_the_reference_conforms(case):
 @pytest.mark.parametrize("cases", [VIRTUAL[::5], pytest.param(VIRTUAL, marks=pytest.mark.slow)], ids=["some", "all"])
 def test_a_broken_vision_of_which_nothing_is_broken_conforms(cases):
     outcomes = {case.id: result_of(case, BrokenVision).outcome for case in cases}
-    assert {name for name, outcome in outcomes.items() if outcome is not Outcome.PASSED} == PENDING & set(outcomes)
+    assert [name for name, outcome in outcomes.items() if outcome is not Outcome.PASSED] == []
 
 
 def test_every_case_has_its_broken_vision():
@@ -60,7 +53,7 @@ def test_a_broken_vision_fails_its_case(name):
 @pytest.mark.parametrize("name", sorted(BROKEN))
 def test_a_broken_vision_fails_no_other_case(name):
     failed = {case.id for case in VIRTUAL if result_of(case, BROKEN[name][1]).outcome is Outcome.FAILED}
-    assert failed - PENDING == {name} - PENDING
+    assert failed == {name}
 
 
 def test_every_clause_is_in_the_specification_and_has_a_case_or_a_reason():

@@ -2,6 +2,7 @@
 
 import socket
 import threading
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -206,7 +207,7 @@ def test_every_caption_fits_the_image():
 
 
 def test_chase_camera_shows_robot_and_ball(scene):
-    with ChaseCamera(*scene, 160, 120) as camera:
+    with closing(ChaseCamera(*scene, 160, 120)) as camera:
         ahead = camera.draw(truth(0, x_m=-1.5, target_x_m=-0.9)).astype(int)
         left = camera.draw(truth(20_000, x_m=-1.5, target_x_m=-0.9, target_y_m=0.3)).astype(int)
     blue = (ahead[..., 2] > ahead[..., 0] + 60).nonzero()

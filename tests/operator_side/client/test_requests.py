@@ -196,3 +196,16 @@ def test_a_report_is_what_was_published():
     report = read_report(message)
     assert report.stamp.t_us == 5
     assert report.status == Status.model_validate_json(message.payload)
+
+
+def test_reset_is_repeated_while_the_wheels_turn_and_cites_the_same_status_so_that_a_stop_wins(monkeypatch):
+    with PumpedRobot() as robot:
+        cited, details = [], iter(["NOT_ALLOWED: the wheels are not at zero yet", "STALE: before the last STOP"])
+
+        def reject(_verb, status, _timeout_s):
+            cited.append(status)
+            return Reply(id=1, to="00000000", ok=False, state="STOPPED", detail=next(details))
+
+        monkeypatch.setattr(robot.operator, "_request", reject)
+        assert robot.operator.reset().detail.startswith("STALE")
+        assert len(cited) == 2 and cited[0] is cited[1]
