@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, install_command
 
 _PYBULLET_UP_TO = (3, 11)
 
@@ -29,9 +29,9 @@ def _advice(package: str, extra: str, version: tuple[int, int]) -> str:
     if package == "pybullet" and version > _PYBULLET_UP_TO:
         return (
             f"PyBullet has no wheel for Python {version[0]}.{version[1]}: use Python 3.11, or "
-            "`docker compose up`, or compile it (minutes): pip install '.[sim]'"
+            f"`docker compose up`, or compile it (minutes): {install_command('sim')}"
         )
-    return f"{package} is not installed: pip install '.[{extra}]'"
+    return f"{package} is not installed: {install_command(extra)}"
 
 
 # --- the place of a result, checked before the work that makes it ------------------------------------------------

@@ -1,4 +1,6 @@
-"""Reasons for rejecting a message, and every exception that Sightline raises on purpose. Pure."""
+"""Reasons for rejecting a message, and every exception that Sightline raises on purpose. Pure but for
+`install_command`, which reads what is installed.
+"""
 
 from enum import StrEnum
 
@@ -71,3 +73,21 @@ class WireError(SightlineError):
         super().__init__(f"{reason}: {detail}")
         self.reason = reason
         self.detail = detail
+
+
+def install_command(extra: str) -> str:
+    """Return the command that adds an extra to this installation: to a clone, or to the wheel that it came from.
+
+    Source: PEP 610, `direct_url.json`. The name on the index is not used, because nothing is published there.
+    """
+    import json  # only errors need these, and imports delay STOP
+    from importlib.metadata import PackageNotFoundError, distribution
+    from pathlib import Path
+    from urllib.parse import unquote, urlsplit
+
+    try:
+        origin = distribution("sightline-robot").read_text("direct_url.json")
+    except PackageNotFoundError:
+        origin = None
+    place = unquote(urlsplit(json.loads(origin)["url"]).path) if origin else "."
+    return f"pip install '{'.' if place == str(Path.cwd()) else place}[{extra}]'"

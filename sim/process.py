@@ -22,7 +22,7 @@ from pydantic import Field
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
-from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.errors import ConfigError, HardwareError, install_command
 from sightline.sim.bus import (
     CAMERA,
     MOTION,
@@ -407,6 +407,6 @@ def _world_class() -> type[World]:
         from sightline.sim.world.world import World
     except ImportError as error:
         raise ConfigError(
-            f"the simulation needs {error.name}; install it with: pip install '.[sim]'"
+            f"the simulation needs {error.name}; install it with: {install_command('sim')}"
         ) from None
     return World

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, install_command
 
 Vector = tuple[float, float, float]
 Rotation = tuple[Vector, Vector, Vector]
@@ -373,7 +373,7 @@ def _expanded(path: Path) -> str:
     try:
         from xacrodoc import XacroDoc
     except ImportError:
-        raise ConfigError(f"{path}: a xacro file needs xacrodoc; install it with: pip install '.[xacro]'"
+        raise ConfigError(f"{path}: a xacro file needs xacrodoc; install it with: {install_command('xacro')}"
                           ) from None
     try:
         return str(XacroDoc.from_file(str(path)).to_urdf_string())

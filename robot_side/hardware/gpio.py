@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config, first_problem
-from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.errors import ConfigError, HardwareError, install_command
 from sightline.robot_side.hardware.gpio_low import import_lgpio, leave_low
 from sightline.robot_side.ports import WheelAngles
 
@@ -106,7 +106,7 @@ def table_text(rows: Sequence[tuple[float, float]], head: str) -> str:
 
 _SPI_DEVICE: Final = Path("/dev/spidev0.0")
 _SPI_PINS: Final = frozenset(range(7, 12))
-_INSTALL: Final = "pip install '.[robot-pi]', or sudo apt install python3-gpiozero python3-lgpio"
+_FROM_APT: Final = "or sudo apt install python3-gpiozero python3-lgpio"
 
 
 class Pins(Protocol):
@@ -145,7 +145,7 @@ def open_pins(config: WiredPins) -> Pins:
     try:
         import gpiozero
     except ImportError:
-        raise ConfigError(f"drive gpio needs gpiozero: {_INSTALL}") from None
+        raise ConfigError(f"drive gpio needs gpiozero: {install_command('robot-pi')}, {_FROM_APT}") from None
     made = _ensure_factory(gpiozero)
     try:
         return GpiozeroPins(gpiozero, config, made)
@@ -220,7 +220,7 @@ def _ensure_factory(gpiozero: Any) -> bool:
 
         device.pin_factory = LGPIOFactory()
     except ImportError:
-        raise ConfigError(f"drive gpio needs lgpio: {_INSTALL}") from None
+        raise ConfigError(f"drive gpio needs lgpio: {install_command('robot-pi')}, {_FROM_APT}") from None
     except Exception as error:
         raise HardwareError(
             f"no GPIO here: {_line(error)}; this drive needs a Raspberry Pi and a user in the group gpio "

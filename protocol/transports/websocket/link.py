@@ -17,7 +17,7 @@ from typing import Final, Protocol
 from sightline.protocol.channels import CHANNELS, FRAME, TWIST, Channel, parse_key
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
-from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.errors import ConfigError, LinkError, install_command
 from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.diagnosis import unresolved_host
 from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_websocket_endpoint
@@ -142,7 +142,7 @@ def open_websocket(
     try:
         import websockets  # noqa: F401
     except ImportError:
-        raise ConfigError("websockets is not installed: pip install '.[websocket]'") from None
+        raise ConfigError(f"websockets is not installed: {install_command('websocket')}") from None
     link = WebSocketLink(rules)
     try:
         link.open(near, far, secure)

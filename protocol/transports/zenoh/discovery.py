@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from sightline.protocol.channels import KEY_PREFIX, STATUS, parse_key
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, install_command
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_zenoh_endpoint
 from sightline.protocol.transports.link import LinkRules, Message
 from sightline.protocol.transports.security import RoleKeys, load_role_keys
@@ -130,7 +130,7 @@ def find_listeners(seconds: float) -> list[str]:
     try:
         import zenoh
     except ImportError:
-        raise ConfigError("Zenoh is not installed: pip install '.[zenoh]'") from None
+        raise ConfigError(f"Zenoh is not installed: {install_command('zenoh')}") from None
     logging.getLogger("zenoh").addHandler(logging.NullHandler())
     answers: zenoh.handlers.RingChannel[zenoh.Hello] = zenoh.handlers.RingChannel(MAX_LISTENERS)
     config = {"scouting": {"multicast": {"enabled": True, "address": multicast_address()}}}

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final
 
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.errors import ConfigError, LinkError, SightlineError
+from sightline.protocol.errors import ConfigError, LinkError, SightlineError, install_command
 from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.diagnosis import connections, diagnose_tls, port_owner, unresolved_host
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
@@ -102,7 +102,7 @@ def open_session(
     try:
         import zenoh
     except ImportError:
-        raise ConfigError("Zenoh is not installed: pip install '.[zenoh]'") from None
+        raise ConfigError(f"Zenoh is not installed: {install_command('zenoh')}") from None
     zenoh.init_log_from_env_or("off")  # RUST_LOG, see docs/how-to/secure-the-link.md
     logging.getLogger("zenoh").addHandler(logging.NullHandler())  # otherwise Python prints its warnings to the terminal
     try:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.errors import ConfigError, HardwareError, WireError
+from sightline.protocol.errors import ConfigError, HardwareError, WireError, install_command
 from sightline.protocol.jpeg import JpegSize, read_jpeg_size
 from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
 from sightline.robot_side.hardware.cameras.timing import FrameTimer
@@ -225,5 +225,5 @@ def _packages() -> tuple[Any, Any]:
         import cv2
         import simplejpeg
     except ImportError:
-        raise ConfigError("camera video needs OpenCV and simplejpeg: pip install '.[camera]'") from None
+        raise ConfigError(f"camera video needs OpenCV and simplejpeg: {install_command('camera')}") from None
     return simplejpeg.encode_jpeg, cv2

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.errors import ConfigError, HardwareError, install_command
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import CameraModel
 from sightline.protocol.transports.diagnosis import process_with_open
@@ -128,7 +128,7 @@ def _opencv() -> Any:
     try:
         import cv2
     except ImportError:
-        raise ConfigError("camera v4l2 needs OpenCV: pip install '.[camera]'") from None
+        raise ConfigError(f"camera v4l2 needs OpenCV: {install_command('camera')}") from None
     return cv2
 
 

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from numpy.typing import NDArray
 
-from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.errors import ConfigError, HardwareError, install_command
 from sightline.vision_side.config import Device
 
 Arrays = dict[str, NDArray[Any]]
@@ -23,8 +23,6 @@ _TYPES: Final = {"tensor(float)": "float32", "tensor(uint8)": "uint8", "tensor(i
 _DEVICES: Final = {provider: device for device, provider in PROVIDERS.items()}
 _BEHIND: Final = {"tensorrt": ("tensorrt", "cuda", "cpu"), "cuda": ("cuda", "cpu"), "cpu": ("cpu",)}
 """Providers that a session for a device may fall back on for single operations."""
-_MISSING: Final = ("onnxruntime is not installed: pip install '.[vision]', or [vision-gpu] for an NVIDIA "
-                   "GPU; it has no wheel for 32-bit ARM")
 _FIX: Final = ("install onnxruntime-gpu in place of onnxruntime (never both), see that `nvidia-smi` shows the GPU, or "
                "take --device auto")
 _ERRORS_ONLY: Final = 3
@@ -67,7 +65,10 @@ def open_engine(path: Path, device: Device, threads: int) -> "Engine":
     try:
         runtime = importlib.import_module("onnxruntime")
     except ImportError:
-        raise ConfigError(_MISSING) from None
+        raise ConfigError(
+            f"onnxruntime is not installed: {install_command('vision')}, or [vision-gpu] for an NVIDIA GPU; "
+            "it has no wheel for 32-bit ARM"
+        ) from None
     try:
         engine = Engine(runtime, path, device, threads)
     except HardwareError:

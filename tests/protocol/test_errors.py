@@ -1,0 +1,33 @@
+"""The command that an error proposes for a missing extra."""
+
+import json
+from importlib import metadata
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from sightline.protocol.errors import install_command
+
+INSTALLED_FROM = {
+    "clone, here": ("file://{here}", "pip install '.[zenoh]'"),
+    "clone, elsewhere": ("file:///srv/sightline", "pip install '/srv/sightline[zenoh]'"),
+    "wheel file": ("file:///srv/my%20files/sightline_robot-1-py3-none-any.whl",
+                   "pip install '/srv/my files/sightline_robot-1-py3-none-any.whl[zenoh]'"),
+    "no record": (None, "pip install '.[zenoh]'"),
+}
+
+
+@pytest.mark.parametrize(("url", "command"), INSTALLED_FROM.values(), ids=INSTALLED_FROM)
+def test_install_command_names_what_was_installed(monkeypatch, url, command):
+    record = url and json.dumps({"url": url.format(here=Path.cwd())})
+    monkeypatch.setattr(metadata, "distribution", lambda _name: SimpleNamespace(read_text=lambda _file: record))
+    assert install_command("zenoh") == command
+
+
+def test_install_command_of_an_unknown_distribution_names_the_clone(monkeypatch):
+    def distribution(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "distribution", distribution)
+    assert install_command("zenoh") == "pip install '.[zenoh]'"
