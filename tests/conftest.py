@@ -8,12 +8,17 @@ import threading
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from sightline.protocol import log
 from tests.fixtures import own_process
 from tests.fixtures.cpu_times import CpuTimes
 
 SECOND_TIER = Path(__file__).with_name("second_tier.txt")
+
+# A test that measures no time has no bound on it: other processes of the machine would decide.
+settings.register_profile("tests", deadline=None)
+settings.load_profile("tests")
 
 # A shell that starts the tests in its background has Ctrl-C ignored, and every child would inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)

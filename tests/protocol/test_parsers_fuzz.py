@@ -184,7 +184,7 @@ def test_corpus_file_name_states_its_result(name, path):
 
 @pytest.mark.parametrize("name", PARSERS)
 def test_parser_accepts_or_rejects_any_bytes(name):
-    @settings(max_examples=EXAMPLES, deadline=None, derandomize="FUZZ_EXAMPLES" not in os.environ)
+    @settings(max_examples=EXAMPLES, derandomize="FUZZ_EXAMPLES" not in os.environ)
     @given(changed(name) | st.binary(max_size=64))
     def target(data):
         read(name, data)

@@ -100,7 +100,7 @@ def test_baseline_scans_one_component_each_are_counted() -> None:
         one.decode(GOOD[:at] + luma * (MAX_SCANS + 1) + b"\xff\xd9")
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(at=st.integers(0, len(GOOD) - 1), junk=st.binary(min_size=1, max_size=8), cut=st.integers(0, 200))
 def test_damaged_pictures_decode_or_are_rejected(at: int, junk: bytes, cut: int) -> None:
     damaged = GOOD[:at] + junk + GOOD[at + len(junk) : len(GOOD) - cut]

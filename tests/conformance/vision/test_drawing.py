@@ -55,7 +55,7 @@ def test_a_picture_is_seen_as_it_was_drawn(name):
         assert np.abs(seen[:, :, 0] - drawn[:, :, 0]).mean() < 0.5
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.randoms(use_true_random=False), st.booleans())
 def test_any_pixels_come_back(random, progressive):
     """Noise is the worst case: every coefficient, both signs, all run lengths."""

@@ -95,7 +95,8 @@ def test_the_javascript_robot_stands_still_when_its_vision_is_killed(tmp_path, o
             while any(json_payload(watcher.recv())["applied"]):
                 assert time.monotonic() - killed_s < 3
         assert time.monotonic() - killed_s < 1.2  # 0.7 s, the watcher's own start, and a status at 10 Hz
-        assert robot.says(r"HOLD \(no accepted command")
+        # The last frame may be old already when the vision service dies, and its age is then what ends the drive.
+        assert robot.says(r"HOLD \((no accepted command|the frame behind the command is too old)")
 
 
 def _yellow_ball(folder):

@@ -49,7 +49,7 @@ def record(path: Path, messages, **about: str) -> Recorder:
     return recorder
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(MESSAGES, max_size=30))
 def test_everything_comes_back_in_order(tmp_path_factory, messages):
     path = tmp_path_factory.mktemp("recording") / "run.mcap"

@@ -35,7 +35,7 @@ def _run(network: MemoryNetwork, frames: int, status_every: int = 0) -> list[tup
 
 
 @given(st.integers(0, 2**32), st.integers(0, 400_000), st.integers(0, 50_000), st.floats(0, 0.9), st.floats(1, 9))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_a_run_repeats_bit_for_bit(seed, delay_us, jitter_us, loss, burst):
     burst = max(burst, loss / (1 - loss) + 0.01) if burst > 1 else burst
     runs = [_run(MemoryNetwork(seed, delay_us, jitter_us, loss, burst=burst), 40) for _ in range(2)]
@@ -58,7 +58,7 @@ def test_added_latency_is_halved_between_the_legs():
 
 
 @given(st.integers(0, 2**32), st.integers(0, 200_000), st.integers(1, 200_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_jitter_stays_in_its_bounds_and_keeps_the_order(seed, delay_us, jitter_us):
     run = _run(MemoryNetwork(seed, delay_us, jitter_us), 60)
     heard = [(arrival, number) for arrival, number, channel in run if channel == "frame"]

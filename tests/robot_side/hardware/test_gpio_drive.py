@@ -140,7 +140,7 @@ def test_left_forward_right_backward_is_what_the_options_make_of_it(board, optio
 speeds = st.one_of(st.floats(-20, 20), st.sampled_from([0.0, -0.0, 1e-12, 1e6, -1e6]))
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.lists(st.tuples(speeds, speeds), max_size=40), st.booleans(), st.booleans())
 def test_no_motor_is_ever_driven_both_ways_at_once(twists, swapped, is_reversed):
     factory = MockFactory(pin_class=NotingPin)

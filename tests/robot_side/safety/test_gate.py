@@ -405,7 +405,7 @@ def test_a_stale_scan_is_an_obstacle(age_us, moves):
     assert RangeGuard(GuardConfig()).limit(AHEAD, 0) == STILL
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     points=st.lists(st.tuples(st.integers(0, 359), st.floats(0.06, 1.5)), max_size=12),
     linear=st.floats(-0.5, 0.5),

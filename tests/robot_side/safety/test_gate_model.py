@@ -269,7 +269,7 @@ def test_the_gate_keeps_its_promises_and_every_state_and_transition_was_visited(
     run_state_machine_as_test(
         Gate,
         settings=settings(
-            max_examples=examples, stateful_step_count=40, deadline=None, derandomize=True, database=None
+            max_examples=examples, stateful_step_count=40, derandomize=True, database=None
         ),
     )
     assert set(State) == STATES

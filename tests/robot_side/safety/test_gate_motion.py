@@ -29,7 +29,7 @@ def refusal(rig, verb, **kwargs):
 # --- the stop, as promised ---------------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     linear=st.floats(-0.5, 0.5),
     angular=st.floats(-2.5, 2.5),
@@ -113,7 +113,7 @@ def test_a_slow_link_may_have_a_longer_age_at_a_lower_speed():
 # --- limits per elapsed time -------------------------------------------------------------------------------------
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(
     goals=st.lists(st.tuples(st.floats(-5, 5), st.floats(-9, 9)), min_size=1, max_size=8),
     ticks_ms=st.lists(st.floats(1, 60), min_size=10, max_size=40),
@@ -180,7 +180,7 @@ def test_nothing_but_arming_leads_from_off_to_armed():
     assert all(next_state(state, Event.STOP) is State.STOPPED for state in State)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     st.lists(
         st.sampled_from(["offer", "old", "step", "gap", "stop", "reset", "arm", "disarm", "teleop", "fault"]),

@@ -104,7 +104,7 @@ def test_a_free_way_is_straight() -> None:
     assert route.left_m(entry) == pytest.approx(math.hypot(3, 1), rel=0.08)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(keep=st.floats(0.1, 0.4), half=st.floats(0.2, 1.2), shift=st.floats(-0.15, 0.15))
 @example(keep=0.10546875, half=0.90625, shift=-0.03125)  # 1.7 cells less than it should keep
 def test_the_way_round_a_wall_keeps_its_distance(keep: float, half: float, shift: float) -> None:

@@ -3,7 +3,7 @@
 import random
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from websockets.frames import Frame, Opcode
 from websockets.protocol import CLIENT, SERVER, Protocol
@@ -124,7 +124,6 @@ def test_the_head_is_that_of_the_library(opcode, size):
 FRAMES = st.tuples(st.sampled_from([0, 1, 2, 8, 9, 10]), st.binary(max_size=120), st.booleans())
 
 
-@settings(deadline=None)
 @given(st.lists(FRAMES, max_size=6), st.randoms(use_true_random=False))
 @example([(1, b"\xff", True)], random.Random(1))
 @example([(2, b"a", False), (1, b"b", True)], random.Random(1))

@@ -125,7 +125,7 @@ def test_speckle_neither_costs_nor_detects() -> None:
     assert len(HsvDetector(config).detect(DecodedImage(picture, 1))) <= 4
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**31), rows=st.integers(16, 60), columns=st.integers(16, 60))
 def test_no_picture_makes_the_detector_raise(seed: int, rows: int, columns: int) -> None:
     rng = np.random.default_rng(seed)

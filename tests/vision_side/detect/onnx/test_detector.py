@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sightline.protocol.errors import ConfigError, HardwareError
@@ -56,7 +56,6 @@ def test_constant_input_is_not_an_input(tmp_path: Path) -> None:
     assert header_of(path).inputs == (Tensor("x", "float32", (1, 3, None, None)),)
 
 
-@settings(deadline=None)
 @given(data=st.binary(min_size=1, max_size=200))
 def test_bytes_that_are_not_a_model_give_one_error(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.mktemp("bytes") / "m.onnx"
@@ -65,7 +64,6 @@ def test_bytes_that_are_not_a_model_give_one_error(tmp_path_factory: pytest.Temp
         detector(path)
 
 
-@settings(deadline=None)
 @given(at=st.integers(0, 600), byte=st.integers(0, 255))
 def test_a_broken_model_is_one_error(tmp_path_factory: pytest.TempPathFactory, at: int, byte: int) -> None:
     path = brightness_model(tmp_path_factory.mktemp("broken") / "m.onnx", BOXES, [0, 1])
