@@ -4,6 +4,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
@@ -418,23 +419,60 @@ def passes_detections_on(bench: Bench) -> None:
     _passed_on(bench, "detections", "vision", b'{"width_px":640, "height_px":480, "boxes":[]}')
 
 
-@SUITE.must("R-SOCK-47", "18.5 Passing on", real=True)
+_MISSIONS: Final = (
+    ("mission", "operator", b'{"id":4711, "name":"follow"}'),
+    ("report", "vision", b'{"mission":"follow", "phase":"looking"}'),
+)
+
+
+@SUITE.should("R-SOCK-47", "18.5 Passing on", real=True)
 def passes_missions_on(bench: Bench) -> None:
-    """Missions and reports are passed on as detections are."""
-    _passed_on(bench, "mission", "operator", b'{"id":4711, "name":"follow"}')
-    _passed_on(bench, "report", "vision", b'{"mission":"follow", "phase":"looking"}')
+    """Missions and reports are passed on to every other peer that wants them."""
+    for channel, role, payload in _MISSIONS:
+        bench.expect(_relay(bench, channel, role, payload).received, f"another peer that wants `{channel}` gets none")
+
+
+@SUITE.must("R-SOCK-48", "18.5 Passing on", real=True)
+def passes_missions_on_as_they_came(bench: Bench) -> None:
+    """Missions and reports that are passed on leave as they came, once, and not back to their sender."""
+    for channel, role, payload in _MISSIONS:
+        relayed = _relay(bench, channel, role, payload)
+        bench.need(relayed.received or relayed.returned, f"this robot passes no `{channel}` on (R-SOCK-47)")
+        relayed.expect_as_sent(bench)
 
 
 def _passed_on(bench: Bench, channel: str, role: str, payload: bytes) -> None:
     """Fail the case unless what `role` reports on `channel` comes to another, once and as it was, and not back."""
-    fields: dict[str, Any] = {"v": 1, "source": role, "session": SESSION, "seq": 7, "note": "as it came"}
+    _relay(bench, channel, role, payload).expect_as_sent(bench)
+
+
+@dataclass(frozen=True, slots=True)
+class _Relayed:
+    """One message that a peer sent, what came of it to another peer, and what came back to the sender."""
+
+    channel: str
+    header: bytes
+    payload: bytes
+    received: list[IncomingMessage]
+    returned: list[IncomingMessage]
+
+    def expect_as_sent(self, bench: Bench) -> None:
+        """Fail the case unless it came once, as it was, and not back."""
+        count = len(self.received)
+        bench.expect(count == 1, f"another peer that wants `{self.channel}` gets {count} of one sent")
+        came = self.received[0]
+        bench.expect(came.payload == self.payload, f"the payload came as {came.payload[:80]!r}")
+        bench.expect(came.header == self.header, f"the header came as {came.header[:120]!r}")
+        bench.expect(not self.returned, f"the client that sent `{self.channel}` gets it back")
+
+
+def _relay(bench: Bench, channel: str, role: str, payload: bytes) -> _Relayed:
+    """Send one message of `role` beside another peer that wants it."""
+    header = as_json({"v": 1, "source": role, "session": SESSION, "seq": 7, "note": "as it came"})
     with spoken(bench, channel) as other, spoken(bench, channel, role=role) as speaker:
-        speaker.send(BINARY, block(b'{"channel":"%b",' % channel.encode() + as_json(fields)[1:], payload))
-        received = _packets_on(channel, other, bench, 1.0)
-        bench.expect(len(received) == 1, f"another peer that wants `{channel}` gets {len(received)} of one sent")
-        bench.expect(received[0].payload == payload, f"the payload came as {received[0].payload[:80]!r}")
-        bench.expect(received[0].header == as_json(fields), f"the header came as {received[0].header[:120]!r}")
-        bench.expect(not _packets_on(channel, speaker, bench, 0.3), f"the client that sent `{channel}` gets it back")
+        speaker.send(BINARY, block(b'{"channel":"%b",' % channel.encode() + header[1:], payload))
+        received, returned = _packets_on(channel, other, bench, 1.0), _packets_on(channel, speaker, bench, 0.3)
+    return _Relayed(channel, header, payload, received, returned)
 
 
 def _packets_on(channel: str, raw: RawWebSocket, bench: Bench, for_s: float) -> list[IncomingMessage]:

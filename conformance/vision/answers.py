@@ -116,7 +116,7 @@ _READS: Final[dict[str, tuple[str, str, Callable[[dict[str, Any]], bytes]]]] = {
     "V-FRAM-16": ("2.1 JSON", "Of a field given twice the last counts.",
                   lambda it: b'{"v":1,"session":"ffffffff","seq":3,"t_us":5,' + packed(it)[1:]),
     "V-FRAM-17": ("2.1 JSON", "Blanks and line ends between a header's fields are JSON, and read.",
-                  lambda it: json.dumps(it, indent=2).encode()),
+                  lambda it: b"{" + json.dumps(it, indent=2).encode()[1:].lstrip()),
     "V-FRAM-18": ("2.1 JSON", "Characters of a header may be escaped.",
                   lambda it: packed(it).replace(b'"seq"', b'"\\u0073eq"')),
 }

@@ -117,6 +117,16 @@ def knows_messages_only(question, right):
     return right if question["kind"] == "message" else {"unsupported": True}
 
 
+def needs_whole_frame_headers(question, right):
+    """Which is allowed: a JPEG that ends within the components of its frame header is rejected."""
+    jpeg = base64.b64decode(question.get("payload", ""))
+    if question["kind"] != "message" or "ok" not in right or jpeg[:2] != b"\xff\xd8":
+        return right
+    at = max(jpeg.find(marker) for marker in (b"\xff\xc0", b"\xff\xc1", b"\xff\xc2"))
+    whole = at + 2 + int.from_bytes(jpeg[at + 2 : at + 4]) <= len(jpeg)
+    return right if whole else {"refusal": "MALFORMED"}
+
+
 def main():
     """Answer each question like the example, with the change applied to each answer."""
     name = sys.argv[1]

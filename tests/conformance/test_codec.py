@@ -79,6 +79,10 @@ def test_a_broken_codec_fails_its_family_and_no_other(name):
         assert all("vectors/twist/text_" in title for title in titles) and len(titles) >= 4
 
 
+def test_a_codec_that_rejects_a_cut_frame_header_passes_every_case():
+    assert failed(run_codec([*BROKEN, "needs_whole_frame_headers"])) == {}
+
+
 @pytest.mark.parametrize(("name", "line"), [
     ("dies", "it ended with 7 before it had answered; it printed 'out of luck'"),
     ("hangs", "no answer within 1 s"),

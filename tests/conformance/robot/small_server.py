@@ -364,7 +364,10 @@ class Client:
             fields = b'{"channel":"%b",' % message.channel.name.encode() + message.header[1:]
             if self.odd("names no channel") and message.channel.name == "odometry":
                 fields = message.header
-            self.send(BINARY, len(fields).to_bytes(2) + fields + message.payload)
+            payload = message.payload
+            if self.has("rewrites missions") and message.channel.name in ("mission", "report"):
+                payload = json.dumps(json.loads(payload)).encode()
+            self.send(BINARY, len(fields).to_bytes(2) + fields + payload)
 
     def on_block(self, message):
         size = int.from_bytes(message[:2])

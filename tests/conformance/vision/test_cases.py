@@ -7,6 +7,8 @@ from sightline.conformance.codec import CASES as CODEC_CASES
 from sightline.conformance.robot.cases import CASES as ROBOT_CASES
 from sightline.conformance.runner import Outcome, run_case
 from sightline.conformance.vision.cases import CASES, prepare
+from sightline.protocol.channels import FRAME
+from sightline.protocol.transports.websocket.framing import pack
 from tests.conformance.clauses import UNTESTED, clauses
 from tests.conformance.vision import broken_answers as vision_broken_answers  # noqa: F401
 from tests.conformance.vision import broken_flow as vision_broken_flow  # noqa: F401
@@ -54,6 +56,22 @@ def test_a_broken_vision_fails_its_case(name):
 def test_a_broken_vision_fails_no_other_case(name):
     failed = {case.id for case in VIRTUAL if result_of(case, BROKEN[name][1]).outcome is Outcome.FAILED}
     assert failed == {name}
+
+
+@pytest.mark.parametrize("case", [case for case in VIRTUAL if "V-FRAM-11" <= case.id <= "V-FRAM-18"],
+                         ids=lambda case: case.id)
+def test_headers_that_must_be_read_have_the_block_of_every_message(case):
+    bench, blocks = virtual_bench(), []
+    send = bench.send
+
+    def watched(channel, header, payload, source):
+        if channel is FRAME:
+            blocks.append(pack(channel, source, "robot", header, b"")[2:])
+        send(channel, header, payload, source)
+
+    bench.send = watched
+    assert run_case(case, bench, prepare).outcome is Outcome.PASSED
+    assert {block[:20] for block in blocks} == {b'{"channel":"frame","'}
 
 
 def test_every_clause_is_in_the_specification_and_has_a_case_or_a_reason():

@@ -48,6 +48,7 @@ DEFECTS = {
     "R-SOCK-45": "twists need a header",
     "R-SOCK-46": "drops what is no JSON",
     "R-SOCK-47": "keeps missions",
+    "R-SOCK-48": "rewrites missions",
     "R-DIAL-11": "pictures are binary",
     "R-DIAL-12": "one line",
     "R-DIAL-13": "deaf to twists",
