@@ -1,0 +1,95 @@
+"""The driver's loop on a virtual clock: 50 ticks a second, however late each one wakes."""
+
+import signal
+from itertools import pairwise
+from types import SimpleNamespace
+
+import pytest
+
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.driver import process
+from sightline.robot_side.driver.process import Driver
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
+
+
+class VirtualLoop:
+    """Clock, drive, network process and `select` of one loop. It wakes `late_us` after each deadline."""
+
+    socket, failed_at_start, exit_code, restarts = None, False, 0, 0
+
+    def __init__(self, late_us):
+        self.now_us, self.late_us = 10_000_000, late_us
+        self.ticks_us = []
+
+    def select(self, _readable, _writable, _broken, timeout_s):
+        self.now_us += round(timeout_s * 1e6) + self.late_us
+
+    def set(self, left_rad_s, right_rad_s):
+        self.ticks_us.append(self.now_us)
+
+    def wheels(self):
+        return None
+
+    def packets(self):
+        return iter(())
+
+    def send(self, packet):
+        pass
+
+    send_aside = send
+
+    def keep_alive(self, now_us, first_seq):
+        pass
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    handlers = {number: signal.getsignal(number) for number in (*EXIT_SIGNALS, *IGNORED_SIGNALS)}
+    made = []
+
+    def run(loop, seconds):
+        """Run the loop for so long and return the times of its ticks, from its start on."""
+        monkeypatch.setattr(process, "monotonic_us", lambda: loop.now_us)
+        monkeypatch.setattr(process, "select", SimpleNamespace(select=loop.select))
+        monkeypatch.setattr(process, "request_real_time", list)
+        driver = Driver(RobotConfig(state_dir=tmp_path), loop, None)
+        made.append(driver)
+        driver.driver_end = loop
+        started_us, tick = loop.now_us, driver._tick
+
+        def counted(now_us, *, punctual):
+            tick(now_us, punctual=punctual)
+            if now_us - started_us >= seconds * 1e6:
+                driver._on_signal(signal.SIGTERM, None)
+
+        monkeypatch.setattr(driver, "_tick", counted)
+        assert driver.loop() == 0
+        return [tick_us - started_us for tick_us in loop.ticks_us]
+
+    yield run
+    for driver in made:
+        driver.latch_writer.close()
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def test_ticks_that_wake_late_still_come_50_times_a_second(run):
+    """Each deadline follows from the deadline before it, not from the time of waking."""
+    ticks_us = run(VirtualLoop(late_us=3_000), seconds=2.0)
+    assert ticks_us == [3_000 + 20_000 * number for number in range(len(ticks_us))]
+    assert len(ticks_us) == 101
+
+
+def test_deadlines_that_a_stall_has_passed_are_not_caught_up(run):
+    loop = VirtualLoop(late_us=0)
+    select = loop.select
+
+    def stall_once(*arguments):
+        select(*arguments)
+        loop.now_us += 500_000 if len(loop.ticks_us) == 5 else 0
+
+    loop.select = stall_once
+    ticks_us = run(loop, seconds=1.0)
+    gaps_us = [after - before for before, after in pairwise(ticks_us)]
+    assert gaps_us[:4] == [20_000] * 4 and gaps_us[4] == 520_000
+    assert sum(gap_us < 20_000 for gap_us in gaps_us[5:]) <= 1, "at most one tick follows at once"

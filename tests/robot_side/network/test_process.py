@@ -1,0 +1,166 @@
+"""The network process: the driver process knows a frame before it leaves, and one thread at a time uses the credit."""
+
+import socket
+
+import pytest
+
+from sightline.protocol.channels import ACK, CAMERA, FRAME
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, Holder, StreamStatus
+from sightline.protocol.transports.link import Message
+from sightline.robot_side import pipe as ipc
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.network.process import NetworkProcess
+from sightline.robot_side.pipe import DriverEnd, NetworkEnd, NetworkSetup
+from sightline.robot_side.ports import Picture
+
+ROBOT = "0000000a"
+MODEL = CameraModel(width_px=320, height_px=240, fx_px=200.0, fy_px=200.0, cx_px=160.0, cy_px=120.0)
+
+
+class Camera:
+    """Delivers one image per call."""
+
+    model, live = MODEL, True
+    t_us = 0
+
+    def read(self, timeout_s):
+        self.t_us += 1_000_000
+        return Picture(b"jpeg", self.t_us)
+
+    def close(self):
+        pass
+
+
+class Link:
+    """A link with a listener. Runs `on_publish` while a message leaves."""
+
+    def __init__(self):
+        self.rejected, self.dropped = {}, {}
+        self.on_publish = lambda channel, header: None
+        self.published = []
+
+    def has_listener(self, channel):
+        return True
+
+    def publish(self, channel, header, payload):
+        self.published.append(channel)
+        self.on_publish(channel, header)
+
+
+class Relay:
+    def look(self):
+        pass
+
+
+@pytest.fixture
+def ends(tmp_path):
+    """The pipe's end in the driver process and that in the network process, joined by real sockets."""
+    waited, aside = (socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2))
+    driver_end = DriverEnd(RobotConfig(state_dir=tmp_path), ROBOT)
+    driver_end.socket, driver_end._aside = waited[0], aside[0]
+    for end in (waited[0], aside[0]):
+        end.setblocking(False)
+    yield driver_end, NetworkEnd(waited[1], aside[1])
+    for end in (*waited, *aside):
+        end.close()
+
+
+@pytest.fixture
+def link():
+    return Link()
+
+
+@pytest.fixture
+def process(tmp_path, ends, link):
+    setup = NetworkSetup(config=RobotConfig(state_dir=tmp_path), session=ROBOT, first_seq=7)
+    made = NetworkProcess(setup, ends[1], link, Camera())
+    made._relay = Relay()
+    return made
+
+
+def issued(driver_end):
+    packets = [packet for packet in driver_end.packets() if ipc.packet_kind(packet) is ipc.PacketKind.ISSUED]
+    return [ipc.unpack_issued(packet)[:2] for packet in packets]
+
+
+def test_driver_process_has_recorded_a_frame_when_it_is_published(process, ends, link):
+    known = []
+
+    def on_publish(channel, header):
+        if channel is FRAME:
+            frame = decode(FrameHeader, header)
+            known.append(((frame.seq, frame.t_us), issued(ends[0])))
+
+    link.on_publish = on_publish
+    process._stream_one()
+    assert known == [((7, 1_000_000), [(7, 1_000_000)])]
+
+
+def test_frame_that_the_driver_process_has_no_room_for_is_not_published(process, ends, link):
+    while ends[1].send_aside(ipc.pack_issued(1, 1, 0)):
+        pass
+    process._stream_one()
+    assert link.published == [CAMERA]
+
+
+class LockedCore:
+    """Stands for the network core. Notes for each call whether the lock was held."""
+
+    def __init__(self, process):
+        self._process = process
+        self.motion = ipc.RobotMotion()
+        self.locked = {}
+
+    def _note(self, name):
+        self.locked[name] = self._process._lock.locked()
+
+    def adapt(self, camera):
+        pass
+
+    def may_capture(self, now_us, listening):
+        self._note("may_capture")
+        return True
+
+    def wait_us(self, now_us):
+        self._note("wait_us")
+        return 0
+
+    def on_camera(self, picture, now_us):
+        self._note("on_camera")
+
+    def announce_camera(self, model, now_us):
+        self._note("announce_camera")
+
+    def on_command_ack(self, ack, now_us):
+        self._note("on_command_ack")
+
+    def on_ack(self, message, now_us):
+        self._note("on_ack")
+
+    def status(self, *_counts):
+        self._note("status")
+        return StreamStatus()
+
+
+def answered(process):
+    echo = Echo(channel="frame", session=ROBOT, seq=7, t_us=1_000_000)
+    header = AnswerHeader(source="viewer", session="0000000c", seq=1, echo=echo)
+    process._on_ack(Message(ACK, "viewer", encode(header), b""))
+
+
+def commanded(process):
+    vision = Holder(source="vision", session="0000000b")
+    process._on_packet(ipc.pack_command_ack(ipc.CommandAck(vision, 7, 0, vision)))
+
+
+@pytest.mark.parametrize(("act", "names"), [
+    (commanded, {"on_command_ack"}), (answered, {"on_ack"}), (lambda process: process._report(1), {"status"}),
+    (lambda process: process._stream_one(), {"may_capture", "wait_us", "on_camera", "announce_camera"}),
+])  # fmt: skip
+def test_each_use_of_the_credit_holds_the_lock(process, act, names):
+    """Three threads use it: the camera loop, the driver's packets and the link's callbacks."""
+    process._network_core = core = LockedCore(process)
+    act(process)
+    assert core.locked == dict.fromkeys(names, True)
+    assert not process._lock.locked(), "and gives it back"
