@@ -10,6 +10,7 @@ from pathlib import Path
 
 from tests.mutation.changes import EQUIVALENTS, select
 from tests.mutation.mutants import Mutant, Name, equivalents, mutants
+from tests.mutation.planted import main as plant
 from tests.mutation.trial import Outcome, finish, start, uncovered
 
 _GATE = (
@@ -33,6 +34,8 @@ TABLES = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Return the exit code: 0; 2 for an unknown commit; 5 if the tables fail, miss a branch or let a mutant live."""
     options = _options(arguments)
+    if options.planted:
+        return plant()
     try:
         files = [file for file in _selected(options.changed) if options.only in file]
     except ValueError as error:
@@ -55,6 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="python -m tests.mutation", description=__doc__)
     parser.add_argument("--list", action="store_true", help="print the mutants and stop")
+    parser.add_argument("--planted", action="store_true", help="plant the bugs of planted.toml instead, one by one")
     parser.add_argument("--only", default="", metavar="TEXT", help="only files whose path contains TEXT")
     parser.add_argument(
         "--changed",

@@ -1,4 +1,4 @@
-"""Run test tables: once for coverage, then against each mutant in a forked child with bounds. Shell."""
+"""Run tests: tables once for coverage, then against each mutant or planted bug in a forked child with bounds. Shell."""
 
 import contextlib
 import importlib
@@ -10,7 +10,7 @@ import sys
 import tempfile
 import time
 import types
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import Enum
 from pathlib import Path
 
@@ -24,6 +24,8 @@ from tests.mutation.mutants import Mutant
 _CPU_SECONDS = 5
 _WALL_SECONDS = 60.0
 _MEMORY_BYTES = 4 << 30
+OPTIONS = ("-q", "--tb=no", "--assert=plain", "-p", "no:cacheprovider", "-p", "no:hypothesispytest")
+"""Options of pytest in each child."""
 
 
 class Outcome(Enum):
@@ -60,17 +62,26 @@ def start(mutant: Mutant, suites: Sequence[str]) -> int:
     Raises:
         RuntimeError: this process has imported the mutant's module already, so every trial would end as if killed.
     """
-    if module_name(mutant.file) in sys.modules:
-        raise RuntimeError(f"{mutant.file} was imported before its mutants; find its importer in this process")
+    return fork(lambda: _run(mutant, suites), mutant.file)
+
+
+def fork(work: Callable[[], int], file: str, cpu_seconds: int = _CPU_SECONDS) -> int:
+    """Fork a child that exits with the result of `work`, which changes `file` in memory; return its pid.
+
+    Raises:
+        RuntimeError: this process has imported the module of `file` already, so every trial would end as if killed.
+    """
+    if module_name(file) in sys.modules:
+        raise RuntimeError(f"{file} was imported before its mutants; find its importer in this process")
     pid = os.fork()
     if pid:
         return pid
     status = 1
     try:
-        resource.setrlimit(resource.RLIMIT_CPU, (_CPU_SECONDS, _CPU_SECONDS))
+        resource.setrlimit(resource.RLIMIT_CPU, (cpu_seconds, cpu_seconds))
         resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        status = _run(mutant, suites)
+        status = work()
     finally:
         os._exit(status)  # the child never returns into the parent's code, whatever the mutant raised
 
@@ -90,25 +101,31 @@ def finish(pid: int, started_s: float) -> Outcome:
 
 
 def _run(mutant: Mutant, suites: Sequence[str]) -> int:
-    options = ("-x", "-q", "--tb=no", "--assert=plain", "-p", "no:cacheprovider", "-p", "no:hypothesispytest")
+    with silence():
+        try:
+            install(mutant.file, mutant.code)
+            return int(pytest.main(["-x", *OPTIONS, *suites]))
+        except BaseException:  # a mutant may raise anything at import: the table notices it
+            return 1
+
+
+@contextlib.contextmanager
+def silence() -> Iterator[None]:
+    """Discard what is printed."""
     with (
         Path(os.devnull).open("w") as nowhere,
         contextlib.redirect_stdout(nowhere),
         contextlib.redirect_stderr(nowhere),
     ):
-        try:
-            _install(mutant)
-            return int(pytest.main([*options, *suites]))
-        except BaseException:  # a mutant may raise anything at import: the table notices it
-            return 1
+        yield
 
 
-def _install(mutant: Mutant) -> None:
-    """Put the mutant where every later import of its module finds it."""
-    name = module_name(mutant.file)
+def install(file: str, code: types.CodeType) -> None:
+    """Put `code` in place of `file`, where every later import of its module finds it."""
+    name = module_name(file)
     module = types.ModuleType(name)
-    module.__file__ = str(Path(mutant.file).resolve())
+    module.__file__ = str(Path(file).resolve())
     sys.modules[name] = module
-    exec(mutant.code, module.__dict__)
+    exec(code, module.__dict__)
     parent, _, leaf = name.rpartition(".")
     setattr(importlib.import_module(parent), leaf, module)
