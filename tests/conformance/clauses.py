@@ -9,29 +9,32 @@ _CLAUSE = re.compile(r"\*\*(\d+\.\d+)(?: ([^*]+?))?\.?\*\*")
 
 
 UNTESTED = {
-    "5.5 A picture that does not change": "the kit cannot hold a robot's camera still; tests/test_driver_*.py",
-    "5.6 Reasons": "what a peer shows to a person is not on the wire; V-STAT-05 sends a reason that nobody knows",
-    "12.1 Detections": "of who looks without steering; the golden vectors hold its bounds",
-    "12.4 Steering by them": "of a vision that steers by another's boxes, which few do; tests/test_vision_*.py",
-    "13.1 Security": "what a link without keys promises is clauses 5 and 6",
+    "5.5 A picture that does not change": "the kit cannot freeze a robot's camera; tests/robot_side/safety",
+    "5.6 Reasons": "the text that a peer shows to an operator is not on the wire; V-STAT-05 sends an unknown reason",
+    "12.1 Detections": "for services that detect without steering; the golden vectors hold its bounds",
+    "12.4 Steering by them":
+        "for a vision service that steers by the boxes of another source, which few do; tests/vision_side/serving",
+    "13.1 Security": "a link without keys promises clauses 5 and 6",
     "13.3 Zenoh": "a denial is silent; protocol/transports/test_security_zenoh.py tries every role on every channel",
     "13.4 WebSocket": "it sums up 14.2 and 14.3",
-    "14.7 Newest only": "what waits for a slow peer lies in two machines' buffers; tests/protocol/transports/websocket",
-    "15.4 Options": "an owner's choice; the golden vectors hold the dialects",
+    "14.7 Newest only":
+        "messages for a slow peer wait in the buffers of two machines; tests/protocol/transports/websocket",
+    "15.4 Options": "the owner chooses; the golden vectors hold the legacy options",
     "15.5 On WebSocket: the legacy protocol": "the kit plays no such robot; tests/protocol/test_legacy_text.py",
     "15.6 Boxes": "the golden vectors `older_boxes` hold it",
     "16.1 On Zenoh": "priority and express are not seen at the other end; tests/protocol/transports/zenoh",
     "16.2 On Zenoh": "the session's configuration; tests/protocol/transports/zenoh",
-    "16.3 On Zenoh": "it allows nothing and refuses nothing",
-    "16.4 On Zenoh": "a courtesy, by which nothing judges; tests/protocol/transports/zenoh/test_presence.py",
+    "16.3 On Zenoh": "it permits nothing and rejects nothing",
+    "16.4 On Zenoh": "for information only; tests/protocol/transports/zenoh/test_presence.py",
     "18.1 Request":
         "for a vision service that knows missions, which is optional; tests/vision_side/missions/test_registry.py",
     "18.2 Freshness": "as 18.1",
     "18.3 Switching": "as 18.1",
     "18.4 Report": "as 18.1",
-    "19.1 Overlay and preview": "of a vision that draws for people, which none must; tests/vision_side/test_viewing.py",
+    "19.1 Overlay and preview":
+        "for a vision service that draws for viewers, which is optional; tests/vision_side/test_viewing.py",
     "19.2 Only while watched": "as 19.1",
-    "19.3 Passing on": "a robot may leave it out; tests/e2e/test_relay.py",
+    "19.3 Passing on": "optional for a robot; tests/e2e/test_relay.py",
 }
 """Clauses without a case of their own, and why; a test demands that all others have one."""
 

@@ -38,7 +38,7 @@ def _check_plan(plan: Plan) -> None:
     speeds = (plan.twist.linear_mps, plan.twist.angular_rad_s)
     assert all(math.isfinite(one) and abs(one) <= MAX_COMMAND for one in speeds), f"finite, sane twists, not {speeds}"
     assert len(format_twist(plan.twist)) <= MAX_TWIST_BYTES
-    assert 1 <= len(plan.phase) <= 32 and "\n" not in plan.phase + plan.note, "words for a person, on one line"
+    assert 1 <= len(plan.phase) <= 32 and "\n" not in plan.phase + plan.note, "short text on one line"
     assert plan.bearing_rad is None or math.isfinite(plan.bearing_rad)
     assert plan.distance_m is None or math.isfinite(plan.distance_m)
 

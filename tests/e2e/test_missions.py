@@ -85,9 +85,9 @@ def _course(robot, connect, said):
     assert until(lambda: robot.speed() > 1.0, START_S), "it drives"
     state = json.loads(sightline("status", "r1", "--json", *connect).stdout)
     assert state["mission"]["mission"] == "goto" and not state["mission"]["done"]
-    refused = sightline("mission", "r1", "folow", *connect)
-    assert refused.returncode == 5 and "no mission called 'folow'; did you mean 'follow'?" in refused.stderr
-    assert robot.speed() > 0.5, "what is refused changes nothing"
+    rejected = sightline("mission", "r1", "folow", *connect)
+    assert rejected.returncode == 5 and "no mission called 'folow'; did you mean 'follow'?" in rejected.stderr
+    assert robot.speed() > 0.5, "a rejected request changes nothing"
     back = sightline("mission", "r1", "follow", "--json", *connect)
     assert back.returncode == 0 and json.loads(back.stdout)["ok"] is True
     assert until(lambda: robot.speed() == 0.0, 3), "nothing to follow: it stands"

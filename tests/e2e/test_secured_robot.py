@@ -57,7 +57,7 @@ def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, ro
             answer = AnswerHeader(source="vision", session=session, seq=answered, echo=echo)
             rogue.publish(TWIST, encode(answer), b"0.4000|0.0000", "vision")
             answered += 1
-        assert answered > 5, "it could have driven, had it been heard"
+        assert answered > 5, "its commands would drive a robot that receives them"
         assert robot.speed() == 0.0, robot.output()
 
 
@@ -120,5 +120,5 @@ def test_rogue_client_on_a_plain_network_is_rejected_and_logged_while_another_dr
             assert time.monotonic() - began_s < 3.0
             assert until(lambda: driver.status().refused.get("NOT_HOLDER", 0) > 10)
             assert driver.status().holder == accepted_of
-            assert rogue.headers, "it could have driven, had it been obeyed"
+            assert rogue.headers, "its commands would drive a robot that accepts them"
         assert all(left >= 0.0 <= right for _, left, right in robot.motor_rows())

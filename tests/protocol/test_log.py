@@ -217,7 +217,7 @@ def test_a_key_that_did_not_come_for_ten_seconds_is_news_again(gap_us, again):
 def test_ever_new_keys_take_no_memory_and_few_lines():
     limiter, draw = RepeatLimiter(), random.Random(3)
     counts = [limiter.due(f"{draw.random()}", number * 1_000) for number in range(2_000)]
-    assert counts[:16] == [1] * 16, "as many as can be told apart"
+    assert counts[:16] == [1] * 16, "the first 16 keys have a count each"
     assert sum(map(bool, counts)) == 18 and max(counts) == 1_000, "the others share one key"
     assert len(limiter._repeats) == 17
     assert limiter.due("later", 20 * SECOND_US) == 1, "an old key makes room"

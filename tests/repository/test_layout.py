@@ -207,9 +207,9 @@ def test_every_file_states_its_kind_and_pure_files_are_pure():
     for path in FILES:
         head = (ast.get_docstring(tree(path)) or "").split("\n\n")[0]
         if not head or (path.name != "__init__.py" and ("Pure" in head) == ("Shell" in head)):
-            wrong.append(f"{shown(path)}: the first paragraph must say Pure or Shell")
+            wrong.append(f"{shown(path)}: the first paragraph must contain Pure or Shell")
         if is_pure(path) and path.name != "__init__.py" and "Pure" not in head:
-            wrong.append(f"{shown(path)}: is listed as pure, but does not say so")
+            wrong.append(f"{shown(path)}: is listed as pure, but its first paragraph lacks Pure")
         if "Pure" in head:
             names = imports(path)
             wrong += [f"{shown(path)}: is pure, but imports {name}" for name in names

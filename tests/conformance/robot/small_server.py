@@ -335,7 +335,7 @@ class Client:
         wants = set(hello.get("wants", ()))
         self.want(wants)
         if not self.greeted:
-            answer = {"v": 1, "robot": "r2" if self.odd("says another name") else "r1", "session": "00000001"}
+            answer = {"v": 1, "robot": "r2" if self.odd("sends another name") else "r1", "session": "00000001"}
             self.send(TEXT, json.dumps(answer).encode())
         self.greeted = True
         if set(hello.get("wants", ())) - set(CHANNELS) and self.has("knows all wants"):
@@ -412,7 +412,7 @@ class Client:
             fields = json.loads(block)
         except ValueError:
             name = block.partition(b'{"channel":"')[2].partition(b'"')[0].decode("utf-8", "replace")
-            if self.has("drops what is no JSON"):
+            if self.has("drops invalid JSON"):
                 return "nothing of ours", self.role, b""
             return name or None, self.role, b"{" + block.partition(b",")[2]
         name = fields.pop("channel", None) if isinstance(fields, dict) else None

@@ -21,7 +21,7 @@ def echoing(case, wrong, change):
     rewriting(case, wrong, lambda fields: {"echo": fields["echo"] | change(fields["echo"])})
 
 
-rewriting("V-FRAM-05", "says teleop in the header", lambda it: {"source": "teleop"})
+rewriting("V-FRAM-05", "writes teleop into the header", lambda it: {"source": "teleop"})
 rewriting("V-FRAM-06", "drives as teleop", lambda it: {"source": "teleop"}, source="teleop")
 rewriting("V-HEAD-01", "writes a byte order mark", before=b"\xef\xbb\xbf")
 rewriting("V-HEAD-02", "pads its headers", after=b" " * 500)
@@ -29,12 +29,12 @@ rewriting("V-HEAD-03", "speaks version 2", lambda it: {"v": 2})
 rewriting("V-HEAD-04", "has a session in upper case", lambda it: {"session": "ABCDEF01"})
 rewriting("V-HEAD-05", "counts in texts", lambda it: {"seq": str(it["seq"])})
 rewriting("V-HEAD-08", "computes in less than no time", lambda it: {"compute_us": -1})
-rewriting("V-HEAD-09", "does not say how long it computed", lambda it: {"compute_us": 0})
+rewriting("V-HEAD-09", "does not state its computing time", lambda it: {"compute_us": 0})
 rewriting("V-HEAD-10", "is NaN sure", lambda it: {"sure": float("nan")})
 rewriting("V-GRAM-01", "ends a twist with a newline", text=lambda text: text + b"\n")
 rewriting("V-GRAM-03", "writes five decimals", text=lambda text: text.replace(b"|", b"0|") + b"0")
 rewriting("V-GRAM-04", "writes -0", text=lambda text: b"-" + text if text.startswith(b"0.0000") else text)
-rewriting("V-CAUS-12", "says ten seconds", lambda it: {"compute_us": 10_000_000})
+rewriting("V-CAUS-12", "states ten seconds", lambda it: {"compute_us": 10_000_000})
 echoing("V-CAUS-01", "cites a status", lambda it: {"channel": "status"})
 echoing("V-CAUS-02", "cites its own session", lambda it: {"session": it["session"][::-1]})
 echoing("V-CAUS-03", "cites `seq` as a real number", lambda it: {"seq": float(it["seq"])})
@@ -93,7 +93,7 @@ class LoudAck(BrokenVision):
         self.puts(fields, text, payload=b"ok" if text is None else text)
 
 
-@breaks("V-FRAM-04", "says it under another key too")
+@breaks("V-FRAM-04", "repeats it under another key")
 class AnotherKey(BrokenVision):
     def writes(self, fields, text):
         self.puts(fields, text)
@@ -115,7 +115,7 @@ class Again(BrokenVision):
         self.puts(self.last[1] | {"seq": self.answered}, self.last[2])
 
 
-@breaks("V-CAUS-06", "says each twist again after 600 ms")
+@breaks("V-CAUS-06", "repeats each twist after 600 ms")
 class Twice(Again):
     def idle(self):
         if self.last and self.now_us - self.last[0] >= 600_000:

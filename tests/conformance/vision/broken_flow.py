@@ -101,7 +101,7 @@ class Tired(Gaps):
         return self.steady < 46
 
 
-@breaks("V-FLOW-01", "is silent about what is no JPEG")
+@breaks("V-FLOW-01", "is silent after an invalid JPEG")
 class Silent(BrokenVision):
     def hears(self, header, jpeg):
         return None if jpeg.startswith(b"no picture") else (header, jpeg)
@@ -173,7 +173,7 @@ def stately(case, wrong, dislikes):
 
 
 stately("V-STAT-02", "is silent while the robot is stopped", lambda it, _: it.get("state") == "STOPPED")
-stately("V-STAT-03", "sulks when refused", lambda it, _: it.get("refused", {}).get("STALE", 0) > 50)
+stately("V-STAT-03", "stops answering after rejections", lambda it, _: it.get("refused", {}).get("STALE", 0) > 50)
 stately("V-STAT-04", "is silent while another drives", lambda it, _: bool(it.get("holder")))
 stately("V-STAT-05", "knows all fields of a status", lambda it, _: "battery" in it)
 for _id, (_title, _payload) in BROKEN_STATUS.items():
@@ -207,7 +207,7 @@ class GivesUp(BrokenVision):
         self.dead = 200_000 < self.gap_us < 500_000
 
 
-@breaks("V-RECO-02", "does not know a robot that starts anew after a second")
+@breaks("V-RECO-02", "does not accept a robot that starts again after a second")
 class OneRobot(PerSession):
     gone, deaf = False, False
 
@@ -237,7 +237,7 @@ class CountsPerConnection(BrokenVision):
         self.answered = 0
 
 
-@breaks("V-RECO-05", "keeps answers back until somebody listens")
+@breaks("V-RECO-05", "delays answers until a client subscribes")
 class KeepsBack(BrokenVision):
     kept = None
 

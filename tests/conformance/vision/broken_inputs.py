@@ -126,7 +126,7 @@ def unordered(case, wrong, drives_by):
 
 unordered("V-CAUS-08", "drives by an older frame", lambda seq, t_us, seq2, t_us2: seq2 < seq and t_us2 < t_us)
 unordered("V-CAUS-09", "drives twice by one frame", lambda seq, t_us, seq2, t_us2: seq2 == seq and t_us2 == t_us)
-unordered("V-CAUS-10", "goes by `seq` alone", lambda seq, t_us, seq2, t_us2: seq2 > seq and t_us2 < t_us)
+unordered("V-CAUS-10", "compares only `seq`", lambda seq, t_us, seq2, t_us2: seq2 > seq and t_us2 < t_us)
 unordered("V-CAUS-11", "drives by a frozen camera", lambda seq, t_us, seq2, t_us2: seq2 > seq and t_us2 == t_us)
 
 

@@ -74,7 +74,7 @@ def _table(kind: int, length: int, symbols: Sequence[int]) -> bytes:
 def _blocks(rows: Sequence[Sequence[Pixel]], which: int) -> Blocks:
     """Split one component into blocks. Raises ValueError for an image without a whole number of blocks."""
     if len(rows) % 8 or len(rows[0]) % 8:
-        raise ValueError(f"{len(rows[0])}x{len(rows)} pixels are no whole blocks of 8x8")
+        raise ValueError(f"{len(rows[0])}x{len(rows)} pixels do not divide into blocks of 8x8")
     return [
         _coefficients([pixel[which] - 128 for row in rows[top : top + 8] for pixel in row[left : left + 8]])
         for top in range(0, len(rows), 8) for left in range(0, len(rows[0]), 8)

@@ -20,7 +20,7 @@ SOCKETS = {
     "V-SOCK-02": "means every robot",
     "V-SOCK-03": "wants the camera only",
     "V-SOCK-04": "has no role",
-    "V-SOCK-05": "follows whoever says hello",
+    "V-SOCK-05": "follows each sender of a hello",
     "V-SOCK-06": "answers in a text",
     "V-SOCK-07": "takes the first fragment for all",
     "V-SOCK-08": "is deaf to pings",

@@ -14,7 +14,7 @@ CONFORM = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "confo
 NOT_APPLICABLE = (
     "the kit has no way to send on this transport",
     "this robot publishes no scans",
-    "no port of the older dialect was named",
+    "no port of the legacy protocol was named",
 )
 
 

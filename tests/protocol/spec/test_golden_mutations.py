@@ -65,13 +65,13 @@ def within_bounds(value):
 
 @pytest.mark.parametrize("case", ACCEPTED, ids=lambda case: f"{case.channel}/{case.name}")
 def test_a_message_cut_or_changed_anywhere_is_read_or_rejected(case):
-    refused = [check(outcome(case.key, header, case.payload)) for header in (*cut(case.header), *flipped(case.header))]
+    rejected = [check(outcome(case.key, header, case.payload)) for header in (*cut(case.header), *flipped(case.header))]
     for payload in cut(case.payload):
         check(outcome(case.key, case.header, payload))
     assert not check(outcome(case.key, case.header, case.payload))
     if case.header:
-        assert all(refused[: len(case.header.rstrip())]), "a header that is cut short is refused"
-        assert any(not one for one in refused) and refused.count(True) > 100, "some bits do not matter, most do"
+        assert all(rejected[: len(case.header.rstrip())]), "the codec rejects a truncated header"
+        assert any(not one for one in rejected) and rejected.count(True) > 100, "some bits do not matter, most do"
 
 
 @pytest.mark.parametrize("case", [one for one in WIRED if one.folder == "websocket"], ids=lambda case: case.name)
@@ -86,7 +86,7 @@ def test_a_websocket_message_cut_or_changed_anywhere_is_taken_apart_or_rejected(
             assert len(got["accept"]["header_hex"]) // 2 <= 576 and len(one) >= len(got["accept"]["payload_hex"]) // 2
     for one in cut(message[:block]):
         assert check(framing_outcome("websocket", case.given | {"message_hex": one.hex()})), (
-            "a block cut short is refused"
+            "the codec rejects a truncated block"
         )
 
 

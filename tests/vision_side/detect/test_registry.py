@@ -118,7 +118,7 @@ def test_a_fallback_lets_pass_what_vision_lets_pass() -> None:
     ("detector", "words"),
     [
         ({"kind": "hsw"}, "no detector called 'hsw'; did you mean 'hsv'"),
-        ({"kind": "nowhere:Eyes"}, "'nowhere:Eyes' cannot be loaded"),
+        ({"kind": "nowhere:Finder"}, "'nowhere:Finder' cannot be loaded"),
         ({"kind": "onx:ball"}, "No module named 'onx'; did you mean 'onnx'?"),
         ({"kind": "onx:models/ball.onnx"}, "no detector called 'onx:models/ball.onnx'; did you mean 'onnx'?"),
         ({"kind": "http://box/detect"}, "no detector called 'http://box/detect'; did you mean 'oip+http'?; there are"),

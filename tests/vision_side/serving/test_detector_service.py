@@ -23,7 +23,7 @@ LONGEST = Detection(10.123456789012345, 11.123456789012345, 312.1234567890123, 2
                     track_id=2**53 - 1)
 
 
-class Says:
+class Named:
     """A detector that returns the detections in `found` or raises its exception, and returns `notices` once."""
 
     def __init__(self, *found, **changes):
@@ -32,7 +32,7 @@ class Says:
     def detect(self, frames, deadline_us):
         if self.found and isinstance(self.found[0], Exception):
             raise self.found[0]
-        return [replace(result_of(one, self.found, Maker("says", device="cpu")), **self.changes) for one in frames]
+        return [replace(result_of(one, self.found, Maker("named", device="cpu")), **self.changes) for one in frames]
 
     def notices(self):
         lines, self.lines = self.lines, []
@@ -46,7 +46,7 @@ class Bench:
         self.network, self.words, self.seq = MemoryNetwork(seed=31), [], 0
         self.robot = self.network.link("r1")
         self.heard = self.robot.latest(DETECTIONS)
-        self.service = DetectorService(self, detector, ServingOptions("says", **serving), self.words.append)
+        self.service = DetectorService(self, detector, ServingOptions("named", **serving), self.words.append)
 
     def robots(self):
         return ["r1"]
@@ -73,13 +73,13 @@ class Bench:
 
 
 def test_rejected_request_adds_no_load_and_each_reason_is_logged_once():
-    says = Says(GOOD)
-    bench = Bench(says)
+    named = Named(GOOD)
+    bench = Bench(named)
     assert bench.look() is not None
-    says.found = (ValueError("out of memory"),)
+    named.found = (ValueError("out of memory"),)
     for _ in range(30):
         assert bench.look() is None
-    says.found, says.changes = (GOOD,), {"device": "d" * 100}
+    named.found, named.changes = (GOOD,), {"device": "d" * 100}
     for _ in range(30):
         assert bench.look() is None
     told = [line for line in bench.words if "receives the frames" not in line]
@@ -89,27 +89,27 @@ def test_rejected_request_adds_no_load_and_each_reason_is_logged_once():
 
 
 def test_other_reasons_each_time_end_somewhere():
-    says = Says()
-    bench = Bench(says)
+    named = Named()
+    bench = Bench(named)
     for number in range(100):
-        says.found = (ValueError(f"failure {number}"),)
+        named.found = (ValueError(f"failure {number}"),)
         bench.look()
     assert 4 < len(bench.words) < 20
 
 
 def test_an_answer_that_is_too_long_for_the_wire_loses_its_last_boxes_and_ends_nothing():
-    bench = Bench(Says(*[LONGEST] * 64))
+    bench = Bench(Named(*[LONGEST] * 64))
     said = bench.look()
     assert said is not None and 50 < len(said.boxes) < 64 and said.boxes[0].label == LONGEST.label
     assert bench.look() is not None and bench.tally().served == 2
 
 
 @pytest.mark.parametrize(("detector", "why"), [
-    (Says(replace(GOOD, label="")), "label"), (Says(replace(GOOD, label="a\x1b[2J")), "label"),
-    (Says(replace(GOOD, label="\ud800")), "label"), (Says(replace(GOOD, circle=Circle(1.0, 1.0, 0.0))), "radius"),
-    (Says(replace(GOOD, track_id=-1)), "track"), (Says(GOOD, detector="d" * 65), "detector"),
-    (Says(GOOD, device="d" * 33), "device"), (Says(GOOD, model_hash="h" * 65), "model"),
-    (Says(*[GOOD] * 65), "65 boxes"), (Says(RuntimeError("out of memory")), "out of memory"),
+    (Named(replace(GOOD, label="")), "label"), (Named(replace(GOOD, label="a\x1b[2J")), "label"),
+    (Named(replace(GOOD, label="\ud800")), "label"), (Named(replace(GOOD, circle=Circle(1.0, 1.0, 0.0))), "radius"),
+    (Named(replace(GOOD, track_id=-1)), "track"), (Named(GOOD, detector="d" * 65), "detector"),
+    (Named(GOOD, device="d" * 33), "device"), (Named(GOOD, model_hash="h" * 65), "model"),
+    (Named(*[GOOD] * 65), "65 boxes"), (Named(RuntimeError("out of memory")), "out of memory"),
 ])
 def test_value_beyond_the_wire_is_counted_and_logged_once(detector, why):
     bench = Bench(detector)
@@ -120,7 +120,7 @@ def test_value_beyond_the_wire_is_counted_and_logged_once(detector, why):
 
 
 def test_notices_of_the_detector_are_logged_at_the_start_and_on_change():
-    detector = Says(GOOD)
+    detector = Named(GOOD)
     detector.lines = ["m.onnx runs on cpu: no GPU runtime is installed"]
     bench = Bench(LabelFilter(detector, ("ball",)))
     bench.service.turn()
@@ -131,11 +131,11 @@ def test_notices_of_the_detector_are_logged_at_the_start_and_on_change():
 
 
 def test_model_and_device_are_known_before_the_first_frame():
-    known = Says()
-    known.maker = Maker("says", "0123456789abcdef", "cuda")
-    assert Bench(LabelFilter(known, ("ball",))).service.about().startswith("says 01234567 on cuda: ")
-    assert Bench(Says()).service.about().startswith("says: ")
-    assert Bench(HSV).service.about().startswith("says on cpu: ")
+    known = Named()
+    known.maker = Maker("named", "0123456789abcdef", "cuda")
+    assert Bench(LabelFilter(known, ("ball",))).service.about().startswith("named 01234567 on cuda: ")
+    assert Bench(Named()).service.about().startswith("named: ")
+    assert Bench(HSV).service.about().startswith("named on cpu: ")
 
 
 class Late:

@@ -40,7 +40,7 @@ def lets_two_drive(robot):
 def loser_is_not_told(robot):
     def bend(_header, payload):
         if (payload.get("last_refusal") or {}).get("reason") == "NOT_HOLDER":
-            payload["last_refusal"]["detail"] = "somebody drives"
+            payload["last_refusal"]["detail"] = "another driver"
 
     bend_out(robot, "status", bend)
 

@@ -257,7 +257,7 @@ def answers_what_it_cannot_read(robot):
         inner(message)
         if isinstance((fields_of(message.payload) or {}).get("id"), str):
             to = fields_of(message.header)["session"]
-            reply = Reply(to=to, id=0, ok=False, state=robot.driving.gate.state, detail="MALFORMED: id is no number")
+            reply = Reply(to=to, id=0, ok=False, state=robot.driving.gate.state, detail="MALFORMED: id is not a number")
             robot.driving._post(REPLY, reply, robot.now())
 
     wrap(robot, "on_request", around)

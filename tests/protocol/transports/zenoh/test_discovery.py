@@ -21,10 +21,10 @@ with open_zenoh(sys.argv[2], listen=[sys.argv[1]], role="robot"):
     print("on", flush=True)
     time.sleep(60)
 '''
-tap = os.open("/dev/net/tun", os.O_RDWR)  # an interface is up for as long as somebody has its other end
-fcntl.ioctl(tap, 0x400454CA, struct.pack("16sH22x", b"eye", 0x1002))  # TUNSETIFF, IFF_TAP | IFF_NO_PI
-for command in ("link set lo up", "link set eye up", "addr add 10.9.8.1/24 dev eye",
-                "route add 224.0.0.0/4 dev eye"):
+tap = os.open("/dev/net/tun", os.O_RDWR)  # an interface is up while a process holds its other end
+fcntl.ioctl(tap, 0x400454CA, struct.pack("16sH22x", b"tap", 0x1002))  # TUNSETIFF, IFF_TAP | IFF_NO_PI
+for command in ("link set lo up", "link set tap up", "addr add 10.9.8.1/24 dev tap",
+                "route add 224.0.0.0/4 dev tap"):
     subprocess.run(["ip", *command.split()], check=True)
 
 def robot(endpoint, name):

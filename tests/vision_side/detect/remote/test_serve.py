@@ -81,4 +81,5 @@ def test_it_ends_within_a_second_of_a_signal(tmp_path):
 def test_more_streams_than_it_can_look_at_are_served_fairly_and_in_time(tmp_path):
     load = measure_streams(free_endpoint(), tmp_path, streams=8, seconds=4)
     assert len(load.answered) == 8 and load.overload > 1.5
-    assert load.p95_ms <= 2 * DEADLINE_MS and load.unfair_percent <= 25, "the bench judges; others load this"
+    # Wide bounds, because other tests load this machine. `sightline bench streams` has the strict ones.
+    assert load.p95_ms <= 2 * DEADLINE_MS and load.unfair_percent <= 25

@@ -128,8 +128,8 @@ def test_a_robots_frames_come_back_as_boxes_that_name_them(bench):
     assert [getattr(found, name) for name in CORNERS] == [getattr(expected, name) for name in CORNERS]
     assert found.circle.radius_px == pytest.approx(expected.circle.radius_px)
     assert (result.robot, result.session, result.seq) == ("r1", robot.session, robot.seq)
-    assert (result.detector, result.device) == ("hsv", "cpu"), "who looked is said by who looked"
-    assert _result(robot, detector, GREY_JPEG).detections == (), "saw nothing is an answer"
+    assert (result.detector, result.device) == ("hsv", "cpu"), "the result names the remote detector and its device"
+    assert _result(robot, detector, GREY_JPEG).detections == (), "an image without a target is an answer too"
 
 
 def test_one_detector_serves_every_robot_of_a_fleet(bench):
