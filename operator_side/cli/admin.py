@@ -56,7 +56,7 @@ def use(
     robot: Annotated[str, typer.Option("--robot", metavar="ID", help="Robot id.")] = contexts.DEFAULT_ROBOT,
     *,
     secure: Secure = "",
-    clear: Annotated[bool, typer.Option("--clear", help="Forget the saved address.")] = False,
+    clear: Annotated[bool, typer.Option("--clear", help="Remove the saved address.")] = False,
     no_check: Annotated[bool, typer.Option("--no-check", help="Save it even if it does not answer.")] = False,
     as_json: Json = False,
 ) -> None:
@@ -176,7 +176,7 @@ def install(
 ) -> None:
     """Install a service under systemd
 
-    Without --yes it only prints the files. For a `gpio` drive, a second file sets the pins low at each end.
+    Without --yes it only prints the files. For a `gpio` drive, a second file sets the pins low after each end.
     """
     program = Path(sys.executable).with_name("sightline")
     file = (config or Path(f"/etc/sightline/{service}.toml")).expanduser().absolute()  # systemd changes the folder

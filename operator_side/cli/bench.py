@@ -121,7 +121,7 @@ _ALONE = (
     "Peers detect as the legacy programs do. With `{}` they use Sightline's pipeline, which shows the cost of their "
     "transport alone, without credit, age or a gate; it is not scored."
 )
-Transport = Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")]
+Transport = Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision service.")]
 
 
 def loop(
@@ -134,11 +134,11 @@ def loop(
         float, typer.Option(help="Images per detection, e.g. 2 for overload; sets rate or detector.")
     ] = 0.0,
     seconds: Annotated[float, typer.Option(help="Length for each contestant, 2 to 600.")] = 10.0,
-    peers: Annotated[str, typer.Option(help="all, none, or of older, lekiwi, openpi, callback.")] = "all",
+    peers: Annotated[str, typer.Option(help="all, none, or names: older, lekiwi, openpi, callback.")] = "all",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write loop.json and loop.png here.")] = None,
     as_json: Json = False,
 ) -> int:
-    """Compare the time from capture to the driver with others
+    """Compare the time from capture to driver with other designs
 
     The others are the in-process minimum, bare TCP and the designs of other projects.
     """
@@ -224,7 +224,7 @@ def _row(name: str, race: "Race") -> str:
 def network(
     *,
     only: Annotated[list[str] | None, typer.Option("--only", metavar="ROW", help="A row; repeatable.")] = None,
-    transport: Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision.")] = "zenoh",
+    transport: Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision service.")] = "zenoh",
     seconds: Annotated[float, typer.Option(help="Length of each row, 4 to 600.")] = 20.0,
     seeds: Annotated[str, typer.Option(help="Seeds of the losses, separated by commas.")] = "1",
     as_json: Json = False,
@@ -300,7 +300,7 @@ _BOUND_US = {"zenoh": 1_000.0, "oip+http": 2_000.0}
 def detector(
     name: Annotated[str, typer.Argument(metavar="NAME", help="zenoh, or the address of a running server.")] = "zenoh",
     *,
-    frames: Annotated[int, typer.Option(min=30, max=10_000, help="Frames hot, and paced at 30 per second.")] = 300,
+    frames: Annotated[int, typer.Option(min=30, max=10_000, help="Frames back to back, then at 30 per second.")] = 300,
     sets: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="An option of the detector's own Config.")
     ] = None,

@@ -78,7 +78,7 @@ def drive(
 ) -> None:
     """Measure the speed of a drive at each duty
 
-    For `gpio` drives: the car drives straight on the floor and you type the distance. Ctrl-C stops it.
+    A car with a `gpio` drive drives straight on the floor, and you type the distance. Ctrl-C stops the car.
     """
     robot: Any = load_service("robot", file=config, sets=sets or (), environ=os.environ).config
     duties = _rising_duties(duty)
@@ -326,16 +326,18 @@ _PAGE_S = 0.3  # in which the page fetches the result
 
 def pick_color(
     robot: Annotated[
-        str | None, typer.Argument(metavar="ROBOT", help="Robot with the images [default: of `sightline use`, or r1].")
+        str | None, typer.Argument(metavar="ROBOT", help="Robot of the images [default: of `sightline use`, or r1].")
     ] = None,
     *,
     picture: Annotated[Path | None, typer.Option("--picture", metavar="FILE", help="Use an image file.")] = None,
     video: Annotated[Path | None, typer.Option("--video", metavar="FILE", help="Use a video file.")] = None,
-    at: Annotated[str | None, typer.Option("--at", metavar="X,Y", help="Pick this pixel, no browser.")] = None,
-    box: Annotated[str | None, typer.Option("--box", metavar="X,Y,W,H", help="Pick this box, no browser.")] = None,
+    at: Annotated[str | None, typer.Option("--at", metavar="X,Y", help="Pick this pixel without a browser.")] = None,
+    box: Annotated[
+        str | None, typer.Option("--box", metavar="X,Y,W,H", help="Pick this box without a browser.")
+    ] = None,
     frames: Annotated[int, typer.Option("--frames", min=1, max=200, help="Images for the test of the range.")] = 20,
     config: Annotated[
-        Path | None, typer.Option("--config", metavar="FILE", help="Write the range to this configuration of vision.")
+        Path | None, typer.Option("--config", metavar="FILE", help="Write the range to this vision configuration.")
     ] = None,
     mask: Annotated[
         Path | None, typer.Option("--mask", metavar="FILE", help="Image of the result [default: pick-color-mask.png].")

@@ -258,7 +258,7 @@ def robot(
 ) -> int:
     """Test a robot against the protocol
 
-    The kit arms the robot and turns its wheels: lift it off the floor. It plays drivers, viewers and attackers.
+    The kit arms the robot and turns its wheels, so lift it off the floor. It plays drivers, viewers and attackers.
     """
     from sightline.conformance.benches import FROM_ROBOT
     from sightline.conformance.raw_peers import RawZenoh

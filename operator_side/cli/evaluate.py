@@ -362,7 +362,7 @@ def train(
 ) -> None:
     """Train the learned detector
 
-    Generates labeled scenes and writes sightline.onnx with its card. An interrupted run continues where it ended.
+    It generates labeled scenes and writes sightline.onnx with its card. An interrupted run continues where it ended.
     """
     with needs("train"):
         import torch

@@ -168,7 +168,7 @@ def reset(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_
 def stop(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_json: Json = False) -> None:
     """STOP a robot and latch the stop until reset
 
-    The wheels go to zero and stay there until `sightline reset`. It needs the network: never use it as emergency stop.
+    The wheels stay at zero until `sightline reset`. STOP needs the network, so it is not an emergency stop.
     """
 
     def on_slow() -> None:
@@ -266,7 +266,7 @@ def goto(
 ) -> int:
     """Send a robot to one or more waypoints
 
-    The robot drives around what its range sensors detect. Ctrl-C does not stop it; `sightline stop` does.
+    The robot drives around obstacles that it detects. Ctrl-C does not stop it; `sightline stop` does.
     """
     from sightline.operator_side.client.missions import cannot, mission_line, request_of
     from sightline.operator_side.config.toml_text import options_of
@@ -328,7 +328,7 @@ def _print_report(robot: str, report: MissionReport, as_json: bool, *, is_answer
 
 _Gamepad = Annotated[
     str | None,
-    typer.Option("--gamepad", metavar="DEVICE", help="Also a gamepad: /dev/input/event5, or `auto` for the first."),
+    typer.Option("--gamepad", metavar="DEVICE", help="Use a gamepad too: /dev/input/event5, or `auto` for the first."),
 ]
 
 

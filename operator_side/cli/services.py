@@ -85,7 +85,7 @@ def sim(
 ) -> int:
     """Simulate a robot's hardware
 
-    Runs until Ctrl-C. `sightline robot` connects to it.
+    It runs until Ctrl-C. `sightline robot` connects to it.
     """
     from sightline.sim.process import run
 
@@ -102,7 +102,7 @@ def sim(
 def robot(
     task: Annotated[
         str | None,
-        typer.Argument(metavar="test-wheels", help="Turn each wheel alone, off the ground, in place of running."),
+        typer.Argument(metavar="test-wheels", help="Only turn each wheel alone, with the wheels off the ground."),
     ] = None,
     *,
     robot: RobotName = None,
@@ -123,8 +123,8 @@ def robot(
 ) -> int:
     """Run a robot: motors, camera and link
 
-    Runs until Ctrl-C and accepts clients of this machine only, unless --listen permits others. Without a configuration
-    it uses the hardware of `sightline sim`.
+    It runs until Ctrl-C and accepts only clients of this machine, unless --listen permits others. Without a
+    configuration it uses the hardware of `sightline sim`.
     """
     from sightline.robot_side.driver.process import run
     from sightline.robot_side.driver.process import zero_motors as set_to_zero
@@ -174,7 +174,7 @@ def vision(
 ) -> int:
     """Run a vision service that steers a robot
 
-    Runs until Ctrl-C. --dry-run also accepts --camera, a camera of this machine.
+    It runs until Ctrl-C. --dry-run also accepts --camera, a camera of this machine.
     """
     start_log(log, "vision")
     if camera is not None and not dry_run:
@@ -213,7 +213,7 @@ def _measured(run: Any, config: Any, where: str) -> int:
 def router(listen: Listen = None, connect: ServiceConnect = None, secure: Secure = "", log: LogForm = None) -> int:
     """Run a router to which all machines of a site connect
 
-    Runs until Ctrl-C. Robots, vision services and clients reach each other through it.
+    It runs until Ctrl-C. Robots, vision services and clients reach each other through it.
     """
     start_log(log, "router")
     with needs("zenoh"):
@@ -326,7 +326,7 @@ def labels(
 ) -> int:
     """Publish the simulation's labels in place of a detector
 
-    Runs until Ctrl-C. The labels are the exact boxes of the objects in each image.
+    It runs until Ctrl-C. The labels are the exact boxes of the objects in each image.
     """
     start_log(None, "labels")
     with needs("zenoh"):
@@ -411,7 +411,7 @@ def metrics(
 ) -> int:
     """Serve a robot's status to Prometheus
 
-    Serves /metrics and /health until Ctrl-C.
+    It serves /metrics and /health until Ctrl-C.
     """
     with needs("metrics"):
         import_module("prometheus_client")

@@ -38,7 +38,7 @@ def register(app: typer.Typer) -> None:
 
 def watch(
     robot: Robot = None,
-    channel: Annotated[str | None, typer.Argument(metavar="CHANNEL", help="Print the messages of it.")] = None,
+    channel: Annotated[str | None, typer.Argument(metavar="CHANNEL", help="Print its messages.")] = None,
     *,
     text: Annotated[bool, typer.Option("--text", help="Show the robot's state in this terminal.")] = False,
     show: Annotated[
@@ -53,7 +53,7 @@ def watch(
 ) -> int:
     """Show a robot's images or messages live
 
-    Serves a page for a browser on this machine until Ctrl-C. With CHANNEL, prints its messages, one per line.
+    It serves a page for a browser on this machine until Ctrl-C. With CHANNEL, it prints the messages, one per line.
     """
     if channel is None and (as_json or count):
         raise ConfigError("--json and --count need a channel; name it, e.g. sightline watch r1 status --json")
