@@ -48,7 +48,7 @@ def boxes_of(jpeg: bytes) -> Detections:
     size = read_jpeg_size(jpeg)
     bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     if bgr is None:
-        raise WireError(RejectReason.MALFORMED, "the picture does not decode")
+        raise WireError(RejectReason.MALFORMED, "the image does not decode")
     return Detections(width_px=size.width_px, height_px=size.height_px, boxes=look(bgr))
 
 
@@ -65,7 +65,7 @@ def answer(message: Message, seq: int) -> tuple[bytes, bytes]:
 def serve(endpoint: str, robot: str) -> None:
     """Look at the newest frame, for ever; while one is looked at, newer ones replace each other in one place."""
     with open_link(robot, connect=[endpoint], role=SOURCE) as link:
-        print(f"detector: looking at the pictures of {robot} at {endpoint}", flush=True)
+        print(f"detector: detecting in the images of {robot} at {endpoint}", flush=True)
         frames, seq = link.latest(FRAME), itertools.count(1)
         while True:
             message = frames.take(1.0)

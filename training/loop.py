@@ -198,8 +198,8 @@ def _helpers(scenes: DrawnScenes, training: Training, folder: Path) -> Iterator[
             one.join(1.0)  # one that has ended is not yet known to have
         if all(one.is_alive() for one in helpers):
             raise
-        raise HardwareError(f"one of the {training.jobs} processes that train has ended ({error}); the same command "
-                            "goes on from the last checkpoint, and --jobs 1 needs less memory") from None
+        raise HardwareError(f"one of the {training.jobs} training processes ended ({error}); the same command "
+                            "continues from the last checkpoint, and --jobs 1 needs less memory") from None
     finally:
         if torch.distributed.is_initialized():
             torch.distributed.destroy_process_group()
@@ -233,7 +233,7 @@ def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
     checkpoint = folder / CHECKPOINT
     begin = state.load(checkpoint)
     if begin and log is not None:
-        log(f"goes on at step {begin} of {training.steps}")
+        log(f"continues at step {begin} of {training.steps}")
     for step, batch in enumerate(_batches(scenes, training, begin), start=begin):
         loss = state.learn(step, batch)
         if log is None:

@@ -107,4 +107,4 @@ def _count_scans(jpeg: bytes) -> int:
 
 
 def _bad(what: str) -> WireError:
-    return WireError(RejectReason.MALFORMED, f"picture {what}")
+    return WireError(RejectReason.MALFORMED, f"image {what}")

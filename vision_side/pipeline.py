@@ -34,7 +34,7 @@ class Observation:
     """The result of one step for viewers.
 
     Args:
-        phase: word of the mission (`follow`: tracking, coasting, searching, lost), or "no picture".
+        phase: word of the mission (`follow`: tracking, coasting, searching, lost), or "no image".
         detections: all detections, best first.
         target: the detection that the mission follows.
         bearing_rad: bearing of the target, left positive.
@@ -190,7 +190,7 @@ class Pipeline:
         self._use_session(header.session)
         return self._last_us is None or header.t_us > self._last_us
 
-    def _skip(self, reason: str, note: str, phase: str = "no picture") -> PipelineAnswer:
+    def _skip(self, reason: str, note: str, phase: str = "no image") -> PipelineAnswer:
         return self.acknowledge(Observation(phase, note=note), reason)
 
     def acknowledge(self, seen: Observation, skipped: str = "") -> PipelineAnswer:

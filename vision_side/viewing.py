@@ -55,7 +55,7 @@ IDLE_S: Final = 2.0
 """Without anything to show for this long the thread ends; the next frame that is watched starts another."""
 KEPT: Final = 4
 """Frames whose answer comes later, from another service's detector: one that is further behind is not shown."""
-NO_PICTURE: Final = "no picture"
+NO_PICTURE: Final = "no image"
 """Phase of an image that the pipeline rejected. It is not decoded here either."""
 _NICE: Final = 10  # of this thread: answering the next frame comes first
 _QUALITIES_BELOW: Final = (50, 30)
@@ -133,7 +133,7 @@ class ViewPublisher:
             try:
                 self._publish(job)
             except Exception as error:  # whatever a plug-in's detections hold: people see less, the robot drives on
-                self._log_change("viewing", f"a picture cannot be shown: {type(error).__name__}: {error}")
+                self._log_change("viewing", f"cannot show an image: {type(error).__name__}: {error}")
 
     def _next(self) -> _Job | None:
         job = self._jobs.take(IDLE_S)

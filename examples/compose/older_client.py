@@ -47,10 +47,10 @@ def main(url: str) -> None:
     while True:
         try:
             with connect(url, compression=None, proxy=None) as robot:
-                print(f"older client: driving by the pictures of {url}", flush=True)
+                print(f"legacy client: driving by the images of {url}", flush=True)
                 drive(robot)
         except (OSError, WebSocketException) as error:
-            print(f"older client: {error}; trying again", flush=True)
+            print(f"legacy client: {error}; trying again", flush=True)
         time.sleep(0.5)
 
 

@@ -45,7 +45,7 @@ function showAge() {
   const age_ms = now_ms - drawnAt_ms.at(-1);
   const old = age_ms > OLD_MS;
   part("figure").className = old ? "old" : "";
-  write("age", old ? `no picture for ${(age_ms / 1000).toFixed(1)} s` : `${drawnAt_ms.length} pictures/s, the newest ${Math.round(age_ms)} ms ago`);
+  write("age", old ? `no image for ${(age_ms / 1000).toFixed(1)} s` : `${drawnAt_ms.length} images/s, the newest ${Math.round(age_ms)} ms ago`);
 }
 
 const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/`;

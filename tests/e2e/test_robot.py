@@ -118,7 +118,7 @@ def test_a_port_in_use_names_its_owner(tmp_path):
 @pytest.mark.parametrize(
     ("change", "code", "says"),
     [
-        ({"camera": {"kind": "folder", "options": {"path": "/nowhere"}}}, 3, "no .jpg pictures in /nowhere"),
+        ({"camera": {"kind": "folder", "options": {"path": "/nowhere"}}}, 3, "no .jpg images in /nowhere"),
         ({"camera": {"kind": "webcam"}}, 2, "no camera called 'webcam'"),
         ({"camera": {"kind": "folders"}}, 2, "did you mean 'folder'?"),
         ({"drive": {"kind": "log", "options": {"pth": "x"}}}, 2, "pth"),

@@ -51,7 +51,7 @@ def test_seen_coasted_searched_and_found() -> None:
 
 def test_no_picture_is_acknowledged_and_starts_no_search() -> None:
     answers = phases([BALL] * 5 + [b"not a picture"] * 90)
-    assert all(answer.twist is None and answer.seen.phase == "no picture" for answer in answers[5:])
+    assert all(answer.twist is None and answer.seen.phase == "no image" for answer in answers[5:])
 
 
 def test_an_empty_room_from_the_start_waits_then_searches() -> None:

@@ -134,7 +134,7 @@ def test_image_that_cannot_be_drawn_is_logged_once_and_driving_continues(site, m
         site.frame()
         assert site.twists.take(2.0) is not None
         time.sleep(0.08)  # so that it is time for another overlay
-    assert until(lambda: site.said.count("vision: a picture cannot be shown: RuntimeError: no paint") == 1)
+    assert until(lambda: site.said.count("vision: cannot show an image: RuntimeError: no paint") == 1)
     monkeypatch.undo()
     assert until(lambda: site.frame() and overlays.take(0.1), 5.0)
 

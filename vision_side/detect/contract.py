@@ -106,7 +106,7 @@ def _keeps_answering(detector: Detector, _make: Make, seed: int) -> str:
     for size in SIZES:
         for index, frame in enumerate(drawn_frames(seed, 6, size)):
             if detector.detect([frame], NO_DEADLINE) == [None]:
-                return f"no answer to picture {index} of {size[0]}x{size[1]}"
+                return f"no answer to image {index} of {size[0]}x{size[1]}"
     return ""
 
 

@@ -179,7 +179,7 @@ def validated(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
     if named != (frame.robot, header.session, header.seq, header.t_us):
         raise ValueError("it answers another frame")
     if (result.width_px, result.height_px) != (frame.width_px, frame.height_px):
-        raise ValueError(f"it is about a {result.width_px}x{result.height_px} picture")
+        raise ValueError(f"it is for a {result.width_px}x{result.height_px} image")
     found = result.detections
     if len(found) > MAX_DETECTED_BOXES:  # the wire's own bound: only the detector knows which of more are the best
         raise ValueError(f"{len(found)} boxes; at most {MAX_DETECTED_BOXES}")

@@ -143,7 +143,7 @@ class TrafficLight:
 
     def _plan(self, view: View) -> Plan:
         if view.picture is None:
-            return Plan(STILL, "no picture", "traffic lights need an image")
+            return Plan(STILL, "no image", "traffic lights need an image")
         pose = view.header.pose
         known = [one for one in view.detections if not self._is_light(one, pose)]
         lights = self._reader.read(view.picture, known)

@@ -160,7 +160,7 @@ class ProgressPrinter:
         if self._printed_s is None:
             self._print(answer, "", now_s)
         elif now_s - self._printed_s >= _PRINT_EVERY_S:
-            self._print(answer, f" ({self._pictures / (now_s - self._printed_s):.0f} pictures/s)", now_s)
+            self._print(answer, f" ({self._pictures / (now_s - self._printed_s):.0f} images/s)", now_s)
 
     def _print(self, answer: PipelineAnswer, rate: str, now_s: float) -> None:
         self._report(f"{seen_text(answer.seen)}{_would_text(answer)}{rate}")

@@ -232,7 +232,7 @@ class Service:
             self._log_change("link", f"frames from robot {self._config.robot}, session {header.session}")
         if self._pipeline is None:
             self._wait_for_camera()
-            self._publish(header, PipelineAnswer(None, Observation("no picture", note="no camera model yet")), 0)
+            self._publish(header, PipelineAnswer(None, Observation("no image", note="no camera model yet")), 0)
             return
         self._mission_channel.prepare(self._pipeline, header)
         deadline_us = monotonic_us() + round(self._config.detector.deadline_s * 1e6)
@@ -284,7 +284,7 @@ class Service:
         if answer.twist is None:
             count = self.skipped.total()
             if count in _REPORTED_COUNTS:
-                self._report(f"vision: pictures skipped so far: {count}; this one: {seen.note}")
+                self._report(f"vision: skipped images: {count}; newest: {seen.note}")
         elif seen.phase in _REPORTED_PHASES:
             self._log_change("phase", _REPORTED_PHASES[seen.phase])
         elif seen.phase == "tracking" and seen.distance_m is not None:
@@ -365,7 +365,7 @@ class BoxesService(Service):
             return
         self._heard_s = time.monotonic()
         self._log_change("link", f"frames from robot {self._config.robot}, session {header.session}")
-        self._publish(header, PipelineAnswer(None, Observation("no picture", note="another service detects")), 0)
+        self._publish(header, PipelineAnswer(None, Observation("no image", note="another service detects")), 0)
         self._viewing.keep(header, message.payload)
         if self._pipeline is None:
             self._wait_for_camera()

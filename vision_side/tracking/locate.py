@@ -179,7 +179,7 @@ class BoxReader:
         found = decode(Detections, payload, DETECTIONS.max_payload_bytes)
         if (found.width_px, found.height_px) != (camera.width_px, camera.height_px):
             size, own = f"{found.width_px}x{found.height_px}", f"{camera.width_px}x{camera.height_px}"
-            raise WireError(RejectReason.MALFORMED, f"boxes of a {size} picture, the camera's is {own}")
+            raise WireError(RejectReason.MALFORMED, f"boxes of a {size} image, the camera delivers {own}")
         frame = self._frame_of(stamp)
         meant = [_detection(box) for box in found.boxes if self._means(box)]
         return frame, tuple(sorted(meant, key=lambda one: one.score, reverse=True))

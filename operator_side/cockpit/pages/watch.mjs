@@ -80,8 +80,8 @@ function showAge() {
   part("figure").className = age_ms > OLD_MS ? "old" : "";
   const age = newest.age_ms === null ? "" : `, at least ${Math.round(age_ms)} ms old`;
   part("age").textContent = since_ms > OLD_MS
-    ? `no picture for ${(since_ms / 1000).toFixed(1)} s`
-    : `${newest.channel} ${newest.size}, ${drawnAt_ms.length} pictures/s${age}`;
+    ? `no image for ${(since_ms / 1000).toFixed(1)} s`
+    : `${newest.channel} ${newest.size}, ${drawnAt_ms.length} images/s${age}`;
 }
 
 setInterval(showAge, AGE_MS);

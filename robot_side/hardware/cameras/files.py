@@ -34,7 +34,7 @@ class FolderCamera:
         self._pictures = [path.read_bytes() for path in paths]
         sizes = {jpeg_size(path, jpeg) for path, jpeg in zip(paths, self._pictures, strict=True)}
         if len({(size.width_px, size.height_px) for size in sizes}) > 1:
-            raise HardwareError(f"the pictures in {config.path} differ in size; one camera has one size")
+            raise HardwareError(f"the images in {config.path} differ in size; name a folder with one size")
         self.model = camera_model(config, sizes.pop())
         self._pace = FrameTimer(config.fps)
         self._count = 0
@@ -54,7 +54,7 @@ def jpegs_in(folder: Path) -> list[Path]:
     """Return the .jpg and .jpeg files of `folder` in name order. Raises HardwareError for an empty result."""
     paths = sorted(path for path in folder.expanduser().glob("*") if path.suffix.lower() in (".jpg", ".jpeg"))
     if not paths:
-        raise HardwareError(f"no .jpg pictures in {folder}; name a folder that has some")
+        raise HardwareError(f"no .jpg images in {folder}; name a folder that has some")
     return paths
 
 
@@ -87,7 +87,7 @@ class StillCamera:
             self._jpeg = config.path.expanduser().read_bytes()
         except OSError as error:
             raise HardwareError(
-                f"picture {config.path} cannot be read: {error.strerror}; set camera.options.path to a .jpg"
+                f"image {config.path} cannot be read: {error.strerror}; set camera.options.path to a .jpg"
             ) from None
         self.model = camera_model(config, jpeg_size(config.path, self._jpeg))
         self._pace = FrameTimer(config.fps)
@@ -211,8 +211,8 @@ class VideoCamera:
         if self._at == 0 or self._at < count * (1 - _COUNT_SLACK) - 1:
             raise self._broken()
         if not self._config.loop:
-            raise HardwareError(f"video {self._config.path} ended after {self._at} pictures; set camera.options.loop "
-                                "= true to play it again and again")
+            raise HardwareError(f"video {self._config.path} ended after {self._at} images; set camera.options.loop "
+                                "= true to repeat it")
 
     def _broken(self) -> HardwareError:
         count = int(self._capture.get(self._cv2.CAP_PROP_FRAME_COUNT))

@@ -84,7 +84,7 @@ def _checked(table: dict[str, Any], where: str) -> CameraModel:
 def _fitting(model: CameraModel, size: JpegSize, where: str) -> CameraModel:
     if (model.width_px, model.height_px) != (size.width_px, size.height_px):
         raise ConfigError(
-            f"{where} is of {model.width_px}x{model.height_px} pictures, the camera gives "
-            f"{size.width_px}x{size.height_px}; calibrate at this size, or choose that one"
+            f"{where} is for {model.width_px}x{model.height_px}, the camera delivers "
+            f"{size.width_px}x{size.height_px}; calibrate at this size, or choose the other size"
         )
     return model

@@ -78,7 +78,7 @@ class PiCamera:
         picture = self._newest.take(timeout_s)
         if picture is None and time.monotonic() - self._heard_s > self._config.frozen_after_s:
             raise HardwareError(
-                f"Raspberry Pi camera {self._config.index} has given no picture for {self._config.frozen_after_s:g} s; "
+                f"Raspberry Pi camera {self._config.index} delivered no image for {self._config.frozen_after_s:g} s; "
                 "check its ribbon cable and restart the robot service"
             )
         return picture

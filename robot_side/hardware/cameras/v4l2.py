@@ -181,7 +181,7 @@ class V4l2Device:
         if not self._capture.grab():
             if not self._config.device.exists():
                 raise self._error("was unplugged; plug it in again")
-            raise self._error("gives no picture; unplug it and plug it in again, or check its cable and power")
+            raise self._error("delivers no image; unplug it and plug it in again, or check its cable and power")
 
     def picture(self) -> Picture | None:
         """The capture last waited for; None if it was damaged on its way."""
@@ -343,6 +343,6 @@ class V4l2Camera:
 
     def _frozen(self) -> HardwareError:
         return HardwareError(
-            f"camera {self._config.device} has given no usable picture for {self._config.frozen_after_s:g} s; unplug "
+            f"camera {self._config.device} delivered no usable image for {self._config.frozen_after_s:g} s; unplug "
             "it and plug it in again, or check its cable and power"
         )

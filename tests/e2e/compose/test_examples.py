@@ -97,7 +97,7 @@ def test_boxes_reach_subscribers_and_name_a_frame_of_the_robot(tmp_path):
     robot = RobotProcess(tmp_path)
     (tmp_path / "pictures" / "0.jpg").write_bytes(jpeg(160))
     with robot, program("detector_service.py", wait_for(robot)) as detector:
-        assert detector.stdout.readline().startswith("detector: looking at the pictures of r1")
+        assert detector.stdout.readline().startswith("detector: detecting in the images of r1")
         with open_zenoh("r1", connect=[robot.endpoint], role="vision") as vision:
             heard = vision.latest(DETECTIONS)
             message = heard.take(8.0)

@@ -99,7 +99,7 @@ def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer
     assert until(lambda: page.text("link") == "connected", START_S), page.text("link")
     assert until(lambda: is_drawn(page), START_S), page.text("age")
     assert until(lambda: answered(page) > 30, START_S), page.text("pictures")
-    assert re.fullmatch(r"\d+ pictures/s, the newest \d+ ms ago", page.text("age"))
+    assert re.fullmatch(r"\d+ images/s, the newest \d+ ms ago", page.text("age"))
     # The page only watches until a request to drive.
     assert page.text("driver") == "nobody"
 
@@ -124,7 +124,7 @@ def test_page_reports_a_lost_robot_and_finds_it_again(tmp_path: Path) -> None:
     with JsRobot(tmp_path, port=port) as robot, Browser(tmp_path, f"http://127.0.0.1:{port}/") as page:
         assert until(lambda: answered(page) > 10, START_S), page.text("pictures")
         robot.kill()
-        assert until(lambda: page.text("age").startswith("no picture for"), 5.0), page.text("age")
+        assert until(lambda: page.text("age").startswith("no image for"), 5.0), page.text("age")
         assert until(lambda: page.text("link").startswith("no connection"), 5.0), page.text("link")
         assert page.run("document.getElementById('figure').className") == "old"
         with JsRobot(tmp_path, port=port):

@@ -165,7 +165,7 @@ def test_the_page_shows_what_vision_sees_and_frames_without_it(tmp_path: Path) -
         site = Site(tmp_path, ending)
         watch = ending.enter_context(Started(tmp_path, "watch", "r1", "--connect", site.web))
         page = ending.enter_context(Browser(tmp_path, address_of(watch)))
-        assert until(lambda: re.fullmatch(r"overlay 640x480, \d+ pictures/s, at least \d+ ms old", page.text("age")),
+        assert until(lambda: re.fullmatch(r"overlay 640x480, \d+ images/s, at least \d+ ms old", page.text("age")),
                      START_S), page.text("age")
         assert until(lambda: page.text("state") == "DISARMED" and page.text("link") == "connected", START_S)
         assert until(lambda: "follow: " in page.text("lines") and "on cpu" in page.text("lines"), START_S)

@@ -188,7 +188,7 @@ def test_the_line_is_never_crossed_on_red_and_the_lane_is_driven_to_its_end(begi
 def test_without_a_picture_or_a_block_nothing_moves() -> None:
     mission = TrafficLight(TrafficLight.Config(), LENS)
     header = FrameHeader(session="0000abcd", seq=1, t_us=0)
-    assert mission.step(View(header, 0.0, 0.05, LENS, (), None)).phase == "no picture"
+    assert mission.step(View(header, 0.0, 0.05, LENS, (), None)).phase == "no image"
     blank = DecodedImage(np.full((240, 320, 3), 120, np.uint8), 1)
     plan = mission.step(View(header, 0.0, 0.05, LENS, (), blank))
     assert plan.phase == "no lane" and plan.twist.linear_mps == plan.twist.angular_rad_s == 0.0

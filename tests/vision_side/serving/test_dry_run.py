@@ -84,7 +84,7 @@ def test_reports_are_limited_to_two_per_second():
         telling.step(PipelineAnswer(None, Observation("lost")), 100 + picture / 30)
     assert len(said) == 21
     assert said[0] == "lost: no target"
-    assert said[-1] == "lost: no target (30 pictures/s)"
+    assert said[-1] == "lost: no target (30 images/s)"
 
 
 def test_dry_run_prints_the_sign_of_a_bearing_and_the_twist():
@@ -123,4 +123,4 @@ def test_dry_run_does_not_move_an_armed_robot(tmp_path):
         assert {row[1:] for row in robot.motor_rows()} <= {(0.0, 0.0)}
     told = [line for line in said if line.startswith("tracking: bearing +11.")]
     assert len(told) >= 2
-    assert "pictures/s" in told[-1]
+    assert "images/s" in told[-1]

@@ -129,7 +129,7 @@ def test_lines_are_logged_per_change_and_never_per_frame(bench: Bench) -> None:
     assert [line.split(": ", 1)[1].split(" at ")[0] for line in bench.said] == [
         "camera is 320x240, fx 190.7 px, calibrated", "frames from robot r1, session 0000abcd", "target seen",
         "target lost", "no target, searching",
-        *(f"pictures skipped so far: {count}; this one: image: not a JPEG, no SOI marker"
+        *(f"skipped images: {count}; newest: image: not a JPEG, no SOI marker"
           for count in (1, 10, 100)),
     ]
 

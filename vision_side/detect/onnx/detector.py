@@ -114,7 +114,7 @@ class OnnxDetector:
         results = self._in_parts(frames, deadline_us, fewer)
         if any(results) and fewer < self._max_batch:
             self._max_batch = fewer
-            self._notices.append(f"{self.maker.detector} fails on {len(frames)} pictures at once, from now on at most "
+            self._notices.append(f"{self.maker.detector} fails on {len(frames)} images in one batch, uses at most "
                               f"{fewer}: {str(error)[:120]}")
         return results
 
@@ -138,7 +138,7 @@ class OnnxDetector:
         wrong = difference(expected, found, least) if expected is not None else ""
         if wrong:
             where = f"{self._engine.device} ({self._engine.name})"
-            raise HardwareError(f"model {path.name} on {where} gives a wrong answer to its test picture: "
+            raise HardwareError(f"model {path.name} on {where} gives a wrong answer to its test image: "
                                 f"{wrong}; try --device cpu, or fetch the file again")
 
 
@@ -206,8 +206,8 @@ def _bytes_of(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         if path == SHIPPED:
-            raise ConfigError("this copy of Sightline comes without a model of its own: name one, e.g. --detector "
-                              "onnx:ball.onnx, or make it: docs/explanation/learned-detector.md") from None
+            raise ConfigError("this copy of Sightline has no model; name one, e.g. --detector onnx:ball.onnx, or "
+                              "train it (docs/explanation/learned-detector.md)") from None
         why = error.strerror or "it cannot be read"
         raise ConfigError(f"model {path}: {why}; name an ONNX file, e.g. --detector onnx:ball.onnx") from None
 

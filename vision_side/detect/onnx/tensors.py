@@ -57,7 +57,7 @@ class ModelFormat:
 def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelFormat:
     """Raises ValueError for a model that takes or gives something else."""
     if len(header.inputs) != 1:
-        raise ValueError(f"it takes {len(header.inputs)} inputs; expected one picture")
+        raise ValueError(f"it takes {len(header.inputs)} inputs; expected one image")
     one = header.inputs[0]
     rows_first, channels_first = one.shape[3:] == (3,), len(one.shape) == 4 and one.shape[1] == 3
     floats = one.type in ("float32", "float16")
@@ -65,7 +65,7 @@ def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelF
         raise ValueError(f"its input is {one.type} {_shape_text(one)}; it should be uint8 (1, H, W, 3) or float "
                          "(1, 3, H, W)")
     if one.shape[0] not in (1, None):
-        raise ValueError(f"it takes {one.shape[0]} pictures at once; export it for 1, or for any number")
+        raise ValueError(f"it takes {one.shape[0]} images in one batch; export it for 1, or for any number")
     rows, columns = one.shape[1:3] if rows_first and not floats else one.shape[2:4]
     size = (rows, columns) if rows and columns else None
     labels = tuple(map(clean_label, names)) or own_labels(header.metadata)
@@ -169,7 +169,7 @@ def read_outputs(
 def split_batch(outputs: Arrays, count: int) -> list[dict[str, NDArray[Any]]]:
     """The outputs for `count` pictures, for each by itself. Raises ValueError if there are not as many."""
     if any(one.shape[:1] != (count,) for one in outputs.values()):
-        raise ValueError(f"outputs of {', '.join(str(one.shape) for one in outputs.values())} for {count} pictures")
+        raise ValueError(f"outputs of {', '.join(str(one.shape) for one in outputs.values())} for {count} images")
     return [{name: one[index : index + 1] for name, one in outputs.items()} for index in range(count)]
 
 

@@ -302,7 +302,7 @@ def read_jpeg_answer(body: bytes, frame: DetectFrame) -> JpegAnswer:
     if (answer.width_px, answer.height_px) != (frame.width_px, frame.height_px):
         raise NoAnswerError(
             NoAnswerReason.OTHER_SIZE,
-            f"boxes of a {answer.width_px}x{answer.height_px} picture, the frame is {frame.width_px}x{frame.height_px}",
+            f"boxes of a {answer.width_px}x{answer.height_px} image, the frame is {frame.width_px}x{frame.height_px}",
         )
     return answer
 

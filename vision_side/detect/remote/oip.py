@@ -99,12 +99,12 @@ class Inferred:
 def model_of(name: str, version: str, inputs: Sequence[TensorSlot], outputs: Sequence[TensorSlot]) -> OipModel:
     """The model, if it can be used here. Raises NoAnswerError UNFIT with what it lacks."""
     if len(inputs) != 1:
-        raise _unfit(name, f"it takes {len(inputs)} inputs, one picture is given")
+        raise _unfit(name, f"it takes {len(inputs)} inputs; expected one image")
     one, given = inputs[0], {slot.name for slot in outputs}
     if one.datatype not in ("BYTES", "UINT8"):
         raise _unfit(name, f"its input is {one.datatype}; BYTES (a JPEG) or UINT8 (pixels) is given")
     if one.datatype == "UINT8" and (len(one.shape) not in (3, 4) or _layout(one.shape) is None):
-        raise _unfit(name, f"its input of shape {list(one.shape)} is not a picture of three channels")
+        raise _unfit(name, f"its input of shape {list(one.shape)} is not an image of three channels")
     if one.datatype == "BYTES" and len(one.shape) not in (1, 2):
         raise _unfit(name, f"its input of shape {list(one.shape)} is not one JPEG")
     missing = {BOXES, SCORES} - given

@@ -174,7 +174,7 @@ def _result(message: Message, header: DetectionsHeader, frame: DetectFrame, min_
         raise NoAnswerError(NoAnswerReason.MALFORMED, error.detail) from None
     size = frame.width_px, frame.height_px
     if (found.width_px, found.height_px) != size:
-        raise NoAnswerError(NoAnswerReason.OTHER_SIZE, f"boxes of a {found.width_px}x{found.height_px} picture")
+        raise NoAnswerError(NoAnswerReason.OTHER_SIZE, f"boxes of a {found.width_px}x{found.height_px} image")
     name = clean_label(found.detector) if found.detector else f"zenoh ({header.source})"
     maker = Maker(name, hash_of(found.model), clean_label(found.device) if found.device else REMOTE)
     return result_of(frame, read_boxes(found.boxes, size, min_score), maker, header.compute_us)

@@ -54,7 +54,7 @@ def test_a_looped_video_begins_again(tmp_path):
 
 def test_the_end_of_a_video_that_is_not_looped_is_reported(tmp_path):
     camera = VideoCamera(VideoCamera.Config(path=video(tmp_path / "film.avi", pictures=4), loop=False, fps=120))
-    with pytest.raises(HardwareError, match=r"ended after 4 pictures; set camera.options.loop = true"):
+    with pytest.raises(HardwareError, match=r"ended after 4 images; set camera.options.loop = true"):
         for _ in range(10):
             next_picture(camera)
 
@@ -143,7 +143,7 @@ def test_guessed_lens_has_the_configured_width_and_is_not_calibrated(width_px, h
         ({"fx": 3.0}, "unknown field 'fx'"),
         ({"fx_px": "wide"}, "fx_px"),
         ({"fx_px": -1.0}, "fx_px"),
-        ({"width_px": 640}, "640x240 pictures, the camera gives 320x240; calibrate at this size"),
+        ({"width_px": 640}, "for 640x240, the camera delivers 320x240; calibrate at this size"),
         ({"distortion": [0.0] * 9}, "distortion"),
     ],
 )

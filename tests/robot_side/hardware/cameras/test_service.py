@@ -25,7 +25,7 @@ def test_end_of_a_video_is_logged_once_and_the_service_stays(tmp_path):
     [
         ("v4l2", {"device": "/dev/video93"}, 3, "camera /dev/video93 is not there"),
         ("picamera", {}, 2, "camera picamera needs picamera2: sudo apt install python3-picamera2"),
-        ("still", {"path": "/nowhere.jpg"}, 3, "picture /nowhere.jpg cannot be read"),
+        ("still", {"path": "/nowhere.jpg"}, 3, "image /nowhere.jpg cannot be read"),
         ("video", {"path": "/nowhere.mp4"}, 3, "video /nowhere.mp4 is not there"),
         ("v4l3", {}, 2, "did you mean 'v4l2'"),
     ],

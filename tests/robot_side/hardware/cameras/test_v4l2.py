@@ -126,7 +126,7 @@ def test_a_size_that_the_camera_does_not_have_is_named(opened):
 def test_model_of_another_size_is_rejected_and_the_device_released(opened):
     device = FakeDevice()
     model = {"width_px": 320, "height_px": 240, "fx_px": 200.0, "fy_px": 200.0, "cx_px": 160.0, "cy_px": 120.0}
-    with pytest.raises(ConfigError, match="320x240 pictures, the camera gives 640x480"):
+    with pytest.raises(ConfigError, match="for 320x240, the camera delivers 640x480"):
         opened(device, model=model)
     assert device.is_released()
 
@@ -223,7 +223,7 @@ def test_a_frozen_camera_is_reported_and_recovers(opened):
     camera = opened(device)
     next_picture(camera)
     device.frozen = True
-    assert "gives no picture" in fault_of(camera)
+    assert "delivers no image" in fault_of(camera)
     device.frozen = False
     eventually(lambda: fault_free(camera))
 
@@ -245,7 +245,7 @@ def test_camera_with_invalid_data_is_reported(opened):
     device = FakeDevice()
     camera = opened(device, frozen_after_s=0.3)
     device.damage = lambda data: bytes(100)
-    assert "no usable picture for 0.3 s" in fault_of(camera)
+    assert "no usable image for 0.3 s" in fault_of(camera)
 
 
 def test_a_camera_that_starts_slowly_is_waited_for(opened):
@@ -254,7 +254,7 @@ def test_a_camera_that_starts_slowly_is_waited_for(opened):
 
 def test_camera_frozen_from_the_start_does_not_open(opened):
     device = FakeDevice(frozen=True)
-    with pytest.raises(HardwareError, match="gives no picture"):
+    with pytest.raises(HardwareError, match="delivers no image"):
         opened(device)
     assert device.is_released()
 

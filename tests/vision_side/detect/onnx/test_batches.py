@@ -60,7 +60,7 @@ def test_a_model_that_cannot_do_with_many_pictures_is_given_fewer(tmp_path: Path
     results = eye.detect(frames, NO_DEADLINE)
     assert [one.seq for one in results] == [0, 1, 2, 3, 4] and runs == [5, 2, 2, 1]
     *_, told = eye.notices()
-    assert "fails on 5 pictures at once, from now on at most 2: " in told and "for 5 pictures" in told
+    assert "fails on 5 images in one batch, uses at most 2: " in told and "for 5 images" in told
     assert all(eye.detect(frames, NO_DEADLINE)) and runs[4:] == [2, 2, 1] and not eye.notices()
 
 

@@ -57,8 +57,8 @@ def test_metadata_defines_the_request():
     ([], OUTPUTS, "takes 0 inputs"), ([JPEG_INPUT, PIXELS], OUTPUTS, "takes 2 inputs"),
     ([TensorSlot("image", "FP32", (1, 3, 240, 320))], OUTPUTS, "FP32; BYTES"),
     ([PIXELS], OUTPUTS[:1], "scores missing"),
-    ([PIXELS], [], "boxes and scores missing"), ([TensorSlot("image", "UINT8", (240, 320))], OUTPUTS, "not a picture"),
-    ([TensorSlot("image", "UINT8", (1, 240, 320, 4))], OUTPUTS, "not a picture"),
+    ([PIXELS], [], "boxes and scores missing"), ([TensorSlot("image", "UINT8", (240, 320))], OUTPUTS, "not an image"),
+    ([TensorSlot("image", "UINT8", (1, 240, 320, 4))], OUTPUTS, "not an image"),
     ([TensorSlot("image", "BYTES", (1, 1, 1))], OUTPUTS, "not one JPEG"),
 ])  # fmt: skip
 def test_model_that_does_not_fit_gives_a_readable_error(inputs, outputs, why):
