@@ -80,7 +80,14 @@ def check_sizes(channel: Channel, header: bytes, payload: bytes) -> None:
 
 
 def request_verb(payload: bytes) -> Verb | None:
-    """Read the verb of a `request` payload. Returns None for an invalid payload."""
+    """Read the verb of a `request` payload.
+
+    Args:
+        payload: payload bytes, any content.
+
+    Returns:
+        The verb, or None for an invalid payload.
+    """
     try:
         return decode(Request, payload, REQUEST.max_payload_bytes).verb
     except WireError:

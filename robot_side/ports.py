@@ -1,7 +1,8 @@
 """The ports of a robot's devices: `Camera`, `Drive`, `RangeSensor`, `Battery`. Pure.
 
-A plug-in is a class with a pydantic `Config` attribute, built as `Plugin(config)`. All times are microseconds of the
-robot's monotonic clock. Every method raises HardwareError when the device is gone. The error text contains the fix.
+A plug-in is a class with a pydantic `Config` attribute. Sightline creates it as `Plugin(config)`. All times are
+microseconds of the robot's monotonic clock. Every method raises HardwareError when the device is gone. The error text
+contains the fix.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class Ranges:
         nan                           a broken scan
 
     A scan with a nan, without rays or without any echo is invalid. A plug-in translates the codes of its device to this
-    table. A device that writes 0 also for objects that are too close needs half of `range_min_m` there. A ray that hits
-    the robot itself is 0.
+    table. Some devices write 0 also for an object that is too close. Their plug-in writes half of `range_min_m`
+    instead. A ray that hits the robot itself is 0.
 
     Args:
         t_us: time of the scan, us.
@@ -100,7 +101,9 @@ class Camera(Protocol):
         """
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release the camera. Idempotent."""
+        ...
 
 
 @runtime_checkable
@@ -136,30 +139,57 @@ class Drive(Protocol):
         ...
 
     def wheels(self) -> WheelAngles | None:
-        """Return the newest encoder reading, or None before the first one. Never blocks."""
+        """Read the encoders. Never blocks.
+
+        Returns:
+            The newest reading in rad, or None before the first reading and without encoders.
+
+        Raises:
+            HardwareError: the drive failed; the gate enters FAULT.
+        """
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release the drive. The caller sets both speeds to zero first. Idempotent."""
+        ...
 
 
 class RangeSensor(Protocol):
     """A sensor that measures distances around the robot."""
 
     def read(self) -> Ranges | None:
-        """Return the newest scan, or None if it was already read. Never blocks."""
+        """Take the newest scan. Never blocks.
+
+        Returns:
+            The scan in m and rad, or None if the last call returned it already.
+
+        Raises:
+            HardwareError: the sensor is gone.
+        """
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release the sensor. Idempotent."""
+        ...
 
 
 class Battery(Protocol):
     """A sensor for the battery voltage. The driver calls it from a separate thread, so it may take a second."""
 
     def read(self) -> float:
-        """Measure the voltage now, in V. The battery counts as low after 5 s without a reading."""
+        """Measure the voltage now. The battery counts as low after 5 s without a reading.
+
+        Returns:
+            The voltage, V.
+
+        Raises:
+            HardwareError: the sensor is gone.
+        """
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release the sensor. Idempotent."""
+        ...
 
 
 def scaled_size(width_px: int, height_px: int, scale_percent: int) -> JpegSize:
@@ -182,6 +212,9 @@ def scaled_model(model: CameraModel, scale_percent: int) -> CameraModel:
     Args:
         model: model at full size, px.
         scale_percent: share of the side lengths, 1 to 100.
+
+    Returns:
+        The model at the reduced size, px.
     """
     if scale_percent == 100:
         return model
@@ -194,5 +227,13 @@ def scaled_model(model: CameraModel, scale_percent: int) -> CameraModel:
 
 
 def scaled_quality(quality: int, percent: int) -> int:
-    """Return a share of a configured JPEG quality, at least 1, which every decoder accepts."""
+    """Scale a JPEG quality.
+
+    Args:
+        quality: configured quality, 1 to 100.
+        percent: share of it, 1 to 100.
+
+    Returns:
+        The share, at least 1, because some decoders reject quality 0.
+    """
     return max(1, round(quality * percent / 100))

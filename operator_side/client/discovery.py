@@ -32,7 +32,7 @@ def lines(statuses: dict[str, Message], peers: list[PeerInfo]) -> Iterator[str]:
 
 
 def as_object(statuses: dict[str, Message], peers: list[PeerInfo]) -> dict[str, Any]:
-    """Return the same for scripts."""
+    """Return the robots and the other peers as JSON types, for scripts."""
     return {
         "robots": [_status_object(name, statuses[name]) for name in sorted(statuses)],
         "peers": [_peer_object(peer) for peer in peers],
@@ -96,7 +96,7 @@ class DiscoveryReport:
                 yield line if len(self.places) == 1 else f"{place}: {line}"
 
     def as_object(self) -> dict[str, Any]:
-        """Return for scripts what all places gave, and the error of each that failed."""
+        """Return the robots and peers of all places as JSON types, and the error of each failed place."""
         whole: dict[str, Any] = {"robots": [], "peers": [], "places": list(self.places), "errors": {}}
         for place, found in self.places.items():
             if isinstance(found, SightlineError):

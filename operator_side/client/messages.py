@@ -23,6 +23,14 @@ class ChannelInbox:
     """Receives the messages of `channel` from its construction on."""
 
     def __init__(self, link: Link, role: str, channel: Channel, secure: str = "") -> None:
+        """Subscribe to the channel.
+
+        Args:
+            link: link to the robot.
+            role: role of `link`.
+            channel: channel whose messages the inbox collects.
+            secure: folder of the keys of `link`, or "".
+        """
         self._waiting: queue.Queue[Message] = queue.Queue(MAX_WAITING)
         self._picture: LatestSlot[Message] | None = LatestSlot() if channel.encoding == JPEG else None
         self._viewer = FrameViewer(link, role, secure) if channel is FRAME else None
@@ -36,7 +44,14 @@ class ChannelInbox:
         return self._overflow + (self._picture.dropped if self._picture else 0)
 
     def take(self, timeout_s: float) -> Message | None:
-        """Return the next message, or None at `timeout_s`."""
+        """Take the next message, in order; of an image channel only the newest.
+
+        Args:
+            timeout_s: longest wait, s.
+
+        Returns:
+            The message, or None if no message arrived in time.
+        """
         message = self._picture.take(timeout_s) if self._picture else self._next_text(timeout_s)
         if message is not None and self._viewer is not None:
             self._viewer.acknowledge(message)

@@ -84,6 +84,11 @@ class MissionClient:
     """Sends an operator's mission requests to one vision service. Every wait is bounded."""
 
     def __init__(self, link: Link) -> None:
+        """Subscribe to the mission reports.
+
+        Args:
+            link: open link to the robot, with the role `operator`.
+        """
         self._link = link
         self.operator = Operator(link)
         self._session = secrets.token_hex(4)
@@ -103,11 +108,26 @@ class MissionClient:
         return self._report is not None and time.monotonic() - self._received_s < PATIENCE_S
 
     def report(self, timeout_s: float = PATIENCE_S) -> MissionReport:
-        """Wait for the next report. Raises LinkError at `timeout_s`."""
+        """Wait for the next report.
+
+        Args:
+            timeout_s: longest wait, s.
+
+        Raises:
+            LinkError: no report in time.
+        """
         return self._next(lambda _report: True, timeout_s)
 
     def request(self, name: str, waypoints: Waypoints = (), options: Mapping[str, Any] | None = None) -> MissionReport:
-        """Request a mission until a report names the request; a non-empty `refused` in it is the rejection.
+        """Request a mission until a report names the request.
+
+        Args:
+            name: name of the mission.
+            waypoints: (x, y) in the odometry frame, m, for `goto`.
+            options: options of the mission.
+
+        Returns:
+            The report. A non-empty `refused` in it is the reason of a rejection.
 
         Raises:
             ConfigError: the request does not fit the protocol.
@@ -225,5 +245,5 @@ def detector_line(report: MissionReport) -> str:
 
 
 def cannot(report: MissionReport) -> bool:
-    """Return whether a mission is over because it is impossible."""
+    """Return True if a mission is over because it failed or cannot reach its goal."""
     return report.done and (report.phase in ("failed", "cannot reach") or report.note.startswith("cannot"))

@@ -19,9 +19,16 @@ from sightline.protocol.transports.security import certificate_role
 
 
 class FrameViewer:
-    """The session of one viewer; `role` names it on the wire. The keys in `secure` may permit no messages at all."""
+    """The session of one viewer, which acknowledges frames where its keys permit it."""
 
     def __init__(self, link: Link, role: str, secure: str = "") -> None:
+        """Create the session.
+
+        Args:
+            link: link to the robot.
+            role: role of `link`, the name of the viewer on the wire.
+            secure: folder of the keys of `link`, or "". The keys of a viewer permit no messages.
+        """
         self._link, self._role = link, role
         self._is_silent = bool(secure) and not SOURCES_OF_ROLE.get(certificate_role(role))
         self._session = secrets.token_hex(4)
@@ -78,7 +85,9 @@ class Pictures:
     """The newest image, taken by one thread at a time. The first `take` subscribes."""
 
     def __init__(self, link: Link, role: str, first: Channel = OVERLAY, secure: str = "") -> None:
-        """Args:
+        """Subscribe to the status, for the clock of the robot.
+
+        Args:
             link: link to the robot.
             role: role of `link`.
             first: OVERLAY, replaced by frames while it is missing, or FRAME.
@@ -98,7 +107,14 @@ class Pictures:
         link.subscribe(STATUS, self._on_status)
 
     def take(self, timeout_s: float) -> Shot | None:
-        """Return the next image, or None at `timeout_s`. Taking a frame acknowledges it."""
+        """Take the next image. Taking a frame acknowledges it.
+
+        Args:
+            timeout_s: longest wait, s.
+
+        Returns:
+            The image, or None if no image arrived in time.
+        """
         ends_s = time.monotonic() + timeout_s
         while True:
             self._choose()
@@ -118,7 +134,7 @@ class Pictures:
             self._newest = None
 
     def age_us(self, shot: Shot) -> int | None:
-        """Return the least possible age of the image, by the robot's clock."""
+        """Return the least possible age of the image by the robot's clock, us, or None before a status."""
         return self.clock.age_us(shot.session, shot.t_us, monotonic_us())
 
     @property

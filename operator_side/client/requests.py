@@ -37,7 +37,11 @@ class StatusReport:
 
 
 def read_report(message: Message) -> StatusReport:
-    """Decode a `status` message. Raises WireError."""
+    """Decode a `status` message.
+
+    Raises:
+        WireError: the header or the payload is invalid.
+    """
     return StatusReport(decode(Stamp, message.header), decode(Status, message.payload, STATUS.max_payload_bytes))
 
 
@@ -45,6 +49,11 @@ class Operator:
     """Sends an operator's requests to one robot. Every wait is bounded and raises LinkError without an answer."""
 
     def __init__(self, link: Link) -> None:
+        """Subscribe to the status and the replies of the robot.
+
+        Args:
+            link: open link to the robot, with the role `operator`.
+        """
         self._link = link
         self._session = secrets.token_hex(4)
         self._seq = self._id = 0
@@ -69,6 +78,12 @@ class Operator:
     def wait_report(self, timeout_s: float = 2.0) -> StatusReport:
         """Wait for the next status.
 
+        Args:
+            timeout_s: longest wait, s.
+
+        Returns:
+            A status that arrived after the call.
+
         Raises:
             LinkError: no status in time, or a status of another protocol version.
         """
@@ -84,7 +99,18 @@ class Operator:
             return self._report
 
     def request(self, verb: Verb, timeout_s: float = 2.0) -> Reply:
-        """Send one request, repeat it until the reply, and return the reply. Raises LinkError at `timeout_s`."""
+        """Send one request and repeat it until the reply.
+
+        Args:
+            verb: the request.
+            timeout_s: longest wait, s; for a verb that cites a status, once for the status and once for the reply.
+
+        Returns:
+            The reply of the robot. `ok` is False for a rejection.
+
+        Raises:
+            LinkError: no reply in time.
+        """
         if verb in _CITES_STATUS:
             self.wait_report(timeout_s)  # a new one: the stored one may precede a STOP or disarm
         return self._request(verb, self._report, timeout_s)
@@ -101,7 +127,17 @@ class Operator:
         raise LinkError(f"no answer from robot '{self.robot}' to {verb} after {timeout_s:g} s; repeat the command")
 
     def arm(self, patience_s: float = 5.0) -> Reply:
-        """Request arming; repeat while the robot reports a missing condition (valid commands, wheels at zero)."""
+        """Request arming. Repeat it while a condition is missing (valid commands, wheels at zero).
+
+        Args:
+            patience_s: time for the conditions, s.
+
+        Returns:
+            The last reply. `ok` is False if the robot did not arm.
+
+        Raises:
+            LinkError: no answer from the robot.
+        """
         deadline_s = time.monotonic() + patience_s
         reply = self.request(Verb.ARM)
         while not reply.ok and reply.detail.startswith(RejectReason.NOT_ALLOWED) and time.monotonic() < deadline_s:
@@ -110,7 +146,19 @@ class Operator:
         return reply
 
     def reset(self, patience_s: float = 1.5) -> Reply:
-        """Request a reset; repeat while the wheels still turn, citing the same status: a STOP in between wins."""
+        """Request a reset. Repeat it while the wheels still turn.
+
+        Every repeat cites the same status, so a STOP in between wins.
+
+        Args:
+            patience_s: time for the wheels, s.
+
+        Returns:
+            The last reply. `ok` is False if the robot did not reset.
+
+        Raises:
+            LinkError: no answer from the robot.
+        """
         deadline_s = time.monotonic() + patience_s
         cited = self.wait_report()
         reply = self._request(Verb.RESET, cited, 2.0)
@@ -123,7 +171,11 @@ class Operator:
         """Send STOP at 20 Hz until a status shows STOPPED.
 
         Args:
-            on_slow: called once if that takes more than 300 ms.
+            on_slow: called once if the confirmation takes more than 300 ms.
+            timeout_s: longest wait, s.
+
+        Returns:
+            The status that shows STOPPED.
 
         Raises:
             LinkError: at `timeout_s`; the robot may still move.

@@ -19,7 +19,13 @@ def reply_line(robot: str, verb: Verb, reply: Reply, driver: str = "") -> str:
     """Format the answer to a request, with the next command for the operator.
 
     Args:
+        robot: robot id.
+        verb: the request.
+        reply: reply of the robot.
         driver: source that holds the lease, or "".
+
+    Returns:
+        One line.
     """
     if not reply.ok:
         reason, _, words = reply.detail.partition(": ")
@@ -37,7 +43,7 @@ def reply_line(robot: str, verb: Verb, reply: Reply, driver: str = "") -> str:
 
 
 def short_lines(robot: str, status: Status) -> Iterator[str]:
-    """Format what an operator needs at a glance, in the columns of `status_lines`."""
+    """Format the most important fields, in the columns of `status_lines`."""
     yield f"robot     {robot}"
     yield f"state     {status.state}: {status.reason}"
     yield f"driver    {status.holder.source if status.holder else 'none'}"
@@ -83,7 +89,7 @@ def status_lines(robot: str, status: Status) -> Iterator[str]:
 
 
 def stream_is_whole(stream: StreamStatus) -> bool:
-    """Return whether images are encoded as configured: the link carries them in full."""
+    """Return True if the robot sends the images as configured, because the link carries them in full."""
     return stream.quality_percent == stream.scale_percent == 100
 
 
@@ -112,7 +118,7 @@ def rejections_text(status: Status) -> str:
 
 
 def twist_text(twist: tuple[float, float]) -> str:
-    """Format (m/s, rad/s) with signs, which show forward and left."""
+    """Format a twist in m/s and rad/s with signs, which show forward and left."""
     return f"{twist[0]:+.2f} m/s {twist[1]:+.2f} rad/s"
 
 

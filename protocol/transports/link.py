@@ -34,7 +34,14 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """Raw bytes from the wire. `source` is the role in the key, "" from a robot. `header` may be empty."""
+    """Raw bytes from the wire.
+
+    Args:
+        channel: the channel.
+        source: role in the key; "" from a robot.
+        header: encoded header, at most 512 bytes, may be empty.
+        payload: encoded payload, within the bound of the channel.
+    """
 
     channel: Channel
     source: str
@@ -117,7 +124,15 @@ class OutgoingQueue(Generic[Item]):
         return len(self._items)
 
     def put(self, message: Message, item: Item) -> bool:
-        """Queue `item` for `message`. Returns False if it was dropped. Never blocks."""
+        """Queue an item. Never blocks.
+
+        Args:
+            message: decides place and order: its channel, source and verb.
+            item: the form in which the transport sends the message.
+
+        Returns:
+            False if the queue dropped the item.
+        """
         channel = message.channel
         verb = request_verb(message.payload) if channel is REQUEST else None
         place = _Place(rank(channel, verb), channel.name, message.source, verb)
@@ -140,7 +155,14 @@ class OutgoingQueue(Generic[Item]):
             return self._items.pop(self._next()) if self._items else None
 
     def flush(self, send: Callable[[Item], bool]) -> bool:
-        """Pass items to `send`, the most urgent first, until it returns False. Returns True for an empty queue."""
+        """Send items, the most urgent first.
+
+        Args:
+            send: sends one item; returns False if the transport has no room. The item then stays in the queue.
+
+        Returns:
+            True if the queue is empty now.
+        """
         with self._lock:
             while self._items:
                 place = self._next()
@@ -214,7 +236,8 @@ class Link(Closing):
 
         Args:
             channel: the channel.
-            callback: called on a transport thread. An error in it is counted and ends nothing.
+            callback: called on a transport thread, so it must only store the message. The link counts an error in it
+                and continues.
         """
 
     @abstractmethod
@@ -236,7 +259,11 @@ class Link(Closing):
         return Counter()
 
     def latest(self, channel: Channel) -> LatestSlot[Message]:
-        """Subscribe to `channel` and return a slot that holds its newest message."""
+        """Subscribe to `channel` with a slot.
+
+        Returns:
+            The slot. It holds the newest message that no thread took.
+        """
         slot: LatestSlot[Message] = LatestSlot()
         self.subscribe(channel, slot.put)
         return slot
@@ -255,7 +282,14 @@ class FleetLink(Closing):
 
     @abstractmethod
     def link(self, robot: str) -> Link:
-        """Return a link to `robot`, which closes with this one."""
+        """Return a link to one robot. It closes with this one.
+
+        Args:
+            robot: robot id, also of a robot without a message so far.
+
+        Raises:
+            ConfigError: the robot id is invalid.
+        """
 
 
 class LinkWrapper(Link):
@@ -337,7 +371,15 @@ class LinkRules:
         return min(channel.max_payload_bytes, self._max_frame_bytes) if channel is FRAME else channel.max_payload_bytes
 
     def key(self, channel: Channel, source: str = "") -> str:
-        """Return the key for publishing. Toward the robot `source` defaults to the role; ValueError without one."""
+        """Return the key for publishing.
+
+        Args:
+            channel: the channel.
+            source: role of the sender toward the robot. The default is the role of the link.
+
+        Raises:
+            ValueError: the channel needs a source, and the link has no role.
+        """
         return key_for(self.robot, channel, source or (self.role if channel.has_source else ""))
 
     def check(self, channel: Channel, header: bytes, payload: bytes) -> None:
@@ -352,7 +394,15 @@ class LinkRules:
     def deliver(
         self, channel: Channel, key: str, header: bytes, payload: bytes, callback: Callable[[Message], None]
     ) -> None:
-        """Pass the message to `callback` if its key is exact and its parts are within bounds. Never raises."""
+        """Pass the message to `callback` if its key is exact and its parts are within bounds. Never raises.
+
+        Args:
+            channel: channel of the subscription.
+            key: key of the message on the wire.
+            header: header bytes.
+            payload: payload bytes.
+            callback: callback of the subscription.
+        """
         parsed = parse_key(key)
         if parsed is None or parsed[0] != self.robot or parsed[1] is not channel:
             self.reject(INEXACT_KEY)

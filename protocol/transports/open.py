@@ -49,6 +49,9 @@ def open_link(
         secure: folder from `sightline keys`, or "".
         session: session id of this end, 8 hex digits, if it has published one already.
 
+    Returns:
+        The link; with endpoints of several transports a link over all of them.
+
     Raises:
         ConfigError: an argument is invalid, or an optional package is missing.
         LinkError: an endpoint cannot be opened or reached. No endpoint stays open then.
@@ -126,7 +129,7 @@ class LinkGroup(Link):
 
 
 class Relay:
-    """Passes messages on between links, as the table of channels defines. Overlays need a viewer on another link."""
+    """Forwards messages between links, as the table of channels defines. Overlays need a viewer on another link."""
 
     def __init__(self, link: Link) -> None:
         """Start with the channels that are always passed on."""

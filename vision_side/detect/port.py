@@ -34,19 +34,26 @@ def is_followable(label: str, wanted: str) -> bool:
 
 
 def is_label(text: str) -> bool:
-    """Return True if the wire accepts the label unchanged."""
+    """Return True if the wire accepts the label unchanged: 1 to 64 printable characters."""
     return 0 < len(text) <= LONGEST_LABEL and text.isprintable()
 
 
 def clean_label(text: str) -> str:
-    """Convert `text` to a valid label: one printable line, bounded, never empty."""
+    """Convert a text to a valid label.
+
+    Args:
+        text: label of a model, any characters and length.
+
+    Returns:
+        The first 64 printable characters, or "thing" for a text without any.
+    """
     return "".join(letter for letter in text if letter.isprintable())[:LONGEST_LABEL] or "thing"
 
 
 # The detector port: `Detector`, its frames and its results. Pure.
 #
-# A `DetectionResult` without detections means "saw nothing". None means "no answer". Only the first may start a search.
-# After the second, the vision service does not steer, and the robot holds.
+# A `DetectionResult` without detections means "detected nothing", and may start a search. None means "no answer". After
+# it the vision service does not steer, and the robot holds.
 
 
 NO_DEADLINE: Final = 2**63 - 1
@@ -55,7 +62,13 @@ NO_DEADLINE: Final = 2**63 - 1
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A circle in pixels of the encoded image."""
+    """A circle in pixels of the encoded image.
+
+    Args:
+        cx_px: center, from the left edge.
+        cy_px: center, from the top edge.
+        radius_px: radius, over 0.
+    """
 
     cx_px: float
     cy_px: float
@@ -123,7 +136,14 @@ class DetectFrame:
         self.goes_by: LabelTest = _any_label  # the pipeline sets the test of the robot's mission
 
     def picture(self) -> DecodedImage:
-        """Return the pixels. Raises WireError MALFORMED unless the image has the size of the camera."""
+        """Decode the image at the first call.
+
+        Returns:
+            The pixels, at half scale from 640x480 up. They are valid until the decoder decodes another image.
+
+        Raises:
+            WireError: MALFORMED for an image that does not decode, or not of the size of the camera.
+        """
         if self._picture is None:
             self._picture = self._decoder.decode(self.jpeg)
         return self._picture
@@ -136,7 +156,13 @@ class DetectFrame:
 
 @dataclass(frozen=True, slots=True)
 class Maker:
-    """The origin of a result: name of the detector, first 16 digits of its model's SHA-256, and device."""
+    """The origin of a result.
+
+    Args:
+        detector: name of the detector, at most 64 characters.
+        model_hash: first 16 hex digits of the model's SHA-256, or "" without a model.
+        device: device that it runs on, e.g. "cpu", at most 32 characters.
+    """
 
     detector: str
     model_hash: str = ""
@@ -145,7 +171,21 @@ class Maker:
 
 @dataclass(frozen=True, slots=True)
 class DetectionResult:
-    """The detections in one frame, best first. It names that frame field for field."""
+    """The detections in one frame. The result names that frame field for field.
+
+    Args:
+        robot: robot id.
+        session: session of the robot, as in the header of the frame.
+        seq: number of the frame in the session.
+        t_us: capture time, us of the robot's clock.
+        width_px: width of the encoded image.
+        height_px: height of the encoded image.
+        detections: objects, best first, at most 64.
+        detector: name of the detector.
+        model_hash: first 16 hex digits of the model's SHA-256, or "".
+        device: device of the detector, or "".
+        compute_us: computing time, us.
+    """
 
     robot: str
     session: str
@@ -163,7 +203,7 @@ class DetectionResult:
 class Detector(Protocol):
     """Finds objects in frames of one or more robots.
 
-    A detector class has a pydantic `Config` and is built as `Plugin(config)`. Optional members:
+    A detector class has a pydantic `Config`. Sightline creates it as `Plugin(config)`. Optional members:
 
         notices()     returns new short lines for the operator
         maker         the `Maker` of its results
@@ -180,8 +220,8 @@ class Detector(Protocol):
             deadline_us: end on this machine's monotonic clock, for a detector that waits for a service.
 
         Returns:
-            One result per frame, in the same order. None means "no answer", never "saw nothing". Boxes are inside the
-            image.
+            One result per frame, in the same order. None means "no answer", never "detected nothing". Boxes are inside
+            the image.
         """
         ...
 
@@ -204,6 +244,9 @@ def result_of(
         detections: objects, best first.
         maker: origin of the result.
         compute_us: computing time, us.
+
+    Returns:
+        The result, which names the frame.
     """
     header = frame.header
     return DetectionResult(frame.robot, header.session, header.seq, header.t_us, frame.width_px, frame.height_px,
@@ -211,7 +254,16 @@ def result_of(
 
 
 def clipped(one: Detection, width_px: int, height_px: int) -> Detection | None:
-    """Clip a box to the image. Returns None for a box outside of it."""
+    """Clip a box to the image.
+
+    Args:
+        one: detection in pixels of the encoded image.
+        width_px: width of the image.
+        height_px: height of the image.
+
+    Returns:
+        The detection with its box inside the image, or None for a box outside of it.
+    """
     # With this order of arguments a nan stays a nan, and fails the comparison below.
     x1, y1 = max(one.x1_px, 0.0), max(one.y1_px, 0.0)
     x2, y2 = min(one.x2_px, float(width_px)), min(one.y2_px, float(height_px))
@@ -230,12 +282,20 @@ Corners = tuple[float, float, float, float]
 
 
 def corners(one: Detection) -> Corners:
-    """Return the corners of its box."""
+    """Return the corners of a detection's box, px."""
     return one.x1_px, one.y1_px, one.x2_px, one.y2_px
 
 
 def overlap(one: Corners, other: Corners) -> float:
-    """Return the intersection over union of two boxes, 0 to 1."""
+    """Compute the intersection over union of two boxes.
+
+    Args:
+        one: corners, px.
+        other: corners in the same image, px.
+
+    Returns:
+        0 for boxes without a common area, to 1 for equal boxes.
+    """
     width = min(one[2], other[2]) - max(one[0], other[0])
     height = min(one[3], other[3]) - max(one[1], other[1])
     if width <= 0 or height <= 0:

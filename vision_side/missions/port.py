@@ -1,7 +1,7 @@
-"""The mission port: `Mission`, what it may go by (`View`), and what it answers (`Plan`). Pure.
+"""The mission port: `Mission`, its input (`View`) and its output (`Plan`). Pure.
 
-A mission is a plug-in: a class with a pydantic `Config`, built as `Plugin(config, camera)`. It knows no clock but the
-frames' capture times, so the same frames give the same plans, byte for byte.
+A mission is a plug-in: a class with a pydantic `Config`. Sightline creates it as `Plugin(config, camera)`. A mission
+uses only the capture times of the frames as clock, so the same frames give the same plans, byte for byte.
 """
 
 from dataclasses import dataclass
@@ -19,8 +19,16 @@ from sightline.vision_side.detect.port import Detection
 class RangeScan:
     """One turn of a range sensor: `ranges_m[i]` at `angle_min_rad + i * angle_increment_rad`, inf = nothing, never NaN.
 
-    Angles start at the robot's x axis, counter-clockwise positive. Distances start at the sensor, whose position the
-    robot does not publish.
+    Angles start at the robot's x axis, counter-clockwise positive. Distances start at the sensor. The robot does not
+    publish the position of the sensor.
+
+    Args:
+        t_us: time of the scan, us of the robot's clock.
+        angle_min_rad: angle of the first ray, rad.
+        angle_increment_rad: angle between two rays, rad.
+        range_min_m: smallest distance that the sensor measures, m.
+        range_max_m: largest distance that the sensor measures, m.
+        ranges_m: (rays,), one distance per ray, m.
     """
 
     t_us: int
@@ -42,8 +50,9 @@ class View:
     latency_s: float
     """Estimated time from capture to wheels, s."""
     camera: CameraModel
+    """Model of the camera at the size of this frame."""
     detections: tuple[Detection, ...]
-    """Detections, best first. Empty means "saw nothing"."""
+    """Detections, best first. Empty means "detected nothing"."""
     picture: DecodedImage | None = None
     """Decoded pixels, valid only during the step. None if another service detects."""
     scan: RangeScan | None = None
@@ -60,7 +69,7 @@ class Plan:
         note: the rest of the line for the operator.
         done: True ends the mission; the robot stays where it is.
         target: the detection that it follows, if any.
-        bearing_rad: bearing of the target, left positive.
+        bearing_rad: bearing of the target, rad, left positive.
         distance_m: distance of the target, m.
     """
 
@@ -85,5 +94,8 @@ class Mission(Protocol):
 
         Args:
             view: the frame, the detections and the newest scan.
+
+        Returns:
+            The twist in m/s and rad/s, with its reason for the operator. The robot's gate limits the twist.
         """
         ...
