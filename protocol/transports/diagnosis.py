@@ -21,13 +21,28 @@ _LISTEN: Final = "0A"
 
 
 def port_owner(port: int) -> str:
-    """`python3 (pid 4711)` for the process listening on TCP `port`; "" where that cannot be found out."""
+    """Find the process that listens on a TCP port.
+
+    Args:
+        port: local port.
+
+    Returns:
+        Name and number, e.g. `python3 (pid 4711)`, or "" if the system does not show it.
+    """
     sockets = {f"socket:[{row[9]}]" for row in _rows({port}) if row[3] == _LISTEN}
     return process_with_open(sockets) if sockets else ""
 
 
 def process_with_open(files: Collection[str], besides: int = 0) -> str:
-    """`python3 (pid 4711)` for a process that has one of `files` open, `besides` left out; "" where none is found."""
+    """Find a process that has one of the files open.
+
+    Args:
+        files: targets of the links in `/proc/PID/fd`.
+        besides: number of a process to skip.
+
+    Returns:
+        Name and number, e.g. `python3 (pid 4711)`, or "" without such a process.
+    """
     for process in Path("/proc").glob("[0-9]*"):
         if process.name != str(besides) and any(_target(link) in files for link in _descriptors(process)):
             return f"{_name(process)} (pid {process.name})"
@@ -39,7 +54,8 @@ def unresolved_host(hosts: Iterable[str]) -> str:
     for host in hosts:
         try:
             socket.getaddrinfo(host, None)
-        except (socket.gaierror, UnicodeError):  # a label of more than 63 characters cannot be encoded
+        # UnicodeError: Python cannot encode a label of more than 63 characters.
+        except (socket.gaierror, UnicodeError):
             return host
     return ""
 
@@ -52,7 +68,7 @@ def connections(ports: Collection[int]) -> Counter[str]:
 
 
 def _rows(ports: Collection[int]) -> list[list[str]]:
-    """The table's rows whose local port is one of `ports`."""
+    """Return the rows of the table whose local port is one of `ports`."""
     rows: list[list[str]] = []
     for table in ("tcp", "tcp6"):
         try:
@@ -63,7 +79,8 @@ def _rows(ports: Collection[int]) -> list[list[str]]:
 
 
 def _host(address: str) -> str:
-    """The table has each 32 bits of an address in the machine's own byte order, in hex digits."""
+    """Convert an address of the table to text."""
+    # The table has each 32 bits in the byte order of the machine, in hex digits.
     digits = address.rpartition(":")[0]
     words = [bytes.fromhex(digits[start:start + 8])[::-1] for start in range(0, len(digits), 8)]
     host = ipaddress.ip_address(b"".join(words))
@@ -71,7 +88,7 @@ def _host(address: str) -> str:
 
 
 def _descriptors(process: Path) -> list[Path]:
-    """The process's open files; none if it is gone or not ours to look at."""
+    """Return the open files of a process, or none if it is gone or belongs to another user."""
     try:
         return list((process / "fd").iterdir())
     except OSError:

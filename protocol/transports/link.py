@@ -55,7 +55,8 @@ class LatestSlot(Generic[Item]):
     def __init__(self) -> None:
         # Two plain locks: a condition would wake the taker a third slower, on the path of every frame and command.
         self._guard = threading.Lock()
-        self._full = threading.Lock()  # free while there is an item; the thread that acquires it takes the item
+        # Free while there is an item. The thread that acquires it takes the item.
+        self._full = threading.Lock()
         self._full.acquire()
         self._item: Item | None = None
         self.dropped = 0
@@ -117,7 +118,8 @@ class OutgoingQueue(Generic[Item]):
         self._max_items = max_items
         self._lock = threading.Lock()
         self._items: dict[_Place, Item] = {}
-        self.dropped = Counter(dict.fromkeys(CHANNELS, 0))  # fixed keys, so that other threads may read it
+        # Fixed keys, so that other threads may read it without the lock.
+        self.dropped = Counter(dict.fromkeys(CHANNELS, 0))
         """Items that were replaced before they were sent, or found no place, by channel."""
 
     def __len__(self) -> int:
@@ -166,6 +168,7 @@ class OutgoingQueue(Generic[Item]):
         with self._lock:
             while self._items:
                 place = self._next()
+                # The item leaves the queue only after it was sent, so that a full transport loses no STOP.
                 if not send(self._items[place]):
                     return False
                 del self._items[place]
@@ -403,6 +406,7 @@ class LinkRules:
             payload: payload bytes.
             callback: callback of the subscription.
         """
+        # A subscription with a wildcard also matches keys with a wildcard, which a third party may publish.
         parsed = parse_key(key)
         if parsed is None or parsed[0] != self.robot or parsed[1] is not channel:
             self.reject(INEXACT_KEY)
@@ -419,7 +423,8 @@ class LinkRules:
     def _call(self, callback: Callable[[Message], None], message: Message) -> None:
         try:
             callback(message)
-        except Exception:  # an error in a callback must not end the thread of the transport
+        # An error in a callback must not end the thread of the transport, which serves all channels.
+        except Exception:
             with self._counting:
                 self.callback_errors += 1
 

@@ -63,6 +63,7 @@ class _Way:
         lost, jitter_us = self._loses(self._random.random()), int(self._random.random() * (self._leg.jitter_us + 1))
         if lost:
             return None
+        # Never before the message ahead of it, because a TCP connection delivers in order.
         self._last_due_us = max(self._last_due_us, now_us + self._leg.delay_us + jitter_us)
         return self._last_due_us
 
@@ -150,6 +151,8 @@ class MemoryNetwork:
 
     def leave(self, link: "MemoryLink") -> None:
         """Remove `link` and all messages in flight to it."""
+        # Messages to a closed link must not arrive at a later link of the same robot. Its streams go too, so that the
+        # number of ways stays bounded over many restarts.
         self._links = [other for other in self._links if other is not link]
         self._flights = [flight for flight in self._flights if flight.to is not link]
         heapq.heapify(self._flights)
@@ -184,7 +187,8 @@ class MemoryNetwork:
         due_us = self._way(packet, to).due_us(self.now_us)
         if due_us is None:
             self.dropped[packet.direction.name] += 1
-            return True  # a sender does not learn of a loss
+            # The result is as for a delivered message, because a real sender does not learn of a loss.
+            return True
         if len(self._flights) >= MAX_IN_FLIGHT:
             self.dropped["overflow"] += 1
             return False
@@ -246,6 +250,7 @@ class MemoryLink(BaseLink):
 
     def receive(self, key: str, header: bytes, payload: bytes) -> None:
         """Deliver an arrived message. Each subscription checks it, as on Zenoh."""
+        # A copy, because a callback may subscribe or unsubscribe.
         for channel, pattern, callback in tuple(self._callbacks):
             if "*" in key or _matches(pattern, key):
                 self._rules.deliver(channel, key, header, payload, callback)

@@ -59,7 +59,9 @@ def open_link(
     options: dict[str, Any] = {"role": role, "timeout_s": timeout_s, "max_frame_bytes": max_frame_bytes}
     web, zenoh = ([_of_kind(ends, is_web) for ends in (listen, connect)] for is_web in (True, False))
     links: list[Link] = []
+    # If one endpoint fails, the others must not stay open, because the robot would answer on one transport only.
     with ExitStack() as undo:
+        # Without any endpoint Zenoh prints the error, because it is the default transport.
         if any(zenoh) or not any(web):
             from sightline.protocol.transports.zenoh.link import open_zenoh
 
@@ -90,6 +92,7 @@ class LinkGroup(Link):
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
         """Publish on all links. Returns True if at least one accepted the message."""
+        # A list, not a generator: `any` would stop at the first link that accepts, and the others would get nothing.
         taken = [link.publish(channel, header, payload, source) for link in self.links]
         return any(taken)
 

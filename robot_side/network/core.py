@@ -104,6 +104,7 @@ class NetworkCore:
             self._answer(who, header.echo.seq, header.compute_us, now_us)
 
     def _answer(self, who: Holder, seq: int, compute_us: int, now_us: int) -> None:
+        # An answer to a frame that does not exist yet must not return credit.
         if seq < self._seq:
             self._stream.on_answer(who, seq, compute_us, now_us)
 
@@ -115,7 +116,8 @@ class NetworkCore:
         try:
             followed = camera.adjust(*target)
         except HardwareError:
-            return  # reading reports it
+            # `Camera.read` reports it. The next call tries again, because `_requested` is unchanged.
+            return
         self._requested = target
         if followed:
             self._applied = target

@@ -1,9 +1,9 @@
 """Position over the floor of a detection: a sphere by its outline, a box by its size. Pure.
 
-A sphere projects to an ellipse, not to a circle about its centre. Its outline rays do form a circular cone: for every
-unit ray u, u . c = cos(alpha) with c towards the centre, and the centre is at radius / sin(alpha). So u . w = 1, or
-p . w = |p| for any point p of the ray, is linear in w = c / cos(alpha), exact at any angle off the axis, and holds for
-whatever part of the outline is in view.
+A sphere projects to an ellipse, not to a circle about its center. Its outline rays form a circular cone. For every unit
+ray u, u . c = cos(alpha) with c toward the center, and the center is at radius / sin(alpha). So u . w = 1, or
+p . w = |p| for any point p of the ray, is linear in w = c / cos(alpha). The equation is exact at any angle off the
+axis, and holds for each part of the outline that is in view.
 """
 
 import math
@@ -33,7 +33,13 @@ _BOX_ANGLES = np.linspace(0.0, 2 * math.pi, 24, endpoint=False)
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A target's centre over the floor, from the axle's midpoint: `x_m` forward, `y_m` left."""
+    """The center of a target over the floor, from the midpoint of the axle.
+
+    Args:
+        x_m: forward.
+        y_m: left.
+        detection: its detection.
+    """
 
     x_m: float
     y_m: float
@@ -56,10 +62,10 @@ def locate_sphere(detection: Detection, camera: CameraModel, radius_m: float) ->
     outline = detection.outline_px if detection.outline_px is not None else _box_outline(detection, camera)
     if len(outline) < _MIN_POINTS:
         return None
-    centre = _cone_centre(points_ahead(outline, camera), radius_m)
-    if centre is None:
+    center = _cone_center(points_ahead(outline, camera), radius_m)
+    if center is None:
         return None
-    right, down, ahead = centre
+    right, down, ahead = center
     tilt_cos, tilt_sin = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)
     x_m = camera.x_m + ahead * tilt_cos + down * tilt_sin
     return Sighting(x_m, camera.y_m - right, detection)
@@ -94,13 +100,13 @@ def _pinhole(cx_px: float, cy_px: float, fx_px: float, fy_px: float) -> tuple[Co
 
 
 def _opencv_distortion(camera: CameraModel) -> NDArray[np.float64]:
-    """OpenCV takes 4, 5 or 8 coefficients; the missing ones are zero."""
+    """Extend the coefficients with zeros to 4, 5 or 8, the numbers that OpenCV takes."""
     count = next(size for size in (4, 5, 8) if len(camera.distortion) <= size)
     return np.array(camera.distortion + (0.0,) * (count - len(camera.distortion)))
 
 
-def _cone_centre(points: NDArray[np.float64], radius_m: float) -> tuple[float, float, float] | None:
-    """Least squares of p . w = |p|, then the centre at radius / sin(alpha) along w. `points` are columns p, |p|."""
+def _cone_center(points: NDArray[np.float64], radius_m: float) -> tuple[float, float, float] | None:
+    """Solve p . w = |p| by least squares. The center is at radius / sin(alpha) along w. `points` are columns p, |p|."""
     w = _solved(points)
     for _ in range(_TRIMS):
         if w is None:
@@ -117,13 +123,16 @@ def _cone_centre(points: NDArray[np.float64], radius_m: float) -> tuple[float, f
     right, down, ahead = w
     square = right * right + down * down + ahead * ahead
     if not 1.0 < square < math.inf or ahead <= 0:
-        return None  # not a cone that opens forward
-    per_w = radius_m / math.sqrt(square - 1.0)  # radius / sin(alpha), by the length of w
+        # Not a cone that opens forward.
+        return None
+    # radius / sin(alpha), by the length of w.
+    per_w = radius_m / math.sqrt(square - 1.0)
     return right * per_w, down * per_w, ahead * per_w
 
 
 def _solved(points: NDArray[np.float64]) -> tuple[float, float, float] | None:
-    """w of the normal equations, by cofactors, several times faster than a call of LAPACK; None if singular."""
+    """Solve the normal equations for w. Returns None if they are singular."""
+    # By cofactors, which is several times faster than a call of LAPACK.
     (a, b, c, x), (_, d, e, y), (_, _, f, z), _ = (points @ points.T).tolist()
     aa, ab, ac = d * f - e * e, c * e - b * f, b * e - c * d
     bb, bc, cc = a * f - c * c, b * c - a * e, a * d - b * b
@@ -135,7 +144,7 @@ def _solved(points: NDArray[np.float64]) -> tuple[float, float, float] | None:
 
 
 def _box_outline(detection: Detection, camera: CameraModel) -> NDArray[np.float64]:
-    """The ellipse in a detector's box, less what the picture's border cut off."""
+    """Return the ellipse in a detector's box, without the points at the border of the image."""
     cx, cy = (detection.x1_px + detection.x2_px) / 2, (detection.y1_px + detection.y2_px) / 2
     half_width, half_height = (detection.x2_px - detection.x1_px) / 2, (detection.y2_px - detection.y1_px) / 2
     points = np.column_stack([cx + half_width * np.cos(_BOX_ANGLES), cy + half_height * np.sin(_BOX_ANGLES)])
@@ -157,23 +166,31 @@ _EDGE_PX = 1.0
 
 
 class BoxReader:
-    """Reads one source's boxes against the frames that came here."""
+    """Reads the boxes of one source, which name frames that this service received."""
 
     def __init__(self, config: BoxesConfig) -> None:
         self._config = config
         self._frames: OrderedDict[tuple[str, int], FrameHeader] = OrderedDict()
 
     def remember(self, frame: FrameHeader) -> None:
-        """A frame that boxes may name."""
+        """Store a frame that boxes may name."""
         self._frames[frame.session, frame.seq] = frame
         if len(self._frames) > REMEMBERED:
             self._frames.popitem(last=False)
 
     def read(self, header: bytes, payload: bytes, camera: CameraModel) -> tuple[FrameHeader, tuple[Detection, ...]]:
-        """The frame that was looked at, and what is meant in it, surest first; empty is "saw nothing".
+        """Decode boxes. The pipeline checks that their frame is newer than the last one.
 
-        Raises WireError: MALFORMED, UNSUPPORTED_VERSION, or UNKNOWN_FRAME for boxes of no frame known here. The
-        pipeline checks that the frame is newer than the last one.
+        Args:
+            header: header bytes.
+            payload: payload bytes.
+            camera: model of the camera, whose size the boxes must have.
+
+        Returns:
+            The frame that they name, and the detections of the target, best first. Empty means "detected nothing".
+
+        Raises:
+            WireError: MALFORMED, UNSUPPORTED_VERSION, or UNKNOWN_FRAME for a frame that this service does not have.
         """
         stamp = decode(DetectionsHeader, header)
         found = decode(Detections, payload, DETECTIONS.max_payload_bytes)
@@ -203,18 +220,26 @@ def _detection(box: DetectedBox) -> Detection:
 
 
 def locate_box(one: Detection, camera: CameraModel, config: BoxesConfig, otherwise_m: float) -> Sighting | None:
-    """Locate the object in a box: its bearing, and its range if its size is known and the box is fully in view.
+    """Locate the object in a box by its bearing, and by its size if the box is fully in view.
 
-    `otherwise_m` is the assumed distance from the lens otherwise. Returns None for an empty box.
+    Args:
+        one: detection in px of the encoded image.
+        camera: model of this image.
+        config: size of the object, m.
+        otherwise_m: assumed distance from the lens if the size is unknown, m.
+
+    Returns:
+        Its center over the floor, or None for an empty box.
     """
     (left, middle), (right, _), (across, top), (_, bottom) = _edges(one, camera)
     ahead_m = _range(right - left, bottom - top, one, camera, config)
     tilt_cos, tilt_sin = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)
-    forward = tilt_cos + middle * tilt_sin  # over the floor, for each metre along the lens's axis
+    # Over the floor, for each meter along the axis of the lens.
+    forward = tilt_cos + middle * tilt_sin
     if forward <= 0 or right <= left or bottom <= top:
         return None
-    per_metre = math.hypot(forward, across)
-    ahead_m = otherwise_m / per_metre if ahead_m is None else ahead_m
+    per_meter = math.hypot(forward, across)
+    ahead_m = otherwise_m / per_meter if ahead_m is None else ahead_m
     return Sighting(camera.x_m + ahead_m * forward, camera.y_m - ahead_m * across, one)
 
 
@@ -227,7 +252,7 @@ def _edges(one: Detection, camera: CameraModel) -> list[list[float]]:
 
 
 def _range(width: float, height: float, one: Detection, camera: CameraModel, config: BoxesConfig) -> float | None:
-    """Metres along the lens's axis, by the configured height or else width; None if neither is wholly in view."""
+    """Return the meters along the axis of the lens, by the configured height or else width, if it is fully in view."""
     whole_height = one.y1_px >= _EDGE_PX and one.y2_px <= camera.height_px - _EDGE_PX
     whole_width = one.x1_px >= _EDGE_PX and one.x2_px <= camera.width_px - _EDGE_PX
     if config.height_m is not None and whole_height and height > 0:

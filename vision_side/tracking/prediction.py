@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from sightline.protocol.messages import Pose, Twist
 from sightline.vision_side.config import LatencyConfig
 
+# About half a frame at 30 fps, so that the heading changes little within a step.
 _STEP_S = 0.015
 _STILL = 1e-6
-_REMEMBERED = 64  # commands: two seconds at 30 fps, five times the longest latency
+# Commands: two seconds at 30 fps, five times the longest latency.
+_REMEMBERED = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +108,7 @@ class MotionPredictor:
                 step_s = length_s / steps
                 linear += _bounded(goal[0] - linear, self._config.linear_acceleration_mps2 * step_s)
                 angular += _bounded(goal[1] - angular, self._config.angular_acceleration_rad_s2 * step_s)
+                # The heading in the middle of the step, so that an arc ends where it should.
                 middle = yaw + angular * step_s / 2
                 x, y = x + linear * math.cos(middle) * step_s, y + linear * math.sin(middle) * step_s
                 yaw += angular * step_s
@@ -122,6 +125,7 @@ class MotionPredictor:
                 until_s = from_s
             if from_s == 0.0:
                 break
+        # Before the oldest known command, e.g. after a restart, only the measured motion is known.
         if until_s > 0.0:
             spans.append((until_s, moving))
         return spans[::-1]

@@ -61,6 +61,7 @@ class Steer:
             linear_mps: applied minus commanded speed.
             angular_rad_s: applied minus commanded turn rate.
         """
+        # At most the whole difference. With more, a long pause between frames would reverse the integrals.
         share = min(1.0, self._config.back_calculation_hz * dt_s)
         self._add(share * linear_mps, share * angular_rad_s)
 

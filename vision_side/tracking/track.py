@@ -12,7 +12,8 @@ from sightline.protocol.messages import Pose
 from sightline.vision_side.config import TrackConfig
 from sightline.vision_side.tracking.locate import Sighting
 
-_FIRST_SPEED_MPS = 0.3  # 1 sigma of the speed of a new target
+# 1 sigma of the speed of a new target.
+_FIRST_SPEED_MPS = 0.3
 # A sighting three sigma off means that the target was pushed. Without more variance the filter would lag behind it.
 _SURPRISE = 9.0
 _PUSHED_MPS = 0.4
@@ -91,6 +92,7 @@ class Track:
         position, both, velocity = self._variance
         dx, dy = seen[0] - target.x_m, seen[1] - target.y_m
         if dx * dx + dy * dy > _SURPRISE * 2 * (position + noise):
+            # The larger variances let this sighting move the estimate most of the way.
             velocity += _PUSHED_MPS**2
             position += (position + noise)
         gain, gain_velocity = position / (position + noise), both / (position + noise)

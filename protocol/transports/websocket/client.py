@@ -66,6 +66,8 @@ class Client:
         while not self._closing.is_set():
             if self._connect():
                 pause_s = FIRST_PAUSE_S
+            # A short first pause, because most losses are a restart of the robot. A longer one later, so that many
+            # clients do not flood a robot that starts.
             self._closing.wait(pause_s)
             pause_s = min(LONGEST_PAUSE_S, pause_s * PAUSE_GROWTH)
 
@@ -95,7 +97,8 @@ class Client:
             self._turned_away(f"no TLS: {why}; use the ca.pem of its authority in --secure", True)
         except OSError:  # no listener, or no answer in time
             self.trouble = ""
-        except Exception as error:  # a broken peer can make the library raise any error; this thread must continue
+        # A broken peer can make the library raise any error. This thread must continue.
+        except Exception as error:
             self._turned_away(f"{type(error).__name__}: {error}"[:200], False)
         return False
 
@@ -110,6 +113,7 @@ class Client:
 
         end = self.endpoint
         near = socket.create_connection((end.host, end.port), OPEN_S)
+        # A small buffer, because a newer message cannot replace data that the kernel already holds.
         near.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         if self._context is not None:
             near = tls_handshake(near, self._context, end.host, time.monotonic() + OPEN_S)
@@ -122,6 +126,7 @@ class Client:
             **PROTOCOL_OPTIONS,
         )
         request = protocol.connect()
+        # In a header and not in the address, because proxies and servers log addresses.
         if self._token:
             request.headers["Authorization"] = bearer_header(self._token)
         protocol.send_request(request)
@@ -140,6 +145,7 @@ class Client:
         except PeerError as error:
             self._count_rejection(error.counted)
             wire.close(error.code, str(error))
+            # Without the wait, a reset of the connection could overtake the reason.
             wire.linger()
             raise
         finally:

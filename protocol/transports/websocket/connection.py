@@ -172,7 +172,8 @@ class MessageReader:
     def _collect(self, events: Sequence[Event]) -> None:
         for event in events:
             if not isinstance(event, self._frame_type):
-                self.ready.append(event)  # of the handshake
+                # A request or response of the handshake.
+                self.ready.append(event)
             elif event.opcode in self._messages:
                 self._add(event, event.opcode is self._texts, event.opcode is self._continued)
 
@@ -192,7 +193,8 @@ class MessageReader:
         try:
             self.ready.append(data.decode() if is_text else data)
         except UnicodeDecodeError as error:
-            self._is_broken = True  # later messages of the same bytes are already parsed
+            # Later messages of the same bytes are already parsed, and must not pass.
+            self._is_broken = True
             self._protocol.fail(1007, f"{error.reason} at position {error.start}")
 
 
@@ -223,9 +225,12 @@ def unmasked_head(size: int, is_text: bool) -> bytes:
 # Security limit: a connection that is closing is cut off after this.
 CLOSE_S: Final = 1.0
 _CHUNK_BYTES: Final = 65_536
-_SMALL_CHUNK_BYTES: Final = 4_096  # for small messages: a flood of them must not become one large batch of objects
-_MUCH_BYTES: Final = 32_768  # sent since the last data from the other end: so much may wait unread before the ping
-_MAX_UNSENT: Final = 12  # security limit: waiting pieces, e.g. pongs, before reading stops
+# For small messages. A flood of them must not become one large batch of objects.
+_SMALL_CHUNK_BYTES: Final = 4_096
+# Sent since the last data from the other end. So much may wait unread before the ping.
+_MUCH_BYTES: Final = 32_768
+# Security limit: waiting pieces, e.g. pongs, before reading stops.
+_MAX_UNSENT: Final = 12
 _MAX_REASON_BYTES: Final = 123  # RFC 6455, 5.5
 _NOT_NOW: Final = (BlockingIOError, InterruptedError, ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
@@ -237,6 +242,7 @@ class Connection:
         from websockets.protocol import SERVER, State
 
         near.setblocking(False)
+        # A twist is one small packet. With Nagle's algorithm it would wait for the acknowledgment of the packet before.
         near.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.protocol = protocol
         self.lock = threading.Lock()
@@ -277,6 +283,7 @@ class Connection:
         if events != self._awaited:
             self._readable.register(self._near, events)
             self._awaited = events
+        # TLS decrypts whole records, so data can wait in this process while the socket has none for `poll`.
         if isinstance(self._near, ssl.SSLSocket) and self._near.pending():
             return
         for descriptor, event in self._readable.poll(timeout_s * 1000):
@@ -404,12 +411,14 @@ class Connection:
     def shut(self) -> None:
         """Close the sockets."""
         with self.lock:
-            self._is_shut = True  # another socket may get the same descriptor number and must not be polled
+            # Another socket may get the same descriptor number. This connection must not poll it.
+            self._is_shut = True
             for end in (self._near, self._alarm, self._bell):
                 end.close()
 
     def _frame(self, pieces: Sequence[bytes], is_text: bool) -> None:
-        if self.protocol.state is not self._open:  # closing: the reading end reports how it ended
+        # The reading end reports how a closing connection ended.
+        if self.protocol.state is not self._open:
             return
         if self._is_server:
             whole = [unmasked_head(sum(map(len, pieces)), is_text), *(piece for piece in pieces if piece)]

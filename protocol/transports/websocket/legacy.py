@@ -122,6 +122,7 @@ class LegacyToVision:
             twist = parse_dashed(text, self._options.swapped) if self._options.dashed else parse_twist(text)
         except WireError:
             return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", text)
+        # Only a valid command claims the slot, so that a client with invalid text cannot stop the driver.
         self._claim_driver_slot()
         barred = format_twist(twist) if self._options.dashed else text
         return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", barred)
@@ -148,7 +149,8 @@ class LegacyToVision:
     def _acknowledgement(self) -> list[IncomingMessage]:
         sent, self._sent, self._looked_at = self._sent, None, None
         echo = _echo(sent[0]) if sent else None
-        if sent is None or echo is None:  # there is no credit to return
+        # Each image has one credit. A second answer to the same image returns none.
+        if sent is None or echo is None:
             return []
         self._answers += 1
         # The share of computing in the answer time is unknown. All of it counts as computing, so that the congestion
@@ -210,6 +212,7 @@ class LegacyToRobot:
             raise PeerError(BAD_FRAMING, 1003, "binary message; the legacy protocol is text: base64 images")
         jpeg = decode_picture(message.encode("utf-8", "surrogatepass"), self._max_frame_bytes)
         self._seq += 1
+        # Two messages of one read arrive in the same microsecond, but the time of a frame must rise.
         self._last_us = max(self._now_us(), self._last_us + 1)
         header = FrameHeader(session=self._session, seq=self._seq, t_us=self._last_us)
         return [IncomingMessage(f"{KEY_PREFIX}/{self._robot}/{FRAME.name}", encode(header), jpeg)]

@@ -291,6 +291,7 @@ class WebSocketLink(BaseLink):
             if self._closed:
                 return False
             self._peers = (*self._peers, peer)
+            # The hello that this peer received lacks a subscription since then.
             if announced != self._subscriptions.announced:
                 self._subscriptions.tell(peer)
             self._announce()
@@ -346,9 +347,11 @@ class WebSocketLink(BaseLink):
             return
         if not peer.admits(packet.key, self._rules.reject, self._tell):
             return
+        # A peer that sends twists drives, so its next frame must not wait behind the copies for the viewers.
         if parsed[1] is TWIST and self._peers[0] is not peer:
             self._put_first(peer)
         callbacks = self._subscriptions.of(parsed[1])
+        # Only a listening end forwards, because its peers have no other connection to each other.
         if parsed[1].passed_on and self._listeners:
             callbacks = (partial(self._pass_on, peer), *callbacks)
         self._in_callback.now = True

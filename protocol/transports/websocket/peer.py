@@ -76,7 +76,8 @@ NOT_GRANTED: Final = "NOT_GRANTED"
 # Assigns a place to a client of that role. Raises PeerError without a free place.
 Promote = Callable[[str], None]
 
-_TICK_US: Final = 250_000  # longest delay of a ping and of the detection of silence
+# Longest delay of a ping and of the detection of silence.
+_TICK_US: Final = 250_000
 _COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE}
 
 
@@ -102,7 +103,8 @@ class Peer:
         if self._wire.granted is None or said in self._wire.granted:
             return True
         refuse(NOT_GRANTED)
-        if said[0] != ACK.name:  # a viewer that acknowledges is harmless, and would fill the log
+        # A viewer that acknowledges is harmless, and would fill the log.
+        if said[0] != ACK.name:
             who = self._wire.address[0] or "a client"
             tell(f"rejected {'/'.join(said)} from {who}: the role of its token does not permit it "
                  "(docs/how-to/secure-the-link.md)")
@@ -124,7 +126,8 @@ class Peer:
         """Limit incoming messages to the largest payload that this end wants."""
         with self._wire.lock:
             self._wire.protocol.max_message_size = self._dialect.bound(wanted_bytes)
-        self._send()  # a thread that found the lock taken left its message to this one
+        # A thread that found the lock taken left its message to this one.
+        self._send()
 
     def run(self, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> None:
         """Read until the connection ends. A peer that breaks the rules is closed with the reason."""
@@ -150,10 +153,12 @@ class Peer:
         self, keepalive: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]
     ) -> bool:
         """Read all available messages, and send. Returns False if the connection has to end."""
-        now_us = monotonic_us()  # before reading, so that data counts that arrived during a pause of this process
+        # Before reading, so that data counts that arrived during a pause of this process.
+        now_us = monotonic_us()
         for message in self._wire.receive():
             self._read(message, deliver, refuse)
-        if now_us < self._look_us:  # the receiver of a message runs only when this thread waits
+        # The receiver of a message runs only when this thread waits, so this turn ends early.
+        if now_us < self._look_us:
             self._send()
             return True
         self._look_us = now_us + _TICK_US

@@ -124,7 +124,8 @@ def listening_socket(endpoint: WebSocketEndpoint) -> socket.socket:
         listening = socket.create_server((endpoint.host, endpoint.port), family=family)
     except OSError as error:
         raise _cannot_listen(endpoint, error) from None
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)  # accepted sockets inherit it
+    # Accepted sockets inherit it.
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
     return listening
 
 
@@ -152,8 +153,10 @@ TOO_MANY_CLIENTS: Final = "TOO_MANY_CLIENTS"
 # Counted for a client of wss:// whose TLS handshake fails.
 NO_TLS: Final = "NO_TLS"
 
-_GUEST: Final = "guest"  # has the certificate of a viewer, and may drive without keys
-_PAUSE_S: Final = 0.1  # after an accept that failed, e.g. without descriptors left
+# Has the certificate of a viewer, and may drive without keys.
+_GUEST: Final = "guest"
+# After an accept that failed, e.g. without descriptors left. Without it the thread would use a whole core.
+_PAUSE_S: Final = 0.1
 
 
 class KeyFolder(NamedTuple):
@@ -228,7 +231,8 @@ class Server:
         slot = self._connection_limits.admit(address)
         if slot is not None and self._is_begun(near, slot):
             return
-        self._reject(TOO_MANY_CLIENTS, address, "too many connections at once")
+        self._reject(TOO_MANY_CLIENTS, address, "too many connections")
+        # Without a reply, because a flood must not cost a thread and a handshake for each connection.
         near.close()
 
     def _is_begun(self, near: socket.socket, slot: Slot) -> bool:

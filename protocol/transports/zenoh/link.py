@@ -93,7 +93,8 @@ class ZenohLink(BaseLink):
         self._subscribers: defaultdict[str, list[zenoh.Subscriber[None]]] = defaultdict(list)
         self._ending = ExitStack()
         if not shared:
-            self._ending.callback(session.close)  # first in, so it runs last
+            # First in, so it runs last. The declarations below need an open session to end.
+            self._ending.callback(session.close)
         self._ending.callback(lambda: self._undeclare([one for some in self._subscribers.values() for one in some]))
         self._declaring = threading.Lock()
         self._in_callback = threading.local()
@@ -115,7 +116,8 @@ class ZenohLink(BaseLink):
         try:
             if self._is_kept(key, source):
                 self._outlet(key, channel).publisher.put(payload, attachment=header or None)
-            else:  # the message still passes, so that no source starves another; only no publisher is stored
+            # The message still passes, so that no source starves another. Only no publisher is stored.
+            else:
                 self._session.put(key, payload, attachment=header or None, **_options(channel))
         except zenoh.ZError:  # closed meanwhile
             return False
@@ -247,7 +249,8 @@ class _MatchedPublisher:
         ending.callback(self.publisher.undeclare)
         listener = self.publisher.declare_matching_listener(zenoh.handlers.Callback(self._note, indirect=False))
         ending.callback(listener.undeclare)
-        status: object = self.publisher.matching_status  # annotated as a bool, but it is a MatchingStatus: always true
+        # Annotated as a bool, but it is a MatchingStatus, which is always true.
+        status: object = self.publisher.matching_status
         self._at_first = bool(getattr(status, "matching", status))
 
     @property

@@ -192,6 +192,7 @@ def query_presence(session: zenoh.Session, timeout_s: float = REPLY_TIMEOUT_S) -
         PRESENCE_PATTERN, zenoh.handlers.FifoChannel(MAX_PEERS), target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s,
     )
+    # A broken or hostile peer may reply with anything, also more than once. Such replies do not count.
     for reply in replies:
         sample = reply.ok
         if sample is None or len(answers) >= MAX_PEERS:

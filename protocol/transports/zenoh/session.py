@@ -103,8 +103,10 @@ def open_session(
         import zenoh
     except ImportError:
         raise ConfigError(f"Zenoh is not installed: {install_command('zenoh')}") from None
-    zenoh.init_log_from_env_or("off")  # RUST_LOG, see docs/how-to/secure-the-link.md
-    logging.getLogger("zenoh").addHandler(logging.NullHandler())  # otherwise Python prints its warnings to the terminal
+    # RUST_LOG switches it on, see docs/how-to/secure-the-link.md.
+    zenoh.init_log_from_env_or("off")
+    # Without a handler Python prints the warnings of Zenoh to the terminal.
+    logging.getLogger("zenoh").addHandler(logging.NullHandler())
     try:
         return _open(session_config(listen, connect, timeout_s, secured))
     except zenoh.ZError as error:
@@ -131,7 +133,8 @@ def session_config(
     config = _session_config(listen, connect, timeout_s)
     if secured is not None:
         config["transport"]["link"]["tls"] = secured.tls_section()
-        if listen:  # the only peer of a client is a listening end, which applies the rules
+        # A client needs no rules, because its only peer is a listening end, which applies them.
+        if listen:
             config["access_control"] = secured.access_section()
             config["low_pass_filter"] = size_limit_section()
     return config
