@@ -1,1 +1,1 @@
-../../sightline/__init__.py
+"""Sightline: the public API."""

@@ -78,7 +78,7 @@ def test_every_row_has_a_picture_and_a_heading_of_its_own():
         assert len({key(row) for row in ROWS}) == len(ROWS)
 
 
-def test_every_behaviour_and_every_baseline_has_its_row():
+def test_every_behavior_and_every_baseline_has_its_row():
     basics = {"static", "circle", "eight", "pushed", "behind", "walls"}  # the performance page has these
     assert {row.scenario for row in ROWS} == set(scenario_names()) - basics
     assert {row.baseline for row in ROWS if row.baseline} == set(CHARACTER)

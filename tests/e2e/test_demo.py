@@ -58,7 +58,7 @@ def test_demo_drives_and_prints_json_for_a_script(driven):
 
 
 @pytest.mark.slow
-def test_the_twists_on_the_wire_come_again_from_the_recording(driven):
+def test_replay_gives_the_twists_of_the_wire(driven):
     folder, _ = driven
     script = (
         "import sys; from pathlib import Path; from sightline.operator_side.recording.replay import replay;"
@@ -71,7 +71,7 @@ def test_the_twists_on_the_wire_come_again_from_the_recording(driven):
 
 
 @pytest.mark.slow
-def test_it_leaves_pictures_that_open(driven):
+def test_demo_writes_images_that_open(driven):
     folder, _ = driven
     assert (folder / "trajectory.png").read_bytes().startswith(b"\x89PNG")
     film = (folder / "run.mp4").read_bytes()
@@ -86,7 +86,7 @@ def test_it_leaves_pictures_that_open(driven):
 
 
 @pytest.mark.slow
-def test_the_motors_end_at_zero_in_their_own_log(driven):
+def test_motor_log_ends_at_zero(driven):
     folder, _ = driven
     with (folder / "motors.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -106,7 +106,7 @@ def test_injected_loss_is_counted_and_checked(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_all_and_the_run_is_still_scored(tmp_path, number):
+def test_signal_ends_all_processes_and_the_run_is_scored(tmp_path, number):
     folder = tmp_path / "run"
     process = subprocess.Popen([*COMMAND, "--out", str(folder), "--seconds", "0", "--json"], stdout=subprocess.PIPE,
                                stderr=subprocess.PIPE, text=True)
@@ -150,7 +150,7 @@ def test_process_that_never_becomes_ready_times_out(tmp_path):
         os.kill(pid, 0)
 
 
-def test_the_last_word_of_a_process_and_its_exit_code_are_passed_on(tmp_path):
+def test_error_names_the_last_line_and_exit_code_of_a_process(tmp_path):
     with Processes(tmp_path) as processes:
         processes.start("robot", ["robot", "--socket-dir", "/nowhere"])
         with pytest.raises(ProcessError, match="nothing simulates a robot in /nowhere") as error:

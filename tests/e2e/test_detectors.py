@@ -143,7 +143,7 @@ def _wheels_us(robot, since_us):
 
 
 @pytest.mark.slow
-def test_a_killed_detector_is_silence_the_robot_holds_and_drives_again_within_three_seconds(tmp_path):
+def test_robot_holds_after_a_detector_is_killed_and_recovers_within_three_seconds(tmp_path):
     with Server(_answer) as server, _driving(tmp_path, _at(server)) as (robot, log):
         port, killed_us = server.port, time.monotonic_ns() // 1000
         server.kill()
@@ -183,7 +183,7 @@ def test_hostile_answers_do_not_move_the_robot(tmp_path, hostile):
 
 
 @pytest.mark.slow
-def test_a_killed_detector_service_is_the_same_over_zenoh(tmp_path):
+def test_robot_recovers_after_a_zenoh_detector_service_is_killed(tmp_path):
     with Processes(tmp_path) as processes:
         def serve(endpoint):
             processes.start("detector", ["detector", "--serve", "hsv", "--connect", endpoint])

@@ -61,7 +61,7 @@ def _count(heard, note):
 
 @pytest.mark.parametrize("channel", [DETECTIONS, MISSION], ids=lambda channel: channel.name)
 @pytest.mark.parametrize("speaker", ["zenoh 1", "web 1"])
-def test_it_comes_once_to_every_other_peer(peers, speaker, channel):
+def test_relay_delivers_once_to_every_other_peer(peers, speaker, channel):
     assert CHANNELS[channel.name].passed_on
     note = _said(peers[speaker][0], channel)
     others = [name for name in peers if name != speaker]
@@ -80,7 +80,7 @@ JPEG = b"\xff\xd8" + bytes(100_000)
 
 @pytest.mark.parametrize("far", ["zenoh", "web"])
 @pytest.mark.parametrize("near", ["zenoh", "web"])
-def test_an_overlay_reaches_who_watches_once_and_only_then(ends, near, far):
+def test_overlay_reaches_a_viewer_once_and_only_while_it_watches(ends, near, far):
     with ExitStack() as ending:
         vision = ending.enter_context(open_link("r1", connect=[ends[near]], role="vision", timeout_s=10))
         viewer = ending.enter_context(open_link("r1", connect=[ends[far]], role="viewer", timeout_s=10))
@@ -102,7 +102,7 @@ def test_an_overlay_reaches_who_watches_once_and_only_then(ends, near, far):
 
 
 @pytest.mark.parametrize("far", ["zenoh", "web"])
-def test_a_viewer_that_goes_away_is_noticed(ends, far):
+def test_relay_stops_after_the_viewer_leaves(ends, far):
     with ExitStack() as ending:
         vision = ending.enter_context(open_link("r1", connect=[ends["zenoh"]], role="vision", timeout_s=10))
         with open_link("r1", connect=[ends[far]], role="viewer", timeout_s=10) as viewer:

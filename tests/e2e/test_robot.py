@@ -20,7 +20,7 @@ BOUND_S, BOUND_M = 0.7, 0.25
 KEYS = [signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP]  # Ctrl-C, Ctrl-\, Ctrl-Z
 
 
-def test_it_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
+def test_robot_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
     with RobotProcess(tmp_path) as robot:
         with Vision(robot.endpoint) as vision:
             assert driving(robot)
@@ -62,7 +62,7 @@ def test_a_key_at_the_terminal_does_not_reach_the_network_process(tmp_path, numb
 
 
 @pytest.mark.parametrize("number", [signal.SIGTTIN, signal.SIGTTOU])
-def test_a_terminal_that_it_is_in_the_background_of_does_not_stop_it(tmp_path, number):
+def test_background_robot_is_not_stopped_by_its_terminal(tmp_path, number):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
         assert driving(robot)
         for pid in (robot.process.pid, robot.network_pid()):
@@ -73,7 +73,7 @@ def test_a_terminal_that_it_is_in_the_background_of_does_not_stop_it(tmp_path, n
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, *KEYS])
-def test_shutdown_is_after_zero_and_leaves_nothing(tmp_path, number):
+def test_shutdown_follows_zero_and_leaves_no_process(tmp_path, number):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
         assert driving(robot)
         network, since = robot.network_pid(), monotonic_us()

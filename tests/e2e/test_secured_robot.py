@@ -43,7 +43,7 @@ def test_vision_drives_an_operator_stops_it_and_a_viewer_sees_that(robot, tmp_pa
 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])
-def test_who_may_not_steer_moves_nothing_though_it_claims_to_be_vision(robot, role):
+def test_client_with_another_role_does_not_steer_as_vision(robot, role):
     """It sees the frames and answers each of them correctly, under a certificate that is not vision's."""
     with open_zenoh("r1", connect=[robot.endpoint], role=role, secure=robot.config["secure"]) as rogue:
         frames, session, answered = rogue.latest(FRAME), secrets.token_hex(4), 0
@@ -90,7 +90,7 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("name", REFUSALS)
-def test_rejected_peer_receives_the_reason_and_its_robot_goes_on(robot, name, tmp_path, capsys):
+def test_rejected_peer_receives_the_reason_and_the_robot_continues(robot, name, tmp_path, capsys):
     spoil, words = REFUSALS[name]
     (tmp_path / "spoilt").mkdir()
     secure = str(spoil(Path(robot.config["secure"]), tmp_path / "spoilt")) if spoil else ""

@@ -64,7 +64,7 @@ def test_film_is_small_and_lasts_25_to_30_seconds(filmed):
 
 
 @pytest.mark.parametrize("option", ["--scenario=eight", "--seconds=5", "--loss=0.1", "--mission=band"])
-def test_story_rejects_options_that_it_has_its_own_value_for(option, tmp_path):
+def test_story_rejects_options_that_it_sets(option, tmp_path):
     result = demo("--story", option, "--out", str(tmp_path / "run"))
     name = option.partition("=")[0]
     assert result.returncode == 2, result.stderr
@@ -73,7 +73,7 @@ def test_story_rejects_options_that_it_has_its_own_value_for(option, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_story_with_a_place_that_cannot_be_written_is_one_line(tmp_path):
+def test_story_in_an_unwritable_folder_is_one_line(tmp_path):
     (tmp_path / "file").touch()
     result = demo("--story", "--out", str(tmp_path / "file" / "run"))
     assert result.returncode == 2

@@ -96,7 +96,7 @@ def wire(tmp_path_factory):
 
 @pytest.mark.alone
 @pytest.mark.parametrize("section", ["direct", "router", "secured"])
-def test_the_page_is_true(section, wire, tmp_path):
+def test_commands_of_the_two_machines_page_work(section, wire, tmp_path):
     with ExitStack() as ending:
         machines = Machines(tmp_path, wire, ending)
         machines.run("simulated")

@@ -61,13 +61,13 @@ def test_a_configuration_that_names_an_old_module_gets_its_new_path(folder):
     assert "\n" not in str(error.value)
 
 
-def test_another_missing_module_is_named_as_it_is(folder):
+def test_other_missing_module_is_named(folder):
     (folder / "needs_more.py").write_text("import no_such_module\n")
     with pytest.raises(ConfigError, match="cannot be loaded: No module named 'no_such_module'"):
         CAMERAS.load("needs_more:Camera")
 
 
-def test_a_plug_in_that_exits_on_import_ends_nothing(folder):
+def test_plug_in_that_exits_on_import_does_not_end_the_service(folder):
     (folder / "leaves.py").write_text("import sys\nsys.exit('bye')\n")
     with pytest.raises(ConfigError, match="'leaves:Camera' cannot be loaded: bye"):
         CAMERAS.load("leaves:Camera")

@@ -26,13 +26,13 @@ UNIT = st.floats(0, 1)
 
 
 @given(st.binary(max_size=2000))
-def test_a_picture_is_written_as_the_write_up_wrote_it(jpeg):
+def test_image_is_encoded_as_in_the_legacy_program(jpeg):
     assert encode_picture(jpeg) == base64.encodebytes(jpeg)
     assert encode_picture(jpeg, newlines=False) == base64.b64encode(jpeg)
 
 
 @given(st.binary(max_size=2000), st.sampled_from([b"\n", b"\r\n", b""]))
-def test_a_picture_is_read_with_any_line_ends_and_within_its_bound(jpeg, line_end):
+def test_an_image_is_read_with_any_line_ends_and_within_its_bound(jpeg, line_end):
     text = encode_picture(jpeg).replace(b"\n", line_end)
     assert len(text) <= text_bound(len(jpeg))
     assert decode_picture(text, len(jpeg)) == jpeg
@@ -52,7 +52,7 @@ def test_invalid_base64_is_rejected(text):
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_a_picture_or_a_wire_error(text):
+def test_any_bytes_are_an_image_or_a_wire_error(text):
     try:
         assert len(decode_picture(text, 100)) <= 100
     except WireError as refusal:
@@ -60,7 +60,7 @@ def test_any_bytes_are_a_picture_or_a_wire_error(text):
 
 
 @given(FINITE, FINITE)
-def test_dashed_twists_read_what_the_write_up_writes(linear, angular):
+def test_dashed_twists_of_the_legacy_program_are_read(linear, angular):
     text = f"{linear}-{angular}".encode()
     twist = parse_dashed(text)
     assert (twist.linear_mps, twist.angular_rad_s) == (linear, angular)
@@ -68,7 +68,7 @@ def test_dashed_twists_read_what_the_write_up_writes(linear, angular):
 
 
 @given(FINITE, FINITE)
-def test_swapped_axes_are_the_same_two_numbers_the_other_way_round(linear, angular):
+def test_swapped_axes_exchange_the_two_numbers(linear, angular):
     twist = parse_dashed(f"{angular}-{linear}".encode(), swapped=True)
     assert (twist.linear_mps, twist.angular_rad_s) == (linear, angular)
 
@@ -123,7 +123,7 @@ def test_invalid_list_of_boxes_is_rejected(text):
     assert refusal.value.reason is RejectReason.MALFORMED
 
 
-def test_a_box_outside_the_picture_cannot_exist():
+def test_box_outside_the_image_is_rejected():
     for corners in ((0, 0, 1, 1.01), (-0.1, 0, 1, 1), (0.5, 0, 0.4, 1), (float("nan"), 0, 1, 1)):
         with pytest.raises(ValueError, match="outside the image"):
             LegacyBox(*corners)
@@ -131,7 +131,7 @@ def test_a_box_outside_the_picture_cannot_exist():
         format_boxes([LegacyBox(0, 0, 1, 1)] * (MAX_BOXES + 1))
 
 
-def test_boxes_become_detections_in_pixels_of_the_picture_in_their_order():
+def test_boxes_become_detections_in_pixels_of_the_image_in_their_order():
     found = detections_from_boxes(parse_boxes(b"0.25,0.5,0.75,1-0,0,1,0.125"), JpegSize(640, 480, 3))
     assert (found.width_px, found.height_px) == (640, 480)
     corners = [(box.label, box.x1_px, box.y1_px, box.x2_px, box.y2_px) for box in found.boxes]

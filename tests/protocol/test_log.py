@@ -79,7 +79,7 @@ def test_a_service_prints_its_errors_as_json_too():
     assert (said["level"], said["service"]) == ("error", "vision") and "nowhere" in said["message"]
 
 
-def test_both_processes_of_a_robot_speak_json(tmp_path, monkeypatch):
+def test_both_processes_of_a_robot_log_json(tmp_path, monkeypatch):
     """The command of the driver process selects its form of log; the network process reads its environment."""
     monkeypatch.setenv(LOG_FORMAT_VARIABLE, "json")
     with RobotProcess(tmp_path) as robot:
@@ -190,13 +190,13 @@ def logged(limiter, key, from_us, until_us, step_us):
 
 
 @pytest.mark.parametrize("step_us", [100, 20_000, 100_000])
-def test_a_key_is_logged_at_once_and_then_ever_more_seldom_with_its_count(step_us):
+def test_key_is_logged_immediately_and_then_less_often_with_its_count(step_us):
     lines = logged(RepeatLimiter(), "STALE", 0, 8 * SECOND_US, step_us)
     assert [when_us for when_us, _ in lines] == [0, SECOND_US, 3 * SECOND_US, 7 * SECOND_US]
     assert [count for _, count in lines] == [1, *(share * SECOND_US // step_us for share in (1, 2, 4))]
 
 
-def test_a_key_that_goes_on_is_logged_at_least_once_a_minute():
+def test_repeated_key_is_logged_at_least_once_a_minute():
     times = [when_us for when_us, _ in logged(RepeatLimiter(), "STALE", 0, 600 * SECOND_US, SECOND_US)]
     assert max(b - a for a, b in itertools.pairwise(times)) == 60 * SECOND_US
 
@@ -207,14 +207,14 @@ def test_two_keys_do_not_hide_one_another():
 
 
 @pytest.mark.parametrize(("gap_us", "again"), [(9_999_999, False), (10_000_000, True)])
-def test_a_key_that_did_not_come_for_ten_seconds_is_news_again(gap_us, again):
+def test_key_is_logged_immediately_after_ten_seconds_of_silence(gap_us, again):
     limiter = RepeatLimiter()
     last_us = logged(limiter, "STALE", 0, 70 * SECOND_US, SECOND_US)[-1][0] + 1
     assert not limiter.due("STALE", last_us, 7)
     assert limiter.due("STALE", last_us + gap_us) == (6 + 7 + 1 if again else 0)
 
 
-def test_ever_new_keys_take_no_memory_and_few_lines():
+def test_many_different_keys_need_bounded_memory_and_few_lines():
     limiter, draw = RepeatLimiter(), random.Random(3)
     counts = [limiter.due(f"{draw.random()}", number * 1_000) for number in range(2_000)]
     assert counts[:16] == [1] * 16, "the first 16 keys have a count each"

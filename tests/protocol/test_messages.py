@@ -194,7 +194,7 @@ def test_a_key_is_exact_or_none(key):
 
 
 @pytest.mark.parametrize("robot", ["", "r1/r2", "*", "r*", "-r1", ".", "a" * 33, "r 1", "r1\n", "é", "r1$"])
-def test_a_robot_id_that_is_invalid_is_rejected_in_words(robot):
+def test_invalid_robot_id_is_rejected_with_a_reason(robot):
     with pytest.raises(ConfigError, match="letters, digits") as refusal:
         check_robot_id(robot)
     assert repr(robot) in str(refusal.value)
@@ -203,7 +203,7 @@ def test_a_robot_id_that_is_invalid_is_rejected_in_words(robot):
 
 
 @pytest.mark.parametrize("channel", CHANNELS.values(), ids=CHANNELS)
-def test_a_source_is_needed_towards_the_robot_and_only_there(channel):
+def test_source_is_required_only_toward_the_robot(channel):
     wrong = "" if channel.has_source else "vision"
     with pytest.raises(ValueError, match=channel.name):
         key_for("r1", channel, wrong)

@@ -25,7 +25,7 @@ speeds = st.floats(-1e4, 1e4)
 @given(speeds, speeds)
 @example(-0.00001, 0.00004)
 @example(-0.00005, 0.00005)
-def test_what_we_write_is_read_back_to_four_decimals(linear_mps, angular_rad_s):
+def test_written_twist_is_read_back_to_four_decimals(linear_mps, angular_rad_s):
     text = format_twist(Twist(linear_mps=linear_mps, angular_rad_s=angular_rad_s))
     assert re.fullmatch(rb"-?[0-9]+\.[0-9]{4}\|-?[0-9]+\.[0-9]{4}", text)
     assert b"-0.0000" not in text
@@ -86,7 +86,7 @@ def test_the_bound_is_exact_in_pixels(width_px, height_px, marker, components):
 
 @pytest.mark.parametrize(("width_px", "height_px"), [(16, 16), (320, 240), (641, 479)])
 @pytest.mark.parametrize("encoder", ["simplejpeg", "cv2", "cv2-progressive", "pillow"])
-def test_real_pictures_pass_with_their_size(encoder, width_px, height_px):
+def test_real_images_pass_with_their_size(encoder, width_px, height_px):
     pixels = np.random.default_rng(3).integers(0, 255, (height_px, width_px, 3), np.uint8)
     size = read_jpeg_size(_encoded(encoder, pixels))
     assert size == JpegSize(width_px, height_px, 3)
@@ -105,7 +105,7 @@ def _encoded(encoder: str, pixels: np.ndarray) -> bytes:
     return cv2.imencode(".jpg", pixels, options)[1].tobytes()
 
 
-def test_a_picture_cut_anywhere_before_its_size_is_rejected():
+def test_an_image_cut_anywhere_before_its_size_is_rejected():
     whole = simplejpeg.encode_jpeg(np.zeros((48, 64, 3), np.uint8), quality=80)
     needed = whole.index(b"\xff\xc0") + 10
     for length in range(needed):

@@ -57,7 +57,7 @@ def test_other_counts_of_fields_are_malformed(data):
 @pytest.mark.parametrize(
     "text", ["nan", "inf", "infinity", "+nan", "-inf", "NaN", "INF", "+Infinity", "1e309", "-1e309", "1e400", "9e999"]
 )
-def test_what_is_not_finite_is_named_so_on_either_side(text):
+def test_number_that_is_not_finite_is_named(text):
     for data in (f"{text}|0", f"0|{text}", f"{text}|{text}", f"{text}|nonsense" if "e" not in text else f"{text}|1"):
         assert refusal(parse_twist, data.encode()).reason is RejectReason.NOT_FINITE
 
@@ -184,7 +184,7 @@ def test_eight_bits_and_one_or_three_components(bits, components):
 
 
 @pytest.mark.parametrize("ahead", [b"", segment(0xE0, 9)])
-def test_a_picture_cut_anywhere_before_its_size_is_rejected(ahead):
+def test_an_image_cut_anywhere_before_its_size_is_rejected(ahead):
     whole = picture(ahead, frame_header(7, 5))
     for size in range(len(whole)):
         what = refusal(read_jpeg_size, whole[:size]).detail
@@ -194,7 +194,7 @@ def test_a_picture_cut_anywhere_before_its_size_is_rejected(ahead):
 
 
 @pytest.mark.parametrize("start", [b"", b"\xff", b"\xd8\xff", b"\x89PNG", b"\xff\xd9", b"\xfe\xd8", b"\x00\xff\xd8"])
-def test_a_picture_starts_with_soi(start):
+def test_an_image_starts_with_soi(start):
     assert "SOI" in refusal(read_jpeg_size, start + frame_header()).detail
 
 

@@ -53,7 +53,7 @@ def test_the_wiring_is_the_configurations_own():
         assert f"GPIO {number} ({position})" in drawn
 
 
-def test_every_option_that_it_names_exists_and_none_is_left_out():
+def test_page_names_every_option_of_the_drive():
     table = CAR[CAR.index("| `drive.options` |") : CAR.index("The drive interpolates")]
     named = set(re.findall(r"`([a-z_]+)`", " ".join(row.split("|")[1] for row in table.splitlines() if row)))
     own = {name for name in GpioDriveConfig.model_fields if not name.endswith("ward_pin")} - {"wheel_radius_m"}

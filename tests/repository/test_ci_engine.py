@@ -58,6 +58,6 @@ def test_missing_engine_prints_the_reason_in_the_last_line(engine, stand_ins, ch
     assert (done.returncode, done.stdout.splitlines()[-1]) == (3, f"no engine: {why}"), done
 
 
-def test_an_engine_that_answers_and_has_its_base_is_left_as_it_is(engine):
+def test_running_engine_with_its_base_image_is_unchanged(engine):
     done = engine({"docker": "exit 0", "docker-compose": ""}, uid=1000)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

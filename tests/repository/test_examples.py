@@ -12,7 +12,7 @@ from tests.fixtures.robot_process import RobotProcess, Vision
 ROOT = Path(__file__).parent.parent.parent
 
 
-def test_the_robot_of_your_own_drives(tmp_path, monkeypatch):
+def test_example_robot_drives(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     config = load_service("robot", file="examples/my_robot.toml", environ={}).config
     serial = tmp_path / "serial"
@@ -24,7 +24,7 @@ def test_the_robot_of_your_own_drives(tmp_path, monkeypatch):
     assert serial.read_text().splitlines()[-1] == "0.000 0.000"
 
 
-def test_the_drive_of_your_own_is_a_drive(tmp_path):
+def test_example_drive_keeps_the_contract(tmp_path):
     config = load_service("robot", file=str(ROOT / "examples/my_robot.toml"), environ={}).config
     drive = DRIVES.build(config.drive)
     drive.set(10.0, -10.0)

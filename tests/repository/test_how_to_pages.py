@@ -12,7 +12,7 @@ SOURCE = "https://github.com/sightline-robot/sightline/blob/main/"
 LINKED = re.compile(r"\]\(([^)]+)\)")
 
 
-def test_there_are_the_agreed_pages():
+def test_how_to_folder_has_the_agreed_pages():
     assert {page.stem for page in PAGES} == {
         "add-a-device", "add-a-status-field", "add-a-command", "write-a-mission", "write-a-detector",
     }  # fmt: skip

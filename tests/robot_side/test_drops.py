@@ -85,7 +85,7 @@ def test_camera_slot_counts_images_that_were_not_taken():
     assert newest.dropped == 3
 
 
-def test_drops_in_words():
+def test_drops_are_formatted_as_text():
     assert drops_text(StreamStatus()) == "nothing"
     stream = StreamStatus(
         dropped={"frame": 12, "scan": 1}, missed_captures=40, overtaken=5, refused_pictures=2, quality_percent=60,

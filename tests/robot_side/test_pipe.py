@@ -43,7 +43,7 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["folder", "my_camera:MyCamera"])
-def test_the_folder_it_starts_in_has_cameras_and_stands_in_for_nothing_else(folder, kind):
+def test_start_folder_provides_cameras_and_shadows_no_module(folder, kind):
     camera = PluginChoice(kind=kind, options={"path": "pictures"})
     listen = (free_endpoint(), free_endpoint("ws://"))
     config = RobotConfig(camera=camera, listen=listen, state_dir=folder)
@@ -56,7 +56,7 @@ def test_the_folder_it_starts_in_has_cameras_and_stands_in_for_nothing_else(fold
         child.close()
 
 
-def test_a_class_of_the_folder_comes_after_all_that_is_installed(folder, monkeypatch):
+def test_class_of_the_start_folder_comes_after_installed_modules(folder, monkeypatch):
     before = list(sys.path)
     monkeypatch.setattr(sys, "path", list(before))
     choice = PluginChoice(kind="my_camera:MyCamera", options={"path": "pictures"})

@@ -39,7 +39,7 @@ class Room:
         return self.places >= 0
 
 
-def test_what_waits_is_sent_once_there_is_room_and_stop_first():
+def test_waiting_requests_are_sent_with_room_and_stop_first():
     waiting = OutgoingQueue(MAX_PENDING)
     arm, stop = request(Verb.ARM), request(Verb.STOP)
     assert put(waiting, arm) and put(waiting, stop) and len(waiting) == 2
@@ -57,7 +57,7 @@ def test_the_newest_of_one_source_and_verb_waits():
 
 
 @pytest.mark.parametrize("first", [Verb.ARM, Verb.STOP])
-def test_it_is_bounded_and_a_stop_still_finds_a_place(first):
+def test_waiting_requests_are_bounded_and_a_stop_has_a_place(first):
     waiting, room = OutgoingQueue(MAX_PENDING), Room(99)
     for number in range(MAX_PENDING):
         assert put(waiting, request(first, f"source{number}"))
@@ -115,7 +115,7 @@ def test_a_dead_process_is_not_forgotten_before_all_it_sent_is_read(child):
     assert child._process is None
 
 
-def test_a_dead_process_whose_descendant_holds_the_socket_is_started_again_all_the_same(child):
+def test_dead_process_with_a_descendant_on_the_socket_is_restarted(child):
     child.keep_alive(0, 0)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setblocking(False)

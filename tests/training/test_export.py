@@ -125,7 +125,7 @@ def test_a_round_of_harder_pictures_has_more_clear_ones_and_more_bad_ones():
     assert clear > clear_before + 10 and bad > bad_before + 10
 
 
-def test_what_the_cut_leaves_too_little_of_is_neither_right_nor_wrong():
+def test_object_mostly_outside_the_cut_is_ignored():
     blanked = marked = 0
     for place in range(60):
         one = shown(one_scene(), 5, 0, place, CUT_PX)
@@ -136,7 +136,7 @@ def test_what_the_cut_leaves_too_little_of_is_neither_right_nor_wrong():
     assert marked > 20 and blanked > 0
 
 
-def test_what_is_unclear_in_a_scene_is_not_learned():
+def test_unclear_objects_are_not_learned():
     one = shown(one_scene((), [(40.0, 40.0, 80.0, 80.0)]), 5, 0, 1, WHOLE_PX)
     assert not one.heat.any() and 90 < np.count_nonzero(one.counts == 0) < 150
 

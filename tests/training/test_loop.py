@@ -48,7 +48,7 @@ def test_the_loss_falls(tmp_path):
     assert len(losses) == 2 and losses[-1] < 10
 
 
-def test_a_training_that_was_cut_ends_as_if_it_had_not_been(tmp_path, monkeypatch):
+def test_interrupted_training_ends_with_the_same_result(tmp_path, monkeypatch):
     training = Training((2, 2), batch=2, seed=4)
     (tmp_path / "whole").mkdir()
     whole = train(scenes(), training, "cpu", tmp_path / "whole", lambda _: None)

@@ -32,7 +32,7 @@ def test_the_card_is_of_this_file():
     assert all(f"`{label}`" in CARD for label in LABELS)
 
 
-def test_it_is_safe_in_every_column_of_its_card():
+def test_shipped_model_is_safe_in_every_column():
     columns = columns_of_the_card()
     assert set(columns) == set(COLUMNS)
     assert all(max(wrong, alarms) <= 100 * MOST_WRONG for _, _, wrong, alarms in columns.values())
@@ -44,7 +44,7 @@ def test_the_same_command_is_the_default():
     assert f"chosen on {cli_train.VALIDATED} scenes a column" in CARD
 
 
-def test_opencv_runs_it():
+def test_opencv_runs_the_shipped_model():
     cv2.dnn.readNetFromONNX(str(SHIPPED))
 
 

@@ -43,7 +43,7 @@ def test_pixels_stay_in_the_cache(size: tuple[int, int]) -> None:
     assert {decoder(*size)._picture.bgr.ctypes.data % 32 for _ in range(8)} == {16}
 
 
-def test_what_a_known_head_spares_is_only_the_check_of_that_head() -> None:
+def test_known_image_header_skips_only_its_own_check() -> None:
     one, fresh = decoder(), decoder()
     first = one.decode(GOOD).bgr.copy()
     for other in (jpeg_of(np.zeros((241, 320, 3), np.uint8)), GOOD[:-200], GOOD[:100], b""):
@@ -54,7 +54,7 @@ def test_what_a_known_head_spares_is_only_the_check_of_that_head() -> None:
     assert np.array_equal(one.decode(GOOD).bgr, first)
 
 
-def test_grey_pictures_decode() -> None:
+def test_gray_images_decode() -> None:
     grey = cv2.imencode(".jpg", np.full((240, 320), 77, np.uint8))[1].tobytes()
     assert np.ptp(decoder().decode(grey).bgr) <= 2
 
@@ -102,7 +102,7 @@ def test_baseline_scans_one_component_each_are_counted() -> None:
 
 @settings(max_examples=150)
 @given(at=st.integers(0, len(GOOD) - 1), junk=st.binary(min_size=1, max_size=8), cut=st.integers(0, 200))
-def test_damaged_pictures_decode_or_are_rejected(at: int, junk: bytes, cut: int) -> None:
+def test_damaged_images_decode_or_are_rejected(at: int, junk: bytes, cut: int) -> None:
     damaged = GOOD[:at] + junk + GOOD[at + len(junk) : len(GOOD) - cut]
     try:
         assert decoder().decode(damaged).bgr.shape == (240, 320, 3)

@@ -29,7 +29,7 @@ def test_static(seed: int) -> None:
     assert distance < 0.03
 
 
-def test_static_from_drawn_pictures() -> None:
+def test_static_from_drawn_images() -> None:
     bearing, distance = errors_after(Rig(ahead(5), seed=5, drawn=True).run(4), 1.5)
     assert bearing < 0.3
     assert distance < 0.02
@@ -102,6 +102,6 @@ def test_a_pushed_ball_is_never_lost() -> None:
     assert max(abs(row.bearing_rad) for row in run) < math.radians(40)
 
 
-def test_a_late_link_leaves_the_robot_standing() -> None:
+def test_robot_on_a_late_link_does_not_move() -> None:
     run = Rig(circle(), latency_s=0.45).run(4)
     assert max(abs(row.moving[0]) + abs(row.moving[1]) for row in run) == 0.0

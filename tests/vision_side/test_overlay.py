@@ -49,7 +49,7 @@ def near(canvas, colour, x_px, y_px, reach_px=4):
     return bool((np.abs(part.astype(int) - colour).max(axis=2) < 40).any())
 
 
-def test_axes_go_through_the_middle_and_the_picture_stays_below():
+def test_axes_go_through_the_middle_and_the_image_stays_below():
     canvas = draw_overlay(GREY, shown(phase="searching"), 640)
     assert canvas.shape == (480, 640, 3) and canvas.dtype == np.uint8
     assert tuple(canvas[200, 320]) == AXES and tuple(canvas[240, 100]) == AXES
@@ -138,7 +138,7 @@ def test_the_age_is_the_robots_own_measure_or_else_the_least_it_can_be():
     assert strips[0] == strips[1] and len(set(strips)) == 3
 
 
-def test_a_preview_is_the_picture_made_small():
+def test_a_preview_is_the_image_made_small():
     picture = scene(MODEL, 1.0, 0.2)
     small = draw_preview(picture, 160)
     assert small.shape == (120, 160, 3)

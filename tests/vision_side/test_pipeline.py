@@ -49,7 +49,7 @@ def test_seen_coasted_searched_and_found() -> None:
     assert answers[9].seen.distance_m is not None and answers[9].seen.target in answers[9].seen.detections
 
 
-def test_no_picture_is_acknowledged_and_starts_no_search() -> None:
+def test_missing_image_is_acknowledged_and_starts_no_search() -> None:
     answers = phases([BALL] * 5 + [b"not a picture"] * 90)
     assert all(answer.twist is None and answer.seen.phase == "no image" for answer in answers[5:])
 
@@ -125,7 +125,7 @@ ALWAYS_PURE = ("pipeline.py", "decode.py", "port.py", "hsv.py", "plugin_calls.py
 """From a frame to its twist: nothing there may become a shell."""
 
 
-def test_only_the_shells_know_of_clocks_and_links() -> None:
+def test_only_shell_files_use_clocks_and_links() -> None:
     forbidden = {"time", "threading", "socket", "asyncio", "logging", "zenoh", "random"}
     for path in Path(sightline.vision_side.__file__).parent.rglob("*.py"):
         tree = ast.parse(path.read_text())

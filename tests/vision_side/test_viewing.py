@@ -68,7 +68,7 @@ def test_overlay_without_a_viewer_is_not_drawn(site):
     assert site.service._viewing._thread is None
 
 
-def test_who_watches_sees_the_answered_frame_with_what_was_seen(site):
+def test_viewer_receives_the_answered_frame_with_its_detections(site):
     overlays = site.viewer.latest(OVERLAY)
     assert until(lambda: site.link.has_listener(OVERLAY))
     header = site.frame()
@@ -100,7 +100,7 @@ def test_viewing_ends_without_viewers(site, monkeypatch):
     assert overlays.take(0.2) is None
 
 
-def test_the_twist_is_out_before_its_picture_and_pictures_keep_their_pace(site):
+def test_twist_leaves_before_its_overlay_and_overlays_keep_their_rate(site):
     arrivals = []
     site.robot.subscribe(TWIST, lambda message: arrivals.append("twist"))
     site.viewer.subscribe(OVERLAY, lambda message: arrivals.append("overlay"))
@@ -114,7 +114,7 @@ def test_the_twist_is_out_before_its_picture_and_pictures_keep_their_pace(site):
     assert arrivals.count("overlay") <= 15.0 * lasted_s + 2
 
 
-def test_a_picture_that_vision_rejects_is_not_shown(site):
+def test_rejected_image_is_not_shown(site):
     overlays = site.viewer.latest(OVERLAY)
     assert until(lambda: site.link.has_listener(OVERLAY))
     site.frame(BAD)

@@ -29,7 +29,7 @@ def test_jitter_costs_no_third_frame(seed):
     assert max(late - early for early, late in pairwise(kept)) < 110_000
 
 
-def test_after_a_pause_nothing_is_made_up_for():
+def test_pause_is_not_made_up_for():
     pace = RateLimiter(10)
     assert pace.is_due(0) and not pace.is_due(50_000)
     assert pace.is_due(5_000_000)

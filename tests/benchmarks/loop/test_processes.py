@@ -105,7 +105,7 @@ def test_every_peer_answers(tmp_path):
 
 
 @pytest.mark.slow
-def test_viewers_come_and_stall_and_the_loop_goes_on():
+def test_loop_continues_while_viewers_stall():
     checks = {check.name: check for check in measure_watchers(replace(SMALL, tries=1), 3, lambda _: None)}
     assert checks["not accepted"].value < 50
     assert checks["memory, more"].value < 50

@@ -97,7 +97,7 @@ def test_of_headers_the_commands_that_were_rejected_are_missing(refused):
     assert course.answered_percent == pytest.approx(100 - len(refused), abs=2.5)
 
 
-def test_frames_that_never_reached_the_vision_are_not_answered():
+def test_frames_that_the_vision_service_did_not_receive_are_unanswered():
     rows = header_rows(100)
     kept = [row for row in rows if not 40 <= row[0] < 60]
     accepted = list(statuses(rows, range(40, 60)))
@@ -138,7 +138,7 @@ def test_turns_joined_are_as_one_sample_of_all_their_pictures(turns, data):
     assert whole.tries == sum(part.tries for part in parts)
 
 
-def test_what_one_turn_could_not_count_is_not_made_up():
+def test_missing_count_of_one_turn_stays_missing():
     assert joined([sample(OURS, [1]), replace(sample(OURS, [1]), carried_bytes=None)]).carried_bytes is None
 
 
@@ -188,7 +188,7 @@ def test_a_disturbed_sample_fails_the_run():
     assert not found["samples disturbed by others"]
 
 
-def test_time_of_others_is_what_neither_we_nor_idleness_had(monkeypatch):
+def test_time_of_other_processes_excludes_idle_and_own_time(monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     before = Reading({"vision": 1.0}, own_s=1.0, busy_s=10.0, steal_s=0.0)
     after = Reading({"vision": 3.0}, own_s=2.0, busy_s=14.0, steal_s=0.5)

@@ -181,7 +181,7 @@ def test_network_bench_without_root_names_its_requirements():
 
 @pytest.mark.slow
 @pytest.mark.skipif(bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun")
-def test_a_short_row_is_run_for_real():
+def test_short_network_row_runs_with_real_processes():
     command = [*COMMAND, "--only", "near", "--seconds", "4", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     told = json.loads(done.stdout)

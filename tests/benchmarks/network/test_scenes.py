@@ -139,7 +139,7 @@ def test_a_robot_that_is_missing_is_noticed():
 
 @pytest.mark.slow
 @pytest.mark.skipif(bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun")
-def test_a_standby_is_run_for_real():
+def test_standby_row_runs_with_real_processes():
     command = [
         sys.executable,
         "-P",

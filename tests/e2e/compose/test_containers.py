@@ -81,7 +81,7 @@ def test_containers_have_no_rights(running):
             assert "Read-only" in told[1]
 
 
-def test_the_robots_image_holds_no_heavy_package(running):
+def test_robot_image_has_no_heavy_package(running):
     only(running, "plain")
     listed = running.inside("robot", "/opt/sightline/bin/pip", "list", "--format", "json")
     assert not {package["name"].lower() for package in json.loads(listed)} & HEAVY
@@ -91,7 +91,7 @@ def test_the_robots_image_holds_no_heavy_package(running):
     assert {"cv2", "numpy", "pybullet_data"} <= {file.rpartition("/")[2] for file in found}, "the search finds them"
 
 
-def test_keys_of_one_role_are_with_that_role_alone(running):
+def test_each_role_has_only_its_own_keys(running):
     only(running, "secure")
     held = {"secure-robot": "robot", "secure-router": "robot", "secure-vision": "vision", "secure-status": "operator"}
     for service, role in held.items():
@@ -109,7 +109,7 @@ def test_client_without_keys_is_rejected_with_the_cause(running):
     assert plain in refused.stderr
 
 
-def test_a_robot_whose_detector_is_gone_holds(running):
+def test_robot_without_its_detector_holds(running):
     only(running, "remote-detector")
     running.compose("stop", "detector")
     assert until(lambda: running.state("r1") in ("HOLD", "DISARMED"), 10)

@@ -64,7 +64,7 @@ def answered(*ball):
     return twist.linear_mps, twist.angular_rad_s
 
 
-def test_the_older_client_turns_to_the_ball_and_keeps_its_distance():
+def test_legacy_client_turns_to_the_ball_and_keeps_its_distance():
     assert answered(80)[1] > 0.5
     assert answered(240)[1] < -0.5
     assert abs(answered(160)[1]) < 0.05

@@ -75,7 +75,7 @@ def commands():
 
 
 @pytest.mark.parametrize("command", list(commands()))
-def test_every_command_is_one_the_command_line_takes(command):
+def test_command_line_accepts_every_command(command):
     name, *arguments = command
     if name == "keys":
         return
@@ -137,13 +137,13 @@ def test_every_image_has_a_target_and_runs_without_rights(name):
 # --- profiles ---------------------------------------------------------------------------------------------------------
 
 
-def test_profiles_are_those_that_are_tried_and_one_is_the_default():
+def test_every_profile_has_a_test_and_one_is_the_default():
     assert {name for service in SERVICES.values() for name in service["profiles"]} == {one.name for one in PROFILES}
     assert f"COMPOSE_PROFILES={DEFAULT}" in (ROOT / ".env").read_text().splitlines()
 
 
 @pytest.mark.parametrize("profile", PROFILES, ids=lambda profile: profile.name)
-def test_a_profile_is_whole_and_opens_no_port_twice(profile):
+def test_profile_is_complete_and_opens_no_port_twice(profile):
     services = {name: SERVICES[name] for name in profile.services}
     for robot, (service, sim) in profile.robots.items():
         assert services[service]["depends_on"].keys() == {sim, profile.router}
@@ -192,7 +192,7 @@ def test_the_robot_image_is_light_and_the_others_are_complete():
     assert extras_of("keys") == ["secure"]
 
 
-def test_images_hold_every_package_and_nothing_is_ignored_that_they_copy():
+def test_images_have_every_package_and_copy_no_ignored_file():
     tree = ast.parse((ROOT / "setup.py").read_text())
     packages = {"sightline", *next(ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign))}
     copied = {rest.split()[0] for word, rest in STAGES["wheel"] if word == "COPY"}
@@ -233,14 +233,14 @@ def test_simulation_and_robot_share_private_sockets():
         assert not any(shared & set(mounts(other)) for other in others)
 
 
-def test_nothing_but_named_volumes_is_mounted_and_every_folder_of_theirs_belongs_to_the_user():
+def test_only_named_volumes_are_mounted_and_the_user_owns_them():
     made = re.search(r"install -d -m 0700 -o sightline -g sightline ([\w/ -]+)", str(STAGES["service"]))[1].split()
     for name in SERVICES:
         assert set(mounts(name)) <= set(COMPOSE["volumes"]), "a host's folder"
         assert set(mounts(name).values()) <= set(made)
 
 
-def test_the_stop_mark_is_kept_on_a_volume_of_each_robots_own():
+def test_each_robot_stores_stop_on_a_separate_volume():
     state_dir = re.search(r"SIGHTLINE_ROBOT__STATE_DIR=([\w/]+)", str(STAGES["service"]))[1]
     for profile in PROFILES:
         kept = [volume for robot, _ in profile.robots.values() for volume in mounts(robot).items()]

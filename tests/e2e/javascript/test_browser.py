@@ -134,7 +134,7 @@ def test_page_reports_a_lost_robot_and_finds_it_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_page_behind_a_token_comes_in_with_the_one_behind_the_hash(tmp_path: Path) -> None:
+def test_page_connects_with_the_token_after_the_hash(tmp_path: Path) -> None:
     (tmp_path / "token").write_text("0123456789abcdef")
     with JsRobot(tmp_path, "--token-file", str(tmp_path / "token")) as robot:
         address = f"http://127.0.0.1:{robot.port}/"

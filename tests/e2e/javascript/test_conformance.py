@@ -34,14 +34,14 @@ def failed(told: dict[str, Any]) -> list[str]:
     ]
 
 
-def test_their_codec_conforms():
+def test_javascript_codec_conforms():
     told = report("codec", "--json", "--", node(), str(EXAMPLES / "codec_adapter.mjs"), seconds=120)
     assert failed(told) == []
     assert told["ok"] and len(told["checks"]) >= 390
 
 
 @pytest.mark.long
-def test_their_robot_conforms(tmp_path):
+def test_javascript_robot_conforms(tmp_path):
     with JsRobot(tmp_path, "--guests") as robot:
         told = report("robot", robot.endpoint, "--robot", "js1", "--json", seconds=580)
     assert failed(told) == []
@@ -49,7 +49,7 @@ def test_their_robot_conforms(tmp_path):
 
 
 @pytest.mark.long
-def test_their_vision_conforms(tmp_path):
+def test_javascript_vision_conforms(tmp_path):
     endpoint = f"ws://127.0.0.1:{free_port()}"
     with JsVision(tmp_path, endpoint, "r1") as vision:
         told = report("vision", endpoint, "--json", seconds=580)

@@ -64,7 +64,7 @@ def test_rejected_client_receives_the_reason_by_http(quiet_robot, options, statu
     assert refused.value.response.status_code == status_code
 
 
-def test_the_seventeenth_client_waits_outside(tmp_path):
+def test_seventeenth_client_is_rejected(tmp_path):
     with JsRobot(tmp_path) as robot, ExitStack() as clients:
         for _ in range(16):
             clients.enter_context(connect(robot.endpoint, subprotocols=["sightline.v1"]))
@@ -73,7 +73,7 @@ def test_the_seventeenth_client_waits_outside(tmp_path):
         assert refused.value.response.status_code == 503
 
 
-def test_the_viewers_page_comes_from_the_robot_itself_and_nothing_else_does(quiet_robot):
+def test_robot_serves_only_the_viewers_page(quiet_robot):
     base = quiet_robot.endpoint.replace("ws://", "http://")
     with urllib.request.urlopen(f"{base}/", timeout=5) as page:
         assert b"STOP" in page.read()
@@ -88,7 +88,7 @@ def test_the_viewers_page_comes_from_the_robot_itself_and_nothing_else_does(quie
     assert foreign.value.code == 403
 
 
-def test_a_client_that_never_reads_is_gone_and_costs_nothing(quiet_robot):
+def test_client_that_never_reads_is_dropped(quiet_robot):
     with connect(quiet_robot.endpoint, subprotocols=["sightline.v1"]) as warm:  # the engine compiles as it goes
         warm.send(hello("js1", wants=["frame", "status"]))
         for _ in range(100):

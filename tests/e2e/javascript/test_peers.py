@@ -20,7 +20,7 @@ SOURCES = sorted(path for path in EXAMPLES.iterdir() if path.suffix in (".mjs", 
 
 
 @pytest.mark.slow
-def test_their_own_unit_tests_pass():
+def test_javascript_unit_tests_pass():
     run = subprocess.run([node(), "--test", str(EXAMPLES)], check=False, capture_output=True, text=True, timeout=120)
     assert run.returncode == 0, run.stdout[-4000:]
     assert int(re.findall(r"^# pass (\d+)", run.stdout, re.MULTILINE)[0]) >= 90
@@ -38,7 +38,7 @@ def test_files_are_short_and_state_their_purpose(path):
             assert not re.search(r'from "node:|\bperformance\b|Date\.now|setTimeout|Math\.random', source)
 
 
-def test_nothing_but_the_platform_is_imported():
+def test_javascript_imports_only_the_platform():
     for path in SOURCES:
         source = re.sub(r"/\*.*?\*/", "", path.read_text("utf-8"), flags=re.DOTALL)
         imported = re.findall(r'^\s*(?:import\b|\}).*?\bfrom "([^"]+)"', source, re.MULTILINE)
@@ -49,7 +49,7 @@ def test_nothing_but_the_platform_is_imported():
 @pytest.mark.parametrize(
     "model", ["FrameHeader", "AnswerHeader", "RequestHeader", "Status", "StreamStatus", "CameraModel", "Detections"]
 )
-def test_their_field_tables_name_the_same_fields_in_the_same_order(model):
+def test_javascript_field_tables_have_the_same_fields_in_the_same_order(model):
     """A field added on our side must be added there: a default that is missing shows in no message."""
     assert _js_fields(model) == list(json_schema()["$defs"][model]["properties"])
 
@@ -141,7 +141,7 @@ def test_adapter_reports_unsupported_cases():
     ]
 
 
-def test_the_page_names_stop_what_it_is():
+def test_page_does_not_call_stop_an_emergency_stop():
     """No network button is an emergency stop, and none is called one."""
     for path in [*SOURCES, Path(ROOT / "docs" / "reference" / "javascript.md")]:
         text = re.sub("no emergency stop|not an emergency stop", "", path.read_text("utf-8"))

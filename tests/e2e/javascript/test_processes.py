@@ -82,7 +82,7 @@ def test_the_stop_latch_of_the_javascript_robot_survives_kill_and_restart(tmp_pa
         assert status(robot)["state"] == "STOPPED"
 
 
-def test_the_javascript_robot_stands_still_when_its_vision_is_killed(tmp_path, our_vision):
+def test_javascript_robot_stops_when_its_vision_is_killed(tmp_path, our_vision):
     with JsRobot(tmp_path, "--auto-arm") as robot:
         vision = our_vision(robot)
         assert robot.says("ACTIVE", 15)

@@ -21,7 +21,7 @@ def robot(tmp_path):
         yield running, older.replace("ws-legacy", "ws").removesuffix("?boxes")
 
 
-def test_boxes_of_an_older_program_reach_zenoh_and_name_their_frame(robot):
+def test_boxes_of_a_legacy_program_reach_zenoh_and_name_their_frame(robot):
     process, older = robot
     with open_zenoh("r1", connect=[process.endpoint], role="vision") as vision, connect(older) as program:
         heard = []
@@ -42,7 +42,7 @@ def test_boxes_of_an_older_program_reach_zenoh_and_name_their_frame(robot):
 
 
 @pytest.mark.slow
-def test_a_detector_on_zenoh_does_not_hold_the_robot_up(robot):
+def test_detector_on_zenoh_does_not_delay_the_robot(robot):
     process, _older = robot
     found = Detections(width_px=16, height_px=16, boxes=())
     with (

@@ -119,7 +119,7 @@ def test_legacy_vision_receives_images_and_drives_within_guest_limits(tmp_path, 
 
 
 @pytest.mark.long
-def test_on_a_quiet_machine_the_older_vision_sees_95_percent_of_the_pictures(tmp_path, pictures):
+def test_legacy_vision_receives_95_percent_of_the_images_on_a_quiet_machine(tmp_path, pictures):
     """A figure, and so no part of `make test`: beside others the older vision becomes too slow itself."""
     with old_vision_drives(tmp_path, pictures) as (_, _, log, _):
         assert best_rate_fps(log, 0.95 * FPS) >= 0.95 * FPS
@@ -127,7 +127,7 @@ def test_on_a_quiet_machine_the_older_vision_sees_95_percent_of_the_pictures(tmp
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "stopped"])
-def test_without_its_vision_the_robot_stands_within_700_ms(tmp_path, pictures, number):
+def test_robot_without_its_vision_stops_within_700_ms(tmp_path, pictures, number):
     with old_vision_drives(tmp_path, pictures) as (robot, vision, _, _):
         since_us = monotonic_us()
         os.kill(vision.pid, number)
@@ -138,7 +138,7 @@ def test_without_its_vision_the_robot_stands_within_700_ms(tmp_path, pictures, n
 
 
 @pytest.mark.alone
-def test_who_never_reads_costs_the_robot_little_and_its_driver_nothing(tmp_path, pictures):
+def test_client_that_never_reads_delays_no_driver(tmp_path, pictures):
     with old_vision_drives(tmp_path, pictures) as (robot, _, log, url):
         memory = Path(f"/proc/{robot.network_pid()}/statm")
         before_kib, alone_fps = int(memory.read_text().split()[1]) * 4, _rate_fps(log, 4.0)
@@ -178,7 +178,7 @@ def said(events: Path) -> list[tuple[int, str]]:
 
 
 @pytest.mark.slow
-def test_our_vision_answers_an_older_robot_at_once_and_finds_it_again(tmp_path, pictures):
+def test_vision_answers_a_legacy_robot_immediately_and_reconnects(tmp_path, pictures):
     port = free_port()
     with our_vision(tmp_path, f"ws-legacy://127.0.0.1:{port}") as vision:
         with old_robot(tmp_path, pictures, port) as (_, events):

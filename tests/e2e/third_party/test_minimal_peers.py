@@ -80,7 +80,7 @@ def check_driven(robot: Process, endpoint: str) -> None:
         assert until(lambda: robot.wheels() == STILL, 0.7), "0.7 s after its driver was killed it still moves"
 
 
-def test_the_robot_of_the_page_is_driven_by_our_vision(tmp_path):
+def test_vision_drives_the_robot_of_the_page(tmp_path):
     code = program_of_the_page()
     assert sum(bool(line.strip()) for line in code.splitlines()) < 70 and "sightline.v1" in code
     (tmp_path / "robot.py").write_text(code, "utf-8")
@@ -91,7 +91,7 @@ def test_the_robot_of_the_page_is_driven_by_our_vision(tmp_path):
 
 
 @pytest.mark.parametrize("kind", SCHEMES)
-def test_the_minimal_robot_is_driven_by_our_vision_and_stopped_by_our_operator(kind):
+def test_vision_drives_and_operator_stops_the_minimal_robot(kind):
     port = str(free_port())
     endpoint = SCHEMES[kind].format(port)
     with Process("examples/minimal_robot.py", kind, port, PICTURES) as robot:
@@ -146,7 +146,7 @@ def test_the_minimal_vision_drives_our_robot(tmp_path, kind):
 
 
 @pytest.mark.parametrize("name", ["minimal_robot", "minimal_vision"])
-def test_they_do_not_import_ours(name):
+def test_minimal_peers_do_not_import_sightline(name):
     text = (ROOT / f"examples/{name}.py").read_text("utf-8")
     for code in (text, program_of_the_page()):
         assert not re.search(r"^\s*(from|import) (protocol|\w+_side|sim)\b", code, re.MULTILINE)

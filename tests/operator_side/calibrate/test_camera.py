@@ -107,7 +107,7 @@ def test_boards_that_do_not_fit_one_camera_are_rejected():
 
 
 @pytest.mark.parametrize("jpeg", [EMPTY, b"", b"\xff\xd8 no picture", EMPTY[:300]], ids=["empty", "none", "bad", "cut"])
-def test_no_board_is_found_where_none_is(jpeg):
+def test_image_without_a_board_gives_no_board(jpeg):
     assert find_board(jpeg, BOARD) is None
 
 

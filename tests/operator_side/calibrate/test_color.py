@@ -48,7 +48,7 @@ BALL = Box(110, 112)
 
 @pytest.mark.parametrize("hue_deg", range(0, 360, 15))
 @pytest.mark.parametrize("place", [BALL, Box(92, 92, 36, 42)], ids=["click", "box"])
-def test_any_colour_is_found_again_and_nothing_else(hue_deg, place):
+def test_picked_color_finds_only_the_target(hue_deg, place):
     random = Random(hue_deg)
     picture = shaded(ball_picture(hue_deg, seed=hue_deg))
     ranges = pick(picture, place)
@@ -62,7 +62,7 @@ def test_any_colour_is_found_again_and_nothing_else(hue_deg, place):
 
 
 @pytest.mark.parametrize(("hue_deg", "count"), [(0, 2), (3, 2), (357, 2), (354, 2), (30, 1), (330, 1), (120, 1)])
-def test_a_colour_on_both_sides_of_red_is_two_ranges(hue_deg, count):
+def test_a_color_on_both_sides_of_red_is_two_ranges(hue_deg, count):
     ranges = pick(ball_picture(hue_deg), BALL)
     assert len(ranges) == count
     if count == 2:
@@ -71,7 +71,7 @@ def test_a_colour_on_both_sides_of_red_is_two_ranges(hue_deg, count):
     assert all(one.hue_low_deg < one.hue_high_deg for one in ranges)
 
 
-def test_vision_follows_by_what_was_picked():
+def test_vision_follows_the_picked_color():
     ranges = pick(ball_picture(210), BALL)
     detector = HsvDetector(HsvConfig(ranges=ranges))
     found = detector.detect(DecodedImage(ball_picture(210, 1.2, -0.1, seed=9), 1))
@@ -85,7 +85,7 @@ def test_vision_follows_by_what_was_picked():
     (np.full((240, 320, 3), 10, np.uint8), "too dark"),
     (np.zeros((240, 320, 3), np.uint8), "too dark"),
 ])
-def test_where_there_is_no_colour_none_is_picked(picture, words):
+def test_place_without_color_is_rejected(picture, words):
     for place in (BALL, Box(110, 112, 20, 20)):
         with pytest.raises(ConfigError, match=words) as why:
             pick(picture, place)
@@ -129,7 +129,7 @@ def test_range_that_marks_only_speckle_is_rejected():
         check_trial(try_out(ranges, [speckled]))
 
 
-def test_the_mask_picture_shows_what_is_marked_beside_the_mask():
+def test_mask_image_shows_the_marked_area_next_to_the_mask():
     picture = ball_picture(60)
     ranges = pick(picture, BALL)
     shown = mask_picture(ranges, picture)
@@ -138,7 +138,7 @@ def test_the_mask_picture_shows_what_is_marked_beside_the_mask():
     assert shown[10, 10].max() < 70 and tuple(shown[10, 330]) == (0, 0, 0)
 
 
-def test_ranges_and_trials_in_words():
+def test_ranges_and_trials_are_formatted_as_text():
     ranges = pick(ball_picture(0), BALL)
     assert " and hue 0 to " in ranges_text(ranges)
     two = ball_picture(0)

@@ -63,7 +63,7 @@ def test_only_the_ranges_change_and_no_comment_is_lost(name, ranges):
     ("hsv = 3\n", "insert by hand"),
     ("x = [\n", "invalid TOML"),
 ])
-def test_what_cannot_be_changed_safely_is_left_alone(text, words, tmp_path):
+def test_file_that_cannot_be_changed_safely_stays_unchanged(text, words, tmp_path):
     file = tmp_path / "vision.toml"
     file.write_text(text)
     with pytest.raises(ConfigError, match=words.replace("[", r"\[")) as why:
@@ -72,7 +72,7 @@ def test_what_cannot_be_changed_safely_is_left_alone(text, words, tmp_path):
     assert [one.name for one in tmp_path.iterdir()] == ["vision.toml"]
 
 
-def test_vision_reads_what_was_written(tmp_path):
+def test_vision_reads_the_written_ranges(tmp_path):
     file = tmp_path / "vision.toml"
     write_ranges(file, YELLOW)
     file.chmod(0o640)
@@ -98,7 +98,7 @@ def there(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_click_in_a_picture_gives_range_mask_and_configuration(there, capsys):
+def test_click_in_an_image_gives_range_mask_and_configuration(there, capsys):
     (there / "vision.toml").write_text("# mine\n[hsv]\nshape = 'any' # all\n")
     assert run(["pick-color", "--picture", "ball.png", "--at", "110,112", "--config", "vision.toml", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
@@ -108,7 +108,7 @@ def test_a_click_in_a_picture_gives_range_mask_and_configuration(there, capsys):
     assert "# mine" in text and "# all" in text and "hue_low_deg = 20" in text
 
 
-def test_a_video_is_tried_all_along(there, capsys):
+def test_range_is_tested_over_the_whole_video(there, capsys):
     with Film(there / "run.mp4", 10) as film:
         for number in range(12):
             film.add(ball_picture(210, 1.0, 0.2 - number * 0.02, seed=number), number * 100_000)
@@ -140,7 +140,7 @@ def test_a_video_is_tried_all_along(there, capsys):
     ("--picture ball.png --at 110,112 --mask none/mask.png", "cannot write none/mask.png"),
     ("--at 1,1 --connect nowhere", "nowhere"),
 ])
-def test_what_cannot_be_picked_is_one_line_and_nothing_is_written(there, capsys, arguments, words):
+def test_failed_pick_is_one_line_and_writes_nothing(there, capsys, arguments, words):
     (there / "vision.toml").write_text("")
     (there / "bad.toml").write_text("hvs = 1\n")
     before = {one.name: one.read_bytes() for one in there.iterdir()}

@@ -60,7 +60,7 @@ def test_each_wheel_turns_by_itself_each_way_and_stops(robot):
 
 
 @pytest.mark.parametrize("answer", ["n", "", "no", "maybe", " "])
-def test_nothing_moves_unless_the_wheels_are_off_the_ground(robot, answer):
+def test_wheels_do_not_turn_without_confirmation(robot, answer):
     config, log = robot
     operator = Operator(off_the_ground=answer)
     assert not wheel_test.try_wheels(config, operator.answer, operator.lines.append)
@@ -75,12 +75,12 @@ def test_nothing_moves_unless_the_wheels_are_off_the_ground(robot, answer):
     ({}, 0, "o", "set drive.options.swapped = true"), ({"swapped": True}, 3, "o", "set drive.options.swapped = false"),
     ({}, 0, "b", "two wires of different motors"), ({}, 0, "n", "check the motors' supply"),
 ])  # fmt: skip
-def test_a_wheel_that_turned_otherwise_names_what_to_change(options, turn, wrong, expected):
+def test_wheel_that_turns_the_wrong_way_names_the_option(options, turn, wrong, expected):
     choice = PluginChoice(kind=GPIO.kind, options={**GPIO.options, **options})
     assert expected in wheel_test._advice(choice, wheel_test.TURNS[turn], wrong)
 
 
-def test_a_drive_without_such_options_is_wired_differently(robot):
+def test_drive_without_these_options_gets_a_wiring_hint(robot):
     config, _ = robot
     operator = Operator(is_that_right=["n", "y", "n", "y"], what_turned=["?", "o"], one_of="w")
     assert not wheel_test.try_wheels(config, operator.answer, operator.lines.append)
@@ -98,7 +98,7 @@ def test_drive_that_fails_is_set_to_zero_and_closed(monkeypatch, robot):
 
 
 @pytest.mark.parametrize("number", EXIT_SIGNALS)
-def test_whatever_a_key_or_a_terminal_sends_ends_with_zero(monkeypatch, robot, number):
+def test_any_key_or_terminal_end_sets_zero(monkeypatch, robot, number):
     config, log = robot
     before = signal.getsignal(number)
     monkeypatch.setattr(wheel_test.time, "sleep", lambda _s: signal.raise_signal(number))
@@ -118,7 +118,7 @@ def test_whatever_a_key_or_a_terminal_sends_ends_with_zero(monkeypatch, robot, n
     (["calibrate", "drive", "--yes", "--set", "drive.kind=log"], "drive 'log' has no duty to calibrate"),
     (["calibrate", "drive", "--yes", "--out", "/nowhere/drive.toml"], "no folder /nowhere"),
 ])  # fmt: skip
-def test_a_mistake_is_one_line_and_nothing_moves(capsys, monkeypatch, arguments, expected):
+def test_invalid_usage_is_one_line_and_moves_nothing(capsys, monkeypatch, arguments, expected):
     monkeypatch.setattr(sys, "stdin", io.StringIO())
     monkeypatch.setattr(wheel_test, "turn_for", lambda *_given: pytest.fail("it moved"))
     assert cli.run(arguments) == 2
@@ -144,7 +144,7 @@ def opened():
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM, signal.SIGINT])
-def test_a_signal_in_the_middle_of_a_turn_is_zero_first(tmp_path, opened, number):
+def test_signal_during_a_turn_sets_zero_first(tmp_path, opened, number):
     log = tmp_path / "drive.csv"
     terminal = opened("robot", "test-wheels", "--set", "drive.kind=log", "--set", f"drive.options.path={log}")
     assert terminal.shows("off the ground? y/n")
@@ -186,7 +186,7 @@ def test_measurements_that_make_no_table_are_not_written(tmp_path, capsys, monke
     assert "[0.4, 0.2]" in said, "what was measured is not lost"
 
 
-def test_only_who_confirmed_or_sits_at_a_terminal_may_turn_wheels():
+def test_wheels_turn_only_after_a_confirmation():
     wheel_test.check_confirmed(True, False, "x")
     wheel_test.check_confirmed(False, True, "x")
     with pytest.raises(ConfigError):

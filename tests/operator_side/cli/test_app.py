@@ -119,7 +119,7 @@ def test_version_is_that_of_the_distribution(capsys):
 
 
 @pytest.mark.parametrize("group", [(), *GROUPS], ids=" ".join)
-def test_without_a_subcommand_a_group_lists_its_own(capsys, group):
+def test_group_without_a_subcommand_lists_its_subcommands(capsys, group):
     if group == ("score",):  # which also runs by itself
         group = ("score", "--help")
     code, out, err = run(capsys, *group)
@@ -210,7 +210,7 @@ def test_a_robot_may_be_given_by_its_address(capsys, monkeypatch):
     ]  # fmt: skip
 
 
-def test_a_misspelt_environment_name_stops_any_service(capsys, monkeypatch):
+def test_misspelled_environment_name_stops_any_service(capsys, monkeypatch):
     monkeypatch.setenv("SIGHTLINE_ROBOT__SAFETY__MAX_LINER_MPS", "0.1")
     for service in ("robot", "vision", "sim"):
         code, _, err = run(capsys, service)
@@ -218,7 +218,7 @@ def test_a_misspelt_environment_name_stops_any_service(capsys, monkeypatch):
         assert "SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPS" in err
 
 
-def test_a_fault_of_the_program_is_one_line_and_a_traceback_only_on_request(capsys, monkeypatch):
+def test_unexpected_error_is_one_line_and_a_traceback_only_on_request(capsys, monkeypatch):
     def broken(*_arguments: object, **_options: object) -> None:
         raise ZeroDivisionError("two\nlines")
 
@@ -287,7 +287,7 @@ def shadowed(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("shadowed")
-def test_every_command_and_module_is_found_beside_files_of_our_names():
+def test_commands_ignore_files_of_the_same_names_in_the_folder():
     """One process, started as the console script is: without -P, and with the current folder on its path."""
     script = """if True:
         import importlib, json, pkgutil, sys
@@ -346,6 +346,6 @@ def test_a_missing_package_names_the_command_that_installs_it(package, version, 
     assert expected in str(error.value)
 
 
-def test_a_missing_module_of_ours_is_a_fault_and_stays_one():
+def test_missing_module_of_sightline_is_an_unexpected_error():
     with pytest.raises(ModuleNotFoundError), needs("sim"):
         raise ModuleNotFoundError(name="sightline.sim.nothing")

@@ -38,7 +38,7 @@ class Leaves(Hsv):
         sys.exit(7)
 
 
-def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:
+def test_detector_list_shows_which_detectors_work(capsys) -> None:
     code, out, _ = run(capsys, "detector", "list", "--json")
     listed = {one["name"]: one for one in json.loads(out)["detectors"]}
     assert code == 0 and {"hsv", "adaptive", "onnx", "zenoh"} <= set(listed)
@@ -47,7 +47,7 @@ def test_every_detector_is_listed_with_whether_it_can_be_used(capsys) -> None:
     assert code == 0 and "adaptive   ok" in out
 
 
-def test_a_detector_that_keeps_its_promises_passes(capsys) -> None:
+def test_detector_that_keeps_the_contract_passes(capsys) -> None:
     code, out, _ = run(capsys, "detector", "check", "hsv", "--json")
     report = json.loads(out)
     assert code == 0 and report["ok"] and len(report["checks"]) >= 8
@@ -148,13 +148,15 @@ def test_a_device_that_is_not_there_ends_the_service_with_3(capsys, tmp_path: Pa
 @pytest.mark.parametrize(
     ("given", "robot"), [((), "*"), (("--set", "robot=r2"), "r2"), (("--set", "robot=r2", "--robot", "r3*"), "r3*")]
 )
-def test_whom_it_serves_is_configured_as_all_else(capsys, monkeypatch, given: tuple[str, ...], robot: str) -> None:
+def test_detector_service_reads_its_robots_from_settings(
+    capsys, monkeypatch, given: tuple[str, ...], robot: str
+) -> None:
     served = []
     monkeypatch.setattr(detector_service, "run", lambda config, *_: served.append(config.robot) or 0)
     assert run(capsys, "detector", "--serve", "hsv", *given)[0] == 0 and served == [robot]
 
 
-def test_the_group_alone_shows_its_help(capsys) -> None:
+def test_detector_group_without_a_subcommand_shows_its_help(capsys) -> None:
     code, out, _ = run(capsys, "detector")
     assert code == 0 and "--serve NAME" in out and "promote" not in out
 
@@ -169,7 +171,7 @@ def test_listing_imports_nothing_heavy_before_it_is_needed() -> None:
     assert done.stdout.rstrip().endswith("False")
 
 
-def test_the_example_of_a_detector_keeps_the_promises(capsys, monkeypatch) -> None:
+def test_example_detector_keeps_the_contract(capsys, monkeypatch) -> None:
     monkeypatch.chdir(Path(__file__).parent.parent.parent.parent / "examples")
     monkeypatch.syspath_prepend(str(Path.cwd()))
     code, out, _ = run(capsys, "detector", "check", "my_detector:BrightestSpot", "--set", "least=150", "--json")

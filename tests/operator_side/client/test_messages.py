@@ -31,13 +31,13 @@ def test_every_channel_is_one_line_and_one_object(name):
     assert json.loads(json.dumps(read, allow_nan=False)) == read
 
 
-def test_pictures_are_their_size_and_twists_their_numbers():
+def test_images_are_shown_by_size_and_twists_by_numbers():
     assert message_object(usual("overlay"))["payload"] == {"width_px": 640, "height_px": 480, "bytes": 21}
     assert "640x480 JPEG, 21 bytes" in message_line(usual("frame"))
     assert message_line(usual("twist")).startswith("twist/vision #7: +0.2000 m/s -0.3500 rad/s   [")
 
 
-def test_a_scan_is_summed_up_and_in_full_as_json():
+def test_scan_is_summarized_as_text_and_complete_as_json():
     message = usual("scan", payload=struct.pack("<4f", 0.5, 1.25, math.inf, 8.0))
     assert "4 rays, 3 detect something, nearest 0.50 m" in message_line(message)
     assert message_object(message)["payload"]["ranges_m"] == [0.5, 1.25, None, 8.0]
@@ -59,7 +59,7 @@ def test_invalid_message_is_shown_with_its_reason():
 @pytest.mark.parametrize(
     "case", [one for one in CASES if one.refuse is None], ids=lambda one: f"{one.channel}/{one.name}"
 )
-def test_what_the_specification_accepts_is_shown(case):
+def test_accepted_messages_of_the_specification_are_shown(case):
     _, _, name, *source = case.key.split("/")
     read = message_object(Message(CHANNELS[name], source[0] if source else "", case.header, case.payload))
     assert "error" not in read
@@ -100,12 +100,12 @@ def heard(name, count):
 
 
 @pytest.mark.parametrize("name", PICTURES)
-def test_only_the_newest_picture_waits(name):
+def test_only_the_newest_image_waits(name):
     inbox, messages = heard(name, 5)
     assert inbox.take(0.0) == messages[-1] and inbox.take(0.0) is None and inbox.dropped == 4
 
 
-def test_words_wait_in_order_up_to_a_bound():
+def test_text_messages_wait_in_order_up_to_a_bound():
     inbox, messages = heard("status", MAX_WAITING + 3)
     assert [inbox.take(0.0) for _ in range(MAX_WAITING)] == messages[:MAX_WAITING]
     assert inbox.take(0.0) is None and inbox.dropped == 3

@@ -73,7 +73,7 @@ def test_request_that_the_protocol_does_not_permit_is_rejected(name, options, wo
         request_of(1, name, (), options)
 
 
-def test_a_report_in_words():
+def test_report_is_formatted_as_text():
     report = MissionReport(mission="goto", phase="driving", note="reached 1 of 2", detector="hsv", device="cpu")
     assert mission_line(report) == "goto: driving; reached 1 of 2" and not cannot(report)
     over = report.model_copy(update={"phase": "cannot reach", "done": True, "refused": "unknown mission 'x'",

@@ -64,7 +64,7 @@ def test_overlays_are_taken_without_other_subscriptions(site):
     assert not site.robot.has_listener(FRAME) and site.acks.take(0.1) is None
 
 
-def test_without_vision_frames_are_taken_and_acknowledged_until_it_is_back(site):
+def test_viewer_acknowledges_frames_while_vision_is_missing(site):
     pictures = Pictures(site.link, "viewer")
     shot = taken(pictures, site.frame)
     assert shot.channel is FRAME and (shot.width_px, shot.height_px) == (320, 240)
@@ -76,7 +76,7 @@ def test_without_vision_frames_are_taken_and_acknowledged_until_it_is_back(site)
     assert until(lambda: taken(pictures, site.frame).channel is FRAME)
 
 
-def test_who_wants_frames_gets_frames(site):
+def test_viewer_of_frames_receives_frames(site):
     pictures = Pictures(site.link, "viewer", FRAME)
     assert taken(pictures, site.frame).channel is FRAME
     assert not site.vision.has_listener(OVERLAY)
@@ -97,7 +97,7 @@ def test_invalid_image_is_counted_and_skipped(site):
     assert taken(pictures, site.overlay).width_px == 640
 
 
-def test_the_robots_silence_is_noticed(site, monkeypatch):
+def test_silent_robot_is_not_online(site, monkeypatch):
     monkeypatch.setattr(pictures_module, "SILENT_S", 0.3)
     pictures = Pictures(site.link, "viewer")
     assert not pictures.is_online
@@ -142,7 +142,7 @@ def test_frame_buffer_over_http_numbers_its_images(site):
     assert buffer.route({"number": "1"}, b"").status == 200 and buffer.route({"number": "2"}, b"").status == 204
 
 
-def test_who_has_the_keys_of_an_operator_watches_as_one(tmp_path):
+def test_viewer_with_operator_keys_has_the_operator_role(tmp_path):
     assert viewer_role("") == "viewer" and viewer_role(str(tmp_path)) == "viewer"
     (tmp_path / "operator.token").write_text("x" * 16)
     assert viewer_role(str(tmp_path)) == "operator"

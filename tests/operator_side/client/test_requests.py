@@ -190,7 +190,7 @@ def test_short_status_fits_a_glance_and_names_the_next_command(state, holder, ex
     assert lines[-1].startswith(expected)
 
 
-def test_a_report_is_what_was_published():
+def test_report_has_the_published_status():
     driving = DriverCore(RobotConfig(), "0000000a")
     message = next(one for one in driving.messages(5) if one.channel is STATUS)
     report = read_report(message)

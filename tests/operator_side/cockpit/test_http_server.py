@@ -57,7 +57,7 @@ def test_a_page_is_served_with_its_words_as_text(port):
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:{port}", "localhost:{port}", "[::1]:{port}", "localhost"])
-def test_this_machine_by_any_name(port, host):
+def test_any_name_of_this_machine_is_accepted(port, host):
     with asked(port, "GET", "/echo?a=1", Host=host.format(port=port)) as (answer, body):
         assert answer.status == 200 and json.loads(body) == {"a": "1"}
 
@@ -70,7 +70,7 @@ def test_other_host_name_is_rejected(port, host):
         assert answer.status == 403 and b"this machine only" in body
 
 
-def test_what_changes_something_comes_from_the_page_itself(port):
+def test_only_posts_of_the_own_page_are_accepted(port):
     with asked(port, "POST", "/echo", b"{}", Origin=f"http://127.0.0.1:{port}") as (answer, body):
         assert (answer.status, body) == (200, b"{}")
     for wrong in ({"Origin": "http://evil.example"}, {"Origin": "null"}, {"Content_Type": "text/plain"}):
@@ -95,7 +95,7 @@ def test_invalid_request_gets_an_error_and_the_next_is_served(port):
         assert (answer.status, said) == (200, b"3")
 
 
-def test_nonsense_ends_nothing(port):
+def test_invalid_requests_do_not_end_the_server(port):
     for noise in (b"\0" * 100 + b"\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 300 + b"\r\n", b""):
         with socket.create_connection(("127.0.0.1", port), 5) as stranger:
             stranger.sendall(noise)

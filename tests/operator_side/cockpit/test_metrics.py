@@ -30,7 +30,7 @@ def _health(port):
 
 
 @pytest.mark.slow
-def test_a_robot_is_measured_and_its_end_is_seen(tmp_path):
+def test_metrics_show_a_robot_and_its_end(tmp_path):
     port = free_port()
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
         command = [

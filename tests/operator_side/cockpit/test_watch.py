@@ -71,7 +71,7 @@ def test_any_channel_is_printed(site: Site, end: str, capsys: pytest.CaptureFixt
     assert re.match(r"status #\d+: state=DISARMED reason=", capsys.readouterr().out)
 
 
-def test_what_cannot_be_watched_is_one_line(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_watch_is_one_line(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, code, words in (
         (["r1", "fram"], 2, "unknown channel 'fram'; did you mean 'frame'?"),
         (["r1", "--json"], 2, "name it"),
@@ -109,7 +109,7 @@ def test_snapshots_and_videos_are_written(
     assert sorted(one.name for one in tmp_path.iterdir()) == ["drawn.jpg", "drawn.mp4", "plain.png"]
 
 
-def test_a_video_that_is_ended_early_is_whole(site: Site, tmp_path: Path) -> None:
+def test_video_that_ends_early_is_complete(site: Site, tmp_path: Path) -> None:
     film = tmp_path / "run.mp4"
     where = ("r1", "--connect", site.zenoh, "--seconds", "60", "--out", str(film))
     with Started(tmp_path, "capture", *where) as capturing:
@@ -138,7 +138,7 @@ def test_a_capture_without_a_robot_leaves_nothing(tmp_path: Path, capsys: pytest
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_colour_is_picked_from_the_robots_own_pictures(
+def test_color_is_picked_from_the_images_of_a_robot(
     site: Site, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     where = ["--connect", site.web, "--mask", str(tmp_path / "mask.png"), "--json"]
@@ -159,7 +159,7 @@ def _yellow(picture):
 
 
 @pytest.mark.alone
-def test_the_page_shows_what_vision_sees_and_frames_without_it(tmp_path: Path) -> None:
+def test_page_shows_the_overlay_and_frames_without_it(tmp_path: Path) -> None:
     chromium()
     with ExitStack() as ending:
         site = Site(tmp_path, ending)
@@ -183,7 +183,7 @@ def test_the_page_shows_what_vision_sees_and_frames_without_it(tmp_path: Path) -
         assert page.errors == []
 
 
-def test_a_colour_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) -> None:
+def test_a_color_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) -> None:
     chromium()
     config = tmp_path / "vision.toml"
     config.write_text("# colors\n[hsv] # of mine\nshape = 'any'\n")
@@ -210,7 +210,7 @@ def test_a_colour_is_picked_on_the_page_and_written(tmp_path: Path, site: Site) 
     assert "# colors" in config.read_text() and "# of mine" in config.read_text()
 
 
-def test_a_colour_is_picked_in_a_video_by_its_box(tmp_path: Path) -> None:
+def test_a_color_is_picked_in_a_video_by_its_box(tmp_path: Path) -> None:
     chromium()
     with Film(tmp_path / "run.mp4", 10) as film:
         for number in range(8):

@@ -103,7 +103,7 @@ def test_a_bad_value_is_one_line_that_names_it_and_what_is_allowed(setting, expe
         assert part in one_line(error)
 
 
-def test_several_errors_are_the_first_and_a_count(tmp_path):
+def test_several_errors_are_shown_as_the_first_and_a_count(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text("foo = 1\n[safety]\nmax_linear_mps = -1\nsilence_ms = 'x'\n")
     with pytest.raises(ConfigError) as error:
@@ -143,7 +143,7 @@ def test_implied_values_yield_to_given_ones():
 
 
 @pytest.mark.parametrize("profile", [None, "sim"])
-def test_one_folder_of_sockets_is_enough_for_the_whole_simulated_robot(profile):
+def test_one_socket_folder_configures_the_whole_simulated_robot(profile):
     options = {f"{device}.options.socket_dir": "/s" for device in ("camera", "drive")}
     config = load_service("robot", profile=profile, options=options, environ={}).config
     assert config.ranging == config.drive == config.camera
@@ -151,7 +151,7 @@ def test_one_folder_of_sockets_is_enough_for_the_whole_simulated_robot(profile):
     assert other.ranging.kind == "other"
 
 
-def test_the_simulation_profile_arms_by_itself_and_nothing_else_does():
+def test_only_the_simulation_profile_arms_automatically():
     assert load("robot", profile="sim", environ={}).config.safety.auto_arm
     assert not load("robot", environ={}).config.safety.auto_arm
     with pytest.raises(ConfigError, match="did you mean 'sim'"):
@@ -159,7 +159,7 @@ def test_the_simulation_profile_arms_by_itself_and_nothing_else_does():
 
 
 @pytest.mark.parametrize("service", SERVICES)
-def test_what_show_prints_is_a_file_that_gives_the_same(service, tmp_path):
+def test_output_of_show_is_a_file_with_the_same_values(service, tmp_path):
     config = load(service, environ={}).config
     path = tmp_path / "shown.toml"
     path.write_text(toml_text(config.model_dump(mode="json"), lambda _key: "where it came from"))
@@ -179,13 +179,13 @@ def test_any_table_survives_as_toml(table):
     assert tomllib.loads(toml_text(table)) == table
 
 
-def test_vision_may_name_several_robots_and_a_robot_is_one():
+def test_vision_accepts_several_robots_and_a_robot_only_one():
     assert load("vision", sets=("robot=r*",), environ={}).config.robot == "r*"
     with pytest.raises(ConfigError, match="invalid robot id 'r\\*'"):
         load("robot", sets=("robot=r*",), environ={})
 
 
-def test_what_a_simulated_robot_is_made_of_may_be_a_file():
+def test_simulated_robot_model_may_be_a_file():
     assert load("sim", sets=("robot=my/car.toml",), environ={}).config.robot == "my/car.toml"
 
 

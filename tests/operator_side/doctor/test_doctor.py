@@ -40,7 +40,7 @@ def test_plain_information_is_not_a_failure():
     assert bad.line.endswith("fix: do this") and "fix" not in good.line
 
 
-def test_what_has_a_unit_is_a_number_for_scripts():
+def test_values_with_units_are_numbers_in_json():
     check = Finding("round trip", True, "12.5", "", "ms", "60").check
     assert (check["value"], check["bound"]) == (12.5, 60.0)
     assert Finding("a", True, "x", "do").check["fix"] == "" and Finding("a", False, "x", "do").check["fix"] == "do"
@@ -204,7 +204,7 @@ def test_the_rate_that_a_camera_delivers_is_measured(capsys):
 
 
 @pytest.mark.slow
-def test_a_robot_is_looked_at_and_its_frames_counted(capsys, tmp_path):
+def test_doctor_checks_a_robot_and_counts_its_frames(capsys, tmp_path):
     with RobotProcess(tmp_path) as robot:
         assert until(lambda: port_owner(port_of(robot.endpoint)), START_S)
         checks = _checks(capsys, "--peer", robot.endpoint)

@@ -51,7 +51,7 @@ def record(path: Path, messages, **about: str) -> Recorder:
 
 @settings(max_examples=40)
 @given(st.lists(MESSAGES, max_size=30))
-def test_everything_comes_back_in_order(tmp_path_factory, messages):
+def test_recording_returns_all_messages_in_order(tmp_path_factory, messages):
     path = tmp_path_factory.mktemp("recording") / "run.mcap"
     recorder = record(path, messages, scenario="circle")
     assert [one.message for one in read_recording(path)] == messages
@@ -145,7 +145,7 @@ def test_replay_names_the_first_difference(recorded, tmp_path):
     assert "0.1234|0.0000" in result.first_difference
 
 
-def test_replay_reports_what_is_not_in_the_recording(recorded, tmp_path):
+def test_replay_reports_missing_messages(recorded, tmp_path):
     whole = replay(recorded)
     frames = [at for at, one in enumerate(read_recording(recorded)) if one.message.channel is FRAME]
     result = replay(rewritten(recorded, tmp_path / "a.mcap", lambda at, one: None if at == frames[5] else one))

@@ -55,7 +55,7 @@ def answers(path):
     return [decode(AnswerHeader, one.message.header) for one in read_recording(path) if one.message.channel is TWIST]
 
 
-def test_scans_and_switched_missions_come_again_byte_for_byte(recorded):
+def test_replay_repeats_scans_and_switched_missions_byte_for_byte(recorded):
     headers = answers(recorded)
     assert [{one.mission.id for one in headers if one.mission} == {1, 3, 4}, headers[-1].mission] == [True, None]
     assert len({one.scan for one in headers if one.scan is not None}) > 10
@@ -65,7 +65,7 @@ def test_scans_and_switched_missions_come_again_byte_for_byte(recorded):
 
 
 @pytest.mark.parametrize("channel", [SCAN, MISSION])
-def test_what_was_gone_by_and_not_recorded_is_missed(recorded, tmp_path, channel):
+def test_replay_reports_an_input_that_was_not_recorded(recorded, tmp_path, channel):
     kept = [one.message for one in read_recording(recorded) if one.message.channel is not channel]
     record(tmp_path / "run.mcap", kept, **read_about(recorded))
     result = replay(tmp_path / "run.mcap")

@@ -31,7 +31,7 @@ def _parsed(text):
 
 
 @pytest.mark.parametrize("service", install.SERVICES)
-def test_a_unit_has_this_machines_paths_and_nothing_of_the_template(service, tmp_path):
+def test_unit_has_the_paths_of_this_machine(service, tmp_path):
     planned = install.plan(service, PROGRAM, CONFIG, "pi", tmp_path)
     unit = _parsed(planned.text)
     assert unit["Service"]["ExecStart"] == f"{PROGRAM} {service} --config {CONFIG}"
@@ -42,7 +42,7 @@ def test_a_unit_has_this_machines_paths_and_nothing_of_the_template(service, tmp
     assert planned.path == tmp_path / f"sightline-{service}.service"
 
 
-def test_a_robots_motors_are_zeroed_however_its_driver_ends(tmp_path):
+def test_unit_zeroes_the_motors_after_every_end(tmp_path):
     unit = _parsed(install.plan("robot", PROGRAM, CONFIG, "pi", tmp_path).text)
     assert unit["Service"]["ExecStopPost"] == f"{PROGRAM} robot --config {CONFIG} --zero-motors"
     assert unit["Service"]["Type"] == "notify"
@@ -57,7 +57,7 @@ def test_value_that_changes_the_unit_is_rejected(service, config, user, tmp_path
         install.plan(service, PROGRAM, config, user, tmp_path)
 
 
-def test_it_shows_first_and_writes_nothing(capsys, monkeypatch, tmp_path):
+def test_install_without_yes_writes_nothing(capsys, monkeypatch, tmp_path):
     monkeypatch.setattr(install, "UNIT_DIR", tmp_path)
     assert cli.run(["install", "vision", "--config", str(CONFIG), "--user", "pi"]) == 0
     said = capsys.readouterr()
@@ -66,13 +66,13 @@ def test_it_shows_first_and_writes_nothing(capsys, monkeypatch, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_under_sudo_it_runs_as_the_calling_user(capsys, monkeypatch):
+def test_unit_runs_as_the_user_of_sudo(capsys, monkeypatch):
     monkeypatch.setenv("SUDO_USER", "pi")
     assert cli.run(["install", "vision", "--config", str(CONFIG)]) == 0
     assert "User=pi\n" in capsys.readouterr().out
 
 
-def test_a_file_that_is_named_from_here_is_found_from_anywhere(capsys, monkeypatch, tmp_path):
+def test_relative_file_is_written_as_absolute_path(capsys, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     Path("car.toml").write_text(CAR)
     assert cli.run(["install", "robot", "--config", "car.toml", "--user", "pi"]) == 0
@@ -112,7 +112,7 @@ def stops_with(text):
 
 
 @pytest.mark.parametrize("enable", [(), (17,), (3, 2)])
-def test_a_robot_on_pins_has_its_own_pins_put_low_first_and_then_its_own_command(enable, tmp_path):
+def test_drop_in_sets_the_pins_low_before_the_units_command(enable, tmp_path):
     options = {"left_forward_pin": 20, "right_backward_pin": 21, "enable_pins": enable}
     robot = RobotConfig(drive=PluginChoice(kind="gpio", options=options))
     planned = install.drop_in(robot, PROGRAM, CONFIG, tmp_path)
@@ -124,7 +124,7 @@ def test_a_robot_on_pins_has_its_own_pins_put_low_first_and_then_its_own_command
     assert "#" not in planned.text and "/opt/" not in planned.text
 
 
-def test_another_drive_has_no_pins(tmp_path):
+def test_drive_without_pins_gets_no_drop_in(tmp_path):
     assert install.drop_in(RobotConfig(), PROGRAM, CONFIG, tmp_path) is None
 
 
@@ -137,7 +137,7 @@ def test_wrong_pins_are_not_installed(car, capsys):
     assert (list(units.iterdir()), told) == ([], [])
 
 
-def test_both_files_are_shown_first_and_written_with_yes(car, capsys):
+def test_both_files_are_written_only_with_yes(car, capsys):
     file, units, told = car
     command = ["install", "robot", "--config", str(file), "--user", "pi"]
     assert cli.run(command) == 0
@@ -152,7 +152,7 @@ def test_both_files_are_shown_first_and_written_with_yes(car, capsys):
                     ["restart", "sightline-robot.service"]], "one that runs has to go on with the new pins"
 
 
-def test_the_pins_of_a_drive_that_is_gone_are_left_alone_again(car, capsys):
+def test_drop_in_is_removed_for_another_drive(car, capsys):
     file, units, _told = car
     command = ["install", "robot", "--config", str(file), "--user", "pi", "--yes"]
     assert cli.run(command) == 0

@@ -42,7 +42,7 @@ def test_a_held_key_moves_the_wheels_within_the_bound(key):
 
 @pytest.mark.parametrize("repeat_ms", [15, 33, 50, 90])
 @pytest.mark.parametrize("offset_ms", [0, 7, 19, 29])
-def test_a_key_let_go_of_is_a_zero_command_within_the_bound(repeat_ms, offset_ms):
+def test_released_key_sends_zero_within_the_bound(repeat_ms, offset_ms):
     rig = TeleopRig().armed()
     rig.hold("u", repeat_us=repeat_ms * 1000)
     rig.run(1.5 + offset_ms / 1000)
@@ -165,7 +165,7 @@ def test_movement_key_right_after_a_hand_over_arms_again():
     assert rig.applied.linear_mps == pytest.approx(0.2)
 
 
-def test_handing_over_again_at_once_is_not_misled_by_an_old_status():
+def test_second_hand_over_ignores_an_old_status():
     rig = vision_drives()
     rig.tap("i")
     rig.run(0.01)
@@ -216,7 +216,7 @@ def test_a_stopped_robot_is_not_armed_by_any_key():
 
 
 @pytest.mark.parametrize("what", ["stop", "disarm"])
-def test_a_key_that_is_held_meanwhile_does_not_arm_again(what):
+def test_key_held_during_a_disarm_does_not_arm_again(what):
     rig = TeleopRig().armed()
     rig.hold("i")
     rig.run(1.5)
@@ -230,7 +230,7 @@ def test_a_key_that_is_held_meanwhile_does_not_arm_again(what):
     assert (rig.applied.linear_mps > 0) == (what == "disarm"), "a new press is a new decision; STOP takes a reset"
 
 
-def test_a_link_that_is_back_does_not_drive_on():
+def test_restored_link_does_not_continue_the_drive():
     rig = TeleopRig().armed()
     rig.hold("i")
     rig.run(1.5)
@@ -242,7 +242,7 @@ def test_a_link_that_is_back_does_not_drive_on():
     assert rig.applied == STILL and rig.state is State.DISARMED
 
 
-def test_leaving_is_zero_and_then_the_lease_is_given_back():
+def test_quitting_sends_zero_and_then_releases_the_lease():
     rig = TeleopRig().armed()
     rig.hold("i")
     rig.run(1.5)

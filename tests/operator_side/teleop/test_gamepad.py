@@ -60,14 +60,14 @@ def plugged(monkeypatch):
     return devices
 
 
-def test_auto_takes_the_first_that_is_a_gamepad_and_lets_go_of_the_others(plugged):
+def test_auto_opens_the_first_gamepad_and_closes_the_others(plugged):
     plugged["/dev/input/event1"] = mouse = Device("/dev/input/event1", keys=(), axes=())
     plugged["/dev/input/event2"] = Device("/dev/input/event2")
     assert Gamepad("auto").name == "pad /dev/input/event2"
     assert mouse.closed
 
 
-def test_what_it_reads_is_the_pads_own_and_its_end_is_an_error(plugged):
+def test_gamepad_events_are_read_and_its_end_is_an_error(plugged):
     plugged["a"] = device = Device("a")
     gamepad = Gamepad("a")
     assert gamepad.read() == [] and gamepad.fileno() == 7
@@ -81,13 +81,13 @@ def test_what_it_reads_is_the_pads_own_and_its_end_is_an_error(plugged):
     ("auto", "no gamepad found"), ("/dev/input/event9", "Permission denied; add your user to the group input"),
     ("keys", "has no stick; name a gamepad"),
 ])  # fmt: skip
-def test_without_a_gamepad_it_is_one_line(plugged, path, says):
+def test_missing_gamepad_is_one_line(plugged, path, says):
     plugged["keys"] = Device("keys", keys=(), axes=(ABS_X,))
     with pytest.raises(HardwareError, match=says):
         Gamepad(path)
 
 
-def test_without_evdev_the_extra_is_named(monkeypatch):
+def test_missing_evdev_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "evdev", None)
     with pytest.raises(ConfigError, match=r"evdev is not installed: pip install '\.\[gamepad\]'"):
         Gamepad("auto")

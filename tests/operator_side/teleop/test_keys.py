@@ -73,7 +73,7 @@ def test_a_held_key_is_held_throughout_once_its_terminal_is_known(delay_ms, repe
         assert not hold.is_held(now_us + LONGEST_HOLD_US + 1)
 
 
-def test_a_tap_ends_by_itself_and_teaches_nothing():
+def test_tap_ends_after_its_time_and_changes_no_rate():
     hold = Hold()
     before = hold.delay_us, hold.interval_us
     for tap in range(10):

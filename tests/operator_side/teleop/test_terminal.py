@@ -181,7 +181,7 @@ def test_tab_and_keys_switch_between_vision_and_manual(seat):
 
 
 @pytest.mark.slow
-def test_over_websocket_it_drives_and_stops_too(tmp_path):
+def test_teleop_drives_and_stops_over_websocket(tmp_path):
     endpoint = free_endpoint("ws://")
     with RobotProcess(tmp_path, endpoint=endpoint, safety={"auto_arm": False}) as robot:
         robot.wait_until_on("on ws://")
@@ -210,7 +210,7 @@ def test_terminal_shows_keys_and_robot(seat):
     assert "Traceback" not in seat.terminal.text()
 
 
-def test_without_a_terminal_it_is_one_line(capsys):
+def test_teleop_without_a_terminal_is_one_line(capsys):
     assert cli.run(["teleop", "r1", "--connect", "tcp/127.0.0.1:1"]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err == (

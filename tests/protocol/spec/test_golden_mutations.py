@@ -64,7 +64,7 @@ def within_bounds(value):
 
 
 @pytest.mark.parametrize("case", ACCEPTED, ids=lambda case: f"{case.channel}/{case.name}")
-def test_a_message_cut_or_changed_anywhere_is_read_or_rejected(case):
+def test_truncated_or_changed_message_is_read_or_rejected(case):
     rejected = [check(outcome(case.key, header, case.payload)) for header in (*cut(case.header), *flipped(case.header))]
     for payload in cut(case.payload):
         check(outcome(case.key, case.header, payload))
@@ -75,7 +75,7 @@ def test_a_message_cut_or_changed_anywhere_is_read_or_rejected(case):
 
 
 @pytest.mark.parametrize("case", [one for one in WIRED if one.folder == "websocket"], ids=lambda case: case.name)
-def test_a_websocket_message_cut_or_changed_anywhere_is_taken_apart_or_rejected(case):
+def test_truncated_or_changed_websocket_message_is_split_or_rejected(case):
     message = bytes.fromhex(case.given["message_hex"])
     block = 2 + int.from_bytes(message[:2])
     changed = [one + message[block:] for one in flipped(message[:block])]
@@ -93,7 +93,7 @@ def test_a_websocket_message_cut_or_changed_anywhere_is_taken_apart_or_rejected(
 @pytest.mark.parametrize(
     "case", [one for one in WIRED if one.folder != "websocket"], ids=lambda case: f"{case.folder}/{case.name}"
 )
-def test_a_text_cut_or_changed_anywhere_is_read_or_rejected(case):
+def test_truncated_or_changed_text_is_read_or_rejected(case):
     """A transport hands over no text that is not UTF-8, so a changed byte stands for the character of that number."""
     text = case.given["text"].encode()
     for one in (*cut(text), *flipped(text)):

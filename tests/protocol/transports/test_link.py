@@ -94,7 +94,7 @@ def test_a_consumer_that_never_takes_costs_no_memory(rig):
     assert resident_kib() - before_kib < 25_000
 
 
-def test_a_callback_that_raises_ends_nothing(rig):
+def test_callback_that_raises_does_not_end_the_link(rig):
     robot, peer, _, _ = _pair(rig)
     calls: list[bytes] = []
 
@@ -147,7 +147,7 @@ def test_oversize_is_rejected_at_both_ends(rig):
     assert twists.take() is None
 
 
-def test_has_listener_follows_who_subscribes(rig):
+def test_has_listener_follows_the_subscriptions(rig):
     robot, peer = rig.robot(), rig.peer()
     assert rig.until(lambda: peer.connected)
     assert not robot.has_listener(FRAME)

@@ -112,7 +112,7 @@ def test_messages_in_flight_are_bounded_and_overflow_returns_false():
     assert network.delivered["FROM_ROBOT"] == MAX_IN_FLIGHT
 
 
-def test_what_is_under_way_to_a_closed_link_is_lost():
+def test_message_in_flight_to_a_closed_link_is_lost():
     network = MemoryNetwork(delay_us=1_000)
     robot, peer, stays = network.link("r1"), network.link("r1"), network.link("r1")
     heard: list[str] = []

@@ -25,7 +25,7 @@ def test_peers_of_both_kinds_send_and_receive():
         assert not robot.publish(STATUS, b"{}", b"{}")
 
 
-def test_a_failure_on_one_endpoint_leaves_none_open():
+def test_failure_of_one_endpoint_closes_all():
     zenoh, web = free_endpoint(), free_endpoint("ws://")
     with open_link("r1", listen=[web]), pytest.raises(LinkError):
         open_link("r1", listen=[zenoh, web])

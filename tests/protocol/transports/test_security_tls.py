@@ -107,7 +107,7 @@ def test_a_certificate_of_another_host_is_rejected(tmp_path):
         open_websocket("r1", connect=endpoint, role="vision", secure=folder)
 
 
-def test_who_speaks_no_tls_is_counted_and_gone(secured, caplog):
+def test_client_without_tls_is_counted_and_closed(secured, caplog):
     robot, endpoint, folder = secured
     with socket.create_connection(address_of(endpoint)) as near:
         near.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
@@ -116,7 +116,7 @@ def test_who_speaks_no_tls_is_counted_and_gone(secured, caplog):
     open_websocket("r1", connect=endpoint, role="vision", secure=folder).close()
 
 
-def test_a_handshake_that_is_dripped_is_not_waited_for(secured):
+def test_slow_handshake_ends_at_its_deadline(secured):
     robot, endpoint, folder = secured
     hello = ssl.MemoryBIO()
     offer = ssl.create_default_context().wrap_bio(ssl.MemoryBIO(), hello, server_hostname="127.0.0.1")
@@ -134,7 +134,7 @@ def test_a_handshake_that_is_dripped_is_not_waited_for(secured):
     open_websocket("r1", connect=endpoint, role="vision", secure=folder).close()
 
 
-def test_another_library_comes_in_over_tls_with_its_token(secured):
+def test_other_library_connects_over_tls_with_its_token(secured):
     _, endpoint, folder = secured
     stranger = websocket.create_connection(
         endpoint, timeout=3, sslopt={"ca_certs": f"{folder}/ca.pem"},
@@ -146,7 +146,7 @@ def test_another_library_comes_in_over_tls_with_its_token(secured):
 
 
 @pytest.mark.parametrize("missing", ["robot.pem", "robot.key"])
-def test_a_folder_without_what_is_needed_is_one_line(tmp_path, missing):
+def test_folder_with_missing_keys_is_one_line(tmp_path, missing):
     folder = folder_of(tmp_path / "keys")
     (tmp_path / "keys" / missing).unlink()
     with pytest.raises(ConfigError, match=r"wss:// needs robot\.pem and robot\.key in a folder; pass --s"):
@@ -163,7 +163,7 @@ def test_a_broken_file_is_named_in_one_line(tmp_path, broken):
     assert "\n" not in str(why.value)
 
 
-def test_the_folder_of_sightline_keys_is_all_that_both_ends_need(tmp_path):
+def test_folder_of_sightline_keys_serves_both_ends(tmp_path):
     keys.make(tmp_path, [])
     endpoint = free_endpoint("wss://").replace("127.0.0.1", "0.0.0.0")
     with open_websocket("r1", listen=endpoint, role="robot", secure=str(tmp_path)) as robot:

@@ -84,7 +84,7 @@ def test_addresses_and_networks(address, listed, may):
     assert (client_address_problem(address, listed) == "") is may
 
 
-def test_the_list_stands_in_the_endpoint():
+def test_allow_list_is_read_from_the_endpoint():
     end = parse_websocket_endpoint("ws-legacy://0.0.0.0:9091?dashed&from=192.168.1.7,10.0.0.1/8")
     assert end.allow_from == ("192.168.1.7/32", "10.0.0.0/8")
     assert end.legacy.dashed
@@ -143,7 +143,7 @@ def test_the_library_logs_nothing_of_a_connection_that_is_rejected(caplog, monke
     assert not [one for one in caplog.records if one.name.startswith("websockets.s")]
 
 
-def test_who_is_listed_comes_in():
+def test_listed_client_connects():
     endpoint, here = everywhere("ws-legacy")
     with open_websocket("r1", listen=f"{endpoint}?from=10.1.2.3,127.0.0.0/8") as robot:
         twists = robot.latest(TWIST)
@@ -192,7 +192,7 @@ def test_a_token_is_shown_once_in_one_of_two_ways(authorizations, offers, role):
     assert role_of_token({token: name for name, token in TOKENS.items()}, authorizations, offers) == role
 
 
-def test_a_token_opens_the_door_and_nothing_else_does(keys, caplog):
+def test_only_the_token_permits_a_connection(keys, caplog):
     endpoint, here = everywhere()
     with open_websocket("r1", listen=endpoint, secure=keys) as robot:
         with open_websocket("r1", connect=here, role="vision", secure=keys) as peer:
@@ -231,7 +231,7 @@ def test_a_role_may_publish_what_the_table_of_channels_gives_it():
 
 
 @pytest.mark.parametrize("role", TOKENS)
-def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, caplog):
+def test_token_decides_the_role_of_a_client(keys, role, caplog):
     endpoint, here = everywhere()
     sources = ("vision", "teleop", "operator", "guest")
     heard, sent = [], [*itertools.product(["twist", "ack", "request", "detections"], sources)]
@@ -257,7 +257,7 @@ def test_a_token_is_a_role_whatever_its_bearer_claims(keys, role, caplog):
 # --- one of many -----------------------------------------------------------------------------------------------------
 
 
-def test_the_seat_is_the_first_s_until_it_leaves_or_is_silent_for_a_second():
+def test_driver_slot_belongs_to_the_first_client_until_it_leaves_or_is_silent():
     seat = DriverSlot()
     claims = ("a", 0), ("b", 1), ("a", 900_000), ("b", DRIVER_SLOT_US)
     assert [seat.claim(who, now_us) for who, now_us in claims] == ["a"] * 4
@@ -269,7 +269,7 @@ def test_the_seat_is_the_first_s_until_it_leaves_or_is_silent_for_a_second():
     assert seat.claim("a", 900_000 + DRIVER_SLOT_US) == "a"
 
 
-def test_one_client_drives_and_the_rest_only_watch(caplog):
+def test_one_legacy_client_drives_and_the_others_watch(caplog):
     endpoint = free_endpoint("ws-legacy://")
     plain = endpoint.replace("ws-legacy", "ws")
     with open_websocket("r1", listen=endpoint) as robot, connect(plain) as viewer, connect(plain) as driver:

@@ -106,7 +106,7 @@ def test_each_role_publishes_only_its_channels(folder, endpoint):
             heard.clear()
 
 
-def test_what_is_over_its_channels_bound_ends_at_who_listens(folder, endpoint):
+def test_listener_drops_a_message_over_the_bound_of_its_channel(folder, endpoint):
     """At a router, so that it crosses no robot's radio; what is just within it passes."""
     heard = []
     with (
@@ -185,7 +185,7 @@ def test_plain_to_secured_and_secured_to_plain_are_rejected_with_the_cause(folde
     assert "plain link, not TLS" in _refusal(endpoint, folder, folder, plain_robot=True)
 
 
-def test_there_is_no_silent_way_back_to_a_plain_link(folder):
+def test_failed_tls_does_not_fall_back_to_a_plain_link(folder):
     with pytest.raises(ConfigError, match="has no TLS"):
         open_zenoh("r1", connect=["tcp/127.0.0.1:7447"], role="vision", secure=str(folder))
 
@@ -221,7 +221,7 @@ def test_keys_are_for_their_owner_only_and_never_overwritten(folder):
         keys.make(folder, [])
 
 
-def test_a_new_token_is_another_and_is_read_as_its_role(broken):
+def test_new_token_differs_and_has_its_role(broken):
     before = read_tokens(str(broken))
     keys.add(broken, "operator", [])
     after = read_tokens(str(broken))

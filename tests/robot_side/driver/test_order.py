@@ -147,7 +147,7 @@ def _arm(driver):
     driver._driver_core.gate._go(Event.ARM, "armed for the test")
 
 
-def test_a_stop_is_on_its_way_to_disk_before_the_tick_that_it_did_not_wait_for(driver, ends, tmp_path):
+def test_stop_is_passed_to_the_disk_thread_before_the_next_tick(driver, ends, tmp_path):
     """The loop may end before that tick, on a signal that came with it."""
     status = Echo(channel="status", session=driver._driver_core.session, seq=0, t_us=monotonic_us())
     driver._driver_core.gate.issued.add("status", status.seq, status.t_us)
@@ -174,7 +174,7 @@ class HungBattery:
         self.closed_by = threading.current_thread().name
 
 
-def test_a_reading_that_hung_is_as_old_as_its_begin_and_its_device_is_closed_by_its_own_thread(monkeypatch):
+def test_hanging_reading_has_the_age_of_its_start_and_its_thread_closes_the_device(monkeypatch):
     monkeypatch.setattr("sightline.robot_side.driver.process._BATTERY_PERIOD_S", 0.01)
     battery = HungBattery()
     reader = BatteryReader(battery)

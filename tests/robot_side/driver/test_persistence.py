@@ -57,7 +57,7 @@ def test_failed_disk_write_leaves_the_latch_unset(tmp_path, monkeypatch):
             latch.write(stopped)
 
 
-def test_a_folder_that_knows_no_sync_keeps_the_mark_as_well_as_it_can(tmp_path, monkeypatch):
+def test_folder_without_sync_still_stores_the_mark(tmp_path, monkeypatch):
     latch, fsync = StopLatch(tmp_path, "r1"), os.fsync
 
     def only_files(descriptor: int) -> None:

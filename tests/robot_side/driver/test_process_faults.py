@@ -115,7 +115,7 @@ def test_a_packet_that_is_invalid_is_dropped(driver, packet):
     assert driver._drain() is False
 
 
-def test_however_the_loop_ends_the_motors_are_set_to_zero(tmp_path, monkeypatch):
+def test_motors_are_set_to_zero_after_every_end_of_the_loop(tmp_path, monkeypatch):
     config = RobotConfig(
         drive=PluginChoice(kind=f"{__name__}:BrokenDrive"), listen=(free_endpoint(),), state_dir=tmp_path
     )

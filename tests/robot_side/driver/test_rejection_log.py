@@ -36,7 +36,7 @@ def test_transport_rejections_show_in_the_status_and_the_log(tmp_path):
         assert until(lambda: "rejected OVERSIZE from the network: rejected by the transport" in robot.output(), 2)
 
 
-def test_what_an_earlier_network_process_counted_stays_in_the_status(tmp_path):
+def test_status_keeps_the_counts_of_an_earlier_network_process(tmp_path):
     def refused():
         try:
             return vision.status().refused.get("OVERSIZE", 0)

@@ -53,7 +53,7 @@ def test_motors_are_zeroed_without_gate_or_network(tmp_path):
     assert log.read_text().strip().endswith(",0.0000,0.0000")
 
 
-def test_the_driver_keeps_its_scheduling_to_itself(tmp_path):
+def test_driver_scheduling_is_not_inherited(tmp_path):
     with RobotProcess(tmp_path) as robot:
         robot.wait_until_on("on tcp/")
         assert os.sched_getscheduler(robot.network_pid()) == os.SCHED_OTHER

@@ -77,6 +77,6 @@ class ClosesOnce(Broken):
 
 
 @pytest.mark.parametrize("broken", [Slow, Forgets, Crossed, Coasts, Ahead, ClosesOnce])
-def test_what_breaks_a_promise_is_caught(broken):
+def test_drive_contract_finds_each_broken_promise(broken):
     with pytest.raises(AssertionError):
         check_drive(broken)

@@ -102,7 +102,7 @@ def test_the_radius_comes_from_the_robots_own_wheels():
     assert robot.motors.options == {"wheel_radius_m": 0.05}
 
 
-def test_the_cars_file_is_valid_and_drives_as_the_write_up_did(board):
+def test_example_of_the_car_is_valid_and_has_the_legacy_speeds(board):
     """60 % straight ahead and 40 % turning on the spot, at the limits of the file."""
     robot = load_service("robot", file=str(ROOT / "examples/raspberry-car.toml"), environ={}).config
     plugin, options = DRIVES.load(robot.motors)
@@ -130,7 +130,7 @@ def test_every_pin_is_pwm_at_its_frequency_and_low_at_first(board, drive):
     ({}, {10: 0.5, 7: 0.5}), ({"left_reversed": True}, {9: 0.5, 7: 0.5}), ({"right_reversed": True}, {10: 0.5, 8: 0.5}),
     ({"swapped": True}, {9: 0.5, 8: 0.5}), ({"trim": 0.2}, {10: 0.4, 7: 0.5}), ({"trim": -0.2}, {10: 0.5, 7: 0.4}),
 ])  # fmt: skip
-def test_left_forward_right_backward_is_what_the_options_make_of_it(board, options, expected):
+def test_options_decide_the_direction_of_each_wheel(board, options, expected):
     drive = GpioDrive(config(**options))
     drive.set(0.10 / 0.0325, -0.10 / 0.0325)
     assert duties(board) == pytest.approx(expected)
@@ -224,7 +224,7 @@ def test_the_enable_line_is_high_from_the_first_motion_to_the_end(board):
     assert duties(board) == {}
 
 
-def test_the_end_leaves_no_output(board):
+def test_close_leaves_no_output_pin(board):
     drive = GpioDrive(config())
     drive.set(4.0, 4.0)
     drive.close()
@@ -268,5 +268,5 @@ def test_without_odometry_there_is_no_reading(board):
     drive.close()
 
 
-def test_it_keeps_what_every_drive_promises(board):
+def test_gpio_drive_keeps_the_contract(board):
     check_drive(lambda: GpioDrive(config()), speed_rad_s=4.0)

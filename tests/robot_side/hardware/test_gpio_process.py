@@ -102,7 +102,7 @@ def test_every_requested_end_leaves_the_pins_low(tmp_path, board, number):
         assert not any(board_state(board).values())
 
 
-def test_after_kill_9_the_pins_stay_as_they_were_until_the_units_own_command_puts_them_low(tmp_path, board):
+def test_pins_keep_their_state_after_kill_9_until_the_units_command(tmp_path, board):
     """Why the unit has an ExecStopPost: nothing that runs in a process outlives it."""
     with RobotProcess(tmp_path, drive=DRIVE) as robot, Vision(robot.endpoint):
         assert rolling(board)

@@ -20,7 +20,7 @@ def test_only_wildcard_endpoints_are_listed_by_address(endpoints, said, monkeypa
     assert reachable_endpoints(endpoints) == said
 
 
-def test_they_are_this_machines_own():
+def test_listed_addresses_belong_to_this_machine():
     for address in own_addresses():
         assert not address.startswith("127.")
         with socket.socket() as probe:

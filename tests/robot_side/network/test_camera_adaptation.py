@@ -88,7 +88,7 @@ def test_a_camera_that_was_gone_receives_the_target_again():
 
 
 @pytest.mark.parametrize("camera", [Eye(follows=False), PlainEye()])
-def test_what_is_passed_through_is_shown_as_it_is(camera):
+def test_camera_with_its_own_jpegs_shows_full_quality(camera):
     assert Core().follow(camera, 30, 50) == (100, 100)
 
 
@@ -113,7 +113,7 @@ def test_a_scaled_model_sees_every_pixel_along_the_same_ray(scale_percent):
     assert (scaled.distortion, scaled.z_m) == (MODEL.distortion, MODEL.z_m)
 
 
-def test_a_new_model_is_announced_before_the_first_picture_of_it():
+def test_a_new_model_is_announced_before_the_first_image_of_it():
     core = Core()
     core.on_camera(Picture(b"", 1), 0)
     first = core.announce_camera(MODEL, 0)
@@ -155,7 +155,7 @@ def pipeline_of(model):
 
 
 @pytest.mark.parametrize(("known", "shown"), [(MODEL, HALF), (HALF, MODEL)])
-def test_a_picture_of_another_size_than_the_model_is_acknowledged_and_never_ranged(known, shown):
+def test_an_image_of_another_size_than_the_model_is_acknowledged_and_never_ranged(known, shown):
     pipeline = pipeline_of(known)
     for seq in range(5):
         pipeline.step(frame(seq, ball(known)))

@@ -99,7 +99,7 @@ def test_credit_belongs_to_the_driver():
     assert stream.on_answer(VIEWER, 2, 0, 2_000_000), "a silent owner loses it"
 
 
-def test_the_rate_is_bounded_whatever_the_camera_does():
+def test_rate_is_bounded_for_any_camera():
     stream, sent = Stream(StreamConfig(max_fps=10)), 0
     for now in range(0, 2_000_000, 1000):
         if stream.may_capture(now, listening=True):
@@ -111,7 +111,7 @@ def test_the_rate_is_bounded_whatever_the_camera_does():
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_whatever_happens_a_picture_is_taken_again(seed):
+def test_stream_captures_again_after_any_events(seed):
     """Frames lost, late, answered out of order, by whom it may be, and changes of the holder: credit always returns."""
     chance, stream, sent, now = random.Random(seed), Stream(StreamConfig()), 0, 0
     for _ in range(400):
@@ -128,7 +128,7 @@ def test_whatever_happens_a_picture_is_taken_again(seed):
     assert any(stream.may_capture(later, listening=True) for later in range(now, until, 10_000)), "it is stuck"
 
 
-def test_a_slow_successor_is_not_held_to_a_quick_ones_times():
+def test_slow_driver_does_not_inherit_the_timeout_of_a_quick_one():
     stream, sent, due, in_flight = Stream(StreamConfig()), 0, [], []
     for now in range(0, 6_000_000, 1000):
         who, takes_us = (VIEWER, 5_000) if now < 3_000_000 else (VISION, 300_000)

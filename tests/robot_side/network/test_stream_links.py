@@ -74,7 +74,7 @@ def test_bursts_of_loss(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_second_of_nothing(seed):
+def test_link_without_delivery_for_a_second(seed):
     seen = course(5_000, 2e7, seed=seed, down_us=(10_000_000, 11_000_000))
     back_s = min(at / 1e6 for at, age, _ in seen.answers if at > 11_000_000 and age <= 250_000)
     assert back_s <= 12.0, "young frames within a second of the link's return"
@@ -92,13 +92,13 @@ def test_a_camera_that_passes_its_own_jpegs_gets_a_lower_rate_instead(seed, seco
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_link_that_was_thin_is_used_again_once_it_is_not(seed):
+def test_rate_recovers_after_a_thin_link(seed):
     steps = ((0, 2e6), (10_000_000, 2e7))
     seen = course(50_000, seed=seed, steps=steps, seconds=20.0, camera=Camera(adjustable=False, seed=seed))
     assert seen.fps(13, 20) >= 20, "wide again within three seconds, though it was known to be thin"
 
 
-def test_a_link_that_only_looked_thin_is_tried_again():
+def test_link_with_a_wrong_thin_estimate_is_tried_again():
     steps = ((0, 2e6), (10_000_000, 0.0))
     out, back = legs(5_000, steps=steps)
     camera = Camera(adjustable=False)
@@ -160,7 +160,7 @@ def test_longer_link_reduces_image_quality_only_briefly():
     assert stream.encoding_target == (100, 100)
 
 
-def test_the_wish_stays_within_what_cameras_are_promised():
+def test_encoding_target_stays_within_its_bounds():
     stream = Stream(StreamConfig())
     stream.on_sent(0, 0, 0, 46_000)
     stream.on_answer(VISION, 0, 0, 10_000)
@@ -179,7 +179,7 @@ def test_adaptation_switched_off_changes_nothing():
     assert stream.encoding_target == (100, 100)
 
 
-def test_answers_of_others_change_nothing():
+def test_answers_of_other_clients_do_not_change_the_target():
     stream = Stream(StreamConfig())
     stream.on_holder(VISION, 0)
     for seq in range(25):  # less than the owner's life

@@ -220,7 +220,7 @@ def test_auto_arm_is_off_by_default_and_does_not_undo_an_operator():
     assert rig.gate.state is State.DISARMED and rig.gate.applied == STILL
 
 
-def test_ten_seconds_of_hold_disarm_and_auto_arm_takes_it_up():
+def test_auto_arm_arms_again_after_ten_seconds_of_hold_disarm():
     rig = Rig(auto_arm=True).drive(400).silence(10_200)
     assert is_armed(rig.gate.state)
     rig.silence(200)
@@ -229,7 +229,7 @@ def test_ten_seconds_of_hold_disarm_and_auto_arm_takes_it_up():
 
 
 @pytest.mark.parametrize(("age_us", "granted"), [(2_000_000, True), (2_000_001, False)])
-def test_an_arm_request_that_was_kept_back_does_not_arm(age_us, granted):
+def test_delayed_arm_request_does_not_arm(age_us, granted):
     rig = Rig(lease_ms=5000)
     for _ in range(5):
         rig.offer()
@@ -289,7 +289,7 @@ def test_a_fault_stops_and_a_reset_leaves_it():
 
 
 @pytest.mark.parametrize(("unchanged_us", "holds"), [(400_000, False), (400_001, True)])
-def test_a_picture_that_does_not_change_holds_the_robot(unchanged_us, holds):
+def test_an_image_that_does_not_change_holds_the_robot(unchanged_us, holds):
     rig = Rig().armed().drive(400)
     rig.gate.pictures.add(rig.now_us, 7)
     rig.gate.pictures.add(rig.now_us + unchanged_us, 7)
@@ -301,7 +301,7 @@ def test_a_picture_that_does_not_change_holds_the_robot(unchanged_us, holds):
 
 
 @pytest.mark.parametrize(("shown_ms", "reason"), [(400, None), (401, RejectReason.STALE)])
-def test_a_repeated_picture_is_as_old_as_when_it_was_first_shown(shown_ms, reason):
+def test_a_repeated_image_is_as_old_as_when_it_was_first_shown(shown_ms, reason):
     rig = Rig(silence_ms=300).armed().drive(400)
     rig.gate.pictures.add(rig.now_us, 7)
     rig.now_us += shown_ms * MS
@@ -347,7 +347,7 @@ def guard_with(points):
     return guard
 
 
-def test_the_guard_slows_towards_what_it_sees_and_only_towards_it():
+def test_guard_slows_only_toward_an_obstacle():
     near = guard_with([(0, 0.12)])  # lens at 0.055: 0.175 from the axle, 0.105 from the front edge
     assert 0 < near.limit(AHEAD, 0).linear_mps < 0.2
     assert near.limit(BACK, 0) == BACK and near.limit(TURN, 0) == TURN
@@ -356,7 +356,7 @@ def test_the_guard_slows_towards_what_it_sees_and_only_towards_it():
     assert guard_with([]).limit(AHEAD, 0) == AHEAD
 
 
-def test_what_comes_so_close_that_it_cannot_be_measured_keeps_the_robot_stopped():
+def test_object_too_close_to_measure_keeps_the_robot_stopped():
     guard = guard_with([(0, 0.09)])
     rig = Rig(guard=guard)
     rig.now_us = 0
@@ -370,7 +370,7 @@ def test_what_comes_so_close_that_it_cannot_be_measured_keeps_the_robot_stopped(
     assert rig.drive(20, -0.3).gate.applied.linear_mps < 0.0, "away from it is free"
 
 
-def test_a_sensor_that_sees_nothing_at_all_any_more_is_silent():
+def test_sensor_without_any_echo_counts_as_silent():
     """Covered, or its laser dead: zeros, where an open hall would be inf."""
     guard = guard_with([])
     rig = Rig(guard=guard)

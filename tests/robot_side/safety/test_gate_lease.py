@@ -54,7 +54,7 @@ def test_acquiring_again_renews_nothing():
     assert rig.gate.holder(rig.now_us + 20_000) is None
 
 
-def test_who_acquires_is_not_driven_by_the_one_before():
+def test_robot_ignores_the_former_driver_after_acquire():
     rig = Rig().armed().drive(400)
     rig.request(Verb.ACQUIRE, source="teleop", session=HUMAN)
     assert rig.step().state is H
@@ -99,7 +99,7 @@ def test_a_human_who_acquires_and_then_is_silent_was_lost():
 @pytest.mark.parametrize(
     ("silent_us", "reason"), [(999_999, RejectReason.NOT_HOLDER), (1_000_000, RejectReason.DISARMED)]
 )
-def test_a_human_lost_between_two_ticks_is_not_succeeded(silent_us, reason):
+def test_no_driver_follows_a_human_lost_between_two_ticks(silent_us, reason):
     rig = driving(A)
     rig.offer(source="teleop", session=HUMAN)
     rig.now_us += silent_us
@@ -112,7 +112,7 @@ def test_a_human_lost_between_two_ticks_is_not_succeeded(silent_us, reason):
     assert (rig.gate.state, rig.gate.reason) == (D, "the operator who drove was lost; arm again")
 
 
-def test_the_commands_of_one_driver_do_not_arm_for_another_who_acquires():
+def test_commands_of_one_driver_do_not_arm_for_another_driver():
     rig = Rig()
     for _ in range(4):
         rig.offer()
@@ -134,7 +134,7 @@ def test_release_gives_the_lease_back():
     assert rig.offer(session=OTHER).accepted
 
 
-def test_a_human_who_lets_go_disarms():
+def test_release_by_the_human_holder_disarms():
     rig = driving(A).drive(60, source="teleop", session=HUMAN)
     assert rig.request(Verb.RELEASE, source="teleop", session=HUMAN, echo=False) == "released"
     assert (rig.gate.state, rig.gate.reason) == (D, "the operator released control; arm again")

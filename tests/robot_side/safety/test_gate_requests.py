@@ -75,7 +75,7 @@ def test_reset_waits_for_the_wheels(state):
 
 
 @pytest.mark.parametrize(("state", "after"), [(A, F), (S, S)])
-def test_a_gate_that_cannot_be_stepped_stands_at_once(state, after):
+def test_gate_that_cannot_step_stops_immediately(state, after):
     rig = Rig().armed().drive(400)
     if state is S:
         rig.gate.stop("STOP by test")
@@ -87,7 +87,7 @@ def test_a_gate_that_cannot_be_stepped_stands_at_once(state, after):
 
 
 @pytest.mark.parametrize("verb", [Verb.ARM, Verb.RESET])
-def test_arm_and_reset_are_not_for_others_beside_a_human(verb):
+def test_other_operators_cannot_arm_or_reset_while_a_human_drives(verb):
     rig = Rig()
     rig.offer(source="teleop", session=HUMAN)
     for source, session in [("operator", OTHER), ("teleop", OTHER), ("operator", HUMAN), ("vision", HUMAN)]:
@@ -277,7 +277,7 @@ def test_request_from_before_the_loss_of_an_operator_does_not_arm(how):
 
 
 @pytest.mark.parametrize("how", ["stop", "disarm", "release", "lost"])
-def test_nor_where_the_robot_was_not_armed(how):
+def test_request_from_before_the_loss_does_not_arm_a_disarmed_robot(how):
     rig = Rig().drive(100)
     asked = ask(rig)
     LEAVING[how](rig)
@@ -295,7 +295,7 @@ def test_a_human_who_is_lost_before_the_robot_is_armed_ends_auto_arm(how):
     assert rig.request(Verb.ARM) == "armed"
 
 
-def test_a_drive_that_goes_on_failing_does_not_stand_against_a_reset():
+def test_repeated_drive_failure_does_not_prevent_a_reset():
     rig = Rig()
     for state in (S, F):
         rig.gate.stop() if state is S else rig.gate.fault("broken")

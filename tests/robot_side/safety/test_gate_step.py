@@ -75,7 +75,7 @@ def test_the_limit_falls_on_both_axes_with_the_frames_age():
 
 
 @pytest.mark.parametrize(("unchanged_us", "state"), [(399_999, G), (400_000, H), (400_001, H)])
-def test_a_frozen_picture_holds(unchanged_us, state):
+def test_a_frozen_image_holds(unchanged_us, state):
     rig = Rig().armed()
     rig.gate.pictures.add(rig.now_us - unchanged_us, 7)
     rig.gate.pictures.add(rig.now_us, 7)
@@ -130,7 +130,7 @@ def test_holding_keeps_the_newest_reason():
 
 
 @pytest.mark.parametrize("elapsed_us", [1, 7_000, 20_000, 61_000])
-def test_the_ramp_runs_by_the_time_between_steps(elapsed_us):
+def test_ramp_uses_the_time_between_steps(elapsed_us):
     rig, axis = Rig().armed(), AxisRamp(2.0, 20.0)
     rig.step()
     rig.offer(0.5)
@@ -141,7 +141,7 @@ def test_the_ramp_runs_by_the_time_between_steps(elapsed_us):
     assert got == axis.speed
 
 
-def test_the_first_step_and_a_clock_that_stands_move_nothing():
+def test_first_step_and_constant_clock_move_nothing():
     rig = Rig(live_commands_to_arm=1)
     rig.offer()
     rig.request(Verb.ARM)
@@ -170,7 +170,7 @@ def see(rig, range_m):
     rig.gate._guard.see(Ranges(rig.now_us, 0.0, 0.0, 0.05, 8.0, array.array("f", [range_m])))
 
 
-def test_the_guard_cuts_last_and_the_ramp_goes_on_from_there():
+def test_the_guard_cuts_last_and_the_ramp_continues_from_there():
     rig = guarded(0.15)  # 0.055 + 0.15 - 0.07 - 0.08: 0.055 m to brake in
     limit_mps = math.sqrt(2 * 0.5 * 0.055)
     rig.offer(0.5)
@@ -185,7 +185,7 @@ def test_the_guard_cuts_last_and_the_ramp_goes_on_from_there():
     assert decision.reason == "driving"
 
 
-def test_a_silent_sensor_stops_at_once_and_reports_it():
+def test_silent_sensor_stops_immediately_and_is_reported():
     rig = guarded()
     rig.gate._guard.see(Ranges(rig.now_us - 5_000_001, 0.0, 0.0, 0.05, 8.0, array.array("f", [math.inf])))
     rig.offer(0.5)
@@ -235,7 +235,7 @@ def test_battery_scales_both_axes_so_that_the_curve_stays(volts, seconds_old, fa
 
 
 @pytest.mark.parametrize(("age_ms", "factor"), [(0, 0.5), (275, 0.5), (350, 0.2)])
-def test_the_smaller_limit_wins_beside_a_low_battery(age_ms, factor):
+def test_smaller_limit_wins_with_a_low_battery(age_ms, factor):
     rig = battery_rig(6.9)
     for _ in range(150):
         rig.offer(0.5, 0.0, age_ms=age_ms - 20 if age_ms else 0)

@@ -84,7 +84,7 @@ def test_each_field_is_bounded(field, lower_allowed, lower, upper):
     ("clearance_m", "limit_mps"),
     [(0.0001, 0.0), (0.2499, 0.0), (0.25, 0.0), (0.26, 0.1), (0.5, 0.5), (1.25, 1.0), (4.25, 2.0)],
 )
-def test_speed_towards_a_point_is_what_can_still_brake(clearance_m, limit_mps):
+def test_speed_toward_a_point_permits_braking(clearance_m, limit_mps):
     ahead, behind = seeing((0.5 + clearance_m, 0.0)), seeing((-1.0 - clearance_m, 0.0))
     assert cut(ahead, 3.0) == near(limit_mps, 0.0)
     assert cut(behind, -3.0) == near(-limit_mps, 0.0)
@@ -97,7 +97,7 @@ def test_the_braking_sets_the_limit():
     assert cut(seeing((1.25, 0.0), brake_mps2=2.0), 3.0) == near(math.sqrt(2 * 2.0 * 0.5), 0.0)
 
 
-def test_what_is_not_cut_is_the_same_object():
+def test_unlimited_twist_is_returned_unchanged():
     guard, slow, fast = seeing((1.0, 0.0)), twist(0.49), twist(0.51)
     assert guard.limit(slow, 0) is slow
     assert guard.limit(fast, 0) is not fast
@@ -161,7 +161,7 @@ def test_cutting_for_one_point_is_looked_at_again_for_those_before_it():
     assert cut(seeing(wall, tail), 2.0, 2.0) == near(0.0, 0.5 / 0.65)
 
 
-def test_a_turn_that_gives_way_late_gives_way_for_the_points_before_it_too():
+def test_late_limit_of_a_turn_applies_to_earlier_points():
     guard = seeing((50.0, 0.0))
     # Two behind the tail that only the speed keeps away, the nearer one first; then a wall that cuts the speed to 0.45.
     guard._near = [_Near(-1.0, 0.5, 0.06), _Near(-1.0, 0.6, 0.1), _Near(1.0, 0.0, 0.45)]
@@ -190,7 +190,7 @@ def test_a_point_inside_forbids_the_turn_that_moves_its_spot_forward(side):
 
 
 @pytest.mark.parametrize(("clearance_m", "inside"), [(0.995e-6, True), (1.005e-6, False)])
-def test_inside_ends_a_micrometre_off_the_outline(clearance_m, inside):
+def test_inside_ends_a_micrometer_off_the_outline(clearance_m, inside):
     guard = seeing((0.25, 0.25 + clearance_m))
     assert (cut(guard, 3.0)[0] < 1e-3) == inside, "beside the outline driving on is free"
 
@@ -213,14 +213,14 @@ def box(**changes):
         (math.inf, False), (0.0, False), (-0.0, False),
     ],
 )  # fmt: skip
-def test_what_a_ray_met_counts_also_too_close_to_measure(range_m, counts):
+def test_echo_below_the_minimum_range_counts(range_m, counts):
     guard = box()
     guard.see(scan([math.inf, range_m], least_m=0.6, most_m=0.7))
     assert (cut(guard, 3.0) != (3.0, 0.0)) == counts
 
 
 @pytest.mark.parametrize("range_m", [1e-9, 0.3, 0.9999, 1.0])
-def test_what_is_too_close_to_measure_is_as_far_as_the_least_range(range_m):
+def test_object_too_close_to_measure_is_at_the_minimum_range(range_m):
     guard = box()
     guard.see(scan([range_m], least_m=1.0))
     assert cut(guard, 3.0) == near(0.5, 0.0) and cut(guard, -3.0) == (-3.0, 0.0)
@@ -340,7 +340,7 @@ def is_refused(sees, **guard):
 @pytest.mark.parametrize(("looks_rad", "edge_m"), [
     (0.0, 0.5 + 0.25), (math.pi, 1.0 + 0.25), (math.pi / 2, 0.25 + 0.25), (-math.pi / 2, 0.25 + 0.25),
 ])  # fmt: skip
-def test_in_each_direction_the_dead_zone_ends_within_the_stop_zone(looks_rad, edge_m):
+def test_blind_zone_ends_within_the_stop_zone_in_each_direction(looks_rad, edge_m):
     assert not is_refused(blind_scan(edge_m - 1e-6, looks_rad))
     assert is_refused(blind_scan(edge_m + 1e-6, looks_rad))
 
@@ -354,7 +354,7 @@ def test_where_the_sensor_sits_counts(sensor_x_m, refused):
     assert is_refused(blind_scan(0.6), sensor_x_m=sensor_x_m) == refused
 
 
-def test_what_is_between_the_robot_and_a_sensor_ahead_of_it_is_not_seen_either():
+def test_space_between_robot_and_sensor_counts_as_blind():
     assert is_refused(blind_scan(0.0), sensor_x_m=0.76) and not is_refused(blind_scan(0.0), sensor_x_m=0.74)
 
 

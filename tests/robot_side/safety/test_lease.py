@@ -20,7 +20,7 @@ def held_by(who, now_us=1_000, life_us=500):
     return lease
 
 
-def test_the_roles_and_who_of_them_is_human():
+def test_roles_and_human_roles_are_as_documented():
     assert sorted(RANKS, key=RANKS.__getitem__) == ["guest", "vision", "teleop"]
     assert len(set(RANKS.values())) == 3
     assert set(HUMANS) == {"teleop"}

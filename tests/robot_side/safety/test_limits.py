@@ -132,7 +132,7 @@ def test_both_axes_are_cut_by_one_factor(asked, given):
     assert (cut.linear_mps, cut.angular_rad_s) == given
 
 
-def test_what_is_within_limits_is_the_same_object():
+def test_twist_within_limits_is_returned_unchanged():
     asked = twist(0.5, 2.5)
     assert clamp_twist(asked, 0.5, 2.5) is asked
     assert clamp_twist(asked, 0.5 - 1e-12, 2.5) is not asked
@@ -207,7 +207,7 @@ def stop_by_hand(settings, step_ms):
     ],
     ids=str,
 )
-def test_the_stop_bound_is_what_its_own_ramp_does(changes):
+def test_stop_bound_equals_the_simulated_ramp(changes):
     settings = config(**changes)
     falls_ms, ramped_ms, zero_ms, distance_m = map(max, stop_by_hand(settings, 20), stop_by_hand(settings, 2))
     bound = stop_bound(settings)
@@ -288,7 +288,7 @@ def test_the_wanted_acceleration_is_a_square_root():
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize(("error", "reached"), [(0.007, True), (0.008, True), (0.0081, False), (0.009, False)])
-def test_a_goal_within_one_jerk_step_is_reached_at_once(sign, error, reached):
+def test_goal_within_one_jerk_step_is_reached_immediately(sign, error, reached):
     axis = AxisRamp(2.0, 20.0)  # 20 x 0.02^2 = 0.008
     axis.force(sign * 0.1)
     goal = sign * (0.1 + error)
@@ -322,7 +322,7 @@ def test_reaching_the_goal_ends_the_acceleration():
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_turned_goal_lets_go_at_once_and_brakes_from_zero_acceleration(sign):
+def test_reversed_goal_brakes_from_zero_acceleration(sign):
     axis = AxisRamp(2.0, 20.0)
     steps(axis, sign * 5.0, 6)
     speed = axis.speed

@@ -63,7 +63,7 @@ def test_rejection_of_an_age_contains_the_milliseconds():
 
 
 @pytest.mark.parametrize("cited", [echo(6), echo(8), echo(t_us=999), echo(t_us=1_001), echo(channel="status")])
-def test_only_what_was_issued_so_is_known(cited):
+def test_only_exactly_issued_frames_are_known(cited):
     assert refusal(issued((7, 1_000)).age_us, cited, 1_000, 400).reason is RejectReason.UNKNOWN_FRAME
 
 
@@ -165,7 +165,7 @@ def test_the_first_status_may_be_cited():
         ([(10, -1), (30, -1)], 20),
     ],
 )
-def test_a_picture_is_unchanged_since_it_was_first_seen(pictures, unchanged_us):
+def test_an_image_is_unchanged_since_it_was_first_seen(pictures, unchanged_us):
     record = FreshnessRecord()
     for t_us, fingerprint in pictures:
         record.add(t_us, fingerprint)

@@ -24,7 +24,7 @@ def hsv() -> Hsv:
 
 
 @pytest.mark.parametrize("name", ["hsv", "adaptive"])
-def test_our_own_keep_every_promise(name: str) -> None:
+def test_built_in_detectors_keep_the_contract(name: str) -> None:
     assert_kept(lambda: build_detector(name, {}, CONFIG))
 
 
@@ -34,7 +34,7 @@ def test_our_own_keep_every_promise(name: str) -> None:
      lambda one: ShadowDetector(one, hsv(), "hsv", 10**7), lambda one: Fallback(one, hsv())],
     ids=["tracked", "colour", "label", "shadow", "fallback"],
 )
-def test_what_is_around_a_detector_keeps_them_too(around) -> None:
+def test_wrapped_detectors_keep_the_contract(around) -> None:
     assert_kept(lambda: around(hsv()), seed=11)
 
 
@@ -166,5 +166,5 @@ class Halved(Broken):
      (Raising, "silence"), (Inventing, "silence"), (Slow, "deadline"), (Moody, "the_same"), (Mixing, "robots_apart"),
      (Nameless, "its_name"), (Halved, "its_name")],
 )
-def test_a_broken_one_is_found_out_by_the_promise_that_it_breaks(broken: type[Broken], promise: str) -> None:
+def test_broken_detector_fails_the_promise_that_it_breaks(broken: type[Broken], promise: str) -> None:
     assert promise in {one.name for one in check_detector(broken, 3) if one.wrong}

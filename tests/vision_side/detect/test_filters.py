@@ -35,7 +35,7 @@ def look(detector, one: DetectFrame) -> tuple[Detection, ...] | None:
     return result and result.detections
 
 
-def test_only_the_labels_that_are_meant_count() -> None:
+def test_only_configured_labels_count() -> None:
     fallback = box(99, label="target")
     detector = LabelFilter(Told([box(10), box(60, label="legs"), fallback], [box(60, label="legs")], None), ("ball",))
     assert look(detector, frame()) == (box(10), fallback)
@@ -54,13 +54,13 @@ def test_model_finds_balls_and_color_selects_one(scale: int) -> None:
 
 
 @given(x=st.floats(-50, 400), y=st.floats(-50, 300), size=st.floats(0.01, 500))
-def test_any_box_in_the_picture_has_a_colour(x: float, y: float, size: float) -> None:
+def test_any_box_in_the_image_has_a_color(x: float, y: float, size: float) -> None:
     inside = clipped(box(x, y, size), 320, 240)
     if inside is not None:
         assert look(ColorFilter(Told([inside]), HsvConfig().ranges), frame()) == ()
 
 
-def test_without_a_picture_the_colour_filter_has_no_answer() -> None:
+def test_without_an_image_the_color_filter_has_no_answer() -> None:
     bad = DetectFrame("r1", frame().header, b"no picture", Decoder(320, 240, 10**7))
     assert ColorFilter(Told([box(1)]), HsvConfig().ranges).detect([bad], NO_DEADLINE) == [None]
 
@@ -69,7 +69,7 @@ def ids(detector, *frames: DetectFrame) -> list[list[int | None]]:
     return [[one.track_id for one in look(detector, each) or ()] for each in frames]
 
 
-def test_what_moves_a_little_keeps_its_id_whatever_the_order() -> None:
+def test_slow_object_keeps_its_id_in_any_order() -> None:
     detector = TrackIds(Told([box(10), box(200)], [box(205), box(16)], [box(22), box(120), box(210)]))
     assert ids(detector, frame(1), frame(2), frame(3)) == [[1, 2], [2, 1], [1, 3, 2]]
 
@@ -92,7 +92,7 @@ def test_robots_and_sessions_have_ids_of_their_own() -> None:
     assert ids(detector, *frames) == [[1], [1], [1], [1]]
 
 
-def test_ever_more_things_cost_no_more_memory() -> None:
+def test_many_objects_need_bounded_memory() -> None:
     many = [box(4.0 * index, size=3.0) for index in range(MAX_TRACKS + 20)]
     detector = TrackIds(Told(*[many] * 4))
     for seq in range(1, 5):
@@ -113,6 +113,6 @@ def test_overlap_is_a_share_and_the_same_both_ways(x: float, y: float, size: flo
     [((-5, -5, 10, 10), (0, 0, 10, 10)), ((300, 200, 400, 300), (300, 200, 320, 240)), ((320, 0, 330, 9), None),
      ((5, 5, 5, 9), None), ((float("nan"), 5, 6, 9), None), ((9, 9, 5, 12), None)],
 )
-def test_boxes_are_clipped_to_the_picture(corners: tuple, expected: tuple | None) -> None:
+def test_boxes_are_clipped_to_the_image(corners: tuple, expected: tuple | None) -> None:
     part = clipped(Detection(*corners, 0.5, "ball"), 320, 240)
     assert (None if part is None else (part.x1_px, part.y1_px, part.x2_px, part.y2_px)) == expected

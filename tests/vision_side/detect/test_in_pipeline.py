@@ -29,7 +29,7 @@ def pipeline(detector, **config: object) -> Pipeline:
     return Pipeline(VisionConfig(**config), MODEL, detector)
 
 
-def test_the_colour_detector_is_one_like_any_other() -> None:
+def test_the_color_detector_is_one_like_any_other() -> None:
     colour = pipeline(Hsv(Hsv.Config()))
     for seq in range(1, 30):
         answer = colour.step(frame(seq, jpeg_of(scene(MODEL, 1.0 + 0.01 * seq, 0.2, seed=seq))))
@@ -37,7 +37,7 @@ def test_the_colour_detector_is_one_like_any_other() -> None:
         assert (answer.result.seq, answer.result.detector, answer.mission) == (seq, "hsv", "follow")
 
 
-def test_saw_nothing_searches_and_no_answer_does_not() -> None:
+def test_empty_result_starts_a_search_and_no_answer_does_not() -> None:
     nothing, silent = pipeline(Told(*[()] * 40)), pipeline(Told(*[None] * 40))
     for seq in range(1, 40):
         answers = nothing.step(frame(seq)), silent.step(frame(seq))
@@ -46,7 +46,7 @@ def test_saw_nothing_searches_and_no_answer_does_not() -> None:
     assert answers[1].twist is None and answers[1].seen.phase == "no answer"
 
 
-def test_after_no_answer_it_goes_on_where_it_was() -> None:
+def test_mission_continues_after_a_missing_answer() -> None:
     good = [box(140, 100)]
     eyes = pipeline(Told(*[good] * 5, None, None, *[good] * 3))
     phases = [eyes.step(frame(seq)).seen.phase for seq in range(1, 11)]
@@ -101,7 +101,7 @@ def test_a_plug_in_may_be_called_after_any_file() -> None:
     assert (report.detector, report.device, report.note) == ("b?ll?.onnx", "?[2J", "")
 
 
-def test_whatever_a_plug_in_raises_can_be_reported() -> None:
+def test_any_error_of_a_plug_in_is_reported() -> None:
     def raises(_one):
         raise OSError("ball\udce9.onnx\x1b[2J is gone")
 
@@ -113,7 +113,7 @@ def test_whatever_a_plug_in_raises_can_be_reported() -> None:
 @pytest.mark.parametrize(("told_us", "us"), [
     (1234.5, 1234), (np.int64(7), 7), (np.float32(9.0), 9), (2**60, MAX_INTEGER), (-3, 0),
 ])  # fmt: skip
-def test_however_a_plug_in_counts_its_time_it_can_be_reported(told_us, us) -> None:
+def test_any_time_of_a_plug_in_is_reported(told_us, us) -> None:
     bench = Bench(VisionConfig(), Strange(lambda one: [replace(one, compute_us=told_us)]))
     bench.frame()
     assert bench.report().inference_us == us
@@ -128,7 +128,7 @@ class OfOneOdd:
         return [result_of(one, (), Maker("mine", "", "cpu")) for one in frames]
 
 
-def test_what_fails_for_one_robots_frame_costs_no_other_robot_its_answer() -> None:
+def test_failure_for_one_robot_keeps_the_answers_of_others() -> None:
     decoder = Decoder(320, 240, 10**6)
     frames = [DetectFrame(robot, frame(1).header, BALL, decoder) for robot in ("r1", "odd", "r2")]
     first, odd, second = checked_results(OfOneOdd(), frames, NO_DEADLINE)
@@ -150,7 +150,7 @@ def test_remote_detector_is_skipped_after_the_deadline() -> None:
     assert first.robot == "r1" and "an odd picture" in odd and late == [odd, odd] and slow.calls == 3
 
 
-def test_boxes_beyond_the_picture_are_cut_and_those_outside_left_out() -> None:
+def test_boxes_beyond_the_image_are_cut_and_those_outside_left_out() -> None:
     one = DetectFrame("r1", frame(1).header, BALL, Decoder(320, 240, 10**6))
     found = result_of(one, (box(-20), box(500), box(100)), Maker("x"))
     inside = validated(one, found).detections
@@ -159,7 +159,7 @@ def test_boxes_beyond_the_picture_are_cut_and_those_outside_left_out() -> None:
     assert validated(one, whole) is whole
 
 
-def test_a_picture_is_decoded_once_for_all_who_share_it() -> None:
+def test_image_is_decoded_once_for_all_detectors() -> None:
     class Counting(Decoder):
         count = 0
 
@@ -186,7 +186,7 @@ def test_lights_and_legs_are_followed_only_on_request() -> None:
     assert both.target is not None and both.target.label == "ball"
 
 
-def test_the_service_gives_credit_back_where_there_is_no_answer() -> None:
+def test_service_returns_credit_without_an_answer() -> None:
     bench = Bench(VisionConfig(), Told(None, [box(140, 100)], None))
     bench.frame()
     assert bench.acks.take() is not None and bench.twists.take() is None
@@ -210,7 +210,7 @@ def test_report_names_detector_device_and_time() -> None:
     assert said == ("onnx:ball.onnx", "ab12", "cuda", 1234)
 
 
-def test_the_colour_detector_reports_how_long_it_took() -> None:
+def test_the_color_detector_reports_how_long_it_took() -> None:
     bench = Bench(VisionConfig())
     bench.frame()
     report = bench.report()

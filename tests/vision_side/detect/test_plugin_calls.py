@@ -28,7 +28,7 @@ def test_error_of_a_plug_in_gives_one_line_with_its_place() -> None:
         close_detector(Failing(HardwareError("no camera")))
 
 
-def test_who_only_talks_badly_may_go_on_looking() -> None:
+def test_detector_with_failing_notices_continues() -> None:
     (line,) = notices_of(Failing(KeyError("x" * 500)))
     assert "notices() raises KeyError" in line and len(line) <= 160
     assert notices_of(object()) == []

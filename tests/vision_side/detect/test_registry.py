@@ -82,7 +82,7 @@ def test_the_configured_detector_always_exists() -> None:
     assert isinstance(configured_detector(config(kind="boxes")), NoDetector)
 
 
-def test_a_class_of_ones_own_gets_its_options_and_what_vision_knows() -> None:
+def test_own_class_gets_its_options_and_the_vision_values() -> None:
     made = build_detector(MINE, {"sure": True}, config(deadline_s=0.2))
     assert isinstance(made, Mine)
     assert made.config == Mine.Config(robot="r7", deadline_s=0.2, sure=True)
@@ -95,7 +95,7 @@ def test_hsv_takes_the_section_of_its_name_with_its_options_over_it() -> None:
     assert (made._hsv_detector._config.min_radius_px, made._hsv_detector._config.max_contours) == (9.0, 2)
 
 
-def test_what_is_around_it_is_built_from_the_inside_out() -> None:
+def test_wrappers_are_built_from_the_inside_out() -> None:
     made = configured_detector(config(labels=("ball",), only_color=True, tracked=True, shadow="adaptive"))
     assert isinstance(made, ShadowDetector)
     made.close()
@@ -104,7 +104,7 @@ def test_what_is_around_it_is_built_from_the_inside_out() -> None:
     assert isinstance(tracked.inner.inner, LabelFilter) and isinstance(tracked.inner.inner.inner, Hsv)
 
 
-def test_a_fallback_lets_pass_what_vision_lets_pass() -> None:
+def test_fallback_has_the_same_label_filter() -> None:
     large = (2000, 1200)
     jpeg = cv2.imencode(".jpg", np.full((large[1], large[0], 3), 120, np.uint8))[1].tobytes()
     made = configured_detector(config(fallback="adaptive").model_copy(update={"max_pixels": 3_000_000}))

@@ -34,7 +34,7 @@ HERE, NEAR, AWAY = (10, 10, 50, 50), (14, 8, 52, 50), (200, 10, 240, 50)
     [((), (), ""), ((HERE,), (NEAR,), ""), ((HERE,), (NEAR, AWAY), ""), ((HERE,), (AWAY, NEAR), "ball at (220, 30)"),
      ((HERE,), (), "onnx nothing"), ((), (HERE,), "hsv nothing")],
 )
-def test_what_counts_is_what_would_be_steered_by(mine: tuple, other: tuple, words: str) -> None:
+def test_shadow_compares_only_followable_detections(mine: tuple, other: tuple, words: str) -> None:
     what = disagreement(result(1, *mine), result(1, *other, name="onnx"), anything)
     assert words in what if words else not what
 
@@ -62,7 +62,7 @@ def test_detections_outside_the_mission_do_not_disagree(mission: str, mine: str,
     assert (disagreement(driving, replace(result(1), detections=found), goes_by) == "") is agree
 
 
-def test_what_a_mission_does_not_go_by_counts_as_nothing() -> None:
+def test_shadow_ignores_detections_outside_the_mission() -> None:
     legs = replace(result(1), detections=(Detection(*NEAR, 0.9, "legs"),))
     assert disagreement(result(1), legs, configured_mission(VisionConfig()).goes_by) == ""
 
@@ -141,7 +141,7 @@ def test_shadow_compares_by_the_mission_of_the_frame_and_counts_again_with_anoth
     assert until(lambda: both.shadow_text("r1") == "shadow 100% agree"), "neither sees legs"
 
 
-def test_both_are_closed_whichever_fails_to(pair) -> None:
+def test_shadow_and_detector_are_closed_if_one_close_fails(pair) -> None:
     driving, shadow, both = pair
     closed = []
     driving.close, shadow.close = lambda: 1 / 0, lambda: closed.append("two")
@@ -171,6 +171,6 @@ def test_the_configuration_builds_it() -> None:
         bench.service._detector.close()
 
 
-def test_grey_pictures_agree_on_nothing() -> None:
+def test_gray_images_agree_on_nothing() -> None:
     assert disagreement(result(1), result(1, name="onnx"), anything) == ""
     assert np.isfinite(Agreement().share)

@@ -187,7 +187,7 @@ def test_time_in_hold_does_not_count_as_missing_progress() -> None:
     assert end_of(run).note == "reached 1 of 1"
 
 
-def test_something_that_goes_away_frees_the_way() -> None:
+def test_removed_obstacle_frees_the_path() -> None:
     shut = Course(walls=(*box(-0.5, -0.5, 0.6, 0.5), (2.5, -2.0, 2.5, 2.0)))
     open_ = Course(walls=shut.walls[:1] + shut.walls[2:])
     shut_until_s = 6.0

@@ -34,7 +34,7 @@ def test_a_pose_between_two_frames_is_between_theirs_also_across_half_a_turn() -
     assert math.remainder(yaw - math.pi, math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_pose_after_the_newest_goes_on_as_the_robot_moves_but_not_for_long() -> None:
+def test_a_pose_after_the_newest_continues_as_the_robot_moves_but_not_for_long() -> None:
     poses = PoseMemory()
     poses.add(header(0, (1.0, 0.0, math.pi / 2), moving=(0.5, 0.0)))
     assert poses.at(100_000) == pytest.approx((1.0, 0.05, math.pi / 2))
@@ -169,7 +169,7 @@ def test_no_room_no_speed() -> None:
     assert braking_mps(0.0, 0.1, 1.0) == braking_mps(-1.0, 0.1, 1.0) == 0.0
 
 
-def test_only_motion_towards_a_point_is_cut() -> None:
+def test_only_motion_toward_a_point_is_cut() -> None:
     body, ahead = Footprint(), np.array([[0.25, 0.0]])
     assert clear_of(ahead, body, (0.5, 0.0), 0.1, 1.0) == pytest.approx(math.sqrt(2 * 0.07) / 0.5)
     assert clear_of(ahead, body, (-0.5, 0.0), 0.1, 1.0) == 1.0

@@ -136,7 +136,7 @@ def mission(name: str, **options):
     (62, 40, (0.1, 0.5)),
     (63, 40, (0.1, 0.0)),
 ])
-def test_band_steering_has_the_write_ups_bands(x_px, radius_px, linear_angular):
+def test_band_steering_has_the_legacy_bands(x_px, radius_px, linear_angular):
     assert twist_of(mission("band"), view(ball(x_px, radius_px))) == linear_angular
 
 
@@ -151,7 +151,7 @@ def test_band_steering_averages_five_positions_and_takes_the_largest_target():
     assert twist_of(law, view()) == (0.0, 0.0)
 
 
-def test_pixel_pi_has_the_write_ups_numbers():
+def test_pixel_pi_has_the_legacy_numbers():
     law = mission("pixel-pi")
     radius = math.sqrt(400 / math.pi)
     linear, angular = twist_of(law, view(ball(200, radius)))
@@ -182,7 +182,7 @@ def test_pixel_pi_can_be_bounded():
     (140, 50, (0.2, 0.009 * 20)),
     (140, 51, (0.0, 0.009 * 20)),
 ])
-def test_pixel_p_has_the_write_ups_numbers(x_px, radius_px, linear_angular):
+def test_pixel_p_has_the_legacy_numbers(x_px, radius_px, linear_angular):
     assert twist_of(mission("pixel-p"), view(ball(x_px, radius_px))) == pytest.approx(linear_angular)
 
 

@@ -53,7 +53,7 @@ def view(seq, moving=(0.0, 0.0), applied=(0.0, 0.0), dt_s=0.033):
     return View(header, dt_s, 0.06, CAMERA, ())
 
 
-def test_a_switch_stands_still_until_the_wheels_do_and_the_new_one_begins_afresh():
+def test_switch_waits_for_resting_wheels_and_starts_fresh():
     duty = MissionSwitch(scripted(), CAMERA)
     assert duty.step(view(1)).twist.linear_mps == 0.3
     duty.switch(scripted(speed=-0.2))
@@ -68,7 +68,7 @@ def test_a_switch_stands_still_until_the_wheels_do_and_the_new_one_begins_afresh
     assert duty.step(view(11)).note == "2 after 0.03"
 
 
-def test_a_robot_that_stands_is_waited_for_no_longer_than_a_command_takes():
+def test_switch_on_a_resting_robot_waits_one_command_delay():
     """An earlier command may still be in flight, so one image of a robot at rest is not enough."""
     duty = MissionSwitch(scripted(), CAMERA)
     duty.step(view(1))
@@ -76,7 +76,7 @@ def test_a_robot_that_stands_is_waited_for_no_longer_than_a_command_takes():
     assert [duty.step(view(seq)).twist.linear_mps for seq in range(2, 5)] == [0.0, 0.1, 0.1]
 
 
-def test_a_robot_that_will_not_stand_is_waited_for_a_second():
+def test_switch_on_a_moving_robot_waits_at_most_a_second():
     duty = MissionSwitch(scripted(), CAMERA)
     duty.switch(scripted(speed=0.1))
     waited = [duty.step(view(seq, moving=(0.3, 0.0), dt_s=0.125)).twist.linear_mps for seq in range(1, 11)]
@@ -84,7 +84,7 @@ def test_a_robot_that_will_not_stand_is_waited_for_a_second():
     assert waited == [0.0] * (frames - 1) + [0.1] * (11 - frames)
 
 
-def test_a_mission_that_is_over_stays_over_and_still():
+def test_finished_mission_stays_finished_and_at_rest():
     duty = MissionSwitch(scripted(done_at=2), CAMERA)
     duty.step(view(1))
     for seq in range(2, 6):
@@ -100,7 +100,7 @@ def test_a_mission_that_is_over_stays_over_and_still():
     ({"wild_at": 2}, "ValueError: returned 1e+09 m/s"),
     ({"speed": float("inf")}, "ValidationError"),
 ])
-def test_a_mission_that_breaks_is_over_and_the_robot_stands(options, words):
+def test_failing_mission_ends_and_the_robot_stops(options, words):
     duty = MissionSwitch(scripted(**options), CAMERA)
     plans = [duty.step(view(seq)) for seq in range(1, 5)]
     assert [plan.twist for plan in plans[1:]] == [STILL] * 3

@@ -87,7 +87,7 @@ def test_yellow_stops_where_it_can_and_clears_where_it_cannot(left_m: float, cle
         assert (speed_mps == 0.3) == (clears or left_m > 0.4)
 
 
-def test_green_lets_go_at_its_second_frame_and_red_stops_at_its_first() -> None:
+def test_second_green_frame_starts_and_first_red_frame_stops() -> None:
     stop = StopLine(StopConfig())
     assert stop.speed(0.02, 0.0, 0.3) == 0.0
     stop.see("green", 0.03)
@@ -98,7 +98,7 @@ def test_green_lets_go_at_its_second_frame_and_red_stops_at_its_first() -> None:
     assert stop.speed(0.02, 0.0, 0.3) == 0.0
 
 
-def test_who_is_across_goes_on_whatever_the_light_shows() -> None:
+def test_robot_past_the_line_continues_at_any_light() -> None:
     stop = StopLine(StopConfig())
     stop.see("red", 0.03)
     assert stop.speed(-0.05, 0.0, 0.3) == 0.0
@@ -121,7 +121,7 @@ def test_a_light_that_is_hidden_for_long_counts_as_red() -> None:
 
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("turn", [0.0, 1.0, 3.0])
-def test_the_lane_runs_beside_its_row(side: int, turn: float) -> None:
+def test_lane_runs_parallel_to_its_blocks(side: int, turn: float) -> None:
     lane, cos, sin = Lane(LaneConfig(pass_m=0.5)), math.cos(turn), math.sin(turn)
     row = [(0.6 * k * cos - side * 0.5 * sin, 0.6 * k * sin + side * 0.5 * cos) for k in range(1, 5)]
     lane.see((0.0, 0.0, turn + 0.1), row)
@@ -185,7 +185,7 @@ def test_the_line_is_never_crossed_on_red_and_the_lane_is_driven_to_its_end(begi
         assert waited[-1] < green_s + 0.7
 
 
-def test_without_a_picture_or_a_block_nothing_moves() -> None:
+def test_without_an_image_or_a_block_nothing_moves() -> None:
     mission = TrafficLight(TrafficLight.Config(), LENS)
     header = FrameHeader(session="0000abcd", seq=1, t_us=0)
     assert mission.step(View(header, 0.0, 0.05, LENS, (), None)).phase == "no image"

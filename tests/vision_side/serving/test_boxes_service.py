@@ -100,7 +100,7 @@ def test_a_frame_is_acknowledged_and_its_boxes_are_answered_by_a_twist_that_cite
     assert twist.linear_mps > 0 and bench.service.skipped == {}
 
 
-def test_no_answer_is_not_saw_nothing():
+def test_no_answer_differs_from_an_empty_result():
     bench = Bench()
     for seq in range(1, 40):
         bench.frame(seq)
@@ -121,7 +121,7 @@ def test_another_source_steers_only_if_it_is_the_configured_one():
         assert (bench.twist() is not None) == obeyed
 
 
-def test_boxes_that_answer_no_frame_that_came_here_move_nothing_and_are_counted():
+def test_boxes_of_an_unknown_frame_are_counted_and_move_nothing():
     bench = Bench()
     for seq in range(1, 4):
         bench.frame(seq)
@@ -181,7 +181,7 @@ def test_the_surest_box_of_the_label_is_followed():
 
 @pytest.mark.parametrize(("x_m", "y_m"), [(1.0, 0.0), (2.5, 0.8), (0.6, -0.3)])
 @pytest.mark.parametrize("pitch_rad", [0.0, 0.2])
-def test_a_known_size_gives_the_place_and_none_only_the_direction(x_m, y_m, pitch_rad):
+def test_box_of_known_size_gives_a_position_and_unknown_size_a_direction(x_m, y_m, pitch_rad):
     model = camera(pitch_rad=pitch_rad)
     right, down, ahead = ball_about_lens(model, x_m, y_m)
     u, v, half = right / ahead, down / ahead, 0.1 / ahead

@@ -88,7 +88,7 @@ def test_rejected_request_adds_no_load_and_each_reason_is_logged_once():
     assert bench.tally().rejected == 60 and "overloaded" not in bench.service.about() and len(bench.words) == 3
 
 
-def test_other_reasons_each_time_end_somewhere():
+def test_number_of_logged_reasons_is_bounded():
     named = Named()
     bench = Bench(named)
     for number in range(100):

@@ -18,7 +18,7 @@ def test_the_newest_takes_the_place_of_the_one_before_and_is_counted():
     assert (tally.offered, tally.overtaken, tally.dropped) == (5, 4, 4)
 
 
-def test_whatever_waits_is_one_batch_up_to_its_bound():
+def test_waiting_frames_form_one_bounded_batch():
     turns = FairQueue(3, DEADLINE_US)
     for name in "abcde":
         turns.offer(name, name, 0)
@@ -37,7 +37,7 @@ def test_last_served_robot_is_last_at_any_rate():
     assert served == ["a", "b", "c"] * 10
 
 
-def test_what_is_too_old_to_be_answered_in_time_is_not_looked_at():
+def test_frame_too_old_for_the_deadline_is_skipped():
     turns = FairQueue(8, DEADLINE_US)
     turns.offer("old", 1, 0)
     turns.offer("young", 2, 60_000)
@@ -56,7 +56,7 @@ def test_a_batch_takes_half_a_deadline_at_most(each_us, batch):
 
 
 @pytest.mark.parametrize("each_us", [DEADLINE_US + 1, 3_000_000])
-def test_after_one_slow_frame_a_fresh_one_is_looked_at_all_the_same(each_us):
+def test_fresh_frame_is_examined_after_a_slow_one(each_us):
     """The first frame on a cold device takes seconds. If that ruled out all others, no new time would be measured."""
     turns = FairQueue(16, DEADLINE_US)
     turns.offer("fresh", 0, 0)

@@ -94,7 +94,7 @@ def test_dry_run_prints_the_sign_of_a_bearing_and_the_twist():
     assert said == ["tracking: bearing -5.7 degrees, distance 1.23 m; would steer +0.20 m/s, -0.50 rad/s"]
 
 
-def test_it_ends_by_itself():
+def test_dry_run_ends_after_its_time():
     assert watch_camera(VisionConfig(), Scripted([BALL] * 1000), lambda _: None, seconds=0.05) == 0
 
 

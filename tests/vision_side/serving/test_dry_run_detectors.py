@@ -43,7 +43,7 @@ class DryBench(DrivingBench):
         self.service = AckingService(config, self.network.link("r1", role="vision"), self.said.append)
 
 
-def test_in_a_robots_pictures():
+def test_dry_run_detects_in_the_images_of_a_robot():
     said = []
     AckingService(CONFIG, MemoryNetwork(seed=3).link("r1", role="vision"), said.append)
     assert f"vision: {STARTS}" in said, "before any frame"
@@ -82,7 +82,7 @@ def test_a_detector_has_as_long_as_when_it_drives():
     assert before_us + patience_us <= heard[0] <= monotonic_us() + patience_us
 
 
-def test_in_the_pictures_of_a_camera_of_this_machine():
+def test_dry_run_detects_in_the_images_of_a_local_camera():
     said = []
     watching = LocalRun(CONFIG, Camera(), said.append)
     assert said == [f"vision: {STARTS}"]

@@ -115,7 +115,7 @@ def shown():
 
 
 @pytest.mark.parametrize("eyes", [_by_http, _by_zenoh])
-def test_who_is_not_answered_keeps_no_other_robot_waiting(shown, eyes):
+def test_unanswered_robot_does_not_delay_others(shown, eyes):
     robots, shares = shown(eyes, "")
     mute = robots[MUTE].heard
     assert mute[TWIST] == 0 and mute[ACK] >= 3, "a frame without an answer is acknowledged without a twist"
@@ -144,7 +144,7 @@ class Quiet:
         return MemoryNetwork().link(robot, role="vision")
 
 
-def test_what_ends_one_robots_thread_ends_the_vision(monkeypatch):
+def test_error_in_one_robot_thread_ends_the_vision_service(monkeypatch):
     def fail(service, wait_s):
         raise RuntimeError("out of threads")
 

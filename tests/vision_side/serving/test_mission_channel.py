@@ -140,7 +140,7 @@ def test_new_robot_session_ends_the_requested_mission_and_reports_it():
     assert (report.mission, report.asked.id) == ("follow", 3) and "a new session" in report.refused
 
 
-def test_only_who_drives_takes_missions():
+def test_only_the_driving_vision_accepts_missions():
     bench = Bench(AckingService).frames(5).ask("band").frames(5)
     assert bench.reports == [] and bench.service._pipeline.mission.name == "follow"
 

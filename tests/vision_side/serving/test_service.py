@@ -74,7 +74,7 @@ def test_a_frame_is_answered_by_a_twist_that_names_it(bench: Bench) -> None:
         assert parse_twist(message.payload).angular_rad_s > 0
 
 
-def test_a_picture_that_does_not_decode_is_acknowledged_and_counted(bench: Bench) -> None:
+def test_an_image_that_does_not_decode_is_acknowledged_and_counted(bench: Bench) -> None:
     bench.camera()
     bench.frame(b"junk", 1)
     message = bench.acks.take()

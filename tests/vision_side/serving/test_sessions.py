@@ -41,7 +41,7 @@ def test_restarted_robot_is_used_immediately(watch):
     assert watch.film(C) == [1.0]
 
 
-def test_late_frames_of_before_a_restart_are_left_out(watch):
+def test_late_frames_from_before_a_restart_are_skipped(watch):
     watch.film(A)
     watch.film(B, seconds=0.1)
     for held_back_us in range(0, 500_000, 20_000):  # half a second of frames that the network held back, in one burst
@@ -118,7 +118,7 @@ def test_restarted_robot_after_a_dispute_waits_for_silence(watch):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_whatever_comes_one_session_at_most_is_admitted_within_the_time_to_change(watch, seed):
+def test_at_most_one_session_is_admitted_within_the_time_to_change(watch, seed):
     draw, last = random.Random(seed), (0, "")
     for _ in range(2_000):
         watch.now_us += draw.choice([1_000, FRAME_US, 400_000])

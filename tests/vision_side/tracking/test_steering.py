@@ -33,7 +33,7 @@ def test_odometry_frame_and_back(x: float, y: float, yaw: float, px: float, py: 
     assert from_odometry((x, y, yaw), *to_odometry((x, y, yaw), px, py)) == pytest.approx((px, py), abs=1e-9)
 
 
-def test_a_robot_that_turns_about_a_still_target_sees_no_speed() -> None:
+def test_turning_about_a_still_target_measures_no_speed() -> None:
     track = Track(TrackConfig())
     for step in range(60):
         pose = (0.0, 0.0, 0.05 * step)
@@ -66,7 +66,7 @@ def test_lost_track_ends_and_a_new_sighting_starts_again() -> None:
     assert (track.target.x_m, track.target.y_m, track.target.sightings) == (2.0, 1.0, 1)
 
 
-def test_another_object_out_of_reach_is_not_taken_for_the_target() -> None:
+def test_distant_object_does_not_replace_the_target() -> None:
     track = Track(TrackConfig())
     for _ in range(10):
         track.step(DT_S, HERE, [at(1.0, 0.0), at(1.5, 0.9)])
@@ -101,7 +101,7 @@ def test_unknown_latency_is_estimated_low_and_a_measured_one_approached_and_boun
     assert one.latency_s == pytest.approx(config.max_s, abs=0.001)
 
 
-def test_commands_under_way_are_foretold() -> None:
+def test_prediction_includes_commands_in_flight() -> None:
     config = LatencyConfig(first_guess_s=0.2, actuation_s=0.0, angular_acceleration_rad_s2=200)
     one = MotionPredictor(config)
     for step in range(30):
@@ -110,7 +110,7 @@ def test_commands_under_way_are_foretold() -> None:
     assert motion.pose[2] == pytest.approx(0.2, abs=0.01)
 
 
-def test_a_held_robot_is_foretold_to_stay() -> None:
+def test_prediction_of_a_held_robot_stays() -> None:
     one = MotionPredictor(LatencyConfig())
     for step in range(30):
         one.sent(step * 33_333, Twist(linear_mps=0.5, angular_rad_s=1.0))
@@ -153,7 +153,7 @@ def test_feed_forward_meets_a_crossing_target_without_error() -> None:
     assert twist.linear_mps == pytest.approx(0.0)
 
 
-def test_integrals_are_bounded_and_bled_by_what_was_not_carried_out() -> None:
+def test_integrals_are_bounded_and_reduced_by_unapplied_commands() -> None:
     config = SteerConfig()
     steer, aim = Steer(config, 0.8), Aim(0.79, 0.05, 0, 0)
     first = steer.step(DT_S, aim, 0.05, True).angular_rad_s
@@ -210,6 +210,6 @@ def test_a_held_robot_keeps_its_search() -> None:
     assert twist is not None
 
 
-def test_one_empty_picture_starts_nothing_and_a_disabled_search_never() -> None:
+def test_one_empty_image_starts_nothing_and_a_disabled_search_never() -> None:
     assert Search(SearchConfig()).step(DT_S, HERE, (0.0, 0.0)) is None
     assert turned(SearchConfig(enabled=False), 1.0, 10) == 0.0

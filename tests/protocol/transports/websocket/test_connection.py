@@ -35,7 +35,7 @@ def gives_up_at(way, heard_at=(), until_us=60_000_000) -> int | None:
     return None
 
 
-def test_silence_with_a_clear_way_out_is_two_seconds_to_the_microsecond():
+def test_silence_with_a_free_send_path_ends_after_exactly_two_seconds():
     life = Keepalive(5)
     assert not life.is_over(5 + SILENCE_US - 1, lambda: CLEAR)
     assert life.is_over(5 + SILENCE_US, lambda: CLEAR)
@@ -64,24 +64,24 @@ def test_a_slow_reader_stays_while_it_takes_something():
         assert gives_up_at(lambda now_us, step=step_us: SendPath(True, now_us // step, False), until_us=10**8) is None
 
 
-def test_who_takes_nothing_for_long_is_given_up_at_last():
+def test_peer_that_reads_nothing_for_long_is_closed():
     assert gives_up_at(lambda _now: FULL) == STALLED_LIMIT_US + 500_000  # what was taken is first looked at then
 
 
-def test_a_word_from_a_slow_reader_starts_its_time_again():
+def test_message_of_a_slow_reader_restarts_its_time_limit():
     assert gives_up_at(lambda _now: FULL, heard_at=[25_000_000]) == 25_000_000 + STALLED_LIMIT_US
 
 
-def test_once_the_way_out_is_clear_a_slow_reader_has_two_seconds_to_answer():
+def test_slow_reader_with_a_free_send_path_has_two_seconds_to_answer():
     assert gives_up_at(lambda now_us: FULL if now_us < 10_000_000 else CLEAR) == 9_750_000 + SILENCE_US
 
 
-def test_a_way_out_that_is_full_only_now_and_then_is_a_slow_reader_s():
+def test_send_path_that_is_full_at_times_counts_as_a_slow_reader():
     assert gives_up_at(lambda now_us: SendPath(now_us % 1_500_000 == 0, now_us, False)) is None
 
 
 @pytest.mark.parametrize("full", [False, True])
-def test_a_machine_that_acknowledges_nothing_is_given_up_after_two_seconds(full):
+def test_machine_without_acknowledgments_is_closed_after_two_seconds(full):
     assert gives_up_at(lambda now_us: SendPath(full, 7, now_us >= 1_000_000)) == SILENCE_US
     assert gives_up_at(lambda now_us: SendPath(True, now_us, now_us >= 9_000_000)) == 9_000_000
 
@@ -153,12 +153,12 @@ def test_a_masked_frame_from_a_server_and_an_unmasked_one_from_a_client_are_reje
     assert (list(messages.ready), protocol.close_sent.code) == ([], 1002)
 
 
-def test_after_a_hang_up_nothing_more_is_read():
+def test_nothing_is_read_after_a_close():
     assert read([served(8, b"\x03\xe8"), served(2, b"late")]) == ([], 1000)
     assert read([served(2, bytes(BOUND + 1)), served(2, b"late")]) == ([], 1009)
 
 
-def test_fragments_are_few():
+def test_number_of_fragments_is_bounded():
     pieces = [served(2, b"", False), *([served(0, b"", False)] * (MAX_FRAGMENTS - 1))]
     assert read([*pieces, served(0, b"", True)])[1] == 1009
     assert read([*pieces[:-1], served(0, b"", True)]) == ([b""], None)

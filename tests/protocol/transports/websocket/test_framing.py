@@ -47,13 +47,13 @@ def test_fields_may_come_in_any_order_and_with_blanks():
     assert unpack(framed(block), "r1", "vision") == IncomingMessage("sightline/r1/twist/teleop", block, b"0|0")
 
 
-def test_the_source_is_that_of_the_header_else_that_of_the_hello():
+def test_source_comes_from_the_header_or_the_hello():
     assert unpack(framed(BLOCK), "r1", "teleop").key == "sightline/r1/twist/vision"
     assert unpack(framed(b'{"channel":"twist"}'), "r1", "guest").key == "sightline/r1/twist/guest"
     assert unpack(framed(b'{"channel":"twist","source":7,"v":1}'), "r1", "guest").key == "sightline/r1/twist"
 
 
-def test_a_source_in_the_header_of_what_comes_from_a_robot_means_nothing():
+def test_source_in_a_header_from_a_robot_is_ignored():
     assert unpack(framed(b'{"channel":"frame","v":1,"source":"vision"}'), "r1", "").key == "sightline/r1/frame"
 
 

@@ -51,7 +51,7 @@ def robot_and_client(options: str = ""):
 # --- the robot's end -------------------------------------------------------------------------------------------------
 
 
-def test_a_picture_goes_out_as_base64_lines_and_a_twist_comes_in_as_a_guests():
+def test_an_image_goes_out_as_base64_lines_and_a_twist_comes_in_as_a_guests():
     with robot_and_client() as (robot, client):
         twists = robot.latest(TWIST)
         assert robot.has_listener(FRAME)
@@ -65,7 +65,7 @@ def test_a_picture_goes_out_as_base64_lines_and_a_twist_comes_in_as_a_guests():
 
 
 @pytest.mark.parametrize("picture_bytes", [12_000, 46_000])
-def test_on_the_socket_a_picture_costs_at_most_1_36_times_its_bytes(picture_bytes):
+def test_on_the_socket_an_image_costs_at_most_1_36_times_its_bytes(picture_bytes):
     endpoint = free_endpoint("ws-legacy://")
     with open_websocket("r1", listen=endpoint) as robot, socket.create_connection(address_of(endpoint)) as near:
         near.sendall(upgrade("127.0.0.1").replace(b"Sec-WebSocket-Protocol: sightline.v1\r\n", b""))
@@ -141,7 +141,7 @@ def test_boxes_without_the_option_are_rejected():
         assert found.take() is None
 
 
-def test_each_twist_also_acknowledges_the_newest_picture_once():
+def test_each_twist_also_acknowledges_the_newest_image_once():
     with robot_and_client() as (robot, client):
         acks, twists = robot.latest(ACK), robot.latest(TWIST)
         client.send("0|0")  # before any picture: answers nothing
@@ -215,7 +215,7 @@ def test_a_twist_over_64_bytes_is_counted_and_the_client_stays():
         assert robot.rejected == {OVERSIZE: 1}
 
 
-def test_a_client_silent_for_its_first_second_gets_the_newest_picture():
+def test_a_client_silent_for_its_first_second_gets_the_newest_image():
     with robot_and_client() as (robot, client):
         for number in range(30):
             robot.publish(FRAME, b"", b"%02d" % number + JPEG)
@@ -226,7 +226,7 @@ def test_a_client_silent_for_its_first_second_gets_the_newest_picture():
         assert got == sorted(got)
 
 
-def test_another_sites_page_cannot_drive_through_the_older_port():
+def test_page_of_another_site_cannot_drive_through_the_legacy_port():
     endpoint = free_endpoint("ws-legacy://")
     with open_websocket("r1", listen=endpoint) as robot:
         with pytest.raises(InvalidStatus):
@@ -236,7 +236,7 @@ def test_another_sites_page_cannot_drive_through_the_older_port():
         connect(plain(endpoint), origin=plain(endpoint).replace("ws:", "http:"), **OLD).close()
 
 
-def test_both_protocols_can_be_served_at_once():
+def test_both_protocols_are_served_in_parallel():
     modern, older = free_endpoint("ws://"), free_endpoint("ws-legacy://")
     with open_websocket("r1", listen=[modern, older]) as robot, open_websocket("r1", connect=modern) as peer:
         frames = peer.latest(FRAME)
@@ -330,7 +330,7 @@ def test_invalid_image_ends_the_connection_which_recovers(message, code, counted
 
 
 @pytest.mark.parametrize("text", ["no base64", "AAA", "0|0", base64.b64encode(bytes(20_001)).decode("ascii")])
-def test_a_text_that_is_not_a_picture_is_counted_and_skipped(text):
+def test_a_text_that_is_not_an_image_is_counted_and_skipped(text):
     with old_robot_and_vision() as (robot, vision):
         frames = vision.latest(FRAME)
         robot.send(text)

@@ -57,7 +57,7 @@ def test_websockets_that_is_not_installed_is_one_line_with_the_fix(monkeypatch):
 
 
 @pytest.mark.parametrize(("kind", "other"), [("ws", "wss"), ("wss", "ws")])
-def test_who_hangs_up_unheard_is_tried_again(kind, other, tmp_path):
+def test_client_retries_after_a_close_without_an_answer(kind, other, tmp_path):
     """Hang up like a listener with too many clients; over TLS the end may come before or after the client's hello."""
     keys.make(tmp_path / "keys", [])
     tried = []

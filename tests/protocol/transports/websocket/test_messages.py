@@ -46,7 +46,7 @@ def test_a_bad_hello_is_rejected_with_a_reason(robot, first, code, reason, count
     robot.still_serves()
 
 
-def test_a_hello_is_answered_with_who_listens_and_what_it_wants(robot):
+def test_hello_is_answered_with_robot_and_wanted_channels(robot):
     connection = connect(robot.endpoint, **V1)
     connection.send(json.dumps(HELLO))
     answer = json.loads(connection.recv(2))
@@ -104,7 +104,7 @@ def test_a_twist_somewhat_too_long_is_counted_and_the_peer_stays(robot):
     stranger.close()
 
 
-def test_a_connection_that_breaks_off_is_forgotten(robot):
+def test_broken_connection_is_removed(robot):
     stranger = hail(robot.endpoint, wants=["status"])
     assert until(lambda: robot.link.has_listener(STATUS))
     stranger.socket.shutdown(socket.SHUT_RDWR)
@@ -123,7 +123,7 @@ def test_a_frame_over_a_smaller_bound_is_counted_and_the_peer_stays(robot):
         assert len(frames.take(2).payload) == 999
 
 
-def test_a_frame_costs_at_most_320_bytes_more_than_its_picture(robot):
+def test_a_frame_costs_at_most_320_bytes_more_than_its_image(robot):
     precise, jpeg = (0.123456789012345, -0.123456789012345), bytes(46_000)
     header = FrameHeader(
         session="0a1b2c3d", seq=9_999_999, t_us=10**14, pose=(*precise, -3.123456789012345), moving=precise,

@@ -34,7 +34,7 @@ def put(queue: Queue, post: Publication) -> bool:
     return queue.put(post.message, post)
 
 
-def test_the_newest_and_the_most_urgent_first():
+def test_queue_holds_the_newest_and_sends_the_most_urgent_first():
     queue = OutgoingQueue()
     for number in b"123":
         for channel, source in ((SCAN, ""), (FRAME, ""), (REPLY, ""), (TWIST, "teleop"), (TWIST, "console")):
@@ -52,7 +52,7 @@ def test_the_newest_and_the_most_urgent_first():
     assert +queue.dropped == {"scan": 2, "frame": 2, "reply": 2, "twist": 4}
 
 
-def test_a_stop_is_replaced_by_nothing_but_a_stop_and_goes_first():
+def test_only_a_stop_replaces_a_stop_and_it_leaves_first():
     queue = OutgoingQueue()
     put(queue, Publication(Message(TWIST, "teleop", b"", b"1|0")))
     for verb in ("reset", "stop", "arm", "acquire", "release", "disarm", "reset"):
@@ -67,7 +67,7 @@ def test_a_stop_is_replaced_by_nothing_but_a_stop_and_goes_first():
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_however_requests_come_every_asker_s_stop_is_there(seed):
+def test_every_stop_stays_queued_in_any_order_of_requests(seed):
     dice, queue, stopped = random.Random(seed), OutgoingQueue(), set()
     for number in range(200):
         source, verb = dice.choice(["teleop", "vision", "operator"]), dice.choice(VERBS)
@@ -103,7 +103,7 @@ def test_invented_sources_get_few_places_and_none_of_a_role(channel):
     assert len(queue)  # places that were left are free again
 
 
-def test_no_number_of_sources_keeps_a_request_back():
+def test_many_sources_do_not_delay_a_request():
     queue, count = OutgoingQueue(), 100
     for number in range(count):
         put(queue, Publication(Message(DETECTIONS, f"s{number}", b"", b"")))
@@ -111,7 +111,7 @@ def test_no_number_of_sources_keeps_a_request_back():
     assert [post.message.channel for post in taken(queue)][:count] == [REQUEST] * count
 
 
-def test_a_publication_is_written_once_for_all_who_are_sent_the_same():
+def test_publication_is_encoded_once_for_equal_peers():
     post = Publication(Message(FRAME, "", b'{"v":1}', b"picture"))
     modern, other = SightlineV1("r1", ""), SightlineV1("r1", "")
     assert post.written(modern) is post.written(other)

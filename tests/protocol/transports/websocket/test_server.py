@@ -31,7 +31,7 @@ def test_client_without_the_sub_protocol_is_rejected(robot, offer):
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1", "file://"])
-def test_a_page_of_another_site_does_not_come_in(robot, origin):
+def test_page_of_another_site_is_rejected(robot, origin):
     with pytest.raises(InvalidStatus) as refusal:
         connect(robot.endpoint, origin=origin, **V1)
     assert refusal.value.response.status_code == 403
@@ -40,13 +40,13 @@ def test_a_page_of_another_site_does_not_come_in(robot, origin):
     robot.still_serves()
 
 
-def test_a_page_of_the_robots_own_address_comes_in(robot):
+def test_page_of_the_robots_own_address_connects(robot):
     hailed = connect(robot.endpoint, origin=robot.endpoint.replace("ws://", "http://"), **V1)
     hailed.close()
     assert robot.rejected == {}
 
 
-def test_a_foreign_name_that_points_here_does_not_come_in(robot):
+def test_foreign_host_name_of_this_address_is_rejected(robot):
     with socket.create_connection(robot.address) as near:
         near.sendall(upgrade("evil.example:9090", "Origin: http://evil.example:9090\r\n"))
         answer = near.recv(4096)
@@ -67,7 +67,7 @@ def test_other_hosts_are_a_problem(hosts):
     assert host_problem(hosts, "127.0.0.1")
 
 
-def test_more_clients_than_the_limit_are_sent_away(robot):
+def test_clients_over_the_limit_are_rejected(robot):
     guests = [hail(robot.endpoint, role="teleop") for _ in range(MAX_CLIENTS - 1)]  # one place is the healthy peer's
     with pytest.raises(InvalidStatus) as refusal:
         connect(robot.endpoint, **V1)
@@ -102,7 +102,7 @@ def test_silent_connections_are_few_and_short_lived(robot):
         connection.close()
 
 
-def test_half_a_request_is_not_waited_for(robot):
+def test_incomplete_request_ends_at_its_deadline(robot):
     with socket.create_connection(robot.address) as near:
         near.sendall(upgrade("127.0.0.1")[:60])
         near.settimeout(3)
@@ -113,7 +113,7 @@ def test_half_a_request_is_not_waited_for(robot):
 
 
 @pytest.mark.parametrize("request_host", ["127.0.0.1", "evil.example"])
-def test_nonsense_right_behind_the_request_is_turned_away(robot, request_host, capfd):
+def test_invalid_data_after_the_request_is_rejected(robot, request_host, capfd):
     with socket.create_connection(robot.address) as near:
         near.sendall(upgrade(request_host) + b"\xff\xff\xff\xff")
         near.settimeout(3)

@@ -58,7 +58,7 @@ def test_last_places_are_reserved_for_clients_that_control():
         assert "16 clients are connected, which is the limit" in settled(places, acts)
 
 
-def test_who_may_act_takes_any_place():
+def test_client_that_controls_takes_any_place():
     places = ConnectionLimits()
     assert [settled(places, True) for _ in range(MAX_CLIENTS)] == [""] * MAX_CLIENTS
     assert places.problem(True) == places.problem(False) != ""
@@ -109,7 +109,7 @@ def test_a_guest_may_steer_and_is_not_a_viewer(robot):
         open_websocket("r1", connect=robot.endpoint, role="guest", timeout_s=1).close()
 
 
-def test_who_is_closed_unheard_for_idle_connections_beside_it_tries_again(robot):
+def test_client_rejected_for_idle_connections_retries(robot):
     address = ("127.0.0.1", port_of(robot.endpoint))
     with ExitStack() as ending:
         for _ in range(MAX_HANDSHAKES_PER_ADDRESS):

@@ -42,7 +42,7 @@ def test_client_that_never_reads_delays_no_peer_and_can_still_send(robot):
 
 @pytest.mark.own_process
 @pytest.mark.parametrize("picture_bytes", [3_000, 46_000, 200_000])
-def test_who_reads_a_picture_a_second_stays_and_is_never_far_behind_what_fits_its_sockets(picture_bytes):
+def test_client_that_reads_one_image_a_second_stays_and_gets_new_images(picture_bytes):
     """Such a reader answers a ping only when it comes to it: seconds late."""
     endpoint, ended, got = free_endpoint("ws://"), threading.Event(), []
 
@@ -68,7 +68,7 @@ def test_who_reads_a_picture_a_second_stays_and_is_never_far_behind_what_fits_it
         assert until(lambda: got[-1] == 8 * FPS - 1)
 
 
-def test_an_end_that_stands_still_is_noticed_within_three_seconds():
+def test_stopped_peer_is_detected_within_three_seconds():
     endpoint = free_endpoint("ws://")
     with open_websocket("r1", listen=endpoint) as robot, bare_client(endpoint, wants=["status"]):
         assert until(lambda: robot.has_listener(STATUS))

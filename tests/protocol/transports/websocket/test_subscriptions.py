@@ -21,7 +21,7 @@ def site():
         yield robot, lambda role: ending.enter_context(open_websocket("r1", connect=end, role=role)), end
 
 
-def test_vision_learns_of_viewers_and_of_their_end(site):
+def test_vision_receives_the_subscriptions_of_viewers_and_their_end(site):
     _, opened, _ = site
     vision, one, two = opened("vision"), opened("viewer"), opened("viewer")
     heard, seen = one.latest(OVERLAY), two.latest(OVERLAY)
@@ -36,7 +36,7 @@ def test_vision_learns_of_viewers_and_of_their_end(site):
     assert not vision.has_listener(PREVIEW)
 
 
-def test_who_comes_later_finds_viewers_there(site):
+def test_late_vision_receives_the_existing_subscriptions(site):
     _, opened, _ = site
     opened("viewer").latest(PREVIEW)
     vision = opened("vision")

@@ -46,7 +46,7 @@ with socket.socket(type=socket.SOCK_DGRAM) as taken:
 
 
 @pytest.mark.parametrize("listen", [(), ("tcp/127.0.0.1:7447",), ("tls/localhost:1", "tcp/[::1]:2")])
-def test_who_listens_on_loopback_only_is_not_to_be_found(listen):
+def test_loopback_listener_does_not_answer_multicast(listen):
     assert multicast_section(listen) == MULTICAST_OFF
 
 

@@ -122,7 +122,7 @@ class _Counting:
                 sink.sendall(data)
 
 
-def test_a_frame_costs_at_most_320_bytes_more_than_its_picture():
+def test_a_frame_costs_at_most_320_bytes_more_than_its_image():
     endpoint, frames_sent, jpeg = free_endpoint(), 200, bytes(20_000)
     precise = (0.123456789012345, -0.123456789012345)
     header = FrameHeader(
@@ -152,7 +152,7 @@ def test_delete_is_rejected_as_not_a_put():
         assert twists.take() is None
 
 
-def test_invented_sources_are_passed_on_and_leave_little_behind():
+def test_invented_sources_are_forwarded_with_bounded_memory():
     endpoint, heard = free_endpoint(), []
     with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as peer:
         peer.subscribe(DETECTIONS, lambda message: heard.append(message.source))
@@ -252,7 +252,7 @@ def _publish_until(link, over):
 
 
 @pytest.mark.parametrize("opened", [partial(open_zenoh, "r1", role="robot"), partial(open_fleet, "r*", role="vision")])
-def test_who_closes_lets_go_of_the_session_at_once(opened):
+def test_closed_link_drops_its_session_immediately(opened):
     """See `GONE` for what happens where the collector frees it instead."""
     end = opened(listen=[free_endpoint()])
     links = [end] if isinstance(end, ZenohLink) else [end.link("r1"), end.link("r2")]

@@ -58,7 +58,7 @@ def start(tmp_path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
         process.communicate()
 
 
-def test_a_port_in_use_is_named_with_who_uses_it(start):
+def test_port_in_use_names_its_process(start):
     endpoint = free_endpoint()
     robot = start(ROBOT, endpoint)
     robot.stdout.readline()
@@ -68,7 +68,7 @@ def test_a_port_in_use_is_named_with_who_uses_it(start):
     assert "\n" not in str(refusal.value)
 
 
-def test_a_killed_robot_comes_back_to_the_same_link(start):
+def test_restarted_robot_uses_the_same_link(start):
     endpoint = free_endpoint()
     robot = start(ROBOT, endpoint)
     robot.stdout.readline()
@@ -143,7 +143,7 @@ def test_a_process_ends_by_itself_after_with(start):
         assert process.stdout.read() + process.stderr.read() == ""
 
 
-def test_nothing_of_zenoh_reaches_the_terminal(start):
+def test_zenoh_prints_nothing_to_the_terminal(start):
     code = """
     from sightline.protocol.errors import LinkError
     with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as peer:

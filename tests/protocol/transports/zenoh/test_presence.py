@@ -37,7 +37,7 @@ def _peer(presence=ROBOT, round_trip_us=2_000, **changes):
 # --- pure ------------------------------------------------------------------------------------------------------------
 
 
-def test_an_answer_gives_who_how_far_and_how_much_its_clock_is_ahead():
+def test_presence_reply_has_role_round_trip_and_clock_offset():
     said = ROBOT.model_copy(update={"clock_us": 1_000_000_000})
     peer = parse_presence_reply(presence_key("robot", "0000abcd"), encode(said), 50_000, 54_000, clock_us=999_000_000)
     assert (peer.presence, peer.round_trip_us, peer.ahead_us) == (said, 4_000, 1_002_000)
@@ -73,7 +73,7 @@ def test_a_flood_of_names_is_bounded():
     ({"session": "0000beef", "up_us": 9_000_000, "robot": "r2"}, False),
     ({"session": "0000beef", "up_us": 9_000_000, "role": "vision"}, False),
 ])  # fmt: skip
-def test_an_id_is_taken_by_another_robot_that_was_there_before(other, is_taken):
+def test_id_belongs_to_the_robot_that_has_run_longer(other, is_taken):
     taken = robot_with_same_id(ROBOT, [_peer(robot="r7", session="00000001", up_us=9_999_999), _peer(**other)])
     assert (taken is not None) is is_taken
 
@@ -131,7 +131,7 @@ def test_a_role_that_is_invalid_is_rejected_and_nothing_stays_open(router, role)
         open_zenoh("r1", connect=[router], role=role)
 
 
-def test_who_has_gone_is_not_listed(router):
+def test_closed_peer_is_not_listed(router):
     with open_zenoh("r1", connect=[router], role="robot"):
         assert len(peers_at([router], 0.6)) == 1
     assert peers_at([router], 0.6) == []
@@ -155,7 +155,7 @@ def test_second_robot_with_one_id_is_rejected_with_the_first(router):
         assert len(peers_at([router], 0.6)) == 1
 
 
-def test_a_robot_of_another_id_and_its_own_restarted_self_are_welcome(router):
+def test_other_id_and_restarted_robot_are_accepted(router):
     with (
         open_zenoh("r1", connect=[router], role="robot", session="0000abcd"),
         open_zenoh("r2", connect=[router], role="robot"),
@@ -204,7 +204,7 @@ def test_secured_peer_with_another_certificate_is_not_listed_as_robot(tmp_path):
     assert listed == ["r2"]
 
 
-def test_the_command_lists_them_for_people_and_scripts(router, capsys):
+def test_command_lists_peers_as_text_and_json(router, capsys):
     import json
 
     with open_zenoh("r1", connect=[router], role="robot"), open_zenoh("r1", connect=[router], role="vision"):

@@ -90,7 +90,7 @@ def test_several_robots_and_vision_services_at_one_router_never_cross(tmp_path):
         assert all(slot.take() is None for slots in seen.values() for slot in slots)
 
 
-def test_a_stock_zenoh_router_does_as_well_as_ours():
+def test_stock_zenoh_router_works():
     """Zenoh's own defaults, as `zenohd` has them: shared memory, gossip and a lease of 10 s."""
     endpoint, config = free_endpoint(), zenoh.Config()
     config.insert_json5("mode", '"router"')

@@ -62,7 +62,7 @@ def test_simulation(tmp_path):
         simulator.process.wait(10)
 
 
-def test_only_what_can_change_by_itself_is_live(tmp_path):
+def test_only_real_cameras_are_live(tmp_path):
     folder = folder_of_pictures(tmp_path)
     film = video(tmp_path / "film.avi")
     for kind, path in (("folder", folder), ("still", folder / "010.jpg"), ("video", film)):

@@ -39,7 +39,7 @@ def test_a_video_is_shown_in_order_at_its_own_speed(tmp_path):
     assert shades[-1] >= 90  # in step with the clock, whatever was left out
 
 
-def test_a_slow_reader_sees_fewer_pictures_not_a_slower_video(tmp_path):
+def test_a_slow_reader_sees_fewer_images_not_a_slower_video(tmp_path):
     camera = VideoCamera(VideoCamera.Config(path=video(tmp_path / "film.avi", pictures=24, fps=25)))
     first = shade_of(next_picture(camera))
     time.sleep(0.4)
@@ -92,7 +92,7 @@ def test_a_folder_is_played_in_name_order_and_looped(tmp_path):
     assert [shade_of(next_picture(camera)) for _ in range(5)] == [30, 60, 90, 30, 60]
 
 
-def test_pictures_of_several_sizes_are_rejected(tmp_path):
+def test_images_of_several_sizes_are_rejected(tmp_path):
     (tmp_path / "a.jpg").write_bytes(jpeg(64, 48))
     (tmp_path / "b.jpg").write_bytes(jpeg(48, 64))
     with pytest.raises(HardwareError, match="differ in size"):
@@ -168,5 +168,5 @@ def test_two_models_at_once_are_rejected(tmp_path):
         camera_model(LensConfig(model_file=tmp_path / "camera.toml", model=MODEL), SIZE)
 
 
-def test_the_model_is_what_goes_on_the_wire():
+def test_camera_model_is_published_unchanged():
     assert set(MODEL) <= set(CameraModel.model_fields)

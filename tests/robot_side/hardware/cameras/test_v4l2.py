@@ -72,12 +72,12 @@ def test_the_cameras_own_jpeg_passes_through_undecoded(opened):
     assert picture.jpeg in given
 
 
-def test_padding_after_the_picture_is_cut_off(opened):
+def test_padding_after_the_image_is_cut_off(opened):
     picture = next_picture(opened(FakeDevice(damage=lambda data: data + bytes(5000))))
     assert picture.jpeg.endswith(b"\xff\xd9")
 
 
-def test_a_damaged_picture_is_left_out(opened):
+def test_a_damaged_image_is_left_out(opened):
     device = FakeDevice()
     camera = opened(device)
     device.damage = lambda data: data[:-200]
@@ -144,7 +144,7 @@ def test_buffer_time_is_converted_to_the_monotonic_clock(opened, clock):
     assert 0.040 <= age_s < 0.140
 
 
-def test_without_a_time_of_its_own_a_picture_is_as_old_as_configured(opened):
+def test_without_a_time_of_its_own_an_image_is_as_old_as_configured(opened):
     camera = opened(FakeDevice(clock=lambda: 0.0), delay_ms=70)
     age_s = age_of(next_picture(camera))
     assert 0.070 <= age_s < 0.170
@@ -163,7 +163,7 @@ def test_without_a_time_of_its_own_a_picture_is_as_old_as_configured(opened):
         (1_700_000_000_000_000 - 50_000, 9_950_000),  # time of the day
     ],
 )
-def test_a_stamp_is_read_on_the_clock_it_was_taken_from(stamp_us, expected_us):
+def test_stamp_is_read_on_its_own_clock(stamp_us, expected_us):
     assert CaptureClock(30_000).captured_us(stamp_us, NOW) == expected_us
 
 
@@ -186,7 +186,7 @@ def test_future_stamp_counts_as_another_clock_or_is_ignored():
     assert stamps.captured_us(NOW.boot_us + 1, NOW) == 9_970_000
 
 
-def test_pictures_that_waited_for_a_process_that_was_held_up_are_not_young(opened):
+def test_images_that_waited_for_a_stalled_process_are_old(opened):
     delay_s = [0.040]
     camera = opened(FakeDevice(clock=lambda: time.monotonic() - delay_s[0]))
     assert age_of(next_picture(camera)) < 0.140
@@ -262,7 +262,7 @@ def test_camera_frozen_from_the_start_does_not_open(opened):
 # --- why a device cannot be used: real nodes ---------------------------------------------------------------------
 
 
-def test_absent_device_lists_what_there_is(tmp_path):
+def test_absent_device_lists_the_existing_devices(tmp_path):
     with pytest.raises(HardwareError, match=r"video9 is not there \((there are|no /dev/video\*)"):
         CAMERAS.build(PluginChoice(kind="v4l2", options={"device": str(tmp_path / "video9")}))
 
@@ -295,7 +295,7 @@ def test_no_permission_names_the_group_and_the_command():
         assert stat.S_IMODE(node.stat().st_mode) == 0
 
 
-def test_who_keeps_a_device_busy_is_named(node):
+def test_busy_device_names_its_process(node):
     hold = f"import sys; held = open({str(node)!r}); print('held', flush=True); sys.stdin.read()"
     with subprocess.Popen([sys.executable, "-c", hold], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout.readline()

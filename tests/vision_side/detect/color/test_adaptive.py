@@ -53,7 +53,7 @@ def test_a_ball_is_found_where_it_is(scale: int) -> None:
     assert (circle.cx_px, circle.cy_px, circle.radius_px) == pytest.approx(true, abs=scale)
 
 
-def test_it_goes_along_with_the_light_where_the_ranges_end() -> None:
+def test_adaptive_color_follows_the_light_beyond_the_ranges() -> None:
     course, seen, plain = Course(), 0, 0
     course.acquire()
     fixed = HsvDetector(HsvConfig())
@@ -68,14 +68,14 @@ def test_it_goes_along_with_the_light_where_the_ranges_end() -> None:
     assert plain < 100, "the light leaves the configured ranges, or this tests nothing"
 
 
-def test_a_ball_that_is_gone_is_lost_and_not_another_one() -> None:
+def test_missing_ball_is_not_replaced_by_another_object() -> None:
     course = Course()
     course.acquire(80, 120)
     for seed in range(12):  # 0.4 s: another ball of the same colour is in view all the time
         assert course.see(room((260, 120, 20), seed=seed)) is None
 
 
-def test_the_nearer_of_two_is_the_one_whichever_is_larger() -> None:
+def test_nearer_of_two_objects_is_the_target() -> None:
     course = Course()
     course.acquire(100, 120)
     for step in range(30):
@@ -91,7 +91,7 @@ def test_lost_target_is_found_again_elsewhere_after_a_while() -> None:
     assert 14 <= first <= 20, "half a second lost, then three pictures in a row"
 
 
-def test_it_follows_a_robot_that_turns_as_fast_as_it_may() -> None:
+def test_detection_follows_the_fastest_turn() -> None:
     course = Course()
     course.acquire(30, 120)
     speed, x, seen = 0.0, 30.0, 0
@@ -104,7 +104,7 @@ def test_it_follows_a_robot_that_turns_as_fast_as_it_may() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_no_picture_makes_it_raise(seed: int) -> None:
+def test_no_image_makes_it_raise(seed: int) -> None:
     rng, course = np.random.default_rng(seed), Course(AdaptiveConfig(confirm=1))
     course.see(room((160, 120, 20)))
     for index in range(40):
@@ -125,14 +125,14 @@ def test_color_is_independent_of_exposure_and_separates_yellow_from_orange() -> 
     assert chroma.distance(np.full((50, 3), (140, 150, 155), np.uint8)) > 4
 
 
-def test_no_single_picture_moves_the_colour_far() -> None:
+def test_no_single_image_moves_the_color_far() -> None:
     yellow, blue = (np.full((300, 3), one, np.uint8) for one in (YELLOW, (220, 60, 30)))
     chroma = ColorModel(yellow)
     chroma.learn(blue, 1.0)
     assert chroma.distance(yellow) < 2
 
 
-def test_the_gate_never_opens_on_the_whole_picture() -> None:
+def test_the_gate_never_opens_on_the_whole_image() -> None:
     track = PixelTrack(Circle(160, 120, 20), 320)
     for _ in range(60):
         track.advance(0.0333)

@@ -86,7 +86,7 @@ def test_distance_hardly_depends_on_light(gain: tuple[float, float, float], add:
     [(20, 200, 30), (190, 210, 225), (30, 30, 200), (200, 60, 30), (255, 255, 255)],
     ids=["green", "beige", "red", "blue", "white"],
 )
-def test_balls_of_other_colours_are_not_the_target(colour: tuple[int, int, int]) -> None:
+def test_balls_of_other_colors_are_not_the_target(colour: tuple[int, int, int]) -> None:
     model = camera()
     assert detect(model, scene(model, 0.855, 0.0, colour=colour)) == ()
 
@@ -127,7 +127,7 @@ def test_speckle_neither_costs_nor_detects() -> None:
 
 @settings(max_examples=40)
 @given(seed=st.integers(0, 2**31), rows=st.integers(16, 60), columns=st.integers(16, 60))
-def test_no_picture_makes_the_detector_raise(seed: int, rows: int, columns: int) -> None:
+def test_no_image_makes_the_detector_raise(seed: int, rows: int, columns: int) -> None:
     rng = np.random.default_rng(seed)
     colours = np.array([(13, 199, 242), (140, 140, 140), (0, 0, 0)], np.uint8)
     blocks = colours[rng.integers(0, 3, (rows // 4 + 1, columns // 4 + 1))].repeat(4, 0).repeat(4, 1)

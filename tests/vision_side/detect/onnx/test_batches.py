@@ -27,7 +27,7 @@ def counted(eye: object, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return runs
 
 
-def test_several_pictures_are_one_run_with_the_answers_that_each_gets_alone(tmp_path: Path, monkeypatch) -> None:
+def test_several_images_are_one_run_with_the_answers_that_each_gets_alone(tmp_path: Path, monkeypatch) -> None:
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1, refine=())
     alone = [eye.detect([grey(level, seq)], NO_DEADLINE)[0] for seq, level in enumerate(LEVELS)]
     runs = counted(eye, monkeypatch)
@@ -50,7 +50,7 @@ def test_invalid_image_is_skipped_and_runs_are_bounded(tmp_path: Path, monkeypat
     assert eye.detect(good, 1) == [None] * 3 and len(runs) == 2, "their time is over"
 
 
-def test_a_model_that_cannot_do_with_many_pictures_is_given_fewer(tmp_path: Path, monkeypatch) -> None:
+def test_model_that_fails_on_many_images_gets_fewer(tmp_path: Path, monkeypatch) -> None:
     """The outputs hold at most two images, whatever the input declares. Batches beyond GPU memory split alike."""
     eye = detector(several_model(tmp_path / "m.onnx", BOXES), min_score=0.1)
     run = eye._engine.run

@@ -90,7 +90,7 @@ def test_boxes_scores_and_labels_become_detections(tmp_path: Path) -> None:
     assert (result.detector, result.device, len(result.model_hash)) == ("onnx:m.onnx", "cpu", 16)
 
 
-def test_what_is_less_sure_than_the_model_wants_does_not_count(tmp_path: Path) -> None:
+def test_detection_below_the_minimum_score_does_not_count(tmp_path: Path) -> None:
     path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], min_score="0.6")
     dark, light = frame(np.full((240, 320, 3), 120, np.uint8)), frame(np.full((240, 320, 3), 200, np.uint8))
     counts = [len(one.detections) if one else None for one in detector(path).detect([dark, light], NO_DEADLINE)]
@@ -98,7 +98,7 @@ def test_what_is_less_sure_than_the_model_wants_does_not_count(tmp_path: Path) -
     assert len(detector(path, min_score=0.1).detect([dark], NO_DEADLINE)[0].detections) == 2
 
 
-def test_half_scale_and_other_shapes_come_back_in_the_pictures_own_pixels(tmp_path: Path) -> None:
+def test_half_scale_and_other_shapes_come_back_in_the_images_own_pixels(tmp_path: Path) -> None:
     eye = detector(brightness_model(tmp_path / "m.onnx", BOXES[:1], [0]), refine=())
     for width, height, expected in ((640, 480, (20, 40, 120, 180)), (160, 120, (5, 10, 30, 45)),
                                     (480, 480, (0, 40, 40, 180))):  # in the middle of a wider input
@@ -115,12 +115,12 @@ def test_yolo_is_read_and_its_overlaps_are_removed(tmp_path: Path) -> None:
     assert (result.detections[0].x1_px, result.detections[0].y2_px) == pytest.approx((22, 42), abs=0.01)
 
 
-def test_it_keeps_the_contract(tmp_path: Path) -> None:
+def test_onnx_detector_keeps_the_contract(tmp_path: Path) -> None:
     path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1])
     assert_kept(lambda: detector(path))
 
 
-def test_the_time_is_over(tmp_path: Path) -> None:
+def test_no_answer_after_the_deadline(tmp_path: Path) -> None:
     eye = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
     assert eye.detect([frame(PICTURE.bgr)], 0) == [None]
 
@@ -189,7 +189,7 @@ class _FailingRuntime(_FakeRuntime):
 
 
 @pytest.mark.parametrize("runtime", [_FakeRuntime, _FailingRuntime])
-def test_a_listed_gpu_that_the_model_did_not_get_is_not_believed(
+def test_gpu_that_the_model_did_not_get_is_rejected(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], runtime: type
 ) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", runtime)
@@ -252,7 +252,7 @@ def test_invalid_numbers_count_as_no_answer(box: float, score: float, label: flo
 
 
 @pytest.mark.parametrize(("box", "score", "count"), [(np.nan, 0.05, 1), (9, -np.inf, 1), (1e300, 0.9, 2)])
-def test_what_does_not_count_may_hold_anything(box: float, score: float, count: int) -> None:
+def test_uncounted_rows_may_have_any_values(box: float, score: float, count: int) -> None:
     found = _found_beside_a_good_one(box, score, 0)
     assert len(found) == count and all(0 <= one.x1_px < one.x2_px <= 320 for one in found)
 

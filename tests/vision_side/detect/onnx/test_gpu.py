@@ -53,7 +53,7 @@ def test_every_result_names_its_device(on_gpu):
     assert [one.device for one in _seen(on_gpu)] == [GPU] * len(JPEGS) and on_gpu.notices() == []
 
 
-def test_it_sees_what_it_sees_on_the_cpu(on_gpu):
+def test_gpu_gives_the_detections_of_the_cpu(on_gpu):
     pairs = list(zip(_seen(on_gpu), _seen(_eyes("cpu")), strict=True))
     assert sum(len(there.detections) for _, there in pairs) >= 3, "there is something to see"
     for here, there in pairs:
@@ -63,7 +63,7 @@ def test_it_sees_what_it_sees_on_the_cpu(on_gpu):
             assert edges[0] == pytest.approx(edges[1], abs=1.0) and mine.score == pytest.approx(other.score, abs=0.02)
 
 
-def test_it_gives_there_what_it_gave_where_it_was_made():
+def test_gpu_gives_the_golden_output():
     engine = open_engine(SHIPPED, GPU, 1)
     form, picture = model_format(engine.header, (), "auto"), DecodedImage(golden_picture(), 1)
     pixels, fitting = fit_picture(picture, form)
@@ -71,11 +71,11 @@ def test_it_gives_there_what_it_gave_where_it_was_made():
     assert found and difference(read_golden(engine.header.metadata[KEY]), found, 0.5) == ""
 
 
-def test_auto_takes_it():
+def test_auto_device_selects_the_gpu():
     assert {one.device for one in _seen(_eyes("auto"))} == {GPU}
 
 
-def test_the_command_keeps_it_to_its_promises(capsys):
+def test_check_command_passes_on_the_gpu(capsys):
     code = cli.run(["detector", "check", "onnx", "--device", GPU, "--json"])
     told = json.loads(capsys.readouterr().out)
     assert code == 0 and told["ok"] and told["times"]

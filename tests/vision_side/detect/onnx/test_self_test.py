@@ -92,7 +92,7 @@ def test_the_model_that_comes_along_opens_with_any_names_and_least_score(options
     assert onnx_detector.OnnxDetector(config).maker.device == "cpu"
 
 
-def test_labels_of_the_metadata_and_of_the_options_are_made_sayable(tmp_path: Path) -> None:
+def test_labels_of_metadata_and_options_are_cleaned(tmp_path: Path) -> None:
     path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], words=("", "a\x1b[2J" + "x" * 99))
     assert onnx_detector.read_onnx_model(onnx_detector.OnnxDetector.Config(address=str(path))).form.labels == (
         "thing", ("a[2J" + "x" * 99)[:64])
@@ -100,7 +100,7 @@ def test_labels_of_the_metadata_and_of_the_options_are_made_sayable(tmp_path: Pa
     assert onnx_detector.read_onnx_model(named).form.labels == ("thing", "b")
 
 
-def test_a_cup_on_a_plate_is_there_beside_the_plate(tmp_path: Path) -> None:
+def test_cup_on_a_plate_is_detected_with_the_plate(tmp_path: Path) -> None:
     columns = np.array([[32, 33, 32, 10], [32, 32, 33, 10], [20, 20, 22, 8], [20, 20, 22, 8],
                         [0.9, 0.8, 0.1, 0.7], [0.1, 0.2, 0.85, 0.1]])
     eye = detector(yolo_model(tmp_path / "yolo.onnx", columns, names="{0: 'cup', 1: 'plate'}"))

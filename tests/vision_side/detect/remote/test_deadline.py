@@ -63,7 +63,7 @@ def test_an_answer_in_time_is_given_in_the_frames_order(by_deadline, held):
     assert [(one.robot, one.seq) for one in results] == [("r1", 1), ("r2", 2)] and held.asked == [[1, 2]]
 
 
-def test_who_hangs_is_not_waited_for_longer_than_the_deadline(by_deadline, held):
+def test_hanging_detector_delays_no_longer_than_the_deadline(by_deadline, held):
     held.free.clear()
     for seq in (1, 2, 3):
         began_s = time.monotonic()
@@ -72,13 +72,13 @@ def test_who_hangs_is_not_waited_for_longer_than_the_deadline(by_deadline, held)
     assert by_deadline.detect([frame(4), frame(5)], within(-1)) == [None, None]
 
 
-def test_what_is_over_before_its_turn_is_not_looked_at(by_deadline, held):
+def test_frame_past_its_deadline_is_skipped(by_deadline, held):
     by_deadline.request([frame(1)], within(-1))
     time.sleep(0.05)
     assert by_deadline.detect([frame(2)], within(2))[0].seq == 2 and held.asked == [[2]]
 
 
-def test_only_the_newest_waits_and_an_answer_that_is_late_is_nobodys(by_deadline, held):
+def test_only_the_newest_frame_waits_and_a_late_answer_is_dropped(by_deadline, held):
     held.free.clear()
     for seq in range(1, 6):
         by_deadline.detect([frame(seq)], within(0.02))
@@ -135,7 +135,7 @@ def test_pixels_of_an_abandoned_frame_do_not_reach_the_next():
     assert seen == [True]
 
 
-def test_ever_new_robots_leave_no_more_decoders_than_there_may_be():
+def test_many_robots_need_a_bounded_number_of_decoders():
     decoders = DecoderPool(10**7)
     for number in range(2 * MAX_DECODERS):
         assert decoders.again(frame(1, robot=f"r{number}")).picture().bgr.shape == (240, 320, 3)
@@ -222,7 +222,7 @@ def test_shadow_of_a_remote_detector_has_the_same_deadline():
     assert remote.besides == [deadline_us - RESERVE_US]
 
 
-def test_of_a_short_deadline_the_remote_has_half():
+def test_remote_detector_gets_half_of_a_short_deadline():
     remote = FakeRemote()
     began_us, deadline_us = monotonic_us(), within(0.01)
     Fallback(remote, Held("own")).detect([frame()], deadline_us)
@@ -230,7 +230,7 @@ def test_of_a_short_deadline_the_remote_has_half():
     assert halves_us[0] <= deadline_us - remote.deadlines[0] <= halves_us[1] + 1
 
 
-def test_it_drives_again_after_ten_good_answers_in_a_row_and_no_earlier():
+def test_remote_detector_steers_again_after_ten_good_answers():
     remote, own = FakeRemote(), Held("own")
     fallback = Fallback(remote, own)
     remote.state = "none"
@@ -244,7 +244,7 @@ def test_it_drives_again_after_ten_good_answers_in_a_row_and_no_earlier():
     assert "drives again" in fallback.notices()[-1]
 
 
-def test_an_answer_under_way_is_waited_for_by_later_frames_not_by_this_one():
+def test_late_answer_serves_later_frames_only():
     remote, own = FakeRemote(), Held("own")
     fallback = Fallback(remote, own)
     remote.state = "none"

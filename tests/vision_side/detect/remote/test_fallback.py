@@ -65,7 +65,7 @@ def test_unexamined_frame_does_not_count_as_a_bad_answer():
     assert _who(fallback, 90) == ["remote"]
 
 
-def test_ever_new_robots_cost_no_more_memory():
+def test_many_robots_need_bounded_memory():
     remote = FakeRemote()
     remote.state = "none"
     fallback = Fallback(remote, Held("own"))
@@ -75,14 +75,14 @@ def test_ever_new_robots_cost_no_more_memory():
     assert len(fallback._good) <= MAX_ROBOTS and len(fallback._beside) <= 1
 
 
-def test_a_memory_is_kept_of_every_robot_that_a_site_meets():
+def test_session_state_is_stored_for_each_robot():
     kept = PerSession(list)
     robots = [f"r{number}" for number in range(MOST_AT_A_SITE)]
     memories = [kept.of(robot, "0000abcd") for robot in robots]
     assert all(kept.of(robot, "0000abcd") is memory for robot, memory in zip(robots, memories, strict=True))
 
 
-def test_both_are_closed_where_the_first_fails_to():
+def test_both_detectors_are_closed_if_one_close_fails():
     class Failing(Held):
         def close(self):
             raise OSError("the port is gone")
@@ -110,7 +110,7 @@ class Heard:
         self.put(Message(DETECTIONS, ROLE, encode(header), encode(said)))
 
 
-def test_boxes_that_come_again_are_taken_again():
+def test_returning_boxes_are_used_again():
     link, far = Heard("r1"), ZenohDetector(ZenohDetector.Config())
     fallback = Fallback(far, Held("own"))
     fallback.attach(link)

@@ -57,7 +57,7 @@ def test_boxes_are_clipped_sorted_and_those_of_low_score_or_outside_left_out():
         (300, 200, 320, 240, 0.8), (0, 10, 20, 40, 0.5)]
 
 
-def test_one_connection_is_kept_and_made_again_when_the_server_let_go_of_it():
+def test_connection_is_reused_and_reopened_after_the_server_closes_it():
     with Server(lambda request: GOOD) as server:
         detector = _asking(server)
         assert all(_ask(detector, seq=seq) for seq in range(1, 6)) and server.connections == 1
@@ -252,7 +252,7 @@ def test_invalid_address_gives_one_line_with_the_correct_form(address, hint):
     assert hint in str(error.value) and "\n" not in str(error.value)
 
 
-def test_addresses_have_the_ports_that_servers_have():
+def test_addresses_have_the_default_ports_of_servers():
     assert parse_address("oip+http://box/ball/3") == parse_address("oip+http://box:8000/ball/3")
     assert parse_address("oip+http://[::1]/ball").host == "::1"
     assert parse_address("http+jpeg://box").path == "/"

@@ -86,7 +86,7 @@ def test_pixels_are_sent_at_the_size_that_the_model_takes(shape, sent, stretch):
         assert tensor.data == one.picture().bgr.tobytes()
 
 
-def test_colours_go_in_the_configured_order():
+def test_colors_go_in_the_configured_order():
     model = model_of("m", "", [PIXELS], OUTPUTS)
     bgr, rgb = (np.frombuffer(tensor_of(model, frame(), order)[0].data, np.uint8).reshape(240, 320, 3)
                 for order in (False, True))
@@ -119,7 +119,7 @@ def test_padded_rows_give_no_boxes_for_any_batch_dimension(boxes, scores, labels
     assert _found(read_infer(*_binary(boxes, scores, labels), ASKED)) == ()
 
 
-def test_boxes_in_the_models_pixels_become_those_of_the_picture():
+def test_boxes_in_the_models_pixels_become_those_of_the_image():
     outputs = {"boxes": np.array([[10.0, 10, 20, 20]]), "scores": np.array([0.9])}
     one = detections_of(Inferred(outputs), OipSettings(address="", labels=("ball",)), (2.0, 3.0), SIZE)[0]
     assert (one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.label) == (20, 30, 40, 60, "ball")
@@ -175,7 +175,7 @@ def _is_a_box(one):
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
 @pytest.mark.parametrize("kind", ["json", "metadata"])
-def test_bytes_at_random_raise_nothing_else(kind, seed):
+def test_random_bytes_raise_no_other_error(kind, seed):
     rng = random.Random(seed)
     body, length = _binary(BOXES, [0.9], [0])
     usual, read = {

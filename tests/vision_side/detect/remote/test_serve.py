@@ -26,7 +26,7 @@ from tests.vision_side.detect.remote.test_zenoh_detector import Robot
     (["--serve", "hsv", "--set", "detector.optoins.x=1"], "options"),
     (["--serve", "hsv", "check", "hsv"], "exclude each other"),
 ])  # fmt: skip
-def test_what_cannot_be_served_is_one_line_and_exit_code_2(capsys, arguments, what):
+def test_invalid_service_is_one_line_and_exit_code_2(capsys, arguments, what):
     assert cli.run(["detector", *arguments]) == 2
     error = capsys.readouterr().err
     assert what in error and error.count("\n") == 1 and error.startswith("error: ")
@@ -52,7 +52,7 @@ def test_detector_process_is_found_answers_and_ends_on_request(tmp_path, capsys)
         assert "detector: ended; hsv on cpu" in processes.log("detector").read_text()
 
 
-def test_it_ends_within_a_second_of_a_signal(tmp_path):
+def test_detector_service_ends_within_a_second_of_a_signal(tmp_path):
     endpoint = free_endpoint()
     command = [
         sys.executable,
@@ -78,7 +78,7 @@ def test_it_ends_within_a_second_of_a_signal(tmp_path):
         process.stdout.close()
 
 
-def test_more_streams_than_it_can_look_at_are_served_fairly_and_in_time(tmp_path):
+def test_overloaded_service_serves_streams_fairly_and_in_time(tmp_path):
     load = measure_streams(free_endpoint(), tmp_path, streams=8, seconds=4)
     assert len(load.answered) == 8 and load.overload > 1.5
     # Wide bounds, because other tests load this machine. `sightline bench streams` has the strict ones.

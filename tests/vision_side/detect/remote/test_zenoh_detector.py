@@ -118,7 +118,7 @@ def _result(robot, detector, jpeg=BALL_JPEG, seconds=0.3):
     return detector.detect([robot.frame(jpeg)], within(seconds))[0]
 
 
-def test_a_robots_frames_come_back_as_boxes_that_name_them(bench):
+def test_boxes_name_the_frame_of_the_robot(bench):
     robot = bench.robot("r1")
     detector = bench.detector("r1")
     assert until(lambda: _result(robot, detector))
@@ -146,7 +146,7 @@ def test_missing_link_is_reported():
     assert "no link to robot r1" in alone.notices()[0]
 
 
-def test_a_bad_picture_and_a_bad_header_get_no_answer_and_are_counted(bench):
+def test_a_bad_image_and_a_bad_header_get_no_answer_and_are_counted(bench):
     robot = bench.robot("r1")
     detector = bench.detector("r1")
     assert until(lambda: _result(robot, detector))
@@ -183,7 +183,7 @@ class Faulty:
         return [replace(one, seq=one.seq + 1) for one in seen] if self.asked == 3 else seen
 
 
-def test_a_detector_that_fails_gives_no_answer_and_the_service_goes_on():
+def test_failing_detector_gives_no_answer_and_the_service_continues():
     with ExitStack() as ending:
         faulty = Faulty()
         bench = Bench(ending, faulty)
@@ -281,7 +281,7 @@ def test_invalid_detections_message_is_rejected_and_counted(pair, payload):
     assert until(lambda: waiting.detect([asked], within(0.05)) == [None] and waiting.rejected["MALFORMED"])
 
 
-def test_boxes_of_an_older_frame_are_nobodys_and_no_news(pair):
+def test_boxes_of_an_older_frame_are_dropped_without_a_log_line(pair):
     """The vision service requests only the newest frame's boxes; the detector service looks at all frames."""
     robot, waiting = pair
     for seq in range(4):
@@ -307,7 +307,7 @@ def test_first_of_two_services_is_used_until_it_is_silent(pair):
     assert waiting.detect([frame(9)], within(1.0))[0].detections[0].label == "box", "the first one is gone"
 
 
-def test_who_talks_nonsense_keeps_no_service_out(pair):
+def test_invalid_service_does_not_block_a_valid_service(pair):
     robot, waiting = pair
     for seq in range(3, 6):
         robot.say(frame(seq), BOX, by="00000002", session="0000ffff")
@@ -316,7 +316,7 @@ def test_who_talks_nonsense_keeps_no_service_out(pair):
         assert waiting.detect([frame(seq + 10)], within(1.0))[0]
 
 
-def test_anothers_boxes_are_not_even_looked_at(pair):
+def test_boxes_of_another_source_are_ignored(pair):
     robot, waiting = pair
     asked = frame(3)
     robot.say(asked, BOX, source="guest")
@@ -324,7 +324,7 @@ def test_anothers_boxes_are_not_even_looked_at(pair):
 
 
 @pytest.mark.parametrize("ahead_us", [10**12, 900_000])
-def test_boxes_of_a_frame_that_never_was_do_not_stand_in_the_way_for_long(pair, ahead_us):
+def test_boxes_of_an_unknown_frame_delay_only_briefly(pair, ahead_us):
     robot, waiting = pair
     robot.say(frame(3), BOX, seq=10**9, t_us=frame(3).header.t_us + ahead_us)
     assert until(lambda: waiting.detect([frame(3)], within(0.05)) == [None] and waiting.rejected["OTHER_FRAME"])
@@ -333,7 +333,7 @@ def test_boxes_of_a_frame_that_never_was_do_not_stand_in_the_way_for_long(pair, 
     assert waiting.detect([frame(seq)], within(1.0))[0], "one message must not blind it for good"
 
 
-def test_who_lags_behind_gets_the_boxes_that_were_kept_for_it_though_newer_ones_came(pair):
+def test_slow_reader_gets_the_stored_boxes_of_its_frame(pair):
     robot, waiting = pair
     for said, asked, is_answered in ((5, 4, False), (6, 5, True)):
         robot.say(frame(said), BOX)
