@@ -62,7 +62,7 @@ def warn_renamed(noun: str, old: str, new: str) -> None:
 
 
 def first_problem(error: ValidationError, noun: str = "", known: Iterable[str] = (), whole: str = "") -> str:
-    """The first problem of a validation as one line.
+    """Format the first problem of a validation as one line.
 
     Args:
         noun: what a field is called, e.g. "option"; without one the line begins with the field's place and a colon.
@@ -98,7 +98,7 @@ class PluginRegistry:
     group: str
 
     def names(self) -> list[str]:
-        """Every name that `load` knows here."""
+        """Return every name that `load` accepts."""
         return sorted(_entries(self.group))
 
     def load(self, kind: str) -> Any:
@@ -117,12 +117,12 @@ class PluginRegistry:
         raise ConfigError(f"no {self.noun} called {kind!r}{self._hint(kind)}; {there}")
 
     def _hint(self, kind: str) -> str:
-        """The nearest name; what stands after a name, behind a colon, is not part of it."""
+        """Return the nearest name. Text after a colon is not part of a name."""
         nearest = difflib.get_close_matches(kind.partition(":")[0], self.names(), n=1)
         return f"; did you mean {nearest[0]!r}?" if nearest else ""
 
     def settings(self, kind: str, plugin: Any, options: Mapping[str, Any]) -> Any:
-        """The checked `Config` of `plugin`. Raises ConfigError, one line, for a wrong option."""
+        """Check the options of `plugin` and return its `Config`. Raises ConfigError for an invalid option."""
         settings = config_model(plugin)
         if settings is None:
             raise ConfigError(f"{self.noun} {kind!r}: {plugin!r} has no pydantic model called Config")
@@ -134,7 +134,7 @@ class PluginRegistry:
 
 
 def config_model(plugin: Any) -> type[BaseModel] | None:
-    """The class's own `Config`."""
+    """Return the `Config` of the class."""
     settings = getattr(plugin, "Config", None)
     return settings if isinstance(settings, type) and issubclass(settings, BaseModel) else None
 
@@ -180,7 +180,7 @@ def _why(error: BaseException, kind: str) -> str:
 
 
 def _lines(trace: TracebackType | None) -> list[str]:
-    """The source lines of a traceback, innermost first."""
+    """Return the source lines of a traceback, innermost first."""
     lines: list[str] = []
     while trace is not None:
         code = trace.tb_frame.f_code

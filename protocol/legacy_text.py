@@ -124,7 +124,7 @@ def parse_boxes(text: bytes) -> tuple[LegacyBox, ...]:
 
 
 def detections_from_boxes(boxes: Sequence[LegacyBox], size: JpegSize) -> Detections:
-    """`boxes` in pixels of a picture of `size`, in their order. They carry no score of their own."""
+    """Convert boxes to pixels of an image of `size`, in their order. They have no score."""
     width_px, height_px = size.width_px, size.height_px
     found = tuple(
         DetectedBox(label=box.label, score=1.0, x1_px=box.x_min * width_px, y1_px=box.y_min * height_px,

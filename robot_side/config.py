@@ -85,7 +85,7 @@ class RobotConfig(Config):
 
     @property
     def ranging(self) -> PluginChoice | None:
-        """The range sensor in use."""
+        """Return the range sensor in use."""
         if self.range_sensor is None and self.drive.kind == "sim":
             return self.drive
         return None if self.range_sensor and self.range_sensor.kind == "none" else self.range_sensor

@@ -30,7 +30,7 @@ def wheel_speeds(drive: DiffDriveConfig, twist: Twist) -> tuple[float, float]:
 
 
 def twist_of(drive: DiffDriveConfig, left_rad_s: float, right_rad_s: float) -> Twist:
-    """The inverse of `wheel_speeds` (without its saturation)."""
+    """Return the twist of two wheel speeds, the inverse of `wheel_speeds` without its saturation."""
     left_mps, right_mps = left_rad_s * drive.wheel_radius_m, right_rad_s * drive.wheel_radius_m
     return Twist(linear_mps=(left_mps + right_mps) / 2, angular_rad_s=(right_mps - left_mps) / drive.track_width_m)
 

@@ -78,12 +78,12 @@ class CommandAck:
 
 
 def packet_kind(packet: bytes) -> PacketKind:
-    """The kind of a packet of ours."""
+    """Return the kind of a packet of this pipe."""
     return PacketKind(packet[0])
 
 
 def pack_issued(seq: int, t_us: int, fingerprint: int) -> bytes:
-    """A frame is about to be published."""
+    """Encode that a frame is about to be published."""
     return _ISSUED.pack(PacketKind.ISSUED, seq, t_us, fingerprint)
 
 
@@ -94,27 +94,27 @@ def unpack_issued(packet: bytes) -> tuple[int, int, int]:
 
 
 def pack_motion(motion: RobotMotion) -> bytes:
-    """The robot at this moment."""
+    """Encode the motion of the robot at this moment."""
     latency_us = -1 if motion.latency_us is None else motion.latency_us
     return _MOTION.pack(PacketKind.MOTION, *motion.pose, *motion.moving, *motion.applied, latency_us)
 
 
 def unpack_motion(packet: bytes) -> RobotMotion:
-    """The inverse."""
+    """Decode a packet of `pack_motion`."""
     _, x, y, yaw, linear, angular, applied_linear, applied_angular, latency_us = _MOTION.unpack(packet)
     latency = None if latency_us < 0 else latency_us
     return RobotMotion((x, y, yaw), (linear, angular), (applied_linear, applied_angular), latency)
 
 
 def pack_command_ack(ack: CommandAck) -> bytes:
-    """A twist was validated."""
+    """Encode the result of a validated twist."""
     return _ACK.pack(
         PacketKind.COMMAND_ACK, ack.seq, ack.compute_us, *_pack_holder(ack.sender), *_pack_holder(ack.holder)
     )
 
 
 def unpack_command_ack(packet: bytes) -> CommandAck:
-    """The inverse."""
+    """Decode a packet of `pack_command_ack`."""
     _, seq, compute_us, source, session, holder_source, holder_session = _ACK.unpack(packet)
     sender = _unpack_holder(source, session)
     if sender is None:
@@ -137,7 +137,7 @@ def pack_rejected(counts: Mapping[str, int]) -> bytes:
 
 
 def unpack_rejected(packet: bytes) -> dict[str, int]:
-    """The inverse."""
+    """Decode a packet of `pack_rejected`."""
     counts = json.loads(packet[1:])
     return {str(reason): int(count) for reason, count in counts.items()}
 
@@ -149,7 +149,7 @@ def pack_message(kind: PacketKind, message: Message) -> bytes:
 
 
 def unpack_message(packet: bytes) -> Message:
-    """The inverse."""
+    """Decode a packet of `pack_message`."""
     _, name, source, header_bytes = _PARTS.unpack_from(packet)
     start = _PARTS.size
     channel = CHANNELS[name.rstrip(b"\0").decode()]
@@ -179,14 +179,14 @@ class NetworkEnd:
         self.dropped_commands = 0
 
     def receive(self) -> bytes:
-        """The next packet, however long it takes; empty when the driver has closed its end."""
+        """Wait for the next packet without a limit. Returns b"" when the driver has closed its end."""
         try:
             return self._waited.recv(MAX_PACKET_BYTES)
         except OSError:
             return b""
 
     def motion(self, last: RobotMotion) -> RobotMotion:
-        """The newest motion that the driver process sent; `last` if it sent nothing since."""
+        """Return the newest motion of the driver process, or `last` without a newer one."""
         with suppress(OSError):
             while packet := self._aside.recv(MAX_PACKET_BYTES, socket.MSG_DONTWAIT):
                 last = unpack_motion(packet)
@@ -325,7 +325,7 @@ class DriverEnd:
         self._backoff_us = min(2 * self._backoff_us, _LONGEST_BACKOFF_US)
 
     def on_ready(self) -> None:
-        """Its endpoint is open: from here on it is restarted whatever happens."""
+        """Note that its endpoint is open. From now on it is restarted after each end."""
         self._was_ready = True
         self._backoff_us = _FIRST_BACKOFF_US
 
@@ -391,7 +391,7 @@ def _send_or_drop(end: socket.socket | None, packet: bytes) -> None:
 
 
 def _receive(end: socket.socket) -> bytes | None:
-    """The next packet; None while no packet waits; empty when the other end is gone and all it sent has been read."""
+    """Return the next packet, None while no packet waits, or b"" after the last packet of a closed end."""
     for _ in range(2):
         try:
             return end.recv(MAX_PACKET_BYTES)

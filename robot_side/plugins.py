@@ -19,7 +19,7 @@ class DeviceGroup(Generic[Port]):
     entry_points: str
 
     def build(self, choice: PluginChoice) -> Port:
-        """The device `choice` names.
+        """Create the device that `choice` names.
 
         Raises:
             ConfigError: for an unknown kind (nearest named), a missing package or a wrong option.
@@ -30,7 +30,7 @@ class DeviceGroup(Generic[Port]):
         return device
 
     def load(self, choice: PluginChoice) -> tuple[Any, Any]:
-        """The class and its checked `Config`, without touching the device. Raises ConfigError."""
+        """Load the class and check its `Config`, without opening the device. Raises ConfigError."""
         registry = PluginRegistry(self.key.replace("_", " "), self.entry_points)
         plugin = registry.load(choice.kind)
         return plugin, registry.settings(choice.kind, plugin, choice.options)

@@ -100,7 +100,7 @@ class Gamepad:
         self.pad = Pad({code: (info.min, info.max) for code, info in axes.items() if code in known})
 
     def fileno(self) -> int:
-        """For `select`."""
+        """Return the descriptor, for `select`."""
         return int(self._device.fd)
 
     def read(self) -> list[PadKey]:

@@ -73,12 +73,18 @@ class DriverCore:
     # --- what arrives --------------------------------------------------------------------------------------------
 
     def on_issued(self, seq: int, t_us: int, fingerprint: int) -> None:
-        """The network process is about to publish frame `seq`, captured at `t_us`; 0 stands for no fingerprint."""
+        """Record a frame before the network process publishes it.
+
+        Args:
+            seq: number of the frame.
+            t_us: capture time, us.
+            fingerprint: of the image bytes; 0 without one.
+        """
         self.gate.issued.add("frame", seq, t_us)
         self.gate.pictures.add(t_us, fingerprint)
 
     def on_twist(self, message: Message, now_us: int) -> CommandAck | None:
-        """Decode and offer a command. Returns the credit it gives back: whatever answers a frame of ours does."""
+        """Decode and offer a command. Returns its credit, if it answers a frame of this robot."""
         try:
             check_sizes(message.channel, message.header, message.payload)
             header = decode(AnswerHeader, message.header) if message.header else None
@@ -93,7 +99,7 @@ class DriverCore:
         return CommandAck(sender, header.echo.seq, header.compute_us, self.gate.holder(now_us))
 
     def on_battery(self, volts: float, t_us: int) -> None:
-        """The newest voltage, and when it was read."""
+        """Store the newest voltage, V, and the time of its reading."""
         if self.battery is not None:
             self.battery.see(volts, t_us)
 
@@ -128,7 +134,7 @@ class DriverCore:
         return wheel_speeds(self.config.wheels, decision.twist)
 
     def motion(self) -> RobotMotion:
-        """The robot at this moment, for frame headers."""
+        """Return the motion of the robot at this moment, for frame headers."""
         applied = self.gate.applied
         return RobotMotion(
             _bounded_pose(self.odometer.pose),

@@ -38,7 +38,7 @@ class StopLatch:
         self._sync_folder()
 
     def _sync_folder(self) -> None:
-        """The mark is an entry in its folder, which is not written with the file."""
+        """Write the folder to disk. The mark is an entry in it, which is not written with the file."""
         folder = os.open(self._path.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             os.fsync(folder)

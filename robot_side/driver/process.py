@@ -260,7 +260,7 @@ class Driver:
             self._driver_core.gate.fault(f"{error or type(error).__name__}")
 
     def _without_sensors(self) -> tuple[float, float]:
-        """The gate's way to zero; zero at once if the gate cannot be stepped either, for this loop must not end."""
+        """Return the gate's ramp to zero, or zero if the gate cannot step either, because this loop must not end."""
         try:
             return self._driver_core.tick(monotonic_us(), None, None)
         except Exception as error:
@@ -268,7 +268,7 @@ class Driver:
             return 0.0, 0.0
 
     def _scanned(self) -> Ranges | None:
-        """The newest scan. Raises BlindZoneError for a sensor that the guard must not rely on."""
+        """Return the newest scan. Raises BlindZoneError for a sensor that the guard must not rely on."""
         scan = self._ranges.read() if self._ranges else None
         if scan is None:
             return None
@@ -279,14 +279,14 @@ class Driver:
         return scan
 
     def _log_state(self, state: State, reason: str) -> None:
-        """One line per change of state."""
+        """Log each change of state in one line."""
         logged, self._logged_state = self._logged_state, state
         self._is_waiting_logged &= state is State.DISARMED
         if state is not logged and {state, logged} != {State.ACTIVE, State.DEGRADED}:
             self._log(f"{state} ({reason})")  # on a lossy link those two alternate many times a second
 
     def _log_battery(self, now_us: int) -> None:
-        """One line per change of level."""
+        """Log each change of level in one line."""
         battery = self._driver_core.battery
         if battery is None:
             return

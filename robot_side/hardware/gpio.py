@@ -56,7 +56,10 @@ class DutyTable:
         self._rows = tuple(rows)
 
     def duty(self, speed_mps: float) -> float:
-        """The duty (-1..1) for a speed; 0 below half the least speed, the least duty up to that: stiction."""
+        """Return the duty (-1..1) for a speed, rad/s.
+
+        Stiction: it is 0 below half the least speed, and the least duty from there to the least speed.
+        """
         least_duty, least_mps = self._rows[0]
         wanted_mps = abs(speed_mps)
         if wanted_mps < least_mps / 2:
@@ -64,7 +67,7 @@ class DutyTable:
         return _signed(_between([(mps, duty) for duty, mps in self._rows], wanted_mps, least_duty), speed_mps)
 
     def speed(self, duty: float) -> float:
-        """The speed that a duty gives, as far as the table knows: 0 below the least duty."""
+        """Return the speed of a duty by the table, rad/s; 0 below the least duty."""
         given = abs(duty)
         return 0.0 if given < self._rows[0][0] else _signed(_between(self._rows, given, self._rows[0][1]), duty)
 
@@ -83,7 +86,7 @@ def _signed(value: float, like: float) -> float:
 
 
 def table_of(text: str, where: str) -> tuple[tuple[float, float], ...]:
-    """The rows of a table file. Raises ConfigError naming `where` and what is wrong."""
+    """Read the rows of a table file. Raises ConfigError that names `where` and the invalid value."""
     try:
         return TableConfig.model_validate(tomllib.loads(text)).table
     except tomllib.TOMLDecodeError as error:
@@ -94,7 +97,7 @@ def table_of(text: str, where: str) -> tuple[tuple[float, float], ...]:
 
 
 def table_text(rows: Sequence[tuple[float, float]], head: str) -> str:
-    """A table file with `head` as its comment; `table_of` reads it."""
+    """Format a table file with `head` as its comment. `table_of` reads it."""
     lines = "".join(f"  [{duty:.3f}, {speed:.4f}],\n" for duty, speed in rows)
     return f"# {head}\ntable = [ # duty, metres per second at the rim\n{lines}]\n"
 
@@ -117,11 +120,11 @@ class Pins(Protocol):
         ...
 
     def enable(self, wanted: bool) -> None:
-        """The enable lines high or low, where there are any."""
+        """Set the enable lines high or low, if there are any."""
         ...
 
     def close(self) -> None:
-        """All low, then given back."""
+        """Set all pins low and release them."""
         ...
 
 
@@ -137,7 +140,7 @@ class WiredPins(Protocol):
 
 
 def open_pins(config: WiredPins) -> Pins:
-    """All pins low.
+    """Open the pins, all low.
 
     Raises ConfigError without gpiozero or lgpio, HardwareError where the pins cannot be had.
     """
@@ -178,12 +181,12 @@ class GpiozeroPins:
         self._motors[number].value = duty
 
     def enable(self, wanted: bool) -> None:
-        """The enable lines high or low."""
+        """Set the enable lines high or low."""
         for device in self._enables:
             device.value = int(wanted)
 
     def close(self) -> None:
-        """Enable lines first, then the motors' pins; idempotent."""
+        """Set the enable lines low first, then the pins of the motors, and release them. Idempotent."""
         for device in (*self._enables, *self._motors.values()):
             with suppress(Exception):  # the rest still has to go down
                 device.value = 0
@@ -350,7 +353,7 @@ class GpioDrive:
         return self._expected() if self._config.odometry == "table" else None
 
     def close(self) -> None:
-        """All pins low, then given back; idempotent."""
+        """Set all pins low and release them. Idempotent."""
         if self._pins is not None:
             self._all_low()
             self._pins.close()
@@ -362,7 +365,7 @@ class GpioDrive:
         return 1 - max(0.0, trim), 1 - max(0.0, -trim)
 
     def _speeds(self, left: float, right: float) -> tuple[float, float]:
-        """At the rims. A wheel that is trimmed is the quicker one: it turns as fast as the other with less."""
+        """Return the speeds at the rims. The trim slows the quicker wheel, so that both turn equally."""
         shares = self._shares
         return self.table.speed(left) / shares[0], self.table.speed(right) / shares[1]
 
@@ -383,7 +386,7 @@ class GpioDrive:
             self._enabled = wanted
 
     def _all_low(self) -> None:
-        """Each pin by itself: one that fails must not keep the others up."""
+        """Set each pin low separately, because one failing pin must not keep the others high."""
         self._angles, self._expected_mps = self._expected(), (0.0, 0.0)
         with suppress(Exception):
             self._enable(False)
@@ -410,7 +413,7 @@ class _Motor:
             self._write(pins, self._pins[duty < 0], min(1.0, abs(duty)))
 
     def low(self, pins: Pins | None) -> None:
-        """Both, whatever happens."""
+        """Set both pins low, also after an error of the first."""
         for number in self._pins:
             try:
                 if pins is not None:

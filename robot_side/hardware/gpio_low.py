@@ -51,7 +51,7 @@ def leave_low(numbers: Sequence[int], chip: int | None = None) -> None:
 
 
 def _header(lgpio: Any) -> Any:
-    """The chip that the pins of the header belong to."""
+    """Open the chip of the pins of the header."""
     for chip in _CHIPS:
         try:
             handle = lgpio.gpiochip_open(chip)

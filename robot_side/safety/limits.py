@@ -188,7 +188,7 @@ class StopBound:
 
 @lru_cache(maxsize=64)  # 5 ms for each configuration, and a process builds the same one several times
 def stop_bound(config: SafetyConfig) -> StopBound:
-    """The stop that `config` implies, by running its own ramp: the worst case, a command on a frame of age zero.
+    """Compute the stop that `config` implies with its own ramp, for the worst case, a command on a frame of age zero.
 
     The driver steps the ramp once a tick, and down to every MIN_TICK_US while commands arrive. The worse of both
     counts: the ramp is slower in short steps.

@@ -16,7 +16,7 @@ from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
 
 
 class FolderCameraConfig(LensConfig):
-    """`path` holds the pictures, all of one size."""
+    """`path` is a folder of JPEGs of one size."""
 
     path: Path
     fps: Annotated[float, Field(gt=0, le=240)] = 30.0
@@ -40,14 +40,14 @@ class FolderCamera:
         self._count = 0
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The picture of the next tick."""
+        """Wait for the next tick and return its image, or None if no tick comes in time."""
         if not self._pace.wait(timeout_s):
             return None
         self._count += 1
         return Picture(self._pictures[(self._count - 1) % len(self._pictures)], monotonic_us())
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Do nothing, because a file camera holds no device."""
 
 
 def jpegs_in(folder: Path) -> list[Path]:
@@ -70,7 +70,7 @@ def jpeg_size(path: Path, jpeg: bytes) -> JpegSize:
 
 
 class StillCameraConfig(LensConfig):
-    """`path` is the picture."""
+    """`path` is a JPEG file."""
 
     path: Path
     fps: Annotated[float, Field(gt=0, le=240)] = 30.0
@@ -93,11 +93,11 @@ class StillCamera:
         self._pace = FrameTimer(config.fps)
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The picture, at the next tick."""
+        """Wait for the next tick and return the image. Returns None if no tick comes in time."""
         return Picture(self._jpeg, monotonic_us()) if self._pace.wait(timeout_s) else None
 
     def close(self) -> None:
-        """Nothing to give back."""
+        """Do nothing, because a file camera holds no device."""
 
 
 # A camera that plays a video file at its own speed, looped or once. Shell (a file and a clock).
@@ -120,7 +120,7 @@ class VideoCameraConfig(LensConfig):
 
 
 class VideoCamera:
-    """Every picture is decoded and encoded here. A slow reader sees fewer pictures, not a slower video."""
+    """Decodes and encodes every image. A slow reader gets fewer images, not a slower video."""
 
     Config = VideoCameraConfig
     live = False
@@ -138,7 +138,11 @@ class VideoCamera:
         self._shown = 0
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The picture of the next tick. Raises HardwareError at the end without `loop`, and where the file breaks."""
+        """Wait for the next tick and decode its image.
+
+        Raises:
+            HardwareError: the video ended without `loop`, or the file is damaged.
+        """
         if not self._pace.wait(timeout_s):
             return None
         for _ in range(self._due()):
@@ -195,7 +199,7 @@ class VideoCamera:
         return ahead
 
     def _step(self) -> None:
-        """To the next picture, past the end if it is looped."""
+        """Go to the next image. After the last image of a looped video, go to the first one."""
         if self._capture.grab():
             self._at += 1
             return

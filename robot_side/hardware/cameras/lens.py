@@ -29,7 +29,7 @@ class LensConfig(Config):
 
 
 def camera_model(config: LensConfig, size: JpegSize) -> CameraModel:
-    """The model of pictures of `size`.
+    """Return the model of images of `size`.
 
     Raises ConfigError for a file that cannot be read, a field that is wrong or unknown, both sources at once, and a
     model that was made at another size: a camera may crop, so nothing is scaled.
@@ -44,7 +44,7 @@ def camera_model(config: LensConfig, size: JpegSize) -> CameraModel:
 
 
 def guessed_model(size: JpegSize, hfov_deg: float) -> CameraModel:
-    """A lens without distortion, its axis through the middle of the picture."""
+    """Return the model of a lens without distortion, with its axis through the center of the image."""
     focal_px = size.width_px / 2 / math.tan(math.radians(hfov_deg) / 2)
     return CameraModel(
         width_px=size.width_px,
@@ -57,7 +57,7 @@ def guessed_model(size: JpegSize, hfov_deg: float) -> CameraModel:
 
 
 def read_model(path: Path) -> CameraModel:
-    """The model in a TOML file. Raises ConfigError naming the file and what is wrong in it."""
+    """Read a model from a TOML file. Raises ConfigError that names the file and the invalid value."""
     try:
         table = tomllib.loads(path.expanduser().read_text("utf-8"))
     except OSError as error:
@@ -70,7 +70,7 @@ def read_model(path: Path) -> CameraModel:
 
 
 def _checked(table: dict[str, Any], where: str) -> CameraModel:
-    """On the wire unknown fields are a newer peer's; in a file they are a slip of the pen."""
+    """Check the fields of a file. An unknown field is an error here, while on the wire it comes from a newer peer."""
     unknown = sorted(set(table) - set(CameraModel.model_fields))
     if unknown:
         known = ", ".join(CameraModel.model_fields)

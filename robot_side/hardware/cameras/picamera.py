@@ -28,12 +28,12 @@ class PiCameraConfig(LensConfig):
     upside_down: bool = False
     hfov_deg: Annotated[float, Field(gt=5, lt=175)] = 62.0
     delay_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
-    """Age of a picture when it is encoded, should the sensor give no usable time."""
+    """Age of an image when it is encoded, ms, if the sensor gives no usable time."""
     frozen_after_s: Annotated[float, Field(ge=0.2, le=60)] = 2.0
 
 
 class PiCamera:
-    """picamera2 captures and encodes in its own threads; here is only the newest picture."""
+    """Holds the newest image. picamera2 captures and encodes on its own threads."""
 
     Config = PiCameraConfig
     live = True
@@ -66,7 +66,7 @@ class PiCamera:
         self._camera.start_recording(self._encoder, _output(self))
 
     def encoded(self, jpeg: bytes, since_first_us: int | None) -> None:
-        """On the encoder's thread: store and return. Its times count from its first picture's sensor time."""
+        """Store the image and return. Runs on the thread of the encoder, whose times count from the first image."""
         first_us = getattr(self._encoder, "firsttimestamp", None)
         stamp_us = 0 if first_us is None or since_first_us is None else first_us + since_first_us
         t_us = self._stamps.captured_us(stamp_us, read_clocks())
@@ -74,7 +74,7 @@ class PiCamera:
         self._newest.put(Picture(jpeg, t_us))
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The next capture; None if none came in time. Raises HardwareError when the camera is frozen."""
+        """Wait for the next capture. Returns None if none comes in time. Raises HardwareError for a frozen camera."""
         picture = self._newest.take(timeout_s)
         if picture is None and time.monotonic() - self._heard_s > self._config.frozen_after_s:
             raise HardwareError(
@@ -119,7 +119,7 @@ def _output(camera: PiCamera) -> Any:
     from picamera2.outputs import Output
 
     class ToCamera(Output):  # type: ignore[misc]
-        """Hands every picture on; later arguments are of newer versions and not needed."""
+        """Forward every image. Newer versions pass more arguments, which are not needed."""
 
         def outputframe(
             self, frame: Any, _keyframe: bool = True, timestamp: int | None = None, *_more: Any, **_named: Any

@@ -67,7 +67,7 @@ class FrameTimer:
 
 
 def read_clocks() -> Clocks:
-    """Every clock that a driver may stamp with, now."""
+    """Read all clocks that a driver may use for its stamps."""
     boot_us = time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000
     return Clocks(monotonic_us(), boot_us, time.time_ns() // 1000)
 
@@ -96,7 +96,7 @@ class LatestPicture:
         self._slot.put((time.monotonic(), picture))
 
     def take(self, timeout_s: float) -> Picture | None:
-        """A picture that has just arrived, else the next one; None if none arrives within `timeout_s`."""
+        """Take the image that has just arrived, else the next one. Returns None if none arrives within `timeout_s`."""
         stored = self._slot.take()
         if stored is not None and time.monotonic() - stored[0] <= _JUST_NOW_S:
             return stored[1]
