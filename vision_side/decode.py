@@ -30,7 +30,7 @@ class DecodedImage:
 
 
 class Decoder:
-    """Decodes pictures of one size into one buffer; half scale from 640x480 up."""
+    """Decodes images of one size into one buffer, at half scale from 640x480 up."""
 
     def __init__(self, width_px: int, height_px: int, max_pixels: int) -> None:
         self.size_px = (width_px, height_px)
@@ -41,7 +41,7 @@ class Decoder:
         self._checked_head: bytes | None = None
 
     def decode(self, jpeg: bytes) -> DecodedImage:
-        """The pixels of `jpeg`. Raises WireError MALFORMED for anything that is not a picture of the camera's size."""
+        """Decode a JPEG. Raises WireError MALFORMED for bytes that are not an image of the camera's size."""
         self.check(jpeg)
         self._fill(jpeg)
         return self._picture
@@ -52,7 +52,7 @@ class Decoder:
             self._checked_head = self._head_of(jpeg)
 
     def _head_of(self, jpeg: bytes) -> bytes | None:
-        """The head that spares a camera's next pictures this check: they repeat it byte for byte. None if none can."""
+        """Return the head that a camera repeats byte for byte, so that its next images skip this check, or None."""
         size = read_jpeg_size(jpeg, self._max_pixels)
         if (size.width_px, size.height_px) != self.size_px:
             own = f"{self.size_px[0]}x{self.size_px[1]}"
@@ -72,7 +72,7 @@ class Decoder:
 
 
 def _cached_pixels(rows: int, columns: int) -> NDArray[np.uint8]:
-    """A buffer 16 bytes off a 32-byte boundary.
+    """Return a buffer 16 bytes off a 32-byte boundary.
 
     On the boundary libjpeg-turbo stores past the cache: its decode takes 10 % longer, and every look at the pixels
     after it waits for memory.
@@ -84,7 +84,7 @@ def _cached_pixels(rows: int, columns: int) -> NDArray[np.uint8]:
 
 
 def _head_of_one_scan(jpeg: bytes, components: int) -> bytes | None:
-    """All up to the pixels of a baseline picture whose first scan holds every component: decoders end after that one.
+    """Return all up to the pixels of a baseline image whose first scan has every component. Decoders end after it.
 
     None for progressive and for several scans. Expects a header that `read_jpeg_size` took.
     """

@@ -50,7 +50,7 @@ class OverlayData:
 
 
 def draw_overlay(picture: Image, shown: OverlayData, width_px: int) -> Image:
-    """`picture`, of any size, made `width_px` wide, with everything drawn over it."""
+    """Scale `picture` to `width_px` and draw the overlay."""
     camera = shown.camera
     height_px = max(1, round(width_px * camera.height_px / camera.width_px))
     canvas = _resized(picture, width_px, height_px)
@@ -73,7 +73,7 @@ def draw_overlay(picture: Image, shown: OverlayData, width_px: int) -> Image:
 
 
 def draw_preview(picture: Image, width_px: int) -> Image:
-    """`picture` made `width_px` wide, or left as it is where it is smaller."""
+    """Scale `picture` down to `width_px`. A smaller image stays unchanged."""
     height, width = picture.shape[:2]
     if width <= width_px:
         return picture
@@ -81,7 +81,7 @@ def draw_preview(picture: Image, width_px: int) -> Image:
 
 
 def raw_px(target: Detection) -> Point:
-    """The middle of what was found: of its circle, else of its box."""
+    """Return the center of the circle, else of the box."""
     if target.circle is not None:
         return target.circle.cx_px, target.circle.cy_px
     return (target.x1_px + target.x2_px) / 2, (target.y1_px + target.y2_px) / 2
@@ -136,7 +136,7 @@ def _draw_target(canvas: Image, target: Detection, scale: float) -> None:
 
 
 def _at(point: Point, scale: float) -> tuple[int, int]:
-    """A place on the canvas; what is far outside or no number stays where drawing it costs nothing."""
+    """Convert a point to the canvas. Points far outside and nan go where drawing them costs nothing."""
     across, down = (-_FAR_PX if math.isnan(value) else min(max(value * scale, -_FAR_PX), _FAR_PX) for value in point)
     return round(across), round(down)
 
@@ -216,7 +216,7 @@ def _width(text: str, font: float) -> int:
 
 
 def _plain(text: str) -> str:
-    """The font has ASCII only."""
+    """Replace letters that the font lacks. It has ASCII only."""
     return "".join(letter if " " <= letter <= "~" else "?" for letter in text)
 
 

@@ -10,7 +10,7 @@ from sightline.vision_side.config import VisionConfig
 
 
 def shared_options(plugin: Any, options: Mapping[str, Any], config: VisionConfig) -> dict[str, Any]:
-    """`options` laid over each section of `config` that the plug-in's `Config` has by name and type.
+    """Merge `options` over each section of `config` that the plug-in's `Config` has by name and type.
 
     Such a section is, for example, `target`, `hsv` or `boxes`.
     """

@@ -76,7 +76,7 @@ class ViewPublisher:
     """The images that a vision service publishes for one robot."""
 
     def __init__(self, config: VisionConfig, link: Link, log_change: Callable[[str, str], None]) -> None:
-        """`log_change` prints a line (about what, the line) if it changed."""
+        """Create the viewing. `log_change(subject, line)` prints a changed line."""
         self._config, self._link, self._log_change = config, link, log_change
         self._paces = {OVERLAY: RateLimiter(config.viewing.overlay_hz), PREVIEW: RateLimiter(config.viewing.preview_hz)}
         self._kept: deque[tuple[FrameHeader, bytes]] = deque(maxlen=KEPT)
@@ -160,7 +160,7 @@ class ViewPublisher:
             yield PREVIEW, draw_preview(picture, config.preview_width_px), config.preview_quality_percent
 
     def _decoded(self, job: _Job) -> NDArray[np.uint8]:
-        """The picture, no larger than it has to be. Raises WireError for one that is not of the camera's size."""
+        """Decode the image, no larger than necessary. Raises WireError for an image not of the camera's size."""
         camera, config = job.shown.camera, self._config
         if self._decoder is None or self._decoder.size_px != (camera.width_px, camera.height_px):
             self._decoder = Decoder(camera.width_px, camera.height_px, config.max_pixels)

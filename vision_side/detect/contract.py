@@ -54,7 +54,7 @@ class Times:
 
 
 def check_detector(make: Make, seed: int = 1) -> list[PromiseResult]:
-    """Every promise in turn; `make` builds a detector that has seen nothing yet."""
+    """Check every promise in turn. `make` builds a new detector."""
     verdicts = []
     for check in _CHECKS:
         promise = (check.__doc__ or "").split("\n")[0].rstrip(".")
@@ -70,7 +70,7 @@ def check_detector(make: Make, seed: int = 1) -> list[PromiseResult]:
 
 
 def time_detector(make: Make, frames: int = 60, seed: int = 1) -> list[Times]:
-    """At the two usual sizes, hot."""
+    """Measure the time per frame at the two usual sizes, one frame after the other."""
     return [_time_size(make, size, frames, seed) for size in SIZES[:2]]
 
 
@@ -102,7 +102,7 @@ def _keeps_order(detector: Detector, _make: Make, seed: int) -> str:
 
 
 def _keeps_answering(detector: Detector, _make: Make, seed: int) -> str:
-    """Every picture gets an answer, of any size, black, noise or full."""
+    """Every image gets an answer, of any size, black, noise or full."""
     for size in SIZES:
         for index, frame in enumerate(drawn_frames(seed, 6, size)):
             if detector.detect([frame], NO_DEADLINE) == [None]:
@@ -231,7 +231,7 @@ def _is_bad(frame: DetectFrame) -> bool:
 
 
 def drawn_frames(seed: int, count: int, size: tuple[int, int], robot: str = "r1") -> Iterator[DetectFrame]:
-    """Frames of one robot, 33 ms apart, each with a decoder of its own so that all stay valid."""
+    """Draw frames of one robot, 33 ms apart, each with a separate decoder, so that all stay valid."""
     random = Random(seed)
     for index in range(count):
         header = FrameHeader(session="0000abcd", seq=index + 1, t_us=5_000_000 + index * _FRAME_US)

@@ -79,7 +79,7 @@ class ColorFilter(DetectorWrapper):
 
 
 def _middle(low_px: float, high_px: float, scale: int, size: int) -> slice:
-    """At least one pixel of the decoded picture."""
+    """Return the middle of the box, at least one pixel of the decoded image."""
     cut = (high_px - low_px) * (1 - _MIDDLE) / 2
     first = min(size - 1, max(0, int((low_px + cut) / scale)))
     return slice(first, max(first + 1, min(size, int((high_px - cut) / scale) + 1)))
@@ -129,7 +129,7 @@ class _Memory:
         self._given = 0
 
     def named(self, found: Sequence[Detection], t_us: int) -> tuple[Detection, ...]:
-        """The best pair first, whichever it is."""
+        """Assign ids, the best pair first."""
         found, rest = found[:MAX_TRACKS], found[MAX_TRACKS:]
         self._tracks = [one for one in self._tracks if t_us - one.t_us <= KEPT_US]
         pairs = sorted(

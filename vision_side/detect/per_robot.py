@@ -23,11 +23,11 @@ class PerSession(Generic[Memory]):
         self._kept: OrderedDict[str, tuple[object, Memory]] = OrderedDict()
 
     def find(self, robot: str) -> Memory | None:
-        """That of the robot's newest session, if there is one."""
+        """Return the item of the robot's newest session, or None."""
         return self._kept[robot][1] if robot in self._kept else None
 
     def of(self, robot: str, session: object) -> Memory:
-        """That of the robot's session, which may be named by more than its id."""
+        """Return the item of a session. Its name may have more parts than the id."""
         before = self._kept.pop(robot, None)
         memory = before[1] if before is not None and before[0] == session else self._begin()
         self._kept[robot] = session, memory
@@ -55,13 +55,13 @@ class DecoderPool:
         self._decoders: OrderedDict[tuple[str, int], Decoder] = OrderedDict()
 
     def again(self, frame: DetectFrame, place: int = 0) -> DetectFrame:
-        """The same frame, to be decoded here; valid until another of its robot and `place` is."""
+        """Return the frame with a decoder of this place. It is valid until the next one of its robot and `place`."""
         return self.frame(frame.robot, frame.header, frame.jpeg, (frame.width_px, frame.height_px), place)
 
     def frame(
         self, robot: str, header: FrameHeader, jpeg: bytes, size_px: tuple[int, int], place: int = 0
     ) -> DetectFrame:
-        """A frame whose size is known."""
+        """Return a frame of known size."""
         decoder = self._decoders.pop((robot, place), None)
         if decoder is None or decoder.size_px != size_px:
             decoder = Decoder(*size_px, self._max_pixels)

@@ -70,7 +70,7 @@ class DetectorWrapper:
 
     @property
     def maker(self) -> Maker | None:
-        """The maker of the results, if the one inside names it."""
+        """Return the maker of the results, if the inner detector names it."""
         return maker_of(self.inner)
 
     def close(self) -> None:
@@ -171,7 +171,7 @@ def _why(error: BaseException) -> str:
 
 
 def validated(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
-    """`result` with its boxes clipped to the picture, those outside of it left out, its time in whole microseconds.
+    """Return `result` with boxes clipped to the image, without boxes outside, and with its time in whole microseconds.
 
     Raises ValueError, with the reason, for an invalid answer to `frame`.
     """
@@ -236,6 +236,6 @@ def annotation_problem(one: Detection) -> str:
 
 
 def _is_circle(circle: Circle) -> bool:
-    """True if the wire can carry it."""
+    """Return True if the wire accepts the circle."""
     return (abs(circle.cx_px) <= _FURTHEST_PX and abs(circle.cy_px) <= _FURTHEST_PX
             and 0 < circle.radius_px <= _FURTHEST_PX)

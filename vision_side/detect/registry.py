@@ -28,7 +28,7 @@ _OF_DETECTOR: Final = ("device", "deadline_s")
 
 
 def configured_detector(config: VisionConfig) -> Detector:
-    """The detector of `config.detector` with all that is around it.
+    """Create the detector of `config.detector` with its filters, fallback and shadow.
 
     Raises ConfigError for an unknown one or a wrong option, HardwareError for a device that is not there.
     """
@@ -82,7 +82,7 @@ def _check_labels(kind: str, wanted: Sequence[str], known: Sequence[str]) -> Non
 
 
 def waits_for_service(config: VisionConfig) -> bool:
-    """True if one of the configured detectors waits for another service, so that others should not wait for it."""
+    """Return True if one of the configured detectors waits for another service and should not delay others."""
     one = config.detector
     kinds = [kind for kind in (one.kind, one.fallback, one.shadow) if kind and kind != BOXES]
     return any(getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False) for kind in kinds)
@@ -119,7 +119,7 @@ def _has_field(kind: str, field: str) -> bool:
 
 
 def split_kind(kind: str) -> tuple[str, str]:
-    """A detector's name and its address; the name is all of it for `package.module:Name`."""
+    """Split a kind into name and address. `package.module:Name` is all name."""
     name, _, rest = kind.partition(":")
     if name not in REGISTRY.names():
         return kind, ""
@@ -127,7 +127,7 @@ def split_kind(kind: str) -> tuple[str, str]:
 
 
 def build_detector(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Detector:
-    """The detector called `kind`, by itself.
+    """Create the detector called `kind`, without wrappers.
 
     Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option, and
     HardwareError for a device that is not there.
@@ -162,7 +162,7 @@ def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) ->
 
 
 def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tuple[Any, Any]:
-    """The plug-in and its `Config`."""
+    """Return the plug-in and its checked `Config`."""
     if kind == BOXES:
         raise ConfigError(f"{BOXES!r} is remote; choose a local detector, e.g. hsv")
     name, address = split_kind(kind)

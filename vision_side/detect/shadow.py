@@ -149,7 +149,7 @@ class ShadowDetector:
             ending.callback(close_detector, self._shadow)
 
     def _put(self, task: _Task) -> None:
-        """The newest frame of each robot waits; an older one that was not looked at yet is left out."""
+        """Store the newest frame of each robot. It replaces an older frame that still waits."""
         with self._bell:
             self._tasks[task.frame.robot] = task
             if len(self._tasks) > MAX_ROBOTS:

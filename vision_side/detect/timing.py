@@ -23,14 +23,14 @@ def _picture_of(frame: DetectFrame) -> DecodedImage | None:
 
 
 def _inside(frame: DetectFrame, found: Sequence[Detection]) -> list[Detection]:
-    """A picture of odd size that was decoded at half scale is a pixel larger than the encoded one."""
+    """Clip to the encoded image. An image of odd size at half scale is a pixel larger."""
     return [part for one in found if (part := clipped(one, frame.width_px, frame.height_px))]
 
 
 def timed_together(
     frames: Sequence[DetectFrame], maker: Maker, look: Callable[[Sequence[DecodedImage]], list[Sequence[Detection]]]
 ) -> list[DetectionResult | None]:
-    """The same of several pictures at once, each with its share of the time."""
+    """Measure a batch, and give each image its share of the time."""
     pictures = [_picture_of(frame) for frame in frames]
     there = [one for one in pictures if one is not None]
     started_ns = time.perf_counter_ns()

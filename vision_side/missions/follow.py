@@ -49,7 +49,7 @@ class Follow:
         self._motion_predictor = MotionPredictor(config.latency)
 
     def step(self, view: View) -> Plan:
-        """The plan for one frame."""
+        """Compute the plan for one frame."""
         places = self._places(view)
         self._hear(view)
         seen = self._track.step(view.dt_s, view.header.pose, self._sightings(places))
@@ -128,7 +128,7 @@ class Follow:
 
 
 def aim_at(target: Target, robot: PredictedMotion, camera: CameraModel, ahead_s: float) -> Aim:
-    """`target`, `ahead_s` from now, about the lens of `robot`."""
+    """Predict `target` `ahead_s` from now, relative to the lens of `robot`."""
     x, y = from_odometry(robot.pose, target.x_m + target.vx_mps * ahead_s, target.y_m + target.vy_mps * ahead_s)
     vx, vy = from_odometry((0.0, 0.0, robot.pose[2]), target.vx_mps, target.vy_mps)
     return Aim(x - camera.x_m, y - camera.y_m, vx, vy, camera.x_m)

@@ -31,13 +31,13 @@ class Footprint(Config):
         return math.hypot(max(self.front_m, self.rear_m), self.half_width_m)
 
     def nearest(self, points: Points) -> Points:
-        """The place of the outline nearest to each of `points`, which are about the robot."""
+        """Return the place of the outline nearest to each of `points`, relative to the robot."""
         return np.column_stack([np.clip(points[:, 0], -self.rear_m, self.front_m),
                                 np.clip(points[:, 1], -self.half_width_m, self.half_width_m)])
 
 
 def braking_mps(room_m: float, delay_s: float, brake_mps2: float) -> float:
-    """The highest speed from which the robot still stops within `room_m`, braking only after `delay_s`."""
+    """Return the highest speed from which the robot stops within `room_m`, if it brakes after `delay_s`."""
     if room_m <= 0:
         return 0.0
     lost = brake_mps2 * delay_s
@@ -45,7 +45,7 @@ def braking_mps(room_m: float, delay_s: float, brake_mps2: float) -> float:
 
 
 def clear_of(points: Points, body: Footprint, twist: tuple[float, float], keep_m: float, brake_mps2: float) -> float:
-    """The part (0..1) of `twist` that lets the robot come no nearer than `keep_m` to any of `points`.
+    """Return the share (0..1) of `twist` that keeps the robot at least `keep_m` from all `points`.
 
     Speed towards a point is what counts: along a wall and away from it the robot may go as it likes.
     """
@@ -192,7 +192,7 @@ class Goto:
         self._ended: Plan | None = None
 
     def step(self, view: View) -> Plan:
-        """The twist towards the next waypoint."""
+        """Compute the twist toward the next waypoint."""
         self._poses.add(view.header)
         self._motion_predictor.measure(view.header.latency_us, view.dt_s)
         self._look(view)
@@ -272,7 +272,7 @@ class Goto:
         return to_odometry(pose, -math.copysign(0.1, x), 0.0)
 
     def _then(self, view: View) -> PredictedMotion:
-        """The robot when the command acts."""
+        """Predict the robot at the time when the command acts."""
         header = view.header
         return self._motion_predictor.motion(header.t_us, header.pose, header.moving, header.applied)
 
@@ -327,7 +327,7 @@ class Goto:
         return braking_mps(room_m, _WHEELS_S, config.brake_mps2)
 
     def _braked(self, pose: Pose, linear: float, angular: float) -> Twist:
-        """The twist, slowed down towards what is known to stand near."""
+        """Slow down the twist toward known obstacles."""
         points = about_robot(self._ground.points(), pose)
         near = points[(abs(points) < _NEAR_M).all(axis=1)]
         keep_m = self._config.clearance_m + _BRAKE_SLACK_M

@@ -64,7 +64,7 @@ class Line:
         return (y_m - self.y_m) * math.cos(self.heading_rad) - (x_m - self.x_m) * math.sin(self.heading_rad)
 
     def at(self, along_m: float) -> tuple[float, float]:
-        """The point of the middle that far along."""
+        """Return the point of the center line that far along."""
         return self.x_m + along_m * math.cos(self.heading_rad), self.y_m + along_m * math.sin(self.heading_rad)
 
 
@@ -103,7 +103,7 @@ class Lane:
         self._blocks = [*self._blocks[-_MAX_BLOCKS + 1 :], Block(x_m, y_m, weight, side)]
 
     def _laid(self, pose: Pose, heading_rad: float) -> Line:
-        """The line through the middle beside the blocks near here; one block alone keeps the direction."""
+        """Lay the center line next to the blocks near here. One block alone keeps the direction."""
         here = Line(pose[0], pose[1], heading_rad)
         near = [one for one in self._blocks if -_BEHIND_M <= here.along_m(one.x_m, one.y_m) <= _AHEAD_M]
         near = near or [min(self._blocks, key=lambda one: math.hypot(one.x_m - pose[0], one.y_m - pose[1]))]
@@ -115,7 +115,7 @@ class Lane:
 
     @staticmethod
     def _turned(near: list[Block], heading_rad: float) -> float:
-        """The rows' common direction, by least squares about each side's own middle; the old one if they are short."""
+        """Fit the common direction of the rows by least squares. Short rows keep the old direction."""
         xx = xy = 0.0
         cos, sin = math.cos(heading_rad), math.sin(heading_rad)
         spread: list[float] = []

@@ -59,13 +59,13 @@ class Legs(Follow):
         self._echoes: Points = np.empty((0, 2))
 
     def step(self, view: View) -> Plan:
-        """The plan for one frame."""
+        """Compute the plan for one frame."""
         self._poses.add(view.header)
         self._lay_out(view)
         return super().step(view)
 
     def _lay_out(self, view: View) -> None:
-        """The newest scan's echoes, in the odometry frame; none when it is too old."""
+        """Convert the echoes of the newest scan to the odometry frame. An old scan gives none."""
         scan = view.scan
         if scan is None or view.header.t_us - scan.t_us > self._legs.max_scan_age_s * 1e6:
             self._echoes = np.empty((0, 2))
@@ -74,7 +74,7 @@ class Legs(Follow):
             self._echoes = in_odometry(echoes(scan, self._legs.sensor_x_m), self._poses.at(scan.t_us))
 
     def _places(self, view: View) -> list[Sighting | None]:
-        """The middle between the legs of each box."""
+        """Return the middle between the legs of each box."""
         near = about_robot(self._echoes + self._walked(view), view.header.pose) - (self._camera.x_m, self._camera.y_m)
         return [self._place(one, near, view) for one in view.detections if self._legs.label in ("", one.label)]
 
@@ -98,7 +98,7 @@ class Legs(Follow):
         return Sighting(x_m, self._camera.y_m + range_m * math.sin(bearing_rad), one)
 
     def _range(self, about_lens: Points, right_rad: float, left_rad: float) -> float | None:
-        """From the lens to the middle between the legs; None without an echo in the span."""
+        """Return the range from the lens to the middle between the legs, m, or None without an echo in the span."""
         bearings = np.arctan2(about_lens[:, 1], about_lens[:, 0])
         inside = (bearings >= right_rad - _SPAN_MARGIN_RAD) & (bearings <= left_rad + _SPAN_MARGIN_RAD)
         away = np.hypot(about_lens[inside, 0], about_lens[inside, 1])
@@ -117,7 +117,7 @@ class Legs(Follow):
 
 
 def nearest_legs(points: Points, away_m: NDArray[np.float64], stride_m: float) -> list[float]:
-    """The range of each leg's nearest echo, nearest leg first, of what is within a stride of the nearest.
+    """Return the range of each leg's nearest echo, nearest first, within a stride of the nearest leg.
 
     `points` come in the order of the scan; a gap between two of them parts one leg from the next.
     """

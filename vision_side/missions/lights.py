@@ -75,7 +75,7 @@ class HousingLightReader:
         self._lit = color_table(tuple(self._ranges.values()))
 
     def read(self, picture: DecodedImage, not_these: Iterable[Detection] = ()) -> list[DetectedLight]:  # noqa: ARG002
-        """Every housing in view, largest first; the colour is unknown where place and hue do not agree."""
+        """Return every housing in view, largest first. The color is unknown where place and hue do not agree."""
         bgr = balanced(picture.bgr)
         bright = _brightest_channel(bgr)
         dark = bright < self._config.dark * float(np.median(bright[::4, ::4]))
@@ -97,7 +97,7 @@ class HousingLightReader:
         return [box for box in boxes if box is not None and self._is_dark(box, dark)]
 
     def _upright(self, shape: NDArray[Any], size: tuple[int, ...]) -> Box | None:
-        """The housing that `shape` is, less its pole; its top is put back where the picture's border cut it off."""
+        """Return the housing of `shape` without its pole, with the top that the border of the image cut off."""
         x, y, width, height = cv2.boundingRect(shape)
         if height < self._config.min_height_px:
             return None
@@ -162,7 +162,7 @@ class BoxLightReader:
         self._tables = {name: color_table((one,)) for name, one in _ranges(config).items()}
 
     def read(self, picture: DecodedImage, not_these: Iterable[Detection] = ()) -> list[DetectedLight]:
-        """Every box of one of the three colours, largest first, but for `not_these`."""
+        """Return every box of one of the three colors, largest first, without `not_these`."""
         codes = cv2.cvtColor(balanced(picture.bgr), cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
         others = [_middle(one) for one in not_these]
         lights = [light for colour, table in self._tables.items()
@@ -188,7 +188,7 @@ class BoxLightReader:
 
 
 def balanced(bgr: Bgr) -> Bgr:
-    """The picture in white light: most of a picture is floor and wall, so its middle tint is that of the light.
+    """Remove the tint of the light. Most of an image is floor and wall, so its median tint is that of the light.
 
     Without it a floor in lamplight is as yellow as a yellow lamp. Tints are compared pixel by pixel: a middle of each
     channel alone would be the floor's in one and the sky's in another.
@@ -201,7 +201,7 @@ def balanced(bgr: Bgr) -> Bgr:
 
 
 def _brightest_channel(bgr: Bgr) -> Bgr:
-    """The largest of the three values of each pixel; a tenth of the time that NumPy takes along an axis of three."""
+    """Return the largest of the three values of each pixel, in a tenth of the time of NumPy's maximum along an axis."""
     blue, green, red = cv2.split(bgr)
     return np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
 

@@ -70,17 +70,17 @@ class Costmap:
             self.version += 1
 
     def cells(self) -> Cells:
-        """The filled cells."""
+        """Return the filled cells."""
         return np.array(list(self._sure), np.int64).reshape(-1, 2)
 
     def points(self) -> Points:
-        """The middles of the filled cells."""
+        """Return the centers of the filled cells."""
         middles: Points = (self.cells().astype(np.float64) + 0.5) * CELL_M
         return middles
 
 
 def cells_of(points: Points) -> Cells:
-    """The cells that hold `points`."""
+    """Return the cells of `points`."""
     return np.floor(points / CELL_M).astype(np.int64)
 
 
@@ -161,7 +161,7 @@ class Planner:
         return (cell[0] + self._corner[0] + 0.5) * CELL_M, (cell[1] + self._corner[1] + 0.5) * CELL_M
 
     def entry(self, robot: Point, within_m: float) -> Cell | None:
-        """The robot's cell, or the nearest one from which a way leads to the goal, or None."""
+        """Return the robot's cell, or the nearest cell with a way to the goal, or None."""
         i, j = self._cell(robot)
         if self.covers(robot) and self._steps[i, j] < _UNREACHED:
             return i, j
@@ -180,7 +180,7 @@ class Planner:
         return float(self._steps[entry]) * CELL_M
 
     def carrot(self, robot: Point, entry: Cell) -> Point:
-        """The farthest point of the way that lies straight ahead of the robot, unhidden by anything known."""
+        """Return the farthest point of the way in direct line of sight from the robot."""
         skip = 1.5 + math.dist(self.middle(entry), robot) / CELL_M
         if self.sees(robot, self.goal, skip):
             return self.goal
@@ -238,7 +238,7 @@ class Planner:
 
 
 def _window(filled: Cells, robot: Point, goal: Point, keep_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The corner cells of the plan: robot, goal and all that is known, with room to go round; the horizon bounds it."""
+    """Return the corner cells of the plan. It has robot, goal, obstacles and a margin, within the horizon."""
     own, margin = cells_of(np.array([robot]))[0], math.ceil(keep_m / CELL_M) + 4
     horizon = round(HORIZON_M / CELL_M)
     near = filled[(np.abs(filled - own) < horizon - margin).all(axis=1)]
@@ -262,7 +262,7 @@ def _away(filled: Cells, size: NDArray[np.int64]) -> NDArray[np.float32]:
 
 def _flooded(blocked: NDArray[np.bool_], tight: NDArray[np.bool_], seeds: list[tuple[int, Cell]]
              ) -> NDArray[np.int32]:
-    """For each cell, how many steps of the wave it takes to get there. It enters tight cells every third step only."""
+    """Count the steps of the wave to each cell. The wave enters tight cells only every third step."""
     free, roomy = (~blocked).astype(np.uint8), (~(blocked | tight)).astype(np.uint8)
     wave, waited = np.zeros_like(free), np.zeros(free.shape, np.int32)
     pending = sorted((one for one in seeds if free[one[1]]), reverse=True)

@@ -14,7 +14,7 @@ from sightline.vision_side.missions.port import RangeScan
 
 
 def decode_scan(header: bytes, payload: bytes) -> tuple[ScanHeader, RangeScan]:
-    """The scan and its stamp.
+    """Decode a scan and its stamp.
 
     Raises WireError: MALFORMED for broken headers and sizes, NOT_FINITE for a nan or a negative range.
     """
@@ -51,12 +51,12 @@ class PoseMemory:
         self._moving = (0.0, 0.0)
 
     def add(self, header: FrameHeader) -> None:
-        """One frame's odometry; frames come in order."""
+        """Store the odometry of a frame. Frames come in order."""
         self._poses.append((header.t_us, header.pose))
         self._moving = header.moving
 
     def at(self, t_us: int) -> Pose:
-        """The pose at `t_us`: between two known ones, or a little beyond the newest, or else the nearest in time."""
+        """Return the pose at `t_us`, between two known poses or shortly after the newest, else the nearest in time."""
         newest_us, newest = self._poses[-1]
         if t_us >= newest_us:
             return _moved(newest, self._moving, min((t_us - newest_us) / 1e6, _MAX_AHEAD_S))

@@ -46,13 +46,13 @@ class MissionSpec:
         return is_followable(label, target.label) if isinstance(target, TargetConfig) else True
 
     def build(self, camera: CameraModel) -> Mission:
-        """A new one, that knows nothing yet."""
+        """Create a new mission without a state."""
         mission: Mission = self.plugin(self.config, camera)
         return mission
 
 
 def configured_mission(config: VisionConfig) -> MissionSpec:
-    """The mission of `config.mission`. Raises ConfigError as `choose` does."""
+    """Return the mission of `config.mission`. Raises ConfigError for an invalid choice."""
     return mission_spec(config.mission.kind, _own_options(config.mission.kind, config), config)
 
 
@@ -73,7 +73,7 @@ def check_missions(config: VisionConfig) -> None:
 
 
 def requested_mission(request: MissionRequest, config: VisionConfig) -> MissionSpec:
-    """The mission of a request: its options over those that `config` has for the same one.
+    """Return the mission of a request. Its options override those of `config` for the same mission.
 
     Raises ConfigError for an unknown one or a wrong option.
     """
@@ -96,7 +96,7 @@ def _lay(options: dict[str, Any], path: list[str], value: Any) -> None:
 
 
 def mission_spec(kind: str, options: Mapping[str, Any], config: VisionConfig) -> MissionSpec:
-    """The mission called `kind` with its checked configuration.
+    """Return the mission called `kind` with its checked configuration.
 
     Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option.
     """

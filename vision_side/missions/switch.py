@@ -30,11 +30,11 @@ class MissionSwitch:
         self._begin(camera)
 
     def switch(self, chosen: MissionSpec) -> None:
-        """From the next frame on come to rest, then carry out `chosen`."""
+        """Come to rest from the next frame on, then start `chosen`."""
         self.chosen, self._switching, self._waited_s = chosen, True, 0.0
 
     def step(self, view: View) -> Plan:
-        """The plan for one frame."""
+        """Compute the plan for one frame."""
         if self._switching:
             self._waited_s += view.dt_s
             if not self._is_at_rest(view):

@@ -57,7 +57,7 @@ class StopLine:
         self._was_green = False
 
     def see(self, colour: str, dt_s: float) -> None:
-        """One frame: what the light shows, unknown if it is not seen or cannot be read."""
+        """Update the state of the light with one frame. It is unknown if no light is detected or readable."""
         self._unseen_s = 0.0 if colour != UNKNOWN else self._unseen_s + dt_s
         if colour == UNKNOWN:
             if self._unseen_s > self._config.hidden_s:
@@ -135,7 +135,7 @@ class TrafficLight:
         self._stop = StopLine(config.stop)
 
     def step(self, view: View) -> Plan:
-        """The twist along the lane."""
+        """Compute the twist along the lane."""
         self._motion_predictor.measure(view.header.latency_us, view.dt_s)
         plan = self._plan(view)
         self._motion_predictor.sent(view.header.t_us, plan.twist)
@@ -200,7 +200,7 @@ class TrafficLight:
             self._stop.see(shown, view.dt_s)
 
     def _light_place(self, one: DetectedLight, pose: Pose) -> Place | None:
-        """Its middle: what is measured is the face towards the robot, half its depth nearer."""
+        """Return its center. The measurement is of its front, half its depth nearer."""
         lamp, is_box = self._config.lamp, self.reader is BoxLightReader
         height_m = lamp.box_height_m if is_box else lamp.housing_height_m
         depth_m = lamp.box_depth_m if is_box else lamp.housing_depth_m
@@ -238,7 +238,7 @@ class TrafficLight:
             self._light = old[0] + share * (place[0] - old[0]), old[1] + share * (place[1] - old[1])
 
     def _left_m(self, line: Line, light: Place, pose: Pose) -> float:
-        """From the robot's front to the light's line."""
+        """Return the distance from the robot's front to the stop line, m."""
         stop = self._config.stop
         return line.along_m(*light) - stop.line_m - line.along_m(pose[0], pose[1]) - stop.front_m
 

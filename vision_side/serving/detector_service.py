@@ -68,12 +68,12 @@ class FrameCounters:
 
     @property
     def dropped(self) -> int:
-        """All frames that were not answered."""
+        """Return the number of frames without an answer."""
         return self.too_many + self.rejected
 
     @property
     def too_many(self) -> int:
-        """Frames not answered for want of time; rejected ones do not count as load."""
+        """Return the number of frames without an answer for lack of time. Rejected frames do not count as load."""
         return self.overtaken + self.stale + self.late
 
 
@@ -313,7 +313,7 @@ class DetectorService:
 
 
 def _payload(result: DetectionResult) -> bytes:
-    """The boxes as the wire has them, the best first; the last are left out where all are too long for it.
+    """Encode the boxes, best first. The last ones are dropped if the message would be too long.
 
     Raises ValueError for a result of a plug-in that the wire cannot carry.
     """

@@ -42,7 +42,7 @@ class LocalCamera(Protocol):
     model: CameraModel
 
     def read(self, timeout_s: float) -> Capture | None:
-        """The next capture, None if none came in time; raises HardwareError while there is no camera."""
+        """Wait for the next capture. Returns None if none comes in time. Raises HardwareError without a camera."""
         ...
 
 

@@ -46,7 +46,7 @@ class Fleet:
     def __init__(
         self, config: VisionConfig, fleet_link: FleetLink, report: LogLine, detector: Detector | None = None
     ) -> None:
-        """`detector`, that of `config` if None, serves every robot, or the first of those that each have their own."""
+        """Create the fleet. `detector` (default: that of `config`) serves every robot that has no separate one."""
         self._config, self._fleet_link, self._report = config, fleet_link, report
         self._waits_for_service = waits_for_service(config)
         self._detector = detector or configured_detector(config)

@@ -43,7 +43,7 @@ class MissionRequests:
         self.rejection = ""
 
     def take(self, message: Message, frame: FrameHeader) -> MissionSpec | None:
-        """The mission from `frame` on; None for a request that came before and for one that is rejected.
+        """Return the mission from `frame` on, or None for a repeated or rejected request.
 
         Raises WireError for an invalid message; `rejection` then contains it too.
         """
@@ -120,7 +120,7 @@ class Reporter:
         )
 
     def _detector_fields(self, result: DetectionResult | None, beside: str) -> dict[str, Any]:
-        """The detector, its device and its time."""
+        """Return the detector, its device and its time."""
         name = result.detector if result else self._detector
         more = f", {beside}" if beside else ""
         said = {"detector": _line(name[: _NAME_LENGTH - len(more)] + more, _NAME_LENGTH)}
@@ -149,7 +149,7 @@ class MissionChannel:
         self, config: VisionConfig, link: Link, detector: Detector, log_change: Callable[[str, str], None],
         reject: Callable[[WireError], None],
     ) -> None:
-        """`log_change` prints a line (about what, the line) if it changed; `reject` counts.
+        """Create the channel. `log_change(subject, line)` prints a changed line, `reject` counts.
 
         Raises ConfigError for a configured mission that there is not.
         """

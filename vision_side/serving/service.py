@@ -135,7 +135,7 @@ Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
 
 
 def open_service(config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None) -> "Service":
-    """The service for one robot that fits its detector; `detector` is that of `config` if None."""
+    """Create the service for one robot that fits its detector (default: that of `config`)."""
     if config.detector.kind == "boxes":
         return BoxesService(config, link, report, detector)
     return Service(config, link, report, detector)
@@ -248,7 +248,7 @@ class Service:
         return self._pipeline.acknowledge(seen) if self._pipeline else PipelineAnswer(None, seen)
 
     def _wait_for_camera(self) -> None:
-        """The model comes twice a second; only a longer wait is worth a word."""
+        """Log a missing camera model. It comes twice a second, so only a longer wait is logged."""
         self._blind_since_s = self._blind_since_s or time.monotonic()
         if time.monotonic() - self._blind_since_s > _CAMERA_PATIENCE_S:
             self._log_change("camera", "frames come, but no camera model; is the robot of another version?")
@@ -335,7 +335,7 @@ class BoxesInbox(LatestSlot[Message]):
             self._arrived.notify()
 
     def take(self, timeout_s: float = 0.0) -> Message | None:
-        """A frame, of which credit bounds the number, before boxes; None if neither comes within `timeout_s`."""
+        """Take a frame before boxes, because credit bounds the number of frames. Returns None at `timeout_s`."""
         with self._arrived:
             self._arrived.wait_for(lambda: self._newest, timeout_s)
             return self._newest.pop(FRAME.name, None) or self._newest.pop(DETECTIONS.name, None)
@@ -356,7 +356,7 @@ class BoxesService(Service):
         return self._inbox
 
     def _frame(self, message: Message, started_ns: int) -> None:
-        """A frame is acknowledged, boxes are answered."""
+        """Acknowledge a frame, or answer boxes."""
         if message.channel is DETECTIONS:
             self._boxes(message, started_ns)
             return

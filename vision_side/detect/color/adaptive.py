@@ -35,7 +35,7 @@ class ColorModel:
     """The colour of one thing."""
 
     def __init__(self, bgr: NDArray[np.uint8]) -> None:
-        """`bgr` (N, 3) are pixels of it."""
+        """Learn the color from its pixels `bgr` (N, 3)."""
         self._middle, self._spread = _cloud(_shares(bgr)[0])
         self._table: NDArray[np.uint8] | None = None
         self._table_middle = self._middle
@@ -125,7 +125,7 @@ class PixelTrack:
         return min(most, _SIGMAS * math.sqrt(self._variance[0]) + 0.5 * self.radius_px)
 
     def away_px(self, circle: Circle) -> float:
-        """From where it should be."""
+        """Return the distance from its expected position, px."""
         return math.hypot(circle.cx_px - self.cx_px, circle.cy_px - self.cy_px)
 
     def admits(self, circle: Circle) -> bool:
@@ -195,7 +195,7 @@ class AdaptiveTracker:
         self._last_us: int | None = None
 
     def detect(self, picture: DecodedImage, t_us: int) -> tuple[Detection, ...]:
-        """The thing, or nothing, in a picture captured at `t_us`."""
+        """Detect the target in an image captured at `t_us`."""
         dt_s = max(0.0, (t_us - self._last_us) / 1e6) if self._last_us is not None else 0.0
         self._last_us = t_us
         if self._track is not None and t_us - self._seen_us > self._config.lost_after_s * 1e6:
@@ -208,7 +208,7 @@ class AdaptiveTracker:
         return (found,)
 
     def _follow(self, track: PixelTrack, picture: DecodedImage, dt_s: float) -> Detection | None:
-        """The nearest to where it should be, of its colour and about its size."""
+        """Return the object nearest to the expected position, of the learned color and about the same size."""
         track.advance(dt_s)
         region = self._region(picture, track)
         if region is None:
@@ -232,7 +232,7 @@ class AdaptiveTracker:
         return Region(part, self._color_model.mask(part, self._config.color_sigmas), (columns.start, rows.start))
 
     def _acquire(self, picture: DecodedImage, t_us: int, dt_s: float) -> Detection | None:
-        """The largest of the configured colour, once it was at one place for some pictures in a row."""
+        """Return the largest object of the configured color after some images in a row at one place."""
         known = self._color_model if t_us - self._seen_us <= self._config.remembered_s * 1e6 else None
         found = next((one for one in self._everywhere.detect(picture) if self._is_it(picture, one, known)), None)
         if found is None:
@@ -265,7 +265,7 @@ class AdaptiveTracker:
 
 
 def _circle(one: Detection) -> Circle:
-    """Its own, or the one in its box."""
+    """Return its circle, or the one in its box."""
     if one.circle is not None:
         return one.circle
     width, height = one.x2_px - one.x1_px, one.y2_px - one.y1_px
@@ -273,7 +273,7 @@ def _circle(one: Detection) -> Circle:
 
 
 def _cut(low_px: float, high_px: float, scale: int, size: int) -> slice:
-    """That part of the decoded picture's rows or columns."""
+    """Return this part of the rows or columns of the decoded image."""
     first = min(size, max(0, math.floor(low_px / scale)))
     return slice(first, min(size, max(first, math.ceil(high_px / scale))))
 

@@ -31,7 +31,7 @@ class Hsv:
         self._hsv_detector = HsvDetector(config.hsv, config.label)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
-        """A result for each; it takes well under a millisecond, whatever the deadline."""
+        """Return a result for each frame. One takes well under a millisecond, so the deadline does not matter."""
         return [timed(frame, self.maker, self._largest) for frame in frames]
 
     def _largest(self, picture: DecodedImage) -> tuple[Detection, ...]:
@@ -48,7 +48,7 @@ class Adaptive:
         self._trackers = PerSession(lambda: AdaptiveTracker(config))
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
-        """A result for each; one takes two or three times as long as by plain colour, whatever the deadline."""
+        """Return a result for each frame. One takes two or three times as long as a plain color range."""
         return [self._look(frame) for frame in frames]
 
     def _look(self, frame: DetectFrame) -> DetectionResult | None:

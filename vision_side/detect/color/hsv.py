@@ -59,7 +59,7 @@ def codes_565(bgr: NDArray[np.uint8]) -> NDArray[np.uint16]:
 
 @cache
 def colors_565() -> NDArray[np.float64]:
-    """The colour (65536, 3) in the middle of each BGR565 code: blue, green, red, 0..255."""
+    """Return the color (65536, 3) in the middle of each BGR565 code: blue, green, red, 0..255."""
     codes = np.arange(65536, dtype=np.uint32)
     blue, green, red = (codes & 31) * 8 + 3.5, (codes >> 5 & 63) * 4 + 1.5, (codes >> 11) * 8 + 3.5
     return _read_only(np.stack([blue, green, red], axis=-1))
@@ -100,7 +100,7 @@ Box = Sequence[int]
 
 
 def sharp_outline(bgr: NDArray[np.uint8], mask: NDArray[Any], box: Box) -> NDArray[Any] | None:
-    """The outermost pixels (N, 1, 2) of the blob of `mask` in `box` (x, y, width, height).
+    """Return the outermost pixels (N, 1, 2) of the blob of `mask` in `box` (x, y, width, height).
 
     None if the blob's color differs too little from its surroundings.
     """
@@ -156,12 +156,12 @@ _CLEAN = 0.25  # RMS, by the limit for a single point: so few points off it bend
 
 
 def fit_circle(points: Outline) -> Fit:
-    """Least-squares circle through `points` (Kåsa's linear form); radius 0 for a straight line or fewer than three."""
+    """Fit a circle by least squares (Kåsa's linear form). Radius 0 for a straight line or fewer than three points."""
     return _fit(_terms(points))[0]
 
 
 def fit_round_part(outline: NDArray[Any], min_radius_px: float, max_roughness: float) -> tuple[Fit, Outline] | None:
-    """The circle of `outline` and the points on it, less what something in front cut off; None if it is not round.
+    """Fit the circle of `outline` without the part that an object in front hides. Returns None if it is not round.
 
     `max_roughness` bounds the RMS distance from the circle, in radii.
     """
@@ -192,7 +192,7 @@ def _terms(points: NDArray[Any]) -> Terms:
 
 
 def _fit(terms: Terms) -> tuple[Fit, float]:
-    """The circle, and the RMS distance of the points from it, to first order.
+    """Return the circle, and the RMS distance of the points from it, to first order.
 
     One product of matrices holds every sum; the rest is plain numbers: normal equations about the points' middle.
     """
@@ -251,7 +251,7 @@ class HsvDetector:
         return tuple(sorted((one for one in found if one), key=_radius, reverse=True))
 
     def _thing(self, picture: DecodedImage, region: Region, outline: Pixels) -> Detection | None:
-        """The box around whatever it is; None if it is too small."""
+        """Return the box around the region, or None if it is too small."""
         box = cv2.boundingRect(outline)
         if min(box[2], box[3]) < 2 * self._config.min_radius_px:
             return None
@@ -262,7 +262,7 @@ class HsvDetector:
         return Detection(left * scale, top * scale, right * scale, bottom * scale, 1.0, self._label)
 
     def _disc(self, picture: DecodedImage, region: Region, outline: Pixels) -> Detection | None:
-        """The disc that `outline` encloses, or None if it is too small or not round."""
+        """Return the disk that `outline` encloses, or None if it is too small or not round."""
         box = cv2.boundingRect(outline)
         if max(box[2], box[3]) < 2 * self._config.min_radius_px:
             return None
@@ -279,7 +279,7 @@ class HsvDetector:
 
 def disc_detection(shape: tuple[Box, Fit, Outline], whose: tuple[float, str], origin_px: tuple[int, int],
                    scale: int) -> Detection:
-    """In pixels of the encoded picture. The shape's circle and edge go by the centres of the region's pixels."""
+    """Convert a disk to a detection, px of the encoded image. Circle and edge use the centers of pixels."""
     box, circle, edge = shape
     x, y = origin_px[0] + box[0], origin_px[1] + box[1]
     cx, cy = origin_px[0] + 0.5 + circle[0], origin_px[1] + 0.5 + circle[1]
@@ -293,7 +293,7 @@ def disc_detection(shape: tuple[Box, Fit, Outline], whose: tuple[float, str], or
 
 
 def own_edge(pixels: Pixels, box: Box, origin_px: tuple[int, int], shape: tuple[int, ...]) -> Pixels:
-    """The outline's pixels (N, 2), less those that the picture's border made."""
+    """Return the pixels (N, 2) of the outline without those at the border of the image."""
     flat = pixels[:, 0]
     left, top = -origin_px[0], -origin_px[1]  # where the picture begins, in the region's pixels
     right, bottom = left + shape[1] - 1, top + shape[0] - 1

@@ -33,7 +33,7 @@ _OFF: Final = 0.4  # radii: a circle further from the box's middle, or so much l
 
 
 def refined(picture: DecodedImage, one: Detection) -> Detection:
-    """`one` with the circle and the outline that the picture shows; `one` itself where it shows none."""
+    """Add the circle and the outline from the image to `one`. Returns `one` unchanged without them."""
     scale = picture.scale
     box = np.array([one.x1_px, one.y1_px, one.x2_px, one.y2_px]) / scale
     around = _around(box, picture.bgr.shape)

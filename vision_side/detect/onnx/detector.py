@@ -79,7 +79,7 @@ class OnnxDetector:
         self._warm_up(model, config)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """A result for each frame for which there is still time; all at once where the model takes that."""
+        """Return a result for each frame that still has time, in one batch if the model takes several."""
         return self._in_parts(frames, deadline_us, self._max_batch)
 
     def notices(self) -> list[str]:
@@ -109,7 +109,7 @@ class OnnxDetector:
     def _fewer_at_once(
         self, frames: Sequence[DetectFrame], deadline_us: int, error: Exception
     ) -> list[DetectionResult | None]:
-        """Too many for its memory, or more than the model's inside takes; where that helps, it stays so."""
+        """Try smaller batches, for a model that fails on large ones. A size that works becomes the limit."""
         fewer = len(frames) // 2
         results = self._in_parts(frames, deadline_us, fewer)
         if any(results) and fewer < self._max_batch:
@@ -124,7 +124,7 @@ class OnnxDetector:
                 for picture, found in zip(pictures, together, strict=True)]
 
     def _warm_up(self, model: "OnnxModel", config: Config) -> None:
-        """Run warm, on the known picture, and compare: with the metadata's answer, or with itself on the CPU."""
+        """Run the model on the test image and compare the answer with the metadata, or with the CPU."""
         picture, path, expected = DecodedImage(golden_picture(), 1), model.path, model.expected
         form, least = model.own_form, model.own_min_score
         try:

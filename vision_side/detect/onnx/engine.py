@@ -106,7 +106,7 @@ class Engine:
                                  dict(self._session.get_modelmeta().custom_metadata_map))
 
     def run(self, pixels: NDArray[Any]) -> Arrays:
-        """All outputs, by name, for one input. Raises whatever ONNX Runtime raises."""
+        """Run the model on one input. Returns all outputs by name. Raises any error of ONNX Runtime."""
         names = [one.name for one in self.header.outputs]
         return dict(zip(names, self._session.run(names, {self.header.inputs[0].name: pixels}), strict=True))
 

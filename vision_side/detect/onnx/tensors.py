@@ -75,7 +75,7 @@ def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelF
 
 
 def _is_for_several(output: Tensor, kind: str) -> bool:
-    """True if its first dimension is open and counts pictures."""
+    """Return True if its first dimension is open and counts images."""
     sides = 2 if kind == "triple" and output.name != "boxes" else 3
     return len(output.shape) == sides and output.shape[0] is None
 
@@ -117,7 +117,7 @@ def own_labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def fit_picture(picture: DecodedImage, form: ModelFormat) -> tuple[NDArray[Any], Letterbox]:
-    """The input, the picture in its middle, and where it lies there."""
+    """Return the input with the image in its center, and the position of the image."""
     bgr: NDArray[Any] = picture.bgr
     rows, columns = form.size or tuple(-(-one // _STEP_PX) * _STEP_PX for one in bgr.shape[:2])
     scale = min(rows / bgr.shape[0], columns / bgr.shape[1]) if form.size else 1.0
@@ -140,7 +140,7 @@ def fit_picture(picture: DecodedImage, form: ModelFormat) -> tuple[NDArray[Any],
 def read_outputs(
     outputs: Arrays, form: ModelFormat, letterbox: Letterbox, picture: DecodedImage, min_score: float
 ) -> tuple[Detection, ...]:
-    """Return the detections, surest first, in pixels of the encoded picture.
+    """Return the detections, best first, in px of the encoded image.
 
     Raises ValueError for outputs of another shape than in the header, and for numbers that are not finite in what
     counts: that is not the same as "saw nothing".
@@ -167,7 +167,7 @@ def read_outputs(
 
 
 def split_batch(outputs: Arrays, count: int) -> list[dict[str, NDArray[Any]]]:
-    """The outputs for `count` pictures, for each by itself. Raises ValueError if there are not as many."""
+    """Split the outputs of `count` images. Raises ValueError for another number."""
     if any(one.shape[:1] != (count,) for one in outputs.values()):
         raise ValueError(f"outputs of {', '.join(str(one.shape) for one in outputs.values())} for {count} images")
     return [{name: one[index : index + 1] for name, one in outputs.items()} for index in range(count)]

@@ -178,7 +178,7 @@ def _check_shapes(boxes: Numbers, scores: Numbers, labels: Sequence[str]) -> Non
 def _detection(
     box: Numbers, score: float, label: str, stretch: tuple[float, float], size_px: tuple[int, int]
 ) -> Detection | None:
-    """The part in the picture; None if there is not any."""
+    """Return the part inside the image, or None without one."""
     across, down = stretch
     x1, y1, x2, y2 = (float(value) for value in box)
     if x2 < x1 or y2 < y1 or score > 1:
@@ -202,7 +202,7 @@ def _of_wire(box: DetectedBox) -> Detection:
 
 
 def hash_of(text: str) -> str:
-    """A model's hash as results carry it: 16 digits; empty for an invalid one."""
+    """Return the first 16 digits of a model's hash, or "" for an invalid one."""
     return text[:16].lower() if _HASH.fullmatch(text) else ""
 
 

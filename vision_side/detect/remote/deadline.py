@@ -53,7 +53,7 @@ class Pending:
 
     @property
     def over(self) -> bool:
-        """True after the deadline."""
+        """Return True after the deadline."""
         return monotonic_us() > self.deadline_us
 
 
@@ -81,7 +81,7 @@ class DeadlineDetector:
 
     @property
     def overtaken(self) -> int:
-        """Frames that newer ones replaced before the inner detector had them."""
+        """Return the number of frames that newer ones replaced before the inner detector took them."""
         return self._pending.dropped
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:

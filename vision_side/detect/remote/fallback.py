@@ -28,7 +28,7 @@ class Fallback:
     def __init__(
         self, first: Detector, second: Detector, good_answers: int = GOOD_ANSWERS, max_pixels: int = MAX_PIXELS
     ) -> None:
-        """A `first` without a deadline of its own gets a thread of its own, with pictures of up to `max_pixels`."""
+        """Run a `first` without its own deadline on a separate thread, with images of up to `max_pixels`."""
         self._first = first if isinstance(first, DeadlineDetector) else DeadlineDetector(first, max_pixels)
         self._second = second
         self._news = Notices()
@@ -77,7 +77,7 @@ class Fallback:
         self._news.add(f"the first detector is late or silent for {robot}: the fallback drives on")
 
     def _filled(self, results: Results, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
-        """The second one's results where the first had none."""
+        """Fill missing results of the first with those of the second."""
         missing = [frame for frame, result in zip(frames, results, strict=True) if result is None]
         more = iter(self._second.detect(missing, deadline_us) if missing else [])
         return [next(more) if result is None else result for result in results]

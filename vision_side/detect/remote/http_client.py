@@ -140,7 +140,7 @@ class HttpExchange:
         return connection
 
     def _reach(self, until_us: int) -> socket.socket:
-        """A connection to one of the host's addresses; each that is still to be tried has its share of the time."""
+        """Connect to one of the host's addresses. Each remaining address gets its share of the time."""
         found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
         found.sort(key=lambda one: one[4] != self._reached)
         for number, one in enumerate(found):
@@ -188,7 +188,7 @@ class HttpExchange:
 
 
 def _connected(found: Any, timeout_s: float) -> socket.socket:
-    """To one of what `getaddrinfo` gives."""
+    """Connect to one of the addresses of `getaddrinfo`."""
     family, kind, protocol, _, address = found
     connection = socket.socket(family, kind, protocol)
     try:
@@ -291,7 +291,7 @@ class HttpJpeg(DeadlineDetector):
 
 
 def read_jpeg_answer(body: bytes, frame: DetectFrame) -> JpegAnswer:
-    """The answer for `frame`. Raises NoAnswerError for anything else."""
+    """Parse the answer for `frame`. Raises NoAnswerError for any other answer."""
     try:
         answer = decode(JpegAnswer, body, MAX_ANSWER_BYTES)
     except WireError as error:

@@ -73,7 +73,7 @@ class OipModel:
 
     @property
     def takes_jpeg(self) -> bool:
-        """True for a model that decodes by itself."""
+        """Return True for a model that takes JPEG."""
         return self.input.datatype == "BYTES"
 
 
@@ -97,7 +97,7 @@ class Inferred:
 
 
 def model_of(name: str, version: str, inputs: Sequence[TensorSlot], outputs: Sequence[TensorSlot]) -> OipModel:
-    """The model, if it can be used here. Raises NoAnswerError UNFIT with what it lacks."""
+    """Parse the metadata of a model. Raises NoAnswerError UNFIT with the missing part."""
     if len(inputs) != 1:
         raise _unfit(name, f"it takes {len(inputs)} inputs; expected one image")
     one, given = inputs[0], {slot.name for slot in outputs}
@@ -144,7 +144,7 @@ def tensor_of(model: OipModel, frame: DetectFrame, rgb: bool) -> tuple[OipTensor
 
 
 def _fitted(bgr: NDArray[np.uint8], shape: tuple[int, ...], rgb: bool) -> NDArray[Any]:
-    """The pixels at the size that the model takes, if it takes only one."""
+    """Return the pixels at the model's size, if the model has a fixed size."""
     rows, columns, _ = _layout(shape) or (-1, -1, False)
     rows, columns = (rows if rows > 0 else bgr.shape[0]), (columns if columns > 0 else bgr.shape[1])
     if max(rows, columns) > _MAX_SIDE:
@@ -159,7 +159,7 @@ def _fitted(bgr: NDArray[np.uint8], shape: tuple[int, ...], rgb: bool) -> NDArra
 
 
 def read_number_tensor(datatype: str, shape: Sequence[int], data: bytes) -> NDArray[Any]:
-    """A tensor of numbers from its bytes. Raises NoAnswerError if they do not fit together."""
+    """Decode a tensor of numbers. Raises NoAnswerError if shape and bytes do not fit."""
     kind = NUMBERS.get(datatype)
     if kind is None:
         raise NoAnswerError(NoAnswerReason.MALFORMED, f"a tensor of datatype {datatype[:20]!r}")
@@ -172,7 +172,7 @@ def read_number_tensor(datatype: str, shape: Sequence[int], data: bytes) -> NDAr
 
 
 def read_text_tensor(shape: Sequence[int], data: bytes) -> list[str]:
-    """A tensor of BYTES: for each element its length as four little-endian bytes, then itself."""
+    """Decode a tensor of BYTES. Each element follows its length in four little-endian bytes."""
     texts, at = [], 0
     for _ in range(elements_of(shape)):
         end = at + 4 + int.from_bytes(data[at : at + 4], "little")

@@ -81,7 +81,7 @@ class _Answer(_FromServer):
 
 
 def read_metadata(body: bytes) -> OipModel:
-    """The model that `GET v2/models/NAME` describes. Raises NoAnswerError."""
+    """Parse the answer of `GET v2/models/NAME`. Raises NoAnswerError."""
     metadata = _validated(_Metadata, body)
     slots = [
         [TensorSlot(one.name, one.datatype, one.shape) for one in of] for of in (metadata.inputs, metadata.outputs)

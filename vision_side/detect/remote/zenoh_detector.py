@@ -120,7 +120,7 @@ class ZenohDetector(FrameByFrame):
         return self._received[robot]
 
     def _wait(self, received: _RobotDetections, frame: DetectFrame, deadline_us: int) -> DetectionResult:
-        """The boxes that cite `frame`. Raises NoAnswerError if none come by the deadline, or those of a newer one."""
+        """Wait for boxes that cite `frame`. Raises NoAnswerError at the deadline, or after boxes of a newer frame."""
         while True:
             message = received.take(seconds_left(deadline_us))
             if received.slot.others and not received.reported:
