@@ -65,7 +65,7 @@ def test_interrupted_training_ends_with_the_same_result(tmp_path, monkeypatch):
     monkeypatch.setattr("sightline.training.loop._LOG_EVERY", 100)
     said = []
     resumed = train(scenes(), training, "cpu", cut, said.append)
-    assert said == ["goes on at step 2 of 4"]
+    assert said == ["continues at step 2 of 4"]
     assert all(np.array_equal(whole[name], resumed[name]) for name in whole)
     for others, again in ((scenes(), Training((5,), batch=2, seed=4)), (scenes(3), training)):
         with pytest.raises(ConfigError, match="other settings or scenes"):
@@ -95,7 +95,7 @@ def test_a_process_that_dies_is_one_line(tmp_path):
         for one in multiprocessing.active_children():
             one.kill()
 
-    with pytest.raises(HardwareError, match="one of the 2 processes that train has ended") as told:
+    with pytest.raises(HardwareError, match="one of the 2 training processes ended") as told:
         train(scenes(), Training((200,), 4, seed=4, jobs=2), "cpu", tmp_path, kill)
     assert "\n" not in str(told.value) and "--jobs 1" in str(told.value)
     assert not multiprocessing.active_children()
@@ -156,7 +156,7 @@ def test_the_last_round_alone_is_trained_from_a_file(tmp_path, capsys):
     model, digest = SHIPPED, hashlib.sha256(SHIPPED.read_bytes()).hexdigest()
     command = ["train", "--out", str(tmp_path), *arguments, "--steps", "70", "--steps", "2", "--start", str(model)]
     assert cli.run(command) == 0
-    assert capsys.readouterr().out.startswith("goes on at step 70 of 72\n")
+    assert capsys.readouterr().out.startswith("continues at step 70 of 72\n")
     card = (tmp_path / "sightline.md").read_text("utf-8")
     assert "--jobs 1 --validated 5 --start MODEL`" in card and f"began from MODEL, of SHA-256 `{digest}`" in card
     begun, ended = (weights_in(one.read_bytes()) for one in (model, tmp_path / "sightline.onnx"))
