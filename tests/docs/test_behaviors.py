@@ -73,7 +73,7 @@ def test_each_light_has_its_line_and_one_that_is_misread_fails_the_row():
     assert not ok and "| 5 of 6 |" in text
 
 
-def test_every_row_has_a_picture_and_a_heading_of_its_own():
+def test_every_row_has_its_image_and_heading():
     for key in (lambda row: picture_name(row.cases(SEEDS)[0]), lambda row: row.title, lambda row: row.anchor):
         assert len({key(row) for row in ROWS}) == len(ROWS)
 

@@ -60,7 +60,7 @@ def test_only_the_chosen_section_is_measured_and_the_rest_of_the_page_stays(tmp_
     assert after.count("# Performance") == 1
 
 
-def test_sections_keep_the_order_of_the_page_whatever_was_measured_first(tmp_path, commands):
+def test_sections_keep_the_order_of_the_page_in_any_measuring_order(tmp_path, commands):
     page = tmp_path / "performance.md"
     for name in ("vision", "messages", "following"):
         write_report(page, sections_named([name]), lambda _: None)
@@ -84,7 +84,7 @@ def test_a_race_shows_its_contestants_and_its_picture(tmp_path, commands):
     assert (page.parent / "img" / "loop-zenoh.png").read_bytes() == b"picture of loop"
 
 
-def test_what_was_measured_before_a_failure_is_kept(tmp_path, monkeypatch):
+def test_results_before_a_failure_are_kept(tmp_path, monkeypatch):
     page = tmp_path / "performance.md"
 
     def run(command, **_):

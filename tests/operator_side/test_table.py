@@ -12,7 +12,7 @@ class Terminal(io.StringIO):
         return True
 
 
-def test_columns_are_as_wide_as_their_cells_whatever_the_terminal(monkeypatch):
+def test_columns_are_as_wide_as_their_cells_in_any_terminal(monkeypatch):
     monkeypatch.setenv("COLUMNS", "10")
     long = "word " * 40
     assert table_lines([("a", "b", long.strip()), ("long name", "", "c"), ("alone",)]) == [

@@ -262,7 +262,7 @@ def test_folders_are_neither_crowded_nor_empty():
             if not 3 <= len(found) <= MAX_ENTRIES)
 
 
-def test_every_folder_states_what_it_is_for_and_what_it_may_import():
+def test_every_folder_states_its_purpose_and_its_imports():
     texts_of = {shown(folder): ast.get_docstring(tree(folder / "__init__.py")) or "" for folder in folders()}
     none_of(folder for folder, text in texts_of.items() if "May import: " not in text or "Interface: " not in text)
 
@@ -347,6 +347,6 @@ def test_no_text_names_a_class_that_is_gone():
     none_of(f"{where}: {name}" for name, where in named if name not in known)
 
 
-def test_the_top_level_is_what_was_agreed():
+def test_top_level_has_the_agreed_entries():
     agreed = ("pyproject.toml", "robot_side", "vision_side", "protocol", "sim", "tests", "compose.yaml")
     assert all((ROOT / name).exists() for name in agreed)

@@ -67,7 +67,7 @@ def test_a_port_that_something_uses_is_passed_over():
         assert free_port() != next_port
 
 
-def test_a_forked_child_gets_ports_of_its_own():
+def test_forked_child_gets_other_ports():
     mine, (reader, writer) = free_port(), os.pipe()
     child = os.fork()
     if not child:

@@ -90,7 +90,7 @@ def child(tmp_path):
     made.close()
 
 
-def test_what_a_process_sent_before_it_died_is_read_even_if_it_left_packets_unread(child):
+def test_packets_of_a_dead_process_are_read_after_unread_ones(child):
     """The kernel reports unread packets ahead of the waiting ones, once."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setblocking(False)

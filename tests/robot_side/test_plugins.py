@@ -29,7 +29,7 @@ def test_the_table_the_configuration_and_the_entry_points_name_the_same_groups()
 
 
 @pytest.mark.parametrize("group", DEVICE_GROUPS, ids=lambda group: group.key)
-def test_each_built_in_device_has_what_its_port_demands(group):
+def test_each_built_in_device_implements_its_port(group):
     demanded = {name for name, value in vars(group.port).items() if callable(value) and not name.startswith("_")}
     assert demanded >= {"close"}
     for kind in ENTRY_POINTS[group.entry_points]:

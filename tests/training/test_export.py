@@ -150,7 +150,7 @@ def test_unlabeled_objects_have_a_separate_map():
     assert np.array_equal(beside.geometry, shown(one_scene(), 5, 0, 1, WHOLE_PX).geometry)
 
 
-def test_labels_have_maps_of_their_own():
+def test_each_label_has_a_separate_map():
     for number, label in enumerate(LABELS):
         one = shown(one_scene((LabelledBox(label, (40.0, 60.0, 90.0, 200.0), 1.0),)), 5, 0, 1, WHOLE_PX)
         assert np.unique(np.argwhere(one.heat > 0)[:, 0]).tolist() == [number]

@@ -101,7 +101,7 @@ def test_a_process_that_dies_is_one_line(tmp_path):
     assert not multiprocessing.active_children()
 
 
-def test_the_graph_gives_what_the_module_gives(tmp_path):
+def test_graph_and_module_give_equal_outputs(tmp_path):
     torch.manual_seed(3)
     network = TorchNetwork()
     with torch.no_grad():
@@ -123,7 +123,7 @@ def test_the_graph_gives_what_the_module_gives(tmp_path):
     assert scores.max() == pytest.approx(float(heat.max()), abs=1e-3)
 
 
-def test_a_network_that_begins_from_a_file_gives_what_the_file_gives():
+def test_network_started_from_a_file_gives_the_outputs_of_the_file():
     network, given = TorchNetwork(), weights()
     images = torch.randint(0, 256, (4, 3, HEIGHT_PX, WIDTH_PX), dtype=torch.uint8)
     begin_from(network, weights_in(onnx_bytes(given, {})), images)

@@ -75,7 +75,7 @@ def test_the_kernel_counts_the_bytes_of_a_connection():
         assert carried_bytes([free_port()]) == {}
 
 
-def test_of_several_connections_to_a_port_the_busiest_counts():
+def test_busiest_of_several_connections_counts():
     assert carried_between({(1, 5): 10}, {(1, 5): 30, (1, 6): 4, (2, 7): 100}) == 120
     assert carried_between({}, {}) is None
 

@@ -60,7 +60,7 @@ def test_a_percentile_is_a_value_that_so_many_do_not_exceed(values, percent):
 
 
 @given(st.lists(st.integers(0, 10**6), unique=True, min_size=1), st.data())
-def test_of_a_tally_every_picture_captured_in_time_counts_once(captured_us, data):
+def test_every_image_of_a_tally_counts_once(captured_us, data):
     answered = data.draw(st.sets(st.sampled_from(captured_us)))
     begin_us, end_us = sorted(data.draw(st.tuples(st.integers(0, 10**6), st.integers(0, 10**6))))
     judged_us = sorted((t_us + 5, t_us) for t_us in answered)
@@ -89,7 +89,7 @@ def statuses(rows, refused=()):
 
 
 @given(st.sets(st.integers(5, 85), max_size=30))
-def test_of_headers_the_commands_that_were_rejected_are_missing(refused):
+def test_rejected_commands_are_missing_from_the_headers(refused):
     rows = header_rows(100, refused)
     course = course_of_headers(rows, list(statuses(rows, refused)), 0, rows[-1][1] + 1)
     assert course.captured == 100
@@ -142,7 +142,7 @@ def test_missing_count_of_one_turn_stays_missing():
     assert joined([sample(OURS, [1]), replace(sample(OURS, [1]), carried_bytes=None)]).carried_bytes is None
 
 
-def test_with_a_slow_detector_age_has_bounds_of_its_own_and_must_not_grow():
+def test_age_with_a_slow_detector_has_separate_bounds_and_does_not_grow():
     slow = replace(SMALL, detector_delay_ms=80.0)
     floor = sample(FLOOR, [81.0] * 100)
     assert all(judged(slow, **{FLOOR: floor, OURS: sample(OURS, [85.0] * 100)}).values())

@@ -67,7 +67,7 @@ def test_only_rows_where_packets_are_lost_differ_by_seed():
     assert [row.name for row in CASES if row.draws] == ["radio", "bursts"]
 
 
-def test_time_is_shared_among_phases_without_a_length_of_their_own():
+def test_phases_without_a_length_share_the_time():
     cut = next(row for row in CASES if row.name == "cut")
     assert spans_s(cut, 20.0) == [10.0, 5.0, 10.0]
 
@@ -92,7 +92,7 @@ def test_a_seed_makes_the_wire_lose_the_same_packets_again():
 # --- figures -----------------------------------------------------------------------------------------------------
 
 
-def test_ages_are_those_of_accepted_commands_and_what_came_too_late_is_infinitely_old():
+def test_ages_come_from_accepted_commands_and_late_ones_count_as_infinite():
     rows = frames(None, 40, 41, 42, 43)
     assert seen(rows, [status(0), status(10)]).p50_ms == pytest.approx(41, abs=1)
     late = seen(rows, [status(0), status(9.9, stale=100)])

@@ -104,7 +104,7 @@ def test_health_checks_use_the_link_of_the_service(name):
 
 
 @pytest.mark.parametrize("name", OF_A_KIND.values())
-def test_health_checks_fail_where_nothing_runs_and_name_what_exists(name, tmp_path):
+def test_health_checks_fail_without_a_service_and_name_existing_targets(name, tmp_path):
     code, *arguments = CHECKS[name][3:]
     nowhere = free_endpoint()
     if name == "sim":

@@ -46,7 +46,7 @@ def commanded(log):
     return [tuple(float(cell) for cell in line.split(",")[1:]) for line in log.read_text().splitlines()]
 
 
-def test_each_wheel_turns_by_itself_each_way_and_stops(robot):
+def test_each_wheel_turns_alone_in_both_directions_and_stops(robot):
     config, log = robot
     operator = Operator()
     assert wheel_test.try_wheels(config, operator.answer, operator.lines.append)

@@ -232,7 +232,7 @@ def test_unexpected_error_is_one_line_and_a_traceback_only_on_request(capsys, mo
         cli.run(["config", "check", "robot"])
 
 
-def test_config_commands_print_what_a_script_can_read(capsys, tmp_path):
+def test_config_commands_print_output_for_scripts(capsys, tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text('robot = "r9"\n')
     code, out, _ = run(capsys, "config", "check", "robot", str(path))

@@ -96,7 +96,7 @@ def test_misspelled_environment_name_is_rejected_with_the_nearest(name):
         ("no equals sign", ["KEY=VALUE"]),
     ],
 )
-def test_a_bad_value_is_one_line_that_names_it_and_what_is_allowed(setting, expected):
+def test_invalid_value_is_one_line_with_the_permitted_values(setting, expected):
     with pytest.raises(ConfigError) as error:
         load("robot", sets=[setting], environ={})
     for part in expected:

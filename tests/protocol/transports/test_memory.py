@@ -69,7 +69,7 @@ def test_jitter_stays_in_its_bounds_and_keeps_the_order(seed, delay_us, jitter_u
 
 @pytest.mark.parametrize("burst", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize("loss", [0.02, 0.1, 0.4])
-def test_loss_and_bursts_are_what_was_requested(loss, burst):
+def test_loss_and_bursts_match_the_request(loss, burst):
     network = MemoryNetwork(3, loss=loss, burst=burst)
     numbers = [number for _, number, channel in _run(network, 20_000) if channel == "frame"]
     gaps = [after - before - 1 for before, after in pairwise(numbers) if after - before > 1]

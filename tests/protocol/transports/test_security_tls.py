@@ -39,7 +39,7 @@ def secured(tmp_path):
         yield robot, endpoint, folder
 
 
-def test_frames_and_twists_go_both_ways_whatever_their_size(secured):
+def test_frames_and_twists_of_any_size_go_both_ways(secured):
     robot, endpoint, folder = secured
     twists = robot.latest(TWIST)
     with open_websocket("r1", connect=endpoint, role="vision", secure=folder) as vision:

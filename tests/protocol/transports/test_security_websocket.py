@@ -221,7 +221,7 @@ def test_only_the_token_permits_a_connection(keys, caplog):
 _OF_VISION = ("twist", "ack", "detections", "report", "overlay", "preview")
 
 
-def test_a_role_may_publish_what_the_table_of_channels_gives_it():
+def test_role_may_publish_its_channels_of_the_table():
     assert grants_of_role("vision") == {(name, "vision") for name in _OF_VISION}
     said = {("twist", "teleop"), ("request", "operator"), ("request", "teleop"), ("mission", "operator")}
     assert said < grants_of_role("operator")

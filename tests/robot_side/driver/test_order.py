@@ -94,7 +94,7 @@ def test_a_frame_that_leaves_does_not_wake_the_driver(ends):
     assert [ipc.packet_kind(packet) for packet in child.packets()] == [ipc.PacketKind.ISSUED]
 
 
-def test_a_tick_does_not_wake_the_network_process_and_the_newest_motion_is_what_it_reads(ends):
+def test_tick_does_not_wake_the_network_process_which_reads_the_newest_motion(ends):
     child, parent = ends
     for latency_us in (1, 2, 3):
         child.send_aside(ipc.pack_motion(ipc.RobotMotion(latency_us=latency_us)))

@@ -142,7 +142,7 @@ speeds = st.one_of(st.floats(-20, 20), st.sampled_from([0.0, -0.0, 1e-12, 1e6, -
 
 @settings(max_examples=150)
 @given(st.lists(st.tuples(speeds, speeds), max_size=40), st.booleans(), st.booleans())
-def test_no_motor_is_ever_driven_both_ways_at_once(twists, swapped, is_reversed):
+def test_no_motor_is_driven_in_both_directions(twists, swapped, is_reversed):
     factory = MockFactory(pin_class=NotingPin)
     factory.events = []
     Device.pin_factory, before = factory, Device.pin_factory

@@ -417,7 +417,7 @@ def test_the_guard_never_adds_motion(points, linear, angular):
     assert abs(cut.angular_rad_s) <= abs(angular) + 1e-9 and cut.angular_rad_s * angular >= 0
 
 
-def test_the_gate_holds_the_guards_limit_whatever_is_commanded():
+def test_gate_keeps_the_limit_of_the_guard_for_any_command():
     guard = guard_with([(0, 0.09)])
     rig = Rig(guard=guard)
     rig.now_us = 0

@@ -70,7 +70,7 @@ def test_a_new_gate_is_off(stopped, state, reason):
     assert SafetyGate(SafetyConfig(), ROBOT).state is D
 
 
-def test_stopped_before_the_restart_does_not_arm_by_itself_after_the_reset():
+def test_robot_stopped_before_a_restart_does_not_arm_automatically_after_the_reset():
     rig = Rig(stopped=True, auto_arm=True)
     rig.request(Verb.RESET)
     assert rig.drive(400).gate.state is D

@@ -88,7 +88,7 @@ def test_a_request_cites_a_status_and_no_frame():
     assert caught.value.reason is RejectReason.MALFORMED
 
 
-def test_a_human_who_acquires_and_then_is_silent_was_lost():
+def test_human_silent_after_acquire_counts_as_lost():
     rig = Rig().armed().drive(100)
     rig.request(Verb.ACQUIRE, source="teleop", session=HUMAN)
     rig.silence(980)

@@ -136,7 +136,7 @@ def test_speed_acceleration_and_its_sign_stay_within_limits(goals, ticks_ms):
         before = twist
 
 
-def test_a_late_step_moves_as_far_as_punctual_ones():
+def test_late_step_moves_as_far_as_several_punctual_steps():
     goal = Twist(linear_mps=0.5, angular_rad_s=0.0)
     late, punctual = Ramp(SafetyConfig()), Ramp(SafetyConfig())
     for _ in range(5):
@@ -162,7 +162,7 @@ def test_out_of_range_is_accepted_clamped_and_counted():
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_never_reaches_the_ramp(value):
+def test_number_that_is_not_finite_never_reaches_the_ramp(value):
     rig = Rig().armed()
     twist = Twist.model_construct(linear_mps=value, angular_rad_s=0.0)
     assert rig.gate.offer("vision", rig.header(), twist, rig.now_us).reason is RejectReason.NOT_FINITE

@@ -227,7 +227,7 @@ def test_robot_after_the_end_by_an_operator_does_not_arm_itself(how):
     assert rig.drive(400).gate.state is A, "an operator armed: unattended again"
 
 
-def test_a_robot_that_starts_stopped_does_not_arm_by_itself():
+def test_robot_that_starts_stopped_does_not_arm_automatically():
     rig = Rig(auto_arm=True, stopped=True)
     rig.request(Verb.RESET)
     assert rig.drive(400).gate.state is D
@@ -287,7 +287,7 @@ def test_request_from_before_the_loss_does_not_arm_a_disarmed_robot(how):
 
 
 @pytest.mark.parametrize("how", ["release", "lost"])
-def test_a_human_who_is_lost_before_the_robot_is_armed_ends_auto_arm(how):
+def test_loss_of_a_human_before_arming_ends_auto_arm(how):
     rig = Rig(auto_arm=True)
     LEAVING[how](rig)
     assert rig.gate.state is D

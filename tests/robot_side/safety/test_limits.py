@@ -231,7 +231,7 @@ def test_stop_bound_exceeded_in_short_steps_or_in_turning_is_rejected(changes):
         SafetyConfig(**changes)
 
 
-def test_a_stop_that_takes_for_ever_is_given_up_after_two_seconds():
+def test_simulated_stop_ends_after_two_seconds():
     assert stop_bound(config(max_acceleration_mps2=0.01)).zero_us == 2_020_000
 
 

@@ -185,7 +185,7 @@ def test_an_image_is_unchanged_since_it_was_first_seen(pictures, unchanged_us):
         ([(10, 0), (20, 0)], 20, 20),
     ],
 )
-def test_a_frame_shows_what_was_first_seen_at_the_last_change(pictures, t_us, since_us):
+def test_image_of_a_frame_is_as_old_as_its_last_change(pictures, t_us, since_us):
     record = FreshnessRecord()
     for at_us, fingerprint in pictures:
         record.add(at_us, fingerprint)

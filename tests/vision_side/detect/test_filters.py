@@ -86,7 +86,7 @@ def test_another_label_or_a_second_away_is_another_thing() -> None:
     assert ids(detector, frame(1), frame(2), frame(3), late) == [[1], [2], [1], [3]]
 
 
-def test_robots_and_sessions_have_ids_of_their_own() -> None:
+def test_robots_and_sessions_have_separate_ids() -> None:
     detector = TrackIds(Told([box(10)], [box(10)], [box(10)], [box(200)]))
     frames = frame(1), frame(1, robot="r2"), frame(2), frame(1, session="0000beef")
     assert ids(detector, *frames) == [[1], [1], [1], [1]]

@@ -71,7 +71,7 @@ def test_every_built_in_name_can_be_imported() -> None:
      ("oip+http://box:8000/ball", ("oip+http", "oip+http://box:8000/ball")), ("my_eyes:Eyes", ("my_eyes:Eyes", "")),
      ("zenoh:operator", ("zenoh", "operator"))],
 )
-def test_a_name_and_what_stands_after_it(kind: str, parts: tuple[str, str]) -> None:
+def test_kind_is_split_into_name_and_address(kind: str, parts: tuple[str, str]) -> None:
     assert split_kind(kind) == parts
 
 

@@ -53,7 +53,7 @@ def test_points_go_to_the_odometry_frame_and_back(x: float, y: float, yaw: float
     assert about_robot(in_odometry(points, (x, y, yaw)), (x, y, yaw)) == pytest.approx(points, abs=1e-9)
 
 
-def test_echoes_leave_out_what_met_nothing_and_what_is_out_of_range() -> None:
+def test_echoes_exclude_rays_without_an_obstacle_or_out_of_range() -> None:
     ranges = np.array([1.0, np.inf, 0.01, 2.0, 9.0], np.float32)
     found = echoes(RangeScan(0, -math.pi / 2, math.pi / 4, 0.05, 8.0, ranges), 0.1)
     assert found == pytest.approx(np.array([[0.1, -1.0], [0.1 + math.sqrt(2), math.sqrt(2)]]), abs=1e-6)
@@ -62,7 +62,7 @@ def test_echoes_leave_out_what_met_nothing_and_what_is_out_of_range() -> None:
 # --- the floor ---------------------------------------------------------------------------------------------------
 
 
-def test_one_echo_counts_at_once_and_rays_through_it_give_it_up_again() -> None:
+def test_one_echo_counts_immediately_and_rays_through_it_remove_it() -> None:
     ground = Costmap()
     ground.see((0.0, 0.0), np.array([[0.31, 0.0]]))
     assert len(ground.cells()) == 1 and ground.version == 1
@@ -73,7 +73,7 @@ def test_one_echo_counts_at_once_and_rays_through_it_give_it_up_again() -> None:
     assert cells_of(ground.points()).tolist() == [[30, 0]]
 
 
-def test_a_wall_at_a_grazing_angle_is_not_given_up() -> None:
+def test_wall_at_a_grazing_angle_stays() -> None:
     ground = Costmap()
     wall = np.column_stack([np.linspace(0.05, 0.6, 40), np.full(40, 0.10)])
     for _ in range(30):

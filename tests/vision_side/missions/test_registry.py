@@ -45,7 +45,7 @@ class Raising:
         return Plan(STILL, "fine" if self.count < 50 else "two\nlines")
 
 
-def test_the_contract_finds_what_is_broken():
+def test_contract_finds_each_broken_promise():
     with pytest.raises(AssertionError, match="one line"):
         check_mission(mission_spec(f"{__name__}:Raising", {}, CONFIG))
 

@@ -148,7 +148,7 @@ def test_only_the_driving_vision_accepts_missions():
 # --- reports ---------------------------------------------------------------------------------------------------------
 
 
-def test_reports_come_twice_a_second_and_at_once_on_a_change_but_not_with_every_frame():
+def test_reports_come_twice_a_second_and_immediately_on_a_change():
     reporter, told = Reporter(DetectorConfig()), []
     for at in range(300):
         now_s = at / 100

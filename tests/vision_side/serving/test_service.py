@@ -174,7 +174,7 @@ def test_frames_after_a_silence_are_reported_again(bench: Bench, monkeypatch: py
     assert len([line for line in bench.said if "frames from robot r1, session 0000abcd" in line]) == 2
 
 
-def test_what_was_skipped_is_counted_over_every_camera(bench: Bench) -> None:
+def test_skipped_frames_are_counted_over_all_cameras(bench: Bench) -> None:
     bench.camera()
     for seq in range(1, 4):
         bench.frame(b"junk", seq)

@@ -92,7 +92,7 @@ def test_forged_frames_of_two_sessions_in_turn_do_not_keep_the_robot_out(watch):
     assert watch.film(A, B, C) == [1.0, 0.0, 0.0]
 
 
-def test_of_two_robots_with_one_id_the_first_is_steered_and_never_both(watch):
+def test_first_of_two_robots_with_one_id_is_steered(watch):
     watch.film(A)
     share_a, share_b = watch.film(A, B, seconds=10)
     assert share_a > 0.95 and share_b < 0.05

@@ -127,7 +127,7 @@ def test_a_stopped_peer_costs_neither_time_nor_memory_nor_others(start):
         stalled.send_signal(signal.SIGCONT)
 
 
-def test_a_process_ends_by_itself_after_with(start):
+def test_process_ends_after_with(start):
     endpoint = free_endpoint()
     code = """
     with open_zenoh("r1", listen=[endpoint]) as link, open_zenoh("r1", connect=[endpoint]) as peer:

@@ -163,7 +163,7 @@ def test_a_model_file_that_is_invalid_is_reported(tmp_path, text, said):
         camera_model(LensConfig(model_file=tmp_path / "camera.toml"), SIZE)
 
 
-def test_two_models_at_once_are_rejected(tmp_path):
+def test_model_and_model_file_exclude_each_other(tmp_path):
     with pytest.raises(ConfigError, match="keep one"):
         camera_model(LensConfig(model_file=tmp_path / "camera.toml", model=MODEL), SIZE)
 

@@ -144,7 +144,7 @@ def test_buffer_time_is_converted_to_the_monotonic_clock(opened, clock):
     assert 0.040 <= age_s < 0.140
 
 
-def test_without_a_time_of_its_own_an_image_is_as_old_as_configured(opened):
+def test_image_without_a_time_has_the_configured_age(opened):
     camera = opened(FakeDevice(clock=lambda: 0.0), delay_ms=70)
     age_s = age_of(next_picture(camera))
     assert 0.070 <= age_s < 0.170

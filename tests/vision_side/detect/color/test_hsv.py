@@ -53,7 +53,7 @@ def test_a_ball_half_out_of_view_is_not_drawn_inwards(x_m: float, y_m: float) ->
     assert abs(distance) < 0.04
 
 
-def test_a_ball_partly_behind_a_box_is_measured_by_what_shows() -> None:
+def test_partly_hidden_ball_is_measured_by_its_visible_part() -> None:
     model = camera()
     picture = scene(model, 0.855, 0.0)
     picture[:, :150] = (90, 90, 90)  # covers the left third
@@ -157,7 +157,7 @@ def test_circle_fit_is_exact_on_arcs(cx: float, cy: float, radius: float, start:
 
 
 @given(cx=st.floats(0, 640), cy=st.floats(0, 480), radius=st.floats(12, 80), start=st.floats(0, 6.28))
-def test_what_cuts_a_disc_off_is_left_out_of_its_circle(cx: float, cy: float, radius: float, start: float) -> None:
+def test_occluding_edge_is_excluded_from_the_circle(cx: float, cy: float, radius: float, start: float) -> None:
     turn = np.linspace(start, start + 2 * math.pi, 120, endpoint=False)
     across = np.minimum(np.cos(turn - start), 0.7)  # a straight cut, at 0.7 radii from the centre
     along = np.sin(turn - start)

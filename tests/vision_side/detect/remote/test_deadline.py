@@ -148,7 +148,7 @@ def test_failed_close_is_reported_by_the_caller(held, monkeypatch):
         DeadlineDetector(held).close()
 
 
-def test_close_ends_the_thread_and_what_is_inside(held):
+def test_close_ends_the_thread_and_the_inner_detector(held):
     before = set(threading.enumerate())
     one = DeadlineDetector(held)
     one.detect([frame(1)], within(2))

@@ -40,7 +40,7 @@ def test_a_robot_that_is_not_answered_changes_nothing_for_another():
     assert drove == ["own"] * GOOD_ANSWERS + ["remote"] * 2, "one beside was under way and not good"
 
 
-def test_of_a_batch_of_several_robots_each_has_its_own():
+def test_each_robot_of_a_batch_gets_its_result():
     remote = Partly("r2", "r4")
     fallback = Fallback(remote, Held("own"))
     robots = ["r1", "r2", "r3", "r4"]
