@@ -130,7 +130,7 @@ class Load:
 
     @property
     def p95_ms(self) -> float:
-        """From a frame's publication to its boxes here."""
+        """Return the 95th percentile from the publication of a frame to its boxes here, ms."""
         return sorted(self.ages_ms)[int(len(self.ages_ms) * 0.95)] if self.ages_ms else float("inf")
 
     @property
@@ -148,7 +148,7 @@ class Load:
 
     @property
     def overload(self) -> float:
-        """Frames offered for each that was answered."""
+        """Return the frames offered for each answered frame."""
         return self.offered / max(1, sum(self.answered.values()))
 
 

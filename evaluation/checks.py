@@ -27,7 +27,7 @@ class Check:
 
 
 def check_lines(checks: Sequence[Check]) -> list[str]:
-    """A line for each: name, value, unit, bound, result."""
+    """Format a line for each check: name, value, unit, bound, result."""
     width = max((len(check.name) for check in checks), default=0)
     return [
         f"{check.name:<{width}} {_value(check):>8} {check.unit:<6} bound {number(check.bound):>6}  "
@@ -37,24 +37,24 @@ def check_lines(checks: Sequence[Check]) -> list[str]:
 
 
 def _value(check: Check) -> str:
-    """With more digits where three would hide why it fails."""
+    """Format a value, with more digits where three would hide the failure."""
     text = number(check.value)
     return text if check.value is None or check.ok or text != number(check.bound) else f"{check.value:g}"
 
 
 def to_dict(checks: Iterable[Check]) -> dict[str, Any]:
-    """The part of a command's `--json` that every command with checks has."""
+    """Return the part of `--json` that every command with checks has."""
     listed = [asdict(check) for check in checks]
     return {"ok": all(check["ok"] for check in listed), "checks": listed}
 
 
 def at_most(name: str, value: float | None, unit: str, bound: float) -> Check:
-    """A figure that must have happened and be within its bound."""
+    """Check that a figure exists and is at most its bound."""
     return Check(name, value, unit, bound, value is not None and value <= bound)
 
 
 def at_least(name: str, value: float, unit: str, bound: float) -> Check:
-    """A figure that must reach its bound."""
+    """Check that a figure reaches its bound."""
     return Check(name, value, unit, bound, value >= bound)
 
 

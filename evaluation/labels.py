@@ -39,7 +39,7 @@ class Labels:
         self._kept: OrderedDict[int, tuple[bytes, bytes]] = OrderedDict()
 
     def label(self, header: FrameHeader, labels: Iterable[Any]) -> None:
-        """One frame that is sent now, and what the simulation labels in it."""
+        """Store a frame that is sent now, with the labels of the simulation."""
         tables = [one._asdict() for one in labels]
         self._kept[header.seq] = boxes_message(header, tables, self._camera, "00000003", header.seq)
         if len(self._kept) > KEPT:
@@ -85,14 +85,14 @@ class LabelPublisher:
         self._seq = 0
 
     def step(self) -> None:
-        """The next frame's boxes, if one comes soon."""
+        """Publish the boxes of the next frame, if one comes soon."""
         frame = self._frames.take(_WAIT_S)
         self._labels.drain()
         if frame is not None:
             self._publish(frame)
 
     def _publish(self, frame: Message) -> None:
-        """By the picture's own size: on a slow link the robot sends smaller ones."""
+        """Publish the boxes at the size of the image, because on a slow link the robot sends smaller ones."""
         try:
             header, size = decode(FrameHeader, frame.header), read_jpeg_size(frame.payload)
         except WireError:

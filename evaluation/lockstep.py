@@ -97,7 +97,7 @@ class Lockstep:
         self._now_us = 0
 
     def step(self) -> None:
-        """One step of the world, then everything that is due."""
+        """Advance the world by one step, then run everything that is due."""
         self.world.step()
         self._now_us = self.world.now_us
         self.network.advance(self._now_us)
@@ -116,7 +116,7 @@ class Lockstep:
     # --- robot ---------------------------------------------------------------------------------------------------
 
     def _film(self) -> None:
-        """The camera's next tick: a picture, if the stream wants one."""
+        """Run the next tick of the camera. It captures an image if the stream wants one."""
         if self._now_us < self._camera_tick * self._frame_interval_us:
             return
         self._camera_tick += 1
@@ -193,7 +193,7 @@ def run_lockstep(
     mission: str | None = None,
     on_progress: Callable[[int], None] = lambda _now_us: None,
 ) -> Run:
-    """One run of `scenario` for `seconds` (its own length if None). `on_progress` receives the time each second.
+    """Run `scenario` for `seconds` (default: its own length). `on_progress` receives the time each second.
 
     `vision` and `mission` stand in for what the scenario names.
     """

@@ -74,7 +74,7 @@ def plot_run(
 
 
 def wall_corners(wall: Wall) -> list[tuple[float, float]]:
-    """The four corners of a wall seen from above, in metres."""
+    """Return the four corners of a wall seen from above, m."""
     (x1, y1), (x2, y2) = wall.start_m, wall.end_m
     length = math.hypot(x2 - x1, y2 - y1) or 1.0
     across_x, across_y = -(y2 - y1) / length * wall.thickness_m / 2, (x2 - x1) / length * wall.thickness_m / 2

@@ -105,11 +105,11 @@ class Processes:
         return self._folder / f"{name}.log"
 
     def pid(self, name: str) -> int:
-        """The process id of `name`."""
+        """Return the process id of `name`."""
         return self._running[name].pid
 
     def child(self, name: str) -> int:
-        """The process id of the newest child of `name`; 0 without one."""
+        """Return the process id of the newest child of `name`, or 0 without one."""
         return next(reversed(children_of(self.pid(name))), 0)
 
     @property
@@ -145,7 +145,7 @@ class Processes:
         self._running[name].send_signal(number)
 
     def exit_code(self, name: str, timeout_s: float) -> int | None:
-        """Its exit code once it has ended, None if it does not in time; an ended one is forgotten."""
+        """Wait for the end of a process. Returns its exit code, or None if it does not end in time."""
         try:
             code = self._running[name].wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -192,13 +192,13 @@ def children_of(pid: int) -> list[int]:
 
 
 def last_line(log: Path) -> str:
-    """The last line of a log, without `error: `."""
+    """Return the last line of a log, without `error: `."""
     lines = [line for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
     return lines[-1].removeprefix("error: ") if lines else "nothing"
 
 
 def free_port() -> int:
-    """A port on loopback on which nothing listens, and nothing on the next one."""
+    """Return a free port on loopback. The next port is free too."""
     while True:
         with socket.socket() as probe, socket.socket() as next_probe:
             probe.bind(("127.0.0.1", 0))

@@ -87,7 +87,7 @@ def _limits(model: RobotModel) -> Table:
 
 
 def robot_config(model: RobotModel, *, auto_arm: bool = False) -> RobotConfig:
-    """The same as a checked model. Raises ConfigError naming the robot's file and the key."""
+    """Return the configuration of the robot as a checked model. Raises ConfigError that names file and key."""
     table = robot_table(model)
     if auto_arm:
         table = laid_over(table, {"safety": {"auto_arm": True}})
@@ -111,7 +111,7 @@ def _check_sight(config: RobotConfig, model: RobotModel) -> None:
 def vision_config(
     scenario: Scenario, model: RobotModel, seed: int = 0, mission: str | None = None, base: VisionConfig | None = None
 ) -> VisionConfig:
-    """The same as a checked model, over `base`. Raises ConfigError naming the scenario and the key."""
+    """Return the vision configuration over `base`, checked. Raises ConfigError that names scenario and key."""
     table = laid_over((base or VisionConfig()).model_dump(), vision_table(scenario, model, seed, mission))
     return _checked(VisionConfig, table, f"scenario {scenario.name}: [vision]")
 

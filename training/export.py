@@ -45,12 +45,12 @@ class Graph:
         self.constants: list[Any] = []
 
     def add(self, kind: str, takes: Sequence[str], name: str, **how: Any) -> str:
-        """One node with one output, whose name is returned."""
+        """Add a node with one output. Returns the name of the output."""
         self.nodes.append(helper.make_node(kind, list(takes), [name], name=name, **how))
         return name
 
     def constant(self, name: str, value: Any, kind: Any = np.float32) -> str:
-        """A number or an array that the graph holds."""
+        """Add a number or an array to the graph."""
         self.constants.append(numpy_helper.from_array(np.asarray(value, kind), name))
         return name
 

@@ -127,7 +127,7 @@ def _module(layer: Layer, channels: int) -> Any:
 
 
 def folded(state: dict[str, Any]) -> Weights:
-    """Every convolution's weight and bias, with the batch normalization after it worked in, and `AGAINST`."""
+    """Fold the batch normalization into weight and bias of every convolution, and add `AGAINST`."""
     weights: Weights = {}
     values = {name: value.detach().cpu().double().numpy().copy() for name, value in state.items()}
     for layer in network():
@@ -282,7 +282,7 @@ class _State:
         self._schedule.last_epoch = self._training.last_from
 
     def learn(self, step: int, batch: list[TrainingSample]) -> float:
-        """One step; its loss."""
+        """Run one step. Returns its loss."""
         loss = _loss(self.network(self._on_device([one.image for one in batch])), batch, self._on_device)
         self._optimizer.zero_grad()
         loss.backward()
@@ -318,7 +318,7 @@ class _State:
         path.with_suffix(".part").replace(path)
 
     def load(self, path: Path) -> int:
-        """The step to go on from; 0 without a checkpoint. Raises ConfigError for one of another training."""
+        """Load a checkpoint. Returns the next step, 0 without one. Raises ConfigError for one of another training."""
         kept = _checkpoint(path, self._made_by, self._device)
         if kept is None:
             return 0
@@ -361,7 +361,7 @@ def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[li
 
 
 def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> list[TrainingSample]:
-    """This process's share."""
+    """Return the share of this process."""
     size_px, count = (WHOLE_PX, training.batch // 2) if training.whole_at(step) else (CUT_PX, training.batch)
     share, shown = max(1, count // training.jobs), training.shown_at(step, len(scenes.truths))
     return [sample(scenes, shown, (training.seed, step, place), size_px)

@@ -53,7 +53,7 @@ class Layer:
 
 
 def network() -> tuple[Layer, ...]:
-    """All layers, in order; the last is the output."""
+    """Return all layers in order. The last one is the output."""
     layers = [
         Layer("half", "conv", ("image",), 16, 2, 2),
         *_down("quarter", "half", 32, 5),

@@ -161,7 +161,7 @@ class TrainingSample:
 def sample(
     scenes: DrawnScenes, shown: SceneRange, numbers: tuple[int, int, int], size_px: tuple[int, int]
 ) -> TrainingSample:
-    """One of the scenes, a cut, a side, defects; the same for the same seed, step, place in a batch."""
+    """Draw a scene, a cut, a side and defects, always the same for the same seed, step and place in a batch."""
     draw = np.random.default_rng(numbers)
     number, around, column = (_harder if shown.harder else _plain)(draw, scenes, shown)
     left, top = _cut(draw, around, size_px)
@@ -190,7 +190,7 @@ def _harder(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, 
 
 
 def _cut(draw: Random, boxes: list[Box], size_px: tuple[int, int]) -> tuple[int, int]:
-    """The cut's corner: three times in four with the middle of one box in it."""
+    """Draw the corner of the cut. Three times in four it contains the center of a box."""
     most = (WIDTH_PX - size_px[0], HEIGHT_PX - size_px[1])
     corner = [int(draw.integers(0, one + 1)) for one in most]
     if boxes and draw.random() < 0.75:
@@ -236,7 +236,7 @@ def _blank(one: TrainingSample, box: Box) -> None:
 
 
 def _mark(one: TrainingSample, truth: LabelledBox, whole: Box) -> None:
-    """A bump on the label's heat map; in its middle cells, where the edges are."""
+    """Add a bump to the heat map of the label, and the edges in its center cells."""
     box = _within(whole, one)
     if _area(box) <= 0:
         return

@@ -52,11 +52,11 @@ class Training:
 
     @property
     def last_from(self) -> int:
-        """The last round's first step."""
+        """Return the first step of the last round."""
         return self.steps - self.rounds[-1]
 
     def rate_at(self, step: int) -> float:
-        """The learning rate by `rate`: up, then down along a cosine, in each round."""
+        """Return the share of `rate` at a step. In each round it rises, then falls along a cosine."""
         number, within, steps = self._place(step)
         highest = max(LEAST_SHARE, 0.5**number)
         if within < _WARM_UP:
@@ -71,7 +71,7 @@ class Training:
         return SceneRange(min(known - 1, scenes * number // len(self.rounds)), known, number >= _HARDER_FROM)
 
     def whole_at(self, step: int) -> bool:
-        """True where whole pictures are shown, half as many."""
+        """Return True where training shows whole images, half as many."""
         _, within, steps = self._place(step)
         return within >= WHOLE_FROM * steps
 

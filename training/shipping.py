@@ -54,14 +54,14 @@ _DEFAULT_THRESHOLD: Final = 0.3  # for a label that no scene showed
 
 
 def ball_threshold(columns: Mapping[str, Sequence[FrameResult]]) -> float:
-    """The least score that keeps every column within `MOST_FALSE`; else the one that comes nearest to it."""
+    """Return the least score that keeps every column within `MOST_FALSE`, else the nearest one."""
     worst = {least: max(_worst(frames, least) for frames in columns.values()) for least in _TRIED}
     within = [least for least, share in worst.items() if share <= MOST_FALSE]
     return within[0] if within else min(_TRIED, key=lambda least: worst[least])
 
 
 def _worst(frames: Sequence[FrameResult], least: float) -> float:
-    """The larger of the shares of false alarms and of wrong objects, if only scores from `least` on counted."""
+    """Return the larger share of false alarms and wrong objects, if only scores from `least` on count."""
     empty = [one for one in frames if not one.has_ball]
     alarms = sum(one.verdict != "none" and one.score >= least for one in empty)
     wrong = sum(one.verdict == "wrong object" and one.score >= least for one in frames)
@@ -187,7 +187,7 @@ _SLICE: Final = 100
 
 
 def written(path: Path, weights: Weights) -> None:
-    """The ONNX file, with what it answers to the known picture in its metadata."""
+    """Write the ONNX file, with its answer to the test image in its metadata."""
     properties = {"min_score": str(COUNTS_FROM)}
     path.write_bytes(onnx_bytes(weights, properties))
     engine = open_engine(path, "cpu", 1)
@@ -201,7 +201,7 @@ def written(path: Path, weights: Weights) -> None:
 
 
 def chosen_thresholds(path: Path, weights: Weights, frames: int, jobs: int, progress: Progress) -> tuple[float, ...]:
-    """Each label's threshold, by `frames` scenes a column; the model without any goes to `path`."""
+    """Choose the threshold of each label by `frames` scenes per column. The model without thresholds goes to `path`."""
     path.write_bytes(onnx_bytes(weights, {"min_score": str(_ALL)}))
     last = VALIDATED_FROM + frames
     slices = [range(first, min(first + _SLICE, last)) for first in range(VALIDATED_FROM, last, _SLICE)]

@@ -41,12 +41,12 @@ def taken_percent(before: Reading, after: Reading, seconds: float) -> float:
 
 
 def high_water_mb(pid: int) -> float:
-    """The most memory the process has had in use, in MB of 2**20 bytes."""
+    """Return the most memory that the process used so far, in MB of 2**20 bytes."""
     return _status_mb(pid, "VmHWM")
 
 
 def resident_mb(pid: int) -> float:
-    """The memory the process has in use now, in MB of 2**20 bytes."""
+    """Return the memory that the process uses now, in MB of 2**20 bytes."""
     return _status_mb(pid, "VmRSS")
 
 
@@ -96,7 +96,7 @@ def carried_bytes(ports: Collection[int]) -> dict[Connection, int]:
 
 
 def carried_between(before: Mapping[Connection, int], after: Mapping[Connection, int]) -> int | None:
-    """Bytes carried in the time between two readings; of several connections to one port, the busiest is taken.
+    """Count the bytes between two readings. Of several connections to one port the busiest counts.
 
     The others are those of viewers. None without counters.
     """

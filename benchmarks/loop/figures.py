@@ -72,7 +72,7 @@ class LoopSetting:
 
 
 def size_of(text: str) -> tuple[int, int]:
-    """`640x480` as (width, height). Raises ConfigError for other text."""
+    """Parse `640x480` as (width, height). Raises ConfigError for other text."""
     width, cross, height = text.partition("x")
     if not cross or not (width + height).isascii() or not width.isdigit() or not height.isdigit():
         raise ConfigError(f"--size {text!r}: write WIDTHxHEIGHT, e.g. 640x480")
@@ -80,7 +80,7 @@ def size_of(text: str) -> tuple[int, int]:
 
 
 def peers_of(text: str) -> tuple[str, ...]:
-    """`all`, `none`, or names separated by commas. Raises ConfigError for a name that is not in `PEERS`."""
+    """Parse `all`, `none`, or names separated by commas. Raises ConfigError for a name that is not in `PEERS`."""
     if text in ("all", "none"):
         return PEERS if text == "all" else ()
     names = tuple(text.split(","))
@@ -234,7 +234,7 @@ class LoopFigures:
 
 
 def percentile(values: Sequence[float], percent: float) -> float | None:
-    """The smallest of `values` that at least `percent` (0..100) of them do not exceed; None of none."""
+    """Return the smallest of `values` that at least `percent` (0..100) of them do not exceed, or None."""
     if not values:
         return None
     ordered = sorted(values)
@@ -243,7 +243,7 @@ def percentile(values: Sequence[float], percent: float) -> float | None:
 
 
 def figures_of(sample: LoopSample) -> LoopFigures:
-    """The figures of a sample."""
+    """Compute the figures of a sample."""
     course = sample.course
     ages_ms = [age_us / 1000 for _, age_us in course.ages_us]
     parts = _parts(course.ages_us)

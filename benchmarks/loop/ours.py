@@ -42,7 +42,7 @@ class Ours:
 
 
 def endpoint_of(transport: str, port: int) -> str:
-    """An endpoint of `transport`. Raises ConfigError for one that is unknown."""
+    """Return an endpoint of `transport`. Raises ConfigError for an unknown transport."""
     if transport not in TRANSPORTS:
         raise ConfigError(f"--transport {transport!r}: {', '.join(TRANSPORTS)}")
     return TRANSPORTS[transport].format(port)

@@ -29,7 +29,7 @@ def write_pictures(folder: Path, width_px: int, height_px: int) -> float:
 
 
 def camera_of(width_px: int, height_px: int) -> CameraModel:
-    """The lens of the pictures: 80 degrees wide, as the folder camera guesses it."""
+    """Return the lens of the images, 80 degrees wide, as the folder camera guesses it."""
     focal_px = width_px / 2 / math.tan(math.radians(40))
     return CameraModel(
         width_px=width_px, height_px=height_px, fx_px=focal_px, fy_px=focal_px, cx_px=width_px / 2, cy_px=height_px / 2

@@ -80,7 +80,7 @@ class Contestants:
 
 
 def take_sample(name: str, setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> LoopSample:
-    """The least disturbed of up to `setting.tries` samples. Raises HardwareError if the contestant does not start."""
+    """Return the least disturbed of up to `setting.tries` samples. Raises HardwareError without a start."""
     taken: list[LoopSample] = []
     while len(taken) < setting.tries:
         number = len(taken) + 1
@@ -179,7 +179,7 @@ def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
 
 
 def _samples(setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> dict[str, LoopSample]:
-    """One of each contestant.
+    """Take a sample of each contestant.
 
     Floor and Sightline take turns, because the result is their difference, and a shared machine changes its clock from
     minute to minute. Under load there is one turn, because the age must be observed over the whole time.

@@ -47,7 +47,7 @@ class DelayedDetector:
 
 
 def delayed_detector(config: VisionConfig, delay_ms: float, busy_ms: float) -> Detector:
-    """The services' own detector, unless it is to be slow."""
+    """Return the detector of the services, slowed down if the setting requests it."""
     detector = configured_detector(config)
     return DelayedDetector(detector, delay_ms / 1000, busy_ms / 1000) if delay_ms or busy_ms else detector
 
@@ -62,7 +62,7 @@ class PipelineVision:
         self._seq = 0
 
     def answer(self, t_us: int, jpeg: bytes) -> str:
-        """The command for a picture captured at `t_us`. Raises ValueError for one that cannot be answered."""
+        """Return the command for an image captured at `t_us`. Raises ValueError for an image without an answer."""
         self._seq += 1
         answer = self._pipeline.step(Frame(FrameHeader(session="00000001", seq=self._seq, t_us=t_us), jpeg))
         if answer.twist is None:

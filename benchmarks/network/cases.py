@@ -60,7 +60,7 @@ class NetworkCase:
 
 
 def both(**changes: float | bool) -> LinkShapes:
-    """The same shape each way."""
+    """Return the same shape for each direction."""
     shape = LinkShape.model_validate(changes)
     return LinkShapes(ab=shape, ba=shape)
 

@@ -61,7 +61,7 @@ def _is_faster(before: WheelCommand, row: WheelCommand) -> bool:
 
 
 def moves_again_s(rows: Sequence[WheelCommand], since_us: int, until_us: int) -> float | None:
-    """From `since_us` to the end of the longest standstill that ends after it, up to `until_us`.
+    """Return the time from `since_us` to the end of the longest standstill that ends after it, up to `until_us`, s.
 
     0 if the wheels never stood; None if they did not turn again, or nothing is known.
     """
@@ -120,7 +120,7 @@ class NetworkFigures:
 
 
 def figures_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: Stretch) -> NetworkFigures:
-    """The figures of `stretch`."""
+    """Compute the figures of `stretch`."""
     frames = [row for row in notes["frames"] if stretch.judged_us <= row[1] < stretch.end_us]
     statuses = [dict(zip(NOTED, row, strict=True)) for row in notes["statuses"]]
     inside = [one for one in statuses if stretch.judged_us <= one["t_us"] < stretch.end_us]
@@ -212,6 +212,6 @@ def network_checks(row: NetworkCase, figures: Sequence[NetworkFigures]) -> Itera
 
 
 def worst_of_seeds(name: str, runs: Sequence[Sequence[Check]]) -> list[Check]:
-    """The demands on the row `name`, each as the seed fared that did worst."""
+    """Return the demands on the row `name`, each with its worst seed."""
     label = f"{name}, worst of {len(runs)} seeds" if len(runs) > 1 else name
     return [replace(check, name=f"{label}: {check.name}") for check in worst_checks(runs)]

@@ -66,7 +66,7 @@ class PlayedRobot:
             link.subscribe(channel, self._on_answer)
 
     def play(self, at_us: int) -> int:
-        """A picture if it is time for one and there is credit; a status ten times a second."""
+        """Publish an image when it is due and has credit, and a status ten times a second."""
         if at_us >= self._due_us:
             self._due_us += self._period_us
             self._ticks += 1

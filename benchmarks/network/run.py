@@ -57,7 +57,7 @@ def run_network(
     telling: NetworkProgress,
     scenes: Mapping[str, Scene],
 ) -> list[NetworkRun]:
-    """Every row, with every seed where chance has a part in it; `scenes` are added to `SCENES`.
+    """Run every row, rows with losses with every seed. `scenes` extend `SCENES`.
 
     Raises ConfigError without root; a process that does not run is a check that fails.
     """
@@ -79,7 +79,7 @@ def run_network(
 
 
 def write_film(folder: Path) -> Path:
-    """The recorded pictures as a film: a camera that decodes may change quality and size."""
+    """Write the recorded images as a film, because a camera that decodes may change quality and size."""
     pictures, path = folder / "pictures", folder / "film.avi"
     pictures.mkdir()
     write_pictures(pictures, WIDTH_PX, HEIGHT_PX)

@@ -98,7 +98,7 @@ def moved(row: NetworkCase, stage: Stage) -> NetworkRun:
 
 
 def start_router(processes: Processes, wire: ShapedWire) -> int:
-    """`sightline router` beyond the radio; returns its process id."""
+    """Start `sightline router` beyond the radio. Returns its process id."""
     pid = processes.start("router", ["router", "--listen", f"tcp/{EVERYWHERE}:7447"], namespace=wire.far_side)
     processes.wait_line("router", "router: on")
     return pid
@@ -363,7 +363,7 @@ def _window(rows: Sequence[MotorRow], begin_us: int, end_us: int) -> list[MotorR
 
 
 def reached_ms(window: Sequence[MotorRow], told_us: int) -> float | None:
-    """From STOP to the first line of the fall after which the wheels stayed at zero; None if they turn to the end."""
+    """Return the time from STOP to the fall after which the wheels stayed at zero, ms, or None."""
     zero = 1 + max((index for index, row in enumerate(window) if wheel_mps(row) > 0), default=-1)
     if zero == len(window):
         return None

@@ -79,11 +79,11 @@ class Stage:
     seed: int
 
     def wire(self) -> AbstractContextManager[ShapedWire]:
-        """The two namespaces and what lies between."""
+        """Return the two namespaces with the wire between them."""
         return self.wiring(self.folder / "wire.log")
 
     def seeded(self, shapes: LinkShapes) -> LinkShapes:
-        """`shapes`, their chance drawn from this run's seed."""
+        """Seed `shapes` from the seed of this run."""
         return shapes.model_copy(update={"seed": self.seed})
 
     def processes(self, name: str) -> Processes:
@@ -109,7 +109,7 @@ Scene = Callable[[NetworkCase, Stage], NetworkRun]
 def start_robot(
     stage: Stage, processes: Processes, namespace: str, *, connect: str = "", passes_through: bool = False
 ) -> int:
-    """A robot that listens, or connects where a router is; returns its process id once it is on."""
+    """Start a robot that listens, or connects to a router. Returns its process id when it is ready."""
     config = _robot_toml(stage, connect, passes_through)
     pid = processes.start("robot", ["robot", "--config", str(config)], namespace=namespace)
     processes.wait_line("robot", f"robot {ROBOT}: on")

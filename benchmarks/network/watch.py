@@ -37,7 +37,7 @@ class Notes:
         self.heard = threading.Event()
 
     def frame(self, message: Message) -> None:
-        """Its header and size only."""
+        """Store only the header and the size of a frame."""
         self.frames.append((message.header, len(message.payload)))
 
     def twist(self, message: Message) -> None:

@@ -30,7 +30,7 @@ class ClassicVision:
         self._integral = 0.0
 
     def answer(self, _t_us: int, jpeg: bytes) -> str:
-        """The command for a picture. Raises ValueError for one that does not decode."""
+        """Return the command for an image. Raises ValueError for an image that does not decode."""
         picture = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
         if picture is None:
             raise ValueError("the picture does not decode")

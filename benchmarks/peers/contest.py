@@ -12,7 +12,7 @@ class Vision(Protocol):
     """Pictures in, `linear|angular` out."""
 
     def answer(self, t_us: int, jpeg: bytes, /) -> str:
-        """The command for a picture captured at `t_us`. Raises ValueError for one that cannot be answered."""
+        """Return the command for an image captured at `t_us`. Raises ValueError for an image without an answer."""
         ...
 
 
@@ -58,11 +58,11 @@ class Tally:
         """Median of one step without pacing, where it was measured."""
 
     def capture(self, t_us: int) -> None:
-        """A picture was captured at `t_us`."""
+        """Note that an image was captured at `t_us`."""
         self._captured_us.append(t_us)
 
     def judge(self, t_us: int) -> None:
-        """The answer to the picture of `t_us` is there, parsed and ready for the motors."""
+        """Note that the answer to the image of `t_us` is parsed and ready for the motors."""
         self._judged_us.append((t_us, monotonic_us()))
         if len(self._judged_us) == 1:
             print("first answer", flush=True)

@@ -65,7 +65,7 @@ class GotoBaseline:
         self._rays: dict[str, list[float]] = {}
 
     def step(self, view: View) -> Plan:
-        """The twist of its last step; a new one every 0.1 s."""
+        """Return the twist of its last step. It computes a new one every 0.1 s."""
         if view.scan is None:
             return Plan(STILL, "no ranges", "the range sensors are silent")
         if view.header.t_us >= self._next_us:

@@ -24,7 +24,7 @@ class Blob:
 
 
 def largest(view: View) -> Blob | None:
-    """The detection with the largest area; None if nothing was seen."""
+    """Return the detection with the largest area, or None without one."""
     blobs = [_blob(one) for one in view.detections]
     return max(blobs, key=lambda blob: blob.area_px, default=None)
 
@@ -123,7 +123,7 @@ class PixelP:
         self._plan = Plan(STILL, "no target")
 
     def step(self, view: View) -> Plan:
-        """The plan for one frame: a new one when it is time, else the last."""
+        """Compute a new plan when it is time, else return the last one."""
         t_us = view.header.t_us
         if self._decided_us is None or t_us - self._decided_us >= self._config.period_s * 1e6:
             self._decided_us = t_us

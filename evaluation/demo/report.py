@@ -111,7 +111,7 @@ def _injected(run: DemoRun) -> dict[str, Any] | None:
 
 
 def _injection_checks(run: DemoRun, injected: dict[str, Any] | None) -> list[Check]:
-    """A run that was to lose messages and lost none has shown nothing."""
+    """Check that a run with injected loss lost messages."""
     if not run.options.loss:
         return []
     lost = sum(leg["lost"] for leg in injected.values()) if injected else 0
@@ -135,7 +135,7 @@ def _checks(run: DemoRun, result: Score) -> list[Check]:
 
 
 def summary(judged: DemoReport) -> list[str]:
-    """The closing lines: the score with its bounds, where everything lies, what to try next."""
+    """Format the closing lines: the score with its bounds, the files, and the next commands."""
     run, replayed = judged.run, judged.replayed
     lines = check_lines(judged.checks)
     lines.append(_replay_line(replayed))

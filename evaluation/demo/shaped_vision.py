@@ -91,7 +91,7 @@ class ShapedLink(LinkWrapper):
         return {direction.name.lower(): line.count for direction, line in self._lines.items()}
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """True although it may be lost: no sender on a bad network knows."""
+        """Return True also for a lost message, because a sender on a bad network does not learn of it."""
         self._put(Direction.TO_ROBOT, lambda: self._link.publish(channel, header, payload, source))
         return True
 

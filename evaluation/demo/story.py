@@ -213,7 +213,7 @@ def shot(story: Story, take: Take, t_us: int) -> FilmShot:
 
 
 def state_at(states: Sequence[StateAt], t_us: int) -> str:
-    """The newest state published by `t_us`; "" before the first."""
+    """Return the newest state published by `t_us`, or "" before the first."""
     index = bisect_right(states, t_us, key=lambda one: one.t_us)
     return states[index - 1].state if index else ""
 
@@ -223,7 +223,7 @@ def _between(events: Mapping[Event, int], t_us: int, begin: Event, end: Event) -
 
 
 def _safe_caption(story: Story, t_us: int) -> tuple[str, Tone]:
-    """The last event by `t_us` decides; after a stop, its figures."""
+    """Return the caption of the last event by `t_us`, after a stop with its figures."""
     events = story.safe.events
     if t_us < events["wifi lost"]:
         return "A vision service steers the robot over Wi-Fi.", "calm"

@@ -271,7 +271,7 @@ _FINE: Final = 2
 
 
 def robot_view(take: Take, t_us: int) -> Pixels:
-    """The newest frame at `t_us`, darker when it is old; black before the first."""
+    """Return the newest frame at `t_us`, darker when it is old, or black before the first."""
     index = bisect_right(take.images, t_us, key=lambda one: one.t_us)
     if not index:
         return np.zeros((VIEW_PX[1], VIEW_PX[0], 3), np.uint8)
@@ -287,14 +287,14 @@ def robot_view(take: Take, t_us: int) -> Pixels:
 
 
 def truth_at(truths: Sequence[Truth], t_us: int) -> Truth:
-    """The newest truth by `t_us`, or the first."""
+    """Return the newest truth by `t_us`, or the first."""
     return truths[max(0, bisect_right(truths, t_us, key=lambda one: one.t_us) - 1)]
 
 
 def film_images(
     story: Story, scenario: Scenario, robot: RobotModel, *, say: Callable[[str], None], fps: float = FPS,
 ) -> "Iterator[Pillow.Image]":
-    """Every image of the film in order, without the closing one."""
+    """Yield every image of the film in order, without the closing one."""
     page, cut = Page(), scenes(story)
     with closing(ChaseCamera(scenario, robot, VIEW_PX[0] * _FINE, VIEW_PX[1] * _FINE)) as chase:
         for number, scene in enumerate(cut, start=1):

@@ -64,7 +64,7 @@ class TopView:
             cv2.putText(self._paper, name, (at_px + 14, 21), _FONT, 0.5, _INK, 1, cv2.LINE_AA)
 
     def draw(self, index: int) -> Image:
-        """The picture at sample `index`, which never goes back."""
+        """Draw the image of sample `index`, which never decreases."""
         for at in range(self._drawn, index):
             now, then = self._samples[at], self._samples[at + 1]
             self._line((now.x_m, now.y_m), (then.x_m, then.y_m), _ROBOT)
@@ -77,7 +77,7 @@ class TopView:
         return picture
 
     def _robot(self, picture: Image, truth: Truth) -> None:
-        """An arrowhead on the axle, as long as the robot."""
+        """Draw an arrowhead on the axle, as long as the robot."""
         corners = [(0.1, 0.0), (-0.08, 0.08), (-0.04, 0.0), (-0.08, -0.08)]
         cos, sin = math.cos(truth.yaw_rad), math.sin(truth.yaw_rad)
         outline = [self._at(truth.x_m + x * cos - y * sin, truth.y_m + x * sin + y * cos) for x, y in corners]

@@ -86,7 +86,7 @@ FAULTS: Final = {"gil": _hold_gil, "unplugged": _unplugged, "frozen": _frozen, "
 
 
 def write_spares(folder: Path) -> None:
-    """The pictures that are shown in place of what the camera sees; the bomb claims 65500 x 65500 pixels."""
+    """Write the images that replace those of the camera. The bomb claims 65500 x 65500 pixels."""
     import cv2
     import numpy as np
 

@@ -104,7 +104,7 @@ def _axle_m(before: MotorRow, after: MotorRow) -> float:
 
 
 def measure_stop(rows: Sequence[MotorRow], since_us: int, until_us: int | None = None) -> Stop:
-    """The stop after the last valid command at `since_us`, within the log up to `until_us`."""
+    """Measure the stop after the last valid command at `since_us`, within the log up to `until_us`."""
     before = [row for row in rows if row.t_us <= since_us]
     after = [row for row in rows if row.t_us > since_us and (until_us is None or row.t_us <= until_us)]
     window = [*before[-1:], *after]
@@ -164,7 +164,7 @@ def moved_on_old_sight(rows: Sequence[MotorRow], sent: Sequence[SentCommand], bl
 
 
 def _ages_us(rows: Iterable[MotorRow], sent: Sequence[SentCommand], blind: Blind | None) -> Iterable[float]:
-    """For each row, the age of the youngest frame that a valid command had brought by then."""
+    """Return for each row the age of the youngest frame of a valid command so far, us."""
     ordered = sorted(sent, key=lambda one: one.t_us)
     for row in rows:
         frames = (
@@ -188,7 +188,7 @@ def most_gain_mps2(rows: Sequence[MotorRow], since_us: int, over_us: int = 100_0
 
 
 def stop_checks(stop: Stop, zero_ms: float = ZERO_MS, distance_m: float = DISTANCE_M) -> list[Check]:
-    """The stop against its bounds."""
+    """Check the stop against its bounds."""
     return [
         at_most("falls", stop.falls_ms, "ms", min(FALLS_MS, zero_ms)),
         at_most("zero", stop.zero_ms, "ms", zero_ms),
@@ -220,7 +220,7 @@ class EventLog:
 
 
 def read_events(path: Path, kind: str) -> list[SentCommand]:
-    """The events of `kind`, oldest first; none while there is no file."""
+    """Read the events of `kind`, oldest first, or none without a file."""
     if not path.exists():
         return []
     rows = [line.split(",") for line in path.read_text("ascii").split("\n")[:-1]]

@@ -325,7 +325,7 @@ class RobotFixture:
     # --- evidence ------------------------------------------------------------------------------------------------
 
     def motors(self) -> list[MotorRow]:
-        """The motors' log so far."""
+        """Read the motor log so far."""
         path = self.folder / "motors.csv"
         return judge.read_motors(path.read_text("ascii")) if path.exists() else []
 
@@ -363,7 +363,7 @@ class RobotFixture:
         return max(grown_kib, default=0) / 1024
 
     def stalled_us(self, from_us: int, to_us: int) -> int:
-        """The longest time in the window for which stamps cannot be trusted."""
+        """Return the longest time in the window without trustworthy stamps, us."""
         return stalled_us(self.holes(), from_us, to_us)
 
     def holes(self) -> list[Hole]:

@@ -27,7 +27,7 @@ def run_line(outcome: FaultOutcome) -> str:
 
 
 def progress_line(outcome: FaultOutcome, done: int, total: int, left_s: float) -> str:
-    """`run_line` with how far the whole is."""
+    """Format `run_line` with the progress of all rows."""
     left = f"{left_s / 60:.0f} min" if left_s >= 90 else f"{left_s:.0f} s"
     return f"{done:>{len(str(total))}}/{total} ({left} left)  {run_line(outcome)}"
 
@@ -41,7 +41,7 @@ def _figure(check: Check) -> str:
 
 
 def figure_text(name: str, value: float | None, unit: str) -> str:
-    """A figure with its name."""
+    """Format a figure with its name."""
     return f"{name} {value_text(value)} {unit}".rstrip()
 
 

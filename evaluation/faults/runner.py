@@ -96,7 +96,7 @@ class FaultOutcome:
 
     @property
     def ok(self) -> bool:
-        """Every check held; a row that was skipped is not ok."""
+        """Return True if every check passed. A skipped row is not ok."""
         return bool(self.checks) and not self.trouble and all(check.ok for check in self.checks)
 
 
@@ -131,7 +131,7 @@ def run_case(row: FaultCase, folder: Path, run: int = 1) -> FaultOutcome:
 
 
 def _run_once(row: FaultCase, place: Path) -> tuple[tuple[Check, ...], int]:
-    """The checks, and for how long the sampler stalled."""
+    """Run a row once. Returns the checks, and the longest stall of the sampler."""
     with RobotFixture(place, row.setup) as rig:
         injected = row.inject(rig)
         grown_mb = rig.grown_mb()

@@ -39,12 +39,12 @@ def sample(path: Path) -> None:
 
 
 def read_holes(path: Path) -> list[Hole]:
-    """All that were noted so far."""
+    """Read all holes so far."""
     return [Hole(*map(int, line.split(","))) for line in path.read_text("ascii").split("\n")[:-1]]
 
 
 def stalled_us(holes: Iterable[Hole], from_us: int, to_us: int) -> int:
-    """The longest hole that touches the window, 0 without one."""
+    """Return the longest hole that touches the window, us, or 0."""
     return max((end - start for start, end in holes if start < to_us and end > from_us), default=0)
 
 
