@@ -31,11 +31,11 @@ _FRAME_US = 33_333
 
 @dataclass(frozen=True, slots=True)
 class StepTime:
-    """One size of picture, medians; `phase` shows that all steps ran.
+    """One size of image, medians; `phase` shows that all steps ran.
 
     `median_us`: hot, one frame right after the other; the bound holds for this one. `alone_us`: of its rounds, the
     best. `paced_us`: 30 frames a second with sleep between, when caches and clock speed have to be regained each time.
-    `decode_us`: the decode alone, hot, of the same pictures, which is the floor: its best round. `hsv_us`: the decode
+    `decode_us`: the decode alone, hot, of the same images, which is the floor: its best round. `hsv_us`: the decode
     and the detector `hsv`, hot, which the bound holds for too, and `hsv_alone_us` of its rounds the best.
     """
 
@@ -63,7 +63,7 @@ class LearnedTime:
 
     `network_us`: the network alone, overlaps removed and boxes decoded; the bound holds for this. `alone_us`: of its
     rounds, the best. `whole_us`: from JPEG to detections. `decode_us`: the JPEG's decode alone, its best round.
-    `missed`: the pictures in which it found no ball.
+    `missed`: the images in which it found no ball.
     """
 
     engine: str
@@ -147,7 +147,7 @@ def _camera(width_px: int, height_px: int) -> CameraModel:
 def _pictures(width_px: int, height_px: int) -> list[bytes]:
     """Textured rooms with the ball of the scenarios, of about the size that the bounds were set for.
 
-    Many, since a processor learns the branches of one picture that is decoded over and over: 20 % of the decode.
+    Many, since a processor learns the branches of one image that is decoded over and over: 20 % of the decode.
     """
     drawn = [_drawn(width_px, height_px, seed) for seed in range(_PICTURES)]
     quality = min(range(40, 96), key=lambda one: abs(len(_encode(drawn[0], one)) - _JPEG_BYTES[width_px, height_px]))

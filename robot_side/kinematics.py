@@ -67,7 +67,7 @@ class Odometer:
         self._update_rate(wheels)
 
     def _advance(self, left_rad: float, right_rad: float) -> None:
-        arc = twist_of(self._drive, left_rad, right_rad)  # angles instead of speeds: metres and radians, not per second
+        arc = twist_of(self._drive, left_rad, right_rad)  # angles instead of speeds: meters and radians, not per second
         half = arc.angular_rad_s / 2
         chord_m = arc.linear_mps * (math.sin(half) / half if half else 1.0)
         self._x_m += chord_m * math.cos(self._yaw_rad + half)

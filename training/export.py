@@ -33,7 +33,7 @@ IR_VERSION: Final = 8
 MOST_BOXES: Final = 32
 SAME_BOX: Final = 0.5
 """Overlap (intersection over union) of two boxes above which the score of the worse one becomes 0."""
-_LARGEST: Final = 3.2  # of a log size: 390 pixels; keeps exp() finite on any picture
+_LARGEST: Final = 3.2  # of a log size: 390 pixels; keeps exp() finite on any image
 
 _NO_PEAK: Final = -30.0
 
@@ -133,7 +133,7 @@ def _layer(graph: Graph, layer: Layer, weights: Weights) -> str:
 
 
 def _convolution(graph: Graph, layer: Layer, source: str, weights: Weights, name: str) -> None:
-    """The picture's own goes over colors beside each other in place of colors behind each other."""
+    """The image's own goes over colors beside each other in place of colors behind each other."""
     weight, bias = weights[f"{layer.name}.weight"], weights[f"{layer.name}.bias"]
     side, colors = weight.shape[2], 1
     if source == "image":
@@ -173,7 +173,7 @@ def _decoded(graph: Graph, head: str) -> None:
 
 
 def _corners(graph: Graph, rows: int, columns: int) -> None:
-    """Cells and their geometry, across and down at once -> `corners`, within the picture."""
+    """Cells and their geometry, across and down at once -> `corners`, within the image."""
     down, across = np.mgrid[:rows, :columns] + 0.5
     graph.constant("cell.middles", np.stack([across.ravel(), down.ravel()]))
     graph.add("Gather", ["cell.middles", "cells"], "cell", axis=1)

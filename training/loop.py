@@ -71,7 +71,7 @@ class TorchNetwork(nn.Module):  # type: ignore[misc]
 
 
 def begin_from(network: TorchNetwork, weights: Weights, images: Any) -> None:
-    """Give a new network the weights of `folded`, and each normalization its statistics on these pictures, uint8 (N, 3,
+    """Give a new network the weights of `folded`, and each normalization its statistics on these images, uint8 (N, 3,
     H, W): the output stays the same. The maps of `TAUGHT` are not among the weights and begin at random; the thresholds
     worked into a file's head are learned away."""
     hooks = []

@@ -27,11 +27,11 @@ AGAINST: Final = 0.5
 thresholds: of 0, 0.3, 0.4, 0.5 and 0.65 the most hits at 3 % of false alarms, 4 to 7 points more than 0. Lights and
 legs gain nothing by it."""
 BRIGHTNESS: Final = 0.5
-"""Each picture is scaled to this mean before all else, so that dim and bright look alike ..."""
+"""Each image is scaled to this mean before all else, so that dim and bright look alike ..."""
 DARKEST: Final = 0.03
 """... unless it is darker than this, which would scale up mere noise."""
 LOOKED_AT: Final = 16
-"""Each sixteenth row is enough to know how bright a picture is."""
+"""Each sixteenth row is enough to know how bright an image is."""
 COLORS: Final = 3
 
 Kind = Literal["conv", "depthwise", "add", "add-up", "head"]

@@ -43,7 +43,7 @@ _TRIED: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class DrawnScenes:
-    """Pictures (N, H, W, 3), RGB, on disk, and what is in each."""
+    """Images (N, H, W, 3), RGB, on disk, and what is in each."""
 
     pictures: npt.NDArray[np.uint8]
     truths: tuple[tuple[LabelledBox, ...], ...]
@@ -52,12 +52,12 @@ class DrawnScenes:
     """Boxes of distractors: things without a label."""
 
     def digest(self) -> str:
-        """Hash the scenes: their number, their truths, the first picture."""
+        """Hash the scenes: their number, their truths, the first image."""
         content = json.dumps([len(self.truths), [[one.label, one.box] for row in self.truths for one in row]])
         return hashlib.sha256(content.encode() + self.pictures[0].tobytes()).hexdigest()[:16]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle pictures on disk by name: the receiver opens them again."""
+        """Pickle images on disk by name: the receiver opens them again."""
         pictures = self.pictures.filename if isinstance(self.pictures, np.memmap) else self.pictures
         return _reopened, (pictures, self.truths, self.unclear, self.others)
 
@@ -131,7 +131,7 @@ def _draw(pictures: Path, seeds: Sequence[int]) -> tuple[int, list[dict[str, Any
 
 
 CUT_PX: Final = (192, 160)
-"""Width and height of the cut-outs that most of the training sees: less than half the time of a whole picture."""
+"""Width and height of the cut-outs that most of the training sees: less than half the time of a whole image."""
 WHOLE_PX: Final = (WIDTH_PX, HEIGHT_PX)
 _LEAST_LEFT: Final = 0.4  # of an object's box after the cut; with less left it is neither right nor wrong
 _NEW: Final = 0.5  # of the samples of a harder round: drawn from the scenes that it adds alone
@@ -145,7 +145,7 @@ Array = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class TrainingSample:
-    """One picture BGR (3, H, W) and its wanted output."""
+    """One image BGR (3, H, W) and its wanted output."""
 
     image: npt.NDArray[np.uint8]
     heat: Array
@@ -182,7 +182,7 @@ def _plain(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, l
 
 
 def _harder(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, list[Box], Column]:
-    """The same, with more of the newest scenes, of distractors, of bad pictures."""
+    """The same, with more of the newest scenes, of distractors, of bad images."""
     number = int(draw.integers(shown.newest if draw.random() < _NEW else 0, shown.known))
     labelled = [one.box for one in scenes.truths[number]]
     around = list(scenes.others[number]) if draw.random() < _AROUND_OTHERS else labelled

@@ -12,11 +12,11 @@ LEAST_SHARE: Final = 1 / 4
 """Highest rate of any round, at least, as a share of the first round's: that of the third. The model that ships had an
 eighth in rounds four and five, and a quarter in the sixth, which made the network smaller."""
 WHOLE_FROM: Final = 0.8
-"""From this part of a round on, whole pictures in place of cut-outs."""
+"""From this part of a round on, whole images in place of cut-outs."""
 
 
 _HARDER_FROM: Final = 2
-"""This round and those after it, counted from 0, are of harder pictures."""
+"""This round and those after it, counted from 0, are of harder images."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class SceneRange:
     newest: int
     known: int
     harder: bool = False
-    """True to show newer scenes, distractors and bad pictures more often than by chance."""
+    """True to show newer scenes, distractors and bad images more often than by chance."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ Seconds = Annotated[float, Field(ge=0, le=60)]
 
 
 class HsvRange(Config):
-    """One two-sided colour range. A hue range whose low end is above its high end goes through red (360 = 0)."""
+    """One two-sided color range. A hue range whose low end is above its high end goes through red (360 = 0)."""
 
     hue_low_deg: HueDeg
     hue_high_deg: HueDeg
@@ -27,16 +27,16 @@ class HsvRange(Config):
 
 
 class HsvConfig(Config):
-    """The colour detector."""
+    """The color detector."""
 
     ranges: Annotated[tuple[HsvRange, ...], Field(min_length=1, max_length=8)] = (
         HsvRange(hue_low_deg=36, hue_high_deg=68, saturation_low=0.5),
     )
     shape: Literal["disc", "any"] = "disc"
-    """`any`: whatever has the colour, e.g. a box; its range then follows from `boxes.height_m` or `boxes.width_m`."""
+    """`any`: whatever has the color, e.g. a box; its range then follows from `boxes.height_m` or `boxes.width_m`."""
     min_radius_px: Annotated[float, Field(gt=1, le=200)] = 3.0
     max_contours: Annotated[int, Field(ge=1, le=256)] = 16
-    """Security limit: no more blobs than this are measured in one picture, the longest outlines first."""
+    """Security limit: no more blobs than this are measured in one image, the longest outlines first."""
     max_roughness: Annotated[float, Field(gt=0, le=0.5)] = 0.07
     """RMS distance of the outline from a circle, in radii; a square has 0.10."""
     min_outline_kept: Annotated[float, Field(ge=0.2, le=1)] = 0.55
@@ -59,7 +59,7 @@ class DetectorConfig(Config):
     deadline_s: Annotated[float, Field(ge=0.005, le=1)] = 0.1
     """Deadline of a remote detector. After it, the robot already slows down, so a later answer does not count."""
     labels: Annotated[tuple[str, ...], Field(max_length=64)] = ()
-    """Only detections with one of these labels count, and `target` of the colour detectors; empty for all."""
+    """Only detections with one of these labels count, and `target` of the color detectors; empty for all."""
     only_color: bool = False
     """Only detections that are mostly of the colors of `hsv.ranges` count.
 
@@ -77,7 +77,7 @@ class DetectorConfig(Config):
 class BoxesConfig(Config):
     """Steering by boxes, when the detector is `boxes`. Without a size the robot only turns toward the box.
 
-    The sizes are also those of what the colour detector finds with `hsv.shape` `any`.
+    The sizes are also those of what the color detector finds with `hsv.shape` `any`.
     """
 
     source: Source = "guest"
@@ -103,7 +103,7 @@ class TargetConfig(Config):
 
     radius_m: Annotated[float, Field(gt=0.005, le=2)] = 0.1
     stand_off_m: Annotated[float, Field(gt=0.1, le=10)] = 0.8
-    """Distance to keep from the lens to the target's centre, over the floor."""
+    """Distance to keep from the lens to the target's center, over the floor."""
     max_range_m: Annotated[float, Field(gt=0.2, le=50)] = 6.0
     label: Annotated[str, Field(max_length=64)] = ""
     """Label of the target. Empty selects any detection except traffic lights and legs."""
@@ -115,17 +115,17 @@ class TrackConfig(Config):
     acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 0.35
     """How hard the target is expected to change its velocity (1 sigma); more follows faster and smooths less."""
     range_noise: Annotated[float, Field(gt=0, le=1)] = 0.008
-    """1 sigma of one position measured at one metre, in metres; grows with the square of the distance."""
+    """1 sigma of one position measured at one meter, in meters; grows with the square of the distance."""
     gate_m: Annotated[float, Field(gt=0, le=5)] = 0.35
     """A sighting further than this from where the target should be is another object ..."""
     gate_growth_mps: Annotated[float, Field(ge=0, le=10)] = 1.5
     """... and the gate widens by this for every second without a sighting."""
     coast_s: Annotated[float, Field(ge=0, le=5)] = 0.5
-    """Without a sighting, drive on for this long where the target should be; then only turn towards it."""
+    """Without a sighting, drive on for this long where the target should be; then only turn toward it."""
     give_up_s: Annotated[float, Field(gt=0, le=10)] = 1.2
     """Without a sighting for this long the target is lost, and nothing of it is kept but its side."""
     confirm: Annotated[int, Field(ge=1, le=30)] = 2
-    """Sightings before the robot drives towards it; it turns at once."""
+    """Sightings before the robot drives toward it; it turns at once."""
 
 
 class SteerConfig(Config):
@@ -169,7 +169,7 @@ class SearchConfig(Config):
     max_turn_rad: Annotated[float, Field(gt=0, le=50)] = 14.0
     max_turning_s: Seconds = 20.0
     after_s: Annotated[float, Field(ge=0, le=10)] = 0.2
-    """Pictures without the target must last this long before the robot turns for it."""
+    """Images without the target must last this long before the robot turns for it."""
 
 
 class ViewingConfig(Config):
@@ -177,7 +177,7 @@ class ViewingConfig(Config):
 
     overlay_hz: Annotated[float, Field(gt=0, le=60)] = 15.0
     overlay_width_px: Annotated[int, Field(ge=160, le=1920)] = 640
-    """However wide the camera's pictures are: the words drawn into it must be legible."""
+    """However wide the camera's images are: the words drawn into it must be legible."""
     overlay_quality_percent: Annotated[int, Field(ge=20, le=95)] = 80
     preview_hz: Annotated[float, Field(gt=0, le=60)] = 10.0
     preview_width_px: Annotated[int, Field(ge=64, le=640)] = 320
@@ -201,7 +201,7 @@ class VisionConfig(Config):
     max_frame_bytes: Annotated[int, Field(ge=1_000, le=FRAME.max_payload_bytes)] = 400_000
     """Security limit: the link rejects larger frames."""
     max_pixels: Annotated[int, Field(ge=256, le=4096 * 4096)] = 1920 * 1080
-    """Security limit: larger pictures are never decoded."""
+    """Security limit: larger images are never decoded."""
     detector: DetectorConfig = DetectorConfig()
     hsv: HsvConfig = HsvConfig()
     boxes: BoxesConfig = BoxesConfig()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import MAX_SEGMENTS, read_jpeg_size
 
-cv2.setNumThreads(1)  # one stream, one thread: pictures this small only lose by being split
+cv2.setNumThreads(1)  # one stream, one thread: images this small only lose by being split
 
 HALF_SCALE_FROM_PIXELS = 640 * 480
 MAX_SCANS = 16
@@ -23,7 +23,7 @@ _SEGMENTS = frozenset(bytes([0xFF, one]) for one in (0xC0, 0xC1, 0xC4, 0xDB, 0xD
 
 @dataclass(frozen=True, slots=True)
 class DecodedImage:
-    """Decoded pixels, valid until the next decode. `scale` turns their pixels into those of the encoded picture."""
+    """Decoded pixels, valid until the next decode. `scale` turns their pixels into those of the encoded image."""
 
     bgr: NDArray[np.uint8]
     scale: int
@@ -101,7 +101,7 @@ def _head_of_one_scan(jpeg: bytes, components: int) -> bytes | None:
 
 
 def _count_scans(jpeg: bytes) -> int:
-    """SOS markers; as vectors, since `bytes.count` would cost five times as much on every picture."""
+    """SOS markers; as vectors, since `bytes.count` would cost five times as much on every image."""
     data = np.frombuffer(jpeg, np.uint8)
     return int(np.count_nonzero((data[:-1] == 0xFF) & (data[1:] == 0xDA)))
 

@@ -1,4 +1,4 @@
-"""Draws what vision saw over the picture it saw it in: axes, outline, raw and filtered centroid, words. Pure."""
+"""Draws what vision saw over the image it saw it in: axes, outline, raw and filtered centroid, words. Pure."""
 
 import math
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ FILTERED: Final = (255, 120, 255)
 TEXT_COLOR: Final = (255, 255, 255)
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _FONT_PER_WIDTH: Final = 0.48 / 640  # about sixty letters from edge to edge
-_STRIP_SHADE: Final = 0.35  # what is left of the picture under words, so that they can be read on anything
+_STRIP_SHADE: Final = 0.35  # what is left of the image under words, so that they can be read on anything
 _LINE_PER_FONT: Final = 40  # pixels from line to line where letters have the size 1
 _GAP: Final = "    "
 _FAR_PX: Final = 9e3  # OpenCV draws in 16 bits
@@ -88,7 +88,7 @@ def raw_px(target: Detection) -> Point:
 
 
 def radius_px(target: Detection) -> float:
-    """Return the radius of the circle, or without one that of a disc with the area of the box, in px."""
+    """Return the radius of the circle, or without one that of a disk with the area of the box, in px."""
     if target.circle is not None:
         return target.circle.radius_px
     return math.sqrt(max(0.0, (target.x2_px - target.x1_px) * (target.y2_px - target.y1_px)) / math.pi)

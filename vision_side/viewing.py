@@ -59,7 +59,7 @@ NO_PICTURE: Final = "no image"
 """Phase of an image that the pipeline rejected. It is not decoded here either."""
 _NICE: Final = 10  # of this thread: answering the next frame comes first
 _QUALITIES_BELOW: Final = (50, 30)
-"""Tried where a picture is over the channel's bound, before it is left out."""
+"""Tried where an image is over the channel's bound, before it is left out."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,9 +42,9 @@ class LoopSetting:
     detector_delay_ms: float = 0.0
     """Every detector waits so much longer, as for an accelerator."""
     overload: float = 0.0
-    """How many times more pictures come than can be detected; 0 leaves the rate as it is."""
+    """How many times more images come than can be detected; 0 leaves the rate as it is."""
     busy_ms: float = 0.0
-    """Every detector works at least so long on a picture, as on a slower processor; follows from `overload`."""
+    """Every detector works at least so long on an image, as on a slower processor; follows from `overload`."""
     seconds: float = 10.0
     peers: tuple[str, ...] = PEERS
     tries: int = 3
@@ -90,7 +90,7 @@ def peers_of(text: str) -> tuple[str, ...]:
     return names
 
 
-# What became of the pictures of one sample: how many were captured, how many answered, and how late. Pure.
+# What became of the images of one sample: how many were captured, how many answered, and how late. Pure.
 
 
 Header = tuple[int, int, int | None]
@@ -212,7 +212,7 @@ class LoopFigures:
     """One contestant. Times are from capture to the result; None without an answer.
 
     `first_ms` and `last_ms` are medians of the first and the last ten seconds, or fifths of a shorter time; `cpu_ms` is
-    per answered picture and process, `memory_mb` the high-water mark, `bytes_per_picture` what went over the sockets,
+    per answered image and process, `memory_mb` the high-water mark, `bytes_per_picture` what went over the sockets,
     both ways.
     """
 

@@ -1,4 +1,4 @@
-"""The distributions of `bench loop` as a picture: share of answers by age, and age over time. Shell (a file)."""
+"""The distributions of `bench loop` as an image: share of answers by age, and age over time. Shell (a file)."""
 
 import math
 from pathlib import Path

@@ -161,7 +161,7 @@ class Race:
 
 
 def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
-    """Measure every contestant, one after the other, on the same pictures; `setting.pictures` is filled in.
+    """Measure every contestant, one after the other, on the same images; `setting.pictures` is filled in.
 
     Raises ConfigError for an unknown transport, HardwareError with its last words for a process that does not run.
     """

@@ -53,7 +53,7 @@ def delayed_detector(config: VisionConfig, delay_ms: float, busy_ms: float) -> D
 
 
 class PipelineVision:
-    """Pictures in, `linear|angular` out."""
+    """Images in, `linear|angular` out."""
 
     def __init__(self, width_px: int, height_px: int, delay_ms: float = 0.0, busy_ms: float = 0.0) -> None:
         config = VisionConfig()
@@ -70,8 +70,8 @@ class PipelineVision:
         return format_twist(answer.twist).decode()
 
 
-# More pictures than can be detected, by a chosen factor: by their rate, else by a slower detector. Shell (a clock).
-# The robot service takes at most `MAX_FPS` pictures a second. If the pipeline is faster, the rate stays
+# More images than can be detected, by a chosen factor: by their rate, else by a slower detector. Shell (a clock).
+# The robot service takes at most `MAX_FPS` images a second. If the pipeline is faster, the rate stays
 # unchanged, and every contestant's detector works for the time that the factor requires.
 
 

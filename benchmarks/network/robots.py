@@ -1,4 +1,4 @@
-"""Twenty robots in one process, for `bench network`: real sessions, real headers and credit, recorded pictures. Shell.
+"""Twenty robots in one process, for `bench network`: real sessions, real headers and credit, recorded images. Shell.
 
     python -m sightline.benchmarks.network.robots SETTINGS_AS_JSON
 

@@ -1,6 +1,6 @@
 """`sightline bench network`: robot and vision in two network namespaces, a shaped wire between. Shell (processes).
 
-The robot plays recorded pictures through a camera that can change their quality and size; nothing is rendered.
+The robot plays recorded images through a camera that can change their quality and size; nothing is rendered.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Zenoh as its first example shows it: publish every picture, compute in the subscriber's callback. Shell.
+"""Zenoh as its first example shows it: publish every image, compute in the subscriber's callback. Shell.
 
 Default session but for the endpoint; shared memory is off, as for every contestant.
 """
@@ -34,7 +34,7 @@ def _session(where: str, port: int) -> zenoh.Session:
 
 
 def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
-    """Publish pictures and listen for commands."""
+    """Publish images and listen for commands."""
 
     def on_command(sample: zenoh.Sample) -> None:
         linear, angular, t_us = sample.payload.to_string().split("|")

@@ -1,6 +1,6 @@
 """Run the color pipeline of the legacy articles, as a detector that a user would build. Shell (a clock).
 
-Whole picture decoded, blurred, turned to HSV, thresholded, opened; the largest outline's middle steers, in pixels, with
+Whole image decoded, blurred, turned to HSV, thresholded, opened; the largest outline's middle steers, in pixels, with
 an integral that has neither time nor bound. Constants are theirs. OpenCV's threads are left as they come.
 """
 

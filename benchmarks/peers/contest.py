@@ -9,21 +9,21 @@ from sightline.protocol.clock import monotonic_us
 
 
 class Vision(Protocol):
-    """Pictures in, `linear|angular` out."""
+    """Images in, `linear|angular` out."""
 
     def answer(self, t_us: int, jpeg: bytes, /) -> str:
         """Return the command for an image captured at `t_us`. Raises ValueError for an image without an answer."""
         ...
 
 
-# A camera for the peers of `bench loop`: the recorded pictures at their pace, stamped when shown. Shell (a clock).
+# A camera for the peers of `bench loop`: the recorded images at their pace, stamped when shown. Shell (a clock).
 #
 # The caller sleeps itself (`film.next_in_s()`), as its own loop does: a thread's sleep or a coroutine's. Missed
 # images are not repeated, as with the folder camera of the robot service.
 
 
 class RecordedFrames:
-    """`fps` pictures a second, looped."""
+    """`fps` images a second, looped."""
 
     def __init__(self, folder: Path, fps: float) -> None:
         self._jpegs = [path.read_bytes() for path in sorted(folder.glob("*.jpg"))]

@@ -1,4 +1,4 @@
-"""The floor: no transport at all. Sleep until the picture's time, then decode and step, in one process. Shell."""
+"""The floor: no transport at all. Sleep until the image's time, then decode and step, in one process. Shell."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _HOT_STEPS: Final = 150
 
 
 def alone(film: RecordedFrames, eyes: Vision, tally: Tally, *, hot: bool) -> None:
-    """Answer pictures at their pace for ever; before that, `hot` measures steps without any pause."""
+    """Answer images at their pace for ever; before that, `hot` measures steps without any pause."""
     if hot:
         tally.hot_us = statistics.median(_step_us(film, eyes) for _ in range(_HOT_STEPS))
     while True:

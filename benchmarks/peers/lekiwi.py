@@ -1,6 +1,6 @@
 """ZeroMQ as LeKiwi uses it: PUSH and PULL that keep the newest message; commands are read once a tick. Shell.
 
-Pictures go as base64 in JSON, with the robot's state, as there. The command that a tick reads answers an earlier tick.
+Images go as base64 in JSON, with the robot's state, as there. The command that a tick reads answers an earlier tick.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def _newest(context: zmq.Context[Socket], kind: int) -> Socket:
 
 
 def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
-    """Tick at the pictures' pace: command in, picture out."""
+    """Tick at the images' pace: command in, image out."""
     context = zmq.Context()
     commands, observations = _newest(context, zmq.PULL), _newest(context, zmq.PUSH)
     commands.bind(f"tcp://127.0.0.1:{port}")
@@ -52,7 +52,7 @@ def _read_command(commands: Socket, tally: Tally) -> None:
 
 
 def vision(eyes: Vision, port: int) -> None:
-    """Answer the newest picture of the robot at `port`."""
+    """Answer the newest image of the robot at `port`."""
     context = zmq.Context()
     commands, observations = _newest(context, zmq.PUSH), _newest(context, zmq.PULL)
     commands.connect(f"tcp://127.0.0.1:{port}")

@@ -1,4 +1,4 @@
-"""One WebSocket request per picture, as openpi does it: the robot sends it, waits, and applies the answer. Shell.
+"""One WebSocket request per image, as openpi does it: the robot sends it, waits, and applies the answer. Shell.
 
 The vision is an asyncio server that computes inside its handler; compression is off and messages are binary, as there.
 """

@@ -1,6 +1,6 @@
 """A bare TCP exchange: length and stamp, JPEG out; a line of text back. Shell.
 
-The robot sends from one thread and listens in another; the vision answers one picture after the other.
+The robot sends from one thread and listens in another; the vision answers one image after the other.
 """
 
 from __future__ import annotations

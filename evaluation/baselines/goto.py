@@ -26,7 +26,7 @@ _SAME_RAY_RAD = 0.2
 
 
 class GotoBaselineConfig(Config):
-    """Its numbers; gains per step of 0.1 s, lengths in metres, speeds in m/s and rad/s."""
+    """Its numbers; gains per step of 0.1 s, lengths in meters, speeds in m/s and rad/s."""
 
     waypoints: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=1, max_length=64)]
     position_kp: float = 0.3

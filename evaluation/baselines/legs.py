@@ -1,7 +1,7 @@
 """The older leg follower. Pure.
 
 It takes 70 of a lidar's rays, one a degree, from 39 degrees left to 30 right, and indexes them with the box's edges as
-shares of the picture. The middle of the picture is ray 35, straight ahead is ray 39, and the law steers for ray 30: the
+shares of the image. The middle of the image is ray 35, straight ahead is ray 39, and the law steers for ray 30: the
 field is lopsided. The integrals know neither time nor bounds; there is no memory. All of that stays.
 """
 
@@ -25,7 +25,7 @@ class LegsBaseline:
     """One step for each answer of the detector, as it was."""
 
     class Config(Settings):
-        """Its numbers; gains per step, ranges in metres, angles in rays. A sane preset halves `angular_kp` and has no
+        """Its numbers; gains per step, ranges in meters, angles in rays. A sane preset halves `angular_kp` and has no
         integrals: `linear_ki = 0`, `angular_ki = 0`.
         """
 

@@ -15,7 +15,7 @@ from sightline.vision_side.missions.port import Plan, View
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """In pixels of the encoded picture; without a circle the box's middle and half of its longer side."""
+    """In pixels of the encoded image; without a circle the box's middle and half of its longer side."""
 
     detection: Detection
     x_px: float
@@ -39,7 +39,7 @@ def _blob(one: Detection) -> Blob:
 
 # Band steering, a baseline: one of three fixed twists, by where the target is and how large it looks. Pure.
 #
-# The law of an older Gazebo robot, its numbers as defaults. `centre_share` is of the picture's whole width, as it was
+# The law of an older Gazebo robot, its numbers as defaults. `centre_share` is of the image's whole width, as it was
 # there, so that the robot turns only when the target almost leaves the image; docs/how-to/missions.md has sane numbers.
 
 
@@ -109,7 +109,7 @@ class PixelPConfig(Config):
     fast_mps: Annotated[float, Field(ge=0, le=5)] = 0.5
     slow_mps: Annotated[float, Field(ge=0, le=5)] = 0.2
     period_s: Annotated[float, Field(ge=0, le=5)] = 0.2
-    """From one decision to the next; 0: with each picture."""
+    """From one decision to the next; 0: with each image."""
 
 
 class PixelP:
@@ -146,7 +146,7 @@ class PixelP:
 
 # PI steering in pixels, a baseline: the nearer the target looks the slower, and an integral without time. Pure.  The
 # law of an older robot that was split over a WebSocket, its numbers as defaults: speed 200 / area, whatever that comes
-# to, and an integral per picture that nothing bounds. What else was wrong there (the position of another outline than
+# to, and an integral per image that nothing bounds. What else was wrong there (the position of another outline than
 # the largest, an integral that started again with each image) is not repeated.
 # docs/how-to/missions.md has sane numbers.
 

@@ -27,7 +27,7 @@ _SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 
 
 class TopView:
-    """A square picture that grows a way: call `draw` with the index of each next sample."""
+    """A square image that grows a way: call `draw` with the index of each next sample."""
 
     def __init__(self, samples: Sequence[Truth], scenario: Scenario, size_px: int) -> None:
         """Raises ValueError for no samples."""

@@ -1,6 +1,6 @@
 """A camera plug-in that fails on command. Shell (files).
 
-Every picture that was spoiled is noted in `camera.ledger` beside it.
+Every image that was spoiled is noted in `camera.ledger` beside it.
 """
 
 import ctypes
@@ -21,7 +21,7 @@ SLOW_S: Final = 0.2
 HEAVY_BYTES: Final = 16_700
 """At 30 fps, 4 Mbit/s."""
 SPARE: Final = {"black": (320, 240), "resized": (160, 120), "bomb": (64, 64)}
-"""Pictures that `write_spares` leaves in the folder, so that the robot's process needs no encoder."""
+"""Images that `write_spares` leaves in the folder, so that the robot's process needs no encoder."""
 _SOF0: Final = b"\xff\xc0\x00\x11\x08"
 
 

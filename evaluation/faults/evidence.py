@@ -54,7 +54,7 @@ class SentCommand:
 class Blind:
     """From `from_us` to `until_us` (None: to the end) no new command is based on a fresh frame.
 
-    With `by_frame`, nothing that is captured: where only pictures are cut off, one under way may still be answered.
+    With `by_frame`, nothing that is captured: where only images are cut off, one under way may still be answered.
     """
 
     from_us: int

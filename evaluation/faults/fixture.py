@@ -64,7 +64,7 @@ _PLAIN: Final = ("taken", "delivered", "delivered_bytes")
 
 
 class BenchWire:
-    """`ab` is from the robot, `ba` towards it. Use it in a `with`."""
+    """`ab` is from the robot, `ba` toward it. Use it in a `with`."""
 
     def __init__(self, log: Path) -> None:
         self.robot_side, self.far_side = (f"sightline-{os.getpid()}-{end}" for end in "ab")

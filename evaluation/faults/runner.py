@@ -59,7 +59,7 @@ class FaultCase:
     blind: bool = False
     """True if commands continue but must not be applied: from the injection on, none counts as good."""
     by_frame: bool = False
-    """It is pictures that end, not commands: one under way may still be answered."""
+    """It is images that end, not commands: one under way may still be answered."""
     stops: bool = True
     """A stop is demanded after the last valid command."""
     again: bool = False

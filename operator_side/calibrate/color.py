@@ -26,7 +26,7 @@ MIN_SATURATION: Final = 0.2
 MIN_VALUE: Final = 0.1
 """Below these, a pixel has no meaningful hue."""
 MIN_BOX_SHARE: Final = 0.3
-"""Least share of one color in a box; a disc fills 79 % of the box around it."""
+"""Least share of one color in a box; a disk fills 79 % of the box around it."""
 MOST_MARKED: Final = 0.5
 """A range that marks this share of an image belongs to the background."""
 _ALIKE_DEG: Final = 20.0  # from the strongest hue: the same object with its shaded side

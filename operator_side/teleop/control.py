@@ -81,7 +81,7 @@ class SpeedUp:
 
 
 def _towards(speed: float, goal: float, change: float) -> float:
-    """Return `goal` if slower in the same direction, else a step of `change` towards it; a reversal starts at zero."""
+    """Return `goal` if slower in the same direction, else a step of `change` toward it; a reversal starts at zero."""
     start = speed if speed * goal > 0 else 0.0
     if abs(goal) <= abs(start):
         return goal

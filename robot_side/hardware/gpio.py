@@ -36,7 +36,7 @@ on 7.4 V, 65 mm wheels, and no motion below the 40 % at which the legacy program
 
 
 class TableConfig(Config):
-    """Rows of (duty, metres per second at the rim), both rising. The first row is the least duty that turns a wheel."""
+    """Rows of (duty, meters per second at the rim), both rising. The first row is the least duty that turns a wheel."""
 
     table: Rows = GUESSED_ROWS
 

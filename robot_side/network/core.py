@@ -63,7 +63,7 @@ class NetworkCore:
         """Make the frame of an image.
 
         Args:
-            picture: the newest image.
+            image: the newest image.
             now_us: monotonic clock.
 
         Returns:

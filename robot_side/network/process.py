@@ -53,7 +53,7 @@ def own_addresses() -> list[str]:
     return [address for address in dict.fromkeys(found) if not address.startswith("127.")]
 
 
-# The network process: camera and link; forwards raw commands to the driver, publishes for it. Shell.
+# The network process: camera and link; forward raw commands to the driver, publishes for it. Shell.
 #
 # Started by `sightline.robot_side.pipe` with its ends of two socket pairs; it ends when the first closes.
 

@@ -1,6 +1,6 @@
 """Check the promises of a detector: `sightline detector check NAME`. Shell (a clock).
 
-A seed defines the images: discs and boxes in all colors, noise, black, odd sizes, and bytes that are not an image.
+A seed defines the images: disks and boxes in all colors, noise, black, odd sizes, and bytes that are not an image.
 """
 
 import math
@@ -111,7 +111,7 @@ def _keeps_answering(detector: Detector, _make: Make, seed: int) -> str:
 
 
 def _keeps_bounds(detector: Detector, _make: Make, seed: int) -> str:
-    """Boxes lie in the picture, of finite numbers, with scores from 0 to 1 and a word each."""
+    """Boxes lie in the image, of finite numbers, with scores from 0 to 1 and a word each."""
     for size in SIZES:
         for frame in drawn_frames(seed, 8, size):
             for result in detector.detect([frame], NO_DEADLINE):
@@ -227,7 +227,7 @@ def _is_bad(frame: DetectFrame) -> bool:
         frame.picture()
     except Exception:
         return True
-    return False  # a decoder fills up what is cut off at the end: that is a picture
+    return False  # a decoder fills up what is cut off at the end: that is an image
 
 
 def drawn_frames(seed: int, count: int, size: tuple[int, int], robot: str = "r1") -> Iterator[DetectFrame]:

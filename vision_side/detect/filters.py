@@ -44,13 +44,13 @@ class LabelFilter(DetectorWrapper):
 
 
 LEAST_SHARE: Final = 0.3
-"""Of the pixels in the box's middle: shade and shine take some of a ball's colour, another ball has none of it."""
+"""Of the pixels in the box's middle: shade and shine take some of a ball's color, another ball has none of it."""
 _MIDDLE: Final = 0.6
-"""The middle part of a box lies wholly on a ball, whose disc leaves the box's corners out."""
+"""The middle part of a box lies wholly on a ball, whose disk leaves the box's corners out."""
 
 
 class ColorFilter(DetectorWrapper):
-    """A detector that leaves out what another one finds in other colours."""
+    """A detector that leaves out what another one finds in other colors."""
 
     def __init__(self, detector: Detector, ranges: tuple[HsvRange, ...]) -> None:
         super().__init__(detector)

@@ -42,7 +42,7 @@ class PerSession(Generic[Memory]):
 MAX_DECODERS: Final = 64
 """Security limit: of decoders kept, one for each robot and place in a batch; the longest unused goes first.
 
-Pictures of 1920x1080, decoded at half scale, are 1.6 MB each: 100 MB at most. A robot whose decoder went gets another.
+Images of 1920x1080, decoded at half scale, are 1.6 MB each: 100 MB at most. A robot whose decoder went gets another.
 """
 
 
@@ -50,7 +50,7 @@ class DecoderPool:
     """Decoders of one thread."""
 
     def __init__(self, max_pixels: int) -> None:
-        """Security limit: pictures of more than `max_pixels` are not decoded."""
+        """Security limit: images of more than `max_pixels` are not decoded."""
         self._max_pixels = max_pixels
         self._decoders: OrderedDict[tuple[str, int], Decoder] = OrderedDict()
 

@@ -126,7 +126,7 @@ def _raises(what: str, error: BaseException) -> str:
     return f"{what} raises {type(error).__name__}: {' '.join(str(error).split())}"[:_LONGEST]
 
 
-# Validates a detector's answer: of this frame, finite, within the picture, not too many. Pure.
+# Validates a detector's answer: of this frame, finite, within the image, not too many. Pure.
 #
 # The detector may be a plug-in or another machine; a mission receives only what passes here.
 

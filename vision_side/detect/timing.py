@@ -1,4 +1,4 @@
-"""Times what looks at pictures, and makes results of what it finds. Shell (a clock)."""
+"""Times what looks at images, and makes results of what it finds. Shell (a clock)."""
 
 import time
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""The default mission: turn towards one target and keep a distance to it; when it is lost, look around. Pure.
+"""The default mission: turn toward one target and keep a distance to it; when it is lost, look around. Pure.
 
 Track, predict, steer and search are separate files. A detection is located as a sphere of known size. A box from
 another service is located by its height or width.

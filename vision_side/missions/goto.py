@@ -47,7 +47,7 @@ def braking_mps(room_m: float, delay_s: float, brake_mps2: float) -> float:
 def clear_of(points: Points, body: Footprint, twist: tuple[float, float], keep_m: float, brake_mps2: float) -> float:
     """Return the share (0..1) of `twist` that keeps the robot at least `keep_m` from all `points`.
 
-    Speed towards a point is what counts: along a wall and away from it the robot may go as it likes.
+    Speed toward a point is what counts: along a wall and away from it the robot may go as it likes.
     """
     if not len(points):
         return 1.0
@@ -126,7 +126,7 @@ class ProgressChecker:
 #
 # Straight to the goal while nothing known is in between; else along the wall, at a clearance, the way that is shortest
 # by all obstacles so far. The range of the sensors limits the speed: an obstacle just beyond it must still leave
-# the clearance. Waypoints are in the odometry frame, in metres.
+# the clearance. Waypoints are in the odometry frame, in meters.
 
 
 Metres = Annotated[float, Field(ge=-100, le=100)]
@@ -246,7 +246,7 @@ class Goto:
         return self._drive(view, route, self._carrot)
 
     def _leave(self, view: View, out: Point) -> Plan:
-        """Too near to something: straight out forwards or backwards, and turn only afterwards, where there is room."""
+        """Too near to something: straight out forward or backward, and turn only afterwards, where there is room."""
         then = self._then(view)
         bearing_rad = _bearing(then.pose, self._room(then) or out)
         backs = abs(bearing_rad) > math.pi / 2

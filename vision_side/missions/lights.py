@@ -1,7 +1,7 @@
-"""Reads traffic lights in a picture. Pure.
+"""Reads traffic lights in an image. Pure.
 
-A lamp counts when place and colour agree: the brightest of three places in a dark upright housing, and the hue that
-belongs there. The ranges are two-sided and do not touch, so that light of another tint makes no other colour of it.
+A lamp counts when place and color agree: the brightest of three places in a dark upright housing, and the hue that
+belongs there. The ranges are two-sided and do not touch, so that light of another tint makes no other color of it.
 """
 
 from collections.abc import Iterable
@@ -20,22 +20,22 @@ from sightline.vision_side.detect.color.hsv import color_table, sharp_outline
 from sightline.vision_side.detect.port import Detection
 
 Box = tuple[float, float, float, float]
-"""left, top, right, bottom, in pixels of the decoded picture."""
+"""left, top, right, bottom, in pixels of the decoded image."""
 Bgr = NDArray[np.uint8]
 
 COLOURS: Final = ("red", "yellow", "green")
 """From top to bottom."""
 UNKNOWN: Final = "unknown"
 _MAX_SHAPES = 24  # security limit: no more dark shapes than this are looked at, the largest first
-_MOST_TINT = 1.5  # no room's light is more coloured than this; what seems to be is a coloured thing that fills the view
-_PALEST = 0.08  # below it hue is noise; JPEG spreads the colour of a lamp of 5 pixels over 16
+_MOST_TINT = 1.5  # no room's light is more colored than this; what seems to be is a colored thing that fills the view
+_PALEST = 0.08  # below it hue is noise; JPEG spreads the color of a lamp of 5 pixels over 16
 _FLAT = 0.6  # rows of a housing that are narrower than this part of its widest are its pole
 _DISC = 0.85  # of a lamp's radius: its edge is mixed with the housing
 _BRIGHT_SHARE = 0.4  # share of a lamp's brightest pixels, which show its color when it is only a few pixels wide
 
 
 class LampConfig(Config):
-    """The light's size and colours."""
+    """The light's size and colors."""
 
     housing_width_m: Annotated[float, Field(gt=0.01, le=3)] = 0.10
     housing_height_m: Annotated[float, Field(gt=0.01, le=3)] = 0.26
@@ -46,12 +46,12 @@ class LampConfig(Config):
     box_width_m: Annotated[float, Field(gt=0.01, le=3)] = 0.317
     box_height_m: Annotated[float, Field(gt=0.01, le=3)] = 0.281
     box_depth_m: Annotated[float, Field(ge=0, le=3)] = 0.266
-    """Of a whole box that changes its colour."""
+    """Of a whole box that changes its color."""
     red: HsvRange = HsvRange(hue_low_deg=335, hue_high_deg=24, saturation_low=0.3, value_low=0.1)
     yellow: HsvRange = HsvRange(hue_low_deg=34, hue_high_deg=72, saturation_low=0.3, value_low=0.1)
     green: HsvRange = HsvRange(hue_low_deg=90, hue_high_deg=172, saturation_low=0.3, value_low=0.1)
     dark: Fraction = 0.4
-    """The housing is darker than this part of the picture's middle brightness."""
+    """The housing is darker than this part of the image's middle brightness."""
     contrast: Annotated[float, Field(gt=1, le=10)] = 1.3
     """A lit lamp is so many times brighter than the next brightest."""
     min_height_px: Annotated[float, Field(ge=6, le=500)] = 13.0
@@ -60,7 +60,7 @@ class LampConfig(Config):
 
 @dataclass(frozen=True, slots=True)
 class DetectedLight:
-    """One light: its colour, and its box in pixels of the encoded picture."""
+    """One light: its color, and its box in pixels of the encoded image."""
 
     colour: str
     box: Detection
@@ -155,7 +155,7 @@ class HousingLightReader:
 
 
 class BoxLightReader:
-    """Lights that are one box, which changes its colour as a whole."""
+    """Lights that are one box, which changes its color as a whole."""
 
     def __init__(self, config: LampConfig) -> None:
         self._config = config

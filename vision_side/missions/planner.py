@@ -18,7 +18,7 @@ Cells = NDArray[np.int64]
 CELL_M = 0.03
 """Fine enough for a robot of 0.11 m; a plan over 6 x 6 m still takes a few milliseconds."""
 MAX_CELLS = 20_000
-"""Security limit: 18 square metres of solid echoes; beyond it the oldest are forgotten."""
+"""Security limit: 18 square meters of solid echoes; beyond it the oldest are forgotten."""
 _ECHO, _SUREST = 3, 6  # one echo counts at once; after two it takes six rays through the cell to give it up
 _SHY_CELLS = 2.5  # a ray does not clear the cells this near to its echo: a wall at a grazing angle fills several
 _PROGRESS_CELL_M = 0.12  # something new was learned when a cell of this size is seen filled for the first time

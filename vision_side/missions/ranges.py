@@ -37,7 +37,7 @@ def decode_scan(header: bytes, payload: bytes) -> tuple[ScanHeader, RangeScan]:
 
 
 Points = NDArray[np.float64]
-"""(N, 2), metres."""
+"""(N, 2), meters."""
 
 _REMEMBERED = 64  # poses: two seconds at 30 fps, longer than any scan is believed
 _MAX_AHEAD_S = 0.2  # a scan newer than the newest pose is laid out by dead reckoning, no further than this

@@ -17,7 +17,7 @@ from sightline.vision_side.tracking.locate import locate_box
 from sightline.vision_side.tracking.prediction import MotionPredictor, PredictedMotion
 from sightline.vision_side.tracking.track import to_odometry
 
-_FRAMES = 2  # a colour that lets go must be seen this often, one after the other; one that stops counts at once
+_FRAMES = 2  # a color that lets go must be seen this often, one after the other; one that stops counts at once
 
 
 _CROSSED_M = 0.15  # a robot that stops for a line never ends so far beyond it: it has crossed, or started there
@@ -191,7 +191,7 @@ class TrafficLight:
         for one in lights:
             place = self._light_place(one, pose)
             if place is None or (one.colour == UNKNOWN and not self._is_known(place, pose)):
-                continue  # a dark shape that shows no colour may be anything
+                continue  # a dark shape that shows no color may be anything
             left_m = self._left_m(line, place, pose)
             if -self._config.stop.cleared_m <= left_m < next_m:
                 next_m, shown = left_m, one.colour
@@ -277,7 +277,7 @@ class TrafficLight:
 
 
 class TrafficLightBoxes(TrafficLight):
-    """A whole box that changes its colour. The lane's blocks must have another colour."""
+    """A whole box that changes its color. The lane's blocks must have another color."""
 
     reader = BoxLightReader
 

@@ -64,7 +64,7 @@ class FrameCounters:
     late: int = 0
     """Detected, but not by their deadline: not published."""
     rejected: int = 0
-    """Not a frame, not a picture, or an invalid result."""
+    """Not a frame, not an image, or an invalid result."""
 
     @property
     def dropped(self) -> int:

@@ -147,7 +147,7 @@ class LocalRun:
 
 
 class ProgressPrinter:
-    """One line at most every half second, with the pictures per second since the last."""
+    """One line at most every half second, with the images per second since the last."""
 
     def __init__(self, report: LogLine) -> None:
         self._report = report

@@ -24,7 +24,7 @@ class FolderCameraConfig(LensConfig):
 
 
 class FolderCamera:
-    """Pictures are read once, at start; the stamps are this machine's clock, as if they were seen now."""
+    """Images are read once, at start; the stamps are this machine's clock, as if they were seen now."""
 
     Config = FolderCameraConfig
     live = False
@@ -107,7 +107,7 @@ class StillCamera:
 
 _USUAL_FPS = 30.0
 _CATCH_UP_S = 1.0  # after a longer pause the video goes on where it was, as if paused
-_COUNT_SLACK = 0.05  # a container may only estimate how many pictures it holds
+_COUNT_SLACK = 0.05  # a container may only estimate how many images it holds
 
 
 class VideoCameraConfig(LensConfig):

@@ -18,7 +18,7 @@ _LIST = "`rpicam-hello --list-cameras` lists what is connected"
 
 
 class PiCameraConfig(LensConfig):
-    """`bitrate_mbit_s` sets the JPEG quality: 8 is about 33 kB a picture at 30 fps. 62 degrees is Camera Module 2."""
+    """`bitrate_mbit_s` sets the JPEG quality: 8 is about 33 kB an image at 30 fps. 62 degrees is Camera Module 2."""
 
     index: Annotated[int, Field(ge=0, le=3)] = 0
     width_px: Annotated[int, Field(ge=64, le=4096)] = 640

@@ -1,6 +1,6 @@
-"""Capture times from driver stamps, a frame timer for files, and the slot of the latest picture. Shell (clocks).
+"""Capture times from driver stamps, a frame timer for files, and the slot of the latest image. Shell (clocks).
 
-A stamp taken when the picture is read makes one that lay in the driver's queue look young. Drivers stamp with the
+A stamp taken when the image is read makes one that lay in the driver's queue look young. Drivers stamp with the
 monotonic clock, some with the clock of the day or with the time since boot; some do not stamp at all.
 """
 
@@ -35,7 +35,7 @@ class CaptureClock:
         """Monotonic time of capture of a buffer stamped `stamp_us` and read `now`.
 
         The first clock on which a stamp lies in the last two seconds is the device's. From then on its stamps are
-        believed, however old the pictures have grown in the driver's queue, unless one is from that clock's future.
+        believed, however old the images have grown in the driver's queue, unless one is from that clock's future.
         """
         ages_us = [clock_us - stamp_us for clock_us in (now.monotonic_us, now.boot_us, now.day_us)]
         if self._known is None or ages_us[self._known] < 0:
@@ -72,7 +72,7 @@ def read_clocks() -> Clocks:
     return Clocks(monotonic_us(), boot_us, time.time_ns() // 1000)
 
 
-# The newest picture of a camera that captures by itself. Shell (a lock and a clock).
+# The newest image of a camera that captures by itself. Shell (a lock and a clock).
 
 
 _JUST_NOW_S = 0.008

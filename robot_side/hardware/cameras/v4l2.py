@@ -85,7 +85,7 @@ def _group(path: Path) -> str:
 # OpenCV is imported when a device is opened; the robot's base install has none.
 
 
-_SELECT_TIMEOUT_S = 2  # OpenCV waits this long for a picture; its own default of 10 would hide a frozen camera
+_SELECT_TIMEOUT_S = 2  # OpenCV waits this long for an image; its own default of 10 would hide a frozen camera
 _SOI, _EOI = b"\xff\xd8", b"\xff\xd9"
 
 

@@ -23,16 +23,16 @@ from sightline.vision_side.detect.port import Circle, Detection, Label
 Shares = NDArray[np.float32]
 """(..., 2): red and green shares."""
 
-_LEAST_SIGMA: Final = 0.012  # JPEG at quality 30 spreads one colour by as much
-_MOST_SIGMA: Final = 0.05  # a cloud wider than this holds half of all colours
+_LEAST_SIGMA: Final = 0.012  # JPEG at quality 30 spreads one color by as much
+_MOST_SIGMA: Final = 0.05  # a cloud wider than this holds half of all colors
 _DARKEST: Final = 36.0  # of 765, below which shares are noise
-_MAX_STEP: Final = 0.01  # of the middle in one picture: light changes slowly, another thing's colour at once
-_MOVED: Final = 0.25  # of a sigma: as long as the cloud moved no further, its table of colours is as good as new
+_MAX_STEP: Final = 0.01  # of the middle in one image: light changes slowly, another thing's color at once
+_MOVED: Final = 0.25  # of a sigma: as long as the cloud moved no further, its table of colors is as good as new
 _KERNEL: Final = np.ones((3, 3), np.uint8)
 
 
 class ColorModel:
-    """The colour of one thing."""
+    """The color of one thing."""
 
     def __init__(self, bgr: NDArray[np.uint8]) -> None:
         """Learn the color from its pixels `bgr` (N, 3)."""
@@ -54,7 +54,7 @@ class ColorModel:
         self._spread = self._spread + (spread - self._spread) * part
 
     def mask(self, bgr: NDArray[np.uint8], sigmas: float) -> NDArray[Any]:
-        """255 where a pixel of `bgr` (rows, columns, 3) has the colour, speckle removed."""
+        """255 where a pixel of `bgr` (rows, columns, 3) has the color, speckle removed."""
         if self._table is None or math.sqrt(float(self._square(self._table_middle[None])[0])) > _MOVED:
             shares, bright = _code_shares()
             inside = (self._square(shares) <= sigmas * sigmas) & bright
@@ -85,7 +85,7 @@ def _code_shares() -> tuple[Shares, NDArray[np.bool_]]:
 
 
 def _cloud(shares: Shares) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Middle and covariance, no narrower than noise and no wider than a colour is."""
+    """Middle and covariance, no narrower than noise and no wider than a color is."""
     middle = np.median(shares, axis=0)
     off = shares - middle
     off = off[np.abs(off).max(axis=-1) <= 3 * _MOST_SIGMA]  # shine and what is in front
@@ -97,15 +97,15 @@ def _cloud(shares: Shares) -> tuple[NDArray[Any], NDArray[Any]]:
     return middle, np.array(((a, b), (b, d)))
 
 
-# Where in the picture a thing should be: a Kalman filter of its place, a smoothed size, and a gate. Pure.
+# Where in the image a thing should be: a Kalman filter of its place, a smoothed size, and a gate. Pure.
 
 
-_ACCELERATION: Final = 6.0  # picture widths per s^2: a robot that begins to turn as hard as it may
-_FIRST_SPEED: Final = 1.5  # picture widths per s: a robot that turns as fast as it may
+_ACCELERATION: Final = 6.0  # image widths per s^2: a robot that begins to turn as hard as it may
+_FIRST_SPEED: Final = 1.5  # image widths per s: a robot that turns as fast as it may
 _NOISE_PX: Final = 0.7
 _SIGMAS: Final = 4.0
 _GATE_RADII, _GATE_WIDTHS = 1.5, 0.06  # whatever the filter thinks: further off it is another thing
-_LEAST_SIZE, _MOST_SIZE = 0.65, 1.55  # of the radius, from one picture to the next
+_LEAST_SIZE, _MOST_SIZE = 0.65, 1.55  # of the radius, from one image to the next
 _SIZE_PART: Final = 0.4  # of a new radius; what is partly hidden looks smaller for a while
 
 
@@ -153,13 +153,13 @@ class PixelTrack:
         self._variance = (position * (1 - gain), both * (1 - gain), velocity - gain_velocity * both)
 
 
-# Colour detector for one thing whose light changes: it learns the colour, looks where the thing should be, and would
+# Color detector for one thing whose light changes: it learns the color, looks where the thing should be, and would
 # rather lose it than jump to another. Pure: the clock is the frames' capture time.  Found by the configured ranges in
-# several pictures in a row, the thing is then followed by its own colour, near where a Kalman filter of its place in
-# the picture expects it. What else has the colour elsewhere is not looked at.
+# several images in a row, the thing is then followed by its own color, near where a Kalman filter of its place in
+# the image expects it. What else has the color elsewhere is not looked at.
 
 
-_CLEAR: Final = 0.8  # of the outline in view: of a thing more hidden than this, no colour is learned
+_CLEAR: Final = 0.8  # of the outline in view: of a thing more hidden than this, no color is learned
 _SAMPLES: Final = 400  # pixels: enough for a middle and a spread
 _CORE: Final = 0.7  # of the radius: the rim's pixels are half the floor's
 
@@ -171,7 +171,7 @@ class AdaptiveConfig(Settings):
     hsv: HsvConfig = HsvConfig()
     label: Label = "target"
     confirm: Annotated[int, Field(ge=1, le=30)] = 3
-    """Pictures in a row with the thing at one place before it is believed."""
+    """Images in a row with the thing at one place before it is believed."""
     lost_after_s: Annotated[float, Field(gt=0, le=5)] = 0.5
     """Not seen for this long, it is lost, and is looked for everywhere again."""
     remembered_s: Annotated[float, Field(ge=0, le=60)] = 5.0
@@ -179,11 +179,11 @@ class AdaptiveConfig(Settings):
     color_sigmas: Annotated[float, Field(gt=1, le=8)] = 4.0
     """Largest distance of a target pixel from the learned color."""
     adapt_s: Annotated[float, Field(gt=0.05, le=60)] = 0.3
-    """How slowly the colour goes along with the light. A lamp that turns from warm to cold in 3 s is not lost yet."""
+    """How slowly the color goes along with the light. A lamp that turns from warm to cold in 3 s is not lost yet."""
 
 
 class AdaptiveTracker:
-    """Follows one thing in one robot's pictures."""
+    """Follows one thing in one robot's images."""
 
     def __init__(self, config: AdaptiveConfig) -> None:
         self._config = config
@@ -220,7 +220,7 @@ class AdaptiveTracker:
         return best
 
     def _region(self, picture: DecodedImage, track: PixelTrack) -> Region | None:
-        """Around where it should be, with what has its colour marked."""
+        """Around where it should be, with what has its color marked."""
         if self._color_model is None:
             return None
         half = track.gate_px + 1.4 * track.radius_px + 4

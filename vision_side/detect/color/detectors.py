@@ -17,7 +17,7 @@ _CPU: Final = "cpu"
 
 
 class Hsv:
-    """The colour detector; it remembers nothing from frame to frame."""
+    """The color detector; it remembers nothing from frame to frame."""
 
     class Config(Settings):
         """The section `hsv` of vision's configuration, and what its detections are called."""
@@ -39,7 +39,7 @@ class Hsv:
 
 
 class Adaptive:
-    """The colour detector that learns the target's colour as it goes, one memory for each robot."""
+    """The color detector that learns the target's color as it goes, one memory for each robot."""
 
     Config = AdaptiveConfig
     maker = Maker("adaptive", device=_CPU)

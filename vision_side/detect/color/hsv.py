@@ -1,4 +1,4 @@
-"""Finds discs and blobs of configured colors: mask, sharp edge, circle fit. Pure.
+"""Finds disks and blobs of configured colors: mask, sharp edge, circle fit. Pure.
 
 The table is over BGR565, so any number of ranges, and a hue range through red, cost the same.
 """
@@ -18,15 +18,15 @@ from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.port import Circle, Detection
 
 COARSE = 4
-"""Where to look is decided on every fourth pixel of every fourth row, which no disc worth measuring slips between."""
+"""Where to look is decided on every fourth pixel of every fourth row, which no disk worth measuring slips between."""
 MARGIN_PX = 10
-"""Around that: the smallest disc reaches 6 pixels from its only one that was looked at; the rest is background."""
+"""Around that: the smallest disk reaches 6 pixels from its only one that was looked at; the rest is background."""
 _KERNEL = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """The part of a picture that holds everything of the colour, a margin around it, and where it lies."""
+    """The part of an image that holds everything of the color, a margin around it, and where it lies."""
 
     bgr: NDArray[np.uint8]
     mask: NDArray[Any]
@@ -34,7 +34,7 @@ class Region:
 
 
 class ColorMask:
-    """Marks the configured colours."""
+    """Marks the configured colors."""
 
     def __init__(self, ranges: tuple[HsvRange, ...]) -> None:
         self._table = color_table(ranges)
@@ -47,7 +47,7 @@ class ColorMask:
             return None
         x1, y1 = max(0, x * COARSE - MARGIN_PX), max(0, y * COARSE - MARGIN_PX)
         part = bgr[y1 : (y + height) * COARSE + MARGIN_PX, x1 : (x + width) * COARSE + MARGIN_PX]
-        # Speckle would cost findContours a hundredfold; a 3x3 opening removes it and keeps discs.
+        # Speckle would cost findContours a hundredfold; a 3x3 opening removes it and keeps disks.
         mask = cv2.morphologyEx(cv2.LUT(codes_565(part), self._table), cv2.MORPH_OPEN, _KERNEL)
         return Region(part, mask, (x1, y1))
 
@@ -67,7 +67,7 @@ def colors_565() -> NDArray[np.float64]:
 
 @lru_cache(maxsize=32)  # 64 KB each; a fleet's robots share one
 def color_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
-    """255 for every BGR565 code whose colour is within one of `ranges`, 0 elsewhere; 65536 entries, read-only."""
+    """255 for every BGR565 code whose color is within one of `ranges`, 0 elsewhere; 65536 entries, read-only."""
     bgr = (colors_565() / 255).astype(np.float32)[None]
     hue, saturation, value = cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV)[0].T
     inside = np.zeros(65536, bool)
@@ -94,7 +94,7 @@ def _read_only(values: NDArray[Any]) -> NDArray[Any]:
 
 _MARGIN_PX = 4
 _AROUND = np.ones((3, 5), np.uint8)  # two pixels each way, where every second row is left out
-_MIN_CONTRAST = 200.0  # squared steps of colour; below it, noise would draw the edge
+_MIN_CONTRAST = 200.0  # squared steps of color; below it, noise would draw the edge
 
 Box = Sequence[int]
 
@@ -114,7 +114,7 @@ def sharp_outline(bgr: NDArray[np.uint8], mask: NDArray[Any], box: Box) -> NDArr
 
 
 def _blob(bgr: NDArray[np.uint8], inside: NDArray[Any]) -> NDArray[Any] | None:
-    """Not zero where a pixel is more like the colour inside the mask than like the one outside, brightness left out."""
+    """Not zero where a pixel is more like the color inside the mask than like the one outside, brightness left out."""
     inside = inside[::2]  # every second row gives the same mean
     return blob_between(bgr, bgr[::2], inside, cv2.bitwise_not(cv2.dilate(inside, _AROUND)))
 
@@ -149,9 +149,9 @@ Terms = NDArray[np.float64]
 """Of each point, the columns (4, N) that a circle is linear in: x, y, x^2 + y^2, 1."""
 
 MIN_POINTS = 8
-_OVAL = 0.1  # a ball at the side of a wide picture is drawn oval; its outline leaves the circle by this part of it
+_OVAL = 0.1  # a ball at the side of a wide image is drawn oval; its outline leaves the circle by this part of it
 _TRIMS = 4  # each leaves out what the fit before shows to be off the circle, and so bends the next fit less
-_STAIRS_PX = 1.5  # no pixel of a clean disc's outline is further from its circle
+_STAIRS_PX = 1.5  # no pixel of a clean disk's outline is further from its circle
 _CLEAN = 0.25  # RMS, by the limit for a single point: so few points off it bend no circle, and none is looked for
 
 
@@ -178,7 +178,7 @@ def fit_round_part(outline: NDArray[Any], min_radius_px: float, max_roughness: f
         circle, rough_px = _fit(terms)
     if terms.shape[1] < MIN_POINTS or circle[2] < min_radius_px:
         return None
-    # The stair-steps of pixels are up to half a pixel. Without this allowance, distant discs would be rejected.
+    # The stair-steps of pixels are up to half a pixel. Without this allowance, distant disks would be rejected.
     return (circle, terms[:2].T) if rough_px <= max_roughness * circle[2] + 0.5 else None
 
 
@@ -226,11 +226,11 @@ def _off(terms: Terms, circle: Fit) -> Outline:
 Pixels = NDArray[Any]
 """Outline as OpenCV gives it: (N, 1, 2), integers."""
 
-_EDGE_PX = 0.45  # the true edge lies this far outside the centre of an outermost pixel, on average over directions
+_EDGE_PX = 0.45  # the true edge lies this far outside the center of an outermost pixel, on average over directions
 
 
 class HsvDetector:
-    """Finds discs of the configured colours, or anything that has them."""
+    """Finds disks of the configured colors, or anything that has them."""
 
     def __init__(self, config: HsvConfig, label: str = "target") -> None:
         self._config = config
@@ -295,7 +295,7 @@ def disc_detection(shape: tuple[Box, Fit, Outline], whose: tuple[float, str], or
 def own_edge(pixels: Pixels, box: Box, origin_px: tuple[int, int], shape: tuple[int, ...]) -> Pixels:
     """Return the pixels (N, 2) of the outline without those at the border of the image."""
     flat = pixels[:, 0]
-    left, top = -origin_px[0], -origin_px[1]  # where the picture begins, in the region's pixels
+    left, top = -origin_px[0], -origin_px[1]  # where the image begins, in the region's pixels
     right, bottom = left + shape[1] - 1, top + shape[0] - 1
     x, y, width, height = box
     if x <= left or y <= top or x + width > right or y + height > bottom:

@@ -1,6 +1,6 @@
 """Finds the exact edge of a ball inside a model's box. Pure.
 
-A model's box is a pixel or two off, which is 5 % of a ball's distance; the edge in the picture is not.
+A model's box is a pixel or two off, which is 5 % of a ball's distance; the edge in the image is not.
 """
 
 from dataclasses import replace

@@ -1,7 +1,7 @@
 """The detector `onnx:PATH`. Shell.
 
 Without a path it is the model that comes with Sightline. Before the first frame it has run warm, and its answer to a
-known picture was compared.
+known image was compared.
 """
 
 import hashlib
@@ -40,7 +40,7 @@ _WARM_UP: Final = 3
 _DEFAULT_MIN_SCORE: Final = 0.25  # for a model without `min_score`
 _NAME_LENGTH: Final = 48
 _MAX_BATCH: Final = 32
-"""Pictures in one run: bounds a GPU's memory."""
+"""Images in one run: bounds a GPU's memory."""
 
 
 class OnnxDetector:
@@ -54,7 +54,7 @@ class OnnxDetector:
         """The file; empty for the model that comes with Sightline."""
         device: Device = "auto"
         threads: Annotated[int, Field(ge=1, le=64)] = 1
-        """Threads on the CPU. A small picture only loses by being split."""
+        """Threads on the CPU. A small image only loses by being split."""
         min_score: Annotated[float | None, Field(ge=0, le=1)] = None
         """None: `min_score` of the model's metadata, or else 0.25."""
         names: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
@@ -62,7 +62,7 @@ class OnnxDetector:
         color: Literal["auto", "bgr", "rgb"] = "auto"
         """The order of an input's channels; `auto`: bytes are BGR, floats RGB."""
         refine: Annotated[tuple[str, ...], Field(max_length=64)] = ("ball",)
-        """Things with these labels are round: their edge is looked for in the picture."""
+        """Things with these labels are round: their edge is looked for in the image."""
 
     def __init__(self, config: Config) -> None:
         """Raises ConfigError for a file that is not such a model, HardwareError for a device that is not there."""
@@ -98,7 +98,7 @@ class OnnxDetector:
     def _run(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         try:
             return timed_together(frames, self.maker, self._detections)
-        except Exception as error:  # an engine that fails on a picture gives no answer, and reports that once
+        except Exception as error:  # an engine that fails on an image gives no answer, and reports that once
             if len(frames) > 1:
                 return self._fewer_at_once(frames, deadline_us, error)
             if not self._failed:
@@ -151,7 +151,7 @@ class OnnxModel:
     form: ModelFormat
     min_score: float
     expected: list[Detection] | None
-    """Detections in the known picture, if the metadata have them: its own labels, from its own least score on."""
+    """Detections in the known image, if the metadata have them: its own labels, from its own least score on."""
     own_form: ModelFormat
     own_min_score: float
     digest: str
@@ -183,7 +183,7 @@ def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
 def _found(
     engine: Engine, pictures: Sequence[DecodedImage], form: ModelFormat, min_score: float
 ) -> list[tuple[Detection, ...]]:
-    """Return the detections of each picture; more than one only where form and engine take them."""
+    """Return the detections of each image; more than one only where form and engine take them."""
     fitted = [fit_picture(picture, form) for picture in pictures]
     if len(fitted) == 1:
         each = [engine.run(fitted[0][0])]

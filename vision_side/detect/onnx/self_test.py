@@ -1,6 +1,6 @@
-"""A picture with a known answer: checks a model on this device. Pure.
+"""An image with a known answer: checks a model on this device. Pure.
 
-The picture is drawn with integers only, so that it is the same everywhere. A model may carry its answer to it in its
+The image is drawn with integers only, so that it is the same everywhere. A model may carry its answer to it in its
 metadata, as `golden`; one that does not is compared with itself on the CPU.
 """
 
@@ -23,7 +23,7 @@ _MAX_TEXT: Final = 20_000
 
 
 def golden_picture() -> NDArray[np.uint8]:
-    """Discs on a chequered floor under a slope of light, BGR."""
+    """Disks on a chequered floor under a slope of light, BGR."""
     width, height = SIZE_PX
     down, right = np.mgrid[0:height, 0:width]
     gray = 90 + (down * 60) // height + ((right // 20 + down // 20) % 2) * 18

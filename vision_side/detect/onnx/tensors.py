@@ -1,4 +1,4 @@
-"""Pictures to input tensors, output tensors to detections. Pure.
+"""Images to input tensors, output tensors to detections. Pure.
 
 Inputs: uint8 rows of pixels (1, H, W, 3), BGR unless configured, or float (1, 3, H, W), RGB as 0..1. Outputs:
 `boxes` (K, 4), `scores` (K), `labels` (K), as Sightline's own; one (N, 6) of x1, y1, x2, y2, score, class; or one
@@ -23,7 +23,7 @@ from sightline.vision_side.detect.port import Detection, clean_label, clipped
 Arrays = Mapping[str, NDArray[Any]]
 _MAX_ROWS: Final = 100_000
 _MAX_OVERLAP: Final = 0.5
-_GRAY: Final = 114  # beside a picture that is narrower or lower than the input; what YOLO was trained with
+_GRAY: Final = 114  # beside an image that is narrower or lower than the input; what YOLO was trained with
 _STEP_PX: Final = 32  # an input of any size is rounded up to this
 _TRIPLE: Final = {"boxes", "scores", "labels"}
 _MAX_LABELS: Final = 1000
@@ -31,7 +31,7 @@ _MAX_LABELS: Final = 1000
 
 @dataclass(frozen=True, slots=True)
 class Letterbox:
-    """Place of the picture in the input: `scale` input pixels for each of its own, from (`left`, `top`)."""
+    """Place of the image in the input: `scale` input pixels for each of its own, from (`left`, `top`)."""
 
     scale: float
     left: int
@@ -51,7 +51,7 @@ class ModelFormat:
     labels: tuple[str, ...]
     dtype: str = "uint8"
     batched: bool = False
-    """True if it takes several pictures at once: inputs and outputs leave the number open."""
+    """True if it takes several images at once: inputs and outputs leave the number open."""
 
 
 def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelFormat:

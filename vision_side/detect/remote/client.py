@@ -95,7 +95,7 @@ class NoAnswerReason(StrEnum):
     NOT_FINITE = "NOT_FINITE"  # a box or score that is nan or infinite
     TOO_MANY = "TOO_MANY"  # more boxes than any scene has
     OTHER_FRAME = "OTHER_FRAME"  # it names another frame than the request
-    OTHER_SIZE = "OTHER_SIZE"  # it looked at a picture of another size
+    OTHER_SIZE = "OTHER_SIZE"  # it looked at an image of another size
     UNFIT = "UNFIT"  # its model takes or gives what this end does not speak
     BAD_PICTURE = "BAD_PICTURE"  # the robot's own frame is not a JPEG of its size: nothing was requested
 
@@ -155,7 +155,7 @@ def read_columns(
 ) -> tuple[Detection, ...]:
     """Boxes (K, 4) xyxy, scores (K,) and labels (K) as detections, best first, at most as many as the wire allows.
 
-    `stretch` turns the boxes' pixels into those of the encoded picture. Rows below `min_score` are left out and
+    `stretch` turns the boxes' pixels into those of the encoded image. Rows below `min_score` are left out and
     may hold anything finite. Raises NoAnswerError for a wrong shape or order, too many rows, and what is not finite.
     """
     _check_shapes(boxes, scores, labels)
@@ -189,7 +189,7 @@ def _detection(
 
 
 def read_boxes(boxes: Sequence[DetectedBox], size_px: tuple[int, int], min_score: float) -> tuple[Detection, ...]:
-    """Boxes of the wire, which checked each by itself, as detections in the picture, best first."""
+    """Boxes of the wire, which checked each by itself, as detections in the image, best first."""
     found = [clipped(_of_wire(box), *size_px) for box in boxes if box.score >= min_score]
     return tuple(sorted((one for one in found if one), key=lambda one: one.score, reverse=True))
 

@@ -63,7 +63,7 @@ class DeadlineDetector:
     waits: ClassVar[bool] = True
 
     def __init__(self, inner: Detector, max_pixels: int = MAX_PIXELS) -> None:
-        """Security limit: pictures of more than `max_pixels` are not decoded."""
+        """Security limit: images of more than `max_pixels` are not decoded."""
         self._inner = inner
         self._decoders = DecoderPool(max_pixels)
         self._failed: Counter[str] = Counter()

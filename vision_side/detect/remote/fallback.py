@@ -19,7 +19,7 @@ from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, DeadlineDet
 GOOD_ANSWERS: Final = 10
 """In a row; a third of a second at 30 fps."""
 RESERVE_US: Final = 20_000
-"""Part of a deadline for the local detector, half of it at most: several times what it needs for one picture."""
+"""Part of a deadline for the local detector, half of it at most: several times what it needs for one image."""
 
 
 class Fallback:

@@ -119,7 +119,7 @@ def _unfit(name: str, why: str) -> NoAnswerError:
 
 
 def _layout(shape: tuple[int, ...]) -> tuple[int, int, bool] | None:
-    """(rows, columns, channels first) of one picture; None if nothing of it is three channels."""
+    """(rows, columns, channels first) of one image; None if nothing of it is three channels."""
     last = shape[-3:]
     if last[2] == _CHANNELS:
         return last[0], last[1], False
@@ -127,7 +127,7 @@ def _layout(shape: tuple[int, ...]) -> tuple[int, int, bool] | None:
 
 
 def tensor_of(model: OipModel, frame: DetectFrame, rgb: bool) -> tuple[OipTensor, tuple[float, float]]:
-    """Return the input for `frame`, and what turns the answer's pixels into those of the encoded picture.
+    """Return the input for `frame`, and what turns the answer's pixels into those of the encoded image.
 
     Raises WireError where the model takes pixels and the JPEG has none.
     """
