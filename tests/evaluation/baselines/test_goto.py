@@ -41,7 +41,7 @@ def drive(course: Course, goal: tuple[float, float], seconds: float, **how) -> l
     return Drive(mission(goal), course, body=THYMIO, latency_s=0.0, loss=0.0, **how).run(seconds)
 
 
-def test_the_two_laws_and_their_numbers() -> None:
+def test_baseline_has_the_numbers_of_the_legacy_controllers() -> None:
     turning = steps(mission((1.0, 1.0)), view((0, 0, 0), 0), view((0, 0, 0), 100_000))
     assert turning.twist.angular_rad_s == pytest.approx(1.2 * math.pi / 4)
     assert turning.twist.linear_mps == 0.0
@@ -51,14 +51,14 @@ def test_the_two_laws_and_their_numbers() -> None:
     assert fast.twist.linear_mps == 0.5
 
 
-def test_it_thinks_ten_times_a_second_only() -> None:
+def test_baseline_decides_ten_times_a_second() -> None:
     one = mission((1.0, 1.0))
     first = steps(one, view((0, 0, 0), 0), view((0, 0, 0), 100_000))
     assert one.step(view((0, 0, 0.5), 133_000)) == first
     assert one.step(view((0, 0, 0.5), 200_000)) != first
 
 
-def test_a_free_way_is_driven() -> None:
+def test_baseline_drives_a_free_way() -> None:
     run = drive(Course(), (1.0, 0.5), 30)
     assert run[-1].plan is not None and run[-1].plan.note == "reached 1 of 1"
     assert math.dist(run[-1].pose[:2], (1.0, 0.5)) < 0.12
@@ -71,7 +71,7 @@ def test_the_contour_is_chosen_by_the_two_middle_rays(left_m: float, right_m: fl
     assert plan.phase == phase
 
 
-def test_it_turns_away_from_a_wall_by_the_clock() -> None:
+def test_baseline_turns_away_from_a_wall_by_time() -> None:
     near = {RAY_RAD * k: 0.12 for k in range(-9, 10)}
     one = mission((1.0, 0.0))
     plan = steps(one, view((0, 0, 0), 0, near), view((0, 0, 0), 100_000, near))
@@ -88,7 +88,7 @@ def test_baseline_uses_the_readings_of_each_sensor(front_m: float, approaches: b
     assert (plan.twist.linear_mps, abs(plan.twist.angular_rad_s)) == ((0.1, 0.0) if approaches else (0.0, 1.0))
 
 
-def test_it_goes_round_a_cylinder_when_nothing_delays_it() -> None:
+def test_baseline_passes_a_cylinder_without_delay() -> None:
     run = drive(Course(posts=((0.75, 0.75, 0.2),)), (1.5, 1.5), 60)
     assert run[-1].plan is not None and run[-1].plan.phase == "arrived"
     assert math.dist(run[-1].pose[:2], (1.5, 1.5)) < 0.12

@@ -16,7 +16,7 @@ TIMES_US = st.lists(st.integers(0, 50_000), min_size=1, max_size=200)
 
 
 @given(TIMES_US, st.integers(0, 300_000), st.floats(0, 1), st.integers(0, 2**32))
-def test_what_is_not_lost_is_due_after_the_delay_and_in_order(steps_us, delay_us, loss, seed):
+def test_delivered_messages_are_due_after_the_delay_in_order(steps_us, delay_us, loss, seed):
     line, now_us, sent_us, came = DelayLine(Leg(delay_us, loss=loss), str(seed)), 0, {}, []
     for at, step_us in enumerate(steps_us):
         now_us += step_us
@@ -36,7 +36,7 @@ def test_what_is_not_lost_is_due_after_the_delay_and_in_order(steps_us, delay_us
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.1, 0.5, 1.0])
-def test_the_share_lost_is_the_share_requested_and_repeats(loss):
+def test_lost_share_matches_the_request_and_repeats(loss):
     counts = []
     for _ in range(2):
         line = DelayLine(Leg(0, loss=loss), "7")
@@ -55,7 +55,7 @@ def test_a_leg_is_bounded():
     assert line.count.overflow == 50
 
 
-def test_half_the_latency_is_on_each_leg():
+def test_each_leg_has_half_of_the_latency():
     network = MemoryNetwork()
     robot, came = network.link("r1"), threading.Event()
     robot.subscribe(TWIST, lambda _message: came.set())
@@ -77,7 +77,7 @@ def test_half_the_latency_is_on_each_leg():
         assert {leg: count.sent for leg, count in shaped.counts.items()} == {"from_robot": 1, "to_robot": 1}
 
 
-def test_a_shape_reads_what_it_writes_and_rejects_the_rest():
+def test_shape_reads_its_own_text_and_rejects_other_text():
     shape = Shape(50.5, 0.1, 3)
     assert Shape.parse(shape.text()) == shape
     for text in ("", "1,2", "a,b,c", "1,2,3,4"):

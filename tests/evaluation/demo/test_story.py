@@ -123,7 +123,7 @@ def test_frame_age_counts_from_the_newest_frame():
     assert ages == [None, 40, 190, 50, 1050], "an old frame that comes late does not make the command older"
 
 
-def test_speed_is_that_of_the_faster_wheel():
+def test_speed_comes_from_the_faster_wheel():
     rows = [MotorRow(100, 2.0, -8.0, 0, 0), MotorRow(200, 0.0, 0.0, 0, 0)]
     assert [round(st.speed_mps(rows, at), 3) for at in (99, 100, 199, 200)] == [0.0, 0.28, 0.28, 0.0]
 
@@ -312,7 +312,7 @@ def test_naive_robot_repeats_its_last_command_forever():
     assert devices.given[5:] == [(0.0, 0.0)], "only its end stops the wheels"
 
 
-def test_naive_robot_sends_frames_with_what_it_applies(scene):
+def test_naive_robot_sends_frames_with_its_applied_twist(scene):
     link, devices = FakeLink(), FakeDevices()
     devices.model = scene[1].camera.camera_model()
     robot = NaiveRobot(link, devices, devices)

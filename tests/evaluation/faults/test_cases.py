@@ -67,7 +67,7 @@ def commands(until_us, age_us=5_000):
 
 
 @given(st.integers(1, 60), st.integers(1, 30), st.integers(0, 4))
-def test_a_stop_is_measured_where_it_is(plateau, ramp, lag_rows):
+def test_stop_is_measured_at_its_time(plateau, ramp, lag_rows):
     rows = log(drive_and_stop(plateau, ramp), lag_rows)
     stop = measure_stop(rows, since_us=0)
     assert stop.falls_ms == plateau * 20
@@ -118,16 +118,16 @@ def test_a_log_is_read_without_its_unfinished_line():
 # --- old frames --------------------------------------------------------------------------------------------------
 
 
-def test_driving_on_young_frames_is_allowed():
+def test_driving_on_young_frames_is_not_counted():
     assert moved_on_old_sight(log(drive_and_stop()), commands(900_000), None) == 0
 
 
-def test_driving_on_for_ever_is_not():
+def test_driving_on_without_a_young_frame_is_counted():
     rows = log([0.5] * 150)
     assert moved_on_old_sight(rows, commands(1_000_000), None) > 70
 
 
-def test_gaining_speed_on_an_old_frame_is_not_even_within_the_ramp():
+def test_gaining_speed_on_an_old_frame_is_counted_within_the_ramp():
     speeds = [0.3] * 50 + [0.3 - 0.01 * k for k in range(20)] + [0.15] + [0.0] * 30
     last_us = (50 + 20 - 22) * TICK_US
     assert moved_on_old_sight(log(speeds), commands(last_us, age_us=0), None) == 1
@@ -140,7 +140,7 @@ def test_commands_while_blind_permit_nothing_until_frames_are_fresh():
     assert moved_on_old_sight(rows, sent, Blind(1_000_000, 1_200_000)) == 0
 
 
-def test_a_picture_under_way_when_pictures_are_cut_off_may_still_be_answered():
+def test_image_in_flight_at_the_cut_may_be_answered():
     rows = log([0.5] * 51 + [0.5 - 0.02 * k for k in range(25)] + [0.0] * 40)
     sent = [*commands(900_000), SentCommand(1_090_000, 990_000)]
     assert moved_on_old_sight(rows, sent, Blind(1_000_000)) > 0
@@ -149,7 +149,7 @@ def test_a_picture_under_way_when_pictures_are_cut_off_may_still_be_answered():
     assert last_valid_us(sent, Blind(1_000_000)) <= 1_000_000
 
 
-def test_where_something_failed_the_whole_run_must_have_been_undisturbed():
+def test_failed_check_extends_the_watched_time_to_the_whole_run():
     good, bad = at_most("zero", 1.0, "ms", 2.0), at_most("zero", 3.0, "ms", 2.0)
     assert watched_us([good, bad]) > 60_000_000 > watched_us([good])
 
@@ -173,7 +173,7 @@ def test_the_hardest_change_is_found(gain_mps2):
 # --- what the bench's own processes note -------------------------------------------------------------------------
 
 
-def test_a_ledger_is_read_as_it_was_written_and_a_torn_line_is_left_out(tmp_path):
+def test_event_log_is_read_without_a_torn_line(tmp_path):
     path = tmp_path / "a.ledger"
     ledger = EventLog(path)
     ledger.note(GOOD, 7)
@@ -192,16 +192,16 @@ def test_only_holes_in_the_window_spoil_a_row(tmp_path):
 
 
 @pytest.mark.parametrize("text", [*MALFORMED, *OVERSIZED], ids=lambda text: repr(text[:12]))
-def test_what_is_sent_as_malformed_is(text):
+def test_malformed_messages_are_malformed(text):
     with pytest.raises(WireError):
         parse_twist(text)
 
 
-def test_the_oversized_are_beyond_the_channel():
+def test_oversized_messages_exceed_the_channel_bound():
     assert all(len(text) > TWIST.max_payload_bytes for text in OVERSIZED)
 
 
-def test_the_cameras_spare_pictures_are_what_they_are_called(tmp_path):
+def test_spare_images_have_the_defects_of_their_names(tmp_path):
     camera.write_spares(tmp_path)
     for name in ("black", "resized"):
         size = read_jpeg_size((tmp_path / f"{name}.jpg").read_bytes())
@@ -261,7 +261,7 @@ def test_the_worst_run_is_reported(values):
     assert worst.value == expected
 
 
-def test_a_failure_outweighs_a_larger_figure_and_less_injected_is_worse():
+def test_failure_outranks_a_larger_figure_and_less_injection_is_worse():
     few, many = (FaultOutcome(CASES[0], (Check("injected", value, "times", 1, value >= 1),)) for value in (1.0, 50.0))
     assert worst_checks([many.checks, few.checks])[0].value == 1.0
 

@@ -27,7 +27,7 @@ def test_gaps_are_those_between_motor_commands():
         (Hole(0, 100_000), []),
     ],
 )
-def test_a_gap_in_which_the_machine_stood_still_is_left_out(hole, left):
+def test_gap_during_a_machine_stall_is_ignored(hole, left):
     assert undisturbed_gaps_us(motors([0, 20_000, 40_000, 60_000]), [hole])[: len(left)] == left
     assert len(undisturbed_gaps_us(motors([0, 20_000, 40_000, 60_000]), [hole])) == {0: 0, 1: 1, 2: 2}[len(left)]
 

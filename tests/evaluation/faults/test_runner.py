@@ -46,7 +46,7 @@ def overlaps(one, other):
     return one[0] < other[1] and other[0] < one[1]
 
 
-def test_the_results_stand_in_the_order_of_the_rows_and_each_run_is_reported(bench):
+def test_results_have_the_order_of_the_rows_and_report_each_run(bench):
     told = []
     rows = [row("a"), row("b"), row("c")]
     results = run_cases(rows, 2, bench, 2, lambda outcome, progress: told.append((outcome.row.id, progress)))
@@ -64,7 +64,7 @@ def test_number_of_parallel_runs_equals_jobs(bench):
         assert sum(begin < moment < end for begin, end in everything) <= 2
 
 
-def test_a_row_that_wants_the_machine_alone_gets_it_last(bench):
+def test_row_that_needs_the_whole_machine_runs_last_and_alone(bench):
     run_cases([row("alone", alone=True), row("a"), row("b")], 2, bench, 3, lambda *_: None)
     (first, second), others = spans(bench, "alone"), spans(bench, "a") + spans(bench, "b")
     assert not overlaps(first, second) and first[0] > max(end for _, end in others)
@@ -77,7 +77,7 @@ def test_skipped_frame_is_logged_once(bench):
     assert told == [1, 2, 3, 4, 5]
 
 
-def test_a_row_whose_own_process_dies_fails_and_ends_nothing_else(bench):
+def test_row_whose_process_dies_fails_without_ending_others(bench):
     died, well = run_cases([row("dies"), row("a")], 1, bench, 1, lambda *_: None)
     assert "ended" in died[0].trouble and not died[0].ok and well[0].ok
 
