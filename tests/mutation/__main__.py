@@ -26,6 +26,7 @@ TABLES = {
     "robot_side/safety/states.py": _GATE,
     "robot_side/kinematics.py": ("tests/robot_side/test_kinematics.py",),
     "robot_side/network/core.py": ("tests/robot_side/network/test_core.py",),
+    "robot_side/network/stream.py": ("tests/robot_side/network/test_credit.py",),
     "robot_side/network/congestion_window.py": ("tests/robot_side/network/test_congestion_window.py",),
     "protocol/text.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
     "protocol/jpeg.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),

@@ -226,6 +226,8 @@ def test_same_model_is_found_without_a_comparison_of_its_fields():
         def __eq__(self, other):
             raise AssertionError("compared")
 
+        __hash__ = CameraModel.__hash__
+
     core, model = core_of(), Model(**MODEL.model_dump())
     assert core.announce_camera(model, 0) is not None
     assert core.announce_camera(model, 1) is None
