@@ -28,6 +28,12 @@ TABLES = {
     "robot_side/network/core.py": ("tests/robot_side/network/test_core.py",),
     "robot_side/network/stream.py": ("tests/robot_side/network/test_credit.py",),
     "robot_side/network/congestion_window.py": ("tests/robot_side/network/test_congestion_window.py",),
+    "vision_side/tracking/prediction.py": ("tests/vision_side/tracking/test_prediction.py",),
+    "vision_side/tracking/track.py": ("tests/vision_side/tracking/test_track.py",),
+    "vision_side/tracking/steering.py": (
+        "tests/vision_side/tracking/test_search.py",
+        "tests/vision_side/tracking/test_steer.py",
+    ),
     "protocol/text.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
     "protocol/jpeg.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
 }

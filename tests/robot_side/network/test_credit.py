@@ -1,5 +1,7 @@
 """The stream's credit, step by step: when a frame may leave, whose answer counts, what an answer measures, timeouts."""
 
+from typing import ClassVar
+
 import pytest
 from pydantic import ValidationError
 
@@ -54,7 +56,7 @@ def test_new_owner_of_the_credit_begins_with_one_frame_in_flight(silent):
 class NotedWindow:
     """Stands for the congestion window: `frames` in flight, and what reached it."""
 
-    made = []
+    made: ClassVar = []
 
     def __init__(self, interval_us, most):
         self.given = (interval_us, most)
