@@ -19,14 +19,16 @@ class PluginChoice(Config):
     """A device: `kind` is the name of an entry point or `package.module:Name`; `options` are for its own `Config`."""
 
     kind: str
+    """Name in the table of devices, entry point, or `package.module:Name`."""
     options: dict[str, Any] = Field(default_factory=dict)
+    """Options of the device."""
 
 
 class LegacyConfig(Config):
     """Clients of the legacy protocol. They carry no token."""
 
     allow_from: Annotated[tuple[str, ...], Field(max_length=64)] = ()
-    """Addresses and networks they may come from, e.g. 192.168.1.7 or 192.168.1.0/24; demanded beyond loopback."""
+    """Permitted addresses and networks, e.g. 192.168.1.7 or 192.168.1.0/24; required beyond loopback."""
 
     @field_validator("allow_from")
     @classmethod
@@ -43,26 +45,28 @@ class RobotConfig(Config):
     """Everything about one robot."""
 
     robot: RobotId = "r1"
+    """Robot id, unique at a router."""
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
-    """Where peers may connect. Loopback by default; a LAN address such as tcp/0.0.0.0:7447 is a decision."""
+    """Endpoints to which peers may connect; tcp/0.0.0.0:7447 opens the port to the network."""
     connect: tuple[str, ...] = ()
-    """A router or vision box to connect to, beside or instead of listening."""
+    """Router or vision service to connect to."""
     secure: str = ""
-    """A folder of `sightline keys`: mutual TLS and access rules; endpoints are then tls/... or quic/..."""
+    """Folder of `sightline keys` for mutual TLS and access rules; endpoints are then tls/... or quic/..."""
     camera: PluginChoice = PluginChoice(kind="sim")
     drive: PluginChoice = PluginChoice(kind="sim")
     range_sensor: PluginChoice | None = None
-    """None: the simulation's when the drive is the simulation's, else none; kind "none" switches it off."""
+    """Range sensor; default: that of the simulation with a simulated drive, else none. Kind "none" switches it off."""
     battery: PluginChoice | None = None
-    """None: the robot does not measure its battery, and nothing depends on it."""
+    """Battery sensor; without one the robot does not measure its battery."""
     legacy: LegacyConfig = LegacyConfig()
     safety: SafetyConfig = SafetyConfig()
     guard: GuardConfig = GuardConfig()
     wheels: DiffDriveConfig = DiffDriveConfig()
     stream: StreamConfig = StreamConfig()
     max_frame_bytes: Annotated[int, Field(ge=1_000, le=1_000_000)] = 400_000
+    """Security limit: the robot does not send larger images."""
     state_dir: Path = Path("~/.local/state/sightline")
-    """Where the STOP latch is kept over restarts."""
+    """Folder that stores the STOP latch over restarts."""
 
     @property
     def doors(self) -> tuple[str, ...]:

@@ -16,8 +16,11 @@ class DiffDriveConfig(Config):
     """Geometry of a two-wheeled robot. The defaults are the Raspberry Pi class robot of the simulation."""
 
     wheel_radius_m: Annotated[float, Field(gt=0.005, lt=1.0)] = 0.035
+    """Radius of the driven wheels."""
     track_width_m: Annotated[float, Field(gt=0.02, lt=3.0)] = 0.174
+    """Distance between the two driven wheels."""
     max_wheel_rad_s: Annotated[float, Field(gt=0.1, lt=500.0)] = 22.0
+    """Highest wheel speed; a faster twist is scaled so that its curve stays."""
 
 
 def wheel_speeds(drive: DiffDriveConfig, twist: Twist) -> tuple[float, float]:

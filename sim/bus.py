@@ -56,6 +56,7 @@ class SimSocketConfig(Config):
     """Address of the simulation."""
 
     socket_dir: Annotated[str, Field(min_length=1, max_length=90)] = Field(default_factory=default_socket_dir)
+    """Folder of the sockets between the simulation and the robot."""
 
 
 class BusConnection:

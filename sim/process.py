@@ -285,10 +285,11 @@ class SimConfig(SimSocketConfig):
     robot: str = ""
     """A name (`sim/robots/`) or the path of a `.toml` file; empty for the one that the scenario names."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """Seed of the start and the noise."""
     motor_log: str | None = None
-    """CSV of every motor command, stamped on receipt."""
+    """CSV file of every motor command, with its arrival time."""
     seconds: Annotated[float, Field(gt=0)] | None = None
-    """End by itself after this long."""
+    """The simulation ends after this time."""
 
 
 class Simulation:

@@ -32,15 +32,17 @@ class HsvConfig(Config):
     ranges: Annotated[tuple[HsvRange, ...], Field(min_length=1, max_length=8)] = (
         HsvRange(hue_low_deg=36, hue_high_deg=68, saturation_low=0.5),
     )
+    """Colors of the target; hue 0 to 360, saturation and value 0 to 1. From a high to a low hue means through red."""
     shape: Literal["disc", "any"] = "disc"
-    """`any`: whatever has the color, e.g. a box; its range then follows from `boxes.height_m` or `boxes.width_m`."""
+    """`disc`: round objects. `any`: each object of the color; its range follows from `boxes.height_m` or `width_m`."""
     min_radius_px: Annotated[float, Field(gt=1, le=200)] = 3.0
+    """Radius of the smallest target in the image."""
     max_contours: Annotated[int, Field(ge=1, le=256)] = 16
-    """Security limit: no more blobs than this are measured in one image, the longest outlines first."""
+    """Security limit: most blobs that the detector measures in one image, the longest outlines first."""
     max_roughness: Annotated[float, Field(gt=0, le=0.5)] = 0.07
     """RMS distance of the outline from a circle, in radii; a square has 0.10."""
     min_outline_kept: Annotated[float, Field(ge=0.2, le=1)] = 0.55
-    """Share of the outline that must lie on the circle; the rest may be cut off by something in front."""
+    """Share of the outline that must lie on the circle; an object in front may hide the rest."""
 
 
 Device = Literal["auto", "cpu", "cuda", "tensorrt"]
@@ -52,26 +54,28 @@ class DetectorConfig(Config):
 
     renamed_keys: ClassVar[Mapping[str, str]] = {"only_colour": "only_color"}
     kind: Annotated[str, Field(min_length=1, max_length=256)] = "hsv"
-    """A name, or `package.module:Name`; what follows a colon is the detector's own: onnx:ball.onnx, oip+http://..."""
+    """A name, or `package.module:Name`; a file or address follows a colon: onnx:ball.onnx, oip+http://..."""
     options: dict[str, Any] = Field(default_factory=dict)
-    """For the detector's own `Config`."""
+    """Options of the detector."""
     device: Device = "auto"
+    """Device of a model: auto, cpu, cuda or tensorrt; only auto accepts another device."""
     deadline_s: Annotated[float, Field(ge=0.005, le=1)] = 0.1
     """Deadline of a remote detector. After it, the robot already slows down, so a later answer does not count."""
     labels: Annotated[tuple[str, ...], Field(max_length=64)] = ()
     """Only detections with one of these labels count, and `target` of the color detectors; empty for all."""
     only_color: bool = False
-    """Only detections that are mostly of the colors of `hsv.ranges` count.
+    """Only detections mostly of the colors of `hsv.ranges` count.
 
     The model finds balls, the color selects one.
     """
     tracked: bool = False
-    """Give what is found in one frame after the other the same `track_id`."""
+    """Give an object the same `track_id` from frame to frame."""
     fallback: Annotated[str, Field(max_length=256)] = ""
-    """The detector that drives on while the other does not answer; empty for none, and the robot holds."""
+    """Detector that steers while the other gives no answer; empty: the robot holds."""
     shadow: Annotated[str, Field(max_length=256)] = ""
-    """A second detector that looks at the same frames, is compared and never steers."""
+    """Second detector on the same frames, for comparison; it never steers."""
     shadow_options: dict[str, Any] = Field(default_factory=dict)
+    """Options of the shadow."""
 
 
 class BoxesConfig(Config):
@@ -81,30 +85,35 @@ class BoxesConfig(Config):
     """
 
     source: Source = "guest"
-    """Whose boxes."""
+    """Source of the boxes."""
     label: Annotated[str, Field(max_length=64)] = ""
-    """The label that is meant, exactly; empty for any."""
+    """Exact label of the target; empty for any."""
     min_score: Fraction = 0.25
+    """Boxes below this score do not count."""
     height_m: Annotated[float | None, Field(gt=0.01, le=10)] = None
-    """How tall the thing is; its range follows from it while top and bottom are in view."""
+    """Height of the object, for its range while top and bottom are in view."""
     width_m: Annotated[float | None, Field(gt=0.01, le=10)] = None
-    """How wide it is, for when the height is not given or not in view."""
+    """Width of the object, for its range without the height."""
 
 
 class MissionConfig(Config):
     """The mission: its name or `package.module:Name`. `options` are for its own `Config`."""
 
     kind: Annotated[str, Field(min_length=1, max_length=64)] = "follow"
+    """Name of the mission, or `package.module:Name`."""
     options: dict[str, Any] = Field(default_factory=dict)
+    """Options of the mission."""
 
 
 class TargetConfig(Config):
     """The target and its distance."""
 
     radius_m: Annotated[float, Field(gt=0.005, le=2)] = 0.1
+    """Radius of the ball."""
     stand_off_m: Annotated[float, Field(gt=0.1, le=10)] = 0.8
     """Distance to keep from the lens to the target's center, over the floor."""
     max_range_m: Annotated[float, Field(gt=0.2, le=50)] = 6.0
+    """Detections further away do not count."""
     label: Annotated[str, Field(max_length=64)] = ""
     """Label of the target. Empty selects any detection except traffic lights and legs."""
 
@@ -113,37 +122,46 @@ class TrackConfig(Config):
     """Memory of the target in the odometry frame."""
 
     acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 0.35
-    """How hard the target is expected to change its velocity (1 sigma); more follows faster and smooths less."""
+    """Expected acceleration of the target (1 sigma); a higher value follows faster and smooths less."""
     range_noise: Annotated[float, Field(gt=0, le=1)] = 0.008
     """1 sigma of one position measured at one meter, in meters; grows with the square of the distance."""
     gate_m: Annotated[float, Field(gt=0, le=5)] = 0.35
-    """A sighting further than this from where the target should be is another object ..."""
+    """A detection further than this from the expected position is another object."""
     gate_growth_mps: Annotated[float, Field(ge=0, le=10)] = 1.5
-    """... and the gate widens by this for every second without a sighting."""
+    """Growth of this gate while the target is not detected."""
     coast_s: Annotated[float, Field(ge=0, le=5)] = 0.5
-    """Without a sighting, drive on for this long where the target should be; then only turn toward it."""
+    """Time without a detection in which the robot drives to the expected position; then it only turns."""
     give_up_s: Annotated[float, Field(gt=0, le=10)] = 1.2
-    """Without a sighting for this long the target is lost, and nothing of it is kept but its side."""
+    """Time without a detection after which the target is lost; only its side is stored."""
     confirm: Annotated[int, Field(ge=1, le=30)] = 2
-    """Sightings before the robot drives toward it; it turns at once."""
+    """Detections before the robot drives toward a target; it turns immediately."""
 
 
 class SteerConfig(Config):
     """Bearing and distance controllers. Gains are per second; kp times latency never exceeds `max_gain_latency`."""
 
     bearing_kp: Annotated[float, Field(gt=0, le=20)] = 6.0
+    """Proportional gain of the bearing, 1/s."""
     bearing_ki: Annotated[float, Field(ge=0, le=20)] = 1.5
+    """Integral gain of the bearing, 1/s2."""
     distance_kp: Annotated[float, Field(gt=0, le=10)] = 3.0
+    """Proportional gain of the distance, 1/s."""
     distance_ki: Annotated[float, Field(ge=0, le=10)] = 0.3
+    """Integral gain of the distance, 1/s2."""
     max_gain_latency: Annotated[float, Field(gt=0, le=0.9)] = 0.9
+    """Highest product of a proportional gain and the latency; a higher one oscillates."""
     max_linear_mps: Annotated[float, Field(gt=0, le=5)] = 0.5
+    """Highest requested speed."""
     max_reverse_mps: Annotated[float, Field(ge=0, le=5)] = 0.3
+    """Highest requested speed backward."""
     max_angular_rad_s: Annotated[float, Field(gt=0, le=10)] = 2.5
+    """Highest requested turn rate."""
     integral_linear_mps: Annotated[float, Field(ge=0, le=1)] = 0.05
-    """Bound of the distance integral: what wheel and friction errors need, no more."""
+    """Bound of the distance integral, enough for wheel and friction errors."""
     integral_angular_rad_s: Annotated[float, Field(ge=0, le=2)] = 0.05
+    """Bound of the bearing integral."""
     back_calculation_hz: Annotated[float, Field(ge=0, le=50)] = 5.0
-    """How fast an integral gives way to what the robot did not carry out."""
+    """Rate at which an integral shrinks by the part of the command that the robot did not apply."""
     drive_within_rad: Annotated[float, Field(gt=0, le=1.5)] = 0.9
     """Forward speed fades to zero as the bearing grows to this."""
 
@@ -152,36 +170,49 @@ class LatencyConfig(Config):
     """The delay from capture to wheels. Prefer a low value: too low is slow, too high is unstable."""
 
     first_guess_s: Annotated[float, Field(ge=0, le=0.5)] = 0.03
+    """Latency before the first measurement."""
     max_s: Annotated[float, Field(gt=0, le=1)] = 0.4
+    """Highest latency that counts."""
     smoothing_s: Annotated[float, Field(gt=0, le=10)] = 0.5
+    """Time constant of the smoothing."""
     actuation_s: Annotated[float, Field(ge=0, le=0.3)] = 0.03
-    """From an accepted command to wheels that follow it; the robot cannot measure this part."""
+    """Time from an accepted command to the motion of the wheels; the robot cannot measure this part."""
     linear_acceleration_mps2: Annotated[float, Field(gt=0, le=50)] = 2.0
+    """Acceleration limit of the robot, for the prediction of commands in flight."""
     angular_acceleration_rad_s2: Annotated[float, Field(gt=0, le=200)] = 10.0
-    """The robot's own limits, for the prediction of where the commands in flight will take it."""
+    """Angular acceleration limit of the robot, for the same prediction."""
 
 
 class SearchConfig(Config):
-    """Turning on the spot after "saw nothing"; bounded by time spent turning and by angle."""
+    """Turning on the spot after an image without the target, bounded by time and by angle."""
 
     enabled: bool = True
+    """True to search for a lost target."""
     rate_rad_s: Annotated[float, Field(gt=0, le=1.2)] = 1.2
+    """Turn rate of the search."""
     max_turn_rad: Annotated[float, Field(gt=0, le=50)] = 14.0
+    """The search ends after this angle."""
     max_turning_s: Seconds = 20.0
+    """The search ends after this time of turning."""
     after_s: Annotated[float, Field(ge=0, le=10)] = 0.2
-    """Images without the target must last this long before the robot turns for it."""
+    """Time without the target before the search starts."""
 
 
 class ViewingConfig(Config):
     """The channels `overlay` and `preview` for viewers."""
 
     overlay_hz: Annotated[float, Field(gt=0, le=60)] = 15.0
+    """Most overlay images per second."""
     overlay_width_px: Annotated[int, Field(ge=160, le=1920)] = 640
-    """However wide the camera's images are: the words drawn into it must be legible."""
+    """Width of the overlay for any camera, so that its text is legible."""
     overlay_quality_percent: Annotated[int, Field(ge=20, le=95)] = 80
+    """JPEG quality of the overlay."""
     preview_hz: Annotated[float, Field(gt=0, le=60)] = 10.0
+    """Most preview images per second."""
     preview_width_px: Annotated[int, Field(ge=64, le=640)] = 320
+    """Greatest width of the preview."""
     preview_quality_percent: Annotated[int, Field(ge=20, le=95)] = 60
+    """JPEG quality of the preview."""
 
 
 def _camera_of_file(value: Any) -> Any:
@@ -193,21 +224,23 @@ class VisionConfig(Config):
     """The vision service."""
 
     robot: Annotated[str, Field(pattern=r"^[A-Za-z0-9*?][A-Za-z0-9_.*?-]{0,31}$")] = "r1"
-    """A robot's id; with `*` or `?` every robot that fits, each with a pipeline of its own."""
+    """Robot id; with `*` or `?` every robot that matches, each with a separate pipeline."""
     connect: Annotated[tuple[str, ...], Field(max_length=16)] = (DEFAULT_ENDPOINT,)
+    """Robot or router to connect to."""
     listen: Annotated[tuple[str, ...], Field(max_length=16)] = ()
+    """Endpoints to which robots may connect."""
     secure: str = ""
-    """A folder of `sightline keys`: mutual TLS and access rules; endpoints are then tls/... or quic/..."""
+    """Folder of `sightline keys` for mutual TLS and access rules; endpoints are then tls/... or quic/..."""
     max_frame_bytes: Annotated[int, Field(ge=1_000, le=FRAME.max_payload_bytes)] = 400_000
     """Security limit: the link rejects larger frames."""
     max_pixels: Annotated[int, Field(ge=256, le=4096 * 4096)] = 1920 * 1080
-    """Security limit: larger images are never decoded."""
+    """Security limit: the vision service does not decode larger images."""
     detector: DetectorConfig = DetectorConfig()
     hsv: HsvConfig = HsvConfig()
     boxes: BoxesConfig = BoxesConfig()
     mission: MissionConfig = MissionConfig()
     missions: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """Options by the name of the mission, for those that may be requested while vision runs, e.g. missions.goto."""
+    """Options of other missions by name, for a later request, e.g. `missions.goto`."""
     target: TargetConfig = TargetConfig()
     track: TrackConfig = TrackConfig()
     steer: SteerConfig = SteerConfig()

@@ -4,11 +4,15 @@
     python -m docs.make.reference --check    # print the pages that are not current; exit code 5 if there is one
 """
 
+import ast
 import inspect
+import itertools
 import json
 import math
+import os
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -142,6 +146,7 @@ def rejections_page() -> str:
 def setting_rows(config: Config, prefix: str = "") -> Iterator[str]:
     """Yield one table row per key of a configuration: key, default, allowed values, meaning."""
     properties = type(config).model_json_schema()["properties"]
+    meanings = attribute_docstrings(type(config))
     for name, field in type(config).model_fields.items():
         value = getattr(config, name)
         if isinstance(value, Config):
@@ -149,7 +154,22 @@ def setting_rows(config: Config, prefix: str = "") -> Iterator[str]:
             continue
         schema: Bounds = properties.get(field.alias or name, {})
         allowed = " ".join(f"{word} {schema[bound]:g}" for bound, word in WORDS.items() if bound in schema)
-        yield f"| `{prefix}{name}` | `{cell(_plain(value))}` | {allowed} | {cell(schema.get('description', ''))} |"
+        meaning = meanings.get(name) or schema.get("description", "")
+        yield f"| `{prefix}{name}` | `{cell(_plain(value))}` | {allowed} | {cell(meaning)} |"
+
+
+def attribute_docstrings(model: type[Config]) -> dict[str, str]:
+    """Return the first paragraph of the docstring below each field of a model and of its bases."""
+    found: dict[str, str] = {}
+    for one in reversed([base for base in model.__mro__ if issubclass(base, Config) and base is not Config]):
+        [definition] = ast.parse(textwrap.dedent(inspect.getsource(one))).body
+        assert isinstance(definition, ast.ClassDef)
+        for field, text in itertools.pairwise(definition.body):
+            if (isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name) and isinstance(text, ast.Expr)
+                    and isinstance(text.value, ast.Constant) and isinstance(text.value.value, str)):
+                paragraph = inspect.cleandoc(text.value.value).partition("\n\n")[0]
+                found[field.target.id] = paragraph.replace("\n", " ").removesuffix(".")
+    return found
 
 
 def _plain(value: Any) -> str:
@@ -158,7 +178,8 @@ def _plain(value: Any) -> str:
         value = value.model_dump(mode="json", exclude_unset=True)
     if isinstance(value, list | tuple) and value and hasattr(value[0], "model_dump"):
         value = [one.model_dump(mode="json") for one in value]
-    return "not set" if value is None else json.dumps(value, default=str, ensure_ascii=False)
+    text = "not set" if value is None else json.dumps(value, default=str, ensure_ascii=False)
+    return text.replace(f"sightline-sim-{os.getuid()}", "sightline-sim-UID")  # the page is the same for every user
 
 
 def settings_page() -> str:

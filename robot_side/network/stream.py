@@ -29,11 +29,13 @@ class StreamConfig(Config):
     """Flow of frames."""
 
     max_fps: Annotated[float, Field(gt=0, le=240)] = 30.0
+    """Most frames per second."""
     max_window: Annotated[int, Field(ge=1, le=32)] = 12
     """Most frames in flight."""
     max_credit_timeout_ms: Annotated[int, Field(ge=20, le=5_000)] = 500
+    """Longest wait for an answer before the credit of a frame returns."""
     owner_life_ms: Annotated[int, Field(ge=100, le=10_000)] = 1_000
-    """Silence after which another peer's answers may return credit."""
+    """Silence after which the answers of another peer may return credit."""
     adapt: bool = True
     """True to reduce quality and size of the images on a slow link, if the camera can follow."""
 

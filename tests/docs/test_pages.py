@@ -157,6 +157,12 @@ def test_generated_pages_are_current():
     assert reference.stale() == [], "run `python -m docs.make.reference`"
 
 
+def test_every_setting_has_a_meaning():
+    page = (DOCS / "reference" / "settings.md").read_text("utf-8")
+    rows = [row for row in page.splitlines() if row.startswith("| `")]
+    assert len(rows) > 100 and [row for row in rows if row.endswith("|  |")] == []
+
+
 def test_every_reason_and_exit_code_is_described():
     assert set(reference.REMEDIES) == set(reference.RejectReason)
     page = (DOCS / "reference" / "exit-codes.md").read_text("utf-8")

@@ -251,7 +251,7 @@ def test_delay_before_any_measurement_is_not_a_queue():
 
 @pytest.mark.parametrize("held", [0, 1, 2])
 def test_queue_needs_one_frame_that_was_due_before_there_was_credit(held):
-    """Where the camera was never kept waiting, delays are only jitter."""
+    """Delays are only jitter if the camera never waited."""
     window = Window(most=1)
     window.alone()
     full = [window.answer(185_000, gap_us=100_000, held_back=number < held) for number in range(2)]

@@ -66,7 +66,7 @@ def test_only_the_time_of_turning_counts(applied_rad_s, counts):
     assert [turns(search, 0.0, 0.125, (0.2, applied_rad_s)) for _ in range(5)] == [True] * 3 + [not counts] * 2
 
 
-def test_time_at_rest_is_no_time_of_turning():
+def test_time_at_rest_does_not_count_as_turning():
     search = Search(SearchConfig(after_s=0.0, max_turning_s=0.5))
     for _ in range(60):
         assert turns(search, 0.0, 0.125, (0.0, 0.0))
