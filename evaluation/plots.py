@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.patches import Circle
 
-ROBOT_COLOUR, TARGET_COLOUR, WALL_COLOUR = "tab:blue", "goldenrod", "0.55"
+ROBOT_COLOR, TARGET_COLOR, WALL_COLOR = "tab:blue", "goldenrod", "0.55"
 LIGHT_DRAWN_M = 0.06
 STATE_COLORS: Final = {
     "ACTIVE": "tab:green", "DEGRADED": "gold", "HOLD": "tab:orange", "STOPPED": "tab:red", "FAULT": "tab:red",
@@ -86,19 +86,19 @@ def wall_corners(wall: Wall) -> list[tuple[float, float]]:
 
 def _plot_ways(axes: "Axes", samples: Sequence[Truth], scenario: Scenario) -> None:
     for number, wall in enumerate(scenario.walls):
-        axes.fill(*zip(*wall_corners(wall), strict=True), color=WALL_COLOUR, label="" if number else "wall")
+        axes.fill(*zip(*wall_corners(wall), strict=True), color=WALL_COLOR, label="" if number else "wall")
     _plot_things(axes, scenario)
     if scenario.target.shape != "place":
-        axes.plot([t.target_x_m for t in samples], [t.target_y_m for t in samples], color=TARGET_COLOUR, label="target")
-    axes.plot([t.x_m for t in samples], [t.y_m for t in samples], color=ROBOT_COLOUR, label="robot")
+        axes.plot([t.target_x_m for t in samples], [t.target_y_m for t in samples], color=TARGET_COLOR, label="target")
+    axes.plot([t.x_m for t in samples], [t.y_m for t in samples], color=ROBOT_COLOR, label="robot")
     start, end = samples[0], samples[-1]
-    axes.plot(start.x_m, start.y_m, "o", color=ROBOT_COLOUR, label="start of the robot", linestyle="none")
+    axes.plot(start.x_m, start.y_m, "o", color=ROBOT_COLOR, label="start of the robot", linestyle="none")
     axes.annotate(
         "", (end.x_m + 0.15 * math.cos(end.yaw_rad), end.y_m + 0.15 * math.sin(end.yaw_rad)), (end.x_m, end.y_m),
-        arrowprops={"arrowstyle": "-|>", "color": ROBOT_COLOUR},
+        arrowprops={"arrowstyle": "-|>", "color": ROBOT_COLOR},
     )
     if scenario.target.shape != "place":
-        axes.add_patch(_circle((end.target_x_m, end.target_y_m), scenario.target.reach_m, TARGET_COLOUR))
+        axes.add_patch(_circle((end.target_x_m, end.target_y_m), scenario.target.reach_m, TARGET_COLOR))
     axes.set(xlabel="x (m)", ylabel="y (m)", title="from above")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(visible=True, color="0.92", linewidth=0.6)
@@ -125,11 +125,11 @@ def _plot_things(axes: "Axes", scenario: Scenario) -> None:
     """Draw what stands about, but for what the seed moved it by; waypoints; the light and its line."""
     standing = [thing for thing in scenario.things if isinstance(thing, Static)]
     for number, thing in enumerate(standing):
-        circle = _circle(thing.at_m, thing.reach_m, WALL_COLOUR)
+        circle = _circle(thing.at_m, thing.reach_m, WALL_COLOR)
         circle.set_label("" if number else "obstacle")
         axes.add_patch(circle)
     if scenario.goals_m:
-        axes.plot(*zip(*scenario.goals_m, strict=True), "x", color=TARGET_COLOUR, markersize=12, label="waypoint")
+        axes.plot(*zip(*scenario.goals_m, strict=True), "x", color=TARGET_COLOR, markersize=12, label="waypoint")
     if scenario.light:
         light = _circle(scenario.light.at_m, LIGHT_DRAWN_M, "black")
         light.set_label("traffic light and stop line")
@@ -138,22 +138,22 @@ def _plot_things(axes: "Axes", scenario: Scenario) -> None:
         axes.plot([line_x_m, line_x_m], [line_y_m - 0.1, line_y_m + 0.9], color="black")
 
 
-def _circle(centre: tuple[float, float], radius_m: float, colour: str) -> "Circle":
+def _circle(center: tuple[float, float], radius_m: float, color: str) -> "Circle":
     from matplotlib.patches import Circle
 
-    return Circle(centre, radius_m, color=colour)
+    return Circle(center, radius_m, color=color)
 
 
 def _plot_bearing(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
     axes.axhline(0.0, color="0.7", linewidth=1)
-    axes.plot(times_s, [math.degrees(truth.bearing_rad) for truth in samples], color=ROBOT_COLOUR)
+    axes.plot(times_s, [math.degrees(truth.bearing_rad) for truth in samples], color=ROBOT_COLOR)
     axes.set(ylabel="bearing (deg)", title="bearing of the target")
 
 
 def _plot_distance(axes: "Axes", times_s: list[float], samples: Sequence[Truth], stand_off_m: float) -> None:
     axes.axhline(stand_off_m, color="0.7", linewidth=1, label="stand-off")
-    axes.plot(times_s, [truth.distance_m for truth in samples], color=ROBOT_COLOUR)
-    axes.set(xlabel="time (s)", ylabel="distance (m)", title="distance, lens to the target's centre")
+    axes.plot(times_s, [truth.distance_m for truth in samples], color=ROBOT_COLOR)
+    axes.set(xlabel="time (s)", ylabel="distance (m)", title="distance, lens to the target's center")
     axes.legend(loc="best")
 
 
@@ -169,7 +169,7 @@ def _plot_age(axes: "Axes", samples: Sequence[Truth], statuses: Sequence[StatusA
         named.add(one.state)
         axes.axvspan(from_s, to_s, color=STATE_COLORS.get(one.state, "0.6"), alpha=0.25, linewidth=0, label=label)
     ages_ms = [math.nan if one.frame_age_us is None else one.frame_age_us / 1000 for one in during]
-    axes.plot(times_s, ages_ms, color=ROBOT_COLOUR)
+    axes.plot(times_s, ages_ms, color=ROBOT_COLOR)
     for limit_ms, style in ((limits.full_ms, "--"), (limits.zero_ms, "-")):
         axes.axhline(limit_ms, color="0.4", linewidth=1, linestyle=style)
     axes.set_ylim(0, 1.5 * limits.zero_ms)
@@ -179,13 +179,13 @@ def _plot_age(axes: "Axes", samples: Sequence[Truth], statuses: Sequence[StatusA
 
 
 def _plot_speed(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
-    axes.plot(times_s, [truth.linear_mps for truth in samples], color=ROBOT_COLOUR)
+    axes.plot(times_s, [truth.linear_mps for truth in samples], color=ROBOT_COLOR)
     axes.set(ylabel="speed (m/s)", title="speed")
 
 
 def _plot_clearance(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
     axes.axhline(0.10, color="0.7", linewidth=1, label="demanded")
-    axes.plot(times_s, [truth.clearance_m or 0.0 for truth in samples], color=ROBOT_COLOUR)
+    axes.plot(times_s, [truth.clearance_m or 0.0 for truth in samples], color=ROBOT_COLOR)
     axes.set(xlabel="time (s)", ylabel="clearance (m)", title="clearance, body to the nearest obstacle")
     axes.legend(loc="best")
 
@@ -194,8 +194,8 @@ def _plot_line(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> 
     """Plot the distance of the front beyond the line, on the color of the light."""
     axes.axhline(0.0, color="black", linewidth=1)
     ways_m = [truth.past_line_m or 0.0 for truth in samples]
-    for colour, shown in (("red", "tab:red"), ("yellow", "gold"), ("green", "tab:green")):
-        lit = [truth.light == colour for truth in samples]
+    for color, shown in (("red", "tab:red"), ("yellow", "gold"), ("green", "tab:green")):
+        lit = [truth.light == color for truth in samples]
         axes.fill_between(times_s, min(ways_m), max(ways_m), where=lit, color=shown, alpha=0.25, linewidth=0)
-    axes.plot(times_s, ways_m, color=ROBOT_COLOUR)
+    axes.plot(times_s, ways_m, color=ROBOT_COLOR)
     axes.set(xlabel="time (s)", ylabel="beyond the line (m)", title="the robot's front and the stop line")

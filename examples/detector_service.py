@@ -3,7 +3,7 @@
     python examples/detector_service.py tcp/127.0.0.1:7447 r1
     sightline vision --detector boxes --set boxes.source=detector --set boxes.height_m=0.2
 
-Put your network into `look`; this one finds the largest yellow thing by its colour. It does not drive: boxes name their
+Put your network into `look`; this one finds the largest yellow thing by its color. It does not drive: boxes name their
 frame, the vision service answers that frame, and the robot validates its age.
 """
 

@@ -40,8 +40,8 @@ class BrightestSpot:
             picture = frame.picture()
         except WireError:
             return None
-        grey = cv2.blur(cv2.cvtColor(picture.bgr, cv2.COLOR_BGR2GRAY), (9, 9))
-        _, brightest, _, (x, y) = cv2.minMaxLoc(grey)
+        gray = cv2.blur(cv2.cvtColor(picture.bgr, cv2.COLOR_BGR2GRAY), (9, 9))
+        _, brightest, _, (x, y) = cv2.minMaxLoc(gray)
         found = [self.spot(x * picture.scale, y * picture.scale, brightest)] if brightest >= self.config.least else []
         inside = [part for one in found if (part := clipped(one, frame.width_px, frame.height_px))]
         return result_of(frame, inside, WHO, (time.perf_counter_ns() - started_ns) // 1000)

@@ -340,7 +340,7 @@ MissionName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9-]{0,31}$")]
 """A name that the vision service knows, never a path to code."""
 OptionName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_.]{0,63}$")]
 OptionValue = bool | Number | Annotated[str, Field(max_length=64)]
-Metres = Annotated[float, Field(ge=-MAX_WAYPOINT_M, le=MAX_WAYPOINT_M)]
+Meters = Annotated[float, Field(ge=-MAX_WAYPOINT_M, le=MAX_WAYPOINT_M)]
 
 
 class MissionRequest(WireModel):
@@ -348,7 +348,7 @@ class MissionRequest(WireModel):
 
     id: Counter = Field(description="the requester's own count of missions; the same in a repetition")
     name: MissionName = Field(description="of the mission, as the vision service knows it")
-    waypoints: tuple[tuple[Metres, Metres], ...] = Field(
+    waypoints: tuple[tuple[Meters, Meters], ...] = Field(
         default=(), max_length=MAX_WAYPOINTS, description="x, y in the odometry frame, in order"
     )
     options: dict[OptionName, OptionValue] = Field(

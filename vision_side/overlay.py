@@ -195,9 +195,9 @@ def _write_strip(canvas: Image, lines: Sequence[StyledText], font: float, *, top
 
 def _write_line(canvas: Image, words: StyledText, y_px: int, font: float) -> None:
     x_px, end_px = 8, canvas.shape[1] - 8
-    for text, colour in words:
+    for text, color in words:
         plain = _fitting(_plain(text), end_px - x_px, font)
-        cv2.putText(canvas, plain, (x_px, y_px), _FONT, font, colour, 1, cv2.LINE_AA)
+        cv2.putText(canvas, plain, (x_px, y_px), _FONT, font, color, 1, cv2.LINE_AA)
         x_px += _width(plain + _GAP, font)
 
 
@@ -220,6 +220,6 @@ def _plain(text: str) -> str:
     return "".join(letter if " " <= letter <= "~" else "?" for letter in text)
 
 
-def _outlined(canvas: Image, text: str, at: tuple[int, int], font: float, colour: Color) -> None:
-    for shade, thickness in (((0, 0, 0), 3), (colour, 1)):
+def _outlined(canvas: Image, text: str, at: tuple[int, int], font: float, color: Color) -> None:
+    for shade, thickness in (((0, 0, 0), 3), (color, 1)):
         cv2.putText(canvas, text, at, _FONT, font, shade, thickness, cv2.LINE_AA)

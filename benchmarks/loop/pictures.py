@@ -46,8 +46,8 @@ def _picture(room: NDArray[np.uint8], number: int) -> NDArray[np.uint8]:
     angle_rad = math.tau * number / COUNT
     right, down = 0.5 + 0.1 * math.cos(angle_rad), 0.5 + 0.05 * math.sin(angle_rad)
     picture = room.copy()
-    centre = round(width_px * right), round(height_px * down)
-    cv2.circle(picture, centre, width_px // 13, _BALL_BGR, -1, cv2.LINE_AA)
+    center = round(width_px * right), round(height_px * down)
+    cv2.circle(picture, center, width_px // 13, _BALL_BGR, -1, cv2.LINE_AA)
     return picture
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, run_lockstep
-from sightline.evaluation.plots import ROBOT_COLOUR, plot_run
+from sightline.evaluation.plots import ROBOT_COLOR, plot_run
 from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.scenario_config import robot_of
 from sightline.evaluation.score.figures import (
@@ -47,7 +47,7 @@ LOOKS: Final = ("dim", "bright", "warm", "desaturated", "quality30")
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One behaviour: a scenario, and a law in place of its own if it is a baseline's."""
+    """One behavior: a scenario, and a law in place of its own if it is a baseline's."""
 
     scenario: str
     baseline: str = ""
@@ -200,7 +200,7 @@ def _slopes(times_s: Sequence[float], values: Sequence[float]) -> list[float]:
 # thymio-speeds.png: speed and acceleration over time, a column per waypoint, both laws. Shell (writes a file).
 
 
-_COLOURS = dict(zip(LAWS, (ROBOT_COLOUR, "tab:red"), strict=True))
+_COLORS = dict(zip(LAWS, (ROBOT_COLOR, "tab:red"), strict=True))
 
 
 def plot_speeds(path: Path, runs: Sequence[SpeedRun]) -> None:
@@ -224,7 +224,7 @@ def plot_speeds(path: Path, runs: Sequence[SpeedRun]) -> None:
 def _plot(axes: "Axes", runs: Sequence[SpeedRun], label: str, values: Sequence[Sequence[float]]) -> None:
     axes.axhline(0.0, color="0.7", linewidth=1)
     for run, each in zip(runs, values, strict=True):
-        axes.plot(run.times_s, each, color=_COLOURS[run.wish.law], label=run.wish.law)
+        axes.plot(run.times_s, each, color=_COLORS[run.wish.law], label=run.wish.law)
     axes.set_ylabel(label)
     axes.legend(loc="best")
 
@@ -272,7 +272,7 @@ def page_lines(
     )
     yield from _overview(rows, results, seeds)
     for row in rows:
-        yield from (_baseline if row.baseline else _behaviour)(row, results, seeds, folder)
+        yield from (_baseline if row.baseline else _behavior)(row, results, seeds, folder)
         if row == Row("thymio") and speeds:
             yield from _speeds(speeds, folder)
 
@@ -314,7 +314,7 @@ def _head(row: Row) -> Iterator[str]:
            f"mission `{row.law}`.\n")
 
 
-def _behaviour(row: Row, results: Results, seeds: Sequence[int], folder: str) -> Iterator[str]:
+def _behavior(row: Row, results: Results, seeds: Sequence[int], folder: str) -> Iterator[str]:
     yield from _head(row)
     yield "| figure | median | worst | bound | |\n|---|---:|---:|---:|---|"
     runs = [results[case] for case in row.cases(seeds)]
@@ -393,7 +393,7 @@ def _figure(value: float | None, unit: str) -> str:
     return "never" if value is None else f"{number(value)} {unit}"
 
 
-# docs/reference/results/behaviors.md: every behaviour and its baseline in lockstep. Shell (files).
+# docs/reference/results/behaviors.md: every behavior and its baseline in lockstep. Shell (files).
 #
 # An image is of the first seed. The page names the command that wrote it; no figure in it is typed by hand.
 

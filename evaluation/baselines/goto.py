@@ -14,7 +14,7 @@ from pydantic import Field
 
 from sightline.protocol.config import Config
 from sightline.protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
-from sightline.vision_side.missions.goto import Metres
+from sightline.vision_side.missions.goto import Meters
 from sightline.vision_side.missions.port import Plan, RangeScan, View
 
 _STEP_US = 100_000  # it ran at 10 Hz
@@ -28,7 +28,7 @@ _SAME_RAY_RAD = 0.2
 class GotoBaselineConfig(Config):
     """Its numbers; gains per step of 0.1 s, lengths in meters, speeds in m/s and rad/s."""
 
-    waypoints: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=1, max_length=64)]
+    waypoints: Annotated[tuple[tuple[Meters, Meters], ...], Field(min_length=1, max_length=64)]
     position_kp: float = 0.3
     position_kd: float = 0.08
     angle_kp: float = 1.2

@@ -29,7 +29,7 @@ REAL_TIME_FACTOR: Final = 1.5
 
 @dataclass(frozen=True, slots=True)
 class DemoReport:
-    """The judgement of a run."""
+    """The score of a run."""
 
     run: DemoRun
     score: Score

@@ -18,7 +18,7 @@ from sightline.sim.truth import Truth
 
 Image = NDArray[np.uint8]
 Point = tuple[int, int]
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 
 _PAPER, _WALL, _ROBOT, _TARGET = (245, 245, 245), (150, 150, 150), (180, 110, 30), (20, 170, 230)  # BGR
 _INK, _FONT = (40, 40, 40), cv2.FONT_HERSHEY_SIMPLEX
@@ -83,12 +83,12 @@ class TopView:
         outline = [self._at(truth.x_m + x * cos - y * sin, truth.y_m + x * sin + y * cos) for x, y in corners]
         cv2.fillPoly(picture, [np.array(outline, np.int32)], _ROBOT, cv2.LINE_AA, _SHIFT)
 
-    def _disc(self, picture: Image, centre: tuple[float, float], radius_m: float, colour: Colour) -> None:
+    def _disc(self, picture: Image, center: tuple[float, float], radius_m: float, color: Color) -> None:
         radius_px = max(2.0, radius_m * self._scale)
-        cv2.circle(picture, self._at(*centre), round(radius_px * 2**_SHIFT), colour, -1, cv2.LINE_AA, _SHIFT)
+        cv2.circle(picture, self._at(*center), round(radius_px * 2**_SHIFT), color, -1, cv2.LINE_AA, _SHIFT)
 
-    def _line(self, start: tuple[float, float], end: tuple[float, float], colour: Colour) -> None:
-        cv2.line(self._paper, self._at(*start), self._at(*end), colour, 1, cv2.LINE_AA, _SHIFT)
+    def _line(self, start: tuple[float, float], end: tuple[float, float], color: Color) -> None:
+        cv2.line(self._paper, self._at(*start), self._at(*end), color, 1, cv2.LINE_AA, _SHIFT)
 
     def _at(self, x_m: float, y_m: float) -> Point:
         """World to sixteenths of pixels: x right, y up."""
@@ -165,8 +165,8 @@ def _overlay(picture: Image, step: Step, scale: float) -> None:
     for one in seen.detections:
         width = 2 if one is seen.target else 1
         if one.circle is not None:
-            centre = round(one.circle.cx_px * scale), round(one.circle.cy_px * scale)
-            cv2.circle(picture, centre, round(one.circle.radius_px * scale), _BOX, width, cv2.LINE_AA)
+            center = round(one.circle.cx_px * scale), round(one.circle.cy_px * scale)
+            cv2.circle(picture, center, round(one.circle.radius_px * scale), _BOX, width, cv2.LINE_AA)
         corners = [round(value * scale) for value in (one.x1_px, one.y1_px, one.x2_px, one.y2_px)]
         cv2.rectangle(picture, (corners[0], corners[1]), (corners[2], corners[3]), _BOX, width)
     twist = step.answer.twist
@@ -176,6 +176,6 @@ def _overlay(picture: Image, step: Step, scale: float) -> None:
 
 
 def _write(picture: Image, text: str, y_px: int) -> None:
-    for colour, off_px in ((_SHADOW, 1), (_TEXT, 0)):
+    for color, off_px in ((_SHADOW, 1), (_TEXT, 0)):
         at = (12 + off_px, y_px + off_px)
-        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.7, colour, 1, cv2.LINE_AA)
+        cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.7, color, 1, cv2.LINE_AA)

@@ -177,7 +177,7 @@ function sizeFromFrameHeader(jpeg, at, maxPixels) {
   return { width_px: width, height_px: height, components };
 }
 
-/** @param {Uint8Array} bytes little-endian float32 metres @returns {number[]} */
+/** @param {Uint8Array} bytes little-endian float32 meters @returns {number[]} */
 export function decodeRanges(bytes) {
   if (bytes.length % 4 !== 0) throw new WireError("MALFORMED", "scan is no whole number of float32");
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.length);

@@ -96,7 +96,7 @@ test("keys are exact", () => {
 });
 
 test("a picture's bound can be set", () => {
-  const grey = Uint8Array.from([0xff, 0xd8, 0xff, 0xc0, 0, 11, 8, 0, 48, 0, 64, 1, 1, 0x11, 0]);
-  assert.deepEqual(readJpegSize(grey), { width_px: 64, height_px: 48, components: 1 });
-  assert.throws(() => readJpegSize(grey, 64 * 48 - 1), refusal("MALFORMED"));
+  const gray = Uint8Array.from([0xff, 0xd8, 0xff, 0xc0, 0, 11, 8, 0, 48, 0, 64, 1, 1, 0x11, 0]);
+  assert.deepEqual(readJpegSize(gray), { width_px: 64, height_px: 48, components: 1 });
+  assert.throws(() => readJpegSize(gray, 64 * 48 - 1), refusal("MALFORMED"));
 });

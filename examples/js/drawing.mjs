@@ -1,7 +1,7 @@
 /**
- * @file A drawn camera: the picture that a robot would see of a yellow ball on a grey floor, as a JPEG. Pure.
+ * @file A drawn camera: the picture that a robot would see of a yellow ball on a gray floor, as a JPEG. Pure.
  *
- * Each 8x8 block has one colour, so that a JPEG is its DC coefficients and nothing else: no transform, no AC codes.
+ * Each 8x8 block has one color, so that a JPEG is its DC coefficients and nothing else: no transform, no AC codes.
  */
 
 const WIDTH_PX = 640;
@@ -9,7 +9,7 @@ const HEIGHT_PX = 480;
 const FOCAL_PX = 400;
 const CAMERA_HEIGHT_M = 0.12;
 const BALL_RADIUS_M = 0.1;
-const COLOURS = { ball: [235, 200, 20], floor: [120, 120, 122], wall: [165, 170, 175] };
+const COLORS = { ball: [235, 200, 20], floor: [120, 120, 122], wall: [165, 170, 175] };
 const DC_COUNTS = [0, 1, 5, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0]; // T.81, table K.3
 const DC_SYMBOLS = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11];
 const DC_QUANTUM = 8; // then the coefficient of a flat block is its level
@@ -36,9 +36,9 @@ export function drawPicture(pose, ball, noise = 0) {
   const circle = projected(pose, ball);
   const [across, down] = [WIDTH_PX / 8, HEIGHT_PX / 8];
   return encodeFlat(across, down, (x, y) => {
-    if (x === 0 && y === 0) return COLOURS.wall.map((level) => level + (noise % 8));
-    if (circle !== null && Math.hypot(x * 8 + 4 - circle.x_px, y * 8 + 4 - circle.y_px) <= circle.radius_px) return COLOURS.ball;
-    return y * 8 > HEIGHT_PX / 2 ? COLOURS.floor : COLOURS.wall;
+    if (x === 0 && y === 0) return COLORS.wall.map((level) => level + (noise % 8));
+    if (circle !== null && Math.hypot(x * 8 + 4 - circle.x_px, y * 8 + 4 - circle.y_px) <= circle.radius_px) return COLORS.ball;
+    return y * 8 > HEIGHT_PX / 2 ? COLORS.floor : COLORS.wall;
   });
 }
 
@@ -57,13 +57,13 @@ function projected(pose, ball) {
 /**
  * A baseline JPEG of flat blocks.
  * @param {number} across blocks @param {number} down blocks
- * @param {(x: number, y: number) => number[]} colourOf red, green, blue of a block, 0 to 255
+ * @param {(x: number, y: number) => number[]} colorOf red, green, blue of a block, 0 to 255
  */
-export function encodeFlat(across, down, colourOf) {
+export function encodeFlat(across, down, colorOf) {
   const bits = new BitWriter();
   const last = [0, 0, 0];
   for (let block = 0; block < across * down; block += 1) {
-    levels(colourOf(block % across, Math.floor(block / across))).forEach((level, index) => {
+    levels(colorOf(block % across, Math.floor(block / across))).forEach((level, index) => {
       bits.difference(level - last[index]);
       last[index] = level;
     });

@@ -185,12 +185,12 @@ export const Detections = {
   width_px: [integer(16, 8192)], height_px: [integer(16, 8192)], boxes: [list(DetectedBox, 0, 64), []],
   detector: [text(64), ""], device: [text(32), ""], model: [text(64), ""],
 };
-const metres = number(-100, 100);
+const meters = number(-100, 100);
 const option = (value, where) => (typeof value === "boolean" ? value : typeof value === "string" ? text(64)(value, where) : real(value, where));
 export const MissionRequest = {
   id: [counter],
   name: [matching(/^[a-z][a-z0-9-]{0,31}$/)],
-  waypoints: [list(list(metres, 2, 2), 0, 64), []],
+  waypoints: [list(list(meters, 2, 2), 0, 64), []],
   options: [map(option, 16, /^[a-z][a-z0-9_.]{0,63}$/), {}],
 };
 export const MissionReport = {

@@ -1,7 +1,7 @@
 /**
- * @file Reads a JPEG at an eighth of its size: the mean colour of each 8x8 block, from the DC coefficients alone. Pure.
+ * @file Reads a JPEG at an eighth of its size: the mean color of each 8x8 block, from the DC coefficients alone. Pure.
  *
- * Enough to find a coloured blob, in 200 lines: no inverse DCT, AC coefficients are only skipped. Baseline Huffman, and
+ * Enough to find a colored blob, in 200 lines: no inverse DCT, AC coefficients are only skipped. Baseline Huffman, and
  * the first DC scan of a progressive picture (ITU-T T.81). Bound the picture with `readJpegSize` before it comes here.
  */
 
@@ -30,9 +30,9 @@ export function decodeDc(jpeg) {
     const segment = jpeg.subarray(at + 4, end);
     at = marker === 0xda ? picture.readScan(segment, jpeg, end) : end;
     if (marker !== 0xda) picture.readTable(marker, segment);
-    if (picture.isComplete()) return picture.colours();
+    if (picture.isComplete()) return picture.colors();
   }
-  return bad("ends before its colours");
+  return bad("ends before its colors");
 }
 
 class Picture {
@@ -133,7 +133,7 @@ class Picture {
     return this.components.length > 0 && this.components.every((one) => one.values !== null);
   }
 
-  colours() {
+  colors() {
     const [width, height] = [Math.ceil(this.width_px / 8), Math.ceil(this.height_px / 8)];
     const rgb = new Uint8ClampedArray(width * height * 3);
     const levels = [0, 0, 0];

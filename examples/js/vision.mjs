@@ -1,5 +1,5 @@
 /**
- * @file A vision of the Sightline protocol: find a coloured blob, steer at it, answer each frame once. Pure; Node and browser.
+ * @file A vision of the Sightline protocol: find a colored blob, steer at it, answer each frame once. Pure; Node and browser.
  *
  * @typedef {{x_px: number, width_px: number, share: number}} Target in pixels of the encoded picture
  */
@@ -15,17 +15,17 @@ const LEAST_PX = 128; // pixels of the encoded picture, two 8x8 blocks: fewer ar
 export const isYellow = (red, green, blue) => red > 110 && green > 85 && blue < 0.6 * green && Math.abs(red - green) < 0.4 * red;
 
 /**
- * A plain scan over the pixels: middle and extent of all that is of the colour.
+ * A plain scan over the pixels: middle and extent of all that is of the color.
  * @param {{width: number, height: number, scale: number, data: ArrayLike<number>, channels: 3|4}} picture
  *   `scale` is how many pixels of the encoded picture one of these is wide
  * @returns {Target|null}
  */
-export function findTarget({ width, height, scale, data, channels }, isColour = isYellow) {
+export function findTarget({ width, height, scale, data, channels }, isColor = isYellow) {
   const columns = new Uint32Array(width);
   let count = 0;
   for (let y = 0, at = 0; y < height; y += 1) {
     for (let x = 0; x < width; x += 1, at += channels) {
-      if (!isColour(data[at], data[at + 1], data[at + 2])) continue;
+      if (!isColor(data[at], data[at + 1], data[at + 2])) continue;
       columns[x] += 1;
       count += 1;
     }

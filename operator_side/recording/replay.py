@@ -39,7 +39,7 @@ _FrameId = tuple[str, int]
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One answered frame: the recorded answer (None: an acknowledgement) and the answer of the pipeline now."""
+    """One answered frame: the recorded answer (None: an acknowledgment) and the answer of the pipeline now."""
 
     frame: Frame
     sent: bytes | None
@@ -131,7 +131,7 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
             _give(pipeline, header, answers, config)
             if config.detector.kind == "boxes":
                 found = answers.boxes.get((frame.header.session, frame.header.seq))
-                if sent is not None and found is not None:  # an acknowledgement shows that the frame arrived
+                if sent is not None and found is not None:  # an acknowledgment shows that the frame arrived
                     yield Step(frame, sent, _by_boxes(pipeline, frame, found, camera, config))
             else:
                 yield Step(frame, sent, pipeline.step(frame))
@@ -218,4 +218,4 @@ def _first_camera(path: Path) -> CameraModel:
 
 
 def _text(payload: bytes | None) -> str:
-    return "an acknowledgement" if payload is None else payload.decode("ascii", "replace")
+    return "an acknowledgment" if payload is None else payload.decode("ascii", "replace")

@@ -99,7 +99,7 @@ def table_of(text: str, where: str) -> tuple[tuple[float, float], ...]:
 def table_text(rows: Sequence[tuple[float, float]], head: str) -> str:
     """Format a table file with `head` as its comment. `table_of` reads it."""
     lines = "".join(f"  [{duty:.3f}, {speed:.4f}],\n" for duty, speed in rows)
-    return f"# {head}\ntable = [ # duty, metres per second at the rim\n{lines}]\n"
+    return f"# {head}\ntable = [ # duty, meters per second at the rim\n{lines}]\n"
 
 
 # A Raspberry Pi's output pins through gpiozero and lgpio: PWM, enable lines, and how they are left behind. Shell.

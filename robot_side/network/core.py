@@ -97,7 +97,7 @@ class NetworkCore:
         self._answer(ack.sender, ack.seq, ack.compute_us, now_us)
 
     def on_ack(self, message: Message, now_us: int) -> None:
-        """Return the credit of an acknowledgement. Raises WireError for an invalid one."""
+        """Return the credit of an acknowledgment. Raises WireError for an invalid one."""
         header = decode(AnswerHeader, message.header)
         if header.source == message.source and header.echo.session == self._session:
             who = Holder(source=header.source, session=header.session)

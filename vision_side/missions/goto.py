@@ -129,7 +129,7 @@ class ProgressChecker:
 # the clearance. Waypoints are in the odometry frame, in meters.
 
 
-Metres = Annotated[float, Field(ge=-100, le=100)]
+Meters = Annotated[float, Field(ge=-100, le=100)]
 
 _NEAR_M = 0.8  # the brake ignores points beyond this distance
 _BRAKE_SLACK_M = 0.017  # what steering and cells of 0.03 m may be off, and so much that it can turn where it stopped
@@ -145,7 +145,7 @@ _SIDE_RAD, _SIDE_M = math.radians(45), 0.15  # to the other side of what is in t
 class GotoConfig(Config):
     """Goal, robot and clearance of a `goto` mission."""
 
-    waypoints: Annotated[tuple[tuple[Metres, Metres], ...], Field(min_length=1, max_length=64)]
+    waypoints: Annotated[tuple[tuple[Meters, Meters], ...], Field(min_length=1, max_length=64)]
     """(x, y) in the odometry frame, one after the other."""
     body: Footprint = Footprint()
     sensor_x_m: Annotated[float, Field(ge=-2, le=2)] = 0.0

@@ -1,4 +1,4 @@
-/** @file Picks a colour in a robot's live pictures, which stand still from the first touch on, or in those of a file. Shell. */
+/** @file Picks a color in a robot's live pictures, which stand still from the first touch on, or in those of a file. Shell. */
 
 const CLICK_PX = 4; // on the screen: a smaller box was meant as a click
 const RETRY_MS = 500;

@@ -89,9 +89,9 @@ _ARP = "IP address HW type Flags HW address Mask Device\n192.168.1.7 0x1 {} aa:b
 ])  # fmt: skip
 def test_isolated_client_and_firewall_are_distinguished(tmp_path, flags, host, words):
     (tmp_path / "arp").write_text(_ARP.format(flags))
-    said = between.neighbour(host, tmp_path / "arp")
+    said = between.neighbor(host, tmp_path / "arp")
     assert words in said and bool(said) is bool(words)
-    assert between.neighbour(host, tmp_path / "absent") == ""
+    assert between.neighbor(host, tmp_path / "absent") == ""
 
 
 @pytest.mark.parametrize(("offered", "ok", "said"), [
@@ -163,7 +163,7 @@ def test_unreadable_certificates_are_reported_with_the_extra(capsys, tmp_path, m
 
 
 def test_closed_port_and_unknown_host_have_different_fixes(capsys, monkeypatch):
-    monkeypatch.setattr(between, "neighbour", lambda host: "; a firewall blocks it")
+    monkeypatch.setattr(between, "neighbor", lambda host: "; a firewall blocks it")
     refused = _checks(capsys, "--peer", free_endpoint())["reach"]
     assert "firewall" not in refused["fix"], "a closed port"
     unknown = _checks(capsys, "--peer", "tcp/no-such-name.invalid:7447")["reach"]
