@@ -63,7 +63,7 @@ class NetworkCore:
         """Make the frame of an image.
 
         Args:
-            image: the newest image.
+            picture: the newest image.
             now_us: monotonic clock.
 
         Returns:

@@ -15,7 +15,7 @@ from enum import Enum
 from pathlib import Path
 
 import cv2  # noqa: F401
-import numpy  # noqa: ICN001, F401
+import numpy  # noqa: F401
 import pytest
 
 # All children share what is loaded here. It imports no file that has mutants, or no mutant of that file would run.

@@ -137,6 +137,30 @@ def test_a_place_with_hidden_reasons_has_comment_lines(place):
     assert len(lines) > 200 and sum(line.startswith("#") for line in lines) >= 0.04 * len(lines)
 
 
+def unknown_arguments(tree: ast.Module) -> Iterator[str]:
+    """Yield each name under `Args:` that is not a parameter or field of its function or class."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        _, _, section = ("\n" + (ast.get_docstring(node) or "")).partition("\nArgs:\n")
+        entries = re.findall(r"^    (\w+):", re.split(r"^\S", section, maxsplit=1, flags=re.MULTILINE)[0], re.MULTILINE)
+        known = {one.arg for one in ast.walk(node) if isinstance(one, ast.arg)}
+        known |= {one.target.id for one in ast.walk(node)
+                  if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)}
+        yield from (f"{node.lineno} {node.name}: {name}" for name in entries if name not in known)
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_every_described_argument_exists(folder):
+    assert [f"{path.relative_to(ROOT)}:{one}" for path in sorted((ROOT / folder).rglob("*.py"))
+            for one in unknown_arguments(ast.parse(path.read_text("utf-8")))] == []
+
+
+def test_an_unknown_argument_is_found():
+    text = 'def f(a):\n    """Do it.\n\n    Args:\n        a: known.\n        b: unknown.\n\n    Raises:\n        C: no.\n    """\n'
+    assert list(unknown_arguments(ast.parse(text))) == ["1 f: b"]
+
+
 def test_every_exception_is_needed():
     files = {name: (ROOT / name).read_text("utf-8").lower() for name, _ in EXCEPTIONS}
     assert [(name, text) for name, text in EXCEPTIONS if text is not None and text not in files[name]] == []

@@ -125,7 +125,7 @@ class DetectFrame:
             header: header of the frame.
             jpeg: the image as received.
             decoder: decoder of this robot.
-            image: pixels of `jpeg`, if already decoded; valid until `decoder` decodes another image.
+            picture: pixels of `jpeg`, if already decoded; valid until `decoder` decodes another image.
         """
         self.robot = robot
         self.header = header

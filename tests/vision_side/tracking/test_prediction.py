@@ -30,7 +30,8 @@ def predictor_of(latency_s, sent=(), **config):
 
 def test_latency_is_the_measured_one_up_to_its_bound_and_the_time_of_the_wheels():
     assert LatencyEstimator(LatencyConfig(first_guess_s=0.1, actuation_s=0.03)).total_s == pytest.approx(0.13)
-    assert LatencyEstimator(LatencyConfig(first_guess_s=0.5, max_s=0.4, actuation_s=0.03)).total_s == pytest.approx(0.43)
+    bounded = LatencyConfig(first_guess_s=0.5, max_s=0.4, actuation_s=0.03)
+    assert LatencyEstimator(bounded).total_s == pytest.approx(0.43)
     assert MotionPredictor(LatencyConfig(first_guess_s=0.1, actuation_s=0.03)).latency_s == pytest.approx(0.13)
 
 

@@ -1,7 +1,5 @@
 """The search, image by image: when it begins, which way it turns, and what its budget counts."""
 
-import math
-
 import pytest
 
 from sightline.protocol.messages import Twist
@@ -31,7 +29,9 @@ def test_search_begins_after_its_time_without_the_target():
     assert [turns(search, 0.0, 0.125) for _ in range(4)] == [False, True, True, True]
 
 
-@pytest.mark.parametrize(("side", "sign"), [(None, 1), (0.3, 1), (1.5, 1), (-0.3, -1), (-2.0, -1), (0.0, 1), (-0.0, -1)])
+@pytest.mark.parametrize(
+    ("side", "sign"), [(None, 1), (0.3, 1), (1.5, 1), (-0.3, -1), (-2.0, -1), (0.0, 1), (-0.0, -1)]
+)
 def test_it_turns_on_the_spot_to_the_side_of_the_target_at_its_rate(side, sign):
     search = Search(SearchConfig(after_s=0.0, rate_rad_s=0.7))
     if side is not None:
