@@ -157,7 +157,8 @@ def test_every_described_argument_exists(folder):
 
 
 def test_an_unknown_argument_is_found():
-    text = 'def f(a):\n    """Do it.\n\n    Args:\n        a: known.\n        b: unknown.\n\n    Raises:\n        C: no.\n    """\n'
+    docstring = "Do it.\n\n    Args:\n        a: known.\n        b: unknown.\n\n    Raises:\n        C: never."
+    text = f"def f(a):\n    \"\"\"{docstring}\n    \"\"\"\n"
     assert list(unknown_arguments(ast.parse(text))) == ["1 f: b"]
 
 
