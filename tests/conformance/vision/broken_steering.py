@@ -2,7 +2,7 @@
 
 from sightline.protocol.messages import Twist
 from sightline.vision_side.pipeline import PipelineAnswer
-from tests.conformance.vision.broken import breaks
+from tests.conformance.vision.broken import BrokenVision, breaks
 from tests.conformance.vision.broken_answers import PerSession
 
 
@@ -60,6 +60,16 @@ def _(self, linear, angular, bearing):
     return linear, abs(angular) if "left" in self.saw else angular
 
 
+@steering("V-STEER-09", "stops where it should drive forward")
+def _(self, linear, angular, bearing):
+    return min(linear, 0.0) if self.saw == {"ahead"} else linear, angular
+
+
+@steering("V-STEER-10", "turns right whatever it sees")
+def _(self, linear, angular, bearing):
+    return 0.0, -0.5
+
+
 @breaks("V-STEER-07", "takes time from its own clock")
 class OwnClock(Steering):
     last_us = 0
@@ -82,3 +92,8 @@ class Remembers(Steering):
         return (0.3 if bearing is None and self.count < 4 and "ahead" in self.before else linear), angular
 
 
+class SwappedAxes(BrokenVision):
+    """Sends `angular|linear`; not in the table, since it fails each case about the axes."""
+
+    def writes(self, fields, text):
+        self.puts(fields, None if text is None else b"|".join(reversed(text.split(b"|"))))

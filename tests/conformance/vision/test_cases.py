@@ -5,7 +5,7 @@ import pytest
 from sightline.conformance.case import Level
 from sightline.conformance.codec import CASES as CODEC_CASES
 from sightline.conformance.robot.cases import CASES as ROBOT_CASES
-from sightline.conformance.runner import Outcome, run_case
+from sightline.conformance.runner import Outcome, passed, run_case
 from sightline.conformance.vision.cases import CASES, prepare
 from sightline.protocol.channels import FRAME
 from sightline.protocol.transports.websocket.framing import pack
@@ -13,7 +13,7 @@ from tests.conformance.clauses import UNTESTED, clauses
 from tests.conformance.vision import broken_answers as vision_broken_answers  # noqa: F401
 from tests.conformance.vision import broken_flow as vision_broken_flow  # noqa: F401
 from tests.conformance.vision import broken_inputs as vision_broken_inputs  # noqa: F401
-from tests.conformance.vision import broken_steering as vision_broken_steering  # noqa: F401
+from tests.conformance.vision import broken_steering as vision_broken_steering
 from tests.conformance.vision.broken import BROKEN, BrokenVision
 from tests.conformance.vision.fixture import VirtualVision, virtual_bench
 
@@ -56,6 +56,22 @@ def test_a_broken_vision_fails_its_case(name):
 def test_a_broken_vision_fails_no_other_case(name):
     failed = {case.id for case in VIRTUAL if result_of(case, BROKEN[name][1]).outcome is Outcome.FAILED}
     assert failed == {name}
+
+
+def test_vision_service_that_swaps_the_axes_fails_must_cases():
+    results = [result_of(case, vision_broken_steering.SwappedAxes) for case in VIRTUAL if case.group == "steering"]
+    failed = {one.case.id: one.case.level for one in results if one.outcome is Outcome.FAILED}
+    assert {name for name, level in failed.items() if level is Level.MUST} >= {
+        "V-STEER-01", "V-STEER-03", "V-STEER-09"}  # fmt: skip
+    assert not passed(results)
+
+
+def test_vision_service_that_follows_no_yellow_ball_fails_no_must_case():
+    results = [result_of(case, BROKEN["V-STEER-10"][1]) for case in VIRTUAL if case.group == "steering"]
+    assert {one.case.id for one in results if one.outcome is Outcome.SKIPPED} == {
+        "V-STEER-01", "V-STEER-02", "V-STEER-03", "V-STEER-09"}  # fmt: skip
+    assert [one.case.id for one in results if one.outcome is Outcome.FAILED] == ["V-STEER-10"]
+    assert passed(results)
 
 
 @pytest.mark.parametrize("case", [case for case in VIRTUAL if "V-FRAM-11" <= case.id <= "V-FRAM-18"],

@@ -1,5 +1,6 @@
 """The kit's cases with sockets of their own: ours passes, a plain client passes, each broken one fails its own case."""
 
+import json
 import threading
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -12,8 +13,11 @@ from sightline.conformance.case import Access
 from sightline.conformance.raw_peers import RawFrame, take_frame
 from sightline.conformance.runner import Outcome, run_case
 from sightline.conformance.vision.cases import CASES
+from sightline.operator_side.cli import app as cli
+from sightline.protocol.text import format_twist
 from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.serving import service
 from sightline.vision_side.serving.process import serve
 from tests.conformance.vision.sockets import SOCKETS, SocketVision
 from tests.fixtures.ports import free_endpoint
@@ -48,6 +52,22 @@ def our_vision(endpoint):
 
 
 @contextmanager
+def started_before(endpoint):
+    """The service in a thread that waits for the kit to listen."""
+    ending = threading.Event()
+
+    def run():
+        with open_link("r1", connect=[endpoint], role="vision", timeout_s=20) as link:
+            serve(VisionConfig(), link, ending, lambda line: None)
+
+    running = threading.Thread(target=run, daemon=True)
+    running.start()
+    yield
+    ending.set()
+    running.join(2)
+
+
+@contextmanager
 def folder_of(token):
     with TemporaryDirectory() as folder:
         (Path(folder) / "vision.token").write_text(token)
@@ -63,6 +83,18 @@ def test_a_good_vision_passes_them_all(vision):
     with bench_with(vision) as bench:
         results = [run_case(case, bench) for case in REAL]
     assert {one.case.id: one.reason for one in results if one.outcome is not Outcome.PASSED} == {}
+
+
+def test_vision_service_that_swaps_the_axes_exits_with_5(capsys, monkeypatch):
+    monkeypatch.setattr(service, "format_twist", lambda twist: b"|".join(reversed(format_twist(twist).split(b"|"))))
+    endpoint, names = free_endpoint("ws://"), ("V-STEER-01", "V-STEER-09")
+    only = [part for name in names for part in ("--only", name)]
+    with started_before(endpoint):
+        code = cli.run(("conform", "vision", endpoint, *only, "--json"))
+    report = json.loads(capsys.readouterr().out)
+    assert (code, report["ok"]) == (5, False)
+    assert {(one["name"], one["level"], one["value"]) for one in report["checks"]} == {
+        (name, "MUST", "failed") for name in names}  # fmt: skip
 
 
 def failed_of(broken, cases):
