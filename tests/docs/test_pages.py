@@ -113,7 +113,8 @@ def test_page_is_short(page):
 @pytest.mark.parametrize("page", [*TOP, *PAGES, ROOT / "protocol" / "README.md"], ids=shown)
 def test_page_has_no_banned_pattern(page):
     text = page.read_text("utf-8")
-    assert [hit[0] for pattern in BANNED for hit in pattern.finditer(without_code(text))] == []
+    prose = " ".join(without_code(text).split())  # the end of a line is a space, also within a pattern
+    assert [hit[0] for pattern in BANNED for hit in pattern.finditer(prose)] == []
     [other_project] = [pattern for pattern in BANNED if pattern.pattern.startswith("pip ")]
     assert not other_project.search(text)  # in a block of code too
 
