@@ -168,7 +168,7 @@ class Operator:
         return reply
 
     def stop(self, on_slow: Callable[[], None], timeout_s: float = 10.0) -> Status:
-        """Send STOP at 20 Hz until a status shows STOPPED.
+        """Send STOP at 20 Hz until a status that arrives afterwards shows STOPPED.
 
         Args:
             on_slow: called once if the confirmation takes more than 300 ms.
@@ -182,11 +182,12 @@ class Operator:
         """
         self._id += 1
         started_s = time.monotonic()
-        warned = False
+        # The stored status may be from before a reset by another operator, on a link that is dead now.
+        seen, warned = self._reports, False
         while time.monotonic() - started_s < timeout_s:
             self._send(Verb.STOP, None)
             with self._changed:
-                if self._changed.wait_for(self._is_stopped, STOP_PERIOD_S):
+                if self._changed.wait_for(lambda: self._reports > seen and self._is_stopped(), STOP_PERIOD_S):
                     assert self._report is not None
                     return self._report.status
             if not warned and time.monotonic() - started_s > STOP_SLOW_S:
