@@ -34,6 +34,7 @@ TABLES = {
         "tests/vision_side/tracking/test_search.py",
         "tests/vision_side/tracking/test_steer.py",
     ),
+    "operator_side/client/requests.py": ("tests/operator_side/client/test_request_repetition.py",),
     "protocol/text.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
     "protocol/jpeg.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
 }
