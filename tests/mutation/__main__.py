@@ -35,10 +35,16 @@ TABLES = {
         "tests/vision_side/tracking/test_steer.py",
     ),
     "operator_side/client/requests.py": ("tests/operator_side/client/test_request_repetition.py",),
+    "operator_side/teleop/control.py": ("tests/operator_side/teleop/test_ramp.py",),
     "protocol/text.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
     "protocol/jpeg.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
 }
 """Each file under the gate, all of `safety/` among them, and the tables that must notice any change to it."""
+PARTS = {
+    "operator_side/teleop/control.py": ("Speeds", "SpeedUp", "_towards", "_STEP", "_LEAST_", "_RAMP_", "_FIRST_STEP_US",
+                                        "_LONGEST_STEP_US"),
+}
+"""Of these files only the mutants inside these names, or of the constants that begin so. The rest decides nothing."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,13 +57,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print("error:", error, file=sys.stderr)
         return 2
-    found = [mutant for file in files for mutant in mutants(file, Path(file).read_text())]
+    found = [mutant for file in files for mutant in _mutants(file)]
     if options.list:
         print(*map(_line, found), sep="\n")
         return 0
     if not files:
         return 0
-    missing = uncovered(files, sorted({table for file in files for table in TABLES[file]}))
+    whole = [file for file in files if file not in PARTS]
+    missing = uncovered(whole, sorted({table for file in files for table in TABLES[file]}))
     if missing:
         print(missing, "error: the tables fail or miss lines or branches (above); correct or extend them", sep="\n")
         return 5
@@ -91,6 +98,14 @@ def _selected(commit: str | None) -> list[str]:
         names = ", ".join(files) if files else "no file of the mutation gate"
         print(f"{names} changed since {base}", file=sys.stderr)
     return files
+
+
+def _mutants(file: str) -> Iterator[Mutant]:
+    source = Path(file).read_text()
+    lines, parts = source.splitlines(), PARTS.get(file, ("",))
+    for mutant in mutants(file, source):
+        if (mutant.where.partition(".")[0] or lines[mutant.line - 1]).startswith(parts):
+            yield mutant
 
 
 def _survivors(found: list[Mutant], jobs: int) -> list[Mutant]:

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+import tests.mutation.__main__ as gate
 from tests.mutation.mutants import mutants
 
 
@@ -76,6 +77,7 @@ def test_mutant_of_an_imported_module_is_rejected():
     code = """
 import sightline.protocol.jpeg
 from pathlib import Path
+import tests.mutation.__main__ as gate
 from tests.mutation.mutants import mutants
 from tests.mutation.trial import start
 mutant = next(mutants("protocol/jpeg.py", Path("protocol/jpeg.py").read_text()))
@@ -83,3 +85,16 @@ start(mutant, ["tests/protocol/test_text_and_jpeg_boundaries.py"])
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ran.returncode == 1 and "imported before its mutants" in ran.stderr
+
+
+def test_part_of_a_file_has_the_mutants_of_its_names_and_constants_only(tmp_path, monkeypatch):
+    file = tmp_path / "example.py"
+    file.write_text("_RAMP_US = 1\nOTHER = 2\ndef f():\n    return 3\nclass A:\n    def g(self):\n        return 4\n")
+    before = {mutant.before for mutant in gate._mutants(str(file))}
+    assert {"1", "2", "3", "4"} < before
+    monkeypatch.setattr(gate, "PARTS", {str(file): ("_RAMP_", "A")})
+    assert {mutant.before for mutant in gate._mutants(str(file))} == {"1", "4", "return 4"}
+
+
+def test_files_of_parts_are_under_the_gate():
+    assert set(gate.PARTS) <= set(gate.TABLES)

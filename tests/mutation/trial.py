@@ -44,13 +44,17 @@ def module_name(file: str) -> str:
 
 
 def uncovered(files: Iterable[str], suites: Iterable[str]) -> str:
-    """Return the report on lines and branches of `files` that `suites` miss, or on their failure; "" if all is well."""
+    """Return the report on lines and branches of `files` that `suites` miss, or on their failure; "" if all is well.
+
+    Without files only a failure counts.
+    """
+    files = list(files)
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "COVERAGE_FILE": str(Path(folder, "data"))}
         include = "--include=" + ",".join(files)
         run = ("run", "--branch", include, "-m", "pytest", "-q", "-p", "no:cacheprovider", *suites)
         report = ("report", include, "--show-missing", "--skip-covered", "--fail-under=100", "--precision=2")
-        for command in (run, report):
+        for command in (run, report) if files else (run,):
             coverage = [sys.executable, "-m", "coverage", *command]
             ran = subprocess.run(coverage, env=environment, capture_output=True, text=True, check=False)
             if ran.returncode:
