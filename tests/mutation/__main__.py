@@ -27,6 +27,7 @@ TABLES = {
     "robot_side/kinematics.py": ("tests/robot_side/test_kinematics.py",),
     "robot_side/network/core.py": ("tests/robot_side/network/test_core.py",),
     "robot_side/network/stream.py": ("tests/robot_side/network/test_credit.py",),
+    "robot_side/network/bitrate_control.py": ("tests/robot_side/network/test_bitrate_control.py",),
     "robot_side/network/congestion_window.py": ("tests/robot_side/network/test_congestion_window.py",),
     "vision_side/tracking/prediction.py": ("tests/vision_side/tracking/test_prediction.py",),
     "vision_side/tracking/track.py": ("tests/vision_side/tracking/test_track.py",),
