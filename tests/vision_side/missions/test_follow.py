@@ -1,4 +1,4 @@
-"""The mission `follow`, frame by frame: which detection it means, where it locates it, and what it lets the wheels do."""
+"""The mission `follow`, frame by frame: which detection it means, where it is, and what the wheels get."""
 
 import math
 
