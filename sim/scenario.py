@@ -320,15 +320,52 @@ LOOKS = Path(__file__).parent / "looks.toml"
 Gain = Annotated[float, Field(gt=0, le=4)]
 
 
-class Look(Config):
-    """The effects on an image between the scene and the JPEG, in this order."""
+DriftPeriod = Annotated[float, Field(gt=0, le=600)]
+ShutterTime = Annotated[float, Field(ge=0, le=100)]
+TextureName = Literal["plain", "boards", "clouds", "bricks", "marble", "mosaic", "stones", "weave"]
 
+
+class Look(Config):
+    """The look of a scene and of its images. Every option is off by default.
+
+    First the room: what is drawn, and the objects that it adds. Then the camera, in the order of its effects.
+    """
+
+    room_m: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Walls of a room around the scenario, so far from the area that robot and target need; 0: no room."""
+    clutter: Annotated[int, Field(ge=0, le=40)] = 0
+    """Number of other objects, of colors near the target's and others. They stand around that area."""
+    floor: TextureName = "boards"
+    floor_likeness: Unit = 0.0
+    """Saturation of the floor as a share of the target's, in the hue of the target; 0 is gray."""
+    wall: TextureName = "plain"
+    """Texture of each wall."""
+    wall_likeness: Unit = 0.0
+    """The same for walls; 0 keeps the color of each wall."""
+    shadows: Unit = 0.0
+    """Share of the light that is missing on the floor in the shadow of an object. Objects shade each other, too."""
+    latency_ms: Annotated[int, Field(ge=0, le=500)] = 0
+    """The image shows the world so long before its capture time, as a webcam does that stamps what it has read."""
+    distortion: Annotated[tuple[Annotated[float, Field(ge=-1, le=1)], ...], Field(max_length=5)] = ()
+    """Of the lens: k1, k2, p1, p2, k3 in OpenCV's order."""
+    lens_known: bool = False
+    """True: the camera model on the channel `camera` has this distortion. False: it is that of an uncalibrated lens."""
+    rolling_shutter_ms: ShutterTime = 0.0
+    """Time from the exposure of the first row to that of the last. The middle row has the time of the image."""
+    motion_blur_ms: ShutterTime = 0.0
+    """Exposure time of each row."""
     exposure: Gain = 1.0
     """Brightness factor; above 1 the bright parts burn out."""
     saturation: Annotated[float, Field(ge=0, le=2)] = 1.0
     """Colourfulness: 0 is a grey picture."""
     white_balance: tuple[Gain, Gain, Gain] = (1.0, 1.0, 1.0)
     """Factors on red, green, blue."""
+    exposure_drift: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """The brightness rises and falls by up to this share, from a phase that the seed draws."""
+    exposure_period_s: DriftPeriod = 8.0
+    white_balance_drift: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """The same for red, and for blue the other way round."""
+    white_balance_period_s: DriftPeriod = 21.0
     blur_px: Annotated[float, Field(ge=0, le=10)] = 0.0
     """Standard deviation of the lens's blur."""
     noise: Annotated[float, Field(ge=0, le=64)] = 2.0

@@ -5,6 +5,7 @@ from functools import cache
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from sightline.sim.scenario import Color, Forced, Light, OnPath, Part, Place, Pushed, Rolling, Static, Thing, color_of
 from sightline.sim.world.engine import pybullet
@@ -12,6 +13,35 @@ from sightline.sim.world.physics import FLOOR, ROBOT, TARGET, WALL, Vector, grou
 from sightline.sim.world.start import target_phase, thing_phase, thing_place
 
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
+_AROUND_RAD = np.linspace(0.0, math.tau, 16, endpoint=False)
+
+Points = npt.NDArray[np.float64]
+Pose = tuple[Vector, tuple[float, float, float, float]]
+"""Position, and orientation as a quaternion."""
+
+
+def hull_of(client: int, body: int, own: Points) -> Points:
+    """Return points `own` (N, 3) of a body where it is in the world."""
+    at, turn = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
+    axes = np.array(pybullet.getMatrixFromQuaternion(turn)).reshape(3, 3)
+    return np.asarray(own @ axes.T + np.array(at))
+
+
+def box_points(size_m: tuple[float, float, float]) -> Points:
+    """Return the corners of a box around its middle."""
+    signs = [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
+    return np.array(signs) * size_m
+
+
+def _thing_points(thing: Thing) -> Points:
+    """Return points around the middle of a body whose convex hull is its shape, or near it."""
+    if thing.shape == "box":
+        return box_points(thing.size_m)
+    ring = np.stack([np.cos(_AROUND_RAD), np.sin(_AROUND_RAD), np.zeros(len(_AROUND_RAD))], axis=-1) * thing.radius_m
+    if thing.shape == "ball":
+        return np.concatenate([ring, ring[:, [0, 2, 1]], ring[:, [2, 0, 1]]])
+    up = np.array([0.0, 0.0, thing.height_m / 2])
+    return np.concatenate([ring - up, ring + up])
 
 
 class ThingBodies:
@@ -23,6 +53,7 @@ class ThingBodies:
         count = {"legs": 2, "place": 0}.get(thing.shape, 1)
         self.bodies = tuple(_add(client, thing, is_target) for _ in range(count))
         self._middle: Vector = (place.x_m, place.y_m, thing.middle_m)
+        self._own_points = _thing_points(thing)
         self.put(place, way_m)
 
     @property
@@ -31,6 +62,10 @@ class ThingBodies:
         if len(self.bodies) != 1:
             return self._middle
         return pybullet.getBasePositionAndOrientation(self.bodies[0], physicsClientId=self._client)[0]  # type: ignore[no-any-return]
+
+    def hulls(self) -> list[Points]:
+        """Return points (N, 3) in the world for each body; their convex hull is its shape."""
+        return [hull_of(self._client, body, self._own_points) for body in self.bodies]
 
     def put(self, place: Place, way_m: float) -> None:
         """Set it down at `place`, having come `way_m`."""
@@ -41,6 +76,15 @@ class ThingBodies:
             round_ = self.thing.shape == "ball"
             turn = _NO_TURN if round_ else pybullet.getQuaternionFromEuler([0, 0, place.heading_rad])
             self._set(self.bodies[0], self._middle, turn)
+
+    @property
+    def pose(self) -> Pose:
+        """Return the pose of a rolling ball."""
+        return pybullet.getBasePositionAndOrientation(self.bodies[0], physicsClientId=self._client)  # type: ignore[no-any-return]
+
+    def put_pose(self, pose: Pose) -> None:
+        """Set a rolling ball down in that pose."""
+        self._set(self.bodies[0], *pose)
 
     def _walk(self, place: Place, way_m: float) -> None:
         legs, cos, sin = self.thing.legs, math.cos(place.heading_rad), math.sin(place.heading_rad)
@@ -147,6 +191,11 @@ class LightBodies:
     def bodies(self) -> frozenset[int]:
         """All that could be touched or is lit."""
         return frozenset(body for _, body in self._parts)
+
+    def hulls(self) -> list[Points]:
+        """Return the corners of pole and housing, or of the box, in the world."""
+        return [hull_of(self._client, body, box_points(part.size_m)) for part, body in self._parts
+                if part.shape == "box"]
 
     def move(self, now_us: int) -> None:
         """Change colour when it is time."""

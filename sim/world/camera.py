@@ -1,22 +1,22 @@
-"""The simulated camera: renderer, painted floor and walls, defects. Shell (PyBullet).
+"""The simulated camera: renderer, painted floor, shadows and walls. Shell (PyBullet).
 
 One over depth is linear across the picture of a plane, so each face needs one plane equation and one comparison.
 """
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-import simplejpeg
 
 from sightline.protocol.messages import CameraModel
-from sightline.robot_side.ports import scaled_quality, scaled_size
-from sightline.sim.scenario import Look, Wall
+from sightline.sim.scenario import Color, Wall
 from sightline.sim.world.engine import camera_arrays, pybullet
 
 PoseMatrix = npt.NDArray[np.float64]
+Pattern = npt.NDArray[np.float32]
 SUBPIXEL_BITS = 4
 AMBIENT = 0.62  # of a face turned away from the light
 
@@ -30,12 +30,15 @@ class Face:
 
     def __init__(self, corners: PoseMatrix, normal: PoseMatrix, colour: PoseMatrix, light_from: PoseMatrix) -> None:
         self.corners, self.normal = corners, normal
+        is_level = abs(normal[2]) > 0.5
+        self.axes = np.eye(3)[:2] if is_level else np.array([[-normal[1], normal[0], 0.0], [0.0, 0.0, 1.0]])
+        """Along and across the face, in the world."""
         lit = AMBIENT + (1 - AMBIENT) * max(0.0, float(normal @ light_from))
         self.rgb = np.clip(np.rint(255 * colour * lit), 0, 255).astype(np.uint8)
 
 
-def faces_of(wall: Wall, light_from: PoseMatrix) -> list[Face]:
-    """The four sides and the top."""
+def corners_of(wall: Wall) -> tuple[PoseMatrix, PoseMatrix]:
+    """Return the eight corners of a wall, and the matrix that turns its own axes into the map's."""
     start, end = np.array(wall.start_m), np.array(wall.end_m)
     along = end - start
     length_m = float(np.hypot(*along))
@@ -43,6 +46,12 @@ def faces_of(wall: Wall, light_from: PoseMatrix) -> list[Face]:
     turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
     corners = (_CORNERS * [length_m, wall.thickness_m, wall.height_m]) @ turn.T
     corners[:, :2] += (start + end) / 2
+    return corners, turn
+
+
+def faces_of(wall: Wall, light_from: PoseMatrix) -> list[Face]:
+    """The four sides and the top."""
+    corners, turn = corners_of(wall)
     colour = np.array(wall.color)
     return [
         Face(corners[list(order)], turn @ normal, colour, light_from)
@@ -53,7 +62,11 @@ def faces_of(wall: Wall, light_from: PoseMatrix) -> list[Face]:
 class WallPainter:
     """Paints the faces that the lens sees and remembers how near each pixel's wall is."""
 
-    def __init__(self, walls: tuple[Wall, ...], model: CameraModel, light_from: list[float], near_m: float) -> None:
+    def __init__(
+        self, walls: tuple[Wall, ...], model: CameraModel, light_from: list[float], near_m: float,
+        pattern: Pattern | None = None,
+    ) -> None:
+        """`pattern` is the brightness of a tile that covers `WALL_TILE_M` of each wall, about 1."""
         light = np.array(light_from) / np.linalg.norm(light_from)
         self._faces = [face for wall in walls for face in faces_of(wall, light)]
         self._model, self._near_m = model, near_m
@@ -64,6 +77,10 @@ class WallPainter:
         self._palette = np.array([(0, 0, 0), *(face.rgb for face in self._faces)], np.uint8)
         self._which = np.empty(size, np.uint16)
         self._colours = np.empty((*size, 3), np.uint8)
+        self._pattern = pattern
+        self._tiles: dict[bytes, npt.NDArray[np.uint8]] = {}
+        self._boxes: dict[int, tuple[slice, slice]] = {}
+        self._rays = inverse_matrix(model)
         self.nearness = np.zeros(size, np.float32)
         """Inverse depth of the wall in each pixel, 1/m; 0 without a wall."""
 
@@ -75,6 +92,8 @@ class WallPainter:
             if face.normal @ (lens - face.corners[0]) > 0:
                 self._add_face(number, (face.corners - lens) @ seen_axes, face.normal @ seen_axes)
         np.take(self._palette, self._which, axis=0, out=self._colours, mode="clip")
+        if self._pattern is not None:
+            self._paint_patterns(self._pattern, lens, seen_axes)
         cv2.copyTo(self._colours, (self._which > 0).view(np.uint8), picture)
 
     def _add_face(self, number: int, corners: PoseMatrix, normal: PoseMatrix) -> None:
@@ -97,8 +116,67 @@ class WallPainter:
         a, b, c = (normal / (normal @ corners[0]) / [*focal, 1]).astype(np.float32)
         nearness = (a * self._columns[box[1]] + c) + b * self._rows[box[0]]
         in_front = (nearness > self.nearness[box]) & polygon.view(np.bool_)
+        self._boxes[number] = box
         np.copyto(self.nearness[box], nearness, where=in_front)
         np.copyto(self._which[box], np.uint16(number), where=in_front)
+
+    def _paint_patterns(self, pattern: Pattern, lens: PoseMatrix, seen_axes: PoseMatrix) -> None:
+        """Paint the pattern over each face that is in view. Pixel -> ray -> point of the face is a homography."""
+        seen = np.bincount(self._which.ravel(), minlength=len(self._faces) + 1)
+        for number in (np.flatnonzero(seen[1:]) + 1).tolist():
+            face, box = self._faces[number - 1], self._boxes[number]
+            normal = face.normal @ seen_axes
+            depth = float(face.normal @ (face.corners[0] - lens))
+            to_face = [depth * (axis @ seen_axes) + float(axis @ lens) * normal for axis in face.axes]
+            shift = np.array([[1, 0, box[1].start], [0, 1, box[0].start], [0, 0, 1.0]])
+            per_m = len(pattern) / WALL_TILE_M
+            to_texel = np.diag([per_m, -per_m, 1.0]) @ np.stack([*to_face, normal]) @ self._rays @ shift
+            colours = self._colours[box]
+            painted = cv2.warpPerspective(
+                self._tile(face.rgb, pattern), to_texel, colours.shape[1::-1], None,
+                cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_WRAP,
+            )
+            np.copyto(colours, painted, where=(self._which[box] == number)[..., None])
+
+    def _tile(self, rgb: npt.NDArray[np.uint8], pattern: Pattern) -> npt.NDArray[np.uint8]:
+        """Return the tile of a face of that color; most faces share a few."""
+        if rgb.tobytes() not in self._tiles:
+            self._tiles[rgb.tobytes()] = np.clip(np.rint(pattern[..., None] * rgb), 0, 255).astype(np.uint8)
+        return self._tiles[rgb.tobytes()]
+
+
+class ShadowPainter:
+    """Darkens the floor where objects keep the light off it, with a soft edge."""
+
+    def __init__(self, model: CameraModel, part: float) -> None:
+        self._model, self._part = model, part
+        self._mask = np.empty((model.height_px, model.width_px), np.uint8)
+        self._light = np.array(LIGHT_FROM)
+
+    def paint(
+        self, picture: npt.NDArray[np.uint8], casters: Sequence[PoseMatrix], lens: PoseMatrix, seen_axes: PoseMatrix
+    ) -> None:
+        """Paint into `picture`, which shows the floor. `casters`: points (N, 3) of the convex hull of each object."""
+        self._mask.fill(255)
+        model = self._model
+        focal, middle = np.array([model.fx_px, model.fy_px]), np.array([model.cx_px, model.cy_px]) - 0.5
+        lit = round(255 * (1 - self._part))
+        for points in casters:
+            shadow = self._on_floor(points)
+            outline = clipped((shadow - lens) @ seen_axes, WALL_NEAR_M)
+            if len(outline) >= 3:
+                pixels = middle + focal * outline[:, :2] / outline[:, 2:]
+                fixed_point = np.clip(np.rint(pixels * (1 << SUBPIXEL_BITS)), -MOST_FIXED, MOST_FIXED).astype(np.int32)
+                cv2.fillConvexPoly(self._mask, fixed_point, lit, shift=SUBPIXEL_BITS)
+        cv2.GaussianBlur(self._mask, (0, 0), SHADOW_EDGE_PX, self._mask)
+        cv2.multiply(picture, cv2.cvtColor(self._mask, cv2.COLOR_GRAY2RGB), picture, 1 / 255)
+
+    def _on_floor(self, points: PoseMatrix) -> PoseMatrix:
+        """Return the outline of the shadow."""
+        down = points[:, 2:] / self._light[2]
+        fallen = (points[:, :2] - down * self._light[:2]).astype(np.float32)
+        hull = cv2.convexHull(fallen)[:, 0].astype(np.float64)
+        return np.column_stack([hull, np.zeros(len(hull))])
 
 
 def clipped(corners: PoseMatrix, near_m: float) -> PoseMatrix:
@@ -112,7 +190,7 @@ def clipped(corners: PoseMatrix, near_m: float) -> PoseMatrix:
     return np.array(kept)
 
 
-# The simulated camera: the ball by TinyRenderer, floor and walls painted, then the defects. Shell (PyBullet).
+# The simulated camera: the ball by TinyRenderer, floor and walls painted. Shell (PyBullet).
 #
 # TinyRenderer's time goes into pixels, and floor and walls are most of them: it draws neither.
 # Pixel (0, 0) is the top-left corner of the top-left pixel, as in `CameraModel`.
@@ -124,7 +202,13 @@ NOTHING_DEPTH = 0.99999  # TinyRenderer leaves 1 where it drew nothing
 FLOOR_SEEN_TO_M = 8.0  # beyond it the floor would only flicker
 TEXELS_PER_M = 128
 TILE_TEXELS = 512
-NOISE_MARGIN_PX = 64
+FLOOR_LEVELS = ((3.0, 0.0), (10.0, 2.0), (math.inf, 8.0))
+"""Of the floor of a look: texels that a pixel may cover, and the blur of the tile that is shown there, texels."""
+WALL_TILE_M = 2.0
+SHADOW_EDGE_PX = 1.2
+MOST_FIXED = 1 << 24  # beyond the border of any image, and within what OpenCV takes
+SHADED_AMBIENT, SHADED_DIFFUSE = 0.45, 0.5
+"""Light on objects where shadows are drawn: less from everywhere, more from the lamp."""
 SKY_RGB = (196, 199, 204)
 LIGHT_FROM = [0.4, 0.3, 1.0]
 
@@ -145,37 +229,72 @@ def floor_tile(seed: int) -> Picture:
     return np.ascontiguousarray(np.clip(tile, 0, 255).astype(np.uint8))
 
 
+class Surfaces(NamedTuple):
+    """The changes of a look to floor and walls; None and 0: none."""
+
+    floor: Picture | None = None
+    """Its tile, `TILE_TEXELS` square."""
+    pattern: Pattern | None = None
+    """Of the walls, see `WallPainter`."""
+    wall_color: Color | None = None
+    shadows: float = 0.0
+
+
+def inverse_matrix(model: CameraModel) -> Matrix:
+    """Return the matrix from pixel indices to rays 1 m ahead."""
+    return np.linalg.inv(np.array([
+        [model.fx_px, 0, model.cx_px - 0.5], [0, model.fy_px, model.cy_px - 0.5], [0, 0, 1]
+    ]))
+
+
 class SceneCamera:
     """Draws one client's bodies and its floor, buffers allocated once."""
 
     def __init__(
-        self, client: int, model: CameraModel, walls: tuple[Wall, ...], seed: int, tile: Picture | None = None
+        self, client: int, model: CameraModel, walls: tuple[Wall, ...], seed: int, tile: Picture | None = None,
+        *, surfaces: Surfaces | None = None,
     ) -> None:
         """`tile` is the floor, `TILE_TEXELS` square, in place of the boards that robots see."""
+        surfaces = surfaces or Surfaces()
         self._client, self._model = client, model
-        self._walls = WallPainter(walls, model, LIGHT_FROM, WALL_NEAR_M) if walls else None
-        self._tile = floor_tile(seed) if tile is None else tile
+        if surfaces.wall_color:
+            walls = tuple(wall.model_copy(update={"color": surfaces.wall_color}) for wall in walls)
+        self._walls = WallPainter(walls, model, LIGHT_FROM, WALL_NEAR_M, surfaces.pattern) if walls else None
+        self._shadows = ShadowPainter(model, surfaces.shadows) if surfaces.shadows else None
+        self._light: dict[str, float] = {"shadow": 0}
+        if self._shadows:
+            self._light = {
+                "shadow": 1, "lightAmbientCoeff": SHADED_AMBIENT, "lightDiffuseCoeff": SHADED_DIFFUSE,
+                "lightSpecularCoeff": 0.0,
+            }
+        self._levels = [(math.inf, floor_tile(seed) if tile is None else tile)]
+        if surfaces.floor is not None:
+            self._levels = [(texels, _blurred(surfaces.floor, sigma)) for texels, sigma in FLOOR_LEVELS]
         size = (model.height_px, model.width_px)
         self._picture = np.empty((*size, 3), np.uint8)
         self._bodies = np.empty((*size, 3), np.uint8)
         self._mask = np.empty(size, np.bool_)
         self._projection = _projection(model)
-        self._rays = np.linalg.inv(np.array([
-            [model.fx_px, 0, model.cx_px - 0.5], [0, model.fy_px, model.cy_px - 0.5], [0, 0, 1]
-        ]))
+        self._rays = inverse_matrix(model)
 
-    def draw(self, lens: tuple[float, float, float], turn: Any) -> Picture:
-        """RGB picture from `lens` with the robot's orientation `turn`; valid until the next call."""
+    def draw(self, lens: tuple[float, float, float], turn: Any, casters: Sequence[Matrix] = ()) -> Picture:
+        """RGB picture from `lens` with the robot's orientation `turn`; valid until the next call.
+
+        `casters` are points (N, 3) of each object that throws a shadow, if the look has shadows.
+        """
         axes = np.array(pybullet.getMatrixFromQuaternion(turn)).reshape(3, 3)
         seen_axes = np.stack([-axes[:, 1], -axes[:, 2], axes[:, 0]], axis=-1)
         self._paint_floor(np.array(lens), seen_axes)
+        if self._shadows:
+            self._shadows.paint(self._picture, casters, np.array(lens), seen_axes)
         if self._walls:
             self._walls.paint(self._picture, np.array(lens), seen_axes)
         forward, up = axes[:, 0], axes[:, 2]
         view = pybullet.computeViewMatrix(lens, [a + b for a, b in zip(lens, forward, strict=True)], up.tolist())
         rgba, depth, _ = camera_arrays(pybullet.getCameraImage(
-            self._model.width_px, self._model.height_px, view, self._projection, shadow=0, lightDirection=LIGHT_FROM,
+            self._model.width_px, self._model.height_px, view, self._projection, lightDirection=LIGHT_FROM,
             flags=pybullet.ER_NO_SEGMENTATION_MASK, renderer=pybullet.ER_TINY_RENDERER, physicsClientId=self._client,
+            **self._light,
         ))
         np.less(depth, NOTHING_DEPTH, out=self._mask)
         if self._walls:
@@ -189,15 +308,37 @@ class SceneCamera:
         seen = seen_axes @ self._rays
         to_floor = np.stack([lens[0] * seen[2] - lens[2] * seen[0], lens[1] * seen[2] - lens[2] * seen[1], seen[2]])
         to_texel = np.diag([TEXELS_PER_M, TEXELS_PER_M, 1.0]) @ to_floor
-        cv2.warpPerspective(
-            self._tile, to_texel, (self._model.width_px, self._model.height_px), self._picture,
-            cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_WRAP,
-        )
+        bottom = self._model.height_px
+        for texels, tile in self._levels:
+            top = 0 if texels == math.inf else min(bottom, self._first_row(lens[2], texels))
+            if top == bottom:
+                continue
+            shift = np.array([[1, 0, 0], [0, 1, top], [0, 0, 1.0]])
+            cv2.warpPerspective(
+                tile, to_texel @ shift, (self._model.width_px, bottom - top), self._picture[top:bottom],
+                cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, cv2.BORDER_WRAP,
+            )
+            bottom = top
         right = self._model.width_px
         limit = seen[2] + np.array([0.0, 0.0, lens[2] / FLOOR_SEEN_TO_M])
         edge = [(-limit[2] - limit[0] * u) / limit[1] for u in (0, right)]
         sky = np.array([[0, -8], [right, -8], [right, edge[1]], [0, edge[0]]])
         cv2.fillConvexPoly(self._picture, np.rint(sky).astype(np.int32), SKY_RGB)
+
+    def _first_row(self, lens_m: float, texels: float) -> int:
+        """Return the upper row in which a pixel covers this many texels of the floor, away from the lens."""
+        model = self._model
+        ahead_m = math.sqrt(texels / TEXELS_PER_M * lens_m * model.fy_px)
+        return max(0, math.ceil(model.cy_px + model.fy_px * lens_m / ahead_m))
+
+
+def _blurred(tile: Picture, sigma: float) -> Picture:
+    """Blur a tile as if it were repeated."""
+    if not sigma:
+        return tile
+    around = cv2.copyMakeBorder(tile, *(TILE_TEXELS // 8,) * 4, cv2.BORDER_WRAP)
+    inner = slice(TILE_TEXELS // 8, -TILE_TEXELS // 8)
+    return np.ascontiguousarray(cv2.GaussianBlur(around, (0, 0), sigma)[inner, inner])
 
 
 def _nearness(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -217,49 +358,3 @@ def _projection(model: CameraModel) -> list[float]:
     matrix[8] += 1 / width
     matrix[9] += 1 / height
     return matrix
-
-
-def _fading(saturation: float) -> Matrix:
-    """Return the matrix that moves red, green and blue toward their brightness, or away from it."""
-    weights = np.array([0.299, 0.587, 0.114])  # of brightness, as JPEG has them
-    return np.asarray(saturation * np.eye(3) + (1 - saturation) * weights)
-
-
-class Defects:
-    """Exposure, white balance, blur, noise, JPEG: what stands between a scene and what arrives."""
-
-    def __init__(self, look: Look, width_px: int, height_px: int, seed: int) -> None:
-        self._look = look
-        self._draw = np.random.default_rng([seed, 5])
-        self._size = (height_px, width_px)
-        steps = np.arange(256)[:, None] * look.exposure * np.array(look.white_balance)
-        self._table = np.clip(np.rint(steps), 0, 255).astype(np.uint8).reshape(1, 256, 3)
-        self._fade = _fading(look.saturation) if look.saturation != 1.0 else None
-        self._is_neutral = look.exposure == 1.0 and look.white_balance == (1.0, 1.0, 1.0)
-        pool = (height_px + NOISE_MARGIN_PX, width_px + NOISE_MARGIN_PX, 3)
-        self._pool = np.rint(self._draw.normal(0.0, look.noise, pool)).astype(np.int16) if look.noise else None
-
-    def jpeg(self, picture: Picture, quality_percent: int = 100, scale_percent: int = 100) -> bytes:
-        """`picture` (RGB, changed in place) as the JPEG that the camera gives."""
-        look = self._look
-        if self._fade is not None:
-            cv2.transform(picture, self._fade, picture)
-        if not self._is_neutral:
-            cv2.LUT(picture, self._table, picture)
-        if look.blur_px:
-            cv2.GaussianBlur(picture, (0, 0), look.blur_px, picture)
-        if self._pool is not None:
-            cv2.add(picture, self._noise(self._pool), picture, dtype=cv2.CV_8U)
-        quality = scaled_quality(look.jpeg_quality, quality_percent)
-        return bytes(simplejpeg.encode_jpeg(self._scaled(picture, scale_percent), quality, "RGB", "420"))
-
-    def _scaled(self, picture: Picture, scale_percent: int) -> Picture:
-        if scale_percent == 100:
-            return picture
-        size = scaled_size(self._size[1], self._size[0], scale_percent)
-        return np.asarray(cv2.resize(picture, (size.width_px, size.height_px), interpolation=cv2.INTER_AREA), np.uint8)
-
-    def _noise(self, pool: npt.NDArray[np.int16]) -> npt.NDArray[np.int16]:
-        """Return a random part of stored noise. New noise costs 20 times as much."""
-        down, right = self._draw.integers(0, NOISE_MARGIN_PX, 2).tolist()
-        return pool[down : down + self._size[0], right : right + self._size[1]]

@@ -8,18 +8,18 @@ from __future__ import annotations
 import array
 import math
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sightline.protocol.messages import CameraModel
 from sightline.robot_side.ports import Ranges
 from sightline.sim.bus import Label
 from sightline.sim.robot import LidarModel, RangeSensorMount
 from sightline.sim.world.bodies import ThingBodies
+from sightline.sim.world.effects import Shutter
 from sightline.sim.world.engine import pybullet
 from sightline.sim.world.physics import TARGET, WALL, Vector
+from sightline.sim.world.view import Moment
 
 Numbers = npt.NDArray[np.float64]
 
@@ -105,33 +105,33 @@ Points = npt.NDArray[np.float64]
 
 
 def leg_labels(
-    client: int, people: Iterable[ThingBodies], camera: CameraModel, lens: Vector, turn: Any
+    client: int, people: Iterable[ThingBodies], camera: Shutter, moment: Moment
 ) -> tuple[Label, ...]:
-    """The people in view, best seen first."""
-    axes = np.array(pybullet.getMatrixFromQuaternion(turn)).reshape(3, 3)
+    """The people in view, best seen first, where the camera's image shows them."""
+    axes = np.array(pybullet.getMatrixFromQuaternion(moment.turn)).reshape(3, 3)
     seen_axes = np.stack([-axes[:, 1], -axes[:, 2], axes[:, 0]], axis=-1)
-    found = [_label(client, one, camera, np.array(lens), seen_axes) for one in people]
+    found = [_label(client, one, camera, moment, seen_axes) for one in people]
     return tuple(sorted((one for one in found if one), key=lambda one: one.score, reverse=True))
 
 
 def _label(
-    client: int, person: ThingBodies, camera: CameraModel, lens: Points, seen_axes: Points
+    client: int, person: ThingBodies, camera: Shutter, moment: Moment, seen_axes: Points
 ) -> Label | None:
-    pixels = _outline_px(client, person, camera, lens, seen_axes)
-    if pixels is None:
+    lens = np.array(moment.place)
+    ahead = _outline(client, person, lens, seen_axes)
+    if ahead is None:
         return None
+    pixels, size = camera.pixels(ahead, moment.turn_rad_s), (camera.model.width_px, camera.model.height_px)
     left, top = np.maximum(pixels.min(axis=0), 0.0).tolist()
-    right, bottom = np.minimum(pixels.max(axis=0), [camera.width_px, camera.height_px]).tolist()
+    right, bottom = np.minimum(pixels.max(axis=0), size).tolist()
     if right - left < _LEAST_PX or bottom - top < _LEAST_PX:
         return None
     score = _seen_share(client, person, lens)
     return Label("legs", score, left, top, right, bottom) if score >= _LEAST_SEEN else None
 
 
-def _outline_px(
-    client: int, person: ThingBodies, camera: CameraModel, lens: Points, seen_axes: Points
-) -> Points | None:
-    """Return the upper and lower rims of the legs in the image, or None next to or behind the lens."""
+def _outline(client: int, person: ThingBodies, lens: Points, seen_axes: Points) -> Points | None:
+    """Return the upper and lower rims of the legs: right, down, ahead of the lens; None next to or behind it."""
     thing = person.thing
     ring = np.stack([np.cos(_AROUND_RAD), np.sin(_AROUND_RAD), np.zeros(len(_AROUND_RAD))], axis=-1) * thing.radius_m
     rims = [
@@ -139,10 +139,7 @@ def _outline_px(
         for leg in person.bodies for up_m in (-thing.height_m / 2, thing.height_m / 2)
     ]
     ahead = (np.concatenate(rims) - lens) @ seen_axes
-    if ahead[:, 2].min() < _NEAR_M:
-        return None
-    focal, middle = np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
-    return np.asarray(middle + focal * ahead[:, :2] / ahead[:, 2:])
+    return None if ahead[:, 2].min() < _NEAR_M else np.asarray(ahead)
 
 
 def _seen_share(client: int, person: ThingBodies, lens: Points) -> float:

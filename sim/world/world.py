@@ -8,14 +8,17 @@ from typing import Any, Self
 from sightline.robot_side.ports import Ranges, WheelAngles
 from sightline.sim.bus import Label
 from sightline.sim.robot import RobotModel, Wheels, outline
-from sightline.sim.scenario import Place, Scenario
+from sightline.sim.scenario import Place, Rolling, Scenario, Thing
 from sightline.sim.truth import Truth
 from sightline.sim.world.bodies import LightBodies, Mover, ThingBodies, begin, begin_thing
-from sightline.sim.world.camera import Defects, SceneCamera
+from sightline.sim.world.camera import SceneCamera
+from sightline.sim.world.effects import Defects, Shutter, published_model
 from sightline.sim.world.engine import pybullet
 from sightline.sim.world.physics import WALL, Vector, add_floor, add_robot, add_wall, open_client
 from sightline.sim.world.sensors import Lidar, leg_labels
 from sightline.sim.world.start import light_begin, robot_start
+from sightline.sim.world.surroundings import surfaces, surroundings
+from sightline.sim.world.view import Moment, Past, Scenery
 
 SLIP_EVERY_STEPS = 25  # 0.1 s of 4 ms steps
 
@@ -81,8 +84,11 @@ class World:
     def __init__(self, scenario: Scenario, robot: RobotModel, seed: int) -> None:
         self.scenario, self.robot, self.seed = scenario, robot, seed
         self.walls = scenario.walls
-        self.camera_model = robot.camera.camera_model()
+        pinhole = robot.camera.camera_model()
+        self.camera_model = published_model(pinhole, scenario.look)
+        self._shutter = Shutter(pinhole, scenario.look)
         self.now_us = 0
+        self._surroundings = surroundings(scenario, seed)
         self._client = client = open_client(STEP_US)
         self._obstacles: list[int] = []
         self._movers: list[tuple[Mover, ThingBodies]] = []
@@ -91,28 +97,49 @@ class World:
         self._obstacles += self._light.bodies if self._light else ()
         self._front_m = outline(robot).front_m
         self._motors = [Motor(robot.wheels, STEP_US / 1e6, f"{seed} {side}") for side in ("left", "right")]
-        self._scene = SceneCamera(client, self.camera_model, scenario.walls, seed)
+        self._see(client)
         self._defects = Defects(scenario.look, robot.camera.width_px, robot.camera.height_px, seed)
         self._lidar = Lidar(client, robot.lidar, seed)
         self._target_velocity: Vector = (0.0, 0.0, 0.0)
         self._wall_contacts = self._target_contacts = self._target_contacts_by_robot = 0
 
+    def _see(self, client: int) -> None:
+        """Prepare what the camera draws: the bodies now, or those of its own past."""
+        things = self.scenario.things + self._surroundings.things
+        scenario, room = self.scenario.model_copy(update={"things": things}), self._surroundings.walls
+        latency_us = 1000 * scenario.look.latency_ms
+        self._past = Past(scenario, room, self.seed, STEP_US, latency_us) if latency_us else None
+        bodies = [bodies for _, bodies in self._movers]
+        self._scenery = self._past.scenery if self._past else Scenery(client, scenario, bodies, self._light)
+        self._scene = SceneCamera(
+            self._scenery.client, self._shutter.canvas, scenario.walls + room, self.seed,
+            surfaces=surfaces(scenario, self.seed),
+        )
+        if self._past:
+            self._past.record(self._now())
+
+    def _now(self) -> Moment:
+        camera = self.robot.camera
+        _, angular = self._body.velocity()
+        target = self._target.pose if isinstance(self.scenario.target, Rolling) else None
+        return Moment(self.now_us, *self._mounted(camera.x_m, camera.z_m), angular[2], target)
+
     def _add_things(self) -> None:
         """Floor, walls, target, robot, then the rest."""
         client, scenario, robot = self._client, self.scenario, self.robot
         self._floor = add_floor(client)
-        self._obstacles += [add_wall(client, wall) for wall in scenario.walls]
+        self._obstacles += [add_wall(client, wall) for wall in scenario.walls + self._surroundings.walls]
         mover, target_at, way_m = begin(client, scenario.target, self.seed)
         self._target = ThingBodies(client, scenario.target, target_at, way_m, is_target=True)
         self._target_at = self._target.middle
         self._movers.append((mover, self._target))
         at = robot_start(scenario.start, target_at, robot.camera.x_m, self.seed)
         self._body = add_robot(client, robot, at)
-        for number, thing in enumerate(scenario.things, start=1):
-            self._add_thing(*begin_thing(thing, number, self.seed), number - 1)
+        for number, thing in enumerate(scenario.things + self._surroundings.things, start=1):
+            self._add_thing(thing, *begin_thing(thing, number, self.seed))
 
-    def _add_thing(self, mover: Mover, at: Place, way_m: float, index: int) -> None:
-        bodies = ThingBodies(self._client, self.scenario.things[index], at, way_m, is_target=False)
+    def _add_thing(self, thing: Thing, mover: Mover, at: Place, way_m: float) -> None:
+        bodies = ThingBodies(self._client, thing, at, way_m, is_target=False)
         self._movers.append((mover, bodies))
         self._obstacles += bodies.bodies
 
@@ -134,6 +161,8 @@ class World:
             motor.rolled(angle_rad)
         self._follow_target()
         self._count_contacts()
+        if self._past:
+            self._past.record(self._now())
 
     def _follow_target(self) -> None:
         before, self._target_at = self._target_at, self._target.middle
@@ -180,15 +209,17 @@ class World:
 
     def render(self, quality_percent: int = 100, scale_percent: int = 100) -> bytes:
         """Return the camera image now as JPEG, at shares of the configured quality and side lengths."""
-        camera = self.robot.camera
-        picture = self._scene.draw(*self._mounted(camera.x_m, camera.z_m))
-        return self._defects.jpeg(picture, quality_percent, scale_percent)
+        moment = self._past.show() if self._past else self._now()
+        casters = self._scenery.hulls() if self.scenario.look.shadows else ()
+        drawn = self._scene.draw(moment.place, moment.turn, casters)
+        picture = self._shutter.exposed(drawn, moment.turn_rad_s)
+        return self._defects.jpeg(picture, quality_percent, scale_percent, moment.t_us)
 
     def labels(self) -> tuple[Label, ...]:
         """Return the labels of an image now, if the scenario has labels."""
-        people = [bodies for _, bodies in self._movers if bodies.thing.shape == self.scenario.labels]
-        camera = self.robot.camera
-        return leg_labels(self._client, people, self.camera_model, *self._mounted(camera.x_m, camera.z_m))
+        people = [bodies for bodies in self._scenery.things if bodies.thing.shape == self.scenario.labels]
+        moment = self._past.show() if self._past else self._now()
+        return leg_labels(self._scenery.client, people, self._shutter, moment)
 
     def _mounted(self, x_m: float, z_m: float) -> tuple[Vector, Any]:
         """Position and orientation of something mounted on the robot."""
@@ -239,6 +270,8 @@ class World:
 
     def close(self) -> None:
         """Free PyBullet's memory; idempotent."""
+        if self._past:
+            self._past.close()
         if pybullet.isConnected(self._client):
             pybullet.disconnect(self._client)
 

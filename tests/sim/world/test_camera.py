@@ -151,3 +151,23 @@ def test_size_and_quality_are_data():
     coarse = load_scenario("circle").model_copy(update={"look": look_named("soft")})
     with World(coarse, big, 1) as world:
         assert len(world.render()) < len(jpeg)
+
+
+@pytest.mark.parametrize(("look", "expected"), [
+    ("plain", (195.44, 197.14, 197.54, 111.78, 109.06, 103.08, 8.79, 0.92)),
+    ("clean", (195.68, 197.39, 197.14, 110.51, 108.95, 103.34, 8.39, 0.72)),
+    ("dim", (98.36, 98.91, 98.41, 55.46, 54.54, 51.95, 4.98, 2.01)),
+    ("bright", (253.81, 253.01, 245.47, 166.75, 162.70, 155.28, 12.51, 1.06)),
+    ("warm", (225.09, 196.99, 148.06, 127.89, 108.97, 77.69, 20.70, 1.22)),
+    ("cold", (166.81, 197.41, 236.84, 94.43, 109.01, 124.33, 14.69, 1.23)),
+    ("soft", (195.35, 197.99, 198.96, 109.61, 110.06, 102.91, 8.46, 0.46)),
+    ("desaturated", (196.20, 197.08, 197.27, 110.09, 109.01, 106.02, 8.32, 1.18)),
+    ("quality30", (195.09, 198.14, 198.88, 109.57, 110.02, 102.87, 8.54, 0.70)),
+])
+def test_looks_without_new_options_draw_what_they_drew_before(look, expected):
+    """Means of both halves, spread of the floor and mean step from pixel to pixel, measured before there was `real`."""
+    with World(seen_at(0.8, 0.0, look=look), robot_with(), 1) as world:
+        rgb = simplejpeg.decode_jpeg(world.render(), "RGB").astype(float)
+    found = (*rgb[:120].mean(axis=(0, 1)), *rgb[120:].mean(axis=(0, 1)), rgb[200:].std(),
+             np.abs(np.diff(rgb, axis=1)).mean())
+    assert found == pytest.approx(expected, abs=0.15)
