@@ -30,6 +30,7 @@ TABLES = {
     "robot_side/network/stream.py": ("tests/robot_side/network/test_credit.py",),
     "robot_side/network/bitrate_control.py": ("tests/robot_side/network/test_bitrate_control.py",),
     "robot_side/network/congestion_window.py": ("tests/robot_side/network/test_congestion_window.py",),
+    "vision_side/missions/switch.py": ("tests/vision_side/missions/test_switch.py",),
     "vision_side/missions/follow.py": ("tests/vision_side/missions/test_follow.py",),
     "vision_side/tracking/prediction.py": ("tests/vision_side/tracking/test_prediction.py",),
     "vision_side/tracking/track.py": ("tests/vision_side/tracking/test_track.py",),

@@ -171,3 +171,64 @@ def test_requested_mission_continues_with_another_camera():
 def test_pipeline_with_an_unknown_mission_is_rejected():
     with pytest.raises(ConfigError, match="did you mean 'goto'"):
         Pipeline(VisionConfig(mission=MissionConfig(kind="gotto")), CAMERA, NoDetector())
+
+
+# --- the bounds, with numbers ------------------------------------------------------------------------------------
+
+
+def looked(dt_s=0.0, moving=(0.0, 0.0), applied=(0.0, 0.0), latency_s=0.0):
+    header = FrameHeader(session="0000abcd", seq=1, t_us=1, moving=moving, applied=applied)
+    return View(header, dt_s, latency_s, CAMERA, ())
+
+
+def begins(*frames):
+    """Return the number of the frame, from 1 on, at which a mission that was switched to begins; None if it waits."""
+    switch = MissionSwitch(scripted(), CAMERA)
+    switch.step(looked())
+    switch.switch(scripted(speed=0.1))
+    phases = [switch.step(one).phase for one in frames]
+    return phases.index("driving") + 1 if "driving" in phases else None
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("linear_mps", "angular_rad_s", "rests"), [
+    (0.00999, 0.02999, True), (0.01, 0.0, False), (0.0, 0.03, False), (0.5, 0.0, False), (0.0, 0.5, False),
+])  # fmt: skip
+def test_robot_rests_below_a_centimeter_a_second_and_30_mrad_a_second(linear_mps, angular_rad_s, rests, sign):
+    speeds = sign * linear_mps, sign * angular_rad_s
+    assert begins(looked(moving=speeds)) == (1 if rests else None)
+    assert begins(looked(applied=speeds)) == (1 if rests else None)
+
+
+@pytest.mark.parametrize(("dt_s", "begin"), [(0.0625, 1), (0.0615, None)])
+def test_resting_robot_is_waited_for_as_long_as_a_command_takes(dt_s, begin):
+    assert begins(looked(dt_s, latency_s=0.0625)) == begin
+
+
+def test_moving_robot_is_waited_for_a_second():
+    assert begins(*[looked(0.25, moving=(0.5, 0.0))] * 4) == 4
+    assert begins(*[looked(0.25, moving=(0.5, 0.0))] * 3, looked(0.245, moving=(0.5, 0.0))) is None
+    assert SETTLE_S == 1.0
+
+
+@pytest.mark.parametrize(("linear_mps", "angular_rad_s", "phase"), [
+    (1000.0, 1000.0, "driving"), (-1000.0, -1000.0, "driving"), (1000.1, 0.0, "failed"), (-1000.1, 0.0, "failed"),
+    (0.0, 1000.1, "failed"), (0.0, -1000.1, "failed"),
+])  # fmt: skip
+def test_command_beyond_a_thousand_ends_the_mission(linear_mps, angular_rad_s, phase):
+    switch = MissionSwitch(scripted(), CAMERA)
+    twist = Twist(linear_mps=linear_mps, angular_rad_s=angular_rad_s)
+    switch._mission.step = lambda _view: Plan(twist, "driving")
+    plan = switch.step(looked())
+    assert (plan.phase, plan.twist) == (phase, twist if phase == "driving" else STILL)
+    assert switch.step(looked()).phase == phase
+
+
+def test_note_of_a_failed_mission_has_at_most_200_characters():
+    switch = MissionSwitch(scripted(), CAMERA)
+
+    def fail(_view):
+        raise RuntimeError("x" * 300)
+
+    switch._mission.step = fail
+    assert switch.step(looked()).note == "RuntimeError: " + "x" * 186
