@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 from sightline.evaluation.labels import Labels
 from sightline.evaluation.scenario_config import robot_config, vision_config
+from sightline.evaluation.score.figures import RimSpeeds, RunRecord
 from sightline.protocol.channels import ACK, FRAME, SCAN, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import FrameHeader, State
@@ -25,7 +26,6 @@ from sightline.robot_side.safety.limits import TICK_US
 from sightline.sim.process import PeriodicTimer
 from sightline.sim.robot import RobotModel
 from sightline.sim.scenario import Scenario
-from sightline.sim.truth import Truth
 from sightline.sim.world.world import World
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector, notices_of
@@ -49,15 +49,12 @@ class Conditions:
 
 
 @dataclass(slots=True)
-class Run:
+class Run(RunRecord):
     """The result of a run."""
 
-    samples: list[Truth] = field(default_factory=list)
     twists: list[bytes] = field(default_factory=list)
     """Every twist the vision side sent, in order."""
     states: set[State] = field(default_factory=set)
-    said: list[tuple[int, str, str]] = field(default_factory=list)
-    """Capture time of each frame that was answered, and the mission's phase and note."""
     news: list[str] = field(default_factory=list)
     """Lines of the detector for the operator."""
 
@@ -132,16 +129,25 @@ class Lockstep:
 
     def _on_twist(self, message: Message) -> None:
         ack = self.driving.on_twist(message, self._now_us)
+        if self.run.accepted_us is None and self.driving.gate.accepted:
+            self.run.accepted_us = self._now_us
         if ack is not None:
             self._network_core.on_command_ack(ack, self._now_us)
         self._tick()
 
     def _tick(self) -> None:
         scan = self.world.scan() if self._scans.due(self._now_us) else None
-        self.world.set_wheels(*self.driving.tick(self._now_us, self.world.wheel_angles(), scan))
+        self._set_wheels(*self.driving.tick(self._now_us, self.world.wheel_angles(), scan))
         self._network_core.motion = self.driving.motion()
         self._publish_scans()
         self.run.states.add(self.driving.gate.state)
+
+    def _set_wheels(self, left_rad_s: float, right_rad_s: float) -> None:
+        radius_m = self.world.robot.wheels.radius_m
+        command = RimSpeeds(self._now_us, left_rad_s * radius_m, right_rad_s * radius_m)
+        if not self.run.wheels or self.run.wheels[-1][1:] != command[1:]:
+            self.run.wheels.append(command)
+        self.world.set_wheels(left_rad_s, right_rad_s)
 
     def _publish_scans(self) -> None:
         """Pass scans to a mission that uses them. It needs no other message of the driver."""
@@ -191,9 +197,9 @@ def run_lockstep(
     *,
     vision: VisionConfig | None = None,
     mission: str | None = None,
-    on_progress: Callable[[int], None] = lambda _now_us: None,
+    is_over: Callable[[Run], bool] = lambda _run: False,
 ) -> Run:
-    """Run `scenario` for `seconds` (default: its own length). `on_progress` receives the time each second.
+    """Run `scenario` for `seconds` (default: its own length), or until `is_over`, which is called each second.
 
     `vision` and `mission` stand in for what the scenario names.
     """
@@ -204,8 +210,8 @@ def run_lockstep(
         try:
             while world.now_us < end_us:
                 lockstep.step()
-                if world.now_us % 1_000_000 == 0:
-                    on_progress(world.now_us)
+                if world.now_us % 1_000_000 == 0 and is_over(lockstep.run):
+                    break
         finally:
             lockstep.close()
         return lockstep.run

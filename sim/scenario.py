@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
@@ -383,6 +383,88 @@ def look_named(name: str) -> Look:
     return check(Look, table[name], LOOKS)
 
 
+# What a scenario evaluates: its figures and their bounds. Pure.
+
+
+AT_LEAST = "least_"
+"""A figure whose name begins so must not fall below its bound. All others must not exceed it."""
+OFF = "off"
+"""In `[bounds]`: drops a bound of the file that is extended."""
+
+
+class Figure(NamedTuple):
+    """One figure of a run.
+
+    Args:
+        unit: its unit.
+        course: how it changes while the run continues. A `count` only rises, an `extreme` only gets worse, a `moment`
+            is one point in time, `rms` and `share` are averages since the acquisition, `other` may change either way.
+        needs: part of the scenario that it is about: light, goals, legs, things, or empty.
+        is_exact: True if a real machine gets no room beyond its bound.
+    """
+
+    unit: str
+    course: Literal["count", "extreme", "moment", "rms", "share", "other"]
+    needs: Literal["", "light", "goals", "legs", "things"] = ""
+    is_exact: bool = False
+
+
+FIGURES: Mapping[str, Figure] = {
+    "acquired_s": Figure("s", "moment"),
+    "found_s": Figure("s", "moment"),
+    "bearing_rms_deg": Figure("deg", "rms"),
+    "distance_rms_m": Figure("m", "rms"),
+    "lost_percent": Figure("%", "share", is_exact=True),
+    "wall_contacts": Figure("steps", "count", is_exact=True),
+    "wall_contact_s": Figure("s", "count", is_exact=True),
+    "target_contacts": Figure("steps", "count", is_exact=True),
+    "commanded_m": Figure("m", "count"),
+    "least_distance_m": Figure("m", "extreme", "legs"),
+    "most_distance_m": Figure("m", "extreme", "legs"),
+    "least_ever_m": Figure("m", "extreme", "legs"),
+    "reached_s": Figure("s", "moment", "goals"),
+    "given_up_s": Figure("s", "moment", "goals"),
+    "least_clearance_m": Figure("m", "extreme", "goals"),
+    "crossed_on_red": Figure("times", "count", "light", is_exact=True),
+    "crossed_late": Figure("times", "count", "light", is_exact=True),
+    "least_crossings": Figure("times", "count", "light", is_exact=True),
+    "least_red_stops": Figure("times", "count", "light", is_exact=True),
+    "start_s": Figure("s", "extreme", "light"),
+    "wrong_states_percent": Figure("%", "other", "light", is_exact=True),
+}
+"""Every figure that `[bounds]` of a scenario may name."""
+_CONTRADICTING = (("least_distance_m", "most_distance_m"), ("least_ever_m", "most_distance_m"))
+"""Pairs of (lower, upper) bounds of the same quantity."""
+
+
+def _without_off(given: Any) -> Any:
+    """Drop the bounds that are off, and reject unknown figures."""
+    if not isinstance(given, Mapping):
+        return given
+    for name in given:
+        if name not in FIGURES:
+            near = difflib.get_close_matches(str(name), FIGURES, n=1, cutoff=0.4)
+            raise ValueError(f"unknown figure {name!r}" + (f", did you mean {near[0]!r}?" if near else ""))
+    return {name: bound for name, bound in given.items() if bound != OFF}
+
+
+def _consistent(bounds: dict[str, float]) -> dict[str, float]:
+    """Reject bounds that no run can be within."""
+    if {"reached_s", "given_up_s"} <= bounds.keys():
+        raise ValueError(f'reached_s and given_up_s exclude each other; set one to "{OFF}"')
+    for lower, upper in _CONTRADICTING:
+        if {lower, upper} <= bounds.keys() and bounds[lower] > bounds[upper]:
+            raise ValueError(f"{lower} {bounds[lower]:g} exceeds {upper} {bounds[upper]:g}; no run is within both")
+    return bounds
+
+
+Bounds = Annotated[
+    dict[str, Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]],
+    BeforeValidator(_without_off), AfterValidator(_consistent),
+]
+"""Bound by the name of its figure."""
+
+
 # What happens in a simulated run: the models behind `scenarios/*.toml`. Pure.
 
 
@@ -393,6 +475,8 @@ class Start(Config):
 
     distance_m: Amounts = (0.0, 0.0)
     """Lens to the target's middle."""
+    except_m: Amounts | None = None
+    """Distances at which no run starts. One that is drawn within moves to the nearer end."""
     bearing_deg: Span = (0.0, 0.0)
     """Of the target, left positive; beyond 90 it is behind the robot."""
     approach_deg: Span = (180.0, 180.0)
@@ -453,6 +537,25 @@ class Scenario(Config):
     """Whether there is a way to the last of them."""
     labels: Literal["", "legs"] = ""
     """Objects that the simulation labels in each image, for a vision service with the detector `boxes`."""
+    acquired_within_deg: Annotated[float, Field(gt=0, le=30)] = 2.0
+    """Bearing within which the target counts as acquired."""
+    bounds: Bounds = Field(default_factory=dict)
+    """What a run is scored by. Without bounds it is not evaluated."""
+
+    @model_validator(mode="after")
+    def _has_what_its_bounds_need(self) -> Self:
+        parts = {
+            "light": self.light is not None, "goals": bool(self.goals_m), "legs": self.target.shape == "legs",
+            "things": any(isinstance(thing, OnPath) for thing in self.things),
+        }
+        for name in self.bounds:
+            needs = FIGURES[name].needs
+            if needs and not parts[needs]:
+                raise ValueError(f"bounds.{name} needs {_PARTS[needs]}, which this scenario does not have")
+        return self
+
+
+_PARTS = {"light": "a [light]", "goals": "goals_m", "legs": 'a target of shape "legs"', "things": "things on a path"}
 
 
 def scenario_names() -> list[str]:

@@ -85,10 +85,17 @@ def _first_problem(model: type[BaseModel], error: ValidationError) -> str:
     where = ".".join(str(part) for part in first["loc"]) or "file"
     if first["type"] == "missing":
         return f"{where}: is missing"
+    if first["type"] == "value_error":
+        return f"{where}: {first['msg'].removeprefix('Value error, ')}{_got(first['input'])}"
     if first["type"] != "extra_forbidden":
         return f"{where}: {first['msg']} (got {str(first['input'])[:60]})"
     near = difflib.get_close_matches(str(first["loc"][-1]), _fields(model), n=1)
     return f"{where}: unknown key{f', did you mean {near[0]!r}?' if near else ''}"
+
+
+def _got(value: Any) -> str:
+    """Return a short value; a whole table would hide the problem."""
+    return "" if isinstance(value, dict) else f" (got {str(value)[:60]})"
 
 
 def _fields(model: type[BaseModel]) -> set[str]:

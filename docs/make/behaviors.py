@@ -18,22 +18,19 @@ from sightline.evaluation.plots import ROBOT_COLOR, plot_run
 from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.scenario_config import robot_of
 from sightline.evaluation.score.figures import (
-    BOUNDS,
     EXACT,
     HARDEST_MPS2,
     REACHED_WITHIN_M,
     READ_WITHIN_M,
     SETTLED_S,
-    UNITS,
     Score,
     checks_of,
-    figures_of,
     median_and_worst,
     score,
 )
 from sightline.evaluation.score.runs import ScoreCase, run_of
 from sightline.operator_side.terminal import progress_bar
-from sightline.sim.scenario import Scenario, Start, load_scenario
+from sightline.sim.scenario import FIGURES, Scenario, Start, load_scenario
 from sightline.sim.truth import Truth
 
 if TYPE_CHECKING:
@@ -235,7 +232,7 @@ def _plot(axes: "Axes", runs: Sequence[SpeedRun], label: str, values: Sequence[S
 Results = Mapping[ScoreCase, Score]
 SPEEDS: Final = "thymio-speeds.png"
 _ALSO_OF_BASELINES: Final = ("unseen_percent", "target_contacts")
-_UNITS: Final = {**UNITS, "unseen_percent": "%"}
+_UNITS: Final = {**{name: figure.unit for name, figure in FIGURES.items()}, "unseen_percent": "%"}
 _IN_LIGHT: Final = ("wrong_states_percent", "crossed_on_red", "crossed_late", "least_crossings", "start_s")
 
 
@@ -290,7 +287,7 @@ def _overview(rows: Sequence[Row], results: Results, seeds: Sequence[int]) -> It
 
 def _tightest(row: Row, checks: Sequence[Check]) -> str:
     """The figure that came nearest to its bound, of those that leave room."""
-    names = set(BOUNDS[row.scenario]) - set(EXACT)
+    names = load_scenario(row.scenario).bounds.keys() - set(EXACT)
     shares = [(_share(check), check) for check in checks if check.name in names and check.value is not None]
     share, check = max(shares, key=lambda one: one[0], default=(0.0, None))
     return f"{check.name} {_figure(check.value, check.unit)}, {share:.0%}" if check else ""
@@ -304,7 +301,7 @@ def _share(check: Check) -> float:
 
 
 def _checks(row: Row, result: Score) -> list[Check]:
-    return checks_of(row.scenario, result, LATENCY_MS)
+    return checks_of(load_scenario(row.scenario), result, LATENCY_MS)
 
 
 def _head(row: Row) -> Iterator[str]:
@@ -430,7 +427,7 @@ def _run(case: ScoreCase, picture: Path | None) -> Score:
         whose = f" on {case.robot}" if case.robot else ""
         law = case.mission or scenario.mission
         plot_run(picture, run.samples, scenario, f"{scenario.name}{whose}, {law}, seed {case.seed}")
-    return score(run.samples, scenario.stand_off_m, figures_of(scenario, run.samples, run.said))
+    return score(scenario, run)
 
 
 def main() -> int:

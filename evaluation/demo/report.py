@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sightline.evaluation.checks import Check, at_most, check_lines, to_dict
-from sightline.evaluation.demo.run import RECORDING, DemoRun
+from sightline.evaluation.demo.run import MOTOR_LOG, RECORDING, DemoRun
 from sightline.evaluation.demo.shaped_vision import INJECTED
+from sightline.evaluation.faults.evidence import read_motors
 from sightline.evaluation.processes import last_line
 from sightline.evaluation.scenario_config import robot_config, robot_of
-from sightline.evaluation.score.figures import Score, checks_of, figures_of, score
-from sightline.operator_side.client.requests import read_report
+from sightline.evaluation.score.figures import NOT_EVALUATED, RimSpeeds, RunRecord, Score, checks_of, score
+from sightline.operator_side.client.requests import StatusReport, read_report
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.recording.recorder import read_recording
 from sightline.operator_side.recording.replay import Replayed, Step, replay
@@ -38,15 +39,17 @@ class DemoReport:
     injected: dict[str, Any] | None
 
     @property
-    def ok(self) -> bool:
-        """Return True if every check passes."""
-        return all(check.ok for check in self.checks)
+    def ok(self) -> bool | None:
+        """Return True if every check passes, None if the scenario has no bounds to check."""
+        if not all(check.ok for check in self.checks):
+            return False
+        return True if self.run.scenario.bounds else None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of `--json` and score.json."""
         options = self.run.options
         return {
-            **to_dict(self.checks),
+            **to_dict(self.checks), "ok": self.ok,
             "score": asdict(self.score),
             "scenario": options.scenario, "seed": options.seed, "latency_ms": options.latency_ms, "loss": options.loss,
             "replayed": asdict(self.replayed), "injected": self.injected,
@@ -63,7 +66,8 @@ def report(run: DemoRun) -> DemoReport:
     said: list[tuple[int, str, str]] = []
     replayed = replay(recording, lambda step: said.append(_printed(step)))
     during = [one for one in said if run.samples[0].t_us <= one[0] <= run.samples[-1].t_us]
-    result = score(run.samples, run.scenario.stand_off_m, figures_of(run.scenario, run.samples, during))
+    record = RunRecord(run.samples, during, accepted_us(recording), _wheels(run))
+    result = score(run.scenario, record)
     injected = _injected(run)
     checks = _checks(run, result) + _injection_checks(run, injected)
     judged = DemoReport(run, result, checks, replayed, injected)
@@ -75,6 +79,18 @@ def report(run: DemoRun) -> DemoReport:
 def _printed(step: Step) -> tuple[int, str, str]:
     """Return the phase and note of a frame. The same pipeline produces the same for the same frames."""
     return step.frame.header.t_us, step.answer.seen.phase, step.answer.seen.note
+
+
+def accepted_us(recording: Path) -> int | None:
+    """Return the time of the first status that counts an accepted twist."""
+    return next((report.stamp.t_us for report in read_reports(recording) if report.status.accepted), None)
+
+
+def _wheels(run: DemoRun) -> list[RimSpeeds]:
+    """Read the wheel commands from the motor log."""
+    radius_m = robot_of(run.scenario).wheels.radius_m
+    rows = read_motors((run.folder / MOTOR_LOG).read_text("ascii"))
+    return [RimSpeeds(row.t_us, row.left_rad_s * radius_m, row.right_rad_s * radius_m) for row in rows]
 
 
 def _draw(run: DemoRun, recording: Path) -> None:
@@ -92,13 +108,20 @@ def read_statuses(recording: Path) -> "list[StatusAt]":
     """Read state and frame age over time from a recording; an invalid message is left out."""
     from sightline.evaluation.plots import StatusAt
 
-    statuses = []
+    return [
+        StatusAt(report.stamp.t_us, report.status.state.value, report.status.frame_age_us)
+        for report in read_reports(recording)
+    ]
+
+
+def read_reports(recording: Path) -> list[StatusReport]:
+    """Read every status of a recording in the order of time; an invalid message is left out."""
+    reports = []
     for recorded in read_recording(recording):
         if recorded.message.channel is STATUS:
             with suppress(WireError):
-                report = read_report(recorded.message)
-                statuses.append(StatusAt(report.stamp.t_us, report.status.state.value, report.status.frame_age_us))
-    return sorted(statuses, key=lambda one: one.t_us)
+                reports.append(read_report(recorded.message))
+    return sorted(reports, key=lambda report: report.stamp.t_us)
 
 
 def _injected(run: DemoRun) -> dict[str, Any] | None:
@@ -126,7 +149,9 @@ def _injection_checks(run: DemoRun, injected: dict[str, Any] | None) -> list[Che
 def _checks(run: DemoRun, result: Score) -> list[Check]:
     """Return the checks of the scenario. The legacy protocol, slow and without odometry, only has to follow."""
     if run.options.transport != "legacy":
-        return checks_of(run.options.scenario, result, run.options.latency_ms, REAL_TIME_FACTOR)
+        return checks_of(run.scenario, result, run.options.latency_ms, REAL_TIME_FACTOR)
+    if not run.scenario.bounds:
+        return []
     unseen = 100 * sum(not sample.visible for sample in run.samples) / len(run.samples)
     return [
         at_most("out of view", unseen, "%", 0.0),
@@ -138,6 +163,8 @@ def summary(judged: DemoReport) -> list[str]:
     """Format the closing lines: the score with its bounds, the files, and the next commands."""
     run, replayed = judged.run, judged.replayed
     lines = check_lines(judged.checks)
+    if not run.scenario.bounds:
+        lines.append(NOT_EVALUATED)
     lines.append(_replay_line(replayed))
     if run.dropped_by_recorder:
         lines.append(f"the recorder dropped {run.dropped_by_recorder} messages: the disk was too slow")

@@ -1,28 +1,54 @@
-"""The figures of a run from world truth, and the bounds of each scenario. Pure."""
+"""The figures of a run from world truth, and their checks against the scenario's bounds. Pure."""
 
-import itertools
 import math
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
+from typing import NamedTuple
 
 from sightline.evaluation.checks import Check
-from sightline.sim.scenario import Scenario
+from sightline.sim.scenario import AT_LEAST, FIGURES, Scenario
 from sightline.sim.truth import Truth
 
-ACQUIRED_WITHIN_DEG = 2.0
 ACQUIRED_WITHIN_M = 0.05
+ACQUIRED_FOR_S = 1.0
+"""So long without a break the target must be within both: a target that only passes through is not acquired."""
 FOUND_WITHIN_DEG = 10.0
+
+MissionPhases = Sequence[tuple[int, str, str]]
+"""Capture time of each frame answered, and the mission's phase and note."""
+
+
+class RimSpeeds(NamedTuple):
+    """Speeds of the wheels at the rim, which the robot commanded from `t_us` until the next command."""
+
+    t_us: int
+    left_mps: float
+    right_mps: float
+
+
+@dataclass(slots=True)
+class RunRecord:
+    """The record of a run for its score, whether in lockstep or in real time."""
+
+    samples: list[Truth] = field(default_factory=list)
+    said: list[tuple[int, str, str]] = field(default_factory=list)
+    """Capture time of each frame that was answered, and the mission's phase and note."""
+    accepted_us: int | None = None
+    """When the robot accepted its first twist; None if it never did."""
+    wheels: list[RimSpeeds] = field(default_factory=list)
+    """Each change of the wheel commands, in order."""
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """One run. From the first acquisition to the end, coasting included; None where it was never acquired."""
+    """One run. From the acquisition to the end, coasting included; None where it was never acquired."""
 
     acquired_s: float | None
-    """When bearing and distance were first within 2 degrees and 0.05 m, since the first sample."""
+    """Begin of the first second, after the first accepted twist, in which the target stayed in view within
+    `acquired_within_deg` and 0.05 m. It counts from the first sample."""
     found_s: float | None
     """When the target was first in view within 10 degrees."""
     bearing_rms_deg: float | None
@@ -47,16 +73,15 @@ class Score:
         return value
 
 
-def score(
-    samples: Sequence[Truth], stand_off_m: float, figures: Mapping[str, float | None] | None = None
-) -> Score:
-    """Score evenly spaced samples. Raises ValueError for none at all."""
+def score(scenario: Scenario, run: RunRecord) -> Score:
+    """Score a run of `scenario` by its evenly spaced samples. Raises ValueError for none at all."""
+    samples = run.samples
     if not samples:
         raise ValueError("a run without samples has no score")
-    start_us = samples[0].t_us
-    acquired = next((at for at, truth in enumerate(samples) if _is_on(truth, stand_off_m)), None)
+    start_us, stand_off_m = samples[0].t_us, scenario.stand_off_m
+    acquired = acquired_at(scenario, run)
     found = next((truth for truth in samples if _is_found(truth)), None)
-    followed = samples[acquired:] if acquired is not None else ()
+    followed = samples[acquired:] if acquired is not None else []
     return Score(
         acquired_s=None if acquired is None else (samples[acquired].t_us - start_us) / 1e6,
         found_s=None if found is None else (found.t_us - start_us) / 1e6,
@@ -64,17 +89,32 @@ def score(
         distance_rms_m=_rms([truth.distance_m - stand_off_m for truth in followed]),
         lost_percent=100 * sum(not truth.visible for truth in followed) / len(followed) if followed else None,
         wall_contacts=samples[-1].wall_contacts - samples[0].wall_contacts,
-        travelled_m=sum(math.dist((a.x_m, a.y_m), (b.x_m, b.y_m)) for a, b in itertools.pairwise(samples)),
+        travelled_m=sum(math.dist((a.x_m, a.y_m), (b.x_m, b.y_m)) for a, b in pairwise(samples)),
         seconds=(samples[-1].t_us - start_us) / 1e6,
         unseen_percent=100 * sum(not truth.visible for truth in samples) / len(samples),
         target_contacts=samples[-1].target_contacts_by_robot - samples[0].target_contacts_by_robot,
-        figures=figures or {},
+        figures=figures_of(scenario, run, followed),
     )
 
 
-def _is_on(truth: Truth, stand_off_m: float) -> bool:
-    near = abs(truth.distance_m - stand_off_m) < ACQUIRED_WITHIN_M
-    return near and abs(math.degrees(truth.bearing_rad)) < ACQUIRED_WITHIN_DEG and truth.visible
+def acquired_at(scenario: Scenario, run: RunRecord) -> int | None:
+    """Return the index of the acquisition: the begin of a second on the target, after the first accepted twist."""
+    if run.accepted_us is None:
+        return None
+    begin: int | None = None
+    for at, truth in enumerate(run.samples):
+        if truth.t_us < run.accepted_us or not _is_on(truth, scenario):
+            begin = None
+            continue
+        begin = at if begin is None else begin
+        if truth.t_us - run.samples[begin].t_us >= ACQUIRED_FOR_S * 1e6:
+            return begin
+    return None
+
+
+def _is_on(truth: Truth, scenario: Scenario) -> bool:
+    near = abs(truth.distance_m - scenario.stand_off_m) < ACQUIRED_WITHIN_M
+    return near and abs(math.degrees(truth.bearing_rad)) < scenario.acquired_within_deg and truth.visible
 
 
 def _is_found(truth: Truth) -> bool:
@@ -94,19 +134,13 @@ def median_and_worst(results: Sequence[Score], name: str) -> tuple[float | None,
     return (median(numbers) if numbers else None), whole
 
 
-AT_LEAST = "least_"
-"""A figure whose name begins so must not fall below its bound."""
-
-
 # The figures of scenarios that are more than following one ball: legs, waypoints, traffic lights. Pure.
 #
-# From world truth alone, except for the reports of a mission: an unreachable waypoint, and the color of the light.
+# From world truth alone, except for the wheel commands and the reports of a mission: an unreachable waypoint, and the
+# color of the light.
 
 
 Figures = dict[str, float | None]
-MissionPhases = Sequence[tuple[int, str, str]]
-"""Capture time of each frame answered, and the mission's phase and note."""
-
 STEP_S = 0.004
 """A physics step: contacts are counted in these."""
 REACHED_WITHIN_M = 0.06
@@ -122,23 +156,34 @@ SETTLED_S = 0.35
 """After a change of colour: a frame's way there and back, and a second look."""
 
 
-def figures_of(scenario: Scenario, samples: Sequence[Truth], said: MissionPhases = ()) -> Figures:
-    """Return the figures of `scenario` in addition to those of following."""
-    figures: Figures = {"wall_contact_s": (samples[-1].wall_contacts - samples[0].wall_contacts) * STEP_S}
+def figures_of(scenario: Scenario, run: RunRecord, followed: Sequence[Truth]) -> Figures:
+    """Return the figures of `scenario` in addition to those of following. `followed` begins at the acquisition."""
+    samples = run.samples
+    figures: Figures = {
+        "wall_contact_s": (samples[-1].wall_contacts - samples[0].wall_contacts) * STEP_S,
+        "commanded_m": commanded_m(run.wheels, samples[0].t_us, samples[-1].t_us),
+    }
     if scenario.target.shape == "legs":
-        figures |= legs_figures(samples, scenario.stand_off_m)
+        figures |= legs_figures(samples, followed)
     if scenario.goals_m:
-        figures |= goal_figures(scenario, samples, said)
+        figures |= goal_figures(scenario, samples, run.said)
     if scenario.light is not None:
-        figures |= light_figures(samples, said)
+        figures |= light_figures(samples, run.said)
     return figures
 
 
-def legs_figures(samples: Sequence[Truth], stand_off_m: float) -> Figures:
-    """Return the distances from the first acquisition on, and the smallest of the whole run."""
-    acquired_s = score(samples, stand_off_m).acquired_s
-    begin_us = samples[0].t_us + acquired_s * 1e6 if acquired_s is not None else math.inf
-    distances = [truth.distance_m for truth in samples if truth.t_us >= begin_us]
+def commanded_m(wheels: Sequence[RimSpeeds], begin_us: int, end_us: int) -> float:
+    """Return the way that the commands alone would roll the faster wheel, whatever pushes the robot."""
+    ends_us = [*(command.t_us for command in wheels[1:]), end_us]
+    return sum(
+        max(abs(command.left_mps), abs(command.right_mps)) * max(0, until_us - max(command.t_us, begin_us)) / 1e6
+        for command, until_us in zip(wheels, ends_us, strict=True)
+    ) if wheels else 0.0
+
+
+def legs_figures(samples: Sequence[Truth], followed: Sequence[Truth]) -> Figures:
+    """Return the distances from the acquisition on, and the smallest of the whole run."""
+    distances = [truth.distance_m for truth in followed]
     return {
         "least_distance_m": min(distances, default=None), "most_distance_m": max(distances, default=None),
         "least_ever_m": min(truth.distance_m for truth in samples),
@@ -165,7 +210,8 @@ def light_figures(samples: Sequence[Truth], said: MissionPhases) -> Figures:
     crossings = list(_crossings(samples))
     starts = list(_starts(samples))
     return {
-        "least_crossings": len(crossings), "crossed_on_red": sum(light == "red" for light, _ in crossings),
+        "least_crossings": len(crossings), "least_red_stops": red_stops(samples),
+        "crossed_on_red": sum(light == "red" for light, _ in crossings),
         "crossed_late": sum(light == "yellow" and could_stop for light, could_stop in crossings),
         "start_s": max(starts, default=0.0), "wrong_states_percent": _wrong_percent(samples, said),
     }
@@ -182,12 +228,21 @@ def _crossings(samples: Sequence[Truth]) -> Iterator[tuple[str, bool]]:
             yield now.light, could_stop
 
 
+def red_stops(samples: Sequence[Truth]) -> int:
+    """Count how often the robot came to rest before the line at a red light."""
+    waits = [truth.light == "red" and _waits(truth) for truth in samples]
+    return sum(now and not before for before, now in pairwise(waits))
+
+
+def _waits(truth: Truth) -> bool:
+    return abs(truth.linear_mps) < STANDING_MPS and -WAITS_WITHIN_M < (truth.past_line_m or 0.0) < 0
+
+
 def _starts(samples: Sequence[Truth]) -> Iterator[float]:
     """Yield the delay between each green and the start of a waiting robot, in s."""
     green_us: int | None = None
     for before, now in pairwise(samples):
-        waits = abs(now.linear_mps) < STANDING_MPS and -WAITS_WITHIN_M < (now.past_line_m or 0.0) < 0
-        if before.light != "green" == now.light and waits:
+        if before.light != "green" == now.light and _waits(now):
             green_us = now.t_us
         if green_us is not None and (now.linear_mps >= STANDING_MPS or now.light != "green"):
             yield (now.t_us - green_us) / 1e6
@@ -218,89 +273,62 @@ def _is_new(t_us: int, changes: Sequence[int]) -> bool:
     return any(0 <= t_us - change < SETTLED_S * 1e6 for change in changes)
 
 
-# The bounds of each scenario, and their check. Pure.
+# A score against the bounds of its scenario. Pure.
 #
-# They apply to 0 to 200 ms added latency and 10 % loss on each leg. Contact is permitted only where a bound names it.
+# The bounds apply to 0 to 200 ms added latency and 10 % loss on each leg.
 
 
-UNITS = {
-    "acquired_s": "s", "found_s": "s", "bearing_rms_deg": "deg", "distance_rms_m": "m", "lost_percent": "%",
-    "wall_contacts": "steps", "target_contacts": "steps", "travelled_m": "m", "wall_contact_s": "s",
-    "least_distance_m": "m", "most_distance_m": "m", "least_ever_m": "m", "reached_s": "s", "least_clearance_m": "m",
-    "given_up_s": "s", "crossed_on_red": "times", "crossed_late": "times", "least_crossings": "times",
-    "start_s": "s", "wrong_states_percent": "%",
-}
+NOT_EVALUATED = "not evaluated: the scenario has no [bounds]"
 STANDS_STILL_FROM_MS = 350
 """Added latency from which every frame is too old. The robot must stand still, and the score checks it."""
-
-_CIRCLE = {"bearing_rms_deg": 1.0, "lost_percent": 0.0, "target_contacts": 0.0}
-_EIGHT = {"bearing_rms_deg": 3.0, "lost_percent": 0.0, "target_contacts": 0.0}
-_LEGS = {
-    "bearing_rms_deg": 3.0, "lost_percent": 0.0, "least_distance_m": 0.7, "most_distance_m": 1.0, "least_ever_m": 0.3,
-    "target_contacts": 0.0,
-}
-_LIGHT = {
-    "crossed_on_red": 0.0, "crossed_late": 0.0, "least_crossings": 1.0, "start_s": 0.7, "wrong_states_percent": 0.0,
-}
-_COURSE = {"reached_s": 40.0, "least_clearance_m": 0.10}
-
-BOUNDS: dict[str, dict[str, float]] = {
-    "static": {"acquired_s": 1.5, "bearing_rms_deg": 0.5, "distance_rms_m": 0.03},
-    "circle": {"bearing_rms_deg": 1.0, "distance_rms_m": 0.05},
-    "eight": {"bearing_rms_deg": 3.0, "lost_percent": 0.0},
-    "pushed": {"lost_percent": 0.0},
-    "behind": {"found_s": 5.0},
-    "walls": {},
-    "occluder": {"wall_contact_s": 0.1},
-    "blue-sphere": _CIRCLE, "ball": _CIRCLE, "blocks": _CIRCLE, "blocks-red": _CIRCLE, "blocks-yellow": _CIRCLE,
-    "chaser": _CIRCLE, "chaser-circle": _CIRCLE,
-    "blue-sphere-eight": _EIGHT, "ball-eight": _EIGHT, "blocks-eight": _EIGHT, "chaser-eight": _EIGHT,
-    "legs": _LEGS, "legs-slow": _LEGS, "legs-fast": _LEGS, "legs-crowd": _LEGS,
-    "traffic-light": _LIGHT, "traffic-light-boxes": _LIGHT,
-    "thymio": {**_COURSE, "reached_s": 15.0}, "thymio-box": _COURSE, "thymio-slalom": _COURSE,
-    "thymio-trap": {**_COURSE, "reached_s": 60.0}, "thymio-closed": {"given_up_s": 60.0, "least_clearance_m": 0.10},
-}
-EXACT = (
-    "lost_percent", "wall_contacts", "target_contacts", "crossed_on_red", "crossed_late", "least_crossings",
-    "wrong_states_percent", "wall_contact_s",
-)
+_STANDS_STILL = {"commanded_m": 0.05, "wall_contacts": 0.0}
+"""Then the wheel commands are checked. A target that pushes a standing robot is not its doing."""
+EXACT = tuple(name for name, figure in FIGURES.items() if figure.is_exact)
 """Figures that leave no room."""
-_ACQUIRES = ("bearing_rms_deg", "distance_rms_m", "lost_percent")
-"""Figures that are taken from the first acquisition on."""
 
 
-def checks_of(scenario: str, result: Score, latency_ms: float = 0.0, factor: float = 1.0) -> list[Check]:
+def bounds_of(scenario: Scenario, latency_ms: float = 0.0) -> Mapping[str, float]:
+    """Return the bounds of `scenario` with that latency; none if it is not evaluated."""
+    if not scenario.bounds:
+        return {}
+    return _STANDS_STILL if latency_ms >= STANDS_STILL_FROM_MS else scenario.bounds
+
+
+def checks_of(scenario: Scenario, result: Score, latency_ms: float = 0.0, factor: float = 1.0) -> list[Check]:
     """Hold `result` against the bounds of `scenario`, each times `factor` but for those that leave no room."""
-    if latency_ms >= STANDS_STILL_FROM_MS:
-        return [_check("travelled_m", result, 0.05), _check("wall_contacts", result, 0.0)]
-    bounds = dict(BOUNDS[scenario] if scenario in BOUNDS else _usual(result))
-    if "wall_contact_s" not in bounds:
-        bounds["wall_contacts"] = 0.0
-    checks = [_check(name, result, _granted(name, bound, factor)) for name, bound in bounds.items()]
-    if "acquired_s" not in bounds and _must_acquire(bounds):
-        checks.insert(0, Check("acquired_s", result.acquired_s, "s", result.seconds, result.acquired_s is not None))
-    return checks
-
-
-def _usual(result: Score) -> dict[str, float]:
-    """Return the bounds of a user's scenario by its kind."""
-    if "least_crossings" in result.figures:
-        return _LIGHT
-    return {**_COURSE, "reached_s": result.seconds} if "reached_s" in result.figures else {}
-
-
-def _must_acquire(bounds: dict[str, float]) -> bool:
-    """Return True if the run must acquire the target, because no other bound of following applies."""
-    return any(name in _ACQUIRES for name in bounds) or set(bounds) <= {"wall_contacts", "wall_contact_s"}
+    bounds = bounds_of(scenario, latency_ms)
+    return [_check(name, result, _granted(name, bound, factor)) for name, bound in bounds.items()]
 
 
 def _granted(name: str, bound: float, factor: float) -> float:
-    if name in EXACT:
+    if FIGURES[name].is_exact:
         return bound
     return bound / factor if name.startswith(AT_LEAST) else bound * factor
 
 
 def _check(name: str, result: Score, bound: float) -> Check:
     value = result.figure(name)
-    ok = value is not None and (value >= bound if name.startswith(AT_LEAST) else value <= bound)
-    return Check(name, value, UNITS[name], bound, ok)
+    return Check(name, value, FIGURES[name].unit, bound, value is not None and _is_within(name, value, bound))
+
+
+def _is_within(name: str, value: float, bound: float) -> bool:
+    return value >= bound if name.startswith(AT_LEAST) else value <= bound
+
+
+def broken(scenario: Scenario, so_far: Score, seconds: float) -> list[str]:
+    """Return the bounds that a run of `seconds` has broken already, whatever happens in the rest of it."""
+    return [name for name, bound in scenario.bounds.items() if _is_beyond_repair(name, bound, so_far, seconds)]
+
+
+def _is_beyond_repair(name: str, bound: float, so_far: Score, seconds: float) -> bool:
+    value, course = so_far.figure(name), FIGURES[name].course
+    if course == "moment" and value is None:
+        return so_far.seconds > bound + (ACQUIRED_FOR_S if name == "acquired_s" else 0.0)
+    if value is None or course == "other" or (course == "count" and name.startswith(AT_LEAST)):
+        return False
+    if course in ("rms", "share"):
+        begin_s = so_far.acquired_s or 0.0
+        share = min(1.0, (so_far.seconds - begin_s) / max(seconds - begin_s, 1e-9))
+        # The best rest of the run has no error at all.
+        value *= share if course == "share" else math.sqrt(share)
+    return not _is_within(name, value, bound)

@@ -3,7 +3,7 @@
 Each run is a process's own, so that they share the machine's cores; a run itself repeats bit for bit.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, field
 from itertools import groupby, product
@@ -13,9 +13,9 @@ from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, Run, run_lockstep
 from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.scenario_config import robot_of, vision_config
-from sightline.evaluation.score.figures import Score, checks_of, figures_of, median_and_worst, score
+from sightline.evaluation.score.figures import NOT_EVALUATED, Score, checks_of, median_and_worst, score
 from sightline.protocol.errors import ConfigError
-from sightline.sim.scenario import Scenario, load_scenario, look_named
+from sightline.sim.scenario import FIGURES, Scenario, load_scenario, look_named
 from sightline.vision_side.detect.registry import check_choice
 from sightline.vision_side.missions.registry import REGISTRY, configured_mission
 
@@ -64,13 +64,17 @@ class ScoreReport:
 
     runs: list[tuple[ScoreCase, Score]]
     judged: list[ScoredFigure]
+    unevaluated: list[str] = field(default_factory=list)
+    """Groups whose scenario has no bounds."""
     news: dict[str, list[str]] = field(default_factory=dict)
     """Lines of the detector for the operator by group, e.g. the cause of a missing answer."""
 
     @property
-    def ok(self) -> bool:
-        """Return True if every run is within every bound."""
-        return all(one.ok for one in self.judged)
+    def ok(self) -> bool | None:
+        """Return True if every run is within every bound, None if a scenario without bounds cannot show that."""
+        if not all(one.ok for one in self.judged):
+            return False
+        return None if self.unevaluated else True
 
     def to_dict(self) -> dict[str, Any]:
         """For `--json`."""
@@ -81,6 +85,7 @@ class ScoreReport:
                  "bound": one.bound, "ok": one.ok}
                 for one in self.judged
             ],
+            "not_evaluated": self.unevaluated,
             "news": self.news,
             "runs": [{**asdict(case), "score": asdict(result)} for case, result in self.runs],
         }
@@ -120,7 +125,7 @@ def cases(
 def run_case(case: ScoreCase) -> tuple[Score, list[str]]:
     """One run in lockstep, scored, and the detector's news."""
     scenario, run = run_of(case)
-    return score(run.samples, scenario.stand_off_m, figures_of(scenario, run.samples, run.said)), run.news
+    return score(scenario, run), run.news
 
 
 def run_of(case: ScoreCase) -> tuple[Scenario, Run]:
@@ -149,7 +154,9 @@ def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCa
         for line in results[case][1]:
             news.setdefault(case.group, []).append(line)
     told = {group: list(dict.fromkeys(lines))[:_MOST_NOTICES] for group, lines in news.items()}
-    return ScoreReport(runs, scored_figures(runs), told)
+    unbounded = {name for name in {case.scenario for case in wanted} if not load_scenario(name).bounds}
+    unevaluated = list(dict.fromkeys(case.group for case in wanted if case.scenario in unbounded))
+    return ScoreReport(runs, scored_figures(runs), unevaluated, told)
 
 
 def scored_figures(runs: Sequence[tuple[ScoreCase, Score]]) -> list[ScoredFigure]:
@@ -157,7 +164,8 @@ def scored_figures(runs: Sequence[tuple[ScoreCase, Score]]) -> list[ScoredFigure
     judged = []
     for name, members in groupby(runs, key=lambda run: run[0].group):
         group = list(members)
-        checks = [checks_of(case.scenario, result, case.latency_ms) for case, result in group]
+        scenario = load_scenario(group[0][0].scenario)
+        checks = [checks_of(scenario, result, case.latency_ms) for case, result in group]
         results = [result for _, result in group]
         judged += [_scored_figure(name, list(same), results) for same in zip(*checks, strict=True)]
     return judged
@@ -181,7 +189,25 @@ def score_text(report: ScoreReport) -> str:
             group = one.group
             lines += [group, *(f"  {line}" for line in report.news.get(group, ()))]
         lines.append(_line(one))
-    return "\n".join([*lines, f"{len(report.runs)} runs, {'all within bounds' if report.ok else 'NOT within bounds'}"])
+    for group in report.unevaluated:
+        results = [result for case, result in report.runs if case.group == group]
+        lines += [group, *(f"  {line}" for line in report.news.get(group, ())), *_unevaluated_lines(results)]
+    return "\n".join([*lines, f"{len(report.runs)} runs, {_result(report)}"])
+
+
+def _result(report: ScoreReport) -> str:
+    if report.ok is False:
+        return "NOT within bounds"
+    return NOT_EVALUATED if report.unevaluated else "all within bounds"
+
+
+def _unevaluated_lines(results: Sequence[Score]) -> Iterator[str]:
+    """Yield the figures that happened, without bounds."""
+    for name, figure in FIGURES.items():
+        median, worst = median_and_worst(results, name)
+        if median is not None:
+            yield f"  {name:<16} median {number(median):>7}  worst {number(worst):>7} {figure.unit:<5}"
+    yield f"  {NOT_EVALUATED}"
 
 
 def _line(one: ScoredFigure) -> str:

@@ -93,8 +93,8 @@ def demo(
     with needs("all"):
         from sightline.benchmarks.real_time import Kinds, measure_demos
         from sightline.evaluation.checks import number
-        from sightline.evaluation.score.figures import AT_LEAST, EXACT
-        from sightline.sim.scenario import load_scenario, scenario_names
+        from sightline.evaluation.score.figures import EXACT
+        from sightline.sim.scenario import AT_LEAST, load_scenario, scenario_names
     names = scenario_names() if scenario == "all" else scenario.split(",")
     for name in names:
         load_scenario(name)

@@ -112,7 +112,8 @@ def _seconds(scenario: str, given: float | None) -> float:
     if given is not None:
         return given
     loaded = load_scenario(scenario)
-    return loaded.seconds if loaded.goals_m or loaded.light else 20.0
+    is_course = loaded.goals_m or loaded.light or "least_passes" in loaded.bounds
+    return loaded.seconds if is_course else 20.0
 
 
 def _check_installed(*packages: str) -> None:

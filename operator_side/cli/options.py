@@ -89,11 +89,11 @@ Number = TypeVar("Number", int, float)
 def print_result(result: dict[str, Any], lines: Iterable[str], as_json: bool) -> int:
     """Print the result of a command with checks as JSON or as `lines`, and return the exit code.
 
-    A result without `ok` cannot fail.
+    A result whose `ok` is missing or None has nothing to fail.
     """
     for line in (json.dumps(result),) if as_json else lines:
         typer.echo(line)
-    return 0 if result.get("ok", True) else CHECK_FAILED
+    return CHECK_FAILED if result.get("ok") is False else 0
 
 
 def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:

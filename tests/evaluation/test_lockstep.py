@@ -14,7 +14,7 @@ ROBOT = load_robot("raspberry")
 def run(name, seed, conditions, seconds):
     scenario = load_scenario(name)
     result = run_lockstep(scenario, ROBOT, seed, conditions, seconds)
-    return result, score(result.samples, scenario.stand_off_m)
+    return result, score(scenario, result)
 
 
 def test_a_run_repeats_bit_for_bit():
@@ -34,12 +34,12 @@ def test_a_run_repeats_bit_for_bit():
 ])
 def test_every_scenario_holds_its_figures(name, seconds):
     _, result = run(name, 103, Conditions(latency_ms=50, loss=0.1), seconds)
-    assert [check for check in checks_of(name, result, 50) if not check.ok] == []
+    assert [check for check in checks_of(load_scenario(name), result, 50) if not check.ok] == []
 
 
 def test_with_400_ms_the_robot_stands_still():
     result, figures = run("eight", 104, Conditions(latency_ms=400, loss=0.1), 3.0)
-    assert all(check.ok for check in checks_of("eight", figures, 400))
+    assert all(check.ok for check in checks_of(load_scenario("eight"), figures, 400))
     assert State.ACTIVE not in result.states
     assert len(result.twists) > 5, "vision did answer; the gate rejected"
 

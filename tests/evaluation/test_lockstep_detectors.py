@@ -15,7 +15,7 @@ demanded.module("pybullet", "sim")
 from examples import older_range
 from sightline.evaluation.lockstep import Conditions, run_lockstep
 from sightline.evaluation.scenario_config import robot_of, vision_config
-from sightline.evaluation.score.figures import ACQUIRED_WITHIN_DEG, score
+from sightline.evaluation.score.figures import score
 from sightline.sim.scenario import load_scenario
 from sightline.vision_side.config import DetectorConfig, HsvConfig
 
@@ -34,7 +34,7 @@ def driven(detector, seed, seconds, scenario=SCENARIO):
     """World truth of a run, and its score."""
     own = vision_config(scenario, ROBOT, seed).model_copy(update={"detector": DetectorConfig(kind=detector)})
     run = run_lockstep(scenario, ROBOT, seed, Conditions(latency_ms=50, loss=0.1), seconds, vision=own)
-    return run.samples, score(run.samples, SCENARIO.stand_off_m)
+    return run.samples, score(SCENARIO, run)
 
 
 def off_axis_deg(truth, box):
@@ -59,7 +59,8 @@ def test_the_scenario_is_what_the_write_up_had():
     assert one == older_range.RANGE
     assert {one.color for one in SCENARIO.things} == {SCENARIO.target.color} and len(SCENARIO.things) == 3
     assert all(one.jitter_m == 0 for one in SCENARIO.things), "the score uses their places"
-    assert SCENARIO.start.distance_m[1] < SCENARIO.stand_off_m and SCENARIO.start.bearing_deg[0] > ACQUIRED_WITHIN_DEG
+    assert SCENARIO.start.distance_m[1] < SCENARIO.stand_off_m
+    assert SCENARIO.start.bearing_deg[0] > SCENARIO.acquired_within_deg
 
 
 def test_hsv_with_the_write_ups_range_goes_for_a_box():

@@ -65,6 +65,42 @@ def test_bad_scenario_file_is_one_line_that_names_the_key(tmp_path, old, new, ex
     assert "\n" not in str(caught.value)
 
 
+def write(folder, text):
+    file = folder / "mine.toml"
+    file.write_text(text)
+    return str(file)
+
+
+def test_bounds_are_inherited_merged_and_dropped_one_by_one(tmp_path):
+    text = 'extends = "static"\n[bounds]\nacquired_s = 2\ndistance_rms_m = "off"\nfound_s = 1.5\n'
+    inherited = load_scenario("static").bounds
+    assert load_scenario(write(tmp_path, 'extends = "static"')).bounds == inherited != {}
+    assert load_scenario(write(tmp_path, 'extends = "static"\nbounds = {}')).bounds == {}
+    mine = load_scenario(write(tmp_path, text)).bounds
+    assert mine == {**{name: inherited[name] for name in inherited if name != "distance_rms_m"},
+                    "acquired_s": 2.0, "found_s": 1.5}
+
+
+@pytest.mark.parametrize(("extends", "bounds", "expected"), [
+    ("static", "aquired_s = 2", "bounds: unknown figure 'aquired_s', did you mean 'acquired_s'?"),
+    ("static", 'aquired_s = "off"', "did you mean 'acquired_s'?"),
+    ("legs", "least_distance_m = 1.2\nmost_distance_m = 0.9", "least_distance_m 1.2 exceeds most_distance_m 0.9"),
+    ("legs", "least_distance_m = 1.2", "least_distance_m 1.2 exceeds most_distance_m 1; no run"),
+    ("legs", "least_ever_m = 1.2", "least_ever_m 1.2 exceeds most_distance_m 1; no run"),
+    ("thymio", "given_up_s = 9", 'reached_s and given_up_s exclude each other; set one to "off"'),
+    ("static", "reached_s = 9", "bounds.reached_s needs goals_m, which this scenario does not have"),
+    ("static", "least_crossings = 1", "bounds.least_crossings needs a [light]"),
+    ("static", "least_ever_m = 1", 'bounds.least_ever_m needs a target of shape "legs"'),
+    ("static", "found_s = nan", "bounds.found_s"), ("static", "found_s = -1", "bounds.found_s"),
+    ("static", 'found_s = "late"', "bounds.found_s"),
+])
+def test_bounds_that_cannot_be_checked_are_one_line(tmp_path, extends, bounds, expected):
+    with pytest.raises(ConfigError) as caught:
+        load_scenario(write(tmp_path, f'extends = "{extends}"\n[bounds]\n{bounds}\n'))
+    assert expected in str(caught.value) and "Value error" not in str(caught.value)
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 300
+
+
 def test_a_scenario_may_write_its_own_look(tmp_path):
     text = (load_scenario.__globals__["SCENARIOS"] / "static.toml").read_text()
     lines = [line for line in text.splitlines() if not line.startswith("look")]

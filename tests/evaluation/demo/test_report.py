@@ -6,18 +6,20 @@ import pytest
 
 from sightline.benchmarks.real_time import Kinds, _figures
 from sightline.evaluation.demo import report as demo_report
-from sightline.evaluation.demo.run import RECORDING, DemoOptions, DemoRun
+from sightline.evaluation.demo.run import MOTOR_LOG, RECORDING, DemoOptions, DemoRun
 from sightline.evaluation.lockstep import Conditions, Lockstep
 from sightline.evaluation.scenario_config import robot_config, robot_of, vision_config
-from sightline.evaluation.score.figures import AT_LEAST, EXACT
+from sightline.evaluation.score.figures import EXACT
 from sightline.operator_side.recording.recorder import Recorder
 from sightline.operator_side.recording.replay import VISION_CONFIG
 from sightline.protocol.channels import CAMERA, STATUS
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import Stamp, State, Status
 from sightline.protocol.transports.link import Message
-from sightline.sim.scenario import load_scenario
+from sightline.sim.scenario import AT_LEAST, load_scenario
 from sightline.sim.world.world import World
+
+RADIUS_M = robot_of(load_scenario("traffic-light")).wheels.radius_m
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +37,8 @@ def lights(tmp_path_factory) -> DemoRun:
             while world.now_us < 2_000_000:
                 lockstep.step()
     (folder / "vision.log").touch()
+    rows = [f"{t_us},{left / RADIUS_M},{right / RADIUS_M},0,0" for t_us, left, right in lockstep.run.wheels]
+    (folder / MOTOR_LOG).write_text("\n".join(["header", *rows, ""]))
     return DemoRun(DemoOptions("traffic-light"), scenario, folder, lockstep.run.samples)
 
 
@@ -50,6 +54,23 @@ def test_color_of_the_light_is_scored_from_the_recording(lights, monkeypatch):
     assert misread(replace(lights, samples=[replace(one, light="off") for one in lights.samples])) == (100.0, False)
     first, late = lights.samples[0], lights.samples[len(lights.samples) // 2 :]
     assert misread(replace(lights, samples=[replace(first, light="off"), *late])) == (0.0, True), "no report"
+
+
+def test_wheel_commands_are_scored_from_the_motor_log(lights, monkeypatch):
+    monkeypatch.setattr(demo_report, "_draw", lambda *_given: None)
+    still = replace(lights, options=replace(lights.options, latency_ms=400.0))
+    (check,) = [check for check in demo_report.report(still).checks if check.name == "commanded_m"]
+    assert check.value > 0.2 and not check.ok
+    assert check.value == pytest.approx(lights.samples[-1].x_m - lights.samples[0].x_m, rel=0.2)
+
+
+def test_demo_of_a_scenario_without_bounds_is_not_evaluated(lights, monkeypatch):
+    monkeypatch.setattr(demo_report, "_draw", lambda *_given: None)
+    bare = demo_report.report(replace(lights, scenario=lights.scenario.model_copy(update={"bounds": {}})))
+    assert bare.ok is None and bare.to_dict()["ok"] is None and bare.checks == []
+    assert any("not evaluated" in line for line in demo_report.summary(bare))
+    legacy = replace(bare.run, options=DemoOptions("traffic-light", transport="legacy"))
+    assert demo_report.report(legacy).ok is None
 
 
 class StatusLink:
@@ -72,6 +93,11 @@ def test_state_and_frame_age_come_from_the_recording_in_order(tmp_path):
         link.give(20, encode(Status(state=State.HOLD, reason="no command")))
         link.give(30, b"{")
         link.give(10, encode(Status(state=State.ACTIVE, reason="driving", frame_age_us=24_000)))
+    assert demo_report.accepted_us(tmp_path / RECORDING) is None
+    with Recorder(link, tmp_path / "later.mcap", {}):
+        for t_us, accepted in ((30, 9), (10, 0), (20, 2)):
+            link.give(t_us, encode(Status(state=State.ACTIVE, reason="driving", accepted=accepted)))
+    assert demo_report.accepted_us(tmp_path / "later.mcap") == 20
     assert demo_report.read_statuses(tmp_path / RECORDING) == [(10, "ACTIVE", 24_000), (20, "HOLD", None)]
 
 

@@ -4,7 +4,8 @@ import math
 
 import pytest
 
-from sightline.evaluation.score.figures import checks_of, score
+from sightline.evaluation.score.figures import RunRecord, checks_of, score
+from sightline.sim.scenario import load_scenario
 from sightline.sim.truth import Truth
 
 STAND_OFF_M = 0.8
@@ -21,7 +22,7 @@ def sample(t_s, *, bearing_deg=0.0, distance_m=STAND_OFF_M, visible=True):
 def test_lost_share_is_of_the_time_since_the_acquisition():
     """Acquired after 2 of 10 s, out of view for the last 2 s: a quarter of the 8 s since then."""
     run = [sample(at / 50, bearing_deg=30.0 if at < 100 else 0.0, visible=at < 400) for at in range(500)]
-    result = score(run, STAND_OFF_M)
+    result = score(load_scenario("static"), RunRecord(run, accepted_us=0))
     assert result.acquired_s == pytest.approx(2.0)
     assert result.lost_percent == pytest.approx(25.0)
     assert result.unseen_percent == pytest.approx(20.0)
@@ -30,8 +31,9 @@ def test_lost_share_is_of_the_time_since_the_acquisition():
 @pytest.mark.parametrize(("factor", "bound_m"), [(1.0, 0.7), (1.5, 0.7 / 1.5), (2.0, 0.35)])
 def test_factor_lowers_the_bound_of_a_figure_that_must_not_fall_below_it(factor, bound_m):
     """`least_distance_m` of `legs` is at least 0.7 m; a factor makes every bound easier."""
-    figures = {"least_distance_m": 0.5, "most_distance_m": 0.9, "least_ever_m": 0.5}
-    result = score([sample(at / 50) for at in range(100)], STAND_OFF_M, figures)
-    (check,) = [one for one in checks_of("legs", result, factor=factor) if one.name == "least_distance_m"]
+    legs = load_scenario("legs")
+    run = [sample(at / 50, distance_m=0.5 if at == 99 else STAND_OFF_M) for at in range(100)]
+    result = score(legs, RunRecord(run, accepted_us=0))
+    (check,) = [one for one in checks_of(legs, result, factor=factor) if one.name == "least_distance_m"]
     assert check.bound == pytest.approx(bound_m)
     assert check.ok == (bound_m <= 0.5)

@@ -17,6 +17,7 @@ from sightline.evaluation.score.runs import (
 )
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import ConfigError
+from sightline.sim.scenario import load_scenario
 
 GOOD = Score(
     acquired_s=1.0, found_s=0.0, bearing_rms_deg=0.2, distance_rms_m=0.01, lost_percent=0.0, wall_contacts=0,
@@ -72,7 +73,7 @@ def test_runs_on_other_processes_are_those_of_this_one(names):
 def test_another_detector_looks_in_place_of_the_scenarios_own():
     """A detector of yellow never finds a blue ball."""
     yellow = "examples.older_range:OlderRange"
-    asked = [cases(["blue-sphere"], [303], [50], [0.1], 2.0, detector=kind)[0] for kind in (None, yellow)]
+    asked = [cases(["blue-sphere"], [303], [50], [0.1], 3.0, detector=kind)[0] for kind in (None, yellow)]
     own, other = (run_case(case)[0] for case in asked)
     assert own.acquired_s is not None and other.acquired_s is None
     assert yellow in cases(["static"], [1], [0], [0], None, detector=yellow)[0].group
@@ -84,6 +85,47 @@ def test_detector_without_an_answer_is_reported_with_its_reason(capsys):
     told = capsys.readouterr().out
     said = [line for line in told.splitlines() if line.startswith("  detector")]
     assert 1 <= len(said) <= 3 and "no answer: UNREACHABLE: 127.0.0.1:9: " in said[0]
+
+
+OPEN_VIEW = """extends = "static"
+bounds = {}
+[start]
+bearing_deg = [150.0, 170.0]
+"""
+"""A scenario of a user, whose target the robot does not see at first."""
+
+
+@pytest.mark.parametrize("latency_ms", ["50", "400"])
+def test_scenario_without_bounds_is_not_evaluated_and_never_ok(latency_ms, tmp_path, capsys):
+    mine = tmp_path / "mine.toml"
+    mine.write_text(OPEN_VIEW)
+    options = ["--scenario", str(mine), "--seeds", "1", "--jobs", "1", "--seconds", "1", "--latency-ms", latency_ms]
+    assert cli.run(["score", *options]) == 0
+    text = capsys.readouterr().out
+    assert "not evaluated" in text and "ok" not in text.split() and "within bounds" not in text
+    assert "found_s" in text or "commanded_m" in text
+    assert cli.run(["score", *options, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["ok"] is None and result["checks"] == [] and len(result["not_evaluated"]) == 1
+    assert result["runs"][0]["score"]["unseen_percent"] > 60
+
+
+def test_scenario_that_extends_another_is_scored_by_its_bounds(tmp_path, capsys):
+    mine = tmp_path / "mine.toml"
+    mine.write_text(OPEN_VIEW.replace("bounds = {}", ""))
+    options = ["--scenario", str(mine), "--seeds", "1", "--jobs", "1", "--seconds", "1"]
+    assert cli.run(["score", *options, "--json"]) == 5
+    checks = json.loads(capsys.readouterr().out)["checks"]
+    assert [one["name"].split(": ")[1] for one in checks] == list(load_scenario("static").bounds)
+    assert not checks[0]["ok"]
+
+
+def test_failure_of_one_scenario_outweighs_another_without_bounds():
+    good = scored_figures([(ScoreCase("static", 50, 0.1, 1, 5.0), GOOD)])
+    bad = scored_figures([(ScoreCase("static", 50, 0.1, 1, 5.0), replace(GOOD, wall_contacts=1))])
+    assert ScoreReport([], good).ok is True
+    assert ScoreReport([], good, ["mine"]).ok is None
+    assert ScoreReport([], bad, ["mine"]).ok is False
 
 
 @pytest.mark.slow
