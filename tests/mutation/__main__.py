@@ -40,6 +40,7 @@ TABLES = {
     ),
     "operator_side/client/requests.py": ("tests/operator_side/client/test_request_repetition.py",),
     "operator_side/teleop/control.py": ("tests/operator_side/teleop/test_ramp.py",),
+    "evaluation/score/figures.py": ("tests/evaluation/score/test_bounds.py",),
     "protocol/text.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
     "protocol/jpeg.py": ("tests/protocol/test_text_and_jpeg_boundaries.py",),
 }
