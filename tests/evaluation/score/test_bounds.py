@@ -340,7 +340,7 @@ def test_each_time_that_it_comes_to_rest_counts():
 def test_start_is_the_time_from_green_to_the_motion_of_a_waiting_robot():
     red, waits, goes = ("red", -0.2, 0.0), ("green", -0.2, 0.0199), ("green", -0.1, 0.02)
     assert light(red, waits, waits, goes, goes)["start_s"] == pytest.approx(0.2)
-    assert light(red, waits, ("green", -0.3, -0.3), goes)["start_s"] == pytest.approx(0.2), "backwards is no start"
+    assert light(red, waits, ("green", -0.3, -0.3), goes)["start_s"] == pytest.approx(0.2), "backwards does not count"
     assert light(red, goes, goes)["start_s"] == 0.0, "it moves already"
     assert light(red, ("green", -0.6, 0.0), goes)["start_s"] == 0.0, "it waits elsewhere"
     assert light(waits, waits, goes)["start_s"] == 0.0, "no change to green"
