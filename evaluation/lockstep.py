@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from sightline.evaluation.labels import Labels
 from sightline.evaluation.scenario_config import robot_config, vision_config
 from sightline.evaluation.score.figures import RimSpeeds, RunRecord
+from sightline.evaluation.score.sabotage import HEALTHY, SeamDetector, Seams
 from sightline.protocol.channels import ACK, FRAME, SCAN, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import FrameHeader, State
@@ -31,7 +32,7 @@ from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector, notices_of
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.ranges import decode_scan
-from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, answer_header
+from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnswer, answer_header
 
 COMPUTE_US = 4_000
 """What one frame costs the vision side in virtual time: one step of the world, above what it takes in truth."""
@@ -69,8 +70,11 @@ class Lockstep:
         vision: VisionConfig,
         conditions: Conditions,
         seed: int,
+        *,
+        seams: Seams = HEALTHY,
     ) -> None:
         self.world = world
+        self._seams = seams
         self.run = Run()
         self.network = MemoryNetwork(
             seed, round(conditions.latency_ms * 1000), round(conditions.jitter_ms * 1000), conditions.loss
@@ -82,12 +86,13 @@ class Lockstep:
         self._robot_link.subscribe(ACK, lambda message: self._network_core.on_ack(message, self._now_us))
         self._vision_link = self.network.link(robot.robot, role=SOURCE)
         self._frames: LatestSlot[Message] = self._vision_link.latest(FRAME)
-        self._detector = configured_detector(vision)
+        self._detector = SeamDetector(configured_detector(vision), seams)
         self._pipeline = Pipeline(vision, world.camera_model, self._detector)
         self._scanned = self._vision_link.latest(SCAN) if self._pipeline.mission.wants_scan else None
         self._labels = Labels(vision.boxes, world.camera_model) if vision.detector.kind == "boxes" else None
         self._computed: deque[tuple[int, Message]] = deque(maxlen=1)
         self._answers = 0
+        self._compute_us = COMPUTE_US + seams.late_us
         self._camera_tick = 0
         self._frame_interval_us = 1e6 / world.robot.camera.fps
         self._scans = PeriodicTimer(1e6 / world.robot.lidar.rate_hz)
@@ -119,7 +124,8 @@ class Lockstep:
         self._camera_tick += 1
         if not self._network_core.may_capture(self._now_us, self._robot_link.has_listener(FRAME)):
             return
-        sent = self._network_core.on_camera(Picture(self.world.render(), self._now_us), self._now_us)
+        picture = Picture(self._seams.camera(self.world.render()), self._now_us)
+        sent = self._network_core.on_camera(picture, self._now_us)
         if sent is not None:
             header, message = sent
             if self._labels is not None:
@@ -136,8 +142,9 @@ class Lockstep:
         self._tick()
 
     def _tick(self) -> None:
-        scan = self.world.scan() if self._scans.due(self._now_us) else None
-        self._set_wheels(*self.driving.tick(self._now_us, self.world.wheel_angles(), scan))
+        scan = self._seams.scan(self.world.scan()) if self._scans.due(self._now_us) else None
+        angles = self._seams.angles(self.world.wheel_angles())
+        self._set_wheels(*self.driving.tick(self._now_us, angles, scan))
         self._network_core.motion = self.driving.motion()
         self._publish_scans()
         self.run.states.add(self.driving.gate.state)
@@ -147,7 +154,7 @@ class Lockstep:
         command = RimSpeeds(self._now_us, left_rad_s * radius_m, right_rad_s * radius_m)
         if not self.run.wheels or self.run.wheels[-1][1:] != command[1:]:
             self.run.wheels.append(command)
-        self.world.set_wheels(left_rad_s, right_rad_s)
+        self.world.set_wheels(*self._seams.wheels(left_rad_s, right_rad_s))
 
     def _publish_scans(self) -> None:
         """Pass scans to a mission that uses them. It needs no other message of the driver."""
@@ -168,24 +175,27 @@ class Lockstep:
             self._vision_link.publish(message.channel, message.header, message.payload)
         taken = self._frames.take()
         if taken is not None:
-            self._computed.append((self._now_us + COMPUTE_US, self._answer(taken)))
+            self._computed.append((self._now_us + self._compute_us, self._answer(taken)))
 
     def _answer(self, message: Message) -> Message:
         frame = Frame(decode(FrameHeader, message.header), message.payload)
         scan = self._scanned.take() if self._scanned else None
         if scan is not None:
             self._pipeline.put_scan(*decode_scan(scan.header, scan.payload))
-        answer = self._pipeline.step(frame) if self._labels is None else self._pipeline.follow(
-            *self._labels.of(frame.header)
-        )
+        answer = self._pipeline.step(frame) if self._labels is None else self._follow(self._labels, frame.header)
         self.run.said.append((frame.header.t_us, answer.seen.phase, answer.seen.note))
-        header = encode(answer_header(frame.header, _VISION_SESSION, self._answers, COMPUTE_US, answer))
+        header = encode(answer_header(frame.header, _VISION_SESSION, self._answers, self._compute_us, answer))
         self._answers += 1
         if answer.twist is None:
             return Message(ACK, SOURCE, header, b"")
         text = format_twist(answer.twist)
         self.run.twists.append(text)
         return Message(TWIST, SOURCE, header, text)
+
+    def _follow(self, labels: Labels, examined: FrameHeader) -> PipelineAnswer:
+        header, found = labels.of(examined)
+        camera = self.world.camera_model
+        return self._pipeline.follow(header, self._seams.detections(found, (camera.width_px, camera.height_px)))
 
 
 def run_lockstep(
@@ -197,15 +207,16 @@ def run_lockstep(
     *,
     vision: VisionConfig | None = None,
     mission: str | None = None,
+    seams: Seams = HEALTHY,
     is_over: Callable[[Run], bool] = lambda _run: False,
 ) -> Run:
     """Run `scenario` for `seconds` (default: its own length), or until `is_over`, which is called each second.
 
-    `vision` and `mission` stand in for what the scenario names.
+    `vision` and `mission` stand in for what the scenario names. `seams` are those of a sabotage.
     """
     vision = vision or vision_config(scenario, model, seed, mission)
     with World(scenario, model, seed) as world:
-        lockstep = Lockstep(world, robot_config(model, auto_arm=True), vision, conditions, seed)
+        lockstep = Lockstep(world, robot_config(model, auto_arm=True), vision, conditions, seed, seams=seams)
         end_us = round((seconds or scenario.seconds) * 1e6)
         try:
             while world.now_us < end_us:

@@ -137,6 +137,11 @@ class Thing(Config):
             return math.hypot(self.size_m[0], self.size_m[1]) / 2
         return self.radius_m + (self.legs.apart_m / 2 if self.shape == "legs" else 0.0)
 
+    @property
+    def swept_m(self) -> float:
+        """Radius of the circle that it never leaves, a swinging leg included."""
+        return self.reach_m + (self.legs.stride_m / 4 if self.shape == "legs" else 0.0)
+
 
 class Static(Thing):
     """Does not move; nothing can move it."""
@@ -430,6 +435,7 @@ FIGURES: Mapping[str, Figure] = {
     "least_crossings": Figure("times", "count", "light", is_exact=True),
     "least_red_stops": Figure("times", "count", "light", is_exact=True),
     "start_s": Figure("s", "extreme", "light"),
+    "least_passes": Figure("times", "count", "things", is_exact=True),
     "wrong_states_percent": Figure("%", "other", "light", is_exact=True),
 }
 """Every figure that `[bounds]` of a scenario may name."""

@@ -34,6 +34,8 @@ class Truth:
     """Those of them in which the robot moved towards the target faster than the target towards it."""
     clearance_m: float | None = None
     """From the robot's body to the nearest obstacle, at most 1; only where it is sent to waypoints."""
+    passes: int = 0
+    """How often so far a thing on a path went through between the lens and the target."""
     light: str = ""
     """What the traffic light shows, if there is one."""
     past_line_m: float | None = None

@@ -9,7 +9,7 @@ from statistics import median
 from typing import NamedTuple
 
 from sightline.evaluation.checks import Check
-from sightline.sim.scenario import AT_LEAST, FIGURES, Scenario
+from sightline.sim.scenario import AT_LEAST, FIGURES, OnPath, Scenario
 from sightline.sim.truth import Truth
 
 ACQUIRED_WITHIN_M = 0.05
@@ -163,6 +163,8 @@ def figures_of(scenario: Scenario, run: RunRecord, followed: Sequence[Truth]) ->
         "wall_contact_s": (samples[-1].wall_contacts - samples[0].wall_contacts) * STEP_S,
         "commanded_m": commanded_m(run.wheels, samples[0].t_us, samples[-1].t_us),
     }
+    if any(isinstance(thing, OnPath) for thing in scenario.things):
+        figures["least_passes"] = samples[-1].passes - samples[0].passes
     if scenario.target.shape == "legs":
         figures |= legs_figures(samples, followed)
     if scenario.goals_m:

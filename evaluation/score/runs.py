@@ -5,7 +5,7 @@ Each run is a process's own, so that they share the machine's cores; a run itsel
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby, product
 from typing import Any, Final
 
@@ -13,9 +13,18 @@ from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, Run, run_lockstep
 from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.scenario_config import robot_of, vision_config
-from sightline.evaluation.score.figures import NOT_EVALUATED, Score, checks_of, median_and_worst, score
+from sightline.evaluation.score.figures import (
+    NOT_EVALUATED,
+    STANDS_STILL_FROM_MS,
+    Score,
+    broken,
+    checks_of,
+    median_and_worst,
+    score,
+)
+from sightline.evaluation.score.sabotage import HEALTHY, SABOTAGES, reason_of
 from sightline.protocol.errors import ConfigError
-from sightline.sim.scenario import FIGURES, Scenario, load_scenario, look_named
+from sightline.sim.scenario import FIGURES, Scenario, load_scenario, look_named, scenario_names
 from sightline.vision_side.detect.registry import check_choice
 from sightline.vision_side.missions.registry import REGISTRY, configured_mission
 
@@ -37,11 +46,13 @@ class ScoreCase:
     robot: str | None = None
     look: str | None = None
     detector: str | None = None
+    sabotage: str | None = None
 
     @property
     def group(self) -> str:
         """Return the name that it shares with the runs of other seeds."""
-        others = "".join(f" {one}" for one in (self.mission, self.robot, self.look, self.detector) if one)
+        given = (self.mission, self.robot, self.look, self.detector, self.sabotage)
+        others = "".join(f" {one}" for one in given if one)
         return f"{self.scenario}{others} +{self.latency_ms:g} ms {100 * self.loss:g}% loss"
 
 
@@ -128,8 +139,8 @@ def run_case(case: ScoreCase) -> tuple[Score, list[str]]:
     return score(scenario, run), run.news
 
 
-def run_of(case: ScoreCase) -> tuple[Scenario, Run]:
-    """The run itself, and the scenario as it was run."""
+def run_of(case: ScoreCase, is_over: Callable[[Run], bool] = lambda _run: False) -> tuple[Scenario, Run]:
+    """Return the scenario as it was run, and the run."""
     scenario = load_scenario(case.scenario)
     if case.look is not None:
         scenario = scenario.model_copy(update={"look": look_named(case.look)})
@@ -137,7 +148,10 @@ def run_of(case: ScoreCase) -> tuple[Scenario, Run]:
     vision = vision_config(scenario, model, case.seed, case.mission)
     if case.detector is not None:
         vision = vision.model_copy(update={"detector": vision.detector.model_copy(update={"kind": case.detector})})
-    return scenario, run_lockstep(scenario, model, case.seed, conditions, case.seconds, vision=vision)
+    seams = SABOTAGES[case.sabotage](case.seed) if case.sabotage else HEALTHY
+    return scenario, run_lockstep(
+        scenario, model, case.seed, conditions, case.seconds, vision=vision, seams=seams, is_over=is_over
+    )
 
 
 def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCase], None]) -> ScoreReport:
@@ -175,6 +189,130 @@ def _scored_figure(group: str, checks: list[Check], results: list[Score]) -> Sco
     first = checks[0]
     median, worst = median_and_worst(results, first.name)
     return ScoredFigure(group, first.name, median, worst, first.unit, first.bound, all(check.ok for check in checks))
+
+
+# Sabotaged runs: each must break a bound of its scenario. Shell (processes).
+
+
+@dataclass(frozen=True, slots=True)
+class SabotagedRun:
+    """The result of one sabotaged run. `unchanged` if it equals the healthy run byte for byte."""
+
+    case: ScoreCase
+    broken: tuple[str, ...]
+    """The bounds that it broke."""
+    seconds: float
+    """When it ended: a bound that is broken for good ends it early."""
+    unchanged: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SabotagedPair:
+    """The runs of one scenario with one sabotage."""
+
+    group: str
+    scenario: str
+    sabotage: str
+    runs: tuple[SabotagedRun, ...]
+
+    @property
+    def failed(self) -> int:
+        """Return the number of runs that broke a bound."""
+        return sum(bool(run.broken) for run in self.runs)
+
+    @property
+    def is_unchanged(self) -> bool:
+        """Return True if the sabotage changed nothing in any run, and need not."""
+        is_expected = self.scenario not in scenario_names() or reason_of(self.sabotage, self.scenario) is not None
+        return is_expected and all(run.unchanged for run in self.runs)
+
+    @property
+    def ok(self) -> bool | None:
+        """Return True if the score noticed the sabotage in each run, or nothing changed; None without bounds."""
+        if not load_scenario(self.scenario).bounds:
+            return None
+        return self.failed == len(self.runs) or self.is_unchanged
+
+    def line(self) -> str:
+        """Return the result as one line."""
+        first = ", ".join(dict.fromkeys(run.broken[0] for run in self.runs if run.broken))
+        if self.is_unchanged:
+            reason = reason_of(self.sabotage, self.scenario) or "the run equals the healthy one"
+            return f"{self.group}: changes nothing: {reason}"
+        if self.ok is None:
+            return f"{self.group}: {NOT_EVALUATED}"
+        text = f"{self.group}: {self.failed} of {len(self.runs)} runs fail" + (f" ({first})" if first else "")
+        return f"{text}  {'ok' if self.ok else 'FAIL'}"
+
+
+@dataclass(frozen=True, slots=True)
+class SabotageReport:
+    """All sabotaged runs."""
+
+    pairs: list[SabotagedPair]
+
+    @property
+    def ok(self) -> bool | None:
+        """Return True if the score noticed every sabotage, None if a scenario without bounds cannot."""
+        results = [pair.ok for pair in self.pairs]
+        return False if False in results else None if None in results else True
+
+    def to_dict(self) -> dict[str, Any]:
+        """For `--json`."""
+        checks = [
+            {"name": f"{pair.group}: runs that fail", "value": pair.failed, "unit": "runs",
+             "bound": 0 if pair.is_unchanged else len(pair.runs), "ok": pair.ok}
+            for pair in self.pairs if pair.ok is not None
+        ]
+        return {"ok": self.ok, "checks": checks, "runs": [asdict(run) for pair in self.pairs for run in pair.runs]}
+
+    def lines(self) -> list[str]:
+        """Return one line for each pair, and the result of all."""
+        result = {True: "the score noticed every sabotage", False: "the score did NOT notice every sabotage",
+                  None: NOT_EVALUATED}
+        return [*(pair.line() for pair in self.pairs), result[self.ok]]
+
+
+def sabotaged(wanted: Sequence[ScoreCase], names: Sequence[str]) -> list[ScoreCase]:
+    """Return each case with each sabotage, those of one group together."""
+    groups = groupby(wanted, key=lambda case: case.group)
+    return [
+        replace(case, sabotage=name) for members in [list(group) for _, group in groups] for name in names
+        for case in members
+    ]
+
+
+def run_sabotaged(case: ScoreCase) -> SabotagedRun:
+    """Run until a bound is broken for good, or to the end. Compare a run that broke none with the healthy run."""
+    scenario = load_scenario(case.scenario)
+    seconds = case.seconds or scenario.seconds
+    is_still = case.latency_ms >= STANDS_STILL_FROM_MS  # then other bounds apply, to the end of the run
+
+    def is_over(run: Run) -> bool:
+        return not is_still and bool(broken(scenario, score(scenario, run), seconds))
+
+    _, run = run_of(case, is_over)
+    checks = checks_of(scenario, score(scenario, run), case.latency_ms)
+    names = tuple(check.name for check in checks if not check.ok)
+    unchanged = not names and run == run_of(replace(case, sabotage=None))[1]
+    return SabotagedRun(case, names, run.samples[-1].t_us / 1e6, unchanged)
+
+
+def run_all_sabotaged(
+    wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCase], None]
+) -> SabotageReport:
+    """Run `wanted` on `jobs` processes, in any order. `on_done` is called after each."""
+    results: dict[ScoreCase, SabotagedRun] = {}
+    with worker_pool(min(jobs, len(wanted))) as pool:
+        futures = {pool.submit(run_sabotaged, case): case for case in wanted}
+        for future in as_completed(futures):
+            results[futures[future]] = future.result()
+            on_done(futures[future])
+    groups = groupby(wanted, key=lambda case: case.group)
+    pairs = [(group, [results[case] for case in cases]) for group, cases in groups]
+    return SabotageReport([
+        SabotagedPair(group, runs[0].case.scenario, runs[0].case.sabotage or "", tuple(runs)) for group, runs in pairs
+    ])
 
 
 # How `sightline score` shows its results: a table of median and worst. Pure.

@@ -142,6 +142,9 @@ def score(
     robot_model: Annotated[str | None, typer.Option(help="Robot model [default: of the scenario].")] = None,
     look: Annotated[str | None, typer.Option(help="Light, e.g. dim [default: of the scenario].")] = None,
     detector: Annotated[str | None, typer.Option(help="Detector, e.g. onnx [default: of the scenario].")] = None,
+    sabotage: Annotated[
+        list[str] | None, typer.Option(help="Break one part, e.g. wheels-dead, or `all`; each run must fail.")
+    ] = None,
     jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Runs in parallel [default: one per core].")] = None,
     as_json: Json = False,
 ) -> int:
@@ -152,13 +155,19 @@ def score(
     if context.invoked_subcommand is not None:
         return 0
     with needs("all"):
-        from sightline.evaluation.score.runs import cases, run_cases, score_text
+        from sightline.evaluation.score.runs import cases, run_all_sabotaged, run_cases, sabotaged, score_text
+        from sightline.evaluation.score.sabotage import sabotages_named
         from sightline.sim.scenario import scenario_names
     wanted = cases(
         scenario_names() if scenario == "all" else scenario.split(","),
         numbers("--seeds", seeds, int), numbers("--latency-ms", latency_ms, float), numbers("--loss", loss, float),
         seconds, mission=mission, robot=robot_model, look=look, detector=detector,
     )
+    if sabotage:
+        wanted = sabotaged(wanted, sabotages_named(sabotage))
+        with progress_bar(len(wanted)) as advance:
+            noticed = run_all_sabotaged(wanted, jobs or os.cpu_count() or 1, lambda _case: advance())
+        return print_result(noticed.to_dict(), noticed.lines(), as_json)
     with progress_bar(len(wanted)) as advance:
         report = run_cases(wanted, jobs or os.cpu_count() or 1, lambda _case: advance())
     return print_result(report.to_dict(), [score_text(report)], as_json)

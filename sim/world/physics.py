@@ -6,6 +6,7 @@ have no friction; a body's position is that of its inertial frame; a body withou
 
 import math
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -146,6 +147,12 @@ class RobotBody:
             self.body, self._wheels, pybullet.VELOCITY_CONTROL, targetVelocities=speeds, forces=self._torques,
             physicsClientId=self._client,
         )
+
+    def pass_through(self, others: Iterable[int]) -> None:
+        """Let the robot and other bodies overlap. Masks alone do not: one of two that admits the other is enough."""
+        for other in others:
+            for link in range(-1, pybullet.getNumJoints(self.body, physicsClientId=self._client)):
+                pybullet.setCollisionFilterPair(self.body, other, link, -1, 0, physicsClientId=self._client)
 
     def wheel_angles(self) -> tuple[float, float]:
         """Return the angle of each wheel, rad."""

@@ -41,7 +41,7 @@ def robot_start(start: Start, target: Place, lens_x_m: float, seed: int) -> Plac
         moved = draw.uniform(-start.jitter_m, start.jitter_m, 2)
         heading_rad = math.radians(draw.uniform(*start.heading_deg))
         return Place(start.at_m[0] + float(moved[0]), start.at_m[1] + float(moved[1]), heading_rad)
-    distance_m = float(draw.uniform(*start.distance_m))
+    distance_m = _outside(float(draw.uniform(*start.distance_m)), start.except_m)
     bearing_rad = math.radians(draw.uniform(*start.bearing_deg))
     from_ball_rad = target.heading_rad + math.radians(draw.uniform(*start.approach_deg))
     yaw_rad = math.remainder(from_ball_rad + math.pi - bearing_rad, math.tau)
@@ -50,6 +50,13 @@ def robot_start(start: Start, target: Place, lens_x_m: float, seed: int) -> Plac
         target.y_m + distance_m * math.sin(from_ball_rad) - lens_x_m * math.sin(yaw_rad),
         yaw_rad,
     )
+
+
+def _outside(distance_m: float, span_m: tuple[float, float] | None) -> float:
+    """Return the distance, moved to the nearer end of a span at which no run starts."""
+    if span_m is None or not span_m[0] < distance_m < span_m[1]:
+        return distance_m
+    return min(span_m, key=lambda end_m: abs(end_m - distance_m))
 
 
 def goals_seen(scenario: Scenario, seed: int) -> list[tuple[float, float]]:

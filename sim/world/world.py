@@ -8,7 +8,7 @@ from typing import Any, Self
 from sightline.robot_side.ports import Ranges, WheelAngles
 from sightline.sim.bus import Label
 from sightline.sim.robot import RobotModel, Wheels, outline
-from sightline.sim.scenario import Place, Rolling, Scenario, Thing
+from sightline.sim.scenario import OnPath, Place, Rolling, Scenario, Thing
 from sightline.sim.truth import Truth
 from sightline.sim.world.bodies import LightBodies, Mover, ThingBodies, begin, begin_thing
 from sightline.sim.world.camera import SceneCamera
@@ -95,7 +95,12 @@ class World:
         self._add_things()
         self._light = LightBodies(client, scenario.light, light_begin(scenario.light, seed)) if scenario.light else None
         self._obstacles += self._light.bodies if self._light else ()
-        self._front_m = outline(robot).front_m
+        reach = outline(robot)
+        self._front_m = reach.front_m
+        self._reach_m = math.hypot(max(reach.front_m, reach.rear_m), reach.half_width_m)
+        self._walkers = [one for one in self._movers[1:] if isinstance(one[1].thing, OnPath)]
+        self._sides: dict[int, bool] = {}
+        self._passes = 0
         self._motors = [Motor(robot.wheels, STEP_US / 1e6, f"{seed} {side}") for side in ("left", "right")]
         self._see(client)
         self._defects = Defects(scenario.look, robot.camera.width_px, robot.camera.height_px, seed)
@@ -137,6 +142,10 @@ class World:
         self._body = add_robot(client, robot, at)
         for number, thing in enumerate(scenario.things + self._surroundings.things, start=1):
             self._add_thing(thing, *begin_thing(thing, number, self.seed))
+        for _, bodies in self._movers:
+            if isinstance(bodies.thing, OnPath):
+                # It has no mass that could yield, so that it would push a standing robot away.
+                self._body.pass_through(bodies.bodies)
 
     def _add_thing(self, thing: Thing, mover: Mover, at: Place, way_m: float) -> None:
         bodies = ThingBodies(self._client, thing, at, way_m, is_target=False)
@@ -161,6 +170,7 @@ class World:
             motor.rolled(angle_rad)
         self._follow_target()
         self._count_contacts()
+        self._count_passes()
         if self._past:
             self._past.record(self._now())
 
@@ -175,18 +185,41 @@ class World:
             point[2]
             for point in pybullet.getContactPoints(self._body.body, physicsClientId=self._client)
             if point[8] <= 0
-        } - {self._floor, self._body.body}
+        } - {self._floor, self._body.body} | self._overlapped()
         target = touched.intersection(self._target.bodies)
         self._wall_contacts += bool(touched - target)
         if target:
             self._target_contacts += 1
             self._target_contacts_by_robot += self._is_robots_doing()
 
+    def _overlapped(self) -> set[int]:
+        """Return the bodies on a path that the robot overlaps. The engine does not let the two push each other."""
+        (x_m, y_m, _), _ = self._body.pose()
+        return {
+            body for _, walker in self._movers if isinstance(walker.thing, OnPath)
+            if math.dist((x_m, y_m), walker.middle[:2]) < self._reach_m + walker.thing.swept_m
+            for body in walker.bodies
+            if any(point[8] <= 0 for point in pybullet.getClosestPoints(
+                self._body.body, body, 0.0, physicsClientId=self._client))
+        }
+
+    def _count_passes(self) -> None:
+        """Count each thing on a path that goes through between the lens and the target."""
+        camera = self.robot.camera
+        (lens_x_m, lens_y_m, _), _ = self._mounted(camera.x_m, camera.z_m)
+        x_m, y_m = self._target_at[0] - lens_x_m, self._target_at[1] - lens_y_m
+        for _, walker in self._walkers:
+            off_x_m, off_y_m = walker.middle[0] - lens_x_m, walker.middle[1] - lens_y_m
+            is_left = x_m * off_y_m - y_m * off_x_m > 0
+            is_between = 0 < x_m * off_x_m + y_m * off_y_m < x_m**2 + y_m**2
+            self._passes += is_between and self._sides.get(walker.bodies[0], is_left) != is_left
+            self._sides[walker.bodies[0]] = is_left
+
     def _is_robots_doing(self) -> bool:
         """Return True if the robot moves toward the target faster than the target toward the robot."""
         (x_m, y_m, _), _ = self._body.pose()
         ahead_x_m, ahead_y_m = self._target_at[0] - x_m, self._target_at[1] - y_m
-        gap_m = math.hypot(ahead_x_m, ahead_y_m)
+        gap_m = max(math.hypot(ahead_x_m, ahead_y_m), 1e-6)
         mine, _ = self._body.velocity()
         other = self._target_velocity
         mine_mps = (mine[0] * ahead_x_m + mine[1] * ahead_y_m) / gap_m
@@ -241,6 +274,7 @@ class World:
             wall_contacts=self._wall_contacts, target_contacts=self._target_contacts,
             target_contacts_by_robot=self._target_contacts_by_robot,
             clearance_m=self._clearance_m() if self.scenario.goals_m else None,
+            passes=self._passes,
             light=self._light.state if self._light else "",
             past_line_m=self._past_line_m(place, yaw_rad),
         )

@@ -10,7 +10,7 @@ from tests.fixtures import demanded
 demanded.module("pybullet", "sim")
 
 from sightline.sim.robot import load_robot
-from sightline.sim.scenario import Start, Wall, load_scenario, scenario_names
+from sightline.sim.scenario import OnPath, PathLeg, Start, Wall, load_scenario, scenario_names
 from sightline.sim.world.world import STEP_US, World
 from tests.fixtures.sim import RADIUS_M, TRACK_M, DeadReckoning, empty, robot_with, seen_at
 
@@ -143,6 +143,7 @@ def test_run_starts_as_configured_and_rests(name, seed):
         truth = world.truth()
         low, high = scenario.start.distance_m
         assert low - 1e-6 <= truth.distance_m <= high + 1e-6
+        assert abs(truth.distance_m - scenario.stand_off_m) > 0.075 or name != "static"
         low, high = scenario.start.bearing_deg
         assert low - 1e-6 <= math.degrees(truth.bearing_rad) % 360 - 360 * (low < 0 and truth.bearing_rad < 0) <= high
         assert truth.visible == (abs(truth.bearing_rad) < math.radians(40))
@@ -203,10 +204,49 @@ def test_a_ball_that_comes_is_not_charged_to_a_robot_that_stands():
     on_its_way = math.degrees(0.5 / 2 / 1.2)  # half the arc that a chord of 0.5 m cuts off
     into_its_way = Start(distance_m=(0.5, 0.5), bearing_deg=(0.0, 0.0), approach_deg=(on_its_way, on_its_way))
     with World(circle.model_copy(update={"start": into_its_way}), robot_with(), 1) as world:
+        before = world.truth()
         for _ in range(1000):
             world.step()
-        assert world.truth().target_contacts > 0
-        assert world.truth().target_contacts_by_robot == 0
+        after = world.truth()
+    assert after.target_contacts > 100
+    assert after.target_contacts_by_robot == 0
+    assert math.hypot(after.x_m - before.x_m, after.y_m - before.y_m) < 1e-3, "it must not push the robot"
+    assert abs(after.yaw_rad - before.yaw_rad) < 1e-3
+
+
+def test_walker_that_comes_counts_as_a_contact_and_does_not_push_the_robot():
+    scenario = seen_at(3.0, 180.0)
+    with World(scenario, robot_with(), 1) as world:
+        at = world.truth()
+    legs = {"shape": "legs", "radius_m": 0.055, "height_m": 0.42, "speed_mps": 0.5, "phase": (0.0, 0.0)}
+    around = (PathLeg(length_m=math.tau, turn_deg=360.0),)
+    walker = OnPath(kind="path", start_m=(at.x_m - 1.0, at.y_m + 1.0), heading_deg=-90.0, path=around, **legs)
+    with World(scenario.model_copy(update={"things": (walker,)}), robot_with(), 1) as world:
+        for _ in range(1500):
+            world.step()
+        after = world.truth()
+    assert after.wall_contacts > 50 and after.target_contacts == 0
+    assert math.hypot(after.x_m - at.x_m, after.y_m - at.y_m) < 1e-3
+
+
+@pytest.mark.parametrize(("ahead_m", "passes"), [(0.5, 1), (-0.5, 0), (1.5, 0)])
+def test_thing_on_a_path_passes_where_it_goes_through_between_lens_and_target(ahead_m, passes):
+    scenario = seen_at(1.0, 0.0)
+    with World(scenario, robot_with(), 1) as world:
+        at = world.truth()
+    cos, sin = math.cos(at.yaw_rad), math.sin(at.yaw_rad)
+    lens_x_m, lens_y_m = at.target_x_m - cos, at.target_y_m - sin
+    begin_m = (lens_x_m + ahead_m * cos + sin, lens_y_m + ahead_m * sin - cos)  # 1 m to the right
+    across = (PathLeg(length_m=4.0), PathLeg(length_m=math.pi, turn_deg=180.0)) * 2
+    walker = OnPath(kind="path", radius_m=0.05, start_m=begin_m, heading_deg=math.degrees(at.yaw_rad) + 90.0,
+                    path=across, speed_mps=0.5, phase=(0.0, 0.0))
+    with World(scenario.model_copy(update={"things": (walker,)}), robot_with(), 1) as world:
+        counts = []
+        for _ in range(900):
+            world.step()
+            counts.append(world.truth().passes if len(counts) % 50 == 0 else -1)
+        assert world.truth().passes == passes
+        assert counts[400] == 0, "not before it is there"
 
 
 def test_driving_into_a_wall_counts_and_a_wall_hides_the_ball():
