@@ -12,7 +12,7 @@ demanded.module("pybullet", "sim")
 import simplejpeg
 
 from sightline.sim.robot import load_robot
-from sightline.sim.scenario import Look, load_scenario
+from sightline.sim.scenario import Look, load_scenario, look_named
 from sightline.sim.world.world import STEP_US, World
 from tests.fixtures.sim import robot_with, seen_at
 
@@ -85,6 +85,21 @@ def test_before_there_is_a_past_the_image_is_the_first():
         for _ in range(60):
             world.step()
         assert world.render() != first
+
+
+def test_images_of_the_look_real_are_of_the_seed_byte_for_byte():
+    def images(seed: int) -> list[bytes]:
+        with started("circle", look_named("real"), seed) as world:
+            world.set_wheels(4.0, 7.0)
+            found = []
+            for _ in range(3):
+                for _ in range(20):
+                    world.step()
+                found.append(world.render())
+            return found
+
+    assert images(5) == images(5)
+    assert images(5) != images(6)
 
 
 def test_truth_and_capture_time_have_no_latency():
