@@ -22,11 +22,12 @@ import heapq
 import itertools
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final, TypeVar
 
+from sightline.conformance.measured import WheelRow
 from sightline.protocol.channels import SOURCES_OF_ROLE, Channel
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import WireError
@@ -220,6 +221,8 @@ class Bench(ABC):
         These three are for cases with sockets of their own.
         """
         self.robot, self.endpoint, self.legacy, self.access = robot, endpoint, legacy, access or Access()
+        self.motor_rows: Callable[[], Sequence[WheelRow]] = tuple
+        """Returns the rows of the robot's motor log so far; none without such a log."""
         self._log: dict[str, deque[Received]] = {}
         self._reactions: list[tuple[Channel, Callable[[Received], None]]] = []
         self._timers: list[tuple[int, int, Callable[[], None]]] = []

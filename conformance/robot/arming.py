@@ -7,10 +7,13 @@ from sightline.conformance.robot.fixture import (
     CRAWL,
     DRIVEN,
     GOOD,
+    SETTLES_US,
+    WATCHED_AT_REST_US,
     Robot,
     Sender,
     arm,
     armed,
+    moving,
     operator,
     ready,
     teleop,
@@ -18,6 +21,8 @@ from sightline.conformance.robot.fixture import (
 from sightline.protocol.messages import State, Status
 
 SUITE: Final = Suite("R")
+_WHEELS_STOP_US: Final = 700_000 + SETTLES_US
+"""From STOP until the wheels are measured to be at rest."""
 
 
 def _driven(bench: Bench, twists: int = 8) -> Sender:
@@ -54,15 +59,17 @@ def unarmed_does_not_move(bench: Bench, driver: Sender) -> None:
     grew = after.refused.get("DISARMED", 0) > before.refused.get("DISARMED", 0)
     bench.expect(grew, f"none was counted as DISARMED: {after.refused}")
     bench.expect(after.applied == (0.0, 0.0), f"the wheels move: {after.applied}")
+    driver.robot.expect_unmoved("though it is not armed")
 
 
-@SUITE.must("R-ARM-05", "8.2 Requests and replies", armed)
+@SUITE.must("R-ARM-05", "8.2 Requests and replies", moving)
 def disarms(bench: Bench, driver: Sender) -> None:
     """`disarm` is granted to any role without `echo`: wheels to zero, whatever is commanded."""
     robot = driver.robot
     Sender(robot, "operator").expect_granted("disarm", "disarm was not granted", cite=False)
     rests = robot.reaches(lambda status: status.state is State.DISARMED and status.applied == (0.0, 0.0), 1_500_000)
     bench.expect(rests, f"1.5 s later it is {robot.status().state} at {robot.status().applied}")
+    robot.expect_rest("after disarm")
 
 
 @SUITE.must("R-ARM-07", "8.3 Freshness", Robot)
@@ -113,10 +120,11 @@ def arming_starts_nothing(bench: Bench, driver: Sender) -> None:
     """Twists from before arming are not applied after it: without new ones the wheels stay at zero."""
     driver.drive(None)
     bench.need(driver.granted("arm"), "arm is not granted (R-ARM-03)")
-    mark = bench.mark()
+    mark, armed_us = bench.mark(), driver.robot.clock_us()
     moved = driver.robot.reaches(lambda status: status.applied != (0.0, 0.0), 500_000)
     moved = moved or any(header.applied != (0.0, 0.0) for _, header in driver.robot.frames(mark))
     bench.expect(not moved, "the wheels moved by a twist from before it was armed")
+    driver.robot.expect_unmoved("without a twist since it was armed", armed_us)
 
 
 @SUITE.must("R-ARM-13", "6.4 Arming", armed)
@@ -195,13 +203,16 @@ SUITE.must_all(_stopped, {
 })
 
 
-@SUITE.must("R-STOP-01", "6.5 STOP", armed)
+@SUITE.must("R-STOP-01", "6.5 STOP", moving)
 def stops(bench: Bench, driver: Sender) -> None:
     """STOP while driving: STOPPED is reported within 300 ms, the reply reports it, wheels at zero within 700 ms."""
+    requested_us = driver.robot.clock_us()
     reply = Sender(driver.robot, "operator").request("stop")
     driver.robot.expect_state(State.STOPPED, within_us=300_000)
     bench.expect(driver.robot.stops(700_000), f"the wheels still turn: {driver.robot.status().applied}")
     bench.expect(reply is None or reply.ok, f"the reply reports {reply}")
+    bench.rest(_WHEELS_STOP_US + WATCHED_AT_REST_US)
+    driver.robot.expect_unmoved("a second after STOP", requested_us + _WHEELS_STOP_US)
 
 
 @SUITE.must("R-STOP-02", "13.5 Security", teleop)
@@ -217,9 +228,11 @@ def any_role_stops(bench: Bench, human: Sender) -> None:
 def latched(bench: Bench, driver: Sender) -> None:
     """In STOPPED good twists are rejected as STOPPED and change nothing."""
     operator = _stopped(bench)
+    stopped_us = operator.robot.clock_us()
     for _ in range(6):
         driver.expect("STOPPED")
     _state(operator.robot, State.STOPPED, "after six twists")
+    operator.robot.expect_unmoved("in STOPPED", stopped_us)
 
 
 @SUITE.must("R-STOP-05", "8.2 Requests and replies", _stopped)
@@ -234,12 +247,14 @@ def no_arming(bench: Bench, operator: Sender) -> None:
 @SUITE.must("R-STOP-06", "6.5 STOP", _stopped)
 def reset_starts_nothing(bench: Bench, operator: Sender) -> None:
     """`reset` leads to DISARMED and starts no motion, also while twists flow."""
+    before_us = operator.robot.clock_us()
     Sender(operator.robot).drive()
     bench.expect(operator.granted("reset"), "reset was not granted")
     status = _state(operator.robot, State.DISARMED, "after reset")
     bench.rest(500_000)
     status = _state(operator.robot, State.DISARMED, "half a second after reset")
     bench.expect(status.applied == (0.0, 0.0), f"the wheels move: {status.applied}")
+    operator.robot.expect_unmoved("after reset", before_us)
 
 
 @SUITE.must("R-STOP-08", "8.3 Freshness", Robot)

@@ -21,6 +21,8 @@ from sightline.protocol.messages import State, Status
 _PARTS: Final = (arming, frames, hostile, lease, legacy, motion, requests, twists, websocket)
 _SETTLES_US: Final = 6_000_000
 _FIRST_US: Final = 5_000_000
+_COASTS_US: Final = 500_000
+"""Wheels with the command zero may turn a little longer. Those that go on are left to the cases about it."""
 _ORDER: Final = tuple(GROUPS)
 
 CASES: Final[tuple[Case, ...]] = tuple(
@@ -51,6 +53,7 @@ def prepare(bench: Bench) -> None:
             break
     else:
         raise ConformanceError("before the case the robot could not be brought to DISARMED, without holder, at zero")
+    bench.wait(lambda: robot.evidence_of_motion(robot.clock_us() - _COASTS_US) is None, _COASTS_US)
     bench.forget()
 
 

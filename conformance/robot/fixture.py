@@ -10,9 +10,10 @@ from functools import partial
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, Received
-from sightline.protocol.channels import ACK, CAMERA, FRAME, REPLY, REQUEST, STATUS, TWIST
+from sightline.conformance.measured import Evidence, MeasuredMotion, evidence_in_log, evidence_of
+from sightline.protocol.channels import ACK, CAMERA, FRAME, ODOMETRY, REPLY, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import CLAMPED, RejectReason
-from sightline.protocol.messages import CameraModel, FrameHeader, Reply, Stamp, State, Status
+from sightline.protocol.messages import MAX_INTEGER, CameraModel, FrameHeader, Odometry, Reply, Stamp, State, Status
 
 GOOD: Final = "GOOD"
 """The result of a command that the robot accepted: applied, or counted as DISARMED."""
@@ -27,6 +28,11 @@ FRAME_US: Final = 1_500_000
 REPLY_US: Final = 1_000_000
 """After which a peer may request again."""
 DRIVEN: Final = (State.ACTIVE, State.DEGRADED)
+SETTLES_US: Final = 200_000
+"""From a command of zero until a motor and its measurement are at rest."""
+WATCHED_AT_REST_US: Final = 500_000
+"""Long enough for several poses that are apart (measured.py)."""
+_STAMPED: Final = (STATUS, ODOMETRY, FRAME)
 _SENT_AGAIN: Final = 2
 
 
@@ -80,6 +86,52 @@ class Robot:
     def stops(self, within_us: int) -> bool:
         """Return True if a status with the wheels at zero arrives in time."""
         return self.reaches(lambda status: status.applied == (0.0, 0.0), within_us)
+
+    # --- measured motion ---------------------------------------------------------------------------------------------
+
+    def clock_us(self) -> int:
+        """The robot's clock now, at most the link's delay behind it."""
+        self.status()
+        stamps = ((one.at_us, one.header(Stamp)) for channel in _STAMPED for one in self.bench.received(channel))
+        return self.bench.now_us - min(at_us - stamp.t_us for at_us, stamp in stamps if stamp is not None)
+
+    def readings(self, since_us: int = 0, until_us: int = MAX_INTEGER) -> dict[str, list[MeasuredMotion]]:
+        """The motion that it published, by channel, between two times of its clock; no channel that has none."""
+        found: dict[str, list[MeasuredMotion]] = {ODOMETRY.name: [], FRAME.name: []}
+        for one in self.bench.received(ODOMETRY):
+            stamp, odometry = one.header(Stamp), one.payload(Odometry)
+            if stamp is not None and odometry is not None:
+                found[ODOMETRY.name].append(MeasuredMotion(stamp.t_us, odometry.moving, odometry.pose))
+        for _, header in self.frames():
+            if header.model_fields_set & {"moving", "pose"}:
+                found[FRAME.name].append(MeasuredMotion(header.t_us, header.moving, header.pose))
+        recent = {name: [one for one in series if since_us <= one.t_us <= until_us] for name, series in found.items()}
+        return {name: series for name, series in recent.items() if series}
+
+    def evidence_of_motion(self, since_us: int = 0) -> Evidence | None:
+        """The newest proof by odometry, frames or motor log that it moved after this time of its clock."""
+        rows = self.bench.motor_rows()
+        found = [*evidence_of(self.readings(since_us)), *(evidence_in_log(rows, self.clock_us()) if rows else ())]
+        return max((one for one in found if one.t_us >= since_us), key=lambda one: one.t_us, default=None)
+
+    def expect_unmoved(self, what: str, since_us: int = 0) -> None:
+        """Fail the case if the robot has measured motion since this time of its clock, or since the case began."""
+        moved = self.evidence_of_motion(since_us or self._first_t_us())
+        self.bench.expect(moved is None, f"{what} the wheels turn: {moved.words if moved else ''}")
+
+    def expect_rest(self, what: str) -> None:
+        """Fail the case unless wheels that now have the command zero come to rest, and stay there for a while."""
+        rests_us = self.clock_us() + SETTLES_US
+        self.bench.rest(SETTLES_US + WATCHED_AT_REST_US)
+        self.expect_unmoved(what, rests_us)
+
+    def _first_t_us(self) -> int:
+        """The robot's clock at the first message of the case: a motor log reaches back further."""
+        stamps = [stamp for channel in _STAMPED for one in self.bench.received(channel)[:1]
+                  if (stamp := one.header(Stamp))]
+        return min((stamp.t_us for stamp in stamps), default=0)
+
+    # --- the rest ----------------------------------------------------------------------------------------------------
 
     def counts(self, reason: str, before: int, within_us: int = 400_000) -> bool:
         """Return True if more than `before` rejections for `reason` are counted in time."""
@@ -348,6 +400,13 @@ def armed(bench: Bench, source: str = "vision", text: bytes = CRAWL) -> Sender:
     if not bench.wait(lambda: driver.seq >= 8, 3_000_000):
         bench.need(False, "too few frames to arm with")
     arm(driver)
+    return driver
+
+
+def moving(bench: Bench, source: str = "vision") -> Sender:
+    """A driver of a robot whose wheels turn, so that there is something to stop."""
+    driver = armed(bench, source)
+    driver.robot.reaches(lambda status: status.applied[0] > 0.05, 1_000_000)
     return driver
 
 

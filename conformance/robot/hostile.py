@@ -236,8 +236,10 @@ def stays_still(bench: Bench, driver: Sender) -> None:
     _away(bench, 1_500_000)
     mark = bench.mark()
     bench.need(bench.wait(lambda: bench.received(STATUS, mark), 5_000_000), "no status again (R-RECO-01)")
+    back_us = driver.robot.clock_us()
     moving = driver.robot.reaches(lambda status: status.applied != (0.0, 0.0), 700_000)
     bench.expect(not moving, f"it moves: {driver.robot.status().applied}, {driver.robot.status().state}")
+    driver.robot.expect_unmoved("after a driver was cut off", back_us)
 
 
 @SUITE.must("R-RECO-04", "6.1 Lease", ready)

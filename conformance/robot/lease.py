@@ -3,7 +3,7 @@
 from typing import Final
 
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.robot.fixture import GOOD, Sender, armed, operator, ready, teleop, vision
+from sightline.conformance.robot.fixture import GOOD, Sender, moving, operator, ready, teleop, vision
 from sightline.protocol.messages import Holder, State
 
 SUITE: Final = Suite("R")
@@ -107,7 +107,7 @@ def human_keeps(bench: Bench) -> None:
 @SUITE.must("R-LEASE-11", "6.2 Losing the human")
 def lost_human_disarms(bench: Bench) -> None:
     """A human driver who falls silent disarms the robot, also while vision's commands flow."""
-    human = armed(bench, "teleop")
+    human = moving(bench, "teleop")
     robot = human.robot
     Sender(robot).drive()
     human.fall_silent()
@@ -115,16 +115,19 @@ def lost_human_disarms(bench: Bench) -> None:
     bench.expect(reached, f"2.5 s after the human fell silent: {robot.status().state}, {robot.status().holder} drives")
     robot.next_status(5)
     bench.expect(robot.status().state is State.DISARMED, f"then it went on as {robot.status().state}")
+    robot.expect_rest("after the human fell silent")
 
 
 @SUITE.must("R-LEASE-12", "6.2 Losing the human")
 def human_lets_go(bench: Bench) -> None:
     """A human driver who releases the lease disarms the robot."""
-    human = armed(bench, "teleop")
+    human = moving(bench, "teleop")
     robot = human.robot
     human.drive(None)
     bench.need(human.granted("release"), "release is not granted (R-LEASE-15)")
     robot.expect_state(State.DISARMED, what="half a second after the release")
+    bench.expect(robot.stops(700_000), f"the wheels still turn: {robot.status().applied}")
+    robot.expect_rest("after the release")
 
 
 @SUITE.must("R-LEASE-13", "8.2 Requests and replies", vision)

@@ -1,4 +1,4 @@
-"""Cases on what the wheels do: limits, ramps, silence and ageing frames, as seen in `applied`. Pure.
+"""Cases on what the wheels do: limits, ramps, silence and ageing frames, in `applied` and measured motion. Pure.
 
 The duration of a stop is the time between two arrivals at the kit, so that the link's delay is in both ends of it.
 """
@@ -7,7 +7,8 @@ import math
 from typing import Final
 
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.robot.fixture import CRAWL, DRIVEN, Robot, Sender, armed
+from sightline.conformance.measured import mean_moving, mean_travel
+from sightline.conformance.robot.fixture import CRAWL, DRIVEN, SETTLES_US, Robot, Sender, armed
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import CLAMPED
 from sightline.protocol.messages import FrameHeader, Planar, State, Status
@@ -18,6 +19,11 @@ _RESOLUTION_US: Final = 100_000
 """Between two status."""
 _TOLERANCE: Final = 0.01
 _ZERO: Final = (0.0, 0.0)
+_OFF_MPS: Final = 0.04
+_OFF_RAD_S: Final = 0.15
+"""How far measured motion may be off, besides a share: a wheel slips, an encoder has steps."""
+_OVERSHOOT: Final = 1.15
+_MEASURED_US: Final = 600_000
 
 
 def _settled(robot: Robot) -> Planar:
@@ -44,6 +50,27 @@ def reaches_the_command(bench: Bench) -> None:
         bench.forget()
 
 
+@SUITE.must("R-LIM-08", "2.8 Fields")
+def measures_what_it_applies(bench: Bench) -> None:
+    """Measured motion, if the robot has it in `moving` or `pose`, agrees with `applied` in each axis and sign."""
+    for text in (b"0.1000|0.4000", b"-0.1000|-0.4000"):
+        robot, (_status, applied) = Robot(bench), _driven(bench, text)
+        began_us = robot.clock_us()
+        bench.rest(800_000)
+        readings = robot.readings(began_us)
+        found = {"moving": mean_moving(readings), "pose": mean_travel(readings)}
+        bench.need(any(found.values()), "this robot publishes no measured motion")
+        for name, measured in found.items():
+            near = measured is None or all(map(_agrees, measured, applied, (_OFF_MPS, _OFF_RAD_S)))
+            bench.expect(near, f"{text.decode()} is applied as {applied}, by `{name}` it moves at {measured}")
+        bench.rest(1_000_000 if Sender(robot, "operator").granted("disarm") else 0)
+        bench.forget()
+
+
+def _agrees(measured: float, applied: float, least: float) -> bool:
+    return abs(measured - applied) <= max(abs(applied) / 2, least)
+
+
 @SUITE.must("R-LIM-02", "9. Status")
 def limits_are_reported(bench: Bench) -> None:
     """`status` reports the robot's limits, both above zero."""
@@ -62,6 +89,7 @@ def linear_is_clamped(bench: Bench) -> None:
     status, applied = _driven(bench, b"48.0000|0.0000")
     bench.need(status.max_linear_mps > 0, "the robot reports no limit (R-LIM-02)")
     bench.expect(applied[0] <= status.max_linear_mps + _TOLERANCE, f"{applied[0]} m/s of {status.max_linear_mps}")
+    _measured_within(Robot(bench), status)
 
 
 @SUITE.must("R-LIM-04", "4.3 Limits")
@@ -71,6 +99,18 @@ def angular_is_clamped(bench: Bench) -> None:
     bench.need(status.max_angular_rad_s > 0, "the robot reports no limit (R-LIM-02)")
     least = -status.max_angular_rad_s - _TOLERANCE
     bench.expect(applied[1] >= least, f"{applied[1]} rad/s of {status.max_angular_rad_s}")
+    _measured_within(Robot(bench), status)
+
+
+def _measured_within(robot: Robot, status: Status) -> None:
+    """Fail the case if the motion that the robot measured last is beyond its limits."""
+    readings = robot.readings(robot.clock_us() - _MEASURED_US)
+    for name, measured in (("moving", mean_moving(readings)), ("pose", mean_travel(readings))):
+        linear, angular = measured or _ZERO
+        within = (abs(linear) <= _OVERSHOOT * status.max_linear_mps + _OFF_MPS
+                  and abs(angular) <= _OVERSHOOT * status.max_angular_rad_s + _OFF_RAD_S)
+        limits = f"{status.max_linear_mps} m/s, {status.max_angular_rad_s} rad/s"
+        robot.bench.expect(within, f"by `{name}` it moves at {linear:.2f} m/s, {angular:.2f} rad/s; limits {limits}")
 
 
 @SUITE.must("R-LIM-05", "4.3 Limits", armed)
@@ -157,7 +197,8 @@ def _silent(driver: Sender) -> tuple[int, FrameHeader]:
 
 
 def _expect_stop(bench: Bench, mark: int, what: str) -> None:
-    began_us = bench.now_us
+    robot = Robot(bench)
+    began_us, began_t_us = bench.now_us, robot.clock_us()
     bench.rest(1_500_000)
     zero_us = _zero_us(bench, mark)
     bench.expect(zero_us is not None, f"{what}: the wheels still turn after 1.5 s")
@@ -165,6 +206,7 @@ def _expect_stop(bench: Bench, mark: int, what: str) -> None:
     took_us = zero_us - began_us
     reported = f"{what}: at zero {took_us / 1e3:.0f} ms after the first frame not answered"
     bench.expect(took_us <= _STOPS_WITHIN_US + _RESOLUTION_US, reported)
+    robot.expect_unmoved(f"{what}: 0.9 s later", began_t_us + _STOPS_WITHIN_US + SETTLES_US)
 
 
 @SUITE.must("R-SIL-01", "5.4 Silence", _driving)
@@ -216,9 +258,11 @@ def ageing_frame_slows(bench: Bench, driver: Sender) -> None:
     driver.drive(f"{limit:.4f}|0.0000".encode())
     bench.rest(1_000_000)
     full = driver.robot.next_status().applied[0]
+    slowed_us = driver.robot.clock_us()
     driver.delay_us = driver.compute_us = 250_000
     bench.rest(1_500_000)
-    mark, accepted = bench.mark(), driver.robot.status()
+    measured = mean_moving(driver.robot.readings(slowed_us - _MEASURED_US, slowed_us))
+    mark, accepted, settled_us = bench.mark(), driver.robot.status(), driver.robot.clock_us()
     bench.rest(1_000_000)
     seen = _reports(bench, mark)
     bench.need(full > 0, "it does not drive (R-LIM-01)")
@@ -226,6 +270,9 @@ def ageing_frame_slows(bench: Bench, driver: Sender) -> None:
     slow = [applied[0] for _, applied, state in seen if state is State.DEGRADED]
     bench.expect(slow, f"answers 250 ms late leave it {sorted({state.value for _, _, state in seen})}")
     bench.expect(min(slow) < 0.9 * full, f"it still drives at {min(slow)} of {full} m/s")
+    slower = mean_moving(driver.robot.readings(settled_us))
+    if measured is not None and slower is not None:
+        bench.expect(slower[0] < 0.95 * measured[0], f"by `moving` it is at {slower[0]:.2f} of {measured[0]:.2f} m/s")
 
 
 @SUITE.must("R-SIL-06", "5.4 Silence", armed)
@@ -242,6 +289,7 @@ def long_hold_disarms(bench: Bench, driver: Sender) -> None:
     bench.need(driver.robot.becomes(State.HOLD, within_us=2_000_000), "it does not hold (R-SIL-06)")
     early = driver.robot.becomes(State.DISARMED, within_us=8_500_000)
     bench.expect(not early, "it disarmed before ten seconds were over")
+    driver.robot.expect_unmoved("in HOLD", driver.robot.clock_us() - 7_000_000)
     driver.robot.expect_state(State.DISARMED, within_us=2_500_000, what="after 11 s")
 
 

@@ -130,6 +130,8 @@ def _row_case(row: Row) -> Case:
 
             result = sender.result_on_next(send)
             bench.expect(result == expected, f"{sent[:160]!r}: {result}, expected {expected}")
+        if row in CITED:
+            sender.robot.expect_unmoved("though no twist was applied")
 
     return Case(number, level, clause, title, run)
 
@@ -192,6 +194,7 @@ def stale_frame(bench: Bench, sender: Sender) -> None:
     bench.rest(1_200_000)
     result = sender.result_of(lambda: sender.twist(frame))
     bench.expect(result in ("STALE", "UNKNOWN_FRAME"), f"it was {result}")
+    sender.robot.expect_unmoved("though no twist was applied")
 
 
 @SUITE.must("R-CAUS-07", "4.5 Echo", ready)

@@ -25,16 +25,7 @@ STREAM_US = 200_000
 
 
 def quicken():
-    """Look keys up instead of matching and parsing them: a quarter of the time that the whole matrix takes."""
-    known, matches = {}, memory._matches
-
-    def looked_up(robot, channel, key):
-        name = robot, channel.name, key
-        if name not in known:
-            known[name] = matches(robot, channel, key)
-        return known[name]
-
-    memory._matches = looked_up
+    """Look keys up instead of parsing them: a quarter of the time that the whole matrix takes."""
     memory.parse_key = link_rules.parse_key = functools.cache(memory.parse_key)
 
 

@@ -14,7 +14,7 @@ from tests.conformance.robot.broken import arming as broken_arming  # noqa: F401
 from tests.conformance.robot.broken import credit as broken_traffic  # noqa: F401  (they fill BROKEN)
 from tests.conformance.robot.broken import frames as broken_output  # noqa: F401  (they fill BROKEN)
 from tests.conformance.robot.broken import lease as broken_lease  # noqa: F401  (they fill BROKEN)
-from tests.conformance.robot.broken import motion as broken_motion  # noqa: F401  (they fill BROKEN)
+from tests.conformance.robot.broken import motion as broken_motion
 from tests.conformance.robot.broken import order as broken_order  # noqa: F401  (they fill BROKEN)
 from tests.conformance.robot.broken import requests as broken_requests  # noqa: F401  (they fill BROKEN)
 from tests.conformance.robot.broken import validation as broken_judging  # noqa: F401  (they fill BROKEN)
@@ -85,6 +85,23 @@ def test_a_robot_without_guests_passes_what_applies():
         if case.id.startswith("R-DIAL"):
             bench, _robot = virtual_robot(guests=False)
             assert run_case(case, bench, prepare).outcome is not Outcome.FAILED, case.id
+
+
+@pytest.mark.parametrize("break_it", broken_motion.LIARS, ids=lambda break_it: break_it.__name__)
+def test_robot_whose_wheels_differ_from_its_status_fails(break_it):
+    bench, _robot = virtual_robot(break_it)
+    found = broken_motion.LIARS[break_it]
+    groups = {case.group for case in VIRTUAL if case.id in found}
+    results = run_cases([case for case in VIRTUAL if case.group in groups], bench, prepare)
+    assert {one.case.id for one in results if one.outcome is Outcome.FAILED} >= set(found)
+    assert not passed(results)
+
+
+def test_coasting_robot_fails_twelve_of_the_cases_about_stopping():
+    bench, _robot = virtual_robot(broken_motion.coasts)
+    results = run_cases([case for case in VIRTUAL if case.group in ("arming", "stop", "silence")], bench, prepare)
+    failed = [one.case.id for one in results if one.outcome is Outcome.FAILED]
+    assert (len(results), len(failed)) == (37, 12), failed
 
 
 def test_a_dead_robot_fails_everything():

@@ -2,6 +2,7 @@
 
 from sightline.protocol.errors import CLAMPED, RejectReason, WireError
 from sightline.protocol.messages import State, Twist
+from sightline.robot_side.kinematics import twist_of, wheel_speeds
 from sightline.robot_side.safety.validation import AcceptedCommand
 from tests.conformance.robot.broken.breaking import bend_out, breaks, fields_of, wrap
 from tests.conformance.robot.broken.lease import who_sends
@@ -179,3 +180,69 @@ def acks_keep_it_going(robot):
             revive(robot)
 
     wrap(robot, "on_ack", around)
+
+
+# --- measured motion -------------------------------------------------------------------------------------------------
+
+
+@breaks("R-LIM-08")
+def measures_a_third_of_its_motion(robot):
+    def third(fields):
+        fields.update(moving=[one * 0.3 for one in fields["moving"]], pose=[one * 0.3 for one in fields["pose"]])
+
+    bend_out(robot, "odometry", lambda _header, payload: third(payload))
+    bend_out(robot, "frame", lambda header, _payload: third(header))
+
+
+LIARS = {}
+"""`break_it(robot)` -> the cases that find it, all of which see the wheels alone. `status` reports a good robot."""
+
+
+def lies(*case_ids):
+    """Decorator: the wheels of this robot do what `bend(robot, asked)` gives, and `applied` hides it."""
+
+    def add(bend):
+        def break_it(robot):
+            speeds = [(0.0, 0.0)]
+
+            def around(inner, now_us, wheels, scan):
+                speeds[0] = bend(robot, inner(now_us, wheels, scan), speeds[0])
+                return speeds[0]
+
+            wrap(robot.driving, "tick", around)
+
+        break_it.__name__ = bend.__name__
+        LIARS[break_it] = case_ids
+        return break_it
+
+    return add
+
+
+@lies("R-STOP-01", "R-STOP-04", "R-STOP-06", "R-ARM-04", "R-ARM-05", "R-ARM-12", "R-LEASE-11", "R-LEASE-12", "R-SIL-01",
+      "R-SIL-02", "R-SIL-03", "R-SIL-04", "R-SIL-07", "R-SIL-09")
+def coasts(robot, asked, last):
+    """The wheels never stop: the last speeds stay on the motors."""
+    return asked if robot.driving.gate.state in (State.ACTIVE, State.DEGRADED) else last
+
+
+@lies("R-LIM-08")
+def swaps_the_axes(robot, asked, last):
+    """Turns by the first number and drives by the second."""
+    twist = twist_of(robot.config.wheels, *asked)
+    return wheel_speeds(robot.config.wheels, Twist(linear_mps=twist.angular_rad_s, angular_rad_s=twist.linear_mps))
+
+
+@lies("R-LIM-03", "R-LIM-04", "R-LIM-08")
+def drives_twice_as_fast(robot, asked, last):
+    return asked[0] * 2, asked[1] * 2
+
+
+@lies("R-SIL-05")
+def does_not_slow(robot, asked, last):
+    full = robot.config.safety.max_linear_mps / robot.config.wheels.wheel_radius_m
+    return (full, full) if robot.driving.gate.state in (State.DEGRADED, State.HOLD) else asked
+
+
+@lies("R-CAUS-02", "R-CAUS-03", "R-CAUS-05", "R-CAUS-06", "R-CAUS-08", "R-CAUS-09")
+def drives_by_rejected_twists(robot, asked, last):
+    return (3.0, 3.0) if robot.driving.gate.state is State.DISARMED and robot.driving.gate.counters else asked
