@@ -6,6 +6,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 
 from tests.mutation.changes import EQUIVALENTS, select
@@ -32,6 +33,7 @@ TABLES = {
     "robot_side/network/congestion_window.py": ("tests/robot_side/network/test_congestion_window.py",),
     "vision_side/missions/switch.py": ("tests/vision_side/missions/test_switch.py",),
     "vision_side/missions/follow.py": ("tests/vision_side/missions/test_follow.py",),
+    "vision_side/tracking/locate.py": ("tests/vision_side/tracking/test_locate.py",),
     "vision_side/tracking/prediction.py": ("tests/vision_side/tracking/test_prediction.py",),
     "vision_side/tracking/track.py": ("tests/vision_side/tracking/test_track.py",),
     "vision_side/tracking/steering.py": (
@@ -114,10 +116,13 @@ def _mutants(file: str) -> Iterator[Mutant]:
 
 
 def _survivors(found: list[Mutant], jobs: int) -> list[Mutant]:
-    began_s, survivors, outcomes = time.monotonic(), [], Counter[Outcome]()
-    for mutant, outcome in _trials(found, jobs):
-        outcomes[outcome] += 1
-        survivors += [mutant] if outcome is Outcome.SURVIVED else []
+    began_s, survivors, outcomes = time.monotonic(), list[Mutant](), Counter[Outcome]()
+    for file, trials in groupby(_trials(found, jobs), key=lambda trial: trial[0].file):
+        file_began_s, before = time.monotonic(), outcomes.total()
+        for mutant, outcome in trials:
+            outcomes[outcome] += 1
+            survivors += [mutant] if outcome is Outcome.SURVIVED else []
+        print(f"{file}: {outcomes.total() - before} mutants in {time.monotonic() - file_began_s:.0f} s", flush=True)
     counts = ", ".join(f"{count} {outcome.value}" for outcome, count in outcomes.items())
     print(f"{len(found)} mutants in {time.monotonic() - began_s:.0f} s: {counts}")
     return survivors

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -65,6 +66,7 @@ def test_gate_imports_no_file_with_mutants():
     """If it did, every mutant of that file would count as killed and none would run."""
     code = """
 import sys
+from pathlib import Path
 import tests.mutation.__main__ as gate
 from tests.mutation.trial import module_name
 print([file for file in gate.TABLES if module_name(file) in sys.modules])
@@ -98,3 +100,11 @@ def test_part_of_a_file_has_the_mutants_of_its_names_and_constants_only(tmp_path
 
 def test_files_of_parts_are_under_the_gate():
     assert set(gate.PARTS) <= set(gate.TABLES)
+
+
+def test_pure_logic_of_wheels_and_frames_is_under_the_gate():
+    folders = ("robot_side/safety", "robot_side/network", "vision_side/tracking")
+    pure = {str(path) for folder in folders for path in Path(folder).glob("[!_]*.py")}
+    pure -= {"robot_side/network/process.py"}  # a shell
+    pure |= {"robot_side/driver/core.py", "robot_side/kinematics.py", "operator_side/client/requests.py"}
+    assert len(pure) > 15 and pure <= set(gate.TABLES)
