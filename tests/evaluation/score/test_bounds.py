@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
 
 import pytest
 
@@ -27,18 +26,21 @@ from sightline.evaluation.score.figures import (
     red_stops,
     score,
 )
+from sightline.sim.scenario import OnPath, load_scenario
 from sightline.sim.truth import Truth
 
+STATIC = load_scenario("static")
 STAND_OFF_M = 0.8
 START_US = 5_000_000
 
 
-def scenario_of(bounds=None, *, shape="sphere", goals_m=(), light=None, stand_off_m=STAND_OFF_M, within_deg=2.0):
-    """Return what the score reads of a scenario."""
-    return SimpleNamespace(
-        stand_off_m=stand_off_m, acquired_within_deg=within_deg, target=SimpleNamespace(shape=shape), goals_m=goals_m,
-        light=light, bounds=bounds or {},
-    )  # fmt: skip
+def scenario_of(bounds=None, *, shape="sphere", goals_m=(), light=None, things=(), stand_off_m=STAND_OFF_M,
+                within_deg=2.0):
+    """Return a scenario with these parts, which are not checked."""
+    return STATIC.model_copy(update={
+        "stand_off_m": stand_off_m, "acquired_within_deg": within_deg, "goals_m": goals_m, "light": light,
+        "target": STATIC.target.model_copy(update={"shape": shape}), "things": things, "bounds": bounds or {},
+    })  # fmt: skip
 
 
 def sample(t_s=0.0, *, bearing_deg=0.0, distance_m=STAND_OFF_M, x_m=0.0, y_m=0.0, linear_mps=0.0, visible=True, walls=0,
@@ -222,14 +224,17 @@ def test_commanded_way_is_that_of_the_faster_wheel_within_the_run(wheels, way_m)
 
 
 def test_scenario_decides_which_figures_a_run_has():
-    run = RunRecord(samples(5, light=lambda _: "red", past_line_m=lambda _: -1.0, walls=lambda at: 7 + at),
+    run = RunRecord(samples(5, light=lambda _: "red", past_line_m=lambda _: -1.0, walls=lambda at: 7 + at,
+                            passes=lambda at: 3 + 2 * at),
                     wheels=[RimSpeeds(START_US, 0.5, 0.0)])
     common = {"wall_contact_s", "commanded_m"}
     found = {name: figures_of(scenario_of(**changes), run, run.samples) for name, changes in (
         ("sphere", {}), ("legs", {"shape": "legs"}), ("goals", {"goals_m": ((9.0, 9.0),)}),
-        ("light", {"light": object()}),
+        ("light", {"light": object()}), ("path", {"things": (object(), OnPath.model_construct())}),
+        ("things", {"things": (object(),)}),
     )}  # fmt: skip
-    assert set(found["sphere"]) == common
+    assert set(found["sphere"]) == set(found["things"]) == common
+    assert set(found["path"]) == common | {"least_passes"} and found["path"]["least_passes"] == 8
     assert found["sphere"] == {"wall_contact_s": pytest.approx(0.016), "commanded_m": pytest.approx(0.5 * 0.08)}
     assert set(found["legs"]) == common | {"least_distance_m", "most_distance_m", "least_ever_m"}
     assert set(found["goals"]) == common | {"reached_s", "least_clearance_m", "given_up_s"}
