@@ -69,10 +69,21 @@ class LiveBench(Bench):
             self._dropped += link.rejected
 
     def join(self) -> None:
-        for role in self._roles:
-            self._links[role] = self._open_it(role)
+        opened: dict[str, Link] = {}
+        try:
+            for role in self._roles:
+                opened[role] = self._open_it(role)
+        except BaseException:
+            for link in opened.values():
+                link.close()
+            raise
+        self._links = opened
         for channel in self._channels:
             self._links[self._roles[0]].subscribe(channel, self._store)
+
+    def restore(self) -> None:
+        if not self._links:
+            self.join()
 
     def _store(self, message: Message) -> None:
         with self._news:

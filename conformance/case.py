@@ -156,6 +156,9 @@ Begin = Callable[["Bench"], Any]
 # beside.
 
 
+_SHOWN_MESSAGES: Final = 3
+_SHOWN_BYTES: Final = 48
+_SHOWN_TEXT: Final = 200
 KEPT_MESSAGES: Final = 600
 """Per channel; 20 s of frames at 30 fps, longer than any case lasts."""
 
@@ -228,6 +231,7 @@ class Bench(ABC):
         self._timers: list[tuple[int, int, Callable[[], None]]] = []
         self._numbers = itertools.count(1)
         self._newest_number = 0
+        self._sent: deque[str] = deque(maxlen=_SHOWN_MESSAGES)
 
     # --- to be brought to life -----------------------------------------------------------------------------------
 
@@ -267,6 +271,7 @@ class Bench(ABC):
         self, channel: Channel, header: WireModel | bytes, payload: WireModel | bytes = b"", source: str = ""
     ) -> None:
         """Send a message; `source` is the role in the key, for channels towards the robot."""
+        self._sent.append(_shown("sent", channel, _bytes(header), _bytes(payload)))
         self.send(channel, _bytes(header), _bytes(payload), source)
 
     def mark(self) -> int:
@@ -298,6 +303,7 @@ class Bench(ABC):
     def forget(self) -> None:
         """Drop the log, the reactions and the timers: between two cases."""
         self._log.clear()
+        self._sent.clear()
         self._reactions.clear()
         self._timers.clear()
 
@@ -308,6 +314,16 @@ class Bench(ABC):
         for channel, react in tuple(self._reactions):
             if channel is message.channel:
                 react(one)
+
+    def evidence(self) -> tuple[str, ...]:
+        """Format the last messages that it sent, and the last of each channel that it received, as bytes and text."""
+        newest = sorted((log[-1] for log in self._log.values() if log), key=lambda one: one.number)
+        parts = ((one.message.channel, one.message.header, one.message.payload) for one in newest)
+        return (*self._sent, *(_shown("received", *part) for part in parts))
+
+    def restore(self) -> None:
+        """Connect again if the case before ended without a connection. Raises LinkError."""
+        return
 
     # --- time ----------------------------------------------------------------------------------------------------
 
@@ -354,3 +370,10 @@ class Bench(ABC):
 
 def _bytes(part: WireModel | bytes) -> bytes:
     return part if isinstance(part, bytes) else encode(part)
+
+
+def _shown(verb: str, channel: Channel, header: bytes, payload: bytes) -> str:
+    """Format one message, bounded: the header as text, the payload as text and hex."""
+    text = payload[:_SHOWN_BYTES].decode("ascii", "replace")
+    return (f"{verb} {channel.name}: header {header[:_SHOWN_TEXT].decode('ascii', 'replace')}, payload {text!a} = "
+            f"{payload[:_SHOWN_BYTES].hex()} ({len(payload)} bytes)")

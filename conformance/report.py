@@ -1,12 +1,14 @@
 """Results as JSON and JUnit XML. Pure."""
 
+import json
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from sightline.conformance.case import Level
+from sightline.conformance.case import Case, Level
 from sightline.conformance.runner import Outcome, Result, passed, printable
+from sightline.protocol.errors import ConfigError
 
 
 def counts(results: Sequence[Result]) -> Counter[str]:
@@ -34,11 +36,42 @@ def to_dict(results: Sequence[Result], side: str, peer: str) -> dict[str, Any]:
         "side": side,
         "peer": peer,
         "counts": dict(counts(results)),
-        "checks": [_check(one) for one in results],
+        "checks": [to_check(one) for one in results],
     }
 
 
-def _check(one: Result) -> dict[str, Any]:
+def from_lines(text: str, cases: Sequence[Case], side: str, peer: str, file: str) -> list[Result]:
+    """Read the results of an earlier run of the same peer, one JSON object a line; the last may be cut.
+
+    Raises ConfigError for a damaged file and for another peer.
+    """
+    known = {case.id: case for case in cases}
+    results: list[Result] = []
+    for number, line in enumerate(text.splitlines(keepends=True), 1):
+        if not line.endswith("\n"):
+            break
+        try:
+            fields = json.loads(line)
+            found = fields["side"], fields["peer"]
+            outcome, reason, took_us = Outcome(fields["value"]), str(fields["reason"]), round(fields["seconds"] * 1e6)
+            case = known.get(fields["name"])
+        except (ValueError, KeyError, TypeError):
+            raise ConfigError(f"damaged --resume {file}, line {number}: not a result; remove the line") from None
+        if found != (side, peer):
+            raise ConfigError(f"--resume {file}: line {number} is of {found[0]} {found[1]}, not of {side} {peer}; "
+                              "name another file")
+        if case is not None:
+            results.append(Result(case, outcome, reason, took_us))
+    return results
+
+
+def to_line(one: Result, side: str, peer: str) -> str:
+    """Return the result of one case as one line of JSON."""
+    return json.dumps({**to_check(one), "side": side, "peer": peer})
+
+
+def to_check(one: Result) -> dict[str, Any]:
+    """Return the result of one case as the report has it."""
     case = one.case
     return {
         "name": case.id,
@@ -52,6 +85,7 @@ def _check(one: Result) -> dict[str, Any]:
         "title": case.title,
         "reason": one.reason,
         "seconds": round(one.took_us / 1e6, 3),
+        "evidence": list(one.evidence),
     }
 
 

@@ -24,6 +24,8 @@ class Result:
     outcome: Outcome
     reason: str = ""
     took_us: int = 0
+    evidence: tuple[str, ...] = ()
+    """The last messages of a failed case."""
 
 
 def run_case(case: Case, bench: Bench, prepare: Callable[[Bench], None] = lambda _bench: None) -> Result:
@@ -32,6 +34,7 @@ def run_case(case: Case, bench: Bench, prepare: Callable[[Bench], None] = lambda
     began_us = bench.now_us
     outcome, reason = Outcome.PASSED, ""
     try:
+        bench.restore()
         prepare(bench)
         case.run(bench)
     except NotApplicableError as missing:
@@ -40,7 +43,8 @@ def run_case(case: Case, bench: Bench, prepare: Callable[[Bench], None] = lambda
         outcome, reason = Outcome.FAILED, str(failed)
     except Exception as error:  # a peer's nonsense must not end the run
         outcome, reason = Outcome.FAILED, f"{type(error).__name__}: {error}"
-    return Result(case, outcome, printable(reason), bench.now_us - began_us)
+    evidence = tuple(map(printable, bench.evidence())) if outcome is Outcome.FAILED else ()
+    return Result(case, outcome, printable(reason), bench.now_us - began_us, evidence)
 
 
 def printable(text: str) -> str:

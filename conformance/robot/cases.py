@@ -41,6 +41,7 @@ def is_there(bench: Bench) -> bool:
 def prepare(bench: Bench) -> None:
     """Bring the robot to where a case begins: DISARMED, no holder, wheels at zero. Raises ConformanceError."""
     robot = Robot(bench)
+    is_there(bench)  # one that hung in the case before may need time to connect again
     robot.status()
     operator = Sender(robot, "operator", acks=False)
     robot.next_status()

@@ -18,7 +18,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from sightline.conformance.benches import LiveBench
 from sightline.conformance.case import Access, Case
-from sightline.conformance.report import summary, to_dict, to_junit
+from sightline.conformance.measured import WheelRow, check_motor_log, read_motor_log
+from sightline.conformance.report import from_lines, summary, to_dict, to_junit, to_line
+from sightline.conformance.robot.fixture import Robot as RobotUnderTest
 from sightline.conformance.runner import Outcome, Result, chosen, run_cases
 from sightline.operator_side.cli.options import Json, Secure, command_group, print_result
 from sightline.operator_side.preflight import check_out_file
@@ -94,8 +96,8 @@ _FEW: Final = 3
 
 
 @contextmanager
-def progress(total: int) -> Iterator[Callable[[Result], None]]:
-    """Show a bar over `total` cases below the failures; without a terminal, print a line per failure."""
+def progress(total: int, every: bool = False) -> Iterator[Callable[[Result], None]]:
+    """Show a bar over `total` cases below the failures, or below a line for `every` case as it ends."""
     console = Console(stderr=True)
     with Progress(
         TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), console=console, transient=True,
@@ -105,10 +107,21 @@ def progress(total: int) -> Iterator[Callable[[Result], None]]:
 
         def show(result: Result) -> None:
             bar.update(task, advance=1, description=result.case.id)
-            if result.outcome is Outcome.FAILED:
-                console.print(f"{result.case.id}: {result.reason}", markup=False, highlight=False)
+            for line in _lines_of(result, every):
+                console.print(line, markup=False, highlight=False, soft_wrap=True)
 
         yield show
+
+
+def _lines_of(result: Result, every: bool) -> Iterator[str]:
+    """Yield the lines of a case that has ended: one, and after a failure the clause and the last messages."""
+    case = result.case
+    if result.outcome is Outcome.FAILED:
+        yield f"{case.id}: {result.reason}" + (f" [{case.clause}]" if every else "")
+        yield from (f"    {line}" for line in result.evidence)
+    elif every:
+        reason = f": {result.reason}" if result.reason else ""
+        yield f"{case.id} {result.outcome.value}, {result.took_us / 1e6:.1f} s{reason}"
 
 
 def print_results(results: Sequence[Result]) -> None:
@@ -182,6 +195,13 @@ OwnToken = Annotated[
 ]
 Junit = Annotated[Path | None, typer.Option("--junit", metavar="FILE", help="Write JUnit XML.")]
 Save = Annotated[Path | None, typer.Option("--save", metavar="FILE", help="Also write the JSON to a file.")]
+JsonLines = Annotated[
+    bool, typer.Option("--json-lines", help="Print the result of each case as one line of JSON, as it ends.")
+]
+Resume = Annotated[
+    Path | None,
+    typer.Option("--resume", metavar="FILE", help="Append each result to FILE, and skip the cases that it has."),
+]
 Name = Annotated[str, typer.Option("--name", metavar="TEXT", help="Peer's name in reports [default: its address].")]
 
 
@@ -196,6 +216,8 @@ class RunOptions:
     save: Save = None
     name: Name = ""
     as_json: Json = False
+    json_lines: JsonLines = False
+    resume: Resume = None
 
     def chosen(self, cases: Sequence[Case]) -> Sequence[Case]:
         """Return the cases to run, or none after --list. Raises ConfigError for a file that cannot be written."""
@@ -203,9 +225,40 @@ class RunOptions:
         if self.list_cases:
             typer.echo(listing(found))
             return ()
-        for path in filter(None, (self.junit, self.save)):
+        for path in filter(None, (self.junit, self.save, self.resume)):
             check_out_file(path)
         return found
+
+    def earlier(self, cases: Sequence[Case], side: str, peer: str) -> list[Result]:
+        """Read the results that --resume has. Raises ConfigError for a damaged file and for another peer."""
+        if self.resume is None or not self.resume.exists():
+            return []
+        try:
+            text = self.resume.read_text("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            why = getattr(error, "strerror", None) or "not a text file"
+            raise ConfigError(f"cannot read --resume {self.resume}: {why}; name another file") from None
+        whole = text[: text.rfind("\n") + 1]
+        if whole != text:  # a killed run may have left half a line, to which nothing can be appended
+            self.resume.write_text(whole, "utf-8")
+        return from_lines(whole, cases, side, self.name or peer, str(self.resume))
+
+    @contextmanager
+    def shown(self, total: int, side: str, peer: str) -> Iterator[Callable[[Result], None]]:
+        """Show each result as it ends, in the forms of --json-lines and --resume too."""
+        with ExitStack() as ending:
+            show = ending.enter_context(progress(total, every=side != "codec"))
+            store = ending.enter_context(self.resume.open("a", encoding="utf-8", buffering=1)) if self.resume else None
+
+            def on_result(result: Result) -> None:
+                show(result)
+                line = to_line(result, side, self.name or peer)
+                if store is not None:
+                    store.write(line + "\n")
+                if self.json_lines:
+                    typer.echo(line)
+
+            yield on_result
 
     def report(self, results: Sequence[Result], side: str, peer: str) -> int:
         """Print and write the results. Returns the exit code."""
@@ -214,9 +267,41 @@ class RunOptions:
             self.junit.write_text(to_junit(results, side, self.name or peer), "utf-8")
         if self.save is not None:
             self.save.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
-        if not self.as_json:
+        if not self.as_json and not self.json_lines:
             print_results(results)
         return print_result(found, (), self.as_json)
+
+
+def _in_order(cases: Sequence[Case], *parts: Sequence[Result]) -> list[Result]:
+    """Join earlier and new results in the order of the cases; of two for one case the last counts."""
+    by_id = {one.case.id: one for part in parts for one in part}
+    return [by_id[case.id] for case in cases if case.id in by_id]
+
+
+def _left(cases: Sequence[Case], earlier: Sequence[Result]) -> list[Case]:
+    done = {one.case.id for one in earlier}
+    return [case for case in cases if case.id not in done]
+
+
+def _need_endpoint(endpoint: str, example: str) -> None:
+    if not endpoint:
+        raise ConfigError(f"no ENDPOINT; write its address, e.g. sightline conform {example}")
+
+
+def _motor_rows(file: Path) -> list[WheelRow]:
+    try:
+        return read_motor_log(file.read_text("ascii"), str(file))
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", None) or "not a text file"
+        raise ConfigError(f"cannot read --motor-log {file}: {why}; name the file of the robot's drive") from None
+
+
+def _use_motor_log(bench: LiveBench, file: Path | None) -> None:
+    """Let the cases read the robot's motor log. Raises ConfigError for one of another run."""
+    if file is not None:
+        t_us = RobotUnderTest(bench).stamp().t_us
+        check_motor_log(_motor_rows(file), t_us, bench.robot, str(file))
+        bench.motor_rows = lambda: [row for row in _motor_rows(file) if row.t_us >= t_us]
 
 
 def with_run_options(command: Callable[..., int]) -> Callable[..., int]:
@@ -246,7 +331,7 @@ def register(app: typer.Typer) -> None:
 
 
 def robot(
-    endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Its address: tcp/..., ws:// or wss://.")],
+    endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Its address: tcp/..., ws:// or wss://.")] = "",
     *,
     robot: Robot = "r1",
     legacy: Annotated[
@@ -254,6 +339,10 @@ def robot(
     ] = "",
     secure: Secure = "",
     tokens: Tokens = None,
+    motor_log: Annotated[
+        Path | None,
+        typer.Option("--motor-log", metavar="FILE", help="The robot's motor log, a second witness of its motion."),
+    ] = None,
     run: RunOptions,
 ) -> int:
     """Test a robot against the protocol
@@ -269,6 +358,9 @@ def robot(
     cases = run.chosen(side.CASES)
     if not cases:
         return 0
+    _need_endpoint(endpoint, "robot ws://192.168.1.20:9090")
+    earlier = run.earlier(cases, "robot", endpoint)
+    left = _left(cases, earlier)
     with ExitStack() as ending:
         access = access_for(secure, tokens or (), _ROLES, ending)
 
@@ -280,19 +372,22 @@ def robot(
 
         put = put_it if "://" in endpoint else ending.enter_context(RawZenoh(endpoint, access.folder)).put
         roles = _ROLES if access.is_guarded else _ROLES[:1]
+        if motor_log is not None:
+            _motor_rows(motor_log)
         bench = LiveBench(
             robot, open_it, FROM_ROBOT, put, roles=roles, endpoint=endpoint, legacy=legacy, access=access
         )  # fmt: skip
         ending.enter_context(bench)
         if not side.is_there(bench):
             raise LinkError(f"no status from robot '{robot}' at {endpoint}; check --robot")
-        show_result = ending.enter_context(progress(len(cases)))
-        results = run_cases(cases, bench, side.prepare, show_result, TRIES)
-    return run.report(results, "robot", endpoint)
+        _use_motor_log(bench, motor_log)
+        show_result = ending.enter_context(run.shown(len(left), "robot", endpoint))
+        results = run_cases(left, bench, side.prepare, show_result, TRIES)
+    return run.report(_in_order(cases, earlier, results), "robot", endpoint)
 
 
 def vision(
-    endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Address on which the kit listens.")],
+    endpoint: Annotated[str, typer.Argument(metavar="ENDPOINT", help="Address on which the kit listens.")] = "",
     *,
     robot: Robot = "r1",
     dial: Annotated[
@@ -314,6 +409,9 @@ def vision(
     cases = run.chosen(side.CASES)
     if not cases:
         return 0
+    _need_endpoint(endpoint, "vision tcp/127.0.0.1:7447")
+    earlier = run.earlier(cases, "vision", endpoint)
+    left = _left(cases, earlier)
     with ExitStack() as ending:
         access = access_for(secure, tokens or (), _ROLES[:1], ending)
 
@@ -329,9 +427,9 @@ def vision(
         if not side.is_there(bench):
             raise LinkError(f"no answer from a vision service for robot '{robot}' at {endpoint}; run "
                             f"`sightline vision --connect {endpoint} --robot {robot}`")
-        show_result = ending.enter_context(progress(len(cases)))
-        results = run_cases(cases, bench, side.prepare, show_result, TRIES)
-    return run.report(results, "vision", endpoint)
+        show_result = ending.enter_context(run.shown(len(left), "vision", endpoint))
+        results = run_cases(left, bench, side.prepare, show_result, TRIES)
+    return run.report(_in_order(cases, earlier, results), "vision", endpoint)
 
 
 def codec(
@@ -352,6 +450,9 @@ def codec(
         return 0
     if not command:
         raise ConfigError("no command; write it after two dashes, e.g. sightline conform codec -- node codec.js")
-    with progress(len(cases)) as show_result:
-        results = side.run_codec(command, cases, show_result)
-    return run.report(results, "codec", " ".join(command))
+    peer = " ".join(command)
+    earlier = run.earlier(cases, "codec", peer)
+    left = _left(cases, earlier)
+    with run.shown(len(left), "codec", peer) as show_result:
+        results = side.run_codec(command, left, show_result)
+    return run.report(_in_order(cases, earlier, results), "codec", peer)

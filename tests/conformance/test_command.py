@@ -1,6 +1,9 @@
 """Tests of `sightline conform` as users and CI jobs run it: a real robot process, over WebSocket and Zenoh."""
 
 import json
+import os
+import signal
+import threading
 import xml.etree.ElementTree as ET
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,11 +14,14 @@ from docs.make.conformance import to_page
 from sightline.conformance.case import Access, Case, Level
 from sightline.conformance.report import summary, to_dict, to_junit
 from sightline.conformance.robot.cases import CASES
-from sightline.conformance.runner import Outcome, Result
+from sightline.conformance.runner import Outcome, Result, run_case
 from sightline.conformance.vision import cases as vision
 from sightline.operator_side.cli import app as cli
+from sightline.operator_side.cli import conform
 from sightline.operator_side.cli.conform import access_for
 from sightline.operator_side.setup import keys
+from sightline.protocol.channels import TWIST
+from tests.conformance.robot.reference import virtual_robot
 from tests.conformance.robot.small_server import SmallServer
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
@@ -48,6 +54,62 @@ def test_a_real_robot_conforms(capsys, tmp_path, scheme):
     assert report["ok"] and report["side"] == "robot" and report["peer"] == endpoint
     assert {check["name"] for check in report["checks"]} == set(QUICK)
     assert json.loads((tmp_path / "r.json").read_text()) == report
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "witnesses", "outcome"), [
+    ("CoastingDrive", False, "failed"), ("BlindCoastingDrive", False, "passed"), ("BlindCoastingDrive", True, "failed"),
+])  # fmt: skip
+def test_robot_whose_wheels_never_stop_fails_what_a_witness_sees(capsys, tmp_path, kind, witnesses, outcome):
+    endpoint = free_endpoint("ws://")
+    drive = {"kind": f"tests.conformance.robot.coasting_drive:{kind}", "options": {"path": str(tmp_path / "m.csv")}}
+    with RobotProcess(tmp_path, endpoint=endpoint, safety={}, drive=drive) as robot:
+        robot.wait_until_on(f"on {endpoint}")
+        more = ["--motor-log", tmp_path / "m.csv"] if witnesses else []
+        code, out, _err = run(capsys, "robot", endpoint, *only("R-STOP-01", "R-ARM-05"), *more, "--json")
+    found = {check["name"]: check["value"] for check in json.loads(out)["checks"]}
+    assert found == {"R-STOP-01": outcome, "R-ARM-05": outcome}, out
+    assert code == (5 if outcome == "failed" else 0)
+
+
+@pytest.mark.slow
+def test_motor_log_of_another_run_is_one_line(capsys, tmp_path):
+    endpoint = free_endpoint("ws://")
+    (tmp_path / "old.csv").write_text("1000000,0,0\n")
+    with RobotProcess(tmp_path, endpoint=endpoint, safety={}) as robot:
+        robot.wait_until_on(f"on {endpoint}")
+        code, out, err = run(capsys, "robot", endpoint, "--motor-log", tmp_path / "old.csv", *only("R-STOP-01"))
+    assert (code, out) == (2, "")
+    assert "name the log of this run" in err and err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_robot_that_hangs_in_a_case_fails_it_in_one_line_and_the_others_run(capsys, tmp_path):
+    endpoint = free_endpoint("ws://")
+    with RobotProcess(tmp_path, endpoint=endpoint, safety={}) as robot:
+        robot.wait_until_on(f"on {endpoint}")
+        begins, run_one = [], conform.run_cases
+
+        def hanging(cases, bench, prepare, on_result, tries):
+            def prepare_and_hang(bench):
+                prepare(bench)
+                begins.append(robot.process.pid)
+                if len(begins) == 2:
+                    for pid in (robot.network_pid(), robot.process.pid):
+                        os.kill(pid, signal.SIGSTOP)
+                    threading.Timer(3.0, lambda: [os.kill(pid, signal.SIGCONT)
+                                                  for pid in (robot.process.pid, robot.network_pid())]).start()
+
+            return run_one(cases, bench, prepare_and_hang, on_result, 1)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(conform, "run_cases", hanging)
+            code, out, err = run(capsys, "robot", endpoint, *only("R-REQ-01", "R-REQ-02", "R-STOP-03"), "--json")
+    found = {check["name"]: (check["value"], check["reason"]) for check in json.loads(out)["checks"]}
+    assert code == 5
+    assert found.pop("R-REQ-01") == ("failed", "no readable status came (waited 2 s)")
+    assert found == {"R-STOP-03": ("passed", ""), "R-REQ-02": ("passed", "")}
+    assert sum(line.startswith("R-REQ-01") for line in err.splitlines()) == 1
 
 
 def test_broken_robot_fails_and_every_report_names_the_cause(capsys, tmp_path):
@@ -93,7 +155,11 @@ def test_missing_robot_exits_with_4(capsys):
         (["robot", "ws://127.0.0.1:1", "--group", "leases"], "no such group"),
         (["robot", "http://127.0.0.1:1"], "expected ws://"),
         (["robot", "ws://127.0.0.1:1", "--save", "/nowhere/r.json"], "no folder /nowhere"),
-        (["robot"], "ENDPOINT"),
+        (["robot"], "no ENDPOINT; write its address, e.g. sightline conform robot ws://"),
+        (["robot", "ws://127.0.0.1:1", "--motor-log", "/nowhere/m.csv"], "cannot read --motor-log /nowhere/m.csv"),
+        (["robot", "ws://127.0.0.1:1", "--motor-log", __file__], "line 1: expected t_us,left_rad_s,right_rad_s"),
+        (["robot", "ws://127.0.0.1:1", "--resume", "/nowhere/r.jsonl"], "no folder /nowhere"),
+        (["robot", "ws://127.0.0.1:1", "--resume", __file__], "line 1: not a result; remove the line"),
         (["vision"], "ENDPOINT"),
         (["robot", "tcp/127.0.0.1"], "expected <protocol>/<host>:<port>"),
         (["robot", "ws://127.0.0.1:1", "--token", "/nowhere/token"], "cannot read --token /nowhere/token"),
@@ -190,6 +256,57 @@ def test_cases_are_listed_without_a_peer(capsys):
     stops = [case for case in CASES if case.group == "stop"]
     assert [line.split()[0] for line in out.splitlines()] == [case.id for case in stops]
     assert all(case.title in out and case.clause in out for case in stops)
+
+
+def test_cases_are_listed_without_an_endpoint(capsys):
+    for side, first in (("robot", "R-FRAM-01"), ("vision", "V-FRAM-01"), ("codec", "C-CODEC-1001")):
+        code, out, _err = run(capsys, side, "--list")
+        assert (code, out.splitlines()[0].split()[0]) == (0, first)
+
+
+# --- one line per case, and going on ---------------------------------------------------------------------------------
+
+
+def test_each_case_is_one_line_and_a_second_run_skips_what_the_file_has(capsys, tmp_path):
+    store = tmp_path / "r.jsonl"
+    with SmallServer({"compresses"}) as server:
+        options = [*only("R-SOCK-01", "R-SOCK-03"), "--resume", store, "--json-lines"]
+        code, out, err = run(capsys, "robot", server.endpoint, *options)
+        lines = [json.loads(line) for line in out.splitlines()]
+        assert (code, [(one["name"], one["value"]) for one in lines]) == (
+            5, [("R-SOCK-01", "passed"), ("R-SOCK-03", "failed")])  # fmt: skip
+        assert [line.split()[0] for line in err.splitlines()[:2]] == ["R-SOCK-01", "R-SOCK-03:"]
+        assert "[14.1 Opening]" in err
+        assert store.read_text() == out
+        store.write_text(store.read_text().splitlines(keepends=True)[1] + '{"name": "R-SO')
+        code, out, _err = run(capsys, "robot", server.endpoint, *options)
+        assert [json.loads(line)["name"] for line in out.splitlines()] == ["R-SOCK-01"]
+        assert code == 5, "the failure that the file has counts"
+        code, out, err = run(capsys, "robot", server.endpoint, *options, "--name", "another")
+        assert (code, out) == (2, "") and "not of robot another" in err and err.count("\n") == 1
+
+
+def test_failed_case_shows_the_last_messages_bounded():
+    bench, _robot = virtual_robot()
+
+    def fails(bench):
+        bench.publish(TWIST, b'{"v":1}', b"x" * 64, "vision")
+        bench.rest(500_000)
+        bench.expect(False, "why")
+
+    result = run_case(Case("R-CAUS-99", Level.MUST, "5.1 Order", "A title.", fails), bench)
+    sent = next(line for line in result.evidence if line.startswith("sent twist"))
+    assert sent == f"sent twist: header {{\"v\":1}}, payload {'x' * 48!r} = {'78' * 48} (64 bytes)"
+    assert any(line.startswith("received status: header") for line in result.evidence)
+    assert max(map(len, result.evidence)) < 600
+
+
+def test_case_after_a_lost_connection_connects_again():
+    bench, _robot = virtual_robot()
+    calls = []
+    bench.restore = lambda: calls.append(bench.now_us)
+    run_case(Case("R-CAUS-99", Level.MUST, "5.1 Order", "A title.", lambda bench: None), bench)
+    assert len(calls) == 1
 
 
 # --- reports ---------------------------------------------------------------------------------------------------------

@@ -19,7 +19,8 @@ ORIGIN = (0.0, 0.0, 0.0)
 
 
 def series(*movings, pose=lambda number: ORIGIN):
-    return {"odometry": [MeasuredMotion(number * 50_000, moving, pose(number)) for number, moving in enumerate(movings)]}
+    readings = [MeasuredMotion(number * 50_000, moving, pose(number)) for number, moving in enumerate(movings)]
+    return {"odometry": readings}
 
 
 def times(readings):
