@@ -430,6 +430,7 @@ FIGURES: Mapping[str, Figure] = {
     "reached_s": Figure("s", "moment", "goals"),
     "given_up_s": Figure("s", "moment", "goals"),
     "least_clearance_m": Figure("m", "extreme", "goals"),
+    "least_around_deg": Figure("deg", "count", "goals"),
     "crossed_on_red": Figure("times", "count", "light", is_exact=True),
     "crossed_late": Figure("times", "count", "light", is_exact=True),
     "least_crossings": Figure("times", "count", "light", is_exact=True),

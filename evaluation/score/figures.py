@@ -4,7 +4,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from statistics import median
 from typing import NamedTuple
 
@@ -203,8 +203,17 @@ def goal_figures(scenario: Scenario, samples: Sequence[Truth], said: MissionPhas
     clearances = [truth.clearance_m for truth in samples if truth.clearance_m is not None]
     return {
         "reached_s": None if goals else reached_s, "least_clearance_m": min(clearances, default=None),
+        "least_around_deg": _around_deg(samples, scenario.goals_m[-1]),
         "given_up_s": None if given_up is None else (given_up - samples[0].t_us) / 1e6,
     }
+
+
+def _around_deg(samples: Sequence[Truth], goal_m: tuple[float, float]) -> float:
+    """Return the angle around the last waypoint that the robot covered: a robot that stands covers none."""
+    angles_rad = [math.atan2(truth.y_m - goal_m[1], truth.x_m - goal_m[0]) for truth in samples]
+    turns_rad = [math.remainder(now - before, math.tau) for before, now in pairwise(angles_rad)]
+    covered_rad = list(accumulate(turns_rad, initial=0.0))
+    return math.degrees(max(covered_rad) - min(covered_rad))
 
 
 def light_figures(samples: Sequence[Truth], said: MissionPhases) -> Figures:

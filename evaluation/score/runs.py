@@ -242,6 +242,8 @@ class SabotagedPair:
         if self.ok is None:
             return f"{self.group}: {NOT_EVALUATED}"
         text = f"{self.group}: {self.failed} of {len(self.runs)} runs fail" + (f" ({first})" if first else "")
+        equal = sum(run.unchanged for run in self.runs)
+        text += f", {equal} equal the healthy run" if equal else ""
         return f"{text}  {'ok' if self.ok else 'FAIL'}"
 
 

@@ -1,5 +1,6 @@
 """Figures of legs, waypoints and traffic lights, from truth made up for the purpose."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -116,9 +117,21 @@ def test_smallest_distance_is_checked_as_a_minimum():
 
 
 def test_closed_room_requires_the_report_that_no_way_exists():
-    run = on_the_way([(0.0, 0.0)] * 100)
+    around = [math.radians(-135 + 2 * at) for at in range(100)]
+    run = on_the_way([(1.5 + 2 * math.cos(angle), 1.5 + 2 * math.sin(angle)) for angle in around])
     assert failed("thymio-closed", run) == {"given_up_s"}
     assert failed("thymio-closed", run, [(1_000_000, "cannot reach", "waypoint 1")]) == set()
+
+
+@pytest.mark.parametrize(("degrees", "covered"), [
+    ([-135] * 100, 0.0), (range(-135, 47), 181.0), ([*range(100, 260), *range(260, 100, -1)], 160.0),
+])
+def test_closed_room_requires_a_way_around_it(degrees, covered):
+    run = on_the_way([(1.5 + math.cos(math.radians(one)), 1.5 + math.sin(math.radians(one))) for one in degrees])
+    found = goal_figures(load_scenario("thymio-closed"), run, ())["least_around_deg"]
+    assert found == pytest.approx(covered, abs=1e-6)
+    report = [(1_000_000, "cannot reach", "waypoint 1")]
+    assert ("least_around_deg" in failed("thymio-closed", run, report)) == (covered < 180)
 
 
 # --- legs and walls ----------------------------------------------------------------------------------------------
