@@ -34,6 +34,23 @@ PREFACE = """`python -m docs.make.conformance` runs the kit over these peers and
 choices leave nothing to test in (no guests, no scan, no port of the legacy protocol, no token, another transport)
 counts as not applicable. Clauses are those of [protocol/README.md](https://github.com/sightline-robot/sightline/blob/main/protocol/README.md)."""
 
+UNSEEN = """## Not visible over the wire
+
+The kit evaluates what a robot publishes: `applied`, and the measured motion in `moving`, `pose` and `odometry`. A robot
+can lie about all of them. The kit does not see:
+
+- **Wheels that turn while the odometry stands still**, or a robot without odometry. `sightline conform robot
+  --motor-log FILE` reads the wheel speeds that the drive was given (`t_us,left_rad_s,right_rad_s`) as a second witness.
+- **Motors that ignore their driver.** No file of the robot shows them. Look at the wheels.
+- **Motion below 0.03 m/s and 0.15 rad/s**, which is noise of a coarse encoder, and a single reading above it.
+- **Wheels that do not turn when they should.** A robot without encoders reports zero as well, so R-LIM-08 is not
+  applicable to it.
+- **The time between a command and the motor**, except as far as the robot's own clock reports it. Stop times are
+  measured to 0.1 s by `status` and 0.2 s by motion.
+- **What a vision service follows.** The cases about the axes use a yellow ball. They are not applicable to a service
+  whose twists do not depend on it (V-STEER-10).
+- **The power supply, the emergency stop and the hardware watchdog.**"""
+
 LISTED_ELSEWHERE = ("codec",)
 """Sides without a table of each case. The cases of a codec are the golden vectors, and each describes itself."""
 
@@ -145,6 +162,7 @@ def to_page(runs: Sequence[Mapping[str, Any]]) -> str:
         figures = (found.get(name, 0) for name in ("passed", "failed", "SHOULD failed", "not applicable"))
         row = [run["peer"], run["side"], "yes" if run["ok"] else "no", *figures, len(run["checks"])]
         lines.append("| " + " | ".join(str(cell) for cell in row) + " |")
+    lines += ["", UNSEEN]
     for run in runs:
         lines += remarks(run)
     for side in dict.fromkeys(run["side"] for run in runs if run["side"] not in LISTED_ELSEWHERE):
