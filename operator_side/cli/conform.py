@@ -5,7 +5,7 @@ import inspect
 import json
 import ssl
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import groupby
@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from sightline.conformance.benches import LiveBench
 from sightline.conformance.case import Access, Case
+from sightline.conformance.jobs import Jobs
 from sightline.conformance.measured import WheelRow, check_motor_log, read_motor_log
 from sightline.conformance.report import from_lines, summary, to_dict, to_junit, to_line
 from sightline.conformance.robot.fixture import Robot as RobotUnderTest
@@ -202,6 +203,10 @@ Resume = Annotated[
     Path | None,
     typer.Option("--resume", metavar="FILE", help="Append each result to FILE, and skip the cases that it has."),
 ]
+JobCount = Annotated[int, typer.Option("--jobs", min=1, max=16, help="Peers that the kit starts and tests at once.")]
+Start = Annotated[
+    str, typer.Option("--start", metavar="COMMAND", help="Start the peer; {endpoint} and {job} are replaced.")
+]
 Name = Annotated[str, typer.Option("--name", metavar="TEXT", help="Peer's name in reports [default: its address].")]
 
 
@@ -218,6 +223,8 @@ class RunOptions:
     as_json: Json = False
     json_lines: JsonLines = False
     resume: Resume = None
+    jobs: JobCount = 1
+    start: Start = ""
 
     def chosen(self, cases: Sequence[Case]) -> Sequence[Case]:
         """Return the cases to run, or none after --list. Raises ConfigError for a file that cannot be written."""
@@ -259,6 +266,17 @@ class RunOptions:
                     typer.echo(line)
 
             yield on_result
+
+    def in_jobs(
+        self, cases: Sequence[Case], side: str, endpoint: str, options: Mapping[str, str]
+    ) -> list[Result] | None:
+        """Run the cases against peers that the kit starts. Returns None without --jobs and --start."""
+        if self.jobs == 1 and not self.start:
+            return None
+        more = [part for name, value in options.items() if value for part in (name, value)]
+        jobs = Jobs(side, endpoint, self.start, self.jobs, more)
+        with self.shown(len(cases), side, endpoint) as show_result:
+            return jobs.run(cases, show_result)
 
     def report(self, results: Sequence[Result], side: str, peer: str) -> int:
         """Print and write the results. Returns the exit code."""
@@ -361,6 +379,9 @@ def robot(
     _need_endpoint(endpoint, "robot ws://192.168.1.20:9090")
     earlier = run.earlier(cases, "robot", endpoint)
     left = _left(cases, earlier)
+    options = {"--robot": robot, "--older": legacy, "--secure": secure}
+    if (found := run.in_jobs(left, "robot", endpoint, options)) is not None:
+        return run.report(_in_order(cases, earlier, found), "robot", endpoint)
     with ExitStack() as ending:
         access = access_for(secure, tokens or (), _ROLES, ending)
 
@@ -412,6 +433,8 @@ def vision(
     _need_endpoint(endpoint, "vision tcp/127.0.0.1:7447")
     earlier = run.earlier(cases, "vision", endpoint)
     left = _left(cases, earlier)
+    if (found := run.in_jobs(left, "vision", endpoint, {"--robot": robot, "--secure": secure})) is not None:
+        return run.report(_in_order(cases, earlier, found), "vision", endpoint)
     with ExitStack() as ending:
         access = access_for(secure, tokens or (), _ROLES[:1], ending)
 

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import sys
 import threading
 import xml.etree.ElementTree as ET
 from contextlib import ExitStack
@@ -156,6 +157,9 @@ def test_missing_robot_exits_with_4(capsys):
         (["robot", "http://127.0.0.1:1"], "expected ws://"),
         (["robot", "ws://127.0.0.1:1", "--save", "/nowhere/r.json"], "no folder /nowhere"),
         (["robot"], "no ENDPOINT; write its address, e.g. sightline conform robot ws://"),
+        (["robot", "ws://127.0.0.1:1", "--jobs", "2"], "--jobs needs --start COMMAND with {endpoint}"),
+        (["robot", "ws://127.0.0.1", "--start", "x {endpoint}"], "--jobs counts its port up"),
+        (["robot", "ws://127.0.0.1:1", "--start", "/nowhere/x {endpoint}"], "cannot start --start '/nowhere/x'"),
         (["robot", "ws://127.0.0.1:1", "--motor-log", "/nowhere/m.csv"], "cannot read --motor-log /nowhere/m.csv"),
         (["robot", "ws://127.0.0.1:1", "--motor-log", __file__], "line 1: expected t_us,left_rad_s,right_rad_s"),
         (["robot", "ws://127.0.0.1:1", "--resume", "/nowhere/r.jsonl"], "no folder /nowhere"),
@@ -284,6 +288,15 @@ def test_each_case_is_one_line_and_a_second_run_skips_what_the_file_has(capsys, 
         assert code == 5, "the failure that the file has counts"
         code, out, err = run(capsys, "robot", server.endpoint, *options, "--name", "another")
         assert (code, out) == (2, "") and "not of robot another" in err and err.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_jobs_start_a_peer_each_and_join_their_results(capsys):
+    first = free_endpoint("ws://")
+    start = f"{sys.executable} -m tests.conformance.robot.small_server {{endpoint}}"
+    names = ("R-SOCK-01", "R-SOCK-02", "R-SOCK-07", "R-SOCK-13")
+    code, out, err = run(capsys, "robot", first, *only(*names), "--jobs", "2", "--start", start, "--json")
+    assert (code, [check["name"] for check in json.loads(out)["checks"]]) == (0, list(names)), err
 
 
 def test_failed_case_shows_the_last_messages_bounded():

@@ -12,6 +12,7 @@ import hashlib
 import json
 import selectors
 import socket
+import sys
 import threading
 import time
 
@@ -41,8 +42,9 @@ class EndError(Exception):
 class SmallServer:
     """Use it in a `with`: one thread, one robot, `sightline.v1` on `endpoint` and the legacy protocol on `older`."""
 
-    def __init__(self, defects=(), tokens=None):
+    def __init__(self, defects=(), tokens=None, port=None):
         """Create the server; `tokens` are role -> token, and without tokens any client may connect."""
+        self._port = port
         self.defects, self.tokens = set(defects), tokens or {}
         self.driver, self.driven_s = None, 0.0
         self.network = MemoryNetwork()
@@ -56,7 +58,7 @@ class SmallServer:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def _listen(self, older):
-        door = socket.create_server(("127.0.0.1", free_port()))
+        door = socket.create_server(("127.0.0.1", free_port() if older or self._port is None else self._port))
         door.setblocking(False)
         self._selector.register(door, selectors.EVENT_READ, lambda: self._accept(door, older))
         return door.getsockname()[1]
@@ -492,3 +494,8 @@ class OlderClient(Client):
             header = {"source": "guest", "session": "00000000", "seq": self.commands, "echo": echo}
             self.server.network.put("sightline/r1/ack/guest", json.dumps(header).encode(), b"", self.link)
             self.shown = None
+
+
+if __name__ == "__main__":  # for `conform --jobs --start`: its argument is the endpoint
+    with SmallServer(port=int(sys.argv[1].rpartition(":")[2])):
+        threading.Event().wait()
