@@ -237,7 +237,7 @@ def test_scenario_decides_which_figures_a_run_has():
     assert set(found["path"]) == common | {"least_passes"} and found["path"]["least_passes"] == 8
     assert found["sphere"] == {"wall_contact_s": pytest.approx(0.016), "commanded_m": pytest.approx(0.5 * 0.08)}
     assert set(found["legs"]) == common | {"least_distance_m", "most_distance_m", "least_ever_m"}
-    assert set(found["goals"]) == common | {"reached_s", "least_clearance_m", "given_up_s"}
+    assert set(found["goals"]) == common | {"reached_s", "least_clearance_m", "least_around_deg", "given_up_s"}
     assert set(found["light"]) == common | {
         "least_crossings", "least_red_stops", "crossed_on_red", "crossed_late", "start_s", "wrong_states_percent"
     }
@@ -275,6 +275,16 @@ def test_clearance_is_the_least_that_was_measured():
     clearance = (0.3, None, 0.1, 0.2)
     assert on_course(((9, 9),), *[(0, 0)] * 4, clearance_m=lambda at: clearance[at])["least_clearance_m"] == 0.1
     assert on_course(((9, 9),), (0, 0))["least_clearance_m"] is None
+
+
+@pytest.mark.parametrize(("degrees", "covered"), [
+    ((30,), 0.0), ((30, 30, 30), 0.0), ((170, -170), 20.0), ((-170, 170), 20.0), ((0, 90, 45), 90.0),
+    ((0, -30, 60), 90.0), ((0, 100, 200, 300, 400), 400.0), ((0, -100, -200), 200.0),
+])  # fmt: skip
+def test_way_around_the_last_waypoint_is_the_angle_that_was_covered(degrees, covered):
+    """Not the sum of all turns: back and forth covers no more."""
+    places = [(4 + math.cos(math.radians(one)), 3 + math.sin(math.radians(one))) for one in degrees]
+    assert on_course(((9, -9), (4, 3)), *places)["least_around_deg"] == pytest.approx(covered)
 
 
 # --- the traffic light -------------------------------------------------------------------------------------------
