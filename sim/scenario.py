@@ -435,6 +435,7 @@ FIGURES: Mapping[str, Figure] = {
     "crossed_late": Figure("times", "count", "light", is_exact=True),
     "least_crossings": Figure("times", "count", "light", is_exact=True),
     "least_red_stops": Figure("times", "count", "light", is_exact=True),
+    "most_aside_m": Figure("m", "extreme", "light"),
     "start_s": Figure("s", "extreme", "light"),
     "least_passes": Figure("times", "count", "things", is_exact=True),
     "wrong_states_percent": Figure("%", "other", "light", is_exact=True),

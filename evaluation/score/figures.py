@@ -170,7 +170,7 @@ def figures_of(scenario: Scenario, run: RunRecord, followed: Sequence[Truth]) ->
     if scenario.goals_m:
         figures |= goal_figures(scenario, samples, run.said)
     if scenario.light is not None:
-        figures |= light_figures(samples, run.said)
+        figures |= light_figures(samples, run.said) | {"most_aside_m": _most_aside_m(scenario, samples)}
     return figures
 
 
@@ -214,6 +214,14 @@ def _around_deg(samples: Sequence[Truth], goal_m: tuple[float, float]) -> float:
     turns_rad = [math.remainder(now - before, math.tau) for before, now in pairwise(angles_rad)]
     covered_rad = list(accumulate(turns_rad, initial=0.0))
     return math.degrees(max(covered_rad) - min(covered_rad))
+
+
+def _most_aside_m(scenario: Scenario, samples: Sequence[Truth]) -> float:
+    """Return the largest distance from the middle of the lane, which runs from the start to the target."""
+    (x_m, y_m), first = scenario.start.at_m or (0.0, 0.0), samples[0]
+    along_rad = math.atan2(first.target_y_m - y_m, first.target_x_m - x_m)
+    cos, sin = math.cos(along_rad), math.sin(along_rad)
+    return max(abs((truth.y_m - y_m) * cos - (truth.x_m - x_m) * sin) for truth in samples)
 
 
 def light_figures(samples: Sequence[Truth], said: MissionPhases) -> Figures:

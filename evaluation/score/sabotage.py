@@ -116,7 +116,10 @@ SABOTAGES: Mapping[str, Callable[[int], Seams]] = {
 }
 """Seams by name of the sabotage and seed of the run."""
 
-UNAFFECTED: Mapping[str, tuple[str, frozenset[str]]] = {}
+UNAFFECTED: Mapping[str, tuple[str, frozenset[str]]] = {
+    "range-blind": ("the robot never comes near an obstacle, so that the range sensor limits nothing",
+                    frozenset({"static"})),
+}
 """Reason and scenarios by sabotage: pairs in which it cannot change anything. A run then equals the healthy one."""
 
 

@@ -33,7 +33,8 @@ SEEDS = (901, 902)
 GOOD = Score(
     acquired_s=1.0, found_s=0.0, bearing_rms_deg=0.2, distance_rms_m=0.01, lost_percent=0.0, wall_contacts=0,
     travelled_m=1.0, seconds=5.0,
-    figures={"crossed_on_red": 0, "crossed_late": 0, "least_crossings": 1, "least_red_stops": 1, "start_s": 0.2,
+    figures={"crossed_on_red": 0, "crossed_late": 0, "least_crossings": 1, "least_red_stops": 1, "most_aside_m": 0.1,
+             "start_s": 0.2,
              "wrong_states_percent": 0.0},
 )
 

@@ -41,7 +41,7 @@ def test_pair_without_effect_has_its_reason_below_the_table(monkeypatch):
     text = page(pair("range-blind", (), (), unchanged=True))
     assert row(text).endswith("| unchanged (1) |")
     assert text.splitlines()[-1] == "1. The run equals the healthy run byte for byte: nothing is near."
-    assert "python -m docs.make.sabotage --seeds 901,902" in text
+    assert "python -m docs.make.sabotage --seeds 901,902 --scenario static`" in text
 
 
 @pytest.mark.parametrize("name", SABOTAGES)

@@ -42,6 +42,14 @@ def test_run_without_a_crossing_fails():
     assert "least_crossings" in failed("traffic-light", run)
 
 
+@pytest.mark.parametrize(("y_m", "is_off"), [(0.2, False), (-0.3, True)])
+def test_robot_beside_the_lane_fails(y_m, is_off):
+    run = [replace(one, target_x_m=4.6, x_m=0.3 * at / 50, y_m=y_m if at == 90 else 0.0)
+           for at, one in enumerate(drive(lambda _s: "green", lambda s: -1.5 + 0.3 * s))]
+    assert ("most_aside_m" in failed("traffic-light", run)) == is_off
+    assert scored(run, "traffic-light").figure("most_aside_m") == pytest.approx(abs(y_m))
+
+
 @pytest.mark.parametrize(("goes_s", "start_s"), [(5.4, 0.4), (6.5, 1.5)])
 def test_a_robot_that_waited_is_timed_from_green(goes_s, start_s):
     run = drive(lambda s: "red" if s < 5 else "green", lambda s: -0.1 + max(0.0, s - goes_s) * 0.3,
