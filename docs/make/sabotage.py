@@ -48,8 +48,8 @@ def page_lines(
     yield (f"Each listed scenario runs with one broken part, in lockstep on {len(seeds)} starts (seeds {listed}), "
            f"+{LATENCY_MS:g} ms latency,\n{LOSS:.0%} loss on each leg. The score must notice it in each run. A cell "
            "names the bound that broke, over all starts.\n")
-    yield (f"Written by `python -m docs.make.sabotage --seeds {listed}{only}`. Break one yourself with `sightline score\n"
-           "--scenario NAME --sabotage NAME`.\n")
+    yield (f"Written by `python -m docs.make.sabotage --seeds {listed}{only}`.\n"
+           "Break one yourself with `sightline score --scenario NAME --sabotage NAME`.\n")
     yield "| sabotage | broken part |\n|---|---|"
     yield from (f"| `{name}` | {meaning} |" for name, meaning in MEANINGS.items())
     yield ""
