@@ -118,7 +118,7 @@ SABOTAGES: Mapping[str, Callable[[int], Seams]] = {
 
 UNAFFECTED: Mapping[str, tuple[str, frozenset[str]]] = {
     "range-blind": ("the robot never comes near an obstacle, so that the range sensor limits nothing",
-                    frozenset({"static"})),
+                    frozenset({"static", "behind"})),
 }
 """Reason and scenarios by sabotage: pairs in which it cannot change anything. A run then equals the healthy one."""
 
