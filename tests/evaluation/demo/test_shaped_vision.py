@@ -55,6 +55,7 @@ def test_a_leg_is_bounded():
     assert line.count.overflow == 50
 
 
+@pytest.mark.alone
 def test_each_leg_has_half_of_the_latency():
     network = MemoryNetwork()
     robot, came = network.link("r1"), threading.Event()

@@ -92,7 +92,7 @@ def test_newest_wins_with_a_consumer_of_200_ms(rig):
     assert len(behind) == 7
     # In virtual time at most the one on its way; on a busy machine never the oldest since the consumer last took one.
     assert max(behind) <= (1 if isinstance(rig, MemoryRig) else 4)
-    assert frames.dropped >= 30
+    assert frames.dropped > len(behind), "most frames are replaced while they wait"
 
 
 @pytest.mark.own_process
