@@ -130,10 +130,11 @@ def accepted_counts(bench: Bench, driver: Sender) -> None:
 def frame_age(bench: Bench, robot: Robot) -> None:
     """`frame_age_us` is the age of the frame behind the command in force, absent without one."""
     bench.expect(robot.status().frame_age_us is None, f"without a command it is {robot.status().frame_age_us}")
-    armed(bench)
-    bench.rest(300_000)
+    driver = armed(bench)
+    driver.delay_us = driver.compute_us = 60_000
+    bench.rest(1_000_000)
     age_us = robot.next_status().frame_age_us
-    bench.expect(age_us is not None and age_us < 400_000, f"while driving it is {age_us}")
+    bench.expect(age_us is not None and 60_000 <= age_us < 400_000, f"driven 60 ms late it is {age_us} us")
 
 
 @SUITE.must("R-STAT-05", "9. Status", armed)
