@@ -65,6 +65,16 @@ def reads_base64_its_way(question, right):
     return {"refusal": "MALFORMED"} if question["kind"] == "older_picture" else right
 
 
+def takes_everything(question, right):
+    """Accept each message, and read nothing in it."""
+    return {"ok": {}}
+
+
+def rejects_everything(question, right):
+    """Reject each message for one reason."""
+    return {"refusal": "MALFORMED"}
+
+
 def dies(question, right):
     """In the middle."""
     if question["id"] == 3:

@@ -1,15 +1,12 @@
 """The robot's own pure logic as a peer in virtual time, with seams where a broken robot can be made of it. Pure."""
 
 import array
-import functools
 import math
 
 from sightline.conformance.benches import FROM_ROBOT, VirtualBench
 from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST, key_for
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import CameraModel
-from sightline.protocol.transports import link as link_rules
-from sightline.protocol.transports import memory
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.core import DriverCore
@@ -22,11 +19,6 @@ MODEL = CameraModel(width_px=16, height_px=16, fx_px=20.0, fy_px=20.0, cx_px=8.0
 CAMERA_US = 1e6 / 30
 SCAN_US = 100_000
 STREAM_US = 200_000
-
-
-def quicken():
-    """Look keys up instead of parsing them: a quarter of the time that the whole matrix takes."""
-    memory.parse_key = link_rules.parse_key = functools.cache(memory.parse_key)
 
 
 class ReferenceRobot:

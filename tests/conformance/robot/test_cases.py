@@ -1,7 +1,4 @@
-"""The kit against our own robot and against one broken robot per case, in virtual time; and the kit's own parts."""
-
-import os
-from concurrent.futures import ProcessPoolExecutor
+"""The kit against our own robot in virtual time, and its own parts. tests/conformance/mutants runs the broken ones."""
 
 import pytest
 
@@ -10,40 +7,16 @@ from sightline.conformance.robot.cases import CASES, prepare
 from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases
 from sightline.protocol.errors import ConfigError
 from tests.conformance.clauses import clauses
-from tests.conformance.robot.broken import arming as broken_arming  # noqa: F401  (they fill BROKEN)
-from tests.conformance.robot.broken import credit as broken_traffic  # noqa: F401  (they fill BROKEN)
-from tests.conformance.robot.broken import frames as broken_output  # noqa: F401  (they fill BROKEN)
-from tests.conformance.robot.broken import lease as broken_lease  # noqa: F401  (they fill BROKEN)
 from tests.conformance.robot.broken import motion as broken_motion
-from tests.conformance.robot.broken import order as broken_order  # noqa: F401  (they fill BROKEN)
-from tests.conformance.robot.broken import requests as broken_requests  # noqa: F401  (they fill BROKEN)
-from tests.conformance.robot.broken import validation as broken_judging  # noqa: F401  (they fill BROKEN)
-from tests.conformance.robot.broken.breaking import BROKEN
-from tests.conformance.robot.reference import quicken, virtual_robot
+from tests.conformance.robot.reference import virtual_robot
 
 VIRTUAL = [case for case in CASES if not case.real]
 NAMES = [case.id for case in VIRTUAL]
-MOST_S = 300.0
-"""One broken robot at all cases takes 5 s of a processor, and waits for those before it."""
 
 
 def result_of(case, break_it=None):
     bench, _robot = virtual_robot(break_it)
     return run_case(case, bench, prepare)
-
-
-def failures_of(broken_id):
-    """The cases that fail at one broken robot; a fresh one for each."""
-    results = [result_of(case, BROKEN[broken_id]) for case in VIRTUAL]
-    return {one.case.id: one.reason for one in results if one.outcome is Outcome.FAILED}
-
-
-@pytest.fixture(scope="module")
-def matrix():
-    """Broken robot -> what will be found of it, so that each is reported when it is done and not all at the end."""
-    pool = ProcessPoolExecutor(os.cpu_count(), initializer=quicken)
-    yield {name: pool.submit(failures_of, name) for name in BROKEN}
-    pool.shutdown(cancel_futures=True)
 
 
 # --- our robot, and broken ones --------------------------------------------------------------------------------------
@@ -53,23 +26,6 @@ def matrix():
 def test_our_robot_passes(case):
     result = result_of(case)
     assert result.outcome is Outcome.PASSED, result.reason
-
-
-def test_every_case_has_its_broken_robot():
-    assert sorted(BROKEN) == sorted(NAMES)
-    assert len({broken.__name__ for broken in BROKEN.values()}) == len(BROKEN)
-
-
-@pytest.mark.parametrize("case", VIRTUAL, ids=NAMES)
-def test_each_case_finds_its_broken_robot(case):
-    assert result_of(case, BROKEN[case.id]).outcome is Outcome.FAILED
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("broken_id", BROKEN, ids=lambda name: f"{name} {BROKEN[name].__name__}")
-def test_a_broken_robot_fails_exactly_its_case(matrix, broken_id):
-    failed = matrix[broken_id].result(timeout=MOST_S)
-    assert set(failed) == {broken_id}, failed
 
 
 @pytest.mark.parametrize("cases", [VIRTUAL[::4], pytest.param(VIRTUAL, marks=pytest.mark.slow)], ids=["some", "all"])

@@ -1,97 +1,42 @@
-"""The cases with sockets of their own, in real time: our own links, a small server, and that server with one defect."""
+"""The cases with sockets of their own, in real time: our own links and a small server pass; and the raw client."""
 
-from concurrent.futures import ProcessPoolExecutor
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
 
-from sightline.conformance.benches import FROM_ROBOT, LiveBench
-from sightline.conformance.case import Access
 from sightline.conformance.raw_peers import LOST, PING, TEXT, RawWebSocket, split_url, xor
-from sightline.conformance.robot.cases import CASES, prepare
+from sightline.conformance.robot.cases import CASES
 from sightline.conformance.runner import Outcome, run_cases
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.open import open_link
-from tests.conformance.robot.broken.websocket import BEHIND_TOKENS, DEFECTS
+from tests.conformance.mutants.sockets import kit_at, small_server
+from tests.conformance.robot.broken.websocket import BEHIND_TOKENS
 from tests.conformance.robot.small_server import SmallServer
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess
 
 REAL = [case for case in CASES if case.real]
-TOKENS = {"vision": "vision-0123456789abcdef", "operator": "operator-0123456789abcdef"}
-DEFECTS_BEHIND_TOKENS = {DEFECTS[name]: True for name in BEHIND_TOKENS}
-MOST_S = 900.0
-"""One defect at all cases takes two minutes, and waits for those before it."""
-AT_ONCE = 8
-"""Servers at a time: they wait far more than they compute."""
-
-
-def run_at(endpoint, older="", folder="", cases=REAL):
-    """The results of `cases`; with a `folder` of keys the kit comes in with those."""
-    tokens = {role: (Path(folder) / f"{role}.token").read_text().strip() for role in TOKENS} if folder else {}
-
-    def open_it(role):
-        return open_link("r1", connect=[endpoint], role=role, timeout_s=20, secure=folder)
-
-    roles = tuple(TOKENS) if folder else ("vision",)
-    options = {"roles": roles, "endpoint": endpoint, "legacy": older, "access": Access(tokens, folder)}
-    with LiveBench("r1", open_it, FROM_ROBOT, **options) as bench:
-        return run_cases(cases, bench, prepare)
 
 
 def bad(results):
     return {one.case.id: one.reason for one in results if one.outcome is not Outcome.PASSED}
 
 
-def failures_at(defect, cases=REAL, guarded=None):
-    """The cases that fail at a small server with `defect`: all, or those that a defect behind tokens can concern."""
-    guarded = DEFECTS_BEHIND_TOKENS.get(defect) if guarded is None else guarded
-    with TemporaryDirectory() as folder, SmallServer({defect} if defect else (), TOKENS if guarded else None) as server:
-        for role, token in TOKENS.items():
-            (Path(folder) / f"{role}.token").write_text(token)
-        results = run_at(server.endpoint, server.older, folder if guarded else "", cases)
-    return {one.case.id: one.reason for one in results if one.outcome is Outcome.FAILED}
-
-
-@pytest.fixture(scope="module")
-def matrix():
-    """Case -> what its defect will make fail, so that each is reported when it is done."""
-    pool = ProcessPoolExecutor(AT_ONCE)
-    yield {name: pool.submit(failures_at, defect) for name, defect in DEFECTS.items()}
-    pool.shutdown(cancel_futures=True)
-
-
-def test_every_case_has_its_defect():
-    assert sorted(DEFECTS) == sorted(case.id for case in REAL)
-    assert len(set(DEFECTS.values())) == len(DEFECTS)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("guarded", [False, True], ids=["open", "behind tokens"])
+@pytest.mark.parametrize("guarded", [
+    pytest.param(False, marks=pytest.mark.long, id="open"), pytest.param(True, id="behind tokens"),
+])
 def test_a_small_server_without_defect_passes(guarded):
-    assert failures_at("", guarded=guarded) == {}
-
-
-@pytest.mark.parametrize("case_id", BEHIND_TOKENS)
-def test_a_defect_behind_tokens_is_found(case_id):
-    cases = [case for case in REAL if case.id == case_id]
-    assert set(failures_at(DEFECTS[case_id], cases)) == {case_id}
-    assert failures_at("", cases, guarded=True) == {}
+    cases = [case for case in REAL if not guarded or case.id in BEHIND_TOKENS]
+    with small_server(guarded=guarded) as (bench, prepare):
+        results = run_cases(cases, bench, prepare)
+    assert {one.case.id: one.reason for one in results if one.outcome is Outcome.FAILED} == {}
 
 
 @pytest.mark.long
 def test_our_own_robot_passes(tmp_path):
     ends = [free_endpoint(scheme) for scheme in ("ws://", "ws-legacy://")]
     with RobotProcess(tmp_path, listen=ends, safety={"guests": True}):
-        assert bad(run_at(*ends, cases=[case for case in REAL if case.id not in BEHIND_TOKENS])) == {}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("case_id", DEFECTS, ids=lambda name: f"{name} {DEFECTS[name]}")
-def test_a_defect_fails_exactly_its_case(matrix, case_id):
-    failed = matrix[case_id].result(timeout=MOST_S)
-    assert set(failed) == {case_id}, failed
+        cases = [case for case in REAL if case.id not in BEHIND_TOKENS]
+        with kit_at(*ends) as (bench, prepare):
+            assert bad(run_cases(cases, bench, prepare)) == {}
 
 
 # --- the client of bytes ---------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Tests of the kit's cases for vision services: ours passes, and each broken service fails only its own case."""
+"""Tests of the cases for vision services: ours passes; tests/conformance/mutants runs the broken ones."""
 
 import pytest
 
@@ -37,25 +37,9 @@ def test_a_broken_vision_of_which_nothing_is_broken_conforms(cases):
     assert [name for name, outcome in outcomes.items() if outcome is not Outcome.PASSED] == []
 
 
-def test_every_case_has_its_broken_vision():
-    assert set(BROKEN) == {case.id for case in VIRTUAL}
+def test_there_are_enough_cases_of_both_levels():
     assert len(VIRTUAL) >= 60
     assert {case.level for case in VIRTUAL} == set(Level)
-
-
-@pytest.mark.parametrize("name", sorted(BROKEN))
-def test_a_broken_vision_fails_its_case(name):
-    case = next(case for case in VIRTUAL if case.id == name)
-    result = result_of(case, BROKEN[name][1])
-    assert result.outcome is Outcome.FAILED
-    assert result.reason and "\n" not in result.reason and "Error:" not in result.reason
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", sorted(BROKEN))
-def test_a_broken_vision_fails_no_other_case(name):
-    failed = {case.id for case in VIRTUAL if result_of(case, BROKEN[name][1]).outcome is Outcome.FAILED}
-    assert failed == {name}
 
 
 def test_vision_service_that_swaps_the_axes_fails_must_cases():

@@ -1,0 +1,93 @@
+/**
+ * @file The pure parts of the JavaScript peers in virtual time: one JSON line in, one JSON line out. Shell (stdin, stdout).
+ *
+ *     node virtual_peer.mjs          {"do": "robot"|"vision", "folder", "now_us", ...}  a fresh peer from the modules of `folder`
+ *                                    {"do": "message", "now_us", "channel", "source", "header", "payload"}     bytes in base64
+ *                                    {"do": "tick", "now_us", "wanted"}  ->  {"out": [[channel, source, header, payload], ...]}
+ *
+ * What `robot_server.mjs` and `vision_client.mjs` do with a clock, a camera and a link, this does with the caller's.
+ */
+
+import { createInterface } from "node:readline";
+import { pathToFileURL } from "node:url";
+
+const COMPUTE_US = 2_000; // what looking at a picture takes
+
+const bytes = (text) => new Uint8Array(Buffer.from(text, "base64"));
+const base64 = (data) => Buffer.from(data).toString("base64");
+
+async function robotOf({ load, session, jpeg, camera, limits, now_us }) {
+  const [{ Robot }, { CHANNELS, encode }, { TICK_US }] = await load("robot", "codec", "limits");
+  const robot = new Robot({ session, fps: 30, camera, limits });
+  const picture = bytes(jpeg);
+  const written = ({ name, header, payload }) => [name, "", base64(encode(header)), base64(payload)];
+  let [nextTick_us, nextPicture_us] = [now_us, now_us];
+
+  const photographed = (at_us, wanted) => {
+    if (at_us < nextPicture_us) return [];
+    nextPicture_us += robot.stream.interval_us;
+    const frame = wanted && robot.mayCapture(at_us) ? robot.onPicture(picture, at_us, at_us) : null;
+    return frame === null ? [] : [frame];
+  };
+
+  return {
+    message({ now_us: at_us, channel, source, header, payload }) {
+      robot.onMessage({ channel: CHANNELS[channel], source, header: bytes(header), payload: bytes(payload) }, at_us);
+      return robot.takeReplies(at_us).map(written);
+    },
+    tick({ now_us: at_us, wanted }) {
+      const due = at_us >= nextTick_us ? robot.tick(at_us) : [];
+      if (at_us >= nextTick_us) nextTick_us = at_us + TICK_US;
+      return [...due, ...photographed(at_us, wanted)].map(written);
+    },
+  };
+}
+
+async function visionOf({ load, session }) {
+  const [{ Eyes }, { Vision }, { CHANNELS, encode }, { decodeDc }] = await load("eyes", "vision", "codec", "jpeg_dc");
+  let [clock_us, out, waiting] = [0, [], []];
+  const look = (jpeg) => {
+    clock_us += COMPUTE_US;
+    const { width, height, scale, rgb } = decodeDc(jpeg);
+    return { width, height, scale, data: rgb, channels: 3 };
+  };
+  const send = (name, header, payload) => out.push([name, header.source, base64(encode(header)), base64(payload)]);
+  const pause = () => new Promise((resume) => waiting.push(resume)); // until all that has arrived was read
+  const eyes = new Eyes(new Vision(session), { look, send, now_us: () => clock_us, pause });
+  const working = [];
+
+  return {
+    message({ now_us, channel, source, header, payload }) {
+      clock_us = now_us;
+      working.push(eyes.onMessage({ channel: CHANNELS[channel], source, header: bytes(header), payload: bytes(payload) }));
+      return [];
+    },
+    async tick({ now_us }) {
+      clock_us = now_us;
+      for (const resume of waiting.splice(0)) resume();
+      await Promise.all(working.splice(0));
+      return out.splice(0);
+    },
+  };
+}
+
+const MAKERS = { robot: robotOf, vision: visionOf };
+let peer = null;
+
+async function answerTo(line) {
+  const fields = JSON.parse(line);
+  if (peer !== null && fields.do in peer) return { out: await peer[fields.do](fields) };
+  const load = (...names) => Promise.all(names.map((name) => import(pathToFileURL(`${fields.folder}/${name}.mjs`))));
+  peer = await MAKERS[fields.do]({ ...fields, load });
+  return { out: [] };
+}
+
+for await (const line of createInterface({ input: process.stdin })) {
+  let answer;
+  try {
+    answer = await answerTo(line);
+  } catch (error) {
+    answer = { error: String(error?.message ?? error).split("\n")[0] };
+  }
+  process.stdout.write(`${JSON.stringify(answer)}\n`);
+}
