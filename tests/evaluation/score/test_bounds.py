@@ -239,7 +239,8 @@ def test_scenario_decides_which_figures_a_run_has():
     assert set(found["legs"]) == common | {"least_distance_m", "most_distance_m", "least_ever_m"}
     assert set(found["goals"]) == common | {"reached_s", "least_clearance_m", "least_around_deg", "given_up_s"}
     assert set(found["light"]) == common | {
-        "least_crossings", "least_red_stops", "most_aside_m", "crossed_on_red", "crossed_late", "start_s", "wrong_states_percent"
+        "least_crossings", "least_red_stops", "most_aside_m", "crossed_on_red", "crossed_late", "start_s",
+        "wrong_states_percent",
     }
 
 
