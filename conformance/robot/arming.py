@@ -80,6 +80,14 @@ def arming_needs_news(bench: Bench, robot: Robot) -> None:
     _driven(bench).expect_rejected("arm", "STALE", "a request 2.5 s late", cite=old)
 
 
+@SUITE.must("R-ARM-15", "8.3 Freshness", _driven)
+def arming_by_a_status_of_a_second_ago(bench: Bench, driver: Sender) -> None:
+    """`arm` that cites a `status` one second old is granted."""
+    cited = driver.robot.stamp()
+    bench.rest(1_000_000)
+    driver.expect_granted("arm", "a request that cites a status one second old", cite=cited)
+
+
 @SUITE.must("R-ARM-08", "8.3 Freshness", _driven)
 def arming_after_disarm(bench: Bench, driver: Sender) -> None:
     """`arm` that cites a `status` from before the last disarm is rejected as STALE."""

@@ -181,6 +181,11 @@ def _needs(condition, reason):
     return around
 
 
+@breaks("R-ARM-15")
+def requests_live_for_half_a_second(robot):
+    on_verb(robot, Verb.ARM, _needs(lambda echo, now_us: echo is None or now_us - echo.t_us < 500_000, "STALE"))
+
+
 @breaks("R-STOP-03")
 def stop_needs_an_echo(robot):
     on_verb(robot, Verb.STOP, _needs(lambda echo, now_us: echo is not None, "MALFORMED"))
