@@ -35,9 +35,10 @@ START_US = 5_000_000
 
 
 def scenario_of(bounds=None, *, shape="sphere", goals_m=(), light=None, things=(), stand_off_m=STAND_OFF_M,
-                within_deg=2.0):
+                within_deg=2.0, start_m=None):
     """Return a scenario with these parts, which are not checked."""
     return STATIC.model_copy(update={
+        "start": STATIC.start.model_copy(update={"at_m": start_m}),
         "stand_off_m": stand_off_m, "acquired_within_deg": within_deg, "goals_m": goals_m, "light": light,
         "target": STATIC.target.model_copy(update={"shape": shape}), "things": things, "bounds": bounds or {},
     })  # fmt: skip
@@ -242,6 +243,21 @@ def test_scenario_decides_which_figures_a_run_has():
         "least_crossings", "least_red_stops", "most_aside_m", "crossed_on_red", "crossed_late", "start_s",
         "wrong_states_percent",
     }
+
+
+@pytest.mark.parametrize("start_m", [(1.0, 2.0), None])
+def test_most_aside_is_from_the_line_between_start_and_first_place_of_the_target(start_m):
+    """The lane has the direction (0.6, 0.8); the target moves away later, which does not turn the lane."""
+    x_m, y_m = start_m or (0.0, 0.0)
+    steps = ((1.0, 0.3), (2.0, -0.5), (3.0, 0.1))  # along the lane, to its left, m
+    places = [(along * 0.6 - left * 0.8, along * 0.8 + left * 0.6) for along, left in steps]
+    run = [
+        replace(sample(at * 0.02, x_m=x_m + x, y_m=y_m + y, light="red", past_line_m=-1.0),
+                target_x_m=x_m + 3.0 - at, target_y_m=y_m + 4.0)
+        for at, (x, y) in enumerate(places)
+    ]
+    found = figures_of(scenario_of(light=object(), start_m=start_m), RunRecord(run), run)
+    assert found["most_aside_m"] == pytest.approx(0.5)
 
 
 def test_legs_have_the_distances_since_the_acquisition_and_the_least_of_all():
