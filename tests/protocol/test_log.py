@@ -119,7 +119,8 @@ def test_a_stream_that_is_not_read_costs_no_time_and_its_lines_come_later(unread
         received += read.read(1 << 16)
         handler.handle(_record("once more"))
     assert received.startswith(b'{"time"' if isinstance(formatter, JsonFormatter) else b"0 ")
-    assert b"999 " not in received, "no more lines wait than the queue holds"
+    waited = [line for line in received.splitlines() if b"once more" not in line]
+    assert len(waited) < 500, "no more lines wait than the queue and the stream hold"
 
 
 def test_all_lines_are_there_after_a_flush_where_they_are_read(unread, handler):
