@@ -108,7 +108,7 @@ def _wait_for(log: Path, text: str, process: subprocess.Popen[bytes]) -> None:
     deadline_s = time.monotonic() + _START_S
     while text not in log.read_text():
         if process.poll() is not None or time.monotonic() > deadline_s:
-            raise HardwareError(f"{log.stem} did not start; it said: {log.read_text().strip()}")
+            raise HardwareError(f"{log.stem} did not start; it printed: {log.read_text().strip()}")
         time.sleep(0.05)
 
 

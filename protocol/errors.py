@@ -89,5 +89,8 @@ def install_command(extra: str) -> str:
         origin = distribution("sightline-robot").read_text("direct_url.json")
     except PackageNotFoundError:
         origin = None
-    place = unquote(urlsplit(json.loads(origin)["url"]).path) if origin else "."
+    record = json.loads(origin) if origin else {}
+    if "vcs_info" in record:
+        return f"pip install 'sightline-robot[{extra}] @ {record['vcs_info']['vcs']}+{record['url']}'"
+    place = unquote(urlsplit(record["url"]).path) if record else "."
     return f"pip install '{'.' if place == str(Path.cwd()) else place}[{extra}]'"

@@ -268,15 +268,24 @@ class RunOptions:
             yield on_result
 
     def in_jobs(
-        self, cases: Sequence[Case], side: str, endpoint: str, options: Mapping[str, str]
+        self, cases: Sequence[Case], side: str, endpoint: str, options: Mapping[str, Sequence[str]]
     ) -> list[Result] | None:
-        """Run the cases against peers that the kit starts. Returns None without --jobs and --start."""
+        """Run the cases against peers that the kit starts. Returns None without --jobs and --start.
+
+        Each kit gets the `options`: name -> values.
+        """
         if self.jobs == 1 and not self.start:
             return None
-        more = [part for name, value in options.items() if value for part in (name, value)]
+        more = [part for name, values in options.items() for value in values if value for part in (name, value)]
         jobs = Jobs(side, endpoint, self.start, self.jobs, more)
         with self.shown(len(cases), side, endpoint) as show_result:
             return jobs.run(cases, show_result)
+
+    def check_one_peer(self, alone: Mapping[str, object]) -> None:
+        """Raise ConfigError where --jobs or --start stands beside an option that only one peer can have."""
+        given = [name for name, value in alone.items() if value]
+        if given and (self.jobs > 1 or self.start):
+            raise ConfigError(f"{given[0]} is for one peer; leave out --jobs and --start")
 
     def report(self, results: Sequence[Result], side: str, peer: str) -> int:
         """Print and write the results. Returns the exit code."""
@@ -377,9 +386,10 @@ def robot(
     if not cases:
         return 0
     _need_endpoint(endpoint, "robot ws://192.168.1.20:9090")
+    run.check_one_peer({"--older": legacy, "--motor-log": motor_log})
     earlier = run.earlier(cases, "robot", endpoint)
     left = _left(cases, earlier)
-    options = {"--robot": robot, "--older": legacy, "--secure": secure}
+    options = {"--robot": [robot], "--secure": [secure], "--token": tokens or []}
     if (found := run.in_jobs(left, "robot", endpoint, options)) is not None:
         return run.report(_in_order(cases, earlier, found), "robot", endpoint)
     with ExitStack() as ending:
@@ -431,9 +441,11 @@ def vision(
     if not cases:
         return 0
     _need_endpoint(endpoint, "vision tcp/127.0.0.1:7447")
+    run.check_one_peer({"--dial": dial})
     earlier = run.earlier(cases, "vision", endpoint)
     left = _left(cases, earlier)
-    if (found := run.in_jobs(left, "vision", endpoint, {"--robot": robot, "--secure": secure})) is not None:
+    options = {"--robot": [robot], "--secure": [secure], "--token": tokens or []}
+    if (found := run.in_jobs(left, "vision", endpoint, options)) is not None:
         return run.report(_in_order(cases, earlier, found), "vision", endpoint)
     with ExitStack() as ending:
         access = access_for(secure, tokens or (), _ROLES[:1], ending)
@@ -473,6 +485,7 @@ def codec(
         return 0
     if not command:
         raise ConfigError("no command; write it after two dashes, e.g. sightline conform codec -- node codec.js")
+    run.check_one_peer({"conform codec": True})
     peer = " ".join(command)
     earlier = run.earlier(cases, "codec", peer)
     left = _left(cases, earlier)

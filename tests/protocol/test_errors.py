@@ -14,13 +14,15 @@ INSTALLED_FROM = {
     "clone, elsewhere": ("file:///srv/sightline", "pip install '/srv/sightline[zenoh]'"),
     "wheel file": ("file:///srv/my%20files/sightline_robot-1-py3-none-any.whl",
                    "pip install '/srv/my files/sightline_robot-1-py3-none-any.whl[zenoh]'"),
+    "repository": ("https://host/sightline.git", "pip install 'sightline-robot[zenoh] @ git+https://host/sightline.git'"),
     "no record": (None, "pip install '.[zenoh]'"),
 }
 
 
 @pytest.mark.parametrize(("url", "command"), INSTALLED_FROM.values(), ids=INSTALLED_FROM)
 def test_install_command_names_what_was_installed(monkeypatch, url, command):
-    record = url and json.dumps({"url": url.format(here=Path.cwd())})
+    vcs = {} if not url or url.startswith("file:") else {"vcs_info": {"vcs": "git"}}
+    record = url and json.dumps({"url": url.format(here=Path.cwd()), **vcs})
     monkeypatch.setattr(metadata, "distribution", lambda _name: SimpleNamespace(read_text=lambda _file: record))
     assert install_command("zenoh") == command
 

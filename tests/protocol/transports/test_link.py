@@ -82,6 +82,16 @@ def test_messages_keep_their_order(rig):
 
 
 def test_newest_wins_with_a_consumer_of_200_ms(rig):
+    """Beside other tests a frame may be on its way for long: never the oldest since the consumer last took one."""
+    _check_newest_wins(rig, most_behind=1 if isinstance(rig, MemoryRig) else 4, least_dropped=8)
+
+
+@pytest.mark.alone
+def test_at_most_one_frame_is_on_its_way_to_a_slow_consumer(rig):
+    _check_newest_wins(rig, most_behind=1, least_dropped=30)
+
+
+def _check_newest_wins(rig, most_behind, least_dropped) -> None:
     robot, _, frames, _ = _pair(rig)
     behind = []
     for number in range(43):  # 30 frames a second for 1.4 s
@@ -90,9 +100,8 @@ def test_newest_wins_with_a_consumer_of_200_ms(rig):
         if number % 6 == 5:
             behind.append(number - int(frames.take().payload.rstrip(b"\0")))
     assert len(behind) == 7
-    # In virtual time at most the one on its way; on a busy machine never the oldest since the consumer last took one.
-    assert max(behind) <= (1 if isinstance(rig, MemoryRig) else 4)
-    assert frames.dropped > len(behind), "most frames are replaced while they wait"
+    assert max(behind) <= most_behind
+    assert frames.dropped >= least_dropped, "frames are replaced while they wait"
 
 
 @pytest.mark.own_process
