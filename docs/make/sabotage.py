@@ -45,7 +45,7 @@ def page_lines(
     listed = ",".join(map(str, seeds))
     only = "" if list(names) == scenario_names() else f" --scenario {','.join(names)}"
     yield "# Sabotage of the score\n"
-    yield (f"Each listed scenario runs with one broken part, in lockstep on {len(seeds)} starts (seeds {listed}), "
+    yield (f"Each listed scenario runs with one broken part, in lockstep from seeds {listed}, "
            f"+{LATENCY_MS:g} ms latency,\n{LOSS:.0%} loss on each leg. The score must notice it in each run. A cell "
            "names the bound that broke, over all starts.\n")
     yield (f"Written by `python -m docs.make.sabotage --seeds {listed}{only}`.\n"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby, product
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, Run, run_lockstep
@@ -28,6 +28,7 @@ from sightline.sim.scenario import FIGURES, Scenario, load_scenario, look_named,
 from sightline.vision_side.detect.registry import check_choice
 from sightline.vision_side.missions.registry import REGISTRY, configured_mission
 
+Result = TypeVar("Result")
 _MOST_NOTICES: Final = 3
 """Of each group: later ones repeat the first with higher counts."""
 
@@ -156,12 +157,7 @@ def run_of(case: ScoreCase, is_over: Callable[[Run], bool] = lambda _run: False)
 
 def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCase], None]) -> ScoreReport:
     """Run `wanted` on `jobs` processes, in any order, and score them. `on_done` is called after each."""
-    results: dict[ScoreCase, tuple[Score, list[str]]] = {}
-    with worker_pool(min(jobs, len(wanted))) as pool:
-        futures = {pool.submit(run_case, case): case for case in wanted}
-        for future in as_completed(futures):
-            results[futures[future]] = future.result()
-            on_done(futures[future])
+    results = _run_each(run_case, wanted, jobs, on_done)
     runs = [(case, results[case][0]) for case in wanted]
     news: dict[str, list[str]] = {}
     for case in wanted:
@@ -171,6 +167,18 @@ def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCa
     unbounded = {name for name in {case.scenario for case in wanted} if not load_scenario(name).bounds}
     unevaluated = list(dict.fromkeys(case.group for case in wanted if case.scenario in unbounded))
     return ScoreReport(runs, scored_figures(runs), unevaluated, told)
+
+
+def _run_each(
+    run: Callable[[ScoreCase], Result], wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCase], None]
+) -> dict[ScoreCase, Result]:
+    results: dict[ScoreCase, Result] = {}
+    with worker_pool(min(jobs, len(wanted))) as pool:
+        futures = {pool.submit(run, case): case for case in wanted}
+        for future in as_completed(futures):
+            results[futures[future]] = future.result()
+            on_done(futures[future])
+    return results
 
 
 def scored_figures(runs: Sequence[tuple[ScoreCase, Score]]) -> list[ScoredFigure]:
@@ -304,12 +312,7 @@ def run_all_sabotaged(
     wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCase], None]
 ) -> SabotageReport:
     """Run `wanted` on `jobs` processes, in any order. `on_done` is called after each."""
-    results: dict[ScoreCase, SabotagedRun] = {}
-    with worker_pool(min(jobs, len(wanted))) as pool:
-        futures = {pool.submit(run_sabotaged, case): case for case in wanted}
-        for future in as_completed(futures):
-            results[futures[future]] = future.result()
-            on_done(futures[future])
+    results = _run_each(run_sabotaged, wanted, jobs, on_done)
     groups = groupby(wanted, key=lambda case: case.group)
     pairs = [(group, [results[case] for case in cases]) for group, cases in groups]
     return SabotageReport([
