@@ -116,9 +116,21 @@ SABOTAGES: Mapping[str, Callable[[int], Seams]] = {
 }
 """Seams by name of the sabotage and seed of the run."""
 
+_WITHOUT_DETECTOR = (
+    "the mission goes to waypoints by odometry and range sensor, and uses no detection",
+    frozenset({"thymio", "thymio-box", "thymio-closed", "thymio-slalom", "thymio-trap"}),
+)
 UNAFFECTED: Mapping[str, tuple[str, frozenset[str]]] = {
-    "range-blind": ("the robot never comes near an obstacle, so that the range sensor limits nothing",
-                    frozenset({"static", "behind"})),
+    "range-blind": (
+        "the robot never comes near an obstacle, so that the range sensor limits nothing",
+        frozenset({
+            "ball", "ball-eight", "behind", "blocks", "blocks-eight", "blocks-red", "blocks-yellow", "blue-sphere",
+            "blue-sphere-eight", "chaser", "chaser-circle", "chaser-eight", "circle", "eight", "pushed", "static",
+            "traffic-light", "traffic-light-boxes", "walls",
+        }),
+    ),
+    "detector-blind": _WITHOUT_DETECTOR,
+    "detector-wrong-object": _WITHOUT_DETECTOR,
 }
 """Reason and scenarios by sabotage: pairs in which it cannot change anything. A run then equals the healthy one."""
 

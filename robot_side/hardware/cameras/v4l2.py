@@ -94,7 +94,7 @@ class V4l2CameraConfig(LensConfig):
 
     device: Path = Path("/dev/video0")
     format: Literal["MJPG", "YUYV"] = "MJPG"
-    """MJPG: the camera's own JPEG, unchanged. YUYV: encoded here, about 1.5 ms of CPU for each image of 640x480."""
+    """MJPG: the camera's own JPEG, unchanged. YUYV: encoded here, which costs CPU for each image."""
     width_px: Annotated[int, Field(ge=16, le=8192)] = 640
     height_px: Annotated[int, Field(ge=16, le=8192)] = 480
     fps: Annotated[float, Field(gt=0, le=240)] = 30.0
