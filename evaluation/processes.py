@@ -6,11 +6,13 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
+import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Final, Self
@@ -44,23 +46,7 @@ READY_S: Final = 30.0
 _END_S: Final = 4.0
 """A process that has not ended this long after SIGTERM is killed; the robot takes up to 2 s to bring wheels to zero."""
 _POLL_S: Final = 0.02
-_BOOTSTRAP: Final = """
-import os, runpy, signal, sys, threading
-
-pipe = os.dup(0)
-os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-
-def end_with_parent():
-    signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())  # a signal is to wake the main thread
-    while os.read(pipe, 1):
-        pass
-    os.kill(os.getpid(), signal.SIGTERM)
-
-threading.Thread(target=end_with_parent, name="parent pipe", daemon=True).start()
-del sys.argv[0]
-runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
-"""
-"""Runs a module as `python -m` does, its standard input empty, until the pipe that it is given as one closes."""
+_REAPER: Final = Path(__file__).with_name("reaper.py")
 
 
 class ProcessError(HardwareError):
@@ -74,7 +60,7 @@ class ProcessError(HardwareError):
 class Processes:
     """Use it in a `with`. Each process leads a session of its own, so that Ctrl-C reaches only who starts them.
 
-    A process ends when its parent does, however that ends.
+    However this program ends, within 2 s no process and no folder of `temporary_folder` is left.
     """
 
     def __init__(self, folder: Path, *, oldest_first: bool = False) -> None:
@@ -82,6 +68,7 @@ class Processes:
         self._folder = folder
         self._oldest_first = oldest_first
         self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._reaper: subprocess.Popen[bytes] | None = None
 
     def start(
         self, name: str, arguments: Sequence[str], *, module: str = COMMAND_LINE, namespace: str = "",
@@ -94,11 +81,28 @@ class Processes:
         entering = ["ip", "netns", "exec", namespace] if namespace else []
         with self.log(name).open("wb") as log:
             self._running[name] = subprocess.Popen(
-                [*entering, sys.executable, "-u", "-P", "-c", _BOOTSTRAP, module, *arguments],
-                stdin=subprocess.PIPE, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
+                [*entering, sys.executable, "-u", "-P", "-m", module, *arguments],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, start_new_session=True,
                 env={**os.environ, LOG_FORMAT_VARIABLE: LOG_FORMATS[0], **(environment or {})},
             )
+        self._note(f"+{self.pid(name)}")
         return self.pid(name)
+
+    def temporary_folder(self) -> str:
+        """Make a folder that is removed when these processes have ended."""
+        folder = tempfile.mkdtemp(prefix="sightline-")
+        self._note(f"folder {folder}")
+        return folder
+
+    def _note(self, line: str) -> None:
+        """Send the reaper one line; start it with the first."""
+        if self._reaper is None:
+            self._reaper = subprocess.Popen(
+                [sys.executable, "-I", "-S", str(_REAPER)], stdin=subprocess.PIPE, bufsize=0, start_new_session=True,
+            )
+        assert self._reaper.stdin is not None
+        with suppress(BrokenPipeError):  # ended from outside: the processes still end with this `with`
+            self._reaper.stdin.write(line.encode() + b"\n")
 
     def log(self, name: str) -> Path:
         """Return the log of process `name`."""
@@ -150,13 +154,18 @@ class Processes:
             code = self._running[name].wait(timeout_s)
         except subprocess.TimeoutExpired:
             return None
-        with self._running.pop(name):  # closes the pipe
-            return code
+        self._forget(name)
+        return code
 
     def kill(self, name: str) -> None:
         """SIGKILL, and forget it."""
-        with self._running.pop(name) as process:  # waits for it, and closes the pipe
-            process.kill()
+        process = self._running[name]
+        process.kill()
+        process.wait()
+        self._forget(name)
+
+    def _forget(self, name: str) -> None:
+        self._note(f"-{self._running.pop(name).pid}")
 
     def end_one(self, name: str) -> bool:
         """SIGTERM, and forget it; whether it had to be killed."""
@@ -184,6 +193,9 @@ class Processes:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.end()
+        if self._reaper is not None:
+            with self._reaper:  # closes its pipe, and waits until it has removed the folders
+                self._reaper = None
 
 
 def children_of(pid: int) -> list[int]:
@@ -220,8 +232,7 @@ def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
 
     Spawned, since a forked child would share PyBullet's state. Raises HardwareError when something else ends one.
     """
-    at_once = (signal.SIGINT, signal.SIG_DFL)  # an exception would only end what each does now, and begin the next
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), signal.signal, at_once) as pool:
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _begin_worker) as pool:
         try:
             yield pool
         except BrokenProcessPool:
@@ -231,3 +242,15 @@ def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
         except BaseException:
             pool.shutdown(cancel_futures=True)  # waits: the pool's own end would take it back
             raise
+
+
+def _begin_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an exception would only end the present work, and begin the next
+    threading.Thread(target=_end_with_parent, name="parent's end", daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)  # the queue of a dead parent never closes, because each worker holds both of its ends

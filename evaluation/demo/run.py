@@ -2,7 +2,6 @@
 
 import math
 import os
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -107,10 +106,9 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
     run = DemoRun(options, scenario, run_folder(options.out, f"{scenario.name}-{options.seed}"))
     with ExitStack() as ending:
         ending.enter_context(terminated_like_interrupted())
-        sockets = ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
         processes = ending.enter_context(Processes(run.folder))
         try:
-            _drive(run, processes, sockets, say)
+            _drive(run, processes, processes.temporary_folder(), say)
         except KeyboardInterrupt:
             run.interrupted = True
         except SightlineError:

@@ -7,7 +7,6 @@ between vision service and robot passes. The runner itself reads the robot's mes
 import json
 import shutil
 import signal
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -134,8 +133,8 @@ class TakeProcesses:
 
     def _start(self) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._sockets = self._ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
         self.processes = self._ending.enter_context(Processes(self._folder))
+        self._sockets = self.processes.temporary_folder()
         self._robot_port, self._relay_port = free_port(), free_port()
         write_configuration(self._folder, self._sockets, self._seed)
         scenario = str(self._folder / SCENARIO)

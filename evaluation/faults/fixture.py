@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
@@ -203,8 +202,8 @@ class RobotFixture:
 
     def _start(self) -> None:
         self.folder.mkdir(parents=True)
-        self._sockets = self._ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-"))
         self._ending.enter_context(self.processes)
+        self._sockets = self.processes.temporary_folder()
         if self.setup.wired:
             self.wire = self._ending.enter_context(BenchWire(self.folder / "wire.log"))
         self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"tcp/127.0.0.1:{free_port()}"

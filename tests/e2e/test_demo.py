@@ -6,13 +6,16 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import av
 import pytest
 
 from sightline.evaluation.processes import ProcessError, Processes
 from sightline.protocol.errors import SightlineError
+from tests.fixtures.links import until
 
 COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "demo"]
 
@@ -119,6 +122,30 @@ def test_signal_ends_all_processes_and_the_run_is_scored(tmp_path, number):
     assert json.loads(said)["interrupted"]
     assert process.returncode in (0, 5)
     assert running_in(folder) == []
+
+
+@pytest.mark.slow
+def test_demo_that_is_killed_leaves_no_process_no_folder_and_stopped_wheels(tmp_path):
+    folder = tmp_path / "run"
+    with TemporaryDirectory() as temporary:  # a short name, for the path of a socket
+        process = subprocess.Popen([*COMMAND, "--out", str(folder), "--seconds", "0"], stderr=subprocess.PIPE,
+                                   text=True, env={**os.environ, "TMPDIR": temporary})
+        with process:
+            try:
+                assert any("ACTIVE" in line for line in process.stderr)
+                assert until(lambda: wheel_speeds(folder)[0] > 3.0, 20)
+            finally:
+                process.kill()
+                killed_s = time.monotonic()
+        assert until(lambda: not running_in(folder) and not any(Path(temporary).iterdir()), 5)
+    assert time.monotonic() - killed_s < 2.0
+    assert wheel_speeds(folder) == (0.0, 0.0)
+
+
+def wheel_speeds(folder: Path) -> tuple[float, float]:
+    """Return the speeds that were set last, rad/s."""
+    _, left, right, *_ = (folder / "motors.csv").read_text().splitlines()[-1].split(",")
+    return float(left), float(right)
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import time
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -47,23 +48,84 @@ import sys, time
 from pathlib import Path
 from sightline.evaluation.processes import Processes
 processes = Processes(Path(sys.argv[1]))
-processes.start("sleeper", [], module="sleeper", environment={"PYTHONPATH": sys.argv[1]})
-processes.wait_line("sleeper", "sleeps", 20)
-print(processes.pid("sleeper"), flush=True)
+folder = processes.temporary_folder()
+for name in ("oldest", "stopped", "stubborn"):
+    processes.start(name, [name, *sys.argv[1:]], module="member", environment={"PYTHONPATH": sys.argv[1]})
+    processes.wait_line(name, "runs", 20)
+print(folder, flush=True)
+time.sleep(60)
+"""
+_MEMBER = """
+import os, signal, subprocess, sys, time
+name, folder = sys.argv[1:]
+def end(*_):
+    open(folder + "/ended", "a").write(name + " ")
+    time.sleep(0.2 if name == "stopped" else 0)
+    sys.exit()
+signal.signal(signal.SIGTERM, signal.SIG_IGN if name == "stubborn" else end)
+if name == "stubborn":
+    subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)", folder])
+print("runs", flush=True)
+if name == "stopped":
+    os.kill(os.getpid(), signal.SIGSTOP)
 time.sleep(60)
 """
 
 
-def test_a_parent_that_is_killed_leaves_no_child(tmp_path):
-    (tmp_path / "sleeper.py").write_text("import time\nprint('sleeps')\ntime.sleep(30)\n")
-    with subprocess.Popen([sys.executable, "-c", _PARENT, str(tmp_path)], stdout=subprocess.PIPE) as parent:
+def naming(text):
+    """Process ids of living processes whose command line contains `text`."""
+    found = []
+    for command in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            if text in command.read_text():
+                found.append(int(command.parent.name))
+    return found
+
+
+def test_a_parent_that_is_killed_leaves_no_process_and_no_folder_after_2_s(tmp_path):
+    """One is stopped, one ignores SIGTERM and has a child; the oldest, e.g. the simulation, ends after the others."""
+    (tmp_path / "member.py").write_text(_MEMBER)
+    with subprocess.Popen([sys.executable, "-c", _PARENT, str(tmp_path)], stdout=subprocess.PIPE, text=True) as parent:
         try:
-            assert parent.stdout is not None
-            child = Path(f"/proc/{int(parent.stdout.readline())}/cmdline")
-            assert child.read_bytes()
+            folder = Path(parent.stdout.readline().strip())
+            assert folder.is_dir() and len(naming(str(tmp_path))) == 5
         finally:
             parent.kill()
-    assert until(lambda: not child.exists() or not child.read_bytes(), 5)
+            killed_s = time.monotonic()
+    assert until(lambda: not naming(str(tmp_path)) and not folder.exists(), 5)
+    assert time.monotonic() - killed_s < 2.0
+    assert (tmp_path / "ended").read_text() == "stopped oldest "
+
+
+def test_a_temporary_folder_is_removed_after_the_processes_ended(tmp_path):
+    with Processes(tmp_path) as processes:
+        folder = Path(processes.temporary_folder())
+        (folder / "file").write_text("left")
+    assert not folder.exists()
+
+
+_POOL = """
+import os, time
+from sightline.evaluation.processes import worker_pool
+if __name__ == "__main__":
+    with worker_pool(2) as pool:
+        print(*{pool.submit(os.getpid).result() for _ in range(9)}, flush=True)
+        pool.submit(time.sleep, 60).result()
+"""
+
+
+def test_workers_end_when_their_parent_is_killed(tmp_path):
+    (tmp_path / "pool.py").write_text(_POOL)
+    command = [sys.executable, str(tmp_path / "pool.py")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
+        try:
+            workers = [Path(f"/proc/{pid}/cmdline") for pid in parent.stdout.readline().split()]
+            assert workers and all(one.read_bytes() for one in workers)
+        finally:
+            parent.kill()
+            killed_s = time.monotonic()
+    assert until(lambda: not any(one.exists() and one.read_bytes() for one in workers), 5)
+    assert time.monotonic() - killed_s < 2.0
 
 
 def test_a_child_sees_the_arguments_and_the_input_that_python_m_gives_it(tmp_path):
