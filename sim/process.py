@@ -13,6 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
@@ -76,12 +77,15 @@ class MotorPort:
         self.angles_rad = (0.0, 0.0)
         """Total angle of each wheel, from the last physics step."""
         self.refused = 0
+        self.lines_lost = 0
+        """Commands that were applied and could not be logged, e.g. on a full disk."""
         try:
             self._log = Path(log_path).open("wb", buffering=0) if log_path else None  # noqa: SIM115  closed by close()
         except OSError as error:
             raise ConfigError(f"motor_log {log_path}: {error.strerror}; name a file in a folder that exists") from None
-        if self._log:
-            self._log.write(LOG_HEADER)
+        self._is_cut = False
+        with suppress(OSError):  # a full disk is reported at the first command
+            self._write(LOG_HEADER)
 
     def take(self, data: bytes) -> None:
         """Take one packet of a drive. A packet without two finite speeds is counted and changes nothing."""
@@ -90,13 +94,28 @@ class MotorPort:
         if not all(map(math.isfinite, speeds)):
             self.refused += 1
             return
-        if self._log:
-            left_rad, right_rad = self.angles_rad
-            self._log.write(b"%d,%.5f,%.5f,%.5f,%.5f\n" % (t_us, *speeds, left_rad, right_rad))
+        try:
+            self._write(b"%d,%.5f,%.5f,%.5f,%.5f\n" % (t_us, *speeds, *self.angles_rad))
+        except OSError as error:  # the command counts more than its line
+            if not self.lines_lost:
+                _log.warning("motor log: %s; commands are applied without a line", error.strerror)
+            self.lines_lost += 1
         self.speeds_rad_s = (speeds[0], speeds[1])
+
+    def _write(self, line: bytes) -> None:
+        """Write a whole line. Raises OSError; what a full disk took of the line ends before the next line."""
+        if self._log is None:
+            return
+        line = b"\n" * self._is_cut + line
+        self._is_cut = True
+        if self._log.write(line) < len(line):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._is_cut = False
 
     def close(self) -> None:
         """Close the log."""
+        if self.lines_lost:
+            _log.warning("motor log: %d commands have no line", self.lines_lost)
         if self._log:
             self._log.close()
 
