@@ -5,17 +5,19 @@ length (uint16, big-endian), header, payload, exactly as they came. `log_time` i
 robot's own clock is in the header. Opens in any MCAP tool; a file cut short by a kill reads up to the cut.
 """
 
+import errno
 import logging
+import os
 import queue
 import struct
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self, cast
 
 from sightline.operator_side.preflight import needs
 from sightline.protocol.channels import (
@@ -42,6 +44,8 @@ METADATA: Final = "sightline"
 RECORDED: Final = (FRAME, TWIST, ACK, STATUS, CAMERA, SCAN, MISSION, REPORT, DETECTIONS)
 MAX_WAITING: Final = 256
 """The most messages that wait for the disk; further ones are dropped and counted."""
+CLOSE_S: Final = 5.0
+"""For the disk to take what waits when the recording is closed."""
 CHUNK_BYTES: Final = 256 * 1024  # a kill loses at most one chunk
 _LENGTH = struct.Struct(">H")
 
@@ -65,7 +69,7 @@ class Recorder:
         """Open the file and store `about` in it as metadata. Raises ConfigError for a path that cannot be written."""
         self._queue: queue.Queue[tuple[int, Message] | None] = queue.Queue(MAX_WAITING)
         self._path, self._file = path, _open_new(path)
-        self._writer = _writer(self._file, about)
+        self._writer, self._about = _writer(self._file), dict(about)
         self._ids: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self.dropped = 0
@@ -73,6 +77,7 @@ class Recorder:
         self.failed = ""
         """The error that ended the recording, or ""."""
         self._closed = False
+        self._ended = threading.Event()
         self._writing = threading.Thread(target=self._write_all, name="recorder", daemon=True)
         self._writing.start()
         for channel in channels:
@@ -84,7 +89,7 @@ class Recorder:
         return dict(self._counts)
 
     def _take(self, message: Message) -> None:
-        if self._closed:
+        if self._closed or self.failed:
             return
         try:
             self._queue.put_nowait((time.time_ns(), message))
@@ -92,20 +97,27 @@ class Recorder:
             self.dropped += 1
 
     def _write_all(self) -> None:
-        while (item := self._queue.get()) is not None:
-            if not self.failed:
-                with self._reporting():
-                    self._write(*item)
+        with self._reporting():
+            self._writer.start(profile="", library="sightline")
+            self._writer.add_metadata(METADATA, self._about)
+            while not (self._ended.is_set() and self._queue.empty()) and (item := self._queue.get()):
+                self._write(*item)
+            self._writer.finish()  # type: ignore[no-untyped-call]
+        with self._reporting():
+            self._file.close()
 
     @contextmanager
     def _reporting(self) -> Iterator[None]:
         """Turn a failed write into one log line and the end of the recording."""
         try:
             yield
-        except OSError as error:
-            if not self.failed:
-                self.failed = error.strerror or str(error)
-                _log.warning("recording %s: %s; the recording ends", self._path, self.failed)
+        except Exception as error:  # the library's own too: whatever it is, `close` must not wait for it
+            self._fail(getattr(error, "strerror", None) or f"{type(error).__name__}: {error}")
+
+    def _fail(self, why: str) -> None:
+        if not self.failed:
+            self.failed = why
+            _log.warning("recording %s: %s; the recording ends", self._path, why)
 
     def _write(self, log_time_ns: int, message: Message) -> None:
         topic = message.channel.name + (f"/{message.source}" if message.source else "")
@@ -116,16 +128,16 @@ class Recorder:
         self._writer.add_message(self._ids[topic], log_time_ns, data, publish_time=log_time_ns, sequence=count)
 
     def close(self) -> None:
-        """Write the waiting messages and finish the file; a second call does nothing."""
+        """Write the waiting messages and finish the file, for `CLOSE_S` at most; a second call does nothing."""
         if self._closed:
             return
         self._closed = True
-        self._queue.put(None)
-        self._writing.join()
-        with self._reporting():
-            self._writer.finish()  # type: ignore[no-untyped-call]
-        with self._reporting():
-            self._file.close()
+        self._ended.set()
+        with suppress(queue.Full):  # then the thread has something to wake for
+            self._queue.put_nowait(None)
+        self._writing.join(CLOSE_S)
+        if self._writing.is_alive():
+            self._fail(f"the disk does not respond for {CLOSE_S:g} s")
 
     def __enter__(self) -> Self:
         return self
@@ -136,21 +148,31 @@ class Recorder:
         self.close()
 
 
-def _open_new(path: Path) -> IO[bytes]:
+class RecordingFile:
+    """A file without a buffer: where the disk hangs, Python waits at its exit for the lock of a buffered file."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("wb", buffering=0)
+        self.tell, self.flush, self.close = self._file.tell, self._file.flush, self._file.close
+
+    def write(self, data: bytes) -> None:
+        """Write all of `data`. Raises OSError where the disk takes only a part."""
+        if self._file.write(data) < len(data):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _open_new(path: Path) -> RecordingFile:
     try:
-        return path.open("wb")
+        return RecordingFile(path)
     except OSError as error:
         raise ConfigError(f"recording {path}: {error.strerror}; choose a folder that you may write") from None
 
 
-def _writer(file: IO[bytes], about: Mapping[str, str]) -> "Writer":
+def _writer(file: RecordingFile) -> "Writer":
     with needs("report"):
         from mcap.writer import CompressionType, Writer
     # JPEG does not compress; the rest is not worth the time on the machine that drives.
-    writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
-    writer.start(profile="", library="sightline")
-    writer.add_metadata(METADATA, dict(about))
-    return writer
+    return Writer(cast(Any, file), chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
 
 
 def read_recording(path: Path) -> Iterator[Recorded]:

@@ -1,5 +1,7 @@
 """Recording and replay: the messages of a link return, and the pipeline answers the same, byte for byte."""
 
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -181,3 +183,43 @@ def test_a_disk_that_is_full_ends_the_recording_with_one_line(caplog, capfd):
             time.sleep(0.0005)
     assert caplog.messages == ["recording /dev/full: No space left on device; the recording ends"]
     assert recorder.failed == "No space left on device" and capfd.readouterr().err == ""
+
+
+_HANGS = """
+import sys, time
+from pathlib import Path
+from sightline.operator_side.recording import recorder
+from sightline.protocol.channels import FRAME
+from sightline.protocol.transports.link import Message
+recorder.CLOSE_S = 0.2
+recorder.RecordingFile.write = lambda *_: time.sleep(60)
+class Wire:
+    def subscribe(self, channel, callback):
+        self.deliver = callback
+wire = Wire()
+recording = recorder.Recorder(wire, Path(sys.argv[1]), {}, [FRAME])
+for _ in range(2 * recorder.MAX_WAITING):
+    wire.deliver(Message(FRAME, "", b"", bytes(recorder.CHUNK_BYTES // 4)))
+recording.close()
+print(recording.failed)
+"""
+
+
+def test_a_disk_that_hangs_ends_neither_close_nor_the_exit(tmp_path):
+    """The place for waiting messages is full, and the thread that writes never returns."""
+    command = [sys.executable, "-c", _HANGS, str(tmp_path / "run.mcap")]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
+    assert (run.returncode, run.stdout) == (0, "the disk does not respond for 0.2 s\n"), run.stderr
+
+
+def test_an_error_of_the_file_format_ends_the_recording_and_close_comes_back(tmp_path, caplog):
+    wire = Wire()
+    recorder = Recorder(wire, tmp_path / "run.mcap", {}, [FRAME])
+    recorder._writer.add_message = lambda *_, **__: 1 / 0
+    for _ in range(2 * MAX_WAITING):
+        wire.deliver(Message(FRAME, "", b"", b""))
+    closing = threading.Thread(target=recorder.close, daemon=True)
+    closing.start()
+    closing.join(5)
+    assert not closing.is_alive()
+    assert recorder.failed == "ZeroDivisionError: division by zero" and len(caplog.messages) == 1
