@@ -12,7 +12,7 @@ class RejectReason(StrEnum):
     UNSUPPORTED_VERSION = "UNSUPPORTED_VERSION"  # another version in header field `v`
     NOT_FINITE = "NOT_FINITE"  # nan, inf, or a number too large for a float
     UNKNOWN_SOURCE = "UNKNOWN_SOURCE"  # unknown role, key and header disagree, or guests are off
-    OTHER_SESSION = "OTHER_SESSION"  # echoes a frame of an earlier robot session
+    OTHER_SESSION = "OTHER_SESSION"  # echoes a frame of an earlier robot session, or a STOP datagram of one
     UNKNOWN_FRAME = "UNKNOWN_FRAME"  # echoes a frame that this robot did not issue, or issued too long ago
     FROM_FUTURE = "FROM_FUTURE"  # echoes a capture time later than now
     STALE = "STALE"  # the frame behind it is too old
@@ -22,6 +22,8 @@ class RejectReason(StrEnum):
     STOPPED = "STOPPED"  # the STOP latch is set
     FAULT = "FAULT"  # the drive reports a fault
     NOT_ALLOWED = "NOT_ALLOWED"  # a request that this source must not send now
+    OTHER_ROBOT = "OTHER_ROBOT"  # a STOP datagram for another robot
+    WRONG_KEY = "WRONG_KEY"  # a STOP datagram without the HMAC of this robot's STOP secret
 
 
 CLAMPED = "CLAMPED"

@@ -36,7 +36,8 @@ REMEDIES: Final = {
     "NOT_FINITE": ("A speed is nan, inf or too large.", "Correct the controller."),
     "UNKNOWN_SOURCE": ("The role is unknown, differs from the key, or guests are off.",
                        "Use a known role; `safety.guests` permits guests."),
-    "OTHER_SESSION": ("The command cites a frame of an earlier robot start.", "None: the next frame ends it."),
+    "OTHER_SESSION": ("The command cites a frame of an earlier robot start, or a STOP datagram is of one.",
+                      "None: the next frame or datagram ends it."),
     "UNKNOWN_FRAME": ("The command cites a frame that this robot did not issue.",
                       "Cite `session`, `seq` and `t_us` exactly as received."),
     "FROM_FUTURE": ("The command cites a capture time later than now.", "Copy `t_us` from the frame."),
@@ -49,6 +50,9 @@ REMEDIES: Final = {
     "FAULT": ("The drive reports a fault.", "Repair the drive, then run `sightline reset`."),
     "NOT_ALLOWED": ("This source may not make this request now.",
                     "Another operator holds the lease, or the role forbids it."),
+    "OTHER_ROBOT": ("A STOP datagram is for another robot.", "Pass the robot's id and address to `sightline stop`."),
+    "WRONG_KEY": ("A STOP datagram has no HMAC of this robot's STOP secret.",
+                  "Copy `stop.secret` of one key folder to robots and operators."),
 }
 README_TABLES: Final = {
     "en": """| measured | result |

@@ -310,7 +310,8 @@ def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventL
             return 0
         ledger.note(REQUESTED)
         ledger.note(INJECTED)
-        print(f"state {operator.stop(lambda: None).state}", flush=True)
+        status = operator.stop(lambda: None)
+        print(f"state {status and status.state}", flush=True)
         if options.fault == "reset":
             reply = operator.request(Verb.RESET)
             print(f"reset {reply.ok}: {reply.detail}", flush=True)

@@ -132,19 +132,20 @@ def init(folder: Folder, host: Hosts = None, days: Days = 825) -> None:
     made = _keys()
     for file in made.make(folder, host or [], days):
         print(f"wrote {file}")
-    print("copy ca.pem and the files of its role to each machine, and every *.token to a robot that listens on wss://; "
+    print("copy ca.pem and the files of its role to each machine, every *.token to a robot that listens on wss://, and "
+          "stop.secret to robots, routers and operators; "
           f"copy ca.key to no machine; then use --secure {folder}")
 
 
 def add(
     folder: Folder,
-    role: Annotated[str, typer.Argument(metavar="ROLE", help="robot, vision, operator, detector or viewer.")],
+    role: Annotated[str, typer.Argument(metavar="ROLE", help="robot, vision, operator, detector or viewer, or stop.")],
     host: Hosts = None,
     days: Days = 825,
 ) -> None:
     """Create the certificate of one role again
 
-    Use it for other addresses or after expiry.
+    Use it for other addresses or after expiry. `stop` creates the secret of STOP datagrams.
     """
     made = _keys()
     for file in made.add(folder, role, host or [], days):

@@ -8,6 +8,7 @@ the command is used.
 import os
 import re
 import sys
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
@@ -196,9 +197,17 @@ def _print_error(line: str, code: int) -> int:
     return code
 
 
+ABANDONED_THREAD: Final = "abandoned link"
+"""Name of a thread that may still open a link when the command has its result: it must not delay the exit."""
+
+
 def main() -> None:
     """Run the command of this process and exit with its code."""
-    sys.exit(run(sys.argv[1:]))
+    code = run(sys.argv[1:])
+    if any(thread.name == ABANDONED_THREAD for thread in threading.enumerate()):
+        sys.stdout.flush()
+        os._exit(code)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

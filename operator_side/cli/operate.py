@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from sightline.operator_side.cli.app import ABANDONED_THREAD
 from sightline.operator_side.cli.options import REJECTED_EXIT, Connect, Json, Robot, Secure, target_of
 from sightline.operator_side.client.requests import SOURCE, Operator
-from sightline.operator_side.client.status import reply_line, short_lines, status_line, status_lines
+from sightline.operator_side.client.status import reply_line, short_lines, status_lines
 from sightline.operator_side.config.context import RobotAddress
 from sightline.operator_side.table import print_block
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.messages import MissionReport, Reply, Status, Verb
+from sightline.protocol.messages import MissionReport, Reply, State, Status, Verb
 from sightline.protocol.transports.open import open_link
+from sightline.protocol.transports.security import stop_secret_file
 
 if TYPE_CHECKING:
     from sightline.operator_side.client.missions import MissionClient, Waypoints
@@ -171,19 +173,31 @@ def stop(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_j
     The wheels stay at zero until `sightline reset`. STOP needs the network, so it is not an emergency stop.
     """
 
+    from sightline.operator_side.client.stop import stop_robot
+
     def on_slow() -> None:
         typer.echo(f"STOP of {target.robot} is not confirmed, repeating; be ready to cut its power by hand", err=True)
 
     target = target_of(robot, connect, secure, announce=True)
-    with _operator(target) as operator:
-        _print_stopped(target.robot, operator.stop(on_slow), as_json)
-
-
-def _print_stopped(robot: str, state: Status, as_json: bool) -> None:
+    done = stop_robot(
+        target.robot, target.connect, target.secure, _stop_secret(target), on_slow, thread_name=ABANDONED_THREAD
+    )
+    if not done.stored:
+        typer.echo(f"STOP of {target.robot} is not on its disk, so that a restart ends it; is the disk full?", err=True)
+    detail = done.status.reason if done.status else "wheels at zero"
     if as_json:
-        typer.echo(json.dumps({"robot": robot, "ok": True, "state": state.state, "detail": state.reason}))
+        typer.echo(json.dumps({"robot": target.robot, "ok": True, "state": State.STOPPED, "detail": detail}))
     else:
-        typer.echo(status_line(robot, state))
+        typer.echo(f"{target.robot}: {State.STOPPED} ({detail})")
+
+
+def _stop_secret(target: RobotAddress) -> str:
+    """Return the file of the STOP secret; print one line where the keys lack it."""
+    try:
+        return stop_secret_file(target.secure) if target.secure else ""
+    except ConfigError as error:
+        typer.echo(str(error), err=True)
+        return ""
 
 
 def _print_reply(operator: Operator, verb: Verb, reply: Reply, as_json: bool) -> int:

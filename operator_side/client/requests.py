@@ -167,15 +167,18 @@ class Operator:
             reply = self._request(Verb.RESET, cited, 2.0)
         return reply
 
-    def stop(self, on_slow: Callable[[], None], timeout_s: float = 10.0) -> Status:
-        """Send STOP at 20 Hz until a status that arrives afterwards shows STOPPED.
+    def stop(
+        self, on_slow: Callable[[], None], timeout_s: float = 10.0, is_proven: Callable[[], bool] = lambda: False
+    ) -> Status | None:
+        """Send STOP at 20 Hz until a status that arrives afterwards shows STOPPED and wheels at zero.
 
         Args:
-            on_slow: called once if the confirmation takes more than 300 ms.
+            on_slow: called once if no status shows STOPPED after 300 ms.
             timeout_s: longest wait, s.
+            is_proven: whether the stop is proven in another way, which ends the repetition.
 
         Returns:
-            The status that shows STOPPED.
+            The status that shows the stop, or None if `is_proven` returned True.
 
         Raises:
             LinkError: at `timeout_s`; the robot may still move.
@@ -184,21 +187,27 @@ class Operator:
         started_s = time.monotonic()
         # The stored status may be from before a reset by another operator, on a link that is dead now.
         seen, warned = self._reports, False
-        while time.monotonic() - started_s < timeout_s:
+        while time.monotonic() - started_s < timeout_s and not is_proven():
             self._send(Verb.STOP, None)
             with self._changed:
                 if self._changed.wait_for(lambda: self._reports > seen and self._is_stopped(), STOP_PERIOD_S):
                     assert self._report is not None
                     return self._report.status
-            if not warned and time.monotonic() - started_s > STOP_SLOW_S:
+                is_latched = self._reports > seen and self._has_state_stopped()
+            if not warned and not is_latched and time.monotonic() - started_s > STOP_SLOW_S:
                 warned = True
                 on_slow()
+        if is_proven():
+            return None
         raise LinkError(
             f"robot '{self.robot}' did not confirm STOP within {timeout_s:g} s; cut its power by hand"
         )
 
-    def _is_stopped(self) -> bool:
+    def _has_state_stopped(self) -> bool:
         return self._report is not None and self._report.status.state is State.STOPPED
+
+    def _is_stopped(self) -> bool:
+        return self._has_state_stopped() and self._report is not None and self._report.status.applied == (0.0, 0.0)
 
     def _send(self, verb: Verb, report: StatusReport | None) -> None:
         """Publish a request. Next: `robot_side/pipe.py`: `NetworkEnd.forward`."""

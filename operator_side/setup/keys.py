@@ -2,7 +2,7 @@
 
 It uses `cryptography`, as Python's own packaging does. Elliptic-curve keys (P-256) keep the TLS handshake short on a
 small robot. Only `ca.pem` and the files of its own role belong on a machine, and all tokens on a
-robot that serves WebSocket; `ca.key` belongs on none.
+robot that serves WebSocket; `stop.secret` on robots, routers and operators; `ca.key` belongs on none.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.security import ROLES
+from sightline.protocol.transports.security import ROLES, STOP_SECRET_FILE
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 DAYS = 825
 """The longest validity that common TLS stacks accept."""
+STOP = "stop"
+"""Name of the STOP secret beside the roles."""
 _TOKEN_BYTES = 24  # 192 bits, 32 letters
 LOOPBACK = ("localhost", "127.0.0.1")
 _BEGUN_EARLIER = datetime.timedelta(days=1)  # for machines whose clocks differ by hours
@@ -63,17 +65,21 @@ def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
         files = _write(folder, "ca", key, _signed(builder, key))
     except OSError as error:
         raise ConfigError(f"cannot write keys to {folder}: {error.strerror}; choose another folder") from None
-    return files + [file for role in ROLES for file in add(folder, role, hosts, days)]
+    return files + [file for role in (*ROLES, STOP) for file in add(folder, role, hosts, days)]
 
 
 def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
     """Create a new certificate and WebSocket token of `role`, signed by the authority in `folder`.
 
+    `STOP` is not a role: it creates the STOP secret.
+
     Raises:
         ConfigError: the role or a host is invalid, or the key of the authority is missing.
     """
+    if role == STOP:
+        return _write_secret(folder)
     if role not in ROLES:
-        raise ConfigError(f"unknown role '{role}'; expected {', '.join(ROLES)}")
+        raise ConfigError(f"unknown role '{role}'; expected {', '.join(ROLES)}, or {STOP} for the STOP secret")
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID as Usage
@@ -154,7 +160,16 @@ def _write(folder: Path, name: str, key: EllipticCurvePrivateKey, certificate: x
 
 
 def _write_token(folder: Path, role: str) -> list[Path]:
-    file = folder / f"{role}.token"
+    return _write_random(folder / f"{role}.token")
+
+
+def _write_secret(folder: Path) -> list[Path]:
+    if not (folder / "ca.pem").is_file():
+        raise ConfigError(f"no keys in {folder}; create them with: sightline keys init {folder}")
+    return _write_random(folder / STOP_SECRET_FILE)
+
+
+def _write_random(file: Path) -> list[Path]:
     _private(file)
     file.write_text(secrets.token_urlsafe(_TOKEN_BYTES) + "\n")
     return [file]

@@ -7,6 +7,7 @@ Each folder of cases has one kind of input, `given`, and one kind of result:
     older_picture  base64 text, at most `max_bytes` of image: the bytes of the JPEG
     older_dashed   `linear-angular`: the twist
     older_boxes    boxes joined by `-`
+    stop           a datagram of the STOP port and the STOP secret, empty without keys: its fields
 """
 
 import dataclasses
@@ -29,9 +30,19 @@ from sightline.protocol.spec.message_cases import (
     packed,
     without,
 )
+from sightline.protocol.transports.stop_datagram import (
+    DATAGRAM_BYTES,
+    STATES,
+    Kind,
+    StopDatagram,
+    check_hmac,
+    pack_stop,
+    unpack_stop,
+)
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, parse_hello, unpack
 
 Fields = dict[str, Any]
+WRONG_KEY: Final = "WRONG_KEY"
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,12 +77,23 @@ def _boxed(given: Fields) -> Fields:
     return {"boxes": [dataclasses.asdict(box) for box in parse_boxes(given["text"].encode())]}
 
 
+def _stopped(given: Fields) -> Fields:
+    data, secret = bytes.fromhex(given["datagram_hex"]), bytes.fromhex(given["secret_hex"])
+    one = unpack_stop(data)
+    if secret:
+        check_hmac(data, secret)
+    fields = one._asdict() | {"kind": int(one.kind), "state": STATES[one.state]}
+    return {"challenge_hex" if name == "challenge" else name: value.hex() if name == "challenge" else value
+            for name, value in fields.items()}
+
+
 READERS: Final[dict[str, Callable[[Fields], Fields]]] = {
     "websocket": _unpacked,
     "hello": _greeted,
     "older_picture": _pictured,
     "older_dashed": _dashed,
     "older_boxes": _boxed,
+    "stop": _stopped,
 }
 
 
@@ -224,6 +246,51 @@ def _texts(folder: str, good: dict[str, str], bad: dict[str, str]) -> list[Frami
     ]
 
 
+# --- the STOP port -----------------------------------------------------------------------------------------------
+
+_SECRET: Final = b"an example of a STOP secret"
+_CHALLENGE: Final = bytes(range(16))
+_STOP: Final = StopDatagram(Kind.STOP, "r1", 41, _CHALLENGE)
+_ANSWER: Final = StopDatagram(Kind.ANSWER, "r1", 41, _CHALLENGE, STATES.index("STOPPED"), True, True, True, 7, 7)
+
+
+def _datagram(
+    name: str, purpose: str, data: bytes, refuse: str | None = None, secret: bytes = b""
+) -> FramingCase:
+    return FramingCase("stop", name, purpose, {"secret_hex": secret.hex(), "datagram_hex": data.hex()}, refuse)
+
+
+def _changed(place: int, byte: int) -> bytes:
+    data = bytearray(pack_stop(_STOP))
+    data[place] = byte
+    return bytes(data)
+
+
+def _datagrams() -> list[FramingCase]:
+    plain, signed = pack_stop(_STOP), pack_stop(_STOP, _SECRET)
+    return [
+        _datagram("stop", "without keys", plain),
+        _datagram("query", "the request for the challenge", pack_stop(StopDatagram(Kind.STOP, "r1", 40))),
+        _datagram("signed", "with keys", signed, secret=_SECRET),
+        _datagram("answer", "stopped, wheels at zero, on disk", pack_stop(_ANSWER, _SECRET), secret=_SECRET),
+        _datagram("answer_silent", "no driver process reports", pack_stop(_ANSWER._replace(state=0, at_rest=False))),
+        _datagram("register", "from a robot to a router", pack_stop(_STOP._replace(kind=Kind.REGISTER))),
+        _datagram("robot_32", "the longest id", pack_stop(_STOP._replace(robot="r" * 32))),
+        _datagram("unsigned", "with keys, and no HMAC", plain, WRONG_KEY, _SECRET),
+        _datagram("other_secret", "of another deployment", pack_stop(_STOP, b"another"), WRONG_KEY, _SECRET),
+        _datagram("counter_changed", "signed for another counter", signed[:47] + b"*" + signed[48:], WRONG_KEY,
+                  _SECRET),
+        _datagram("empty", "no bytes", b"", MALFORMED),
+        _datagram("cut", "a byte too short", plain[:-1], MALFORMED),
+        _datagram("long", "a byte too long", plain.ljust(DATAGRAM_BYTES + 1), MALFORMED),
+        _datagram("magic", "another protocol", _changed(0, 0x73), MALFORMED),
+        _datagram("version_2", "another version is rejected by name", _changed(4, 2), VERSION),
+        _datagram("kind_0", "an unknown kind", _changed(5, 0), MALFORMED),
+        _datagram("state_7", "an unknown state", _changed(6, 7), MALFORMED),
+        _datagram("robot_not_ascii", "an invalid id", _changed(8, 0xFF), MALFORMED),
+    ]
+
+
 FRAMING_CASES: tuple[FramingCase, ...] = (
     *_messages(),
     *_hellos(),
@@ -231,5 +298,6 @@ FRAMING_CASES: tuple[FramingCase, ...] = (
     *_texts("older_dashed", _DASHED_GOOD, _DASHED_MALFORMED),
     FramingCase("older_dashed", "overflow", "not a finite number", {"text": "1e999-0"}, NOT_FINITE),
     *_texts("older_boxes", _BOXES_GOOD, _BOXES_MALFORMED),
+    *_datagrams(),
 )
 """Every case; what is made of what is not a message by itself but carries messages."""

@@ -180,6 +180,25 @@ def host_problem(hosts: Sequence[str], listen_host: str) -> str:
     return f"Host {hosts[0][:80]!r} is not this machine; connect by its address or .local name"
 
 
+def stop_addresses(endpoints: Sequence[str]) -> list[tuple[str, int]]:
+    """Return the UDP addresses of the STOP port beside `endpoints`, each once: the same host, the next higher port.
+
+    The port beside the default endpoint is 7448. So robots on one machine have different STOP ports, and an
+    answer is never that of another robot. The legacy protocol has no STOP.
+    """
+    places = []
+    for endpoint in endpoints:
+        if "://" not in endpoint:
+            _, host, port = parse_zenoh_endpoint(endpoint)
+        elif not endpoint.startswith("ws-legacy://"):
+            web = parse_websocket_endpoint(endpoint)
+            host, port = web.host, web.port
+        else:
+            continue
+        places.append((host, min(port + 1, 65_535)))
+    return list(dict.fromkeys(places))
+
+
 def _is_address(name: str) -> bool:
     try:
         ipaddress.ip_address(name)

@@ -69,6 +69,11 @@ class LatchWriter:
         self._thread = threading.Thread(target=self._write_all, name="latch", daemon=True)
         self._thread.start()
 
+    @property
+    def is_stored(self) -> bool:
+        """Return True if the disk has the mark of a STOP."""
+        return self._stored is True
+
     def want(self, stopped: bool) -> None:
         """Want the latch so; never waits."""
         if stopped is not self._wanted:

@@ -16,14 +16,20 @@ from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.config import PLUGIN_ERRORS
-from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.errors import ConfigError, RejectReason, WireError
 from sightline.protocol.log import RepeatLimiter, start_log_thread
 from sightline.protocol.messages import LastRejection, State, StreamStatus
+from sightline.protocol.transports.endpoints import stop_addresses
+from sightline.protocol.transports.security import stop_secret_file
+from sightline.protocol.transports.stop_datagram import STOP_PORT
+from sightline.protocol.transports.stop_port import StopProcess, read_packets, send_packet
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.core import DriverCore
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS, SystemdNotifier, request_real_time
+from sightline.robot_side.guardian import stop_receiver
+from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.plugins import BATTERIES, DRIVES, RANGE_SENSORS
 from sightline.robot_side.ports import Battery, Drive, Ranges, RangeSensor, WheelAngles
@@ -44,6 +50,7 @@ _WATCHDOG_PERIOD_US = 100_000
 # The process locks its memory, a stack of the usual 8 MB with it. A plug-in's code needs more than ours.
 _STACK_BYTES, _PLUGIN_STACK_BYTES = 256 * 1024, 1024 * 1024
 _BATTERY_PERIOD_S = 1.0
+_STOP_REPORT_US = 100_000
 _WARNING = (
     "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
     "(docs/explanation/safety.md)"
@@ -68,10 +75,14 @@ def run(config: RobotConfig) -> int:
             ending.callback(reader.close)
         threading.stack_size(_STACK_BYTES)
         start_log_thread()
-        driver = Driver(config, drive, ranges, reader)
+        receiver = stop_receiver_of(config)
+        if receiver is not None:
+            ending.callback(receiver.close)
+        driver = Driver(config, drive, ranges, reader, receiver)
         threading.stack_size(_PLUGIN_STACK_BYTES)
         ending.callback(driver.latch_writer.close)
         ending.callback(driver.driver_end.close)
+        ending.callback(driver.finish)
         ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are set to zero
         return driver.loop()
 
@@ -79,6 +90,19 @@ def run(config: RobotConfig) -> int:
 def _zero(drive: Drive) -> None:
     with suppress(Exception):  # nothing may keep what ends after it from ending
         drive.set(0.0, 0.0)
+
+
+def stop_receiver_of(config: RobotConfig) -> StopProcess | None:
+    """Prepare the STOP receiver beside the links of this robot; None where keys are used without a STOP secret."""
+    try:
+        secret_file = stop_secret_file(config.secure) if config.secure else ""
+    except ConfigError as error:
+        _log.warning("robot %s: %s", config.robot, error)
+        return None
+    addresses, routers = stop_addresses(config.listen), stop_addresses(config.connect)
+    if not addresses and not routers:
+        addresses = [("127.0.0.1", STOP_PORT)]
+    return stop_receiver.start(config.robot, addresses, routers, secret_file)
 
 
 def zero_motors(config: RobotConfig) -> int:
@@ -137,7 +161,8 @@ class Driver:
     """The loop and what it holds."""
 
     def __init__(
-        self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None, battery_reader: BatteryReader | None = None
+        self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None,
+        battery_reader: BatteryReader | None = None, receiver: StopProcess | None = None,
     ) -> None:
         latch = StopLatch(config.state_dir, config.robot)
         self.latch_writer = LatchWriter(latch)
@@ -157,6 +182,10 @@ class Driver:
         self._rejection_limiter = RepeatLimiter()
         self._rejected_by_network: Counter[str] = Counter()
         self.driver_end = DriverEnd(config, self._driver_core.session)
+        self._receiver = receiver
+        self._stop_applied = 0
+        """Number of the newest STOP of the receiver that is latched."""
+        self._stop_report, self._stop_report_us = b"", 0
         for number in EXIT_SIGNALS:
             signal.signal(number, self._on_signal)
         for number in IGNORED_SIGNALS:
@@ -184,6 +213,15 @@ class Driver:
         self._systemd_notifier.notify("STOPPING=1")
         return self.driver_end.exit_code
 
+    def finish(self) -> None:
+        """Latch and answer what arrived before the end. The motors are at zero."""
+        self._drain()
+        now_us = monotonic_us()
+        for message in self._driver_core.messages(now_us):
+            self.driver_end.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
+        self.latch_writer.close()
+        self._report_stop(now_us)
+
     def _log_missing(self) -> None:
         """Log what this robot lacks before it moves."""
         missing = list(request_real_time())
@@ -202,6 +240,7 @@ class Driver:
     def _wait(self, deadline_us: int) -> None:
         timeout_s = max(0, deadline_us - monotonic_us()) / 1e6
         readable = [self.driver_end.socket] if self.driver_end.socket else []
+        readable += [self._receiver.near] if self._receiver else []
         select.select(readable, [], [], timeout_s)
 
     def _tick(self, now_us: int, *, punctual: bool) -> None:
@@ -211,12 +250,15 @@ class Driver:
         if punctual:
             for message in self._driver_core.messages(now_us):
                 self.driver_end.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
+            if self._receiver is not None:
+                self._receiver.keep_alive(now_us)
             self.driver_end.keep_alive(now_us, self._driver_core.gate.issued.last_seq("frame") + 1)
             self._driver_core.network_restarts = max(0, self.driver_end.restarts)
             self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)
             self._log_state(self._driver_core.gate.state, self._driver_core.gate.reason)
             self._log_battery(now_us)
             self._feed_watchdog(now_us)
+        self._report_stop(now_us)
 
     def _answer(self) -> None:
         """Send command acks once the wheels are set; motion first, for the frame that an ack permits carries it.
@@ -302,12 +344,41 @@ class Driver:
     # --- packets of the network process --------------------------------------------------------------------------
 
     def _drain(self) -> bool:
-        """Handle what the network process sent; True if a command was among it."""
-        commanded = False
+        """Handle what the network process and the STOP receiver sent; True if a command was among it."""
+        commanded = self._drain_receiver()
         for packet in self.driver_end.packets():
             with suppress(ValueError, KeyError, struct.error, WireError):  # a broken process is restarted
                 commanded |= self._on_packet(packet)
         return commanded
+
+    def _drain_receiver(self) -> bool:
+        """Handle what the STOP receiver sent; True if a STOP was among it. Next: `SafetyGate.stop`."""
+        stopped = False
+        for packet in read_packets(self._receiver.near) if self._receiver else ():
+            if packet.startswith(b"S"):
+                self._driver_core.gate.stop("STOP by a datagram")
+                self.latch_writer.want(True)
+                self._stop_applied, stopped = unpack_number(packet), True
+            elif packet.startswith(b"C"):
+                counts, address = unpack_ignored(packet)
+                self._driver_core.rejected_by_transport += Counter(counts)
+                for reason, count in counts.items():
+                    rejection = LastRejection(source=address, reason=reason, detail="a STOP datagram was ignored")
+                    self._log_rejection(rejection, count)
+            elif packet.startswith(b"L"):
+                self._log(packet[1:].decode())
+        return stopped
+
+    def _report_stop(self, now_us: int) -> None:
+        """Send the STOP receiver the state, when it changes and ten times a second."""
+        if self._receiver is None:
+            return
+        at_rest = self._driver_core.at_rest and self._speeds_are_set
+        state, stored = self._driver_core.gate.state, self.latch_writer.is_stored
+        report = pack_report(DriverReport(self._stop_applied, state.value, at_rest, stored))
+        if report != self._stop_report or now_us - self._stop_report_us >= _STOP_REPORT_US:
+            self._stop_report, self._stop_report_us = report, now_us
+            send_packet(self._receiver.near, report)
 
     def _on_packet(self, packet: bytes) -> bool:
         kind = ipc.packet_kind(packet)

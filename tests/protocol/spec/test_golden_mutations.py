@@ -91,10 +91,21 @@ def test_truncated_or_changed_websocket_message_is_split_or_rejected(case):
 
 
 @pytest.mark.parametrize(
-    "case", [one for one in WIRED if one.folder != "websocket"], ids=lambda case: f"{case.folder}/{case.name}"
+    "case", [one for one in WIRED if "text" in one.given], ids=lambda case: f"{case.folder}/{case.name}"
 )
 def test_truncated_or_changed_text_is_read_or_rejected(case):
     """A transport hands over no text that is not UTF-8, so a changed byte stands for the character of that number."""
     text = case.given["text"].encode()
     for one in (*cut(text), *flipped(text)):
         check(framing_outcome(case.folder, case.given | {"text": one.decode("latin-1")}))
+
+
+@pytest.mark.parametrize("case", [one for one in WIRED if one.folder == "stop"], ids=lambda case: case.name)
+def test_truncated_or_changed_datagram_is_read_or_rejected(case):
+    data = bytes.fromhex(case.given["datagram_hex"])
+    for one in cut(data):
+        assert "refuse" in framing_outcome("stop", case.given | {"datagram_hex": one.hex()})
+    for one in flipped(data):
+        got = framing_outcome("stop", case.given | {"datagram_hex": one.hex()})
+        assert ("accept" in got) != ("refuse" in got)
+        assert "refuse" in got or not case.given["secret_hex"], "with keys, no bit can be changed"

@@ -1,0 +1,205 @@
+"""STOP of one robot by datagrams and by its link at the same time, until one of both proves it. Shell (threads).
+
+The datagrams go out first: opening a link can take seconds, or fail, while a flood occupies the ports of the links.
+"""
+
+import secrets
+import select
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from typing import Final, NamedTuple
+
+from sightline.operator_side.client.requests import SOURCE, STOP_SLOW_S, Operator
+from sightline.protocol.errors import LinkError, SightlineError
+from sightline.protocol.messages import State, Status
+from sightline.protocol.transports.endpoints import stop_addresses
+from sightline.protocol.transports.link import Link
+from sightline.protocol.transports.open import open_link
+from sightline.protocol.transports.stop_datagram import DATAGRAM_BYTES, StopRequests
+from sightline.protocol.transports.stop_port import read_secret
+
+DATAGRAM_PERIOD_S: Final = 0.02
+_STORED_S: Final = 1.0
+"""Longest wait for the disk of a robot that is stopped, with its wheels at zero."""
+_ANSWERED_S: Final = 1.0
+"""Time for the answer to a datagram, if the link cannot be opened."""
+_LINK_CLOSES_S: Final = 0.3
+_FIRST_BELOW: Final = 2**62
+
+
+class StopSender:
+    """Sends STOP datagrams to the ports beside `endpoints` until `close`. Use it in a `with`."""
+
+    def __init__(self, robot: str, endpoints: Sequence[str], secret_file: str = "") -> None:
+        """Start the thread that sends.
+
+        Args:
+            robot: robot id.
+            endpoints: of the robot or of its router, as for a link.
+            secret_file: file of the STOP secret, or "" without keys.
+        """
+        secret = read_secret(secret_file)
+        self._requests = [(address, StopRequests(robot, secret, secrets.randbelow(_FIRST_BELOW)))
+                          for address in stop_addresses(endpoints)]
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="stop datagrams", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> "StopSender":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._ending.set()
+
+    @property
+    def is_answered(self) -> bool:
+        """Return True if a robot has answered."""
+        return any(one.answer is not None for _, one in self._requests)
+
+    @property
+    def is_latched(self) -> bool:
+        """Return True once the robot has applied this STOP. Its wheels may still turn."""
+        return any(one.is_latched for _, one in self._requests)
+
+    @property
+    def is_stopped(self) -> bool:
+        """Return True once the robot has applied this STOP and its wheels are at zero."""
+        return any(one.is_stopped for _, one in self._requests)
+
+    @property
+    def is_stored(self) -> bool:
+        """Return True once the STOP is on the disk of the robot, too."""
+        return any(one.is_stored for _, one in self._requests)
+
+    @property
+    def lacks_secret(self) -> bool:
+        """Return True if the robot accepts only datagrams that are signed with its STOP secret."""
+        return any(one.lacks_secret for _, one in self._requests)
+
+    def _run(self) -> None:
+        with ExitStack() as ending:
+            places = [(ending.enter_context(socket.socket(family, socket.SOCK_DGRAM)), place, requests)
+                      for address, requests in self._requests for family, place in _resolve(address)]
+            sockets = [one for one, _, _ in places]
+            while not self._ending.is_set():
+                for one, place, requests in places:
+                    self._send(one, place, requests)
+                self._receive(sockets, time.monotonic() + DATAGRAM_PERIOD_S)
+
+    @staticmethod
+    def _send(one: socket.socket, place: tuple[str, int], requests: StopRequests) -> None:
+        for data in requests.datagrams():
+            with suppress(OSError):  # e.g. no route at present
+                one.sendto(data, place)
+
+    def _receive(self, sockets: Sequence[socket.socket], until_s: float) -> None:
+        while (left_s := until_s - time.monotonic()) > 0:
+            for one in select.select(sockets, [], [], left_s)[0]:
+                with suppress(OSError):
+                    data, place = one.recvfrom(DATAGRAM_BYTES + 1)
+                    for _, requests in self._requests:
+                        if requests.on_datagram(data):
+                            self._send(one, place, requests)
+
+
+def _resolve(address: tuple[str, int]) -> list[tuple[socket.AddressFamily, tuple[str, int]]]:
+    try:
+        family, _, _, _, place = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)[0]
+    except (OSError, UnicodeError):
+        return []
+    return [(family, (str(place[0]), int(place[1])))]
+
+
+class Stopped(NamedTuple):
+    """A robot that is stopped: its status, if that came by the link, and whether the STOP is on its disk."""
+
+    status: Status | None
+    stored: bool
+
+
+class _LinkStop(threading.Thread):
+    """Opens the link and sends STOP there."""
+
+    def __init__(self, name: str, open_it: Callable[[], Link], timeout_s: float) -> None:
+        super().__init__(name=name, daemon=True)
+        self._open, self._timeout_s = open_it, timeout_s
+        self._operator: Operator | None = None
+        self.ended = threading.Event()
+        """Set from outside: then no more STOP is sent here."""
+        self.status: Status | None = None
+        self.error: SightlineError | None = None
+
+    def run(self) -> None:
+        """Set `status` or `error`."""
+        try:
+            with self._open() as link:
+                self._operator = Operator(link)
+                self.status = self._operator.stop(lambda: None, self._timeout_s, self.ended.is_set)
+        except SightlineError as error:
+            self.error = error
+
+    @property
+    def is_latched(self) -> bool:
+        """Return True if the newest status shows STOPPED."""
+        report = self._operator.report if self._operator else None
+        return report is not None and report.status.state is State.STOPPED
+
+
+def stop_robot(
+    robot: str, connect: Sequence[str], secure: str, secret_file: str, on_slow: Callable[[], None], *,
+    timeout_s: float = 10.0, thread_name: str = "stop link",
+) -> Stopped:
+    """Stop a robot by datagrams and by its link. Returns once it is STOPPED with its wheels at zero.
+
+    Args:
+        robot: robot id.
+        connect: endpoints of the robot or of its router.
+        secure: folder of keys, or "".
+        secret_file: file of the STOP secret, or "".
+        on_slow: called once if the robot has not shown STOPPED after 300 ms.
+        timeout_s: longest wait, s.
+        thread_name: of the thread that opens the link. It may still run when this function returns.
+
+    Raises:
+        SightlineError: that of the link, if no datagram is answered; or at `timeout_s`. The robot may still move.
+    """
+    with StopSender(robot, connect, secret_file) as sender:
+        link = _LinkStop(
+            thread_name, lambda: open_link(robot, connect=connect, role=SOURCE, secure=secure), timeout_s
+        )
+        link.start()
+        try:
+            return _wait(robot, sender, link, on_slow, timeout_s)
+        finally:
+            link.ended.set()
+            link.join(_LINK_CLOSES_S)
+
+
+def _wait(
+    robot: str, sender: StopSender, link: _LinkStop, on_slow: Callable[[], None], timeout_s: float
+) -> Stopped:
+    began_s = time.monotonic()
+    stopped_s: float | None = None
+    warned = False
+    while (now_s := time.monotonic()) - began_s < timeout_s:
+        if sender.is_stored:
+            return Stopped(link.status, True)
+        if sender.is_stopped or link.status is not None:
+            stopped_s = stopped_s or now_s
+            if not sender.is_answered or now_s - stopped_s > _STORED_S:
+                return Stopped(link.status, not sender.is_answered)
+        elif link.error is not None and not sender.is_answered and now_s - began_s > _ANSWERED_S:
+            raise link.error
+        if not warned and now_s - began_s > STOP_SLOW_S and not (sender.is_latched or link.is_latched):
+            warned = True
+            on_slow()
+        time.sleep(DATAGRAM_PERIOD_S / 4)
+    hint = "; copy stop.secret of the robot's keys to this machine" if sender.lacks_secret else ""
+    raise LinkError(f"robot '{robot}' did not confirm STOP within {timeout_s:g} s; cut its power by hand{hint}")

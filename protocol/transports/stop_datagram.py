@@ -1,0 +1,192 @@
+"""The STOP datagram: one fixed size both ways, and with keys an HMAC. Pure; standard library only.
+
+    0   4  `STOP`                           48  16  challenge: random at each start of the receiver
+    4   1  version, 1                       64   8  number of valid STOPs that the receiver has counted
+    5   1  kind: `Kind`                     72   8  newest of those numbers that the driver process has applied
+    6   1  state: index in `STATES`         80  32  HMAC-SHA256 of bytes 0 to 79, or zeros
+    7   1  bit 0: wheels at zero, bit 1: latch on disk, bit 2: the receiver accepts only an HMAC
+    8  32  robot id, filled with zeros
+    40  8  counter of the sender            all integers big-endian; the sender of a STOP leaves 6, 7, 64 and 72 zero
+
+An answer is not longer than the request, so that the port cannot amplify traffic to a forged address.
+"""
+
+import struct
+from _operator import _compare_digest as compare_digest
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+from sightline.protocol.errors import RejectReason, WireError
+
+try:
+    from _sha2 import sha256  # type: ignore[import-not-found]  # Python 3.12 and later
+except ImportError:
+    from _sha256 import sha256  # type: ignore[import-not-found]
+
+STOP_PORT: Final = 7448
+"""UDP port beside the default port of a link. Beside another port of a link it is the next higher port, too."""
+DATAGRAM_BYTES: Final = 112
+CHALLENGE_BYTES: Final = 16
+NO_CHALLENGE: Final = bytes(CHALLENGE_BYTES)
+STATES: Final = ("", "DISARMED", "HOLD", "ACTIVE", "DEGRADED", "STOPPED", "FAULT")
+"""States of the gate by their number in a datagram. The first one: the driver process is silent."""
+STOPPED: Final = STATES.index("STOPPED")
+_FORM: Final = struct.Struct(">4s4B32sQ16sQQ")
+_MAGIC: Final = b"STOP"
+_VERSION: Final = 1
+_HMAC_BYTES, _BLOCK_BYTES = 32, 64
+_INNER, _OUTER = (bytes(byte ^ pad for byte in range(256)) for pad in (0x36, 0x5C))
+_AT_REST, _STORED, _KEYED = 1, 2, 4
+
+
+class Kind(IntEnum):
+    """Purpose of a datagram."""
+
+    STOP = 1
+    """To a receiver. With `NO_CHALLENGE`, a receiver with a secret only answers with its challenge."""
+    ANSWER = 2
+    """From a receiver, with the counter of the request."""
+    REGISTER = 3
+    """From a receiver to a router: forward the STOPs of this robot to the sender of this datagram."""
+
+
+class StopDatagram(NamedTuple):
+    """One datagram. Only an answer uses the fields after `challenge`."""
+
+    kind: Kind
+    robot: str
+    counter: int
+    challenge: bytes = NO_CHALLENGE
+    state: int = 0
+    at_rest: bool = False
+    stored: bool = False
+    keyed: bool = False
+    received: int = 0
+    applied: int = 0
+
+
+def pack_stop(one: StopDatagram, secret: bytes = b"") -> bytes:
+    """Encode a datagram, with an HMAC if there is a secret."""
+    flags = _AT_REST * one.at_rest | _STORED * one.stored | _KEYED * one.keyed
+    head = _FORM.pack(_MAGIC, _VERSION, one.kind, one.state, flags, one.robot.encode("ascii"), one.counter,
+                      one.challenge, one.received, one.applied)
+    return head + (_hmac(head, secret) if secret else bytes(_HMAC_BYTES))
+
+
+def unpack_stop(data: bytes) -> StopDatagram:
+    """Decode a datagram in constant time. Does not check the HMAC.
+
+    Raises:
+        WireError: MALFORMED, or UNSUPPORTED_VERSION.
+    """
+    if len(data) != DATAGRAM_BYTES:
+        raise WireError(RejectReason.MALFORMED, f"a STOP datagram has {DATAGRAM_BYTES} bytes")
+    magic, version, kind, state, flags, robot, counter, challenge, received, applied = _FORM.unpack_from(data)
+    if magic != _MAGIC:
+        raise WireError(RejectReason.MALFORMED, "a STOP datagram begins with STOP")
+    if version != _VERSION:
+        raise WireError(RejectReason.UNSUPPORTED_VERSION, f"version {version % 256}, expected {_VERSION}")
+    name = robot.rstrip(b"\0")
+    if not Kind.STOP <= kind <= Kind.REGISTER or state >= len(STATES) or not name.isascii():
+        raise WireError(RejectReason.MALFORMED, "unknown kind or state, or an invalid robot id")
+    return StopDatagram(Kind(kind), name.decode("ascii"), counter, challenge, state, bool(flags & _AT_REST),
+                        bool(flags & _STORED), bool(flags & _KEYED), received, applied)
+
+
+def check_hmac(data: bytes, secret: bytes) -> None:
+    """Raise WireError WRONG_KEY unless `data` ends in the HMAC of `secret`. Takes constant time."""
+    # In constant time: otherwise the time of the answer reveals the correct part of a guess.
+    if not compare_digest(data[_FORM.size :], _hmac(data[: _FORM.size], secret)):
+        raise WireError(RejectReason.WRONG_KEY, "the HMAC is not that of this STOP secret")
+
+
+def _hmac(head: bytes, secret: bytes) -> bytes:
+    """Return HMAC-SHA256. The module `hmac` loads OpenSSL, 3 MB, for the same. Source: RFC 2104."""
+    key = (secret if len(secret) <= _BLOCK_BYTES else sha256(secret).digest()).ljust(_BLOCK_BYTES, b"\0")
+    inner = sha256(key.translate(_INNER) + head).digest()
+    return bytes(sha256(key.translate(_OUTER) + inner).digest())
+
+
+# The side that sends STOP: the datagrams to send, and when an answer proves the stop.
+
+
+_UNANSWERED: Final = 5
+"""After this many STOPs without an answer, the receiver may have started again, with another challenge."""
+
+
+class StopRequests:
+    """STOP of one robot, for one sender. The caller sends `datagrams()` repeatedly and hands in each answer."""
+
+    def __init__(self, robot: str, secret: bytes, counter: int) -> None:
+        """Begin a STOP.
+
+        Args:
+            robot: robot id.
+            secret: STOP secret, or b"" without keys.
+            counter: random start below 2^63. A third party cannot guess a counter that was sent.
+        """
+        self.answer: StopDatagram | None = None
+        """Newest answer."""
+        self._robot, self._secret = robot, secret
+        self._first = self._next = counter
+        self._challenge = NO_CHALLENGE
+        self._unanswered = 0
+        self._since: int | None = None
+        """Number of this STOP at the receiver: what it has applied must be this one or a later one."""
+
+    def datagrams(self) -> list[bytes]:
+        """Return what to send now: a STOP, and with a secret the request for the challenge while it is not known."""
+        challenges = {self._challenge}
+        if self._secret and self._unanswered >= _UNANSWERED:
+            challenges.add(NO_CHALLENGE)
+        self._unanswered += 1
+        return [self._pack(challenge) for challenge in sorted(challenges)]
+
+    def _pack(self, challenge: bytes) -> bytes:
+        self._next += 1
+        return pack_stop(StopDatagram(Kind.STOP, self._robot, self._next, challenge), self._secret)
+
+    def on_datagram(self, data: bytes) -> bool:
+        """Take a datagram from the network. Returns True for a new challenge: send the STOP immediately.
+
+        Anything but an answer to this STOP is ignored, and with a secret also an answer without its HMAC.
+        """
+        try:
+            one = unpack_stop(data)
+            if self._secret:
+                check_hmac(data, self._secret)
+        except WireError:
+            return False
+        if one.kind is not Kind.ANSWER or one.robot != self._robot or not self._first < one.counter <= self._next:
+            return False
+        self._unanswered = 0
+        # Another challenge is another start of the receiver, whose numbers cannot be compared with those before.
+        is_new = one.challenge != self._challenge
+        if is_new:
+            self._challenge, self._since = one.challenge, None
+        # An answer to a request for the challenge has no number: it was not counted as a STOP.
+        if one.received:
+            self._since = min(one.received, self._since or one.received)
+        self.answer = one
+        return is_new and bool(self._secret)
+
+    @property
+    def is_latched(self) -> bool:
+        """Return True once the robot has applied this STOP. Its wheels may still turn."""
+        one = self.answer
+        return one is not None and self._since is not None and one.applied >= self._since and one.state == STOPPED
+
+    @property
+    def is_stopped(self) -> bool:
+        """Return True once the robot has applied this STOP and its wheels are at zero."""
+        return self.is_latched and self.answer is not None and self.answer.at_rest
+
+    @property
+    def is_stored(self) -> bool:
+        """Return True if the STOP is on the disk of the robot, too."""
+        return self.is_stopped and self.answer is not None and self.answer.stored
+
+    @property
+    def lacks_secret(self) -> bool:
+        """Return True if the receiver accepts only datagrams with an HMAC, and this side has no secret."""
+        return not self._secret and self.answer is not None and self.answer.keyed

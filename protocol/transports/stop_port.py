@@ -1,0 +1,226 @@
+"""Serve the STOP port in a process of its own, which does nothing else. Shell (sockets); standard library only."""
+
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from typing import Any, Final
+
+Address = tuple[str, int]
+Origin = tuple[int, Address]
+Replies = Iterable[tuple[bytes, Origin]]
+
+_AT_ONCE: Final = 64
+"""Datagrams of one socket before the next one is read, so that a flood on one address does not hold up another."""
+_PERIOD_MS: Final = 100
+_RETRY_US: Final = 1_000_000
+_LONGEST: Final = 2048
+_KEYS: Final = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP)
+
+
+def now_us() -> int:
+    """Return the monotonic time, us."""
+    return time.monotonic_ns() // 1000
+
+
+class StopPort:
+    """UDP sockets on a set of addresses, and the pipe to the process that started this one."""
+
+    def __init__(self, pipe: socket.socket, addresses: Sequence[Address], *, outgoing: bool = False) -> None:
+        """Bind the addresses. An address that is in use is tried again each second.
+
+        Args:
+            pipe: `SOCK_SEQPACKET` end; `serve` returns when the other end is closed.
+            addresses: to listen on.
+            outgoing: whether to open a socket for datagrams that begin here, on a free port.
+        """
+        self._pipe, self._missing = pipe, list(addresses)
+        self._sockets: dict[int, socket.socket] = {}
+        self._poll = select.poll()
+        self._poll.register(pipe, select.POLLIN)
+        self._retry_us = 0
+        self.outgoing = -1
+        if outgoing:
+            self.outgoing = self._add(_bound(("0.0.0.0", 0)))
+        self._bind_missing()
+
+    def _add(self, one: socket.socket) -> int:
+        one.setblocking(False)
+        self._sockets[one.fileno()] = one
+        self._poll.register(one, select.POLLIN)
+        return one.fileno()
+
+    def _bind_missing(self) -> None:
+        # An address that is missing at start may come later: a Wi-Fi that is not up yet, or a receiver that still ends.
+        first = self._retry_us == 0
+        self._retry_us = now_us() + _RETRY_US
+        for address in list(self._missing):
+            try:
+                self._add(_bound(address))
+            except OSError as error:
+                if first:
+                    self.log(f"STOP port {address[0]}:{address[1]}/udp: {error.strerror}; trying again, until then "
+                             "STOP needs the link")
+                continue
+            self._missing.remove(address)
+            if not first:
+                self.log(f"STOP port {address[0]}:{address[1]}/udp is open")
+
+    def log(self, line: str) -> None:
+        """Send a line for the log."""
+        self.send(b"L" + line.encode())
+
+    def send(self, packet: bytes) -> bool:
+        """Send a packet to the process that started this one; False if there is no room."""
+        # Never wait: while no process reads the pipe, a STOP is in it already.
+        try:
+            self._pipe.send(packet, socket.MSG_DONTWAIT)
+        except OSError:
+            return False
+        return True
+
+    def send_to(self, data: bytes, origin: Origin) -> None:
+        """Send a datagram or drop it."""
+        with suppress(OSError, KeyError):
+            self._sockets[origin[0]].sendto(data, origin[1])
+
+    def serve(
+        self, on_datagram: Callable[[bytes, Origin], Replies], on_packet: Callable[[bytes], None],
+        on_turn: Callable[[], None],
+    ) -> None:
+        """Hand over what arrives until the pipe closes; `on_turn` runs after each round and ten times a second."""
+        while True:
+            ready = self._poll.poll(_PERIOD_MS)
+            for number, _ in ready:
+                if number in self._sockets:
+                    self._read(number, on_datagram)
+                elif not self._read_pipe(on_packet):
+                    return
+            on_turn()
+            if self._missing and now_us() >= self._retry_us:
+                self._bind_missing()
+
+    def _read(self, number: int, on_datagram: Callable[[bytes, Origin], Replies]) -> None:
+        one = self._sockets[number]
+        # In portions, so that the pipe is read between them whatever arrives.
+        for _ in range(_AT_ONCE):
+            try:
+                data, address = one.recvfrom(_LONGEST)
+            except BlockingIOError:
+                return
+            except OSError:  # the report of a host that has no such port, for an earlier datagram
+                continue
+            for reply, origin in on_datagram(data, (number, address)):
+                self.send_to(reply, origin)
+
+    def _read_pipe(self, on_packet: Callable[[bytes], None]) -> bool:
+        try:
+            packet = self._pipe.recv(_LONGEST, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return True
+        except OSError:
+            return False
+        if packet:
+            on_packet(packet)
+        return bool(packet)
+
+
+def _bound(address: Address) -> socket.socket:
+    family, kind, number, _, place = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)[0]
+    one = socket.socket(family, kind, number)
+    try:
+        one.bind(place)
+    except OSError:
+        one.close()
+        raise
+    return one
+
+
+def read_arguments() -> tuple[socket.socket, dict[str, Any]]:
+    """Return the pipe and the options of this process, see `StopProcess`. The keys of a terminal do not end it."""
+    for number in _KEYS:
+        signal.signal(number, signal.SIG_IGN)
+    return socket.socket(fileno=int(sys.argv[1])), json.loads(sys.argv[2])
+
+
+def read_secret(file: str) -> bytes:
+    """Return the STOP secret in `file`, b"" for no file."""
+    if not file:
+        return b""
+    with open(file, "rb") as secret:  # noqa: PTH123  pathlib takes a megabyte
+        return secret.read().strip()
+
+
+# The side that starts such a process.
+
+
+_RESTART_US: Final = 1_000_000
+_CHILD: Final = (
+    "import sys; top = type(sys)('sightline'); top.__path__ = [sys.argv.pop(1)]; sys.modules['sightline'] = top; "
+    "from sightline.{} import main; main()"
+)
+"""Without Python's site module, which takes 2 MB, only the folder of our packages is found."""
+
+
+class StopProcess:
+    """A process that serves the STOP port. It ends when no process holds `near` any longer."""
+
+    def __init__(self, module: str, options: dict[str, Any]) -> None:
+        """Prepare it; `keep_alive` starts it.
+
+        Args:
+            module: with a function `main`, below `sightline`.
+            options: for that function, as JSON.
+        """
+        self.near, self._far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        """`near` is the end of the process that applies a STOP. What is sent while no process reads it waits there."""
+        self.near.setblocking(False)
+        self._module, self._options = module, json.dumps(options)
+        self._process: Any = None
+        self._start_at_us = 0
+
+    def keep_alive(self, at_us: int) -> None:
+        """Start it if it is not there, at most once a second."""
+        if at_us < self._start_at_us:
+            return
+        self._start_at_us = at_us + _RESTART_US
+        if self._process is None or self._process.poll() is not None:
+            # Here, because the process itself would pay for it too.
+            import subprocess
+
+            root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
+            number = self._far.fileno()
+            command = [sys.executable, "-I", "-S", "-c", _CHILD.format(self._module), root, str(number), self._options]
+            with suppress(OSError):  # no process or descriptor is left; later there may be
+                self._process = subprocess.Popen(command, pass_fds=[number], stdin=subprocess.DEVNULL)
+
+    def close(self) -> None:
+        """End it."""
+        self.near.close()
+        self._far.close()
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+
+
+def read_packets(near: socket.socket) -> Iterable[bytes]:
+    """Yield what a STOP process has sent, a bounded number of packets."""
+    for _ in range(_AT_ONCE):
+        try:
+            packet = near.recv(_LONGEST)
+        except OSError:
+            return
+        if not packet:
+            return
+        yield packet
+
+
+def send_packet(near: socket.socket, packet: bytes) -> None:
+    """Send a STOP process a packet, or drop it."""
+    with suppress(OSError):
+        near.send(packet)

@@ -1,0 +1,244 @@
+"""Logic of the STOP port: of the receiver beside a driver process, and of the forwarder beside a router. Pure.
+
+Packets between receiver and driver process, over one `SOCK_SEQPACKET` pair that outlives both:
+
+    receiver -> driver   `S` number                              a valid STOP came
+                         `C` reason count ... address            datagrams that were ignored since the last such packet
+                         `L` text                                a line for the log
+    driver -> receiver   `R` number state at_rest stored         newest applied STOP, and the state now
+"""
+
+import struct
+from collections import Counter, OrderedDict
+from collections.abc import Hashable
+from typing import Final, NamedTuple
+
+from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.transports.stop_datagram import (
+    NO_CHALLENGE,
+    STATES,
+    Kind,
+    StopDatagram,
+    check_hmac,
+    pack_stop,
+    unpack_stop,
+)
+
+_NUMBER: Final = struct.Struct(">cQ")
+_REPORT: Final = struct.Struct(">cQB??")
+_SILENT_US: Final = 500_000
+"""A driver process reports ten times a second. After this time its state is unknown."""
+_LOST_US: Final = 50_000
+"""A live driver process applies a STOP within a tick. One that reports without it never read it: its predecessor did,
+and died with it."""
+
+
+class DriverReport(NamedTuple):
+    """State of the driver process: `applied` is the number of the newest STOP that it has latched."""
+
+    applied: int
+    state: str
+    at_rest: bool
+    stored: bool
+
+
+def pack_report(report: DriverReport) -> bytes:
+    """Encode a report."""
+    return _REPORT.pack(b"R", report.applied, STATES.index(report.state), report.at_rest, report.stored)
+
+
+def pack_number(number: int) -> bytes:
+    """Encode that a valid STOP came."""
+    return _NUMBER.pack(b"S", number)
+
+
+def unpack_number(packet: bytes) -> int:
+    """Decode a packet of `pack_number`."""
+    return int(_NUMBER.unpack(packet)[1])
+
+
+def pack_ignored(counts: Counter[str], address: str) -> bytes:
+    """Encode how many datagrams were ignored, by reason, and the address of the last one."""
+    return b"C" + " ".join([*(f"{reason} {count}" for reason, count in counts.items()), address]).encode()
+
+
+def unpack_ignored(packet: bytes) -> tuple[dict[str, int], str]:
+    """Decode a packet of `pack_ignored`."""
+    *words, address = packet[1:].decode().split(" ")
+    return dict(zip(words[::2], map(int, words[1::2]), strict=True)), address
+
+
+class ReceiverCore:
+    """STOP port of one robot."""
+
+    def __init__(self, robot: str, secret: bytes, challenge: bytes, number: int) -> None:
+        """Begin without a report of the driver process.
+
+        Args:
+            robot: robot id.
+            secret: STOP secret, or b"" to accept every STOP.
+            challenge: random bytes of this start.
+            number: of the STOPs so far; above that of any earlier receiver, e.g. the time since boot, us.
+        """
+        self._robot, self._secret, self._challenge = robot, secret, challenge
+        self._received = self._sent = self._applied = number
+        self._sent_us = self._report_us = 0
+        self._report = DriverReport(0, "", False, False)
+        self._has_lost = False
+
+    def on_stop(self, data: bytes, one: StopDatagram, now_us: int) -> bytes:
+        """Take a STOP. Returns the answer.
+
+        Args:
+            data: the datagram.
+            one: the same, decoded.
+            now_us: time of the receiver.
+
+        Raises:
+            WireError: ignore it.
+        """
+        if one.robot != self._robot:
+            raise WireError(RejectReason.OTHER_ROBOT, "for another robot")
+        if self._secret and one.challenge == NO_CHALLENGE:
+            return self._pack(StopDatagram(Kind.ANSWER, self._robot, one.counter, self._challenge, keyed=True))
+        if self._secret:
+            if one.challenge != self._challenge:
+                raise WireError(RejectReason.OTHER_SESSION, "of an earlier start of the robot")
+            check_hmac(data, self._secret)
+        self._received += 1
+        applied, state, at_rest, stored = self._report
+        if now_us - self._report_us > _SILENT_US:
+            state, at_rest = "", False
+        return self._pack(StopDatagram(
+            Kind.ANSWER, self._robot, one.counter, self._challenge, STATES.index(state), at_rest, stored,
+            bool(self._secret), self._received, applied,
+        ))
+
+    def _pack(self, answer: StopDatagram) -> bytes:
+        return pack_stop(answer, self._secret)
+
+    def on_report(self, packet: bytes, now_us: int) -> None:
+        """Take a report of the driver process."""
+        _, applied, state, at_rest, stored = _REPORT.unpack(packet)
+        self._report, self._report_us = DriverReport(applied, STATES[state], at_rest, stored), now_us
+        self._applied = max(self._applied, applied)
+        self._has_lost = self._sent > self._applied and now_us - self._sent_us >= _LOST_US
+
+    def packet(self, now_us: int) -> bytes | None:
+        """Return the STOP to send to the driver process now, or None. One is in flight at a time."""
+        is_free = self._sent <= self._applied or self._has_lost
+        if self._received <= self._applied or not is_free:
+            return None
+        self._sent, self._sent_us, self._has_lost = self._received, now_us, False
+        return pack_number(self._sent)
+
+
+class Registration:
+    """Registers a robot at one router, so that the router forwards STOPs to it."""
+
+    def __init__(self, robot: str, secret: bytes, counter: int) -> None:
+        """Begin. `counter` is a random start, below 2^63."""
+        self._robot, self._secret = robot, secret
+        self._first = self._counter = counter
+        self._challenge = NO_CHALLENGE
+        self._unanswered = 0
+
+    def datagram(self) -> bytes:
+        """Return the datagram to send now, about once a second."""
+        self._unanswered += 1
+        if self._unanswered > 2:  # the router may have started again
+            self._challenge = NO_CHALLENGE
+        self._counter += 1
+        return pack_stop(StopDatagram(Kind.REGISTER, self._robot, self._counter, self._challenge), self._secret)
+
+    def on_answer(self, data: bytes, one: StopDatagram) -> bytes | None:
+        """Take an answer. Returns the next datagram if it must be sent immediately.
+
+        Raises:
+            WireError: it has no valid HMAC.
+        """
+        if not self._first < one.counter <= self._counter:
+            return None
+        if self._secret:
+            check_hmac(data, self._secret)
+        self._unanswered = 0
+        is_new, self._challenge = one.challenge != self._challenge, one.challenge
+        return self.datagram() if is_new and self._secret else None
+
+
+# The forwarder beside a router.
+
+
+MAX_ROBOTS: Final = 1024
+"""Security limit: robots of one router."""
+MAX_PLACES: Final = 8
+"""Security limit: addresses of one robot id. Without keys a third party may register the id too: STOP goes to all."""
+MAX_WAITING: Final = 4096
+"""Security limit: STOPs whose answer may still come."""
+_FRESH_US: Final = 3_000_000
+Origin = tuple[int, tuple[str, int]]
+"""Socket on which a datagram came, and the address of its sender."""
+
+
+class ForwarderCore:
+    """Forwards STOPs to the robots that registered, and the answers back."""
+
+    def __init__(self, secret: bytes, challenge: bytes) -> None:
+        """Begin without robots. With a secret, only robots that know it may register."""
+        self._secret, self._challenge = secret, challenge
+        self._robots: dict[str, dict[str, tuple[Origin, int]]] = {}
+        """Robot id -> host -> address and time of the last registration."""
+        self._waiting: OrderedDict[Hashable, Origin] = OrderedDict()
+
+    def on_datagram(self, data: bytes, origin: Origin, now_us: int) -> list[tuple[bytes, Origin]]:
+        """Take a datagram. Returns what to send.
+
+        Raises:
+            WireError: ignore it.
+        """
+        one = unpack_stop(data)
+        if one.kind is Kind.REGISTER:
+            return self._register(data, one, origin, now_us)
+        if one.kind is Kind.ANSWER:
+            sender = self._waiting.get((one.robot, one.counter))
+            known = origin[1][0] in self._robots.get(one.robot, {})
+            return [(data, sender)] if sender is not None and known else []
+        places = self._robots.get(one.robot)
+        if not places:
+            raise WireError(RejectReason.OTHER_ROBOT, "for a robot that is not registered here")
+        self._waiting[one.robot, one.counter] = origin
+        if len(self._waiting) > MAX_WAITING:
+            self._waiting.popitem(last=False)
+        return [(data, place) for place, _ in places.values()]
+
+    def _register(
+        self, data: bytes, one: StopDatagram, origin: Origin, now_us: int
+    ) -> list[tuple[bytes, Origin]]:
+        if self._secret and one.challenge != NO_CHALLENGE:
+            if one.challenge != self._challenge:
+                raise WireError(RejectReason.OTHER_SESSION, "of an earlier start of the router")
+            check_hmac(data, self._secret)
+        if not self._secret or one.challenge != NO_CHALLENGE:
+            self._place(one.robot, origin, now_us)
+        answer = StopDatagram(Kind.ANSWER, one.robot, one.counter, self._challenge, keyed=bool(self._secret))
+        return [(pack_stop(answer, self._secret), origin)]
+
+    def _place(self, robot: str, origin: Origin, now_us: int) -> None:
+        """Note where a robot is. A robot that still registers is never forgotten for another sender."""
+        if robot not in self._robots and len(self._robots) >= MAX_ROBOTS:
+            quiet = next((name for name, places in self._robots.items() if not _is_fresh(places, now_us)), None)
+            if quiet is None:
+                return
+            del self._robots[quiet]
+        places = self._robots.setdefault(robot, {})
+        host = origin[1][0]
+        if host not in places and len(places) >= MAX_PLACES:
+            oldest = min(places, key=lambda name: places[name][1])
+            if now_us - places[oldest][1] < _FRESH_US:
+                return
+            del places[oldest]
+        places[host] = origin, now_us
+
+
+def _is_fresh(places: dict[str, tuple[Origin, int]], now_us: int) -> bool:
+    return any(now_us - seen_us < _FRESH_US for _, seen_us in places.values())

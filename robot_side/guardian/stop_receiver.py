@@ -1,0 +1,103 @@
+"""The STOP receiver: a process that reads the STOP port of a robot and does nothing else. Shell.
+
+Load on the links cannot hold it up. It imports the standard library only. `start` is for the process that starts it.
+"""
+
+import os
+import time
+from collections import Counter
+from collections.abc import Sequence
+from typing import Final
+
+from sightline.protocol.errors import WireError
+from sightline.protocol.transports.stop_datagram import CHALLENGE_BYTES, Kind, unpack_stop
+from sightline.protocol.transports.stop_port import (
+    Address,
+    Origin,
+    Replies,
+    StopPort,
+    StopProcess,
+    now_us,
+    read_arguments,
+    read_secret,
+)
+from sightline.robot_side.guardian.stop_core import ReceiverCore, Registration, pack_ignored
+
+_REGISTER_S: Final = 1.0
+_REPORT_US: Final = 1_000_000
+
+
+def start(robot: str, addresses: Sequence[Address], routers: Sequence[Address], secret_file: str) -> StopProcess:
+    """Prepare the receiver of one robot; `keep_alive` of what is returned starts it.
+
+    Args:
+        robot: robot id.
+        addresses: UDP addresses to listen on.
+        routers: UDP addresses of routers, which forward STOPs.
+        secret_file: file of the STOP secret, or "" to accept every STOP.
+    """
+    options = {"robot": robot, "addresses": addresses, "routers": routers, "secret_file": secret_file}
+    return StopProcess("robot_side.guardian.stop_receiver", options)
+
+
+class StopReceiver:
+    """Connects the sockets to the logic."""
+
+    def __init__(self, port: StopPort, robot: str, secret: bytes, routers: Sequence[Address]) -> None:
+        self._port = port
+        self._core = ReceiverCore(robot, secret, os.urandom(CHALLENGE_BYTES), now_us())
+        self._routers = [(address, Registration(robot, secret, _random())) for address in routers]
+        self._ignored: Counter[str] = Counter()
+        self._ignored_from = ""
+        self._report_us = 0
+        if routers:
+            import threading  # for a robot that connects to a router only
+
+            # A thread, because a name server may take seconds.
+            threading.Thread(target=self._register_all, name="registration", daemon=True).start()
+
+    def _register_all(self) -> None:
+        while True:
+            for address, registration in self._routers:
+                self._port.send_to(registration.datagram(), (self._port.outgoing, address))
+            time.sleep(_REGISTER_S)
+
+    def on_datagram(self, data: bytes, origin: Origin) -> Replies:
+        """Answer a datagram, or ignore and count it."""
+        try:
+            one = unpack_stop(data)
+            if one.kind is Kind.ANSWER and self._routers:
+                answers = (registration.on_answer(data, one) for _, registration in self._routers)
+                return [(answer, origin) for answer in answers if answer is not None]
+            return [(self._core.on_stop(data, one, now_us()), origin)]
+        except WireError as error:
+            self._ignored[error.reason] += 1
+            self._ignored_from = origin[1][0]
+            return ()
+
+    def on_report(self, packet: bytes) -> None:
+        """Take a report of the driver process."""
+        self._core.on_report(packet, now_us())
+
+    def on_turn(self) -> None:
+        """Send the driver process what is new."""
+        packet = self._core.packet(now_us())
+        if packet is not None:
+            self._port.send(packet)
+        if self._ignored and now_us() >= self._report_us:
+            self._report_us = now_us() + _REPORT_US
+            if self._port.send(pack_ignored(self._ignored, self._ignored_from)):
+                self._ignored.clear()
+
+
+def _random() -> int:
+    return int.from_bytes(os.urandom(7), "big")
+
+
+def main() -> None:
+    """Run the receiver until no process holds the other end of its pipe."""
+    pipe, options = read_arguments()
+    addresses, routers = ([(host, port) for host, port in options[key]] for key in ("addresses", "routers"))
+    port = StopPort(pipe, addresses, outgoing=bool(routers))
+    receiver = StopReceiver(port, options["robot"], read_secret(options["secret_file"]), routers)
+    port.serve(receiver.on_datagram, receiver.on_report, receiver.on_turn)

@@ -1,0 +1,178 @@
+"""STOP by datagrams and by the link at the same time: either of both proves it, and neither holds up the other."""
+
+import socket
+import threading
+import time
+from contextlib import contextmanager
+
+import pytest
+
+from sightline.operator_side.client import stop as client
+from sightline.operator_side.client.stop import StopSender, stop_robot
+from sightline.protocol.errors import LinkError, RejectReason, WireError
+from sightline.protocol.messages import State, Status
+from sightline.protocol.transports.stop_datagram import unpack_stop
+from sightline.robot_side.guardian.stop_core import DriverReport, ReceiverCore, pack_report, unpack_number
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
+
+
+class Robot:
+    """A STOP receiver and a driver process, whose wheels need `turns_s` to zero, on a thread of this process."""
+
+    def __init__(self, port, *, secret=b"", turns_s=0.0, stored=True, state="STOPPED"):
+        self.core = ReceiverCore("r1", secret, b"c" * 16, 50)
+        self.turns_s, self.stored, self.state = turns_s, stored, state
+        self.reasons, self.stopped_s = [], 0.0
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", port))
+        self._socket.settimeout(0.02)
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self):
+        applied = 0
+        while not self._ending.is_set():
+            if packet := self.core.packet(0):
+                applied, self.stopped_s = unpack_number(packet), self.stopped_s or time.monotonic()
+                if self.state != "STOPPED":
+                    applied = 0
+            at_rest = bool(self.stopped_s) and time.monotonic() - self.stopped_s >= self.turns_s
+            state = self.state if self.stopped_s else "ACTIVE"
+            self.core.on_report(pack_report(DriverReport(applied, state, at_rest, at_rest and self.stored)), 0)
+            try:
+                data, place = self._socket.recvfrom(2048)
+                self._socket.sendto(self.core.on_stop(data, unpack_stop(data), 0), place)
+            except TimeoutError:
+                continue
+            except WireError as error:
+                self.reasons.append(error.reason)
+
+    def close(self):
+        self._ending.set()
+        self._thread.join()
+        self._socket.close()
+
+
+@pytest.fixture
+def port():
+    return free_port()
+
+
+@pytest.fixture
+def robot(port):
+    made = []
+
+    def start(**options):
+        made.append(Robot(port, **options))
+        return made[0]
+
+    yield start
+    for one in made:
+        one.close()
+
+
+@pytest.fixture
+def link(monkeypatch):
+    """Replace the link: `link.opens` raises, hangs, or returns a status."""
+
+    class Links:
+        def __init__(self):
+            self.begun_s, self.status, self.error, self.hangs = 0.0, None, None, threading.Event()
+
+        @contextmanager
+        def open_link(self, _robot, **_options):
+            self.begun_s = time.monotonic()
+            if self.error:
+                raise self.error
+            yield self
+
+    class LinkOperator:
+        def __init__(self, links):
+            self.links, self.report = links, None
+
+        def stop(self, _on_slow, _timeout_s, is_proven):
+            until(lambda: is_proven() or self.links.status, 5.0)
+            return self.links.status
+
+    links = Links()
+    monkeypatch.setattr(client, "open_link", links.open_link)
+    monkeypatch.setattr(client, "Operator", LinkOperator)
+    return links
+
+
+def stop(port, secret_file="", timeout_s=5.0, on_slow=lambda: None):
+    return stop_robot("r1", [f"tcp/127.0.0.1:{port - 1}"], "", str(secret_file), on_slow, timeout_s=timeout_s)
+
+
+STOPPED = Status(state=State.STOPPED, reason="STOP by operator")
+
+
+def test_stop_returns_when_the_wheels_are_at_zero(robot, link, port):
+    one = robot(turns_s=0.3)
+    done = stop(port, on_slow=lambda: pytest.fail("slow"))
+    assert done.stored and done.status is None and time.monotonic() - one.stopped_s >= 0.3
+
+
+def test_a_link_that_cannot_be_opened_does_not_matter(robot, link, port):
+    link.error = LinkError("no answer")
+    robot()
+    assert stop(port).stored
+
+
+def test_without_an_answer_the_status_of_the_link_proves_the_stop(link, port):
+    link.status = STOPPED
+    done = stop(port)
+    assert done.status is STOPPED and done.stored
+
+
+def test_without_an_answer_the_error_of_the_link_is_reported(link, port):
+    link.error = LinkError("no answer from tcp/127.0.0.1:1")
+    with pytest.raises(LinkError, match="no answer from tcp"):
+        stop(port)
+
+
+def test_a_stop_that_the_disk_does_not_store_is_reported(robot, link, port, monkeypatch):
+    monkeypatch.setattr(client, "_STORED_S", 0.1)
+    robot(stored=False)
+    assert not stop(port).stored
+
+
+def test_a_robot_that_goes_on_ends_in_an_error_and_a_warning(robot, link, port):
+    robot(state="ACTIVE")
+    slow = []
+    with pytest.raises(LinkError, match=r"did not confirm STOP within 0\.5 s; cut its power by hand"):
+        stop(port, timeout_s=0.5, on_slow=lambda: slow.append(1))
+    assert slow == [1]
+
+
+def test_with_keys_the_secret_is_used(robot, link, port, tmp_path):
+    (tmp_path / "stop.secret").write_text("of this site\n")
+    one = robot(secret=b"of this site")
+    assert stop(port, tmp_path / "stop.secret").stored and one.reasons == []
+
+
+def test_keys_of_another_deployment_stop_nothing(robot, link, port, tmp_path):
+    (tmp_path / "stop.secret").write_text("of another site\n")
+    one = robot(secret=b"of this site")
+    with pytest.raises(LinkError, match="did not confirm"):
+        stop(port, tmp_path / "stop.secret", timeout_s=0.4)
+    assert not one.stopped_s
+
+
+def test_a_missing_secret_is_named(robot, link, port):
+    robot(secret=b"of this site")
+    with pytest.raises(LinkError, match=r"copy stop\.secret"):
+        stop(port, timeout_s=0.4)
+
+
+def test_datagrams_go_on_until_the_sender_is_closed(robot, port):
+    one = robot()
+    with StopSender("r2", [f"tcp/127.0.0.1:{port - 1}"]) as sender:
+        assert until(lambda: len(one.reasons) > 3)
+        assert set(one.reasons) == {RejectReason.OTHER_ROBOT} and not sender.is_answered
+    sender._thread.join()
+    count = len(one.reasons)
+    time.sleep(0.1)
+    assert len(one.reasons) == count

@@ -1,0 +1,194 @@
+"""The STOP receiver as a process: small, only the standard library, deaf to anything but a valid STOP."""
+
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sightline.protocol.transports.stop_datagram import DATAGRAM_BYTES, StopRequests, pack_stop, unpack_stop
+from sightline.protocol.transports.stop_port import now_us, read_packets, send_packet
+from sightline.robot_side.guardian import stop_forwarder, stop_receiver
+from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
+from tests.fixtures.links import START_S, until
+from tests.fixtures.ports import free_port
+
+MAX_RSS_KIB = 15_000
+FOREIGN = """
+import sys
+import sightline.robot_side.guardian.stop_receiver, sightline.robot_side.guardian.stop_forwarder
+names = {name.partition(".")[0] for name in sys.modules} - sys.stdlib_module_names - {"__main__"}
+print(*sorted(name for name in names if not name.startswith("__editable__")))
+"""
+
+
+class Driver:
+    """A driver process that applies each STOP and reports it, as far as `turn` is called."""
+
+    def __init__(self, process):
+        self.near, self.applied, self.ignored = process.near, 0, {}
+
+    def turn(self):
+        for packet in read_packets(self.near):
+            if packet.startswith(b"S"):
+                self.applied = unpack_number(packet)
+            elif packet.startswith(b"C"):
+                for reason, count in unpack_ignored(packet)[0].items():
+                    self.ignored[reason] = self.ignored.get(reason, 0) + count
+        state = "STOPPED" if self.applied else "ACTIVE"
+        send_packet(self.near, pack_report(DriverReport(self.applied, state, bool(self.applied), True)))
+
+
+@pytest.fixture
+def operator():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.setblocking(False)
+        yield one
+
+
+@pytest.fixture
+def started():
+    running = []
+
+    def start(process):
+        running.append(process)
+        process.keep_alive(now_us())
+        return process
+
+    yield start
+    for process in running:
+        process.close()
+
+
+def stop(operator, address, driver, requests):
+    """Send STOP until the answer proves it."""
+
+    def proven():
+        for data in requests.datagrams():
+            operator.sendto(data, address)
+        time.sleep(0.005)
+        driver.turn()
+        while True:
+            try:
+                requests.on_datagram(operator.recv(2048))
+            except OSError:
+                return requests.is_stored
+
+    return until(proven, START_S)
+
+
+@pytest.mark.parametrize("secret", [b"", b"a secret of this site"])
+def test_receiver_answers_stop_and_stays_below_15_mb(started, operator, tmp_path, secret):
+    file = tmp_path / "stop.secret"
+    file.write_bytes(secret + b"\n")
+    address = ("127.0.0.1", free_port())
+    process = started(stop_receiver.start("r1", [address], [], str(file) if secret else ""))
+    assert stop(operator, address, Driver(process), StopRequests("r1", secret, 7))
+    status = Path(f"/proc/{process._process.pid}/status").read_text()
+    assert int(status.partition("VmRSS:")[2].split()[0]) <= MAX_RSS_KIB
+
+
+def test_both_processes_import_only_the_standard_library():
+    done = subprocess.run([sys.executable, "-c", FOREIGN], capture_output=True, text=True, timeout=30, check=True)
+    assert done.stdout.split() == ["sightline"]
+
+
+def test_bad_datagrams_of_every_length_have_no_effect_but_a_count(started, operator):
+    address = ("127.0.0.1", free_port())
+    process = started(stop_receiver.start("r1", [address], [], ""))
+    driver = Driver(process)
+    assert stop(operator, address, driver, StopRequests("r1", b"", 7))
+    applied = driver.applied
+    for length in range(2001):
+        operator.sendto(b"S" * length, address)
+        if length % 50 == 0:
+            time.sleep(0.001)  # its socket holds some hundred
+    for data in StopRequests("r2", b"", 7).datagrams():
+        operator.sendto(data, address)
+
+    def counted():
+        driver.turn()
+        return driver.ignored.get("OTHER_ROBOT") == 1
+
+    assert until(counted, START_S)
+    assert 0.9 * 2001 <= driver.ignored["MALFORMED"] <= 2001 and driver.applied == applied
+    with pytest.raises(BlockingIOError):
+        operator.recv(2048)
+    assert stop(operator, address, driver, StopRequests("r1", b"", 70))
+
+
+def test_receiver_outlives_a_driver_process_and_ends_with_the_last_holder_of_its_pipe(started, operator):
+    address = ("127.0.0.1", free_port())
+    process = started(stop_receiver.start("r1", [address], [], ""))
+    assert stop(operator, address, Driver(process), StopRequests("r1", b"", 7))
+    operator.sendto(StopRequests("r1", b"", 70).datagrams()[0], address)  # no driver process lives
+    later = Driver(process)
+    assert until(lambda: later.turn() or later.applied, START_S)
+    process.near.close()
+    assert until(lambda: process._process.poll() == 0, START_S)
+
+
+def test_a_killed_receiver_is_started_again(started, operator):
+    address = ("127.0.0.1", free_port())
+    process = started(stop_receiver.start("r1", [address], [], ""))
+    driver = Driver(process)
+    assert stop(operator, address, driver, StopRequests("r1", b"", 7))
+    process._process.kill()
+    process._process.wait()
+    process.keep_alive(now_us() + 2_000_000)
+    assert stop(operator, address, driver, StopRequests("r1", b"", 70))
+
+
+def test_a_port_in_use_is_reported_and_opened_later(started, operator):
+    address = ("127.0.0.1", free_port())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(address)
+        process = started(stop_receiver.start("r1", [address], [], ""))
+        lines = []
+        assert until(lambda: lines.extend(read_packets(process.near)) or lines, START_S)
+        assert lines[0].startswith(b"LSTOP port 127.0.0.1:") and b"in use" in lines[0]
+    assert stop(operator, address, Driver(process), StopRequests("r1", b"", 7))
+
+
+@pytest.mark.parametrize("secret", [b"", b"a secret of this site"])
+def test_behind_a_router_stop_is_forwarded_and_answered(started, operator, tmp_path, secret):
+    file = tmp_path / "stop.secret"
+    file.write_bytes(secret)
+    name, router = str(file) if secret else "", ("127.0.0.1", free_port())
+    started(stop_forwarder.start([router], name))
+    robot = started(stop_receiver.start("r1", [], [router], name))
+    assert stop(operator, router, Driver(robot), StopRequests("r1", secret, 7))
+
+
+def test_with_keys_datagrams_of_an_earlier_start_are_ignored(started, operator, tmp_path):
+    file = tmp_path / "stop.secret"
+    file.write_bytes(b"secret")
+    address, recorded = ("127.0.0.1", free_port()), []
+
+    class Recorder:
+        def sendto(self, data, to):
+            recorded.append(data)
+            operator.sendto(data, to)
+
+        recv = operator.recv
+
+    first = started(stop_receiver.start("r1", [address], [], str(file)))
+    assert stop(Recorder(), address, Driver(first), StopRequests("r1", b"secret", 7))
+    first.close()
+    second = started(stop_receiver.start("r1", [address], [], str(file)))
+    driver = Driver(second)
+    signed = [data for data in recorded if any(unpack_stop(data).challenge)]
+
+    def ignored():
+        for data in signed:
+            operator.sendto(data, address)
+        driver.turn()
+        return driver.ignored.get("OTHER_SESSION")
+
+    assert signed and len(signed[0]) == DATAGRAM_BYTES and until(ignored, START_S)
+    assert driver.applied == 0
+    forged = unpack_stop(signed[0])._replace(counter=9)
+    operator.sendto(pack_stop(forged, b"another"), address)
+    assert until(lambda: driver.turn() or "OTHER_SESSION" in driver.ignored, START_S) and driver.applied == 0
