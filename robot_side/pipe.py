@@ -16,6 +16,7 @@ reads ISSUED before it validates a RAW: it was sent before the frame, so it is t
 
 import json
 import logging
+import signal
 import socket
 import struct
 import subprocess
@@ -241,6 +242,8 @@ _LONGEST_BACKOFF_US = 2_000_000
 _WEDGED_US = 2_000_000
 _STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card
 _END_S = 1.0
+KEYS: Final = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP)
+"""Ctrl-C, Ctrl-\\ and Ctrl-Z reach the network process too. It ignores them; the driver ends it, after zero."""
 _CHILD: Final = (
     "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); "
     "from sightline.robot_side.network.process import main; main()"
@@ -297,13 +300,15 @@ class DriverEnd:
     def _start(self, first_seq: int) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         aside, their_aside = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with ExitStack() as undo, theirs, their_aside:
+        with ExitStack() as undo, ExitStack() as unmask, theirs, their_aside:
             for end in (ours, aside):
                 undo.callback(end.close)
                 end.setblocking(False)
             setup = NetworkSetup(config=self._config, session=self._session, first_seq=first_seq)
             ours.send(setup.model_dump_json().encode())
             ends = (theirs.fileno(), their_aside.fileno())
+            # The child inherits the mask, so a key does not interrupt its imports; later it ignores these signals.
+            unmask.callback(signal.pthread_sigmask, signal.SIG_SETMASK, signal.pthread_sigmask(signal.SIG_BLOCK, KEYS))
             self._process = subprocess.Popen(_command(ends), pass_fds=ends, stdin=subprocess.DEVNULL)
             undo.pop_all()
         self.socket, self._aside = ours, aside

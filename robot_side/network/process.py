@@ -25,7 +25,7 @@ from sightline.protocol.transports.open import Relay, open_link
 from sightline.protocol.transports.zenoh.session import report_floods
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.network.core import NetworkCore
-from sightline.robot_side.pipe import NetworkEnd, NetworkSetup
+from sightline.robot_side.pipe import KEYS, NetworkEnd, NetworkSetup
 from sightline.robot_side.plugins import CAMERAS
 from sightline.robot_side.ports import Camera, Picture
 
@@ -63,7 +63,6 @@ _CAMERA_TIMEOUT_S = 0.2
 _CAMERA_RETRY_S = 0.5
 _LONGEST_NAP_S = 0.1
 _LEAVES_WITHIN_S = 3.0
-_KEYS = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP)  # Ctrl-C, Ctrl-\ and Ctrl-Z
 
 
 class NetworkProcess:
@@ -224,8 +223,9 @@ def _run(driver: NetworkEnd) -> None:
 def main() -> None:
     """Run the network process. argv[1] and argv[2] are the descriptors of its sockets."""
     start_log(None, "robot")
-    for number in _KEYS:  # they reach the whole group; the driver ends us, after zero
+    for number in KEYS:
         signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, KEYS)
     driver = NetworkEnd(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
     code = 1
     try:

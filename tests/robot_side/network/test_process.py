@@ -1,6 +1,10 @@
 """The network process: the driver process knows a frame before it leaves, and one thread at a time uses the credit."""
 
+import signal
 import socket
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -11,7 +15,7 @@ from sightline.protocol.transports.link import Message
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.network.process import NetworkProcess
-from sightline.robot_side.pipe import DriverEnd, NetworkEnd, NetworkSetup
+from sightline.robot_side.pipe import KEYS, DriverEnd, NetworkEnd, NetworkSetup
 from sightline.robot_side.ports import Picture
 
 ROBOT = "0000000a"
@@ -164,3 +168,20 @@ def test_each_use_of_the_credit_holds_the_lock(process, act, names):
     act(process)
     assert core.locked == dict.fromkeys(names, True)
     assert not process._lock.locked(), "and gives it back"
+
+
+@pytest.mark.parametrize("number", KEYS)
+def test_a_key_during_a_start_of_the_network_process_does_not_end_it(tmp_path, monkeypatch, number):
+    """Whatever it does then, e.g. importing, a traceback would be the last that the operator reads."""
+    monkeypatch.setattr(ipc, "_command", lambda _ends: [sys.executable, "-c", "import time; time.sleep(30)"])
+    driver_end = DriverEnd(RobotConfig(state_dir=tmp_path), ROBOT)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    driver_end.keep_alive(1, 0)
+    started = driver_end._process
+    started.send_signal(number)
+    with pytest.raises(subprocess.TimeoutExpired):
+        started.wait(0.3)
+    assert Path(f"/proc/{started.pid}/stat").read_text().split()[2] != "T"
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before, "the driver gets its keys again"
+    started.kill()
+    driver_end.close()
