@@ -2,7 +2,8 @@
 
 image     base64 of the JPEG, a newline after every 76 characters and at the end
 twist     `linear|angular`, as in `sightline.protocol.text`
-dashed    `linear-angular`, opt-in; swapped, another option, `angular-linear`: as the legacy robot read the two
+dashed    `linear-angular`, opt-in; swapped, another option, `angular-linear`: as the legacy robot read the two.
+          A legacy robot splits it at each `-`, so that it cannot read a negative number
 boxes     `y_min,x_min,y_max,x_max` or `class,x_min,y_min,x_max,y_max`, joined by `-`, opt-in: fractions of the
           image's height and width; in both, a reader of the legacy protocol finds x in the 2nd and 4th field
 """
@@ -106,6 +107,28 @@ class LegacyBox:
         """Raise ValueError for a box that is not inside the image."""
         if not (0 <= self.y_min <= self.y_max <= 1 and 0 <= self.x_min <= self.x_max <= 1):
             raise ValueError(f"{self} is outside the image")
+
+
+def format_dashed(twist: bytes, swapped: bool, nonnegative: bool) -> bytes:
+    """Convert `linear|angular`, as Sightline writes it, to `linear-angular`.
+
+    Args:
+        twist: the text, m/s and rad/s with four decimals.
+        swapped: True for `angular-linear`.
+        nonnegative: True to write zero in place of a negative number.
+    """
+    numbers = [b"0.0000" if nonnegative and number.startswith(b"-") else number for number in twist.split(b"|")]
+    return b"-".join(reversed(numbers) if swapped else numbers)
+
+
+def boxes_from_detections(found: Detections) -> tuple[LegacyBox, ...]:
+    """Convert boxes in pixels to fractions of the image, without labels. The best 16, cut to the image."""
+    width_px, height_px = found.width_px, found.height_px
+    return tuple(
+        LegacyBox(*(min(1.0, max(0.0, share)) for share in (
+            box.y1_px / height_px, box.x1_px / width_px, box.y2_px / height_px, box.x2_px / width_px)))
+        for box in found.boxes[:MAX_BOXES]
+    )
 
 
 def format_boxes(boxes: Sequence[LegacyBox]) -> bytes:

@@ -66,18 +66,19 @@ def check_zenoh_endpoints(listen: Sequence[str], connect: Sequence[str]) -> None
 #     ws-legacy://127.0.0.1:9091   the legacy protocol, with options after a `?`, joined by `&`:
 #         dashed                         linear-angular instead of the bar
 #         swapped                        angular-linear, with dashed
+#         nonnegative                    zero in place of each negative number, with dashed: toward a legacy robot
 #         oneline                        base64 without newlines
-#         boxes                          accept boxes next to twists, see `sightline.protocol.legacy_text`
+#         boxes                          accept boxes next to twists, see `sightline.protocol.legacy_text`; toward a
+#                                        legacy robot: send the box of the target in place of twists
 #         from=192.168.1.7,10.0.0.0/24   addresses that may connect
 
 
 _WEBSOCKET_ENDPOINT: Final = re.compile(
     r"(ws|wss|ws-legacy)://(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]@]+):([0-9]{1,5})/?(?:\?([^\s?#]*))?", re.ASCII
 )
-_WORDS: Final = ("dashed", "swapped", "oneline", "boxes")
+_WORDS: Final = ("dashed", "swapped", "nonnegative", "oneline", "boxes")
+_WITH_DASHED: Final = {"swapped", "nonnegative"}
 _FROM: Final = "from="
-
-
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +91,12 @@ class LegacyOptions:
     """`linear-angular` instead of the bar."""
     swapped: bool = False
     """`angular-linear`, as the legacy robot reads it."""
+    nonnegative: bool = False
+    """Toward a legacy robot: zero in place of each negative number."""
     boxes: bool = False
-    """Toward the robot: boxes are accepted too, as detections of a guest."""
+    """At a robot: boxes are accepted too, as detections of a guest. Toward a legacy robot: boxes in place of twists."""
+
+
 @dataclass(frozen=True, slots=True)
 class WebSocketEndpoint:
     """A valid endpoint. `text` is the original text."""
@@ -137,14 +142,14 @@ def parse_websocket_endpoint(text: str) -> WebSocketEndpoint:
 def _legacy(text: str, words: Sequence[str]) -> tuple[LegacyOptions, bool, tuple[str, ...]]:
     """Return the options, False for TLS, and the permitted addresses."""
     unknown = [word for word in words if word not in _WORDS and not word.startswith(_FROM)]
-    if unknown or ("swapped" in words and "dashed" not in words):
+    if unknown or (_WITH_DASHED & set(words) and "dashed" not in words):
         raise ConfigError(
-            f"invalid endpoint {text!r}: after the ? use {', '.join(_WORDS)} (swapped only with dashed) or "
-            "from=<address>, joined by &, e.g. ws-legacy://127.0.0.1:9091?oneline"
+            f"invalid endpoint {text!r}: after the ? use {', '.join(_WORDS)} (swapped and nonnegative only with dashed) "
+            "or from=<address>, joined by &, e.g. ws-legacy://127.0.0.1:9091?oneline"
         )
     networks = [part for word in words if word.startswith(_FROM) for part in word[len(_FROM) :].split(",")]
     options = LegacyOptions(newlines="oneline" not in words, dashed="dashed" in words, swapped="swapped" in words,
-                            boxes="boxes" in words)
+                            nonnegative="nonnegative" in words, boxes="boxes" in words)
     return options, False, tuple(check_network(network) for network in networks)
 
 

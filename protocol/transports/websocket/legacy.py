@@ -12,14 +12,17 @@ from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.legacy_text import (
     MAX_BOXES_BYTES,
+    boxes_from_detections,
     decode_picture,
     detections_from_boxes,
     encode_picture,
+    format_boxes,
+    format_dashed,
     parse_boxes,
     parse_dashed,
     text_bound,
 )
-from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader
+from sightline.protocol.messages import AnswerHeader, Detections, DetectionsHeader, Echo, FrameHeader
 from sightline.protocol.text import format_twist, parse_twist
 from sightline.protocol.transports.endpoints import LegacyOptions
 from sightline.protocol.transports.link import Message
@@ -169,6 +172,76 @@ def _echo(header: bytes) -> Echo | None:
     return Echo.of(frame)
 
 
+# A legacy robot without a newer command for this long is brought to rest. Equal to the silence that a robot permits.
+SILENCE_US: Final = 300_000
+# A connection that ends so soon after a text was probably closed because of it.
+CLOSED_BY_TEXT_US: Final = 100_000
+CLOSED_BY_TEXT: Final = 3
+# Zeros after each motion.
+_ZEROS: Final = 2
+
+
+class LegacyCommands:
+    """The commands that one legacy robot received, over all connections. Two zeros follow each motion.
+
+    Such a robot has no watchdog: it applies its last command for ever.
+    """
+
+    def __init__(self, endpoint: str, options: LegacyOptions, tell: Callable[[str], None]) -> None:
+        """Create the record for the robot at `endpoint`. `tell` writes a log line."""
+        self._endpoint, self._options, self._tell = endpoint, options, tell
+        self.zero = b"" if options.boxes else as_text(options, b"0.0000|0.0000")
+        """The text that stops the robot."""
+        # A link that never sent a command belongs to a viewer. It must not stop the robot of another driver.
+        self._last: bytes | None = None
+        self._last_us = self._zeros = self._closed_by_text = 0
+
+    def sent(self, text: bytes, now_us: int) -> None:
+        """Record a command that is being sent."""
+        self._last, self._last_us = text, now_us
+        self._zeros = self._zeros + 1 if text == self.zero else 0
+
+    def rest_due(self, now_us: int) -> bool:
+        """Return True if a zero is due: the second after a first, or the first after silence or a lost connection."""
+        if self._last is None or self._zeros >= _ZEROS:
+            return False
+        return self._zeros > 0 or now_us - self._last_us > SILENCE_US
+
+    def farewell(self) -> tuple[bytes, ...]:
+        """Return the last texts of a link that ends, none if it never sent a command."""
+        return () if self._last is None else (self.zero,) * _ZEROS
+
+    def closed(self, now_us: int) -> None:
+        """Note that a connection ended. Logs a text format that the robot may be able to read."""
+        last = self._last
+        if last is None:
+            return
+        self._closed_by_text = self._closed_by_text + 1 if now_us - self._last_us <= CLOSED_BY_TEXT_US else 0
+        if self._closed_by_text == CLOSED_BY_TEXT:
+            self._closed_by_text = 0
+            self._tell(
+                f"robot at {self._endpoint} closed {CLOSED_BY_TEXT} connections within {CLOSED_BY_TEXT_US // 1000} ms "
+                f"after '{last.decode('ascii')}'; use the text format that it reads, probably {self._alternative(last)}"
+            )
+        # The robot may still apply its last command. Zero is due as soon as it is connected again.
+        self._zeros, self._last_us = 0, now_us - SILENCE_US - 1
+
+    def _alternative(self, last: bytes) -> str:
+        """Return the endpoint with the format that avoids the end of the connection after `last`."""
+        options, address = self._options, self._endpoint.partition("?")[0]
+        if options.boxes or not options.dashed:
+            return address if options.boxes else f"{address}?dashed"
+        numbers = last.split(b"-")
+        if options.nonnegative or len(numbers) == 2:
+            return address
+        return f"{address}?dashed{'&swapped' if options.swapped else ''}&nonnegative"
+
+
+def as_text(options: LegacyOptions, twist: bytes) -> bytes:
+    """Write the text of a twist in the format of `options`."""
+    return format_dashed(twist, options.swapped, options.nonnegative) if options.dashed else twist
+
+
 class LegacyToRobot:
     """The vision service's end of the legacy protocol: base64 text in as frames, twists out as bare text.
 
@@ -180,11 +253,12 @@ class LegacyToRobot:
     wants: tuple[str, ...] = ()
 
     def __init__(
-        self, robot: str, options: LegacyOptions, now_us: Callable[[], int], session: str, max_frame_bytes: int
+        self, robot: str, options: LegacyOptions, now_us: Callable[[], int], session: str, max_frame_bytes: int,
+        commands: LegacyCommands,
     ) -> None:
         """Create the codec. `session` is 8 hex digits, new for each connection. `now_us` reads a monotonic clock."""
         self._robot, self._options, self._now_us = robot, options, now_us
-        self._session, self._max_frame_bytes = session, max_frame_bytes
+        self._session, self._max_frame_bytes, self._commands = session, max_frame_bytes, commands
         self._seq = 0
         self._last_us = -1
 
@@ -193,19 +267,18 @@ class LegacyToRobot:
         return self._options
 
     def subscribes_to(self, channel: Channel) -> bool:
-        return channel is TWIST
+        return channel is (DETECTIONS if self._options.boxes else TWIST)
 
     def write(self, message: Message) -> tuple[bytes, ...]:
-        linear, bar, angular = message.payload.partition(b"|")
-        if not bar or not self._options.dashed:
-            return (message.payload,)
-        return (angular, b"-", linear) if self._options.swapped else (linear, b"-", angular)
+        if message.channel is DETECTIONS:
+            return (format_boxes(boxes_from_detections(decode(Detections, message.payload))),)
+        return (as_text(self._options, message.payload),)
 
     def note_sent(self, message: Message) -> None:
-        pass
+        self._commands.sent(b"".join(self.write(message)), self._now_us())
 
     def note_gone(self) -> None:
-        pass
+        self._commands.closed(self._now_us())
 
     def read(self, message: str | bytes) -> list[IncomingMessage]:
         if isinstance(message, bytes):

@@ -25,7 +25,13 @@ from sightline.protocol.transports.link import INEXACT_KEY, BaseLink, LinkRules,
 from sightline.protocol.transports.websocket.client import Client as Dialer
 from sightline.protocol.transports.websocket.connection import Connection
 from sightline.protocol.transports.websocket.framing import Hello, IncomingMessage, PeerCodec, SightlineV1
-from sightline.protocol.transports.websocket.legacy import DriverSlot, LegacyClient, LegacyToRobot, LegacyToVision
+from sightline.protocol.transports.websocket.legacy import (
+    DriverSlot,
+    LegacyClient,
+    LegacyCommands,
+    LegacyToRobot,
+    LegacyToVision,
+)
 from sightline.protocol.transports.websocket.peer import Peer, Promote, Publication, exchange_hellos
 from sightline.protocol.transports.websocket.server import KeyFolder, Server
 
@@ -174,6 +180,7 @@ class WebSocketLink(BaseLink):
         self._in_callback = threading.local()
         self._dropped: Counter[str] = Counter()
         self._driver_slot = DriverSlot()
+        self._commands: dict[str, LegacyCommands] = {}
         self._repeat_limiter = RepeatLimiter()
 
     @property
@@ -239,6 +246,8 @@ class WebSocketLink(BaseLink):
         for end in near:
             self._listeners.append(Server(end, partial(self._serve, end), refuse, self._tell, keys))
         for end in far:
+            if end.legacy is not None:
+                self._commands[end.text] = LegacyCommands(end.text, end.legacy, self._tell)
             self._dialers.append(Dialer(end, partial(self._serve, end), refuse, keys))
 
     def wait_connected(self, timeout_s: float) -> None:
@@ -273,7 +282,7 @@ class WebSocketLink(BaseLink):
         with self._joining:
             announced, hello = self._subscriptions.announced, self._subscriptions.hello()
             wanted_bytes = self._subscriptions.bound()
-        peer = Peer(wire, dialect, self._on_change)
+        peer = Peer(wire, dialect, self._on_change, self._commands.get(end.text) if settle is None else None)
         peer.limit(wanted_bytes)
         if isinstance(dialect, SightlineV1):
             exchange_hellos(wire, dialect, hello, settle)
@@ -332,7 +341,8 @@ class WebSocketLink(BaseLink):
             client = LegacyClient(who, self._driver_slot, self._tell)
             return LegacyToVision(self.robot, end.legacy, monotonic_us, client)
         bound = self._rules.payload_bound(FRAME)
-        return LegacyToRobot(self.robot, end.legacy, monotonic_us, secrets.token_hex(4), bound)
+        return LegacyToRobot(self.robot, end.legacy, monotonic_us, secrets.token_hex(4), bound,
+                             self._commands[end.text])
 
     def _tell(self, text: str) -> None:
         with self._joining:

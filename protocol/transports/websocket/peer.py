@@ -21,6 +21,7 @@ from sightline.protocol.transports.websocket.framing import (
     PeerError,
     SightlineV1,
 )
+from sightline.protocol.transports.websocket.legacy import LegacyCommands
 
 if TYPE_CHECKING:
     from websockets.exceptions import ConnectionClosed
@@ -78,15 +79,29 @@ Promote = Callable[[str], None]
 
 # Longest delay of a ping and of the detection of silence.
 _TICK_US: Final = 250_000
+# Longest delay of a zero for a legacy robot.
+_REST_TICK_US: Final = 50_000
 _COUNTED_FOR_CODE: Final = {1002: BAD_FRAMING, 1007: BAD_FRAMING, 1009: OVERSIZE}
 
 
 class Peer:
     """An open connection to a known peer, with its codec."""
 
-    def __init__(self, wire: Connection, dialect: PeerCodec, on_change: Callable[[], None] = lambda: None) -> None:
-        """Create a peer. The reading thread calls `on_change` when the peer changes its wants."""
+    def __init__(
+        self, wire: Connection, dialect: PeerCodec, on_change: Callable[[], None] = lambda: None,
+        commands: LegacyCommands | None = None,
+    ) -> None:
+        """Create a peer.
+
+        Args:
+            wire: the connection.
+            dialect: the codec.
+            on_change: called on the reading thread when the peer changes its wants.
+            commands: of a legacy robot, which must not be left driving.
+        """
         self.queue: OutgoingQueue[Publication | str] = OutgoingQueue()
+        self._commands = commands
+        self._ended = False
         self._on_change = on_change
         self._wire, self._dialect = wire, dialect
         self._reader = threading.current_thread()
@@ -136,12 +151,12 @@ class Peer:
         keepalive = Keepalive(monotonic_us())
         try:
             while self._turn(keepalive, deliver, refuse):
-                self._wire.wait(_TICK_US / 1e6)
+                self._wire.wait((_TICK_US if self._commands is None else _REST_TICK_US) / 1e6)
             refuse(SILENT)
-            self._wire.close(1011, "silent for too long")
+            self._end(1011, "silent for too long")
         except PeerError as refusal:
             refuse(refusal.counted)
-            self._wire.close(refusal.code, str(refusal))
+            self._end(refusal.code, str(refusal))
             self._wire.linger()
         except ConnectionClosed as closed:
             count_close(closed, refuse)
@@ -184,7 +199,14 @@ class Peer:
 
     def close(self, reason: str) -> None:
         """Begin to close with a reason."""
-        self._wire.close(1001, reason)
+        self._end(1001, reason)
+
+    def _end(self, code: int, reason: str) -> None:
+        # Set first: a command that another thread sends now must not follow the zeros.
+        self._ended = True
+        for text in self._commands.farewell() if self._commands else ():
+            self._wire.send_text(text.decode("ascii"))
+        self._wire.close(code, reason)
 
     def wait_gone(self, timeout_s: float = CLOSE_S) -> None:
         """Wait until the peer is gone. The reading thread itself does not wait."""
@@ -195,7 +217,7 @@ class Peer:
         """Send while the socket has room."""
         # A publisher never waits for the lock: the thread that holds it also sends the new message.
         lock = self._wire.lock
-        while len(self.queue) and lock.acquire(blocking=False):
+        while self._has_more() and lock.acquire(blocking=False):
             try:
                 has_room = self._wire.fill(self._take)
             finally:
@@ -203,8 +225,16 @@ class Peer:
             if not has_room:
                 return
 
+    def _has_more(self) -> bool:
+        commands = self._commands
+        return not self._ended and bool(len(self.queue) or (commands and commands.rest_due(monotonic_us())))
+
     def _take(self) -> tuple[Sequence[bytes], bool] | None:
-        item = self.queue.take()
+        commands, now_us = self._commands, monotonic_us()
+        if commands is not None and not self._ended and commands.rest_due(now_us):
+            commands.sent(commands.zero, now_us)
+            return (commands.zero,), True
+        item = None if self._ended else self.queue.take()
         if item is None:
             return None
         if isinstance(item, str):

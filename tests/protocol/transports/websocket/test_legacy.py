@@ -15,10 +15,11 @@ from websockets.sync.server import serve
 from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason
-from sightline.protocol.messages import AnswerHeader, Detections, DetectionsHeader, FrameHeader
+from sightline.protocol.messages import AnswerHeader, DetectedBox, Detections, DetectionsHeader, FrameHeader
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint
 from sightline.protocol.transports.link import OVERSIZE, Message
 from sightline.protocol.transports.websocket.framing import BAD_FRAMING
+from sightline.protocol.transports.websocket.legacy import LegacyCommands
 from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.server import CROSS_SITE
 from tests.fixtures.links import until
@@ -313,6 +314,97 @@ def test_dashed_twists_go_out_dashed(options, said):
     with old_robot_and_vision(options) as (robot, vision):
         vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
         assert until(lambda: robot.said == [said])
+
+
+def test_nonnegative_text_has_zero_for_each_negative_number():
+    with old_robot_and_vision("?dashed&nonnegative") as (robot, vision):
+        for twist, said in ((b"-0.2000|0.3500", "0.0000-0.3500"), (b"0.2000|-0.3500", "0.2000-0.0000")):
+            vision.publish(TWIST, b"{}", twist)
+            assert until(lambda: robot.said[-1:] == [said])  # noqa: B023
+
+
+def test_boxes_go_out_in_place_of_twists():
+    with old_robot_and_vision("?boxes") as (robot, vision):
+        box = DetectedBox(label="ball", score=0.9, x1_px=-4, y1_px=30, x2_px=80, y2_px=60)
+        found = Detections(width_px=160, height_px=120, boxes=(box,))
+        assert vision.has_listener(DETECTIONS)
+        assert not vision.has_listener(TWIST)
+        vision.publish(DETECTIONS, b"{}", encode(found))
+        assert until(lambda: robot.said == ["0.2500,0.0000,0.5000,0.5000"])
+        assert until(lambda: robot.said[1:] == ["", ""]), "an empty text stops it"
+
+
+# --- a legacy robot is never left driving ------------------------------------------------------------------------------
+
+ZEROS = [("", "0.0000|0.0000"), ("?dashed", "0.0000-0.0000"), ("?dashed&swapped", "0.0000-0.0000")]
+
+
+@pytest.mark.parametrize(("options", "zero"), ZEROS)
+def test_a_link_that_closes_leaves_two_zeros(options, zero):
+    with old_robot_and_vision(options) as (robot, vision):
+        vision.publish(TWIST, b"{}", b"0.2000|0.3500")
+    assert until(lambda: not robot.clients)
+    assert robot.said[1:] == [zero, zero]
+
+
+def test_a_link_that_never_drove_sends_nothing():
+    with old_robot_and_vision() as (robot, _):
+        time.sleep(0.4)
+    assert until(lambda: not robot.clients)
+    assert robot.said == []
+
+
+def test_silence_after_a_motion_brings_two_zeros():
+    with old_robot_and_vision() as (robot, vision):
+        vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
+        sent_s = time.monotonic()
+        assert until(lambda: len(robot.said) > 1)
+        assert 0.3 <= time.monotonic() - sent_s
+        assert until(lambda: robot.said[1:] == ["0.0000|0.0000"] * 2)
+        time.sleep(0.4)
+        assert len(robot.said) == 3
+
+
+def test_a_robot_whose_connection_was_lost_while_driving_is_stopped_at_the_next():
+    with old_robot_and_vision() as (robot, vision):
+        vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
+        assert until(lambda: robot.said)
+        robot.clients[0].socket.shutdown(socket.SHUT_RDWR)
+        assert until(lambda: robot.said[1:] == ["closed 0", "0.0000|0.0000", "0.0000|0.0000"])
+
+
+OPTIONS = {one: parse_websocket_endpoint(f"ws-legacy://robot:9091{one}").legacy
+           for one in ("", "?dashed", "?dashed&swapped", "?dashed&nonnegative", "?boxes")}
+
+
+@pytest.mark.parametrize(("options", "last", "better"), [
+    ("", b"0.2000|0.0000", "?dashed"),
+    ("?dashed", b"0.2000--0.3500", "?dashed&nonnegative"),
+    ("?dashed&swapped", b"-0.3500-0.2000", "?dashed&swapped&nonnegative"),
+    ("?dashed", b"0.2000-0.3500", ""),
+    ("?dashed&nonnegative", b"0.2000-0.0000", ""),
+    ("?boxes", b"", ""),
+])
+def test_three_connections_that_end_after_a_text_are_reported_with_another_format(options, last, better):
+    told = []
+    commands = LegacyCommands(f"ws-legacy://robot:9091{options}", OPTIONS[options], told.append)
+    for number in range(3):
+        assert told == []
+        commands.sent(last, number * 1_000_000)
+        commands.closed(number * 1_000_000 + 100_000)
+    assert told == [
+        f"robot at ws-legacy://robot:9091{options} closed 3 connections within 100 ms after '{last.decode()}'; "
+        f"use the text format that it reads, probably ws-legacy://robot:9091{better}"
+    ]
+
+
+def test_a_later_end_of_a_connection_is_not_blamed_on_the_text():
+    told = []
+    commands = LegacyCommands("ws-legacy://robot:9091", OPTIONS[""], told.append)
+    for number in range(9):
+        commands.sent(b"0.2000|0.0000", number * 1_000_000)
+        commands.closed(number * 1_000_000 + (100_001 if number % 3 == 2 else 0))
+    assert told == []
 
 
 @pytest.mark.parametrize(
