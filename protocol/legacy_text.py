@@ -123,10 +123,12 @@ def format_dashed(twist: bytes, swapped: bool, nonnegative: bool) -> bytes:
 
 def boxes_from_detections(found: Detections) -> tuple[LegacyBox, ...]:
     """Convert boxes in pixels to fractions of the image, without labels. The best 16, cut to the image."""
-    width_px, height_px = found.width_px, found.height_px
+    def share(px: float, whole_px: int) -> float:
+        return min(1.0, max(0.0, px / whole_px))
+
+    wide, high = found.width_px, found.height_px
     return tuple(
-        LegacyBox(*(min(1.0, max(0.0, share)) for share in (
-            box.y1_px / height_px, box.x1_px / width_px, box.y2_px / height_px, box.x2_px / width_px)))
+        LegacyBox(share(box.y1_px, high), share(box.x1_px, wide), share(box.y2_px, high), share(box.x2_px, wide))
         for box in found.boxes[:MAX_BOXES]
     )
 

@@ -216,8 +216,9 @@ def _write_configuration(run: DemoRun, sockets: str) -> None:
         }),
         "vision": {
             "robot": ROBOT, **vision_table(run.scenario, model, options.seed, options.mission),
-            # The legacy protocol has no camera model.
-            **({"camera": model.camera.camera_model().model_dump()} if legacy else {}),
+            # The legacy protocol has no camera model. The operator of a demo uses the robot, not the vision service.
+            **({"camera": model.camera.camera_model().model_dump(), "listen": [f"tcp/127.0.0.1:{free_port()}"]}
+               if legacy else {}),
         },
     }
     if options.detector is not None:

@@ -144,8 +144,8 @@ def _legacy(text: str, words: Sequence[str]) -> tuple[LegacyOptions, bool, tuple
     unknown = [word for word in words if word not in _WORDS and not word.startswith(_FROM)]
     if unknown or (_WITH_DASHED & set(words) and "dashed" not in words):
         raise ConfigError(
-            f"invalid endpoint {text!r}: after the ? use {', '.join(_WORDS)} (swapped and nonnegative only with dashed) "
-            "or from=<address>, joined by &, e.g. ws-legacy://127.0.0.1:9091?oneline"
+            f"invalid endpoint {text!r}: after the ? use {', '.join(_WORDS)} (swapped, nonnegative with dashed) or "
+            "from=<address>, joined by &, e.g. ws-legacy://127.0.0.1:9091?oneline"
         )
     networks = [part for word in words if word.startswith(_FROM) for part in word[len(_FROM) :].split(",")]
     options = LegacyOptions(newlines="oneline" not in words, dashed="dashed" in words, swapped="swapped" in words,

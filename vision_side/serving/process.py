@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Final
 
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector
@@ -15,6 +16,7 @@ from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.registry import configured_mission
 from sightline.vision_side.pipeline import SOURCE
+from sightline.vision_side.serving.legacy_robot import LegacyRobotLink, is_legacy
 from sightline.vision_side.serving.service import LogLine, Observe, endpoints_text, open_service
 
 _log: Final = logging.getLogger(__name__)
@@ -57,10 +59,18 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | None, detector: Detector) -> int:
     from sightline.protocol.transports.open import open_link
 
-    opened = open_link(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
+    legacy = any(is_legacy(one) for one in config.connect)
+    listen = config.listen
+    if not listen and all(is_legacy(one) for one in config.connect):
+        # A legacy robot has no STOP. Its operators send theirs here, to the address that they use without options.
+        listen = (DEFAULT_ENDPOINT,)
+    opened = open_link(config.robot, listen=listen, connect=config.connect, role=SOURCE,
                         max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     # Signals are caught only from here on: until the link is open, they end the process by themselves.
-    with opened as link, ends_on_signal(ending):
+    with LegacyRobotLink(opened) if legacy else opened as link, ends_on_signal(ending):
+        if legacy:
+            _log.info("vision: STOP and disarm of robot %s: sightline stop %s --connect %s", config.robot, config.robot,
+                      ", ".join(listen or config.connect))
         _log.info("vision: looking for robot %s at %s", config.robot, endpoints_text(config))
         serve(config, link, ending, _log.info, observe, detector=detector)
     return 0

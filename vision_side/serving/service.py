@@ -5,6 +5,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
@@ -12,6 +13,7 @@ from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MAX_HEAD
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import CameraModel, FrameHeader, Stamp
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
@@ -20,6 +22,7 @@ from sightline.vision_side.detect.plugin_calls import attach_detector
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header
+from sightline.vision_side.serving.legacy_robot import assumed_camera, camera_line, is_legacy, target_box
 from sightline.vision_side.serving.mission_channel import NO_FRAMES, MissionChannel
 from sightline.vision_side.tracking.locate import REMEMBERED, BoxReader
 from sightline.vision_side.viewing import ViewPublisher
@@ -153,6 +156,7 @@ class Service:
         self._camera: CameraModel | None = None
         self._pipeline: Pipeline | None = None
         self._session = secrets.token_hex(4)
+        self._is_legacy = any(is_legacy(one) for one in config.connect)
         self._robot_session = ""
         self._sessions = SessionSelector()
         self._reported: dict[str, str] = {}
@@ -231,7 +235,7 @@ class Service:
             self._robot_session = header.session
             self._log_change("link", f"frames from robot {self._config.robot}, session {header.session}")
         if self._pipeline is None:
-            self._wait_for_camera()
+            self._wait_for_camera(message.payload)
             self._publish(header, PipelineAnswer(None, Observation("no image", note="no camera model yet")), 0)
             return
         self._mission_channel.prepare(self._pipeline, header)
@@ -247,8 +251,14 @@ class Service:
     def _acknowledge(self, seen: Observation) -> PipelineAnswer:
         return self._pipeline.acknowledge(seen) if self._pipeline else PipelineAnswer(None, seen)
 
-    def _wait_for_camera(self) -> None:
-        """Log a missing camera model. It comes twice a second, so only a longer wait is logged."""
+    def _wait_for_camera(self, jpeg: bytes) -> None:
+        """Assume a camera for a legacy robot. Log a missing model: it comes twice a second, so only a longer wait."""
+        if self._is_legacy:
+            with suppress(WireError):
+                camera = assumed_camera(read_jpeg_size(jpeg))
+                self._report(f"vision: {camera_line(camera)}")
+                self._use(camera)
+            return
         self._blind_since_s = self._blind_since_s or time.monotonic()
         if time.monotonic() - self._blind_since_s > _CAMERA_PATIENCE_S:
             self._log_change("camera", "frames come, but no camera model; is the robot of another version?")
@@ -266,6 +276,8 @@ class Service:
             self._link.publish(ACK, stamp, b"")
         else:
             self._link.publish(TWIST, stamp, format_twist(answer.twist))
+        if self._is_legacy and self._camera is not None:
+            self._link.publish(DETECTIONS, b"", target_box(answer.seen.target, self._camera))
 
     def _decoded(self, model: type[Model], data: bytes, max_bytes: int) -> Model | None:
         try:
@@ -368,7 +380,7 @@ class BoxesService(Service):
         self._publish(header, PipelineAnswer(None, Observation("no image", note="another service detects")), 0)
         self._viewing.keep(header, message.payload)
         if self._pipeline is None:
-            self._wait_for_camera()
+            self._wait_for_camera(message.payload)
         elif time.monotonic() - self._boxes_heard_s > _BOXES_SILENCE_S:
             self._mission_channel.report(time.monotonic(), self._acknowledge(_NO_BOXES), header)
             source = self._config.boxes.source

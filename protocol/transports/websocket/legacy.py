@@ -189,7 +189,7 @@ class LegacyCommands:
 
     def __init__(self, endpoint: str, options: LegacyOptions, tell: Callable[[str], None]) -> None:
         """Create the record for the robot at `endpoint`. `tell` writes a log line."""
-        self._endpoint, self._options, self._tell = endpoint, options, tell
+        self._endpoint, self.options, self._tell = endpoint, options, tell
         self.zero = b"" if options.boxes else as_text(options, b"0.0000|0.0000")
         """The text that stops the robot."""
         # A link that never sent a command belongs to a viewer. It must not stop the robot of another driver.
@@ -228,7 +228,7 @@ class LegacyCommands:
 
     def _alternative(self, last: bytes) -> str:
         """Return the endpoint with the format that avoids the end of the connection after `last`."""
-        options, address = self._options, self._endpoint.partition("?")[0]
+        options, address = self.options, self._endpoint.partition("?")[0]
         if options.boxes or not options.dashed:
             return address if options.boxes else f"{address}?dashed"
         numbers = last.split(b"-")
@@ -253,12 +253,12 @@ class LegacyToRobot:
     wants: tuple[str, ...] = ()
 
     def __init__(
-        self, robot: str, options: LegacyOptions, now_us: Callable[[], int], session: str, max_frame_bytes: int,
-        commands: LegacyCommands,
+        self, robot: str, commands: LegacyCommands, now_us: Callable[[], int], session: str, max_frame_bytes: int
     ) -> None:
         """Create the codec. `session` is 8 hex digits, new for each connection. `now_us` reads a monotonic clock."""
-        self._robot, self._options, self._now_us = robot, options, now_us
-        self._session, self._max_frame_bytes, self._commands = session, max_frame_bytes, commands
+        self._robot, self._commands, self._now_us = robot, commands, now_us
+        self._options = commands.options
+        self._session, self._max_frame_bytes = session, max_frame_bytes
         self._seq = 0
         self._last_us = -1
 

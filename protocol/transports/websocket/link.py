@@ -341,8 +341,7 @@ class WebSocketLink(BaseLink):
             client = LegacyClient(who, self._driver_slot, self._tell)
             return LegacyToVision(self.robot, end.legacy, monotonic_us, client)
         bound = self._rules.payload_bound(FRAME)
-        return LegacyToRobot(self.robot, end.legacy, monotonic_us, secrets.token_hex(4), bound,
-                             self._commands[end.text])
+        return LegacyToRobot(self.robot, self._commands[end.text], monotonic_us, secrets.token_hex(4), bound)
 
     def _tell(self, text: str) -> None:
         with self._joining:

@@ -91,13 +91,9 @@ class Peer:
         self, wire: Connection, dialect: PeerCodec, on_change: Callable[[], None] = lambda: None,
         commands: LegacyCommands | None = None,
     ) -> None:
-        """Create a peer.
+        """Create a peer. The reading thread calls `on_change` when the peer changes its wants.
 
-        Args:
-            wire: the connection.
-            dialect: the codec.
-            on_change: called on the reading thread when the peer changes its wants.
-            commands: of a legacy robot, which must not be left driving.
+        `commands` are those of a legacy robot, which must not be left driving.
         """
         self.queue: OutgoingQueue[Publication | str] = OutgoingQueue()
         self._commands = commands

@@ -10,6 +10,7 @@ format does not contain raises an error, and the library then closes the connect
 import asyncio
 import base64
 import contextlib
+import importlib
 import itertools
 import sys
 import threading
@@ -70,7 +71,7 @@ def film(texts, send):
 
 
 async def film_to(texts, send):
-    """As `film`, in asyncio, to one client."""
+    """Send the images to one client, in asyncio."""
     for text in itertools.cycle(texts):
         await send(text)
         await asyncio.sleep(1 / FPS)
@@ -105,15 +106,11 @@ def simple_websocket_server(motors, port, texts, module):
 
 
 def article(motors, port, texts):
-    import SimpleWebSocketServer as module
-
-    simple_websocket_server(motors, port, texts, module)
+    simple_websocket_server(motors, port, texts, importlib.import_module("SimpleWebSocketServer"))
 
 
 def successor(motors, port, texts):
-    import simple_websocket_server as module
-
-    simple_websocket_server(motors, port, texts, module)
+    simple_websocket_server(motors, port, texts, importlib.import_module("simple_websocket_server"))
 
 
 def websockets(motors, port, texts):

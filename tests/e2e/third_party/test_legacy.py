@@ -157,7 +157,7 @@ def test_client_that_never_reads_delays_no_driver(tmp_path, pictures):
 def our_vision(folder: Path, endpoint: str):
     """Run `sightline vision` for a robot that reports nothing about its camera."""
     lens = "\n".join(f"{name} = {json.dumps(value)}" for name, value in camera_of(640, 480).model_dump().items())
-    (folder / "vision.toml").write_text(f'connect = ["{endpoint}"]\n[camera]\n{lens}\n')
+    (folder / "vision.toml").write_text(f'connect = ["{endpoint}"]\nlisten = ["{free_endpoint()}"]\n[camera]\n{lens}\n')
     command = ("-P", "-m", "sightline.operator_side.cli.app", "vision", "--config", folder / "vision.toml")
     with running(*command) as process:
         yield process
@@ -204,3 +204,49 @@ def _delays_ms(events: Path) -> list[float]:
         elif what == "said" and sent_us:
             delays_ms.append((int(t_us) - sent_us) / 1000)
     return delays_ms
+
+
+# --- a legacy robot is never left driving ----------------------------------------------------------------------------
+
+FORMATS = {"bar": "", "dashed": "?dashed&swapped&nonnegative", "boxes": "?boxes"}
+LIBRARIES = ("article", "websockets", "uvicorn")
+
+
+@contextmanager
+def driven_legacy_robot(folder: Path, pictures: Path, library: str, form: str):
+    """A robot in `library` that drives, the README's line, and the motor log. Its connection is the only option."""
+    port, operator = free_port(), free_endpoint()
+    motors = folder / "motors.csv"
+    robot = (STRANGERS / "legacy_robot.py", library, form, port, pictures, motors)
+    line = ("-P", "-m", "sightline.operator_side.cli.app", "vision", "--robot",
+            f"ws-legacy://127.0.0.1:{port}{FORMATS[form]}", "--listen", operator)
+    with running(*robot), running(*line) as vision:
+        assert until(lambda: sum(row[1:] != ["0.0", "0.0"] for row in rows_of(motors)) > 5, 30)
+        yield vision, operator, motors
+
+
+def is_at_rest(motors: Path) -> bool:
+    """Return True if the last two commands are zero, and stay so for half a second."""
+    time.sleep(0.5)
+    return [row[1:] for row in rows_of(motors)[-2:]] == [["0.0", "0.0"]] * 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_readme_line_drives_a_legacy_robot_and_ctrl_c_leaves_it_at_rest(tmp_path, pictures, library, form):
+    with driven_legacy_robot(tmp_path, pictures, library, form) as (vision, _, motors):
+        vision.send_signal(signal.SIGINT)
+        assert vision.wait(5) == 0
+        assert is_at_rest(motors)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["stop", "disarm"])
+@pytest.mark.parametrize("form", FORMATS)
+def test_an_operator_stops_a_legacy_robot(tmp_path, pictures, verb, form):
+    with driven_legacy_robot(tmp_path, pictures, "article", form) as (vision, operator, motors):
+        command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", verb, "--connect", operator]
+        assert subprocess.run(command, check=False, timeout=20).returncode == 0
+        assert is_at_rest(motors)
+        assert vision.poll() is None

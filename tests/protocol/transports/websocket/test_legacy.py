@@ -334,7 +334,7 @@ def test_boxes_go_out_in_place_of_twists():
         assert until(lambda: robot.said[1:] == ["", ""]), "an empty text stops it"
 
 
-# --- a legacy robot is never left driving ------------------------------------------------------------------------------
+# --- a legacy robot is never left driving ----------------------------------------------------------------------------
 
 ZEROS = [("", "0.0000|0.0000"), ("?dashed", "0.0000-0.0000"), ("?dashed&swapped", "0.0000-0.0000")]
 
@@ -359,7 +359,7 @@ def test_silence_after_a_motion_brings_two_zeros():
         vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
         sent_s = time.monotonic()
         assert until(lambda: len(robot.said) > 1)
-        assert 0.3 <= time.monotonic() - sent_s
+        assert time.monotonic() - sent_s >= 0.3
         assert until(lambda: robot.said[1:] == ["0.0000|0.0000"] * 2)
         time.sleep(0.4)
         assert len(robot.said) == 3

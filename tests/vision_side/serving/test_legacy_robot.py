@@ -1,0 +1,150 @@
+"""The stand-in of a legacy robot over a link in memory: STOP, disarm, arm, the assumed camera, the target's box."""
+
+import pytest
+
+from sightline.operator_side.config.loading import load_service
+from sightline.protocol.channels import DETECTIONS, FRAME, REPLY, REQUEST, STATUS, TWIST
+from sightline.protocol.codec import decode, encode
+from sightline.protocol.jpeg import JpegSize
+from sightline.protocol.messages import (
+    DetectedBox,
+    Detections,
+    Echo,
+    FrameHeader,
+    Reply,
+    Request,
+    RequestHeader,
+    Stamp,
+    Status,
+    Verb,
+)
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.serving.legacy_robot import LegacyRobotLink, assumed_camera, camera_line, target_box
+from sightline.vision_side.serving.service import Service
+from tests.fixtures.vision.vision import camera, jpeg_of, scene
+
+DRIVE = b"0.2000|-0.3500"
+ZERO = b"0.0000|0.0000"
+
+
+class Bench:
+    """The vision service's link, with an operator and the robot on the other end."""
+
+    def __init__(self) -> None:
+        self.network = MemoryNetwork(seed=1)
+        self.far = self.network.link("r1")
+        self.operator = self.network.link("r1", role="operator")
+        self.twists, self.boxes = self.far.latest(TWIST), self.far.latest(DETECTIONS)
+        self.replies, self.statuses = self.operator.latest(REPLY), self.operator.latest(STATUS)
+        self.link = LegacyRobotLink(self.network.link("r1", role="vision"), lambda: self.network.now_us)
+
+    def advance(self) -> None:
+        self.network.advance(self.network.now_us + 10_000)
+
+    def drive(self) -> bytes | None:
+        """The text that arrives for a command of the vision service."""
+        self.link.publish(TWIST, b"", DRIVE)
+        self.advance()
+        message = self.twists.take()
+        return message and message.payload
+
+    def status(self) -> tuple[Stamp, Status]:
+        self.link._post_status()
+        self.advance()
+        message = self.statuses.take()
+        return decode(Stamp, message.header), decode(Status, message.payload, STATUS.max_payload_bytes)
+
+    def request(self, verb: Verb, echo: Echo | None = None, source: str = "operator") -> Reply:
+        header = RequestHeader(source=source, session="0000beef", seq=1, echo=echo)
+        self.operator.publish(REQUEST, encode(header), encode(Request(id=7, verb=verb)), "operator")
+        self.advance()
+        self.advance()
+        return decode(Reply, self.replies.take().payload, REPLY.max_payload_bytes)
+
+
+@pytest.fixture
+def bench():
+    made = Bench()
+    yield made
+    made.link.close()
+
+
+def test_commands_pass_from_the_start(bench):
+    assert bench.drive() == DRIVE
+    _, status = bench.status()
+    assert (status.state, status.applied, status.accepted, status.frame_age_us) == ("ACTIVE", (0.2, -0.35), 1, None)
+
+
+@pytest.mark.parametrize(("verb", "state"), [(Verb.STOP, "STOPPED"), (Verb.DISARM, "DISARMED")])
+def test_stop_and_disarm_send_zero_at_once_and_hold_later_commands_at_zero(bench, verb, state):
+    bench.drive()
+    reply = bench.request(verb)
+    assert (reply.ok, reply.state) == (True, state)
+    assert bench.twists.take().payload == ZERO
+    assert decode(Detections, bench.boxes.take().payload).boxes == ()
+    assert bench.drive() == ZERO
+    found = Detections(width_px=160, height_px=120, boxes=(
+        DetectedBox(label="ball", score=1, x1_px=1, y1_px=1, x2_px=9, y2_px=9),))
+    bench.link.publish(DETECTIONS, b"", encode(found))
+    bench.advance()
+    assert decode(Detections, bench.boxes.take().payload).boxes == ()
+    assert bench.status()[1].applied == (0.0, 0.0)
+
+
+def test_after_a_stop_only_reset_and_arm_with_a_new_status_permit_motion(bench):
+    before = Echo.of(bench.status()[0])
+    bench.request(Verb.STOP)
+    assert bench.request(Verb.RESET, before).detail.startswith("STALE")
+    assert bench.request(Verb.RESET).detail.startswith("STALE")
+    new = Echo.of(bench.status()[0])
+    assert bench.request(Verb.ARM, new).detail.startswith("STOPPED")
+    assert bench.request(Verb.RESET, new).state == "DISARMED"
+    assert bench.drive() == ZERO
+    assert bench.request(Verb.ARM, new).state == "ACTIVE"
+    assert bench.drive() == DRIVE
+
+
+def test_disarm_does_not_clear_a_stop(bench):
+    bench.request(Verb.STOP)
+    assert bench.request(Verb.DISARM).state == "STOPPED"
+
+
+def test_a_request_of_another_source_than_its_key_changes_nothing(bench):
+    assert bench.request(Verb.STOP, source="teleop").detail.startswith("UNKNOWN_SOURCE")
+    assert bench.drive() == DRIVE
+
+
+def test_a_second_driver_is_rejected(bench):
+    assert bench.request(Verb.ACQUIRE, Echo.of(bench.status()[0])).detail.startswith("NOT_ALLOWED")
+
+
+def test_the_printed_option_sets_the_assumed_camera():
+    camera = assumed_camera(JpegSize(640, 480, 3))
+    assert (camera.fx_px, camera.cx_px, camera.calibrated) == (554.3, 320, False)
+    option = camera_line(camera).rpartition("--set ")[2].strip("'")
+    assert load_service("vision", file=None, sets=[option], options={}, environ={}).config.camera == camera
+
+
+def test_a_service_assumes_a_camera_for_a_legacy_robot_once_and_drives(bench):
+    said = []
+    service = Service(VisionConfig(connect=("ws-legacy://127.0.0.1:9091",)), bench.link, said.append)
+    for seq in range(1, 4):
+        header = FrameHeader(session="0000abcd", seq=seq, t_us=seq * 33_333)
+        bench.far.publish(FRAME, encode(header), jpeg_of(scene(camera(), 1.0, 0.2)))
+        bench.advance()
+        service.turn(0.0)
+        bench.advance()
+    assert bench.twists.take().payload != ZERO
+    (box,) = decode(Detections, bench.boxes.take().payload).boxes
+    assert box.x1_px < box.x2_px
+    assert sum("publishes no camera model; assuming 60 degrees" in line for line in said) == 1
+
+
+def test_without_a_target_the_list_of_boxes_is_empty():
+    shown = camera()
+    assert decode(Detections, target_box(None, shown)).boxes == ()
+    target = Detection(x1_px=1, y1_px=2, x2_px=3, y2_px=4, score=1.0, label="")
+    (box,) = decode(Detections, target_box(target, shown)).boxes
+    assert (box.label, box.x1_px, box.y2_px) == ("target", 1, 4)

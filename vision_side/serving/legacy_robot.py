@@ -1,0 +1,187 @@
+"""Stands in for a legacy robot, which has no gate: STOP, disarm and arm of operators, status, a camera model. Shell.
+
+    with legacy_link(config) as link:
+        serve(config, link, ...)
+
+A legacy robot applies each command for ever and validates nothing. Its operators therefore send their requests to the
+vision service that drives it, and the commands of that service pass through here.
+"""
+
+from __future__ import annotations
+
+import math
+import secrets
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from sightline.protocol.channels import DETECTIONS, REPLY, REQUEST, STATUS, TWIST, Channel
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import check_sizes, decode, encode
+from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.jpeg import JpegSize
+from sightline.protocol.messages import (
+    LEAST_SIDE_PX,
+    STILL,
+    CameraModel,
+    DetectedBox,
+    Detections,
+    Echo,
+    Reply,
+    Request,
+    RequestHeader,
+    Stamp,
+    State,
+    Status,
+    Verb,
+    WireModel,
+)
+from sightline.protocol.text import format_twist, parse_twist
+from sightline.protocol.transports.link import Link, LinkWrapper, Message
+from sightline.vision_side.detect.port import Detection
+
+FIELD_OF_VIEW_DEG: Final = 60.0
+"""Horizontal, of the assumed camera. Most webcams and phone cameras have 55 to 70 degrees."""
+STATUS_PERIOD_S: Final = 0.1
+_ZERO: Final = format_twist(STILL)
+_NO_BOX: Final = encode(Detections(width_px=LEAST_SIDE_PX, height_px=LEAST_SIDE_PX))
+_FRESH: Final = round(2.0 / STATUS_PERIOD_S)
+"""Statuses that a request may cite: those of the last two seconds."""
+_DRIVING: Final = "legacy robot: it validates no image age, and has no watchdog"
+
+
+def is_legacy(endpoint: str) -> bool:
+    """Return True for the endpoint of a legacy robot."""
+    return endpoint.startswith("ws-legacy://")
+
+
+def assumed_camera(size: JpegSize) -> CameraModel:
+    """Return a camera model of 60 degrees for a robot that publishes none."""
+    focal_px = round(size.width_px / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG / 2)), 1)
+    return CameraModel(width_px=size.width_px, height_px=size.height_px, fx_px=focal_px, fy_px=focal_px,
+                       cx_px=size.width_px / 2, cy_px=size.height_px / 2)
+
+
+def camera_line(camera: CameraModel) -> str:
+    """Return the log line that names the assumed camera and the option that sets it."""
+    keys = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")
+    given = ", ".join(f"{key} = {getattr(camera, key):g}" for key in keys)
+    return (f"the robot publishes no camera model; assuming {FIELD_OF_VIEW_DEG:g} degrees horizontally; "
+            f"set yours with --set 'camera={{{given}}}'")
+
+
+def target_box(target: Detection | None, camera: CameraModel) -> bytes:
+    """Encode the box of the target, or no box, for a legacy robot that steers by boxes."""
+    boxes = () if target is None else (DetectedBox(
+        label=target.label or "target", score=target.score, x1_px=target.x1_px, y1_px=target.y1_px, x2_px=target.x2_px,
+        y2_px=target.y2_px),)
+    return encode(Detections(width_px=camera.width_px, height_px=camera.height_px, boxes=boxes))
+
+
+class LegacyRobotLink(LinkWrapper):
+    """A link to a legacy robot and its operators. Only in state ACTIVE do commands pass; else zero replaces them."""
+
+    def __init__(self, link: Link, now_us: Callable[[], int] = monotonic_us) -> None:
+        super().__init__(link)
+        self._now_us = now_us
+        self._session = secrets.token_hex(4)
+        self._lock = threading.Lock()
+        self._state, self._reason = State.ACTIVE, _DRIVING
+        self._applied = (0.0, 0.0)
+        self._accepted = 0
+        self._seqs = {STATUS: 0, REPLY: 0}
+        # A request that permits motion cites one of these. STOP and disarm clear them.
+        self._issued: deque[Echo] = deque(maxlen=_FRESH)
+        self._ending = threading.Event()
+        link.subscribe(REQUEST, self._on_request)
+        threading.Thread(target=self._report, name="legacy status", daemon=True).start()
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        """Send a message. A command is sent as zero while the robot may not move."""
+        if channel not in (TWIST, DETECTIONS):
+            return self._link.publish(channel, header, payload, source)
+        # With the lock: a command that was computed before a STOP must not follow the zero of that STOP.
+        with self._lock:
+            if self._state is not State.ACTIVE:
+                payload = _ZERO if channel is TWIST else _NO_BOX
+            if channel is TWIST:
+                twist = parse_twist(payload)
+                self._applied = (twist.linear_mps, twist.angular_rad_s)
+                self._accepted += self._state is State.ACTIVE
+            return self._link.publish(channel, header, payload, source)
+
+    def close(self) -> None:
+        """Close the link."""
+        self._ending.set()
+        super().close()
+
+    # --- operators ---------------------------------------------------------------------------------------------------
+
+    def _on_request(self, message: Message) -> None:
+        try:
+            check_sizes(message.channel, message.header, message.payload)
+            header, request = decode(RequestHeader, message.header), decode(Request, message.payload)
+        except WireError:
+            return
+        try:
+            if header.source != message.source:
+                raise WireError(RejectReason.UNKNOWN_SOURCE, "key and header disagree on the source")
+            detail, ok = self._carry_out(header, request.verb), True
+        except WireError as error:
+            detail, ok = f"{error.reason}: {error.detail}"[:200], False
+        reply = Reply(to=header.session, id=request.id, ok=ok, state=self._state, detail=detail)
+        self._post(REPLY, reply)
+        self._post_status()
+
+    def _carry_out(self, header: RequestHeader, verb: Verb) -> str:
+        """Return one line for the operator. Raises WireError for a request that is rejected."""
+        if verb is Verb.STOP:
+            return self._halt(State.STOPPED, f"STOP by {header.source}")
+        if verb is Verb.DISARM:
+            return self._halt(self._state if self._state is State.STOPPED else State.DISARMED,
+                              f"disarmed by {header.source}")
+        if verb in (Verb.ACQUIRE, Verb.RELEASE):
+            raise WireError(RejectReason.NOT_ALLOWED, "only its vision service can drive a legacy robot")
+        with self._lock:
+            if header.echo not in self._issued:
+                raise WireError(RejectReason.STALE, "cites no status of the last 2 s; repeat the request")
+            if verb is Verb.RESET:
+                if self._state is not State.STOPPED:
+                    return f"nothing to reset: {self._state}"
+                self._state, self._reason = State.DISARMED, f"reset by {header.source}; not armed"
+                return "reset; arm to drive"
+            if self._state is State.STOPPED:
+                raise WireError(RejectReason.STOPPED, f"{self._reason}; reset first")
+            self._state, self._reason = State.ACTIVE, _DRIVING
+            return "armed"
+
+    def _halt(self, state: State, reason: str) -> str:
+        """Send zero now, without waiting for the next frame. The link repeats it."""
+        with self._lock:
+            self._issued.clear()
+            if self._state is not state:
+                self._state, self._reason = state, reason
+            self._applied = (0.0, 0.0)
+            for channel, zero in ((TWIST, _ZERO), (DETECTIONS, _NO_BOX)):
+                self._link.publish(channel, b"", zero)
+        return "STOPPED" if state is State.STOPPED else "disarmed"
+
+    # --- status ------------------------------------------------------------------------------------------------------
+
+    def _report(self) -> None:
+        while not self._ending.wait(STATUS_PERIOD_S):
+            self._post_status()
+
+    def _post_status(self) -> None:
+        with self._lock:
+            status = Status(state=self._state, reason=self._reason, applied=self._applied, accepted=self._accepted)
+        self._post(STATUS, status)
+
+    def _post(self, channel: Channel, model: WireModel) -> None:
+        with self._lock:
+            self._seqs[channel] += 1
+            stamp = Stamp(session=self._session, seq=self._seqs[channel], t_us=self._now_us())
+            if channel is STATUS:
+                self._issued.append(Echo.of(stamp))
+        self._link.publish(channel, encode(stamp), encode(model))
