@@ -1,10 +1,19 @@
-"""The monotonic clock of this machine, and the age of stamps from a robot's clock. Shell (a clock)."""
+"""The clocks of this machine, and the age of stamps from a robot's clock. Shell (clocks)."""
 
 import time
+from typing import Final
+
+# Linux alone has this clock. On other systems the clock of heartbeats is all there is.
+_WITH_SUSPEND: Final = getattr(time, "CLOCK_BOOTTIME", None)
 
 
 def monotonic_us() -> int:
-    """Return the microseconds since a fixed moment."""
+    """Return the microseconds since a fixed moment, those in suspend included: a frame ages while the robot sleeps."""
+    return heartbeat_us() if _WITH_SUSPEND is None else time.clock_gettime_ns(_WITH_SUSPEND) // 1000
+
+
+def heartbeat_us() -> int:
+    """Return the microseconds for which this machine has run. In suspend neither end of a heartbeat is late."""
     return time.monotonic_ns() // 1000
 
 

@@ -128,7 +128,7 @@ right, right_ns = time.time, time.time_ns
 time.time = lambda: right() + ({offset_s})
 time.time_ns = lambda: right_ns() + int(({offset_s}) * 1e9)
 with open({str(folder / "clock.ledger")!r}, "a") as ledger:
-    ledger.write(f"{INJECTED},{{time.monotonic_ns() // 1000}},0\\n")
+    ledger.write(f"{INJECTED},{{time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000}},0\\n")
 """,
         "utf-8",
     )

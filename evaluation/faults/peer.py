@@ -22,6 +22,7 @@ from sightline.operator_side.client.requests import SOURCE as OPERATOR_SOURCE
 from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.config.loading import load_service
 from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, TWIST, Channel, key_for
+from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.config import Config
 from sightline.protocol.messages import MAX_INTEGER, AnswerHeader, Echo, FrameHeader, Twist, Verb
@@ -199,7 +200,7 @@ def late(script: Script) -> None:
 
 
 def _is_late(frame: FrameHeader) -> bool:
-    return time.monotonic() - frame.t_us / 1e6 > LATE_S
+    return monotonic_us() - frame.t_us > LATE_S * 1e6
 
 
 def replay(script: Script) -> None:

@@ -13,7 +13,7 @@ from types import FrameType
 from typing import Final
 
 from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
-from sightline.protocol.clock import monotonic_us
+from sightline.protocol.clock import heartbeat_us, monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import ConfigError, RejectReason, WireError
@@ -251,8 +251,8 @@ class Driver:
             for message in self._driver_core.messages(now_us):
                 self.driver_end.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
             if self._receiver is not None:
-                self._receiver.keep_alive(now_us)
-            self.driver_end.keep_alive(now_us, self._driver_core.gate.issued.last_seq("frame") + 1)
+                self._receiver.keep_alive(heartbeat_us())
+            self.driver_end.keep_alive(heartbeat_us(), self._driver_core.gate.issued.last_seq("frame") + 1)
             self._driver_core.network_restarts = max(0, self.driver_end.restarts)
             self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)
             self._log_state(self._driver_core.gate.state, self._driver_core.gate.reason)

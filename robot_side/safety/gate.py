@@ -129,6 +129,7 @@ class SafetyGate:
         # The lease is renewed in DISARMED too. Otherwise arming would never find a live driver.
         self._live_commands = self._live_commands + 1 if holder == who else 1
         self._lease.take(who, now_us)
+        self._sequence.promote((who.source, who.session))
         if not is_armed(self.state):
             raise WireError(RejectReason.DISARMED, self.reason)
         self._accept(source, twist, now_us, age_us)
@@ -151,7 +152,7 @@ class SafetyGate:
         age_us = now_us - self.pictures.shown_since_us(header.echo.t_us)
         if age_us > self.config.max_age_us:
             raise WireError(RejectReason.STALE, f"the camera image has not changed for {age_us / 1e3:.0f} ms")
-        self._sequence.check(header)
+        self._sequence.check(header, now_us)
         return Holder(source=header.source, session=header.session), age_us
 
     def _accept(self, source: str, twist: Twist, now_us: int, age_us: int) -> None:

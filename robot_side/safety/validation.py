@@ -13,6 +13,12 @@ from sightline.protocol.messages import AnswerHeader, Echo, State, Twist
 _KEPT_PER_CHANNEL = 256
 # A peer can invent any number of sessions, so the memory for them is bounded.
 _KEPT_SENDERS = 64
+_SENDER_MEMORY_US = 10_000_000
+_SeqTable = OrderedDict[tuple[str, str], tuple[int, int]]
+# A year of commands at 100 Hz, and ten hours of lost commands at 30 Hz. A forged number near 2^53 would bar its owner.
+_MAX_FIRST_SEQ, _MAX_SEQ_JUMP = 2**32, 2**20
+# 8 s at 30 fps. A camera that repeats its buffers has up to 32 of them.
+_KEPT_IMAGES = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,10 +144,10 @@ class IssuedRecord:
 
 
 class FreshnessRecord:
-    """Stores the time since which the camera image has been the same, byte for byte."""
+    """Stores the time since which the camera has delivered no new image, byte for byte."""
 
     def __init__(self) -> None:
-        self._fingerprint: int | None = None
+        self._fingerprints: OrderedDict[int, None] = OrderedDict()
         self._newest_us = self._changed_us = 0
 
     def add(self, t_us: int, fingerprint: int) -> None:
@@ -151,37 +157,60 @@ class FreshnessRecord:
             t_us: capture time.
             fingerprint: checksum of the image; 0 for a source that is not live and may repeat an image.
         """
-        # The noise of a live sensor never repeats, so an equal image means a frozen camera.
-        if fingerprint == 0 or fingerprint != self._fingerprint:
+        # The noise of a live sensor never repeats, so an earlier image means a frozen camera or repeated buffers.
+        if fingerprint == 0 or fingerprint not in self._fingerprints:
             self._changed_us = t_us
-        self._fingerprint, self._newest_us = fingerprint, t_us
+            self._fingerprints[fingerprint] = None
+            if len(self._fingerprints) > _KEPT_IMAGES:
+                self._fingerprints.popitem(last=False)
+        self._newest_us = t_us
 
     def unchanged_us(self) -> int:
-        """Return the time in us for which the image has not changed."""
+        """Return the time in us since the last new image."""
         return self._newest_us - self._changed_us
 
     def shown_since_us(self, t_us: int) -> int:
         """Return the time at which the image of the frame captured at `t_us` first appeared."""
-        return t_us if self._fingerprint is None else min(t_us, self._changed_us)
+        return min(t_us, self._changed_us) if self._fingerprints else t_us
 
 
 class SequenceRecord:
-    """Stores the newest sequence number of each (source, session), for a bounded number of senders."""
+    """Stores the newest sequence number of each (source, session), for a bounded number of senders.
+
+    The senders that held the lease have a table of their own, so that no number of rejected senders evicts them.
+    """
 
     def __init__(self) -> None:
-        self._last: OrderedDict[tuple[str, str], int] = OrderedDict()
+        self._drivers: _SeqTable = OrderedDict()
+        self._others: _SeqTable = OrderedDict()
 
-    def check(self, header: AnswerHeader) -> None:
+    def check(self, header: AnswerHeader, now_us: int) -> None:
         """Store the sequence number of a command.
 
         Raises:
-            WireError: OUT_OF_ORDER if it is not newer than all others of this source and session.
+            WireError: OUT_OF_ORDER if it is not newer than all others of this source and session, or jumps too far.
         """
         sender = (header.source, header.session)
-        last = self._last.get(sender, -1)
-        if header.seq <= last:
-            raise WireError(RejectReason.OUT_OF_ORDER, f"seq {header.seq} of {header.source} is not newer than {last}")
-        self._last[sender] = header.seq
-        self._last.move_to_end(sender)
-        if len(self._last) > _KEPT_SENDERS:
-            self._last.popitem(last=False)
+        table = self._drivers if sender in self._drivers else self._others
+        seq, stored_us = table.get(sender, (-1, 0))
+        # A frame that old is STALE, so nothing of this sender can be replayed.
+        is_known = seq >= 0 and now_us - stored_us <= _SENDER_MEMORY_US
+        if is_known and header.seq <= seq:
+            raise WireError(RejectReason.OUT_OF_ORDER, f"seq {header.seq} of {header.source} is not newer than {seq}")
+        if header.seq > (seq + _MAX_SEQ_JUMP if is_known else _MAX_FIRST_SEQ):
+            raise WireError(
+                RejectReason.OUT_OF_ORDER, f"seq {header.seq} of {header.source} jumps too far; start a new session"
+            )
+        _store(table, sender, (header.seq, now_us))
+
+    def promote(self, sender: tuple[str, str]) -> None:
+        """Store a sender with the drivers: its last command took or renewed the lease."""
+        if sender in self._others:
+            _store(self._drivers, sender, self._others.pop(sender))
+
+
+def _store(table: _SeqTable, sender: tuple[str, str], entry: tuple[int, int]) -> None:
+    table[sender] = entry
+    table.move_to_end(sender)
+    if len(table) > _KEPT_SENDERS:
+        table.popitem(last=False)

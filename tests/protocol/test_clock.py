@@ -1,10 +1,11 @@
 """The age of a robot's stamp, measured against its quickest message: never too old, and separate for each start."""
 
+import time
 from random import Random
 
 import pytest
 
-from sightline.protocol.clock import RobotClock
+from sightline.protocol.clock import RobotClock, heartbeat_us, monotonic_us
 
 
 @pytest.mark.parametrize("seed", [1, 29, 400])
@@ -26,3 +27,12 @@ def test_another_session_is_another_clock():
     clock.update("11111111", 500, 10_100_000)
     assert clock.age_us("0a0b0c0d", 9_000_000, 10_200_000) is None
     assert clock.age_us("11111111", 500, 10_200_000) == 100_000
+
+
+def test_time_in_suspend_counts_for_ages_and_not_for_heartbeats(monkeypatch):
+    real, suspended_us = time.clock_gettime_ns, 60_000_000
+    before_us, beat_us = monotonic_us(), heartbeat_us()
+    added_ns = {time.CLOCK_BOOTTIME: suspended_us * 1000}
+    monkeypatch.setattr(time, "clock_gettime_ns", lambda clock: real(clock) + added_ns.get(clock, 0))
+    assert suspended_us <= monotonic_us() - before_us < suspended_us + 1_000_000
+    assert 0 <= heartbeat_us() - beat_us < 1_000_000

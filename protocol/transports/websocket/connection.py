@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from itertools import takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from sightline.protocol.clock import monotonic_us
+from sightline.protocol.clock import heartbeat_us
 
 if TYPE_CHECKING:
     from websockets.frames import Frame
@@ -248,7 +248,7 @@ class Connection:
         self.lock = threading.Lock()
         self.granted: frozenset[tuple[str, ...]] | None = None
         """(channel, source) pairs that the other end may publish, None for all. Set with the check of its token."""
-        self.heard_us = monotonic_us()
+        self.heard_us = heartbeat_us()
         """Time of the last data from the other end."""
         self._unheard_bytes = 0
         self._near = near
@@ -337,7 +337,7 @@ class Connection:
         except OSError:
             return False
         if data:
-            self.heard_us, self._unheard_bytes = monotonic_us(), 0
+            self.heard_us, self._unheard_bytes = heartbeat_us(), 0
             self._messages.feed(data)
         return bool(data)
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from sightline.protocol.channels import ACK, Channel
-from sightline.protocol.clock import monotonic_us
+from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.errors import WireError
 from sightline.protocol.transports.link import OVERSIZE, Message, OutgoingQueue
 from sightline.protocol.transports.websocket.connection import CLOSE_S, Connection, Keepalive
@@ -144,7 +144,7 @@ class Peer:
         """Read until the connection ends. A peer that breaks the rules is closed with the reason."""
         from websockets.exceptions import ConnectionClosed
 
-        keepalive = Keepalive(monotonic_us())
+        keepalive = Keepalive(heartbeat_us())
         try:
             while self._turn(keepalive, deliver, refuse):
                 self._wire.wait((_TICK_US if self._commands is None else _REST_TICK_US) / 1e6)
@@ -165,7 +165,7 @@ class Peer:
     ) -> bool:
         """Read all available messages, and send. Returns False if the connection has to end."""
         # Before reading, so that data counts that arrived during a pause of this process.
-        now_us = monotonic_us()
+        now_us = heartbeat_us()
         for message in self._wire.receive():
             self._read(message, deliver, refuse)
         # The receiver of a message runs only when this thread waits, so this turn ends early.

@@ -7,19 +7,21 @@ monotonic clock, some with the clock of the day or with the time since boot; som
 import time
 from dataclasses import dataclass
 
-from sightline.protocol.clock import monotonic_us
+from sightline.protocol.clock import heartbeat_us, monotonic_us
 from sightline.protocol.transports.link import LatestSlot
 from sightline.robot_side.ports import Picture
 
+_RUNNING = 0  # the clock that stops in suspend, in the order in which clocks are tried
+_SHORTEST_SUSPEND_US = 50_000  # a shorter one makes no image look young
 _OLDEST_US = 2_000_000  # until its clock is known, what seems older than this was stamped by another
 
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """The same moment on each clock that a driver may stamp with."""
+    """The same moment on each clock that a driver may stamp with: since boot, less suspend, of the day."""
 
-    monotonic_us: int
     boot_us: int
+    running_us: int
     day_us: int
 
 
@@ -30,18 +32,36 @@ class CaptureClock:
         """Take `delay_us`, the assumed age of an image without a usable stamp."""
         self._delay_us = delay_us
         self._known: int | None = None
+        self._suspended_us: int | None = None
+        self._resumed_us: int | None = None
 
     def captured_us(self, stamp_us: int, now: Clocks) -> int:
-        """Monotonic time of capture of a buffer stamped `stamp_us` and read `now`.
+        """Time of capture, on the robot's clock, of a buffer stamped `stamp_us` and read `now`.
 
         The first clock on which a stamp lies in the last two seconds is the device's. From then on its stamps are
         believed, however old the images have grown in the driver's queue, unless one is from that clock's future.
         """
-        ages_us = [clock_us - stamp_us for clock_us in (now.monotonic_us, now.boot_us, now.day_us)]
+        ages_us = [now.running_us - stamp_us, now.boot_us - stamp_us, now.day_us - stamp_us]
         if self._known is None or ages_us[self._known] < 0:
             self._known = next((at for at, age_us in enumerate(ages_us) if 0 <= age_us <= _OLDEST_US), self._known)
         age_us = -1 if self._known is None else ages_us[self._known]
-        return now.monotonic_us - (age_us if age_us >= 0 else self._delay_us)
+        if self._known == _RUNNING and age_us >= 0:
+            age_us += self._asleep_us(stamp_us, now)
+        return now.boot_us - (age_us if age_us >= 0 else self._delay_us)
+
+    def _asleep_us(self, stamp_us: int, now: Clocks) -> int:
+        """Return the time in suspend since `stamp_us`, which the clock of that stamp lacks.
+
+        A buffer that was filled before the first reading after a suspend may be from before it, and counts as such.
+        """
+        suspended_us = now.boot_us - now.running_us
+        if self._suspended_us is None or suspended_us - self._suspended_us <= _SHORTEST_SUSPEND_US:
+            self._suspended_us = suspended_us
+        elif self._resumed_us is None:
+            self._resumed_us = now.running_us
+        if self._resumed_us is not None and stamp_us > self._resumed_us:
+            self._suspended_us, self._resumed_us = suspended_us, None
+        return suspended_us - self._suspended_us
 
 
 # The robot's clocks, and a rhythm for sources that have none of their own, such as files. Shell (clocks).
@@ -68,8 +88,7 @@ class FrameTimer:
 
 def read_clocks() -> Clocks:
     """Read all clocks that a driver may use for its stamps."""
-    boot_us = time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000
-    return Clocks(monotonic_us(), boot_us, time.time_ns() // 1000)
+    return Clocks(monotonic_us(), heartbeat_us(), time.time_ns() // 1000)
 
 
 # The newest image of a camera that captures by itself. Shell (a lock and a clock).

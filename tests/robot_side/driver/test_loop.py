@@ -50,6 +50,7 @@ def run(tmp_path, monkeypatch):
     def run(loop, seconds):
         """Run the loop for so long and return the times of its ticks, from its start on."""
         monkeypatch.setattr(process, "monotonic_us", lambda: loop.now_us)
+        monkeypatch.setattr(process, "heartbeat_us", lambda: loop.now_us)
         monkeypatch.setattr(process, "select", SimpleNamespace(select=loop.select))
         monkeypatch.setattr(process, "request_real_time", list)
         driver = Driver(RobotConfig(state_dir=tmp_path), loop, None)

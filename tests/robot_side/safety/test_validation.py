@@ -158,9 +158,11 @@ def test_the_first_status_may_be_cited():
         ([(10, 5), (30, 5), (60, 5)], 50),
         ([(10, 5), (30, 6)], 0),
         ([(10, 5), (30, 6), (60, 6)], 30),
-        ([(10, 5), (30, 6), (60, 5)], 0),
+        ([(10, 5), (30, 6), (60, 5)], 30),
+        ([(10, 5), (30, 6), (60, 5), (90, 6)], 60),
+        ([(10, 5), (30, 6), (60, 5), (90, 7)], 0),
         ([(10, 0), (30, 0)], 0),
-        ([(10, 5), (30, 0), (60, 5)], 0),
+        ([(10, 5), (30, 0), (60, 5)], 30),
         ([(10, 1), (30, 1)], 20),
         ([(10, -1), (30, -1)], 20),
     ],
@@ -169,6 +171,14 @@ def test_an_image_is_unchanged_since_it_was_first_seen(pictures, unchanged_us):
     record = FreshnessRecord()
     for t_us, fingerprint in pictures:
         record.add(t_us, fingerprint)
+    assert record.unchanged_us() == unchanged_us
+
+
+@pytest.mark.parametrize(("buffers", "unchanged_us"), [(2, 2_000), (255, 2_000), (256, 2_000), (257, 0)])
+def test_a_camera_that_repeats_up_to_256_images_is_frozen(buffers, unchanged_us):
+    record = FreshnessRecord()
+    for index in range(buffers + 2_000):
+        record.add(index, 1 + index % buffers)
     assert record.unchanged_us() == unchanged_us
 
 
@@ -194,55 +204,110 @@ def test_image_of_a_frame_is_as_old_as_its_last_change(pictures, t_us, since_us)
 
 # --- sequence numbers --------------------------------------------------------------------------------------------
 
+FIRST_SEQ, JUMP, MEMORY_US = 2**32, 2**20, 10_000_000
+
 
 def header(seq, session="0000bbbb", source="vision"):
     return AnswerHeader(source=source, session=session, seq=seq, echo=echo())
+
+
+def used(*headers, now_us=0, held=False):
+    record = SequenceRecord()
+    for one in headers:
+        record.check(one, now_us)
+        if held:
+            record.promote((one.source, one.session))
+    return record
 
 
 @pytest.mark.parametrize(
     ("first", "then", "accepted"), [(0, 0, False), (0, 1, True), (5, 4, False), (5, 5, False), (5, 6, True)]
 )
 def test_sequence_numbers_only_grow(first, then, accepted):
-    record = SequenceRecord()
-    record.check(header(first))
+    record = used(header(first))
     if accepted:
-        record.check(header(then))
+        record.check(header(then), 0)
     else:
-        error = refusal(record.check, header(then))
+        error = refusal(record.check, header(then), 0)
         assert error.reason is RejectReason.OUT_OF_ORDER
         assert error.detail == f"seq {then} of vision is not newer than {first}"
 
 
+@pytest.mark.parametrize(
+    ("record", "seq", "accepted"),
+    [
+        (used(), FIRST_SEQ, True), (used(), FIRST_SEQ + 1, False), (used(), 2**52, False),
+        (used(header(7)), 7 + JUMP, True), (used(header(7)), 8 + JUMP, False), (used(header(7)), 2**52, False),
+        (used(header(FIRST_SEQ)), FIRST_SEQ + JUMP, True),
+    ],
+)  # fmt: skip
+def test_jump_of_a_sequence_number_is_bounded(record, seq, accepted):
+    if accepted:
+        record.check(header(seq), 0)
+    else:
+        error = refusal(record.check, header(seq), 0)
+        assert error.reason is RejectReason.OUT_OF_ORDER
+        assert error.detail == f"seq {seq} of vision jumps too far; start a new session"
+
+
 def test_rejected_number_is_not_stored():
-    record = SequenceRecord()
-    record.check(header(5))
-    refusal(record.check, header(3))
-    assert refusal(record.check, header(4)).reason is RejectReason.OUT_OF_ORDER
+    record = used(header(5))
+    refusal(record.check, header(3), 0)
+    refusal(record.check, header(5 + JUMP + 1), 0)
+    assert refusal(record.check, header(4), 0).detail == "seq 4 of vision is not newer than 5"
+    record.check(header(6), 0)
 
 
 def test_each_source_and_session_counts_for_itself():
-    record = SequenceRecord()
-    for sender in [("0000bbbb", "vision"), ("0000cccc", "vision"), ("0000bbbb", "teleop")]:
-        record.check(header(0, *sender))
+    record = used(header(5))
+    for sender in [("0000cccc", "vision"), ("0000bbbb", "teleop")]:
+        record.check(header(0, *sender), 0)
 
 
-@pytest.mark.parametrize(("others", "remembered"), [(62, True), (63, True), (64, False)])
-def test_64_senders_are_remembered(others, remembered):
-    record = SequenceRecord()
-    record.check(header(5))
-    for index in range(others):
-        record.check(header(5, f"{index:08x}"))
+@pytest.mark.parametrize(
+    ("silent_us", "remembered"), [(MEMORY_US - 1, True), (MEMORY_US, True), (MEMORY_US + 1, False)]
+)
+def test_silent_sender_is_remembered_for_ten_seconds(silent_us, remembered):
+    # A frame that old is STALE, so nothing of that sender can be replayed.
+    record = used(header(5), now_us=1_000)
     if remembered:
-        refusal(record.check, header(5))
+        refusal(record.check, header(5), 1_000 + silent_us)
     else:
-        record.check(header(5))
+        record.check(header(5), 1_000 + silent_us)
 
 
-def test_the_longest_silent_sender_is_forgotten_first():
-    record = SequenceRecord()
-    for index in range(64):
-        record.check(header(5, f"{index:08x}"))
-    record.check(header(6, "00000000"))
-    record.check(header(5, "0000ffff"))
-    refusal(record.check, header(6, "00000000"))
-    record.check(header(5, "00000001"))
+@pytest.mark.parametrize("held", [False, True])
+@pytest.mark.parametrize(("others", "remembered"), [(62, True), (63, True), (64, False)])
+def test_64_senders_of_each_kind_are_remembered(others, remembered, held):
+    record = used(header(5), *(header(5, f"{index:08x}") for index in range(others)), held=held)
+    if remembered:
+        refusal(record.check, header(5), 0)
+    else:
+        record.check(header(5), 0)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_the_longest_silent_sender_is_forgotten_first(held):
+    senders = [header(5, f"{index:08x}") for index in range(64)]
+    record = used(*senders, header(6, "00000000"), header(5, "0000ffff"), held=held)
+    refusal(record.check, header(6, "00000000"), 0)
+    record.check(header(5, "00000001"), 0)
+
+
+def test_rejected_senders_evict_no_driver():
+    record = used(header(5), held=True)
+    for index in range(1_000):
+        record.check(header(5, f"{index:08x}"), 0)
+    refusal(record.check, header(5), 0)
+
+
+def test_promoted_sender_counts_on():
+    record = used(header(5), header(6, "0000cccc"))
+    record.promote(("vision", "0000bbbb"))
+    record.promote(("vision", "0000dddd"))
+    refusal(record.check, header(5), 0)
+    refusal(record.check, header(6, "0000cccc"), 0)
+    record.check(header(6), 0)
+    record.promote(("vision", "0000bbbb"))
+    refusal(record.check, header(6), 0)
+    record.check(header(0, "0000dddd"), 0)

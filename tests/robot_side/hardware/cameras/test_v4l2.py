@@ -134,7 +134,7 @@ def test_model_of_another_size_is_rejected_and_the_device_released(opened):
 # --- times -------------------------------------------------------------------------------------------------------
 
 
-NOW = Clocks(monotonic_us=10_000_000, boot_us=500_000_000, day_us=1_700_000_000_000_000)
+NOW = Clocks(running_us=10_000_000, boot_us=500_000_000, day_us=1_700_000_000_000_000)
 
 
 @pytest.mark.parametrize("clock", [time.monotonic, time.time, lambda: time.clock_gettime(time.CLOCK_BOOTTIME)])
@@ -151,39 +151,51 @@ def test_image_without_a_time_has_the_configured_age(opened):
 
 
 @pytest.mark.parametrize(
-    ("stamp_us", "expected_us"),
+    ("stamp_us", "age_us"),
     [
-        (9_900_000, 9_900_000),  # monotonic
-        (10_000_000, 10_000_000),  # this very moment
-        (8_000_000, 8_000_000),  # as old as is believed
-        (7_999_999, 9_970_000),  # older: by the configured delay
-        (10_000_001, 9_970_000),  # from the future
-        (0, 9_970_000),  # none
-        (500_000_000 - 50_000, 9_950_000),  # time since boot
-        (1_700_000_000_000_000 - 50_000, 9_950_000),  # time of the day
+        (9_900_000, 100_000),  # monotonic
+        (10_000_000, 0),  # this very moment
+        (8_000_000, 2_000_000),  # as old as is believed
+        (7_999_999, 30_000),  # older: by the configured delay
+        (10_000_001, 30_000),  # from the future
+        (0, 30_000),  # none
+        (500_000_000 - 50_000, 50_000),  # time since boot
+        (1_700_000_000_000_000 - 50_000, 50_000),  # time of the day
     ],
 )
-def test_stamp_is_read_on_its_own_clock(stamp_us, expected_us):
-    assert CaptureClock(30_000).captured_us(stamp_us, NOW) == expected_us
+def test_stamp_is_read_on_its_own_clock(stamp_us, age_us):
+    assert CaptureClock(30_000).captured_us(stamp_us, NOW) == NOW.boot_us - age_us
 
 
-@pytest.mark.parametrize("clock_us", [NOW.monotonic_us, NOW.boot_us, NOW.day_us])
+@pytest.mark.parametrize("clock_us", [NOW.running_us, NOW.boot_us, NOW.day_us])
 @pytest.mark.parametrize("age_us", [0, 2_000_000, 2_000_001, 9_000_000])
 def test_later_stamps_of_a_known_clock_are_accepted_at_any_age(clock_us, age_us):
     stamps = CaptureClock(30_000)
     stamps.captured_us(clock_us - 10_000, NOW)
-    assert stamps.captured_us(clock_us - age_us, NOW) == NOW.monotonic_us - age_us
-    assert stamps.captured_us(clock_us - 10_000, NOW) == NOW.monotonic_us - 10_000, "and is not forgotten"
+    assert stamps.captured_us(clock_us - age_us, NOW) == NOW.boot_us - age_us
+    assert stamps.captured_us(clock_us - 10_000, NOW) == NOW.boot_us - 10_000, "and is not forgotten"
 
 
 def test_future_stamp_counts_as_another_clock_or_is_ignored():
     """Monotonic time and time since boot are one until the machine is first put to sleep."""
     stamps = CaptureClock(30_000)
-    awake = Clocks(monotonic_us=9_000_000, boot_us=9_000_000, day_us=1_700_000_000_000_000)
+    awake = Clocks(running_us=9_000_000, boot_us=9_000_000, day_us=1_700_000_000_000_000)
     assert stamps.captured_us(8_990_000, awake) == 8_990_000
-    assert stamps.captured_us(NOW.boot_us - 10_000, NOW) == 9_990_000
-    assert stamps.captured_us(NOW.boot_us - 3_000_000, NOW) == 7_000_000
-    assert stamps.captured_us(NOW.boot_us + 1, NOW) == 9_970_000
+    assert stamps.captured_us(NOW.boot_us - 10_000, NOW) == NOW.boot_us - 10_000
+    assert stamps.captured_us(NOW.boot_us - 3_000_000, NOW) == NOW.boot_us - 3_000_000
+    assert stamps.captured_us(NOW.boot_us + 1, NOW) == NOW.boot_us - 30_000
+
+
+def test_image_from_before_a_suspend_is_as_old_as_the_suspend():
+    """The clock of most drivers stops in suspend, so their stamp of such an image looks young."""
+    stamps, asleep_us = CaptureClock(30_000), 60_000_000
+    assert stamps.captured_us(9_990_000, NOW) == NOW.boot_us - 10_000
+    awake = Clocks(boot_us=500_100_000 + asleep_us, running_us=10_100_000, day_us=0)
+    for stamp_us in (10_030_000, 10_099_000, 10_100_000):
+        assert awake.boot_us - stamps.captured_us(stamp_us, awake) >= asleep_us
+    later = Clocks(boot_us=500_200_000 + asleep_us, running_us=10_200_000, day_us=0)
+    assert later.boot_us - stamps.captured_us(10_100_000, later) >= asleep_us
+    assert stamps.captured_us(10_100_001, later) == later.boot_us - 99_999
 
 
 def test_images_that_waited_for_a_stalled_process_are_old(opened):
