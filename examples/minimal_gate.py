@@ -12,6 +12,7 @@ from typing import Any
 SESSION = secrets.token_hex(4)
 FULL_SPEED_US, MAX_AGE_US, SILENCE_US, LEASE_US, STATUS_US = 150_000, 400_000, 300_000, 1_000_000, 2_000_000
 MAX_LINEAR_MPS, MAX_ANGULAR_RAD_S = 0.3, 1.5
+MAX_JUMP = 2**32
 NOTHING = (0.0, 0.0, -MAX_AGE_US, -SILENCE_US)  # linear, angular, when the frame was captured, when it came
 NUMBER = rb"([+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)"
 TWIST = re.compile(NUMBER + rb"\|" + NUMBER)  # 4.1
@@ -48,7 +49,7 @@ class Gate:
             "NOT_FINITE": math.isfinite(linear) and math.isfinite(angular),
             "UNKNOWN_SOURCE": who[0] in ("vision", "teleop"),
             **self.young(echo, "frame", now, MAX_AGE_US),
-            "OUT_OF_ORDER": header["seq"] > self.last_seq.get(who, -1),
+            "OUT_OF_ORDER": 0 < header["seq"] - self.last_seq.get(who, -1) <= MAX_JUMP,
         }
         wrong = next((reason for reason, holds in checks.items() if not holds), "")
         return wrong or self.take(who, header["seq"], (linear, angular, echo["t_us"], now))
@@ -68,7 +69,9 @@ class Gate:
         }
 
     def take(self, who: tuple[str, str], seq: int, command: tuple[float, float, int, int]) -> str:
-        self.last_seq = dict([*self.last_seq.items(), (who, seq)][-64:])
+        others = [one for one in self.last_seq.items() if one[0] not in (who, self.holder)]
+        kept = [one for one in self.last_seq.items() if one[0] == self.holder]
+        self.last_seq = dict([*others[-62:], *kept, (who, seq)])  # 5.1: whom it rejects displaces no driver
         linear, angular, frame_us, now = command
         live = self.live(now)
         if self.stopped or (live and who != self.holder):  # 6.5, 6.1

@@ -60,16 +60,19 @@ class Vision:
     """Answers each frame once: with a twist that cites it, or with an ack (4.5, 7.1)."""
 
     def __init__(self, answer: Answer) -> None:
-        self.answer, self.robot_session, self.last = answer, "", (-1, -1)
+        self.answer, self.robot_session, self.last, self.heard_us = answer, "", (-1, -1), 0
 
     def frame(self, header: Header, jpeg: bytes) -> None:
         started = time.monotonic_ns()
         session, now = header["session"], (header["seq"], header["t_us"])
         if header.get("v", 1) != 1 or any(type(one) is not int or not 0 <= one < 2**53 for one in now):  # 2.2, 2.4
             return
-        newer = session != self.robot_session or (now[0] > self.last[0] and now[1] > self.last[1])  # 2.6
+        silent_us = started // 1000 - self.heard_us
+        newer = now[0] > self.last[0] and 0 < now[1] - self.last[1] <= silent_us + 500_000  # 2.6: nor of the future
+        newer |= session != self.robot_session or silent_us > 500_000
         twist = look(jpeg) if newer else None
-        self.robot_session, self.last = (session, now) if newer else (self.robot_session, self.last)
+        if newer:
+            self.robot_session, self.last, self.heard_us = session, now, started // 1000
         echo = {"channel": "frame", **{name: header[name] for name in ("session", "seq", "t_us")}}  # 2.7
         stamp = {"v": 1, "source": SOURCE, "session": SESSION, "seq": next(COUNT), "echo": echo,
                  "compute_us": (time.monotonic_ns() - started) // 1000}

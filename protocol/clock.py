@@ -17,28 +17,92 @@ def heartbeat_us() -> int:
     return time.monotonic_ns() // 1000
 
 
-# The age of a robot's stamp without synchronized clocks, estimated from its fastest message. Pure.
+# The time of a robot's messages, measured on this machine's clock without synchronization. Pure.
 #
 # The delay of the fastest message of a session cannot be separated from the offset of the clocks. Ages are therefore
 # lower bounds; they lack the shortest one-way delay of the link.
 
 
+AHEAD_US: Final = 500_000
+"""Largest lead of a message over the fastest one: its time cannot be true. More than clocks and links of one robot
+differ, and short enough to steer again within a second after a forged message."""
+_PROVEN_US: Final = 300_000
+"""Another time of a session replaces the current one after messages over this long, during which that one is silent."""
+_DRIFT: Final = 5_000
+"""Two quartz clocks differ by less than 1 in 5000."""
+_FRAMES_PER_S: Final = 1_000
+
+
+class _Timeline:
+    """Messages of one session whose times agree with this machine's clock."""
+
+    def __init__(self, seq: int, t_us: int, now_us: int) -> None:
+        self.offset_us = now_us - t_us
+        self.heard_us = self._begun_us = now_us
+        self._begun_t_us = self._t_us = t_us
+        self._seq = seq
+
+    def fits(self, seq: int, t_us: int, now_us: int) -> bool:
+        """Return True unless a message runs ahead, or goes back further than a link delays."""
+        most = self._seq + _FRAMES_PER_S + (now_us - self.heard_us) * _FRAMES_PER_S // 1_000_000
+        return self._t_us - AHEAD_US <= t_us <= now_us - self.offset_us + AHEAD_US and seq <= most
+
+    def extend(self, seq: int, t_us: int, now_us: int) -> None:
+        drift_us = (now_us - self.heard_us) // _DRIFT
+        self.offset_us = min(self.offset_us + drift_us, now_us - t_us)
+        self.heard_us = now_us
+        self._t_us, self._seq = max(self._t_us, t_us), max(self._seq, seq)
+
+    @property
+    def is_proven(self) -> bool:
+        """Return True if time passed in its messages as it passed here."""
+        return min(self.heard_us - self._begun_us, self._t_us - self._begun_t_us) >= _PROVEN_US
+
+
 class RobotClock:
-    """Estimates the offset of one robot's monotonic clock, separately for each session."""
+    """Estimates the offset of one robot's clock, separately for each session, and bounds what its messages state."""
 
     def __init__(self) -> None:
         self._session = ""
-        self._offset_us = 0
+        self._current: _Timeline | None = None
+        self._other: _Timeline | None = None
+        self.replaced = 0
+        """How often another time of one session replaced a current one that was not true."""
 
-    def update(self, session: str, t_us: int, now_us: int) -> None:
-        """Learn from a message that left at `t_us` on the robot's clock and arrived at `now_us` on this clock."""
-        offset_us = now_us - t_us
+    def update(self, session: str, t_us: int, now_us: int, seq: int = 0) -> bool:
+        """Learn from a message.
+
+        Args:
+            session: session of the robot.
+            t_us: its time on the robot's clock.
+            now_us: its arrival on this clock.
+            seq: its sequence number, 0 if messages of several channels are mixed.
+
+        Returns:
+            False for a message whose time or number runs ahead of what this clock allows, or goes far back.
+        """
         if session != self._session:
-            self._session, self._offset_us = session, offset_us
-        self._offset_us = min(self._offset_us, offset_us)
+            self._session, self._current, self._other = session, None, None
+        if self._current is None:
+            self._current = _Timeline(seq, t_us, now_us)
+        if self._current.fits(seq, t_us, now_us):
+            self._current.extend(seq, t_us, now_us)
+            return True
+        return self._replaces(self._current, seq, t_us, now_us)
+
+    def _replaces(self, current: _Timeline, seq: int, t_us: int, now_us: int) -> bool:
+        """Collect messages of another time. They replace the current time if they last and that one is silent."""
+        if self._other is None or not self._other.fits(seq, t_us, now_us):
+            self._other = _Timeline(seq, t_us, now_us)
+        self._other.extend(seq, t_us, now_us)
+        if not self._other.is_proven or now_us - current.heard_us < _PROVEN_US:
+            return False
+        self._current, self._other = self._other, None
+        self.replaced += 1
+        return True
 
     def age_us(self, session: str, t_us: int, now_us: int) -> int | None:
         """Return the lowest possible age of `t_us`, in us, or None for a session other than the current one."""
-        if not session or session != self._session:
+        if self._current is None or session != self._session:
             return None
-        return max(0, now_us - t_us - self._offset_us)
+        return max(0, now_us - t_us - self._current.offset_us)

@@ -100,9 +100,10 @@ class Pipeline:
         """Forget all earlier frames and the requested mission."""
         self._mission_switch = MissionSwitch(self._first, self._camera)
         self._request: RequestId | None = None
-        self._begin_clock()
+        self.restart_clock()
 
-    def _begin_clock(self) -> None:
+    def restart_clock(self) -> None:
+        """Forget the time of the last frame, if it was not true or is of another camera model."""
         self._latency = LatencyEstimator(self._config.latency)
         self._last_us: int | None = None
 
@@ -144,7 +145,7 @@ class Pipeline:
         if self._request is None:
             self._forget()
             return
-        self._begin_clock()
+        self.restart_clock()
         if self.mission.needs_camera:
             self._mission_switch = MissionSwitch(self.mission, camera)
 

@@ -267,8 +267,8 @@ def rejected_seq_bars_no_driver(bench: Bench, sender: Sender) -> None:
 _REMEMBERED_FRAMES: Final = 256
 _APART_US: Final = 8_000
 """Twists on one frame: apart enough for none to replace another, and all before the next frame."""
-_OTHERS: Final = 60
-"""Senders between a twist and its replay; a robot remembers 64."""
+_OTHERS: Final = 80
+"""Rejected senders between a twist and its replay; they must not displace the one that held the lease."""
 
 
 def _watcher(bench: Bench) -> Sender:
@@ -293,6 +293,10 @@ SUITE.must_all(ready, {
                  lambda it: it.expect("OUT_OF_ORDER", seq=it.seq)),
     "R-SEQ-08": ("2.5 Session and sequence", "A `seq` that jumps forward is taken.",
                  lambda it: it.expect(GOOD, seq=it.seq + 1001)),
+    "R-SEQ-13": ("5.1 Order", "A `seq` near the largest integer does not continue a session: it would bar its owner.",
+                 lambda it: it.expect("OUT_OF_ORDER", seq=1 << 52)),
+    "R-SEQ-14": ("5.1 Order", "A `seq` near the largest integer does not begin a session.",
+                 lambda it: it.expect("OUT_OF_ORDER", seq=1 << 52, session="fffffff1")),
 })
 SUITE.must_all(_watcher, {
     "R-CAUS-12": ("5.1 Order", "The grammar is validated before the role: nonsense of a watcher is MALFORMED.",
@@ -346,12 +350,12 @@ def rejected_for_the_lease_counts(bench: Bench, first: Sender) -> None:
 
 @SUITE.must("R-SEQ-12", "5.1 Order", ready)
 def remembers_senders(bench: Bench, sender: Sender) -> None:
-    """A robot remembers 64 senders: a replay is OUT_OF_ORDER after sixty others have sent."""
+    """A robot remembers the senders that drove: a replay is OUT_OF_ORDER after eighty others were rejected."""
     replayed = sender.twist_result(seq=sender.seq)
     bench.need(replayed == "OUT_OF_ORDER", f"a replay is {replayed} (R-SEQ-06)")
     sender.need_good()
     for number in range(_OTHERS):
-        header = {**sender.header(sender.robot.frame()), "session": f"{0xA0000000 + number:08x}", "seq": 1 << 40}
+        header = {**sender.header(sender.robot.frame()), "session": f"{0xA0000000 + number:08x}", "seq": 1 << 20}
         bench.publish(TWIST, as_json(header), CRAWL, sender.source)
     sender.robot.next_status(2)
     sender.expect("OUT_OF_ORDER", seq=sender.seq)

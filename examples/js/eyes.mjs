@@ -56,7 +56,7 @@ export class Eyes {
   onFrame({ channel, header, payload }) {
     checkSizes(channel, header, payload);
     const stamp = decode(channel.header, header);
-    if (!this.vision.isNew(stamp)) throw new WireError("OUT_OF_ORDER", `frame ${stamp.seq} is not newer than the last`);
+    if (!this.vision.isNew(stamp, this.now_us())) throw new WireError("OUT_OF_ORDER", `frame ${stamp.seq} is not newer than the last`);
     this.newest = { stamp, jpeg: payload, arrival_us: this.now_us() };
     return this.busy ? undefined : this.work();
   }

@@ -91,7 +91,7 @@ export class Gate {
     this.issued.age_us(header.echo, now_us, this.limits.zeroSpeedAge_us);
     const age_us = now_us - this.pictures.shownSince_us(header.echo.t_us);
     if (age_us > this.limits.zeroSpeedAge_us) throw new WireError("STALE", "the camera image does not change");
-    this.sequence.check(header);
+    this.sequence.check(header, now_us);
     return { who: { source, session: header.session }, age_us };
   }
 
@@ -103,6 +103,7 @@ export class Gate {
     if (!this.lease.mayTake(who, now_us)) throw new WireError("NOT_HOLDER", `${holder.source} ${holder.session} drives`);
     this.liveCommands = same(holder, who) ? this.liveCommands + 1 : 1;
     this.lease.take(who, now_us);
+    this.sequence.promote(who);
     if (!this.armed) throw new WireError("DISARMED", this.reason);
   }
 

@@ -10,6 +10,9 @@ import { WireError } from "./codec.mjs";
 
 const KEPT_PER_CHANNEL = 256; // 8 s of 30 fps frames; anything older is STALE long before
 const KEPT_SENDERS = 64;
+const SENDER_MEMORY_US = 10_000_000;
+const MAX_FIRST_SEQ = 2 ** 32;
+const MAX_SEQ_JUMP = 2 ** 20;
 
 /** Roles that may drive, by rank. */
 export const RANKS = Object.freeze(Object.assign(Object.create(null), { guest: 0, vision: 1, teleop: 2 }));
@@ -87,21 +90,38 @@ export class FreshnessRecord {
   }
 }
 
-/** The newest seq of each (source, session); the longest silent sender is forgotten first. */
+/** The newest seq of each (source, session); the longest silent sender is forgotten first. Rejected senders displace no driver. */
 export class SequenceRecord {
   constructor() {
-    this.last = new Map();
+    this.drivers = new Map();
+    this.others = new Map();
   }
 
-  /** @throws {WireError} OUT_OF_ORDER unless newer than all before */
-  check({ source, session, seq }) {
+  /** @throws {WireError} OUT_OF_ORDER unless newer than all before, and not too far ahead */
+  check({ source, session, seq }, now_us) {
     const sender = `${source}/${session}`;
-    const last = this.last.get(sender) ?? -1;
+    const table = this.drivers.has(sender) ? this.drivers : this.others;
+    const entry = table.get(sender);
+    const last = entry !== undefined && now_us - entry.now_us <= SENDER_MEMORY_US ? entry.seq : -1;
     if (seq <= last) throw new WireError("OUT_OF_ORDER", `seq ${seq} of ${source} is not newer than ${last}`);
-    this.last.delete(sender);
-    this.last.set(sender, seq);
-    if (this.last.size > KEPT_SENDERS) this.last.delete(this.last.keys().next().value);
+    if (seq > (last < 0 ? MAX_FIRST_SEQ : last + MAX_SEQ_JUMP)) throw new WireError("OUT_OF_ORDER", `seq ${seq} of ${source} jumps too far`);
+    store(table, sender, { seq, now_us });
   }
+
+  /** Its last command took or renewed the lease. */
+  promote({ source, session }) {
+    const sender = `${source}/${session}`;
+    const entry = this.others.get(sender);
+    if (entry === undefined) return;
+    this.others.delete(sender);
+    store(this.drivers, sender, entry);
+  }
+}
+
+function store(table, sender, entry) {
+  table.delete(sender);
+  table.set(sender, entry);
+  if (table.size > KEPT_SENDERS) table.delete(table.keys().next().value);
 }
 
 /** Who drives: one at a time, by rank, for as long as its commands are judged good. */

@@ -54,6 +54,8 @@ export function steer(target, camera, side = 1) {
   };
 }
 
+const AHEAD_US = 500_000; // more than links and clocks differ
+
 /** What a vision knows of one robot, and the headers of its answers. */
 export class Vision {
   /** @param {string} session 8 hex digits @param {string} source the role: `vision`, or one that only watches */
@@ -63,6 +65,7 @@ export class Vision {
     this.robotSession = "";
     this.camera = null;
     this.lastSeq = this.last_us = -1;
+    this.heard_us = -Infinity; // when the last new frame came, by this machine's clock
     this.side = 1; // where the target was last: left
     this.seq = this.requestSeq = this.requestId = 0;
     this.status = null; // {header, payload}: the newest
@@ -89,13 +92,17 @@ export class Vision {
   }
 
   /**
-   * Whether a frame is newer than all before.
-   * @param {{session: string, seq: number}} header
+   * Whether a frame is newer than all before, and does not run ahead of this machine's clock: that one is forged.
+   * @param {{session: string, seq: number, t_us: number}} header
    */
-  isNew({ session, seq }) {
+  isNew({ session, seq, t_us = 0 }, now_us = 0) {
     this.meet(session);
-    if (seq <= this.lastSeq) return false;
+    const silent_us = now_us - this.heard_us;
+    if (silent_us > AHEAD_US) this.lastSeq = this.last_us = -1; // what came last was not of the robot, or it paused
+    const ahead = this.last_us >= 0 && t_us - this.last_us > silent_us + AHEAD_US;
+    if (ahead || seq <= this.lastSeq) return false;
     this.lastSeq = seq;
+    this.heard_us = now_us;
     return true;
   }
 

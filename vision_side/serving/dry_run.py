@@ -97,9 +97,9 @@ class AckingService(Service):
 class ScansOnly(MissionChannel):
     """Takes no missions and reports nothing: what the robot does is not this one's doing."""
 
-    def prepare(self, pipeline: Pipeline, frame: FrameHeader) -> None:  # noqa: ARG002
+    def prepare(self, pipeline: Pipeline, frame: FrameHeader) -> None:
         """Give `pipeline` the newest scan."""
-        self._give_scan(pipeline)
+        self._give_scan(pipeline, frame)
 
     def report(self, now_s: float, answer: PipelineAnswer, frame: FrameHeader | None) -> None:  # noqa: ARG002
         """Log only the detector's notices."""

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from sightline.protocol.channels import MISSION, REPORT, SCAN
+from sightline.protocol.clock import AHEAD_US
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError, RejectReason, WireError
 from sightline.protocol.messages import (
@@ -78,6 +79,8 @@ def _check(header: RequestHeader, source: str, frame: FrameHeader) -> None:
         raise WireError(RejectReason.OTHER_SESSION, f"requested in session {echo.session}, the robot is in "
                                                f"{frame.session}; repeat the request")
     age_us = frame.t_us - echo.t_us
+    if age_us < -AHEAD_US:
+        raise WireError(RejectReason.FROM_FUTURE, "cites a status from the future")
     if age_us > MAX_AGE_US:
         raise WireError(RejectReason.STALE, f"requested {age_us / 1e6:.1f} s ago; repeat the request")
 
@@ -168,7 +171,7 @@ class MissionChannel:
         message = self._missions.take()
         if message is not None:
             self._apply(message, pipeline, frame)
-        self._give_scan(pipeline)
+        self._give_scan(pipeline, frame)
 
     def report(self, now_s: float, answer: PipelineAnswer, frame: FrameHeader | None) -> None:
         """Publish the report of an answer, if it is time; `frame` is None if no frame comes."""
@@ -204,7 +207,7 @@ class MissionChannel:
         elif self._requests.rejection:
             self._log_change("mission", f"rejected a mission of {message.source}: {self._requests.rejection}")
 
-    def _give_scan(self, pipeline: Pipeline) -> None:
+    def _give_scan(self, pipeline: Pipeline, frame: FrameHeader) -> None:
         if not pipeline.mission.wants_scan:
             return
         if self._scans is None:
@@ -213,7 +216,10 @@ class MissionChannel:
         if message is None:
             return
         try:
-            pipeline.put_scan(*decode_scan(message.header, message.payload))
+            stamp, scan = decode_scan(message.header, message.payload)
+            if stamp.session == frame.session and stamp.t_us > frame.t_us + AHEAD_US:
+                raise WireError(RejectReason.FROM_FUTURE, "the time of the scan is ahead of the frames")
+            pipeline.put_scan(stamp, scan)
         except WireError as error:
             self._reject(error)
             self._log_change("scan", f"rejected scans: {error.detail}")

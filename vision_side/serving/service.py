@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MAX_HEADER_BYTES, TWIST
-from sightline.protocol.clock import monotonic_us
+from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
@@ -57,7 +57,7 @@ Observe = Callable[[CountsNow], None]
 # A robot that restarts begins a new session, and the newest session is used immediately. But on a network without keys
 # any client can send one frame of a new session, and two robots may have one id. Therefore an earlier session that
 # continues is used again, because a restarted robot cannot continue its old session. From then on it is replaced only
-# after silence.
+# after silence. Within a session, a frame whose time or number runs ahead of this machine's clock is not of the robot.
 
 
 GOES_ON_US: Final = 300_000
@@ -95,15 +95,21 @@ class SessionSelector:
         self._proven = False
         """True if the current session continued next to another one, which is then no sign of its end."""
         self._earlier: dict[str, _Earlier] = {}
+        self.clock = RobotClock()
 
-    def admits(self, session: str, captured_us: int, now_us: int) -> bool:
-        """Return True if a frame of `session` is from the steered robot. This frame may change the session."""
-        if session != self.current:
-            if not self._replaces(session, captured_us, now_us):
-                return False
-            self._follow(session)
+    def check(self, stamp: Stamp, now_us: int) -> None:
+        """Check that a frame is from the steered robot. This frame may change the session.
+
+        Raises:
+            WireError: OTHER_SESSION, or FROM_FUTURE for a time or a number that runs ahead or goes far back.
+        """
+        if stamp.session != self.current:
+            if not self._replaces(stamp.session, stamp.t_us, now_us):
+                raise WireError(RejectReason.OTHER_SESSION, f"{stamp.session}: steered in session {self.current}")
+            self._follow(stamp.session)
+        if not self.clock.update(stamp.session, stamp.t_us, now_us, stamp.seq):
+            raise WireError(RejectReason.FROM_FUTURE, "frame disagrees with this clock")
         self._heard_us = now_us
-        return True
 
     def _replaces(self, session: str, captured_us: int, now_us: int) -> bool:
         if self._proven and now_us - self._heard_us <= SILENT_US:
@@ -224,11 +230,7 @@ class Service:
         header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
         if header is None:
             return
-        if not self._sessions.admits(header.session, header.t_us, monotonic_us()):
-            self.skipped["OTHER_SESSION"] += 1
-            self._log_change("other", f"rejecting frames of session {header.session}: robot {self._config.robot} is "
-                                f"steered in session {self._sessions.current}; give each robot its "
-                                "own with --robot")
+        if not self._is_of_robot(header):
             return
         self._heard_s = time.monotonic()
         if header.session != self._robot_session:
@@ -247,6 +249,28 @@ class Service:
         self._report_phase(answer)
         self._mission_channel.report(time.monotonic(), answer, header)
         self._viewing.show(header, answer, self._camera, started_ns=started_ns, jpeg=message.payload)
+
+    def _is_of_robot(self, header: FrameHeader) -> bool:
+        """Return True for a frame of the steered robot. Another is counted, and logged once."""
+        replaced = self._sessions.clock.replaced
+        try:
+            self._sessions.check(header, self._now_us())
+        except WireError as error:
+            self.skipped[error.reason] += 1
+            if error.reason is RejectReason.OTHER_SESSION:
+                self._log_change("other", f"rejecting frames of session {header.session}: robot {self._config.robot} "
+                                          f"is steered in session {self._sessions.current}; give each robot its "
+                                          "own with --robot")
+            else:
+                self._log_change("time", f"rejecting frames of robot {self._config.robot} whose time disagrees with "
+                                         "this clock; does another client send frames?")
+            return False
+        if self._pipeline is not None and self._sessions.clock.replaced != replaced:
+            self._pipeline.restart_clock()
+        return True
+
+    def _now_us(self) -> int:
+        return monotonic_us()
 
     def _acknowledge(self, seen: Observation) -> PipelineAnswer:
         return self._pipeline.acknowledge(seen) if self._pipeline else PipelineAnswer(None, seen)
@@ -326,7 +350,7 @@ _NO_BOXES = Observation("no boxes")
 
 
 class BoxesInbox(LatestSlot[Message]):
-    """The newest frame and the newest boxes of one source; also the last frames' headers, which boxes may name."""
+    """The newest frame and the newest boxes of one source; also the headers of replaced frames."""
 
     def __init__(self, source: str) -> None:
         super().__init__()
@@ -340,9 +364,10 @@ class BoxesInbox(LatestSlot[Message]):
         if item.channel is DETECTIONS and item.source != self._source:
             return
         with self._arrived:
-            if item.channel is FRAME:
-                self.headers.append(item.header)
-            self.dropped += item.channel.name in self._newest
+            replaced = self._newest.get(item.channel.name)
+            if replaced is not None and item.channel is FRAME:
+                self.headers.append(replaced.header)
+            self.dropped += replaced is not None
             self._newest[item.channel.name] = item
             self._arrived.notify()
 
@@ -372,7 +397,8 @@ class BoxesService(Service):
         if message.channel is DETECTIONS:
             self._boxes(message, started_ns)
             return
-        header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
+        self._remember_replaced()
+        header = self._remember(message.header)
         if header is None:
             return
         self._heard_s = time.monotonic()
@@ -387,7 +413,7 @@ class BoxesService(Service):
             self._log_change("boxes", f"frames come, but no boxes from {source}; does its detector run?")
 
     def _boxes(self, message: Message, started_ns: int) -> None:
-        self._remember_frames()
+        self._remember_replaced()
         self._boxes_heard_s = time.monotonic()
         if self._pipeline is None or self._camera is None:
             return
@@ -408,9 +434,15 @@ class BoxesService(Service):
         self._mission_channel.report(time.monotonic(), answer, frame)
         self._viewing.show(frame, answer, self._camera, started_ns=started_ns)
 
-    def _remember_frames(self) -> None:
-        """Store the headers of all frames, including those that newer ones replaced before use."""
+    def _remember_replaced(self) -> None:
+        """Store the headers of the frames that newer ones replaced before use."""
         while self._inbox.headers:
-            header = self._decoded(FrameHeader, self._inbox.headers.popleft(), MAX_HEADER_BYTES)
-            if header is not None:
-                self._reader.remember(header)
+            self._remember(self._inbox.headers.popleft())
+
+    def _remember(self, data: bytes) -> FrameHeader | None:
+        """Store the header of a frame of the steered robot, which boxes may name."""
+        header = self._decoded(FrameHeader, data, MAX_HEADER_BYTES)
+        if header is None or not self._is_of_robot(header):
+            return None
+        self._reader.remember(header)
+        return header

@@ -143,8 +143,22 @@ def leaping(case, wrong, too_far):
     breaks(case, wrong)(type("Leaping", (Leaping,), {"drives_by": lambda self, *four: too_far(*four)}))
 
 
-leaping("V-CAUS-13", "waits for what was never sent", lambda seq, t_us, seq2, t_us2: seq2 - seq > 1_000)
-leaping("V-CAUS-14", "does not believe in hours", lambda seq, t_us, seq2, t_us2: t_us2 - t_us > 2_000_000_000)
+leaping("V-CAUS-13", "waits for what was never sent", lambda seq, t_us, seq2, t_us2: seq2 - seq > 50)
+
+
+class Believing(Leaping):
+    """Believes in a time that lies ahead, so that earlier frames are old from then on."""
+
+    newest_us = 0
+
+    def drives_by(self, _seq, _t_us, _seq2, t_us2):
+        if t_us2 > self.newest_us + self.believed_us:
+            self.newest_us = t_us2
+        return t_us2 < self.newest_us - 1_000_000
+
+
+breaks("V-CAUS-14", "believes in an hour")(type("Believing", (Believing,), {"believed_us": 3_000_000_000}))
+breaks("V-CAUS-15", "believes in any time")(type("Believing", (Believing,), {"believed_us": 10**14}))
 
 
 # --- pictures and cameras --------------------------------------------------------------------------------------------

@@ -65,6 +65,9 @@ class VirtualVision(Service):
         self.now_us = now_us
         self.turn(0.0)
 
+    def _now_us(self) -> int:
+        return self.now_us
+
     def _use(self, camera: CameraModel) -> None:
         self._camera, self._pipeline = camera, self.pipeline(camera)
 

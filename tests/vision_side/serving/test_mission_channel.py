@@ -174,7 +174,7 @@ GOTO = VisionConfig.model_validate({"mission": {"kind": "goto", "options": {"way
 
 
 def scan(seq, payload=None, session=SESSION, t_us=None):
-    header = ScanHeader(session=session, seq=seq, t_us=seq * 100_000 if t_us is None else t_us, angle_min_rad=-0.5,
+    header = ScanHeader(session=session, seq=seq, t_us=seq * FRAME_US if t_us is None else t_us, angle_min_rad=-0.5,
                         angle_increment_rad=0.1, range_min_m=0.02, range_max_m=0.2)
     return encode(header), encode_ranges(array.array("f", [0.1] * 11)) if payload is None else payload
 
@@ -189,6 +189,16 @@ def test_a_mission_that_uses_scans_is_given_the_newest_and_cites_it():
     assert [bench.answer().scan for _ in range(2)] == [None, None], "possibly another robot's"
     bench.robot.publish(SCAN, *scan(10))
     assert bench.answer().scan == 10
+    bench.robot.publish(SCAN, *scan(11, t_us=2**53 - 1))
+    assert bench.answer().scan == 10 and bench.service.skipped["FROM_FUTURE"] == 1
+    bench.robot.publish(SCAN, *scan(12))
+    assert bench.answer().scan == 12
+
+
+def test_mission_that_cites_a_status_of_the_future_is_rejected():
+    bench = Bench().frames(2).ask(age_us=-600_000)
+    assert bench.report().refused.startswith("FROM_FUTURE")
+    assert bench.ask(number=2, age_us=-400_000).report().refused == ""
 
 
 def test_scans_are_subscribed_only_for_a_mission_that_uses_them():

@@ -201,6 +201,30 @@ def test_frames_of_an_ended_session_are_skipped_and_logged_once(bench):
     assert bench.service.answered == 5
 
 
+@pytest.mark.parametrize("t_us", [600_000, 3_600_000_000, 2**53 - 1])
+def test_forged_frame_of_the_future_costs_no_answer(bench, monkeypatch, t_us):
+    monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: bench.now_us)
+    bench.camera()
+    bench.frame(BALL, 1)
+    bench.raw(encode(FrameHeader(session="0000abcd", seq=2, t_us=bench.now_us + t_us if t_us < 2**52 else t_us)), BALL)
+    assert bench.service.skipped["FROM_FUTURE"] == 1
+    for seq in range(3, 9):
+        bench.twists.take()
+        bench.frame(BALL, seq)
+        assert bench.twists.take() is not None
+    assert sum("whose time disagrees" in line for line in bench.said) == 1
+
+
+def test_forged_first_frame_of_the_future_costs_less_than_a_second(bench, monkeypatch):
+    monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: bench.now_us)
+    bench.camera()
+    bench.raw(encode(FrameHeader(session="0000abcd", seq=2**53 - 1, t_us=2**53 - 1)), BALL)
+    bench.twists.take()
+    for seq in range(2, 20):
+        bench.frame(BALL, seq)
+    assert bench.service.skipped["FROM_FUTURE"] < 15 and bench.twists.take() is not None
+
+
 def test_second_robot_with_one_id_is_rejected_and_logged(bench, monkeypatch):
     """Only the vision service can detect two robots that cannot reach each other."""
     monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: bench.now_us)

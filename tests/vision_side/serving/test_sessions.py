@@ -4,6 +4,8 @@ import random
 
 import pytest
 
+from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.messages import MAX_INTEGER, Stamp
 from sightline.vision_side.serving.service import GOES_ON_US, KEPT, SILENT_US, SessionSelector
 
 A, B, C = "0000aaaa", "0000bbbb", "0000cccc"
@@ -17,8 +19,14 @@ class Watch:
         self.sessions = SessionSelector()
         self.now_us = 50_000_000
 
-    def frame(self, session, late_us=0):
-        return self.sessions.admits(session, self.now_us - late_us + int(session, 16), self.now_us)
+    def frame(self, session, late_us=0, seq=0):
+        stamp = Stamp(session=session, seq=seq, t_us=self.now_us - late_us + int(session, 16))
+        try:
+            self.sessions.check(stamp, self.now_us)
+        except WireError as error:
+            self.reason = error.reason
+            return False
+        return True
 
     def film(self, *playing, seconds=1.0, every_us=FRAME_US):
         """Frames of all that play, side by side; the share of each that was admitted."""
@@ -127,3 +135,57 @@ def test_at_most_one_session_is_admitted_within_the_time_to_change(watch, seed):
             assert watch.sessions.current == session
             last = (watch.now_us, session)
     assert watch.sessions.current == last[1]
+
+
+# --- time within a session ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ahead_us", [600_000, 3_600_000_000, MAX_INTEGER - 2**40])
+@pytest.mark.parametrize("times", [1, 100])
+def test_forged_frames_of_the_future_cost_nothing(watch, ahead_us, times):
+    watch.film(A)
+    for _ in range(times):
+        assert not watch.frame(A, late_us=-ahead_us)
+        assert watch.reason is RejectReason.FROM_FUTURE
+        assert watch.film(A, seconds=0.1) == [1.0]
+
+
+@pytest.mark.parametrize("every_us", [FRAME_US, 120_000, 250_000])
+def test_forged_first_frame_of_a_session_costs_less_than_a_second(watch, every_us):
+    assert watch.frame(A, late_us=-3_600_000_000)
+    lost = 0
+    while not watch.frame(A):
+        watch.now_us += every_us
+        lost += 1
+    assert 0 < lost * every_us <= 600_000 and watch.sessions.clock.replaced == 1
+    assert watch.film(A) == [1.0]
+
+
+@pytest.mark.parametrize("seq", [2_000, 2**52, MAX_INTEGER])
+def test_forged_seq_of_the_future_costs_nothing(watch, seq):
+    for number in range(100):
+        watch.now_us += FRAME_US
+        assert watch.frame(A, seq=number)
+    assert not watch.frame(A, seq=seq)
+    assert watch.frame(A, seq=101)
+
+
+def test_frames_that_a_link_held_back_are_of_the_robot(watch):
+    watch.film(A)
+    watch.now_us += 4_000_000
+    for late_us in range(3_990_000, 0, -10_000):
+        assert watch.frame(A, late_us=late_us)
+
+
+def test_session_that_began_on_a_stalled_link_is_used_again_within_half_a_second(watch):
+    assert watch.frame(A, late_us=3_000_000)
+    watch.film(A, seconds=0.4)
+    assert watch.film(A) == [1.0]
+
+
+@pytest.mark.parametrize("ppm", [-200, 200])
+def test_clocks_of_different_pace_agree(watch, ppm):
+    for _ in range(2_000):
+        watch.now_us += 10_000_000
+        assert watch.frame(A, late_us=watch.now_us * ppm // 1_000_000)
+    assert not watch.frame(A, late_us=watch.now_us * ppm // 1_000_000 - 600_000)

@@ -19,6 +19,12 @@ def breaks(case_id):
     return add
 
 
+def last_seq(robot, source, session):
+    """The newest seq of one sender, -1 before its first."""
+    record, sender = robot.driving.gate._sequence, (source, session)
+    return (record._drivers.get(sender) or record._others.get(sender, (-1, 0)))[0]
+
+
 def fields_of(data):
     """Return a header as a dict, or None if it is not a JSON object."""
     try:

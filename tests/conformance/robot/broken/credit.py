@@ -278,10 +278,10 @@ def drowns(robot):
 def forgets_who_drives_when_many_come(robot):
     record = robot.driving.gate._sequence
 
-    def around(inner, header):
-        if len(record._last) > 60:
+    def around(inner, *arguments):
+        if len(record._others) > 60:
             robot.driving.gate._lease.drop()
-        inner(header)
+        inner(*arguments)
 
     wrap(record, "check", around)
 

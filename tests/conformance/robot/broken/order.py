@@ -7,7 +7,7 @@ from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import MAX_INTEGER, Reply, State, Verb
 from sightline.protocol.transports.link import Message
 from tests.conformance.robot.broken.arming import absent, forgives
-from tests.conformance.robot.broken.breaking import bend_out, bend_twists, breaks, fields_of, wrap
+from tests.conformance.robot.broken.breaking import bend_out, bend_twists, breaks, fields_of, last_seq, wrap
 from tests.conformance.robot.broken.credit import owns_too, stream_of
 from tests.conformance.robot.broken.validation import refuse, refuses
 
@@ -90,7 +90,7 @@ def session_before_role(robot):
 @breaks("R-CAUS-14")
 def count_before_record(robot):
     def wrong(fields, _message):
-        last = record_of(robot)._last.get((fields.get("source"), fields.get("session")), -1)
+        last = last_seq(robot, fields.get("source"), fields.get("session"))
         seq, echo = fields.get("seq"), echo_of(fields)
         replayed = isinstance(seq, int) and seq <= last
         return replayed and echo.get("session") == robot.driving.session and echo.get("seq") == MAX_INTEGER
@@ -129,29 +129,48 @@ def remembers_fifty_frames(robot):
 
 @breaks("R-SEQ-11")
 def refused_for_the_lease_uses_nothing_up(robot):
-    last = record_of(robot)._last
+    others = record_of(robot)._others
 
     def around(inner, source, header, *arguments):
-        sender = (source, header.session) if header is not None else None
-        before = last.get(sender, -1)
         verdict = inner(source, header, *arguments)
         if verdict.reason is RejectReason.NOT_HOLDER:
-            last[sender] = before
+            others.pop((source, header.session if header else ""), None)
         return verdict
 
     wrap(robot.driving.gate, "offer", around)
 
 
 @breaks("R-SEQ-12")
-def remembers_32_senders(robot):
+def one_memory_for_all_senders(robot):
     record = record_of(robot)
 
-    def around(inner, header):
-        inner(header)
-        while len(record._last) > 32:
-            record._last.popitem(last=False)
+    def around(inner, *arguments):
+        inner(*arguments)
+        if len(record._others) > 63:
+            record._drivers.clear()
 
     wrap(record, "check", around)
+
+
+@breaks("R-SEQ-13")
+def any_next_seq_will_do(robot):
+    forgives_seq(robot, 1 << 52, lambda last: last >= 0)
+
+
+@breaks("R-SEQ-14")
+def any_first_seq_will_do(robot):
+    forgives_seq(robot, 1 << 52, lambda last: last < 0)
+
+
+def forgives_seq(robot, seq, when):
+    """Takes `seq` as the next one."""
+
+    def around(inner, header, now_us):
+        if header.seq == seq and when(last_seq(robot, header.source, header.session)):
+            return None
+        return inner(header, now_us)
+
+    wrap(record_of(robot), "check", around)
 
 
 # --- arming and the lease --------------------------------------------------------------------------------------------

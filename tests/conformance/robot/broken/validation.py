@@ -6,7 +6,7 @@ import re
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import MAX_INTEGER
 from sightline.protocol.transports.link import Message
-from tests.conformance.robot.broken.breaking import as_json, bend_twists, breaks, fields_of, wrap
+from tests.conformance.robot.broken.breaking import as_json, bend_twists, breaks, fields_of, last_seq, wrap
 
 HEX = re.compile(r"[0-9a-f]{8}")
 
@@ -366,7 +366,7 @@ def forgets_the_frame_before(robot):
 @breaks("R-CAUS-11")
 def seq_before_session(robot):
     def wrong(fields, message):
-        last = robot.driving.gate._sequence._last.get((fields.get("source"), fields.get("session")), -1)
+        last = last_seq(robot, fields.get("source"), fields.get("session"))
         echo = fields.get("echo")
         foreign = isinstance(echo, dict) and echo.get("session") != robot.driving.session
         return foreign and isinstance(fields.get("seq"), int) and fields["seq"] <= last
@@ -379,12 +379,10 @@ def seq_before_session(robot):
 
 def check_seq(robot, check):
     """`check(inner, header, last)` in place of the reference's."""
-    record = robot.driving.gate._sequence
+    def around(inner, header, now_us):
+        return check(lambda one: inner(one, now_us), header, last_seq(robot, header.source, header.session))
 
-    def around(inner, header):
-        return check(inner, header, record._last.get((header.source, header.session), -1))
-
-    wrap(record, "check", around)
+    wrap(robot.driving.gate._sequence, "check", around)
 
 
 @breaks("R-SEQ-06")
@@ -394,12 +392,8 @@ def a_replay_will_do(robot):
 
 @breaks("R-SEQ-07")
 def only_the_same_is_a_replay(robot):
-    record = robot.driving.gate._sequence
-
     def check(inner, header, last):
-        if last - 40 < header.seq < last:
-            record._last[(header.source, header.session)] = header.seq
-        else:
+        if not last - 40 < header.seq < last:
             inner(header)
 
     check_seq(robot, check)
@@ -434,7 +428,7 @@ def remembers_seq_of_the_refused(robot):
         sender = fields.get("source"), fields.get("session")
         echo = fields.get("echo")
         unknown = isinstance(echo, dict) and echo.get("seq") not in robot.driving.gate.issued._times.get("frame", {})
-        if unknown and sender in robot.driving.gate._sequence._last:
-            robot.driving.gate._sequence._last[sender] = fields["seq"]
+        if unknown and last_seq(robot, *sender) >= 0:
+            robot.driving.gate._sequence._drivers[sender] = fields["seq"], robot.now()
 
     bend_twists(robot, bend)
