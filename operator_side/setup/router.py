@@ -1,22 +1,30 @@
 """Runs a Zenoh router to which robots, vision services and operators of one site connect. Shell.
 
-A stock `zenohd` also works, without the access rules of `--secure`.
+A stock `zenohd` also works, without the access rules of `--secure` and without the STOP port.
 """
 
 import logging
 import signal
 import threading
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from typing import Final
 
-from sightline.protocol.transports.endpoints import check_zenoh_endpoints
-from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.log import RepeatLimiter
+from sightline.protocol.transports.endpoints import check_zenoh_endpoints, stop_addresses
+from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys, stop_secret_file
+from sightline.protocol.transports.stop_port import StopProcess, read_packets
 from sightline.protocol.transports.zenoh.session import open_session, report_floods
+from sightline.robot_side.guardian import stop_forwarder
+from sightline.robot_side.guardian.stop_core import unpack_ignored
 
 _log: Final = logging.getLogger(__name__)
 
 _REACH_S = 5.0
+_WATCHED_S = 1.0
+_limiter: Final = RepeatLimiter()
 
 
 def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
@@ -25,13 +33,42 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
     secured = load_role_keys(secure, ROBOT_ROLE)
     ending = threading.Event()
     with (
+        ExitStack() as closing_all,
         report_floods(listen, lambda line: _log.info("router: %s", line)),
         closing(open_session(listen, connect, _REACH_S, secured)),
     ):
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: ending.set())
         rules = f"keys of {secure}, access rules on" if secure else "no keys, every client that reaches it may connect"
+        forwarder = _stop_forwarder(listen, secure)
+        if forwarder is not None:
+            closing_all.callback(forwarder.close)
+            forwarder.keep_alive(monotonic_us())
         _log.info("router: on %s; %s", ", ".join(listen), rules)
-        ending.wait()
+        while not ending.wait(_WATCHED_S):
+            if forwarder is not None:
+                _watch(forwarder)
     _log.info("router: ended")
     return 0
+
+
+def _stop_forwarder(listen: Sequence[str], secure: str) -> StopProcess | None:
+    """Prepare the forwarder of STOP datagrams; None where keys are used without a STOP secret."""
+    try:
+        return stop_forwarder.start(stop_addresses(listen), stop_secret_file(secure) if secure else "")
+    except ConfigError as error:
+        _log.warning("router: %s", error)
+        return None
+
+
+def _watch(forwarder: StopProcess) -> None:
+    """Start the forwarder again where it ended, and log what it reports."""
+    forwarder.keep_alive(monotonic_us())
+    for packet in read_packets(forwarder.near):
+        if packet.startswith(b"L"):
+            _log.info("router: %s", packet[1:].decode())
+        elif packet.startswith(b"C"):
+            counts, address = unpack_ignored(packet)
+            for reason, count in counts.items():
+                if times := _limiter.due(reason, monotonic_us(), count):
+                    _log.info("router: ignored %d STOP datagrams (%s), the last from %s", times, reason, address)
