@@ -360,8 +360,9 @@ def teleop(
 ) -> None:
     """Drive a robot with the keyboard or a gamepad
 
-    Hold W A S D or an arrow key to drive; Space stops, Tab switches to vision, Q quits. The first press arms.
+    Hold W A S D or an arrow key to drive; Space stops, Enter sends STOP, Q quits. The first press arms.
     """
+    from sightline.operator_side.client.stop import StopSender
     from sightline.operator_side.teleop.control import SOURCE as ROLE
     from sightline.operator_side.teleop.control import Speeds, Teleop, layout_of
     from sightline.operator_side.teleop.gamepad import Gamepad
@@ -374,5 +375,7 @@ def teleop(
         pad = Gamepad(gamepad) if gamepad else None
         if pad is not None:
             ending.callback(pad.close)
+        secret_file = _stop_secret(target)
         link = ending.enter_context(_link(target, ROLE))
-        Cockpit(link, Teleop(session, Speeds(linear, angular), layout), pad).run()
+        steered = Teleop(session, Speeds(linear, angular), layout)
+        Cockpit(link, steered, lambda: StopSender(target.robot, target.connect, secret_file), pad).run()

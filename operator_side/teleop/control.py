@@ -98,11 +98,12 @@ _BOTH_SPEEDS: Final = {"+": (1, 1), "=": (1, 1), "-": (-1, -1)}
 _SPACE: Final = " "
 SWITCH: Final = "\t"
 QUIT: Final = "q"
+STOP_KEYS: Final = ("\n", "\r")
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The keys of one layout. Tab, Q, Space, the arrows, + and - are in all of them.
+    """The keys of one layout. Tab, Q, Space, Enter, the arrows, + and - are in all of them.
 
     `moves` maps a key to its share of (linear, angular) speed. Back and left turns clockwise, as a car does.
     `speeds` maps a key to a change of (linear, angular) speed, up (1) or down (-1).
@@ -118,6 +119,7 @@ class Layout:
 _COMMON_HELP: Final = """\
   Tab  switch between manual and vision         + -  both speeds 10 % up, down
   q    quit; the robot stops                    {linear}  speed    {angular}  turn rate
+  Enter  STOP: it stays at zero until `sightline reset`
 The first press arms the robot: make sure that it may move.
 """
 
@@ -285,6 +287,8 @@ class Teleop:
         self.note = ""
         """A note for the operator next to the robot's status."""
         self.wants_to_quit = False
+        self.is_stopping = False
+        """STOP was pressed, and nothing has proven it yet."""
         self._hold = Hold()
         self._ignored_until_us = 0
         self._stick: tuple[float, float] | None = None
@@ -312,13 +316,15 @@ class Teleop:
         if len(keys) > MOST_AT_ONCE:
             self._ignored_until_us = now_us + FRESH_US
         if now_us < self._ignored_until_us:
-            keys = [key for key in keys if key in self.layout.stops]
+            keys = [key for key in keys if key in (*self.layout.stops, *STOP_KEYS)]
             self._hold.miss(now_us)
         for key in keys:
             if key in self.layout.moves:
                 self._drive(self._hold.press(key, now_us), now_us)
             elif key in self.layout.stops:
                 self.stop()
+            elif key in STOP_KEYS:
+                self.latch_stop(now_us)
             elif key == SWITCH:
                 self.switch(now_us)
             elif key == QUIT:
@@ -362,6 +368,8 @@ class Teleop:
             self.note = f"invalid status from the robot: {error.detail}"
             return
         self.speeds.limit(self.report.status)
+        if self.report.status.state is State.STOPPED and self.report.status.applied == (0.0, 0.0):
+            self.on_stopped()
         if self.mode is Mode.HANDING_OVER and self._pending_request is not Verb.RELEASE and self._other_drives():
             self.mode, self._pending_request, self.note = Mode.WATCHING, None, ""
 
@@ -389,6 +397,17 @@ class Teleop:
         """Take over and stand still; the robot stays armed, and this operator is the driver."""
         self._let_go()
         self.mode, self._pending_request, self._due_us = Mode.DRIVING, None, 0
+
+    def latch_stop(self, now_us: int) -> None:
+        """Send STOP until it is proven. The shell sends it by datagrams meanwhile, too."""
+        self._let_go()
+        self.mode, self.note, self.is_stopping = Mode.WATCHING, "STOP is not confirmed, repeating", True
+        self._pending_request, self._request_due_us = None, now_us
+
+    def on_stopped(self) -> None:
+        """End the repetition of STOP: the robot is STOPPED, and its wheels are at zero."""
+        if self.is_stopping:
+            self.is_stopping, self.note = False, ""
 
     def switch(self, now_us: int) -> None:
         """Hand over to vision, or take over from it and stand still."""
@@ -438,6 +457,9 @@ class Teleop:
 
     def messages(self, now_us: int) -> Iterator[Message]:
         """Yield the messages to send now; call it every few milliseconds and after every input."""
+        if self.is_stopping and now_us >= self._request_due_us:
+            self._request_due_us = now_us + _REPEAT_AFTER_US
+            yield self._request(Verb.STOP)
         if self._echo is None:
             return
         goal = self._goal(now_us)

@@ -14,6 +14,7 @@ from types import FrameType
 from typing import Final
 
 from sightline.operator_side.client.status import millis, twist_text
+from sightline.operator_side.client.stop import StopSender
 from sightline.operator_side.teleop.control import Mode, Teleop
 from sightline.operator_side.teleop.gamepad import Gamepad, PadKey
 from sightline.protocol.channels import FRAME, REPLY, STATUS, Channel
@@ -87,8 +88,20 @@ def check_terminal() -> None:
 class Cockpit:
     """Connects a link, a terminal and optionally a gamepad to a `Teleop`."""
 
-    def __init__(self, link: Link, teleop: Teleop, gamepad: Gamepad | None = None) -> None:
+    def __init__(
+        self, link: Link, teleop: Teleop, send_stop: Callable[[], StopSender], gamepad: Gamepad | None = None
+    ) -> None:
+        """Subscribe to the robot.
+
+        Args:
+            link: open link with the role of teleop.
+            teleop: the session.
+            send_stop: begins to send STOP datagrams.
+            gamepad: an open gamepad.
+        """
         self._link, self._teleop, self._gamepad = link, teleop, gamepad
+        self._send_stop = send_stop
+        self._stop_sender: StopSender | None = None
         self._woken, self._wake = os.pipe()
         os.set_blocking(self._woken, False)
         os.set_blocking(self._wake, False)
@@ -119,6 +132,8 @@ class Cockpit:
                     self._turn()
             finally:
                 self._leave()
+                if self._stop_sender is not None:
+                    self._stop_sender.close()
                 _print("\n\n")
 
     def _end(self, _number: int, _frame: FrameType | None) -> None:
@@ -134,8 +149,19 @@ class Cockpit:
         if self._gamepad in ready and self._gamepad is not None:
             self._read_gamepad(self._gamepad)
         self._take_messages()
+        self._stop_by_datagrams()
         self._publish(self._teleop.messages(monotonic_us()))
         self._show()
+
+    def _stop_by_datagrams(self) -> None:
+        """Send STOP datagrams while a STOP is not proven; their answers prove it, too."""
+        if self._stop_sender is not None and self._stop_sender.is_stopped:
+            self._teleop.on_stopped()
+        if self._teleop.is_stopping and self._stop_sender is None:
+            self._stop_sender = self._send_stop()
+        elif not self._teleop.is_stopping and self._stop_sender is not None:
+            self._stop_sender.close()
+            self._stop_sender = None
 
     def _read_keys(self) -> None:
         try:

@@ -277,3 +277,39 @@ def test_second_operator_does_not_take_over():
         if rig.now_us % 1_000_000 < 4_000:
             other.teleop.on_keys("j", rig.now_us)
     assert rig.holder.session == OPERATOR and rig.applied.linear_mps == pytest.approx(0.2)
+
+
+# --- STOP ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("key", ["\n", "\r"])
+def test_enter_latches_stop_and_is_repeated_until_a_status_proves_it(key):
+    rig = TeleopRig(loss=0.3).armed()
+    rig.hold("i")
+    rig.run(1.0)
+    rig.let_go()
+    rig.tap(key)
+    assert rig.teleop.is_stopping and "STOP" in rig.teleop.note
+    assert rig.until(lambda: rig.state is State.STOPPED) <= 400
+    assert rig.until(lambda: not rig.teleop.is_stopping) <= 1500
+    assert rig.applied == STILL and Verb.STOP in rig.requested
+    sent = len(rig.requested)
+    rig.run(0.5)
+    assert len(rig.requested) == sent
+
+
+def test_enter_counts_among_many_late_keys_and_a_held_key_does_not_drive_on():
+    rig = TeleopRig().armed()
+    rig.hold("i")
+    rig.run(0.5)
+    rig.teleop.on_keys("iiiii\niiii", rig.now_us)
+    assert rig.until(lambda: rig.state is State.STOPPED) is not None
+    rig.run(1.0)
+    assert rig.state is State.STOPPED and rig.applied == STILL
+
+
+def test_an_answer_to_a_datagram_ends_the_repetition():
+    rig = TeleopRig().armed()
+    rig.tap("\n")
+    rig.teleop.on_stopped()
+    assert not rig.teleop.is_stopping and rig.teleop.note == ""

@@ -151,6 +151,21 @@ def test_any_end_commands_zero_soon_and_releases_the_robot(seat, how):
 
 
 @pytest.mark.slow
+def test_enter_stops_the_robot_by_a_datagram_and_latches(seat):
+    seat.sit()
+    seat.fingers.press("w")
+    assert until(lambda: seat.robot.speed() > 4, 2)
+    seat.terminal.types("\n")
+    assert until(lambda: "STOPPED (STOP by" in seat.robot.output(), 2), seat.robot.output()
+    seat.fingers.lift()
+    assert until(lambda: seat.robot.speed() == 0, 2)
+    seat.fingers.press("w")
+    time.sleep(0.5)
+    seat.fingers.lift()
+    assert seat.robot.speed() == 0, "no key starts it"
+
+
+@pytest.mark.slow
 def test_killed_teleop_stops_the_robot(seat):
     seat.sit()
     seat.fingers.press("w")
