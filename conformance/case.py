@@ -43,6 +43,7 @@ GROUPS: Final = {
     "SEQ": "sequence",
     "LIM": "limits",
     "LEASE": "lease",
+    "PROOF": "proof of identity",
     "ARM": "arming",
     "STOP": "stop",
     "SIL": "silence",
@@ -226,6 +227,8 @@ class Bench(ABC):
         self.robot, self.endpoint, self.legacy, self.access = robot, endpoint, legacy, access or Access()
         self.motor_rows: Callable[[], Sequence[WheelRow]] = tuple
         """Returns the rows of the robot's motor log so far; none without such a log."""
+        self.played: dict[str, object] = {}
+        """The peers that the kit plays, by the digest of their session: a robot shows no more of a driver."""
         self._log: dict[str, deque[Received]] = {}
         self._reactions: list[tuple[Channel, Callable[[Received], None]]] = []
         self._timers: list[tuple[int, int, Callable[[], None]]] = []

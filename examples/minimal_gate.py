@@ -3,6 +3,7 @@
 Numbers in comments are clauses of protocol/README.md.
 """
 
+import hashlib
 import math
 import re
 import secrets
@@ -27,6 +28,7 @@ class Gate:
         self.denied = -1  # 8.3: no status up to this one lets anything move
         self.last_seq: dict[tuple[str, str], int] = {}
         self.holder, self.held_us, self.good = ("", ""), -LEASE_US, 0
+        self.proof = (None, None)  # 6.6: the last of the holder, and the first of its next chain
         self.stopped, self.armed, self.arms_itself = False, False, True
         self.command = NOTHING
         self.accepted, self.refused = 0, Counter[str]()
@@ -49,10 +51,22 @@ class Gate:
             "NOT_FINITE": math.isfinite(linear) and math.isfinite(angular),
             "UNKNOWN_SOURCE": who[0] in ("vision", "teleop"),
             **self.young(echo, "frame", now, MAX_AGE_US),
+            "NOT_PROVEN": self.proven(header, now),
             "OUT_OF_ORDER": 0 < header["seq"] - self.last_seq.get(who, -1) <= MAX_JUMP,
         }
         wrong = next((reason for reason, holds in checks.items() if not holds), "")
-        return wrong or self.take(who, header["seq"], (linear, angular, echo["t_us"], now))
+        return wrong or self.take(who, header, (linear, angular, echo["t_us"], now))
+
+    def proven(self, header: Header, now: int) -> bool:
+        """6.6: a message that states the driver's session continues its chain of proofs."""
+        element = header.get("proof")
+        if not (self.live(now) and self.holder == (header["source"], header["session"]) and self.proof[0]):
+            return element is None or len(bytes.fromhex(element)) == 16
+        for _ in range(64 if element else 0):
+            element = hashlib.sha256(bytes.fromhex(element)).hexdigest()[:32]
+            if element in self.proof:
+                return True
+        return False
 
     def issue(self, channel: str, seq: int, t_us: int) -> None:
         """Record a message before it is sent, so that no peer can answer it earlier."""
@@ -68,16 +82,16 @@ class Gate:
             "STALE": now - echo["t_us"] <= most_us,
         }
 
-    def take(self, who: tuple[str, str], seq: int, command: tuple[float, float, int, int]) -> str:
+    def take(self, who: tuple[str, str], header: Header, command: tuple[float, float, int, int]) -> str:
         others = [one for one in self.last_seq.items() if one[0] not in (who, self.holder)]
         kept = [one for one in self.last_seq.items() if one[0] == self.holder]
-        self.last_seq = dict([*others[-62:], *kept, (who, seq)])  # 5.1: whom it rejects displaces no driver
+        self.last_seq = dict([*others[-62:], *kept, (who, header["seq"])])  # 5.1: whom it rejects displaces no driver
         linear, angular, frame_us, now = command
         live = self.live(now)
         if self.stopped or (live and who != self.holder):  # 6.5, 6.1
             return "STOPPED" if self.stopped else "NOT_HOLDER"
         self.good = self.good + 1 if live else 1
-        self.holder, self.held_us = who, now
+        self.holder, self.held_us, self.proof = who, now, (header.get("proof"), header.get("next_proof"))
         if not self.armed:  # 6.4
             self.armed = self.arms_itself and self.good >= 5
             return "DISARMED"
@@ -94,16 +108,22 @@ class Gate:
         self.armed, self.arms_itself, self.good, self.command = False, False, 0, NOTHING
         self.denied = max((seq for channel, seq in self.issued if channel == "status"), default=-1)
 
-    def request(self, verb: str, who: tuple[str, str], echo: Any, now: int) -> str:
+    def request(self, verb: str, header: Header, now: int) -> str:
         """Carry out a request. Returns the reason of a rejection with a text, or "" (8.2)."""
+        who, echo = (header["source"], header["session"]), header.get("echo")
         mine = self.live(now) and self.holder == who
         if verb in ("stop", "disarm"):
             self.stopped = self.stopped or verb == "stop"
             self.disarm()
+        elif not self.proven(header, now):
+            return "NOT_PROVEN: another peer drives in this session"
         elif verb == "release":
             self.held_us = -LEASE_US if mine else self.held_us
         elif verb in ("arm", "reset", "acquire"):
-            return self.permit(verb, who, echo, now)
+            wrong = self.permit(verb, who, echo, now)
+            if not wrong and who == self.holder:
+                self.proof = header.get("proof"), header.get("next_proof")
+            return wrong
         else:
             raise ValueError(verb)
         return ""
@@ -139,7 +159,8 @@ class Gate:
         linear, angular = self.wheels(now)
         commanded = now - self.command[3] <= SILENCE_US
         state = "STOPPED" if self.stopped else "DISARMED" if not self.armed else "ACTIVE" if commanded else "HOLD"
-        holder = {"source": self.holder[0], "session": self.holder[1]} if self.live(now) else None
+        digest = hashlib.sha256("/".join(self.holder).encode()).hexdigest()[:8]  # 6.7
+        holder = {"source": self.holder[0], "digest": digest} if self.live(now) else None
         refused = {reason: count for reason, count in self.refused.items() if reason and count}
         return {"state": state, "reason": "a minimal robot", "holder": holder, "applied": [linear, angular],
                 "accepted": self.accepted, "refused": refused, "auto_arm": self.arms_itself,

@@ -78,10 +78,10 @@ class Robot:
 
     def answer(self, header: Header, request: Header) -> Iterator[Message]:
         """8.1: one reply to each request that can be read."""
-        now, who = now_us(), (header["source"], header["session"])
-        wrong = self.gate.request(request["verb"], who, header.get("echo"), now)
+        now = now_us()
+        wrong = self.gate.request(request["verb"], header, now)
         self.gate.refused[wrong.partition(":")[0]] += bool(wrong)
-        reply = {"to": who[1], "id": request["id"], "ok": not wrong, "detail": wrong or "done"}
+        reply = {"to": header["session"], "id": request["id"], "ok": not wrong, "detail": wrong or "done"}
         reply["state"] = self.gate.status(now)["state"]
         yield "reply", self.stamp("reply", now), json.dumps(reply).encode()
 

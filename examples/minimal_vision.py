@@ -5,7 +5,7 @@ Shell.
     sightline robot --listen tcp/127.0.0.1:7447       python examples/minimal_vision.py tcp/127.0.0.1:7447
 
 Numbers in comments are clauses of protocol/README.md. What is left out: the camera's model (10.1), most checks of a
-header's fields (2.8), tokens and certificates (13).
+header's fields (2.8), tokens and certificates (13), and the proofs that a robot with keys needs (6.6).
 """
 
 import itertools

@@ -17,6 +17,7 @@ class RejectReason(StrEnum):
     FROM_FUTURE = "FROM_FUTURE"  # echoes a capture time later than now
     STALE = "STALE"  # the frame behind it is too old
     OUT_OF_ORDER = "OUT_OF_ORDER"  # its `seq` is not newer than the last of that source and session
+    NOT_PROVEN = "NOT_PROVEN"  # its `proof` does not continue that of the driver whose session it states
     NOT_HOLDER = "NOT_HOLDER"  # another driver holds the lease
     DISARMED = "DISARMED"  # valid, but the wheels are off
     STOPPED = "STOPPED"  # the STOP latch is set

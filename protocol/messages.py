@@ -11,6 +11,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sightline.protocol import VERSION
+from sightline.protocol.proof import session_digest
 
 MAX_INTEGER = 2**53 - 1  # the largest integer that every JSON reader holds exactly
 MAX_CHANNELS_SHOWN = 16
@@ -20,6 +21,8 @@ MAX_DETECTED_BOXES = 64
 
 # A Literal would let `true` and 1.0 pass as 1.
 Version = Annotated[int, Field(ge=VERSION, le=VERSION, description="version of this protocol")]
+Element = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
+"""One element of a hash chain (`protocol/proof.py`)."""
 SessionId = Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")]
 Source = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,15}$")]
 RobotId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
@@ -118,6 +121,10 @@ class SenderHeader(WireModel):
     seq: Counter = Field(description="count of the sender's messages on this channel within the session")
 
 
+_PROOF: Final = "the next element of the sender's hash chain; of the first command its commitment"
+_NEXT_PROOF: Final = "near the end of the chain: the first element of the next chain"
+
+
 class AnswerHeader(SenderHeader):
     """Header of a twist and of an ack: the sender, the frame, and the computing time.
 
@@ -132,12 +139,16 @@ class AnswerHeader(SenderHeader):
         default=None, description="`seq` of the newest scan that was used, of the frame's session"
     )
     mission: RequestId | None = Field(default=None, description="the requested mission that it carries out")
+    proof: Element | None = Field(default=None, description=_PROOF)
+    next_proof: Element | None = Field(default=None, description=_NEXT_PROOF)
 
 
 class RequestHeader(SenderHeader):
     """Header of a request or mission. `echo` names the newest `status`. Only stop, disarm and release may omit it."""
 
     echo: Echo | None = Field(default=None, description="the newest received `status`")
+    proof: Element | None = Field(default=None, description=_PROOF)
+    next_proof: Element | None = Field(default=None, description=_NEXT_PROOF)
 
 
 class DetectionsHeader(SenderHeader):
@@ -191,10 +202,22 @@ class State(StrEnum):
 
 
 class Holder(WireModel):
-    """The driver that holds the lease."""
+    """The driver that holds the lease, as a robot knows it. No message contains it: a peer could copy the session."""
 
-    source: Source = Field(description="the sender's role; equal to the one in the key")
-    session: SessionId = Field(description="the sender's start: 8 hex digits drawn at random")
+    source: Source
+    session: SessionId
+
+
+class LeaseHolder(WireModel):
+    """The driver that holds the lease, as a robot shows it."""
+
+    source: Source = Field(description="its role")
+    digest: SessionId = Field(description="first 8 hex digits of the SHA-256 of `source/session`")
+
+    @classmethod
+    def of(cls, source: str, session: str) -> Self:
+        """Show the driver that has this session."""
+        return cls(source=source, digest=session_digest(source, session))
 
 
 class LastRejection(WireModel):
@@ -233,7 +256,7 @@ class Status(WireModel):
 
     state: State = Field(strict=False, description="of the gate")
     reason: str = Field(max_length=200, description="why it is in this state, one line for the operator")
-    holder: Holder | None = Field(default=None, description="the driver; null without one")
+    holder: LeaseHolder | None = Field(default=None, description="the driver; null without one")
     applied: Planar = Field(
         default=(0.0, 0.0), description="last given to the wheels, after every limit: linear, angular"
     )

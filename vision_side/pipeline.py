@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, RequestId, ScanHeader, Twist
+from sightline.protocol.proof import NO_PROOF, Proof
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import DecodedImage, Decoder
 from sightline.vision_side.detect.plugin_calls import checked_results
@@ -230,7 +231,8 @@ def _seen(plan: Plan, detections: tuple[Detection, ...]) -> Observation:
 
 
 def answer_header(
-    frame: FrameHeader, session: str, seq: int, compute_us: int = 0, answer: PipelineAnswer | None = None
+    frame: FrameHeader, session: str, seq: int, compute_us: int = 0, answer: PipelineAnswer | None = None,
+    *, proof: Proof = NO_PROOF,
 ) -> AnswerHeader:
     """Create the header of an answer.
 
@@ -240,7 +242,8 @@ def answer_header(
         seq: sequence number of the answer.
         compute_us: computing time, us.
         answer: the answer, which names its scan and its mission.
+        proof: proof that the twist is of this service.
     """
     scan, mission = (answer.scan, answer.request) if answer else (None, None)
     return AnswerHeader(source=SOURCE, session=session, seq=seq, echo=Echo.of(frame), compute_us=compute_us, scan=scan,
-                        mission=mission)
+                        mission=mission, proof=proof.proof, next_proof=proof.next_proof)

@@ -63,9 +63,9 @@ def _release(robot: Robot) -> None:
     """Give the lease of the case before back: to wait for its end costs a second a case."""
     holder = robot.status().holder
     if holder is not None and robot.bench.access.may_request(holder.source):
-        driver = Sender(robot, holder.source, acks=False)
-        driver.session = holder.session
-        driver.request("release")
+        driver = robot.bench.played.get(holder.digest)
+        if isinstance(driver, Sender):
+            driver.request("release")
 
 
 def _is_at_rest(status: Status) -> bool:

@@ -7,6 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
+from hashlib import sha256
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, Received
@@ -14,6 +15,7 @@ from sightline.conformance.measured import Evidence, MeasuredMotion, evidence_in
 from sightline.protocol.channels import ACK, CAMERA, FRAME, ODOMETRY, REPLY, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import CLAMPED, RejectReason
 from sightline.protocol.messages import MAX_INTEGER, CameraModel, FrameHeader, Odometry, Reply, Stamp, State, Status
+from sightline.protocol.proof import ProofChain, session_digest
 
 GOOD: Final = "GOOD"
 """The result of a command that the robot accepted: applied, or counted as DISARMED."""
@@ -185,6 +187,9 @@ class Sender:
         # A robot remembers sessions of earlier runs of the kit, so theirs must differ: by the kit's clock.
         draw = (self.bench.now_us + 7919 * self.bench.number() + id_of(source)) * 2_654_435_761
         self.session = f"{draw & 0xFFFFFFFF:08x}"
+        self._draws = 0
+        self.proofs = ProofChain(self._draw)
+        self.bench.played[session_digest(source, self.session)] = self
         self.seq = 0
         self.ack_seq = 0
         self.request_id = 0
@@ -193,6 +198,11 @@ class Sender:
         self.delay_us = self.compute_us = 0
         robot.each_frame(self._on_frame)
 
+    def _draw(self, count: int) -> bytes:
+        """Draw bytes for a chain of proofs. A kit in virtual time must repeat its runs, so they are not random."""
+        self._draws += 1
+        return sha256(f"{self.session}/{self._draws}".encode()).digest()[:count]
+
     # --- headers -------------------------------------------------------------------------------------------------
 
     def header(self, frame: FrameHeader, **changes: Any) -> dict[str, Any]:
@@ -200,7 +210,8 @@ class Sender:
         echo = {"channel": "frame", "session": frame.session, "seq": frame.seq, "t_us": frame.t_us}
         echo.update({name[5:]: changes.pop(name) for name in list(changes) if name.startswith("echo_")})
         fields = {"v": 1, "source": self.source, "session": self.session, "seq": self.seq, "echo": echo}
-        fields.update(compute_us=self.compute_us, **changes)
+        proof = {} if "proof" in changes else self.proofs.next()._asdict()
+        fields.update(compute_us=self.compute_us, **proof, **changes)
         return {name: value for name, value in fields.items() if value is not None}
 
     # --- twists and acks -----------------------------------------------------------------------------------------
@@ -213,7 +224,7 @@ class Sender:
     def ack(self, frame: FrameHeader, **changes: Any) -> None:
         """Acknowledge `frame`."""
         self.ack_seq += 1
-        fields = {"seq": self.ack_seq, **changes}
+        fields = {"seq": self.ack_seq, "proof": None, **changes}
         self.bench.publish(ACK, as_json(self.header(frame, **fields)), b"", self.source)
 
     def drive(self, text: bytes | None = CRAWL) -> None:
@@ -318,6 +329,7 @@ class Sender:
         fields: dict[str, Any] = {"v": 1, "source": self.source, "session": self.session, "seq": self.request_id}
         if isinstance(stamp, Stamp):
             fields["echo"] = {"channel": "status", "session": stamp.session, "seq": stamp.seq, "t_us": stamp.t_us}
+        fields.update((name, value) for name, value in self.proofs.next()._asdict().items() if value)
         payload = {"id": changes.pop("id", self.request_id), "verb": verb, **changes.pop("extra", {})}
         self.bench.publish(REQUEST, as_json({**fields, **changes}), as_json(payload), self.source)
 

@@ -323,7 +323,7 @@ def rejected_twists_return_credit(bench: Bench, watcher: Sender) -> None:
     bench.rest(2 * OWNED_US)
     by_acks = _gap_us(bench, "with acks")
     rejected = Sender(watcher.robot, acks=False)
-    rejected.session, rejected.compute_us = watcher.session, SLOW_US
+    rejected.session, rejected.proofs, rejected.compute_us = watcher.session, watcher.proofs, SLOW_US
     watcher.fall_silent()
     frame = watcher.robot.frame()
     bench.rest(SLOW_US)
@@ -391,7 +391,7 @@ def _silent_for(bench: Bench, for_us: int) -> bool:
 def again(watcher: Sender) -> Sender:
     """The same peer, answering by hand."""
     again = Sender(watcher.robot, acks=False)
-    again.session, again.ack_seq = watcher.session, watcher.ack_seq
+    again.session, again.proofs, again.ack_seq = watcher.session, watcher.proofs, watcher.ack_seq
     again.compute_us = SLOW_US
     return again
 

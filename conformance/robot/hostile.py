@@ -16,7 +16,7 @@ from sightline.conformance.robot.fixture import (
     watcher,
 )
 from sightline.protocol.channels import FRAME, REQUEST, STATUS, TWIST, key_for
-from sightline.protocol.messages import Holder, Stamp, State
+from sightline.protocol.messages import LeaseHolder, Stamp, State
 
 SUITE: Final = Suite("R")
 _GUEST_MPS: Final = 0.2
@@ -99,7 +99,7 @@ def guests_are_one(bench: Bench, watcher: Sender) -> None:
     reported = watcher.robot.reaches(lambda status: status.holder is not None, 500_000)
     bench.need(reported, "`status` names no holder (R-LEASE-01)")
     holder = watcher.robot.status().holder
-    bench.expect(holder == Holder(source="guest", session="00000000"), f"holder is {holder}")
+    bench.expect(holder == LeaseHolder.of("guest", "00000000"), f"holder is {holder}")
 
 
 # --- roles and keys --------------------------------------------------------------------------------------------------

@@ -4,7 +4,9 @@ from typing import Final
 
 from sightline.conformance.case import Bench, Suite
 from sightline.conformance.robot.fixture import GOOD, Sender, moving, operator, ready, teleop, vision
-from sightline.protocol.messages import Holder, State
+from sightline.protocol.channels import STATUS
+from sightline.protocol.messages import LeaseHolder, State
+from sightline.protocol.proof import ProofChain
 
 SUITE: Final = Suite("R")
 _LEASE_US: Final = 1_000_000
@@ -29,22 +31,23 @@ def _held_for_a_while(bench: Bench) -> Sender:
 
 
 def _holder_is(sender: Sender, within_us: int = 400_000) -> bool:
-    me = Holder(source=sender.source, session=sender.session)
+    me = LeaseHolder.of(sender.source, sender.session)
     return sender.robot.reaches(lambda status: status.holder == me, within_us)
 
 
 @SUITE.must("R-LEASE-01", "6.1 Lease", ready)
 def first_holds(bench: Bench, sender: Sender) -> None:
     """The source of the first good twist holds the lease, and `status` names it as holder."""
-    bench.expect(_holder_is(sender), f"holder is {sender.robot.status().holder}, not vision {sender.session}")
+    bench.expect(_holder_is(sender), f"holder is {sender.robot.status().holder}, not vision, session {sender.session}")
 
 
 @SUITE.should("R-LEASE-03", "5.1 Order", ready)
 def rejected_driver_receives_holder(bench: Bench, first: Sender) -> None:
-    """The words of the rejection name the source and session that drive."""
+    """The words of the rejection name the source that drives and the digest of its session, never the session."""
     bench.need(Sender(first.robot).twist_result() == "NOT_HOLDER", "a second driver is not rejected so (R-LEASE-02)")
     last = first.robot.status().last_refusal
-    reported = last is not None and first.session in last.detail and first.source in last.detail
+    reported = last is not None and first.source in last.detail and (
+        LeaseHolder.of(first.source, first.session).digest in last.detail and first.session not in last.detail)
     bench.expect(reported, f"last_refusal is {last}")
 
 
@@ -185,3 +188,77 @@ SUITE.must_all(teleop, {
     "R-LEASE-20": ("8.3 Freshness", "`acquire` without `echo` is rejected as MALFORMED.",
                    lambda it: it.expect_rejected("acquire", "MALFORMED", "a request without echo", cite=False)),
 })
+
+
+# --- proof of identity -----------------------------------------------------------------------------------------------
+
+_FORGED: Final = "ab" * 16
+
+
+def _copied(bench: Bench) -> Sender:
+    """A second peer that has read the driver's session and its last number, and has a chain of its own."""
+    first = ready(bench)
+    copy = Sender(first.robot, first.source, acks=False)
+    copy.session, copy.seq = first.session, first.seq + 100
+    return copy
+
+
+SUITE.must_all(_copied, {
+    "R-PROOF-01": ("6.6 Proof", "A twist that states the driver's session with another proof is NOT_PROVEN.",
+                   lambda it: it.expect("NOT_PROVEN")),
+    "R-PROOF-02": ("6.6 Proof", "A twist that states the driver's session without a proof is NOT_PROVEN.",
+                   lambda it: it.expect("NOT_PROVEN", proof=None)),
+})
+
+
+@SUITE.must("R-PROOF-03", "6.6 Proof", ready)
+def read_proof_is_over(_bench: Bench, first: Sender) -> None:
+    """A proof that was accepted once proves nothing: a copy with a higher `seq` is NOT_PROVEN."""
+    proof = first.proofs.next().proof
+    first.expect(GOOD, proof=proof)
+    first.expect("NOT_PROVEN", proof=proof)
+
+
+@SUITE.must("R-PROOF-04", "6.6 Proof", ready)
+def copied_identity_bars_no_driver(_bench: Bench, first: Sender) -> None:
+    """The `seq` of a twist that is NOT_PROVEN is not used up: the driver's next one is good."""
+    first.expect("NOT_PROVEN", proof=_FORGED, seq=first.seq + 1000)
+    first.expect(GOOD)
+
+
+@SUITE.must("R-PROOF-05", "6.6 Proof", ready)
+def lost_commands_are_no_forgery(_bench: Bench, first: Sender) -> None:
+    """A proof that is 40 commands ahead continues: so many may be lost."""
+    for _ in range(40):
+        first.proofs.next()
+    first.expect(GOOD)
+
+
+@SUITE.must("R-PROOF-06", "6.6 Proof", ready)
+def chain_is_renewed(_bench: Bench, first: Sender) -> None:
+    """A driver that announced its next chain continues in it."""
+    following = ProofChain(lambda count: bytes(range(count)))
+    first.expect(GOOD, proof=first.proofs.next().proof, next_proof=following.next().proof)
+    first.proofs = following
+    first.expect(GOOD, what="the first twist of the next chain")
+    first.expect(GOOD, what="the second twist of the next chain")
+
+
+@SUITE.must("R-PROOF-07", "6.6 Proof", teleop)
+def copied_identity_releases_nothing(bench: Bench, human: Sender) -> None:
+    """A `release` that states the driver's session without its proof is NOT_PROVEN, and the lease stays."""
+    bench.need(human.twist_result() == GOOD, "a twist of teleop is not accepted")
+    copy = Sender(human.robot, "teleop", acks=False)
+    copy.session = human.session
+    copy.expect_rejected("release", "NOT_PROVEN", "a release by a copied identity")
+    human.expect(GOOD)
+    bench.expect(_holder_is(human), "the lease is gone")
+
+
+@SUITE.must("R-PROOF-08", "6.7 Digest", ready)
+def status_shows_no_session(bench: Bench, first: Sender) -> None:
+    """No status contains the driver's session, nor does it after a rejected second driver."""
+    Sender(first.robot).twist_result()
+    received = bench.newest(STATUS)
+    found = received is not None and first.session.encode() in received.message.payload
+    bench.expect(not found, "the status contains the session")

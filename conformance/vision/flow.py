@@ -8,7 +8,7 @@ from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, RobotPlaye
 from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.conformance.vision.images import HALF_CAMERA
 from sightline.protocol.channels import REQUEST
-from sightline.protocol.messages import Holder, LastRejection, State, Status
+from sightline.protocol.messages import LastRejection, LeaseHolder, State, Status
 from sightline.protocol.spec.message_cases import packed
 
 SUITE = Suite("V")
@@ -147,7 +147,7 @@ def _goes_on(status: Status | bytes, what: str, robot: RobotPlayed, *, twists: b
 
 
 _OTHER_HOLDER: Final = Status(state=State.ACTIVE, reason="teleop drives",
-                              holder=Holder(source="teleop", session="99999999"))
+                              holder=LeaseHolder.of("teleop", "99999999"))
 _REJECTING: Final = Status(state=State.HOLD, reason="no command", refused={"STALE": 99},
                            last_refusal=LastRejection(source="vision", reason="STALE", detail="frame is 900 ms old"))
 _NEWER: Final = packed({"state": "HOLD", "reason": "x", "refused": {"TOO_PURPLE": 3}, "battery": {"volts": 11.1}})

@@ -44,6 +44,10 @@ REMEDIES: Final = {
     "STALE": ("The frame behind the command is too old.",
               "See [slow links](../how-to/troubleshooting.md#the-robot-is-slow-or-stops)."),
     "OUT_OF_ORDER": ("`seq` is not newer than the last one of this source and session.", "Count up by one."),
+    "NOT_PROVEN": (
+        "The command states the driver's session without continuing its proof, or a robot with keys gets no proof.",
+        "Another peer copied the identity of the driver. A peer of an older version needs an update.",
+    ),
     "NOT_HOLDER": ("Another driver holds the lease.", "`sightline status` names the driver."),
     "DISARMED": ("The command is valid, but the robot is disarmed.", "Run `sightline arm`."),
     "STOPPED": ("The STOP latch is set.", "Run `sightline reset`, then `sightline arm`."),

@@ -77,7 +77,7 @@ test("characters are code points", () => {
 test("what is encoded is decoded again, nulls left out", () => {
   const echo = { channel: "frame", session: "0a1b2c3d", seq: 1, t_us: 2 };
   const header = { v: 1, source: "vision", session: "4e5f6071", seq: 3, echo, compute_us: 4 };
-  assert.deepEqual(decode(AnswerHeader, encode(header)), { ...header, scan: null, mission: null });
+  assert.deepEqual(decode(AnswerHeader, encode(header)), { ...header, scan: null, mission: null, proof: null, next_proof: null });
   assert.equal(new TextDecoder().decode(encode({ a: null, b: 0 })), '{"b":0}');
 });
 

@@ -98,7 +98,8 @@ export class Eyes {
 
   answer({ stamp, arrival_us }, twist) {
     this.answered += 1;
-    const header = this.vision.answerHeader(stamp, this.now_us() - arrival_us);
+    const proof = twist === null ? {} : this.vision.proofs.next();
+    const header = this.vision.answerHeader(stamp, this.now_us() - arrival_us, proof);
     if (twist === null) this.send("ack", header, NOTHING);
     else this.send("twist", header, formatTwist(twist));
   }

@@ -83,6 +83,7 @@ export function readFields(fields, value, where = "") {
 const counter = integer(0, MAX_INTEGER);
 const real = number(-1e6, 1e6);
 const session = matching(/^[0-9a-f]{8}$/);
+const element = matching(/^[0-9a-f]{32}$/);
 const source = matching(/^[a-z][a-z0-9_]{0,15}$/);
 const pose = list(real, 3, 3);
 const planar = list(real, 2, 2);
@@ -107,9 +108,11 @@ const asker = { v: [version, VERSION], source: [source], session: [session], seq
 export const Asked = { session: [session], id: [counter] };
 export const AnswerHeader = {
   ...asker, echo: [object(Echo)], compute_us: [counter, 0], scan: [orNull(counter), null],
-  mission: [orNull(object(Asked)), null],
+  mission: [orNull(object(Asked)), null], proof: [orNull(element), null], next_proof: [orNull(element), null],
 };
-export const RequestHeader = { ...asker, echo: [orNull(object(Echo)), null] };
+export const RequestHeader = {
+  ...asker, echo: [orNull(object(Echo)), null], proof: [orNull(element), null], next_proof: [orNull(element), null],
+};
 
 export const VERBS = ["arm", "disarm", "stop", "reset", "acquire", "release"];
 export const STATES = ["DISARMED", "HOLD", "ACTIVE", "DEGRADED", "STOPPED", "FAULT"];
@@ -117,7 +120,7 @@ export const Request = { id: [counter], verb: [oneOf(...VERBS)] };
 export const Reply = { to: [session], id: [counter], ok: [boolean], state: [any], detail: [text(200)] };
 export const Odometry = { pose: [pose], moving: [planar] };
 
-export const Holder = { source: [source], session: [session] };
+export const LeaseHolder = { source: [source], digest: [session] };
 export const LastRefusal = { source: [text(32)], reason: [text(32)], detail: [text(200)] };
 export const StreamStatus = {
   sent: [counter, 0],
@@ -136,7 +139,7 @@ export const StreamStatus = {
 export const Status = {
   state: [oneOf(...STATES)],
   reason: [text(200)],
-  holder: [orNull(object(Holder)), null],
+  holder: [orNull(object(LeaseHolder)), null],
   applied: [planar, [0, 0]],
   frame_age_us: [orNull(counter), null],
   latency_us: [orNull(counter), null],

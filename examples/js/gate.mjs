@@ -5,7 +5,7 @@
  */
 
 import { WireError } from "./codec.mjs";
-import { FreshnessRecord, IssuedRecord, Lease, RANKS, SequenceRecord, isHuman, same } from "./judging.mjs";
+import { FreshnessRecord, IssuedRecord, Lease, RANKS, SequenceRecord, isHuman, proofOf, same, shown } from "./judging.mjs";
 import { LIMITS, Ramp, STILL, ageFactor, clampTwist, isStill } from "./limits.mjs";
 
 const MAX_REQUEST_AGE_US = 2_000_000;
@@ -57,7 +57,7 @@ export class Gate {
   offer(source, header, twist, now_us) {
     try {
       const { who, age_us } = this.identify(source, header, now_us);
-      this.admit(who, now_us);
+      this.admit(who, header, now_us);
       this.keep(header, twist, now_us, age_us);
       this.accepted += 1;
       return null;
@@ -91,18 +91,20 @@ export class Gate {
     this.issued.age_us(header.echo, now_us, this.limits.zeroSpeedAge_us);
     const age_us = now_us - this.pictures.shownSince_us(header.echo.t_us);
     if (age_us > this.limits.zeroSpeedAge_us) throw new WireError("STALE", "the camera image does not change");
+    const who = { source, session: header.session };
+    this.lease.checkProof(who, proofOf(header), now_us);
     this.sequence.check(header, now_us);
-    return { who: { source, session: header.session }, age_us };
+    return { who, age_us };
   }
 
   /** Steps 7 to 9: the latch, the lease, the arming. */
-  admit(who, now_us) {
+  admit(who, header, now_us) {
     if (this.state === "STOPPED" || this.state === "FAULT") throw new WireError(this.state, this.reason);
     this.noticeLostHuman(now_us);
     const holder = this.lease.liveHolder(now_us);
-    if (!this.lease.mayTake(who, now_us)) throw new WireError("NOT_HOLDER", `${holder.source} ${holder.session} drives`);
+    if (!this.lease.mayTake(who, now_us)) throw new WireError("NOT_HOLDER", `${holder.source} ${shown(holder).digest} drives`);
     this.liveCommands = same(holder, who) ? this.liveCommands + 1 : 1;
-    this.lease.take(who, now_us);
+    this.lease.take(who, now_us, proofOf(header));
     this.sequence.promote(who);
     if (!this.armed) throw new WireError("DISARMED", this.reason);
   }
@@ -169,6 +171,10 @@ export class Gate {
     const who = { source: header.source, session: header.session };
     if (!ALWAYS_GRANTED.includes(verb) && verb !== "release") this.issued.checkRequest(header.echo, now_us, MAX_REQUEST_AGE_US);
     this.noticeLostHuman(now_us);
+    if (!ALWAYS_GRANTED.includes(verb)) {
+      this.lease.checkProof(who, proofOf(header), now_us);
+      this.lease.advance(who, proofOf(header), now_us);
+    }
     switch (verb) {
       case "stop":
         return this.stop(`STOP by ${who.source}`);
@@ -177,7 +183,7 @@ export class Gate {
       case "release":
         return this.release(who, now_us);
       case "acquire":
-        return this.acquire(who, now_us);
+        return this.acquire(who, now_us, proofOf(header));
       case "reset":
         return this.reset(who, now_us);
       default:
@@ -225,7 +231,7 @@ export class Gate {
     return "armed";
   }
 
-  acquire(who, now_us) {
+  acquire(who, now_us, proof) {
     const holder = this.lease.liveHolder(now_us);
     if (!(who.source in RANKS) || !this.lease.mayTake(who, now_us)) {
       throw new WireError("NOT_HOLDER", holder ? `${holder.source} drives` : `${who.source} may not drive`);
@@ -233,7 +239,7 @@ export class Gate {
     if (same(holder, who)) return "already held";
     this.liveCommands = 0;
     this.command = null; // the driver before neither arms nor drives for this one
-    this.lease.take(who, now_us);
+    this.lease.take(who, now_us, proof);
     return "acquired";
   }
 
@@ -252,7 +258,7 @@ export class Gate {
   refuseBesideHuman(who, now_us) {
     const holder = this.lease.liveHolder(now_us);
     if (holder !== null && isHuman(holder.source) && !same(holder, who)) {
-      throw new WireError("NOT_ALLOWED", `${holder.source} ${holder.session} drives`);
+      throw new WireError("NOT_ALLOWED", `${holder.source} ${shown(holder).digest} drives`);
     }
   }
 

@@ -4,6 +4,7 @@ import assert from "node:assert/strict";
 import test from "node:test";
 import { WireError } from "./codec.mjs";
 import { Gate } from "./gate.mjs";
+import { ProofChain, continues, sessionDigest, sha256 } from "./proof.mjs";
 import { LIMITS, Ramp, TICK_US, ageFactor, clampTwist } from "./limits.mjs";
 
 const ROBOT = "0a1b2c3d";
@@ -28,9 +29,9 @@ class Rig {
     return { channel, session: ROBOT, seq: this.frames, t_us: this.now_us };
   }
 
-  command(echo, { source = "vision", session = "4e5f6071", twist = FORWARD, seq = undefined } = {}) {
+  command(echo, { source = "vision", session = "4e5f6071", twist = FORWARD, seq = undefined, ...proof } = {}) {
     this.commands += 1;
-    const header = { source, session, seq: seq ?? this.commands, echo, compute_us: 0 };
+    const header = { source, session, seq: seq ?? this.commands, echo, compute_us: 0, ...proof };
     return this.gate.offer(source, header, twist, this.now_us);
   }
 
@@ -264,4 +265,30 @@ test("the ramp is per elapsed time and never overshoots", () => {
   assert.ok(Math.abs(often.twist.linear_mps - 0.2) < 1e-9);
   assert.ok(Math.abs(seldom.twist.linear_mps - 0.2) < 1e-9);
   assert.equal(seldom.step(FORWARD, 900_000).linear_mps, 0.4);
+});
+
+test("proofs: SHA-256 as Node's, a chain that is renewed, and nothing that was revealed continues it", async () => {
+  const { createHash } = await import("node:crypto");
+  for (const text of ["", "abc", "x".repeat(55)]) {
+    assert.equal(Buffer.from(sha256(Buffer.from(text))).toString("hex"), createHash("sha256").update(text).digest("hex"));
+  }
+  const chain = new ProofChain();
+  let last = chain.next();
+  for (let count = 0; count < 2_500; count += 1) {
+    const next = chain.next();
+    assert.ok(continues(next.proof, last));
+    assert.ok(!continues(last.proof, last) && !continues(last.next_proof ?? null, last));
+    last = next;
+  }
+  assert.equal(sessionDigest("vision", "0000bbbb"), "20500bbc");
+});
+
+test("a copied identity neither drives nor locks the driver out", () => {
+  const rig = new Rig();
+  const chain = new ProofChain();
+  for (let count = 0; count < 5; count += 1) rig.command(rig.frame(), chain.next());
+  assert.equal(rig.ask("arm"), "armed");
+  assert.equal(rig.command(rig.frame(), { proof: "ab".repeat(16), seq: 9_000 }), "NOT_PROVEN");
+  assert.equal(rig.command(rig.frame(), { seq: 9_000 }), "NOT_PROVEN");
+  assert.equal(rig.command(rig.frame(), chain.next()), null);
 });

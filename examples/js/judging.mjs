@@ -7,6 +7,7 @@
  */
 
 import { WireError } from "./codec.mjs";
+import { continues, sessionDigest } from "./proof.mjs";
 
 const KEPT_PER_CHANNEL = 256; // 8 s of 30 fps frames; anything older is STALE long before
 const KEPT_SENDERS = 64;
@@ -16,6 +17,10 @@ const MAX_SEQ_JUMP = 2 ** 20;
 
 /** Roles that may drive, by rank. */
 export const RANKS = Object.freeze(Object.assign(Object.create(null), { guest: 0, vision: 1, teleop: 2 }));
+const NO_PROOF = Object.freeze({ proof: null, next_proof: null });
+export const proofOf = (header) => (header === null ? NO_PROOF : { proof: header.proof ?? null, next_proof: header.next_proof ?? null });
+/** What others see of a driver: not its session, which a peer could copy. */
+export const shown = ({ source, session }) => ({ source, digest: sessionDigest(source, session) });
 export const isHuman = (source) => source === "teleop";
 export const same = (one, other) => one !== null && other !== null && one.source === other.source && one.session === other.session;
 
@@ -142,13 +147,26 @@ export class Lease {
     return holder === null || same(holder, who) || RANKS[who.source] > RANKS[holder.source];
   }
 
-  take(who, now_us) {
+  /** @throws {WireError} NOT_PROVEN for a message that states the session of the driver and is not its own */
+  checkProof(who, proof, now_us) {
+    if (!same(this.liveHolder(now_us), who) || this.proof.proof === null || continues(proof.proof, this.proof)) return;
+    throw new WireError("NOT_PROVEN", `its proof does not continue that of the ${who.source} that drives`);
+  }
+
+  /** The proof of the driver's request is used up. */
+  advance(who, proof, now_us) {
+    if (same(this.liveHolder(now_us), who)) this.proof = proof;
+  }
+
+  take(who, now_us, proof = NO_PROOF) {
     this.holder = who;
+    this.proof = proof;
     this.expires_us = now_us + this.life_us;
   }
 
   drop() {
     this.holder = null;
+    this.proof = NO_PROOF;
     this.expires_us = 0;
   }
 

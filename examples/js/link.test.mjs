@@ -90,7 +90,7 @@ const message = (block, payload = "0|0") => Uint8Array.from([block.length >> 8, 
 test("a packed message is unpacked", () => {
   const packet = unpack(pack("twist", HEADER, bytes("0|0")), "", "r1");
   assert.deepEqual([packet.channel.name, packet.source, text(packet.payload)], ["twist", "vision", "0|0"]);
-  assert.deepEqual(decode(AnswerHeader, packet.header), { ...HEADER, scan: null, mission: null });
+  assert.deepEqual(decode(AnswerHeader, packet.header), { ...HEADER, scan: null, mission: null, proof: null, next_proof: null });
 });
 
 test("the channel may stand anywhere, the role of the hello stands in for a source", () => {

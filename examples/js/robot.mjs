@@ -7,6 +7,7 @@
 import { CHANNELS, WireError, encode, readJpegSize, readMessage } from "./codec.mjs";
 import { Gate } from "./gate.mjs";
 import { isStill } from "./limits.mjs";
+import { shown } from "./judging.mjs";
 import { Stream } from "./stream.mjs";
 
 const PERIODS_US = { status: 100_000, odometry: 50_000, camera: 500_000 };
@@ -60,8 +61,8 @@ export class Robot {
   }
 
   onTwist(source, { header, payload }, now_us) {
-    this.gate.offer(source, header, payload, now_us);
-    if (header === null || header.source !== source) return;
+    const reason = this.gate.offer(source, header, payload, now_us);
+    if (header === null || header.source !== source || reason === "NOT_PROVEN") return;
     this.stream.onHolder(this.gate.lease.liveHolder(now_us), now_us);
     this.returnCredit(header, now_us);
   }
@@ -161,11 +162,12 @@ export class Robot {
 
   status(now_us) {
     const { gate } = this;
+    const holder = gate.lease.liveHolder(now_us);
     const stream = { ...this.stream.status(now_us), refused_pictures: this.refusedPictures, calibrated: this.camera.calibrated };
     return {
       state: gate.state,
       reason: gate.reason,
-      holder: gate.lease.liveHolder(now_us),
+      holder: holder && shown(holder),
       applied: rounded(gate.applied),
       frame_age_us: gate.frameAge_us(now_us),
       latency_us: gate.latency_us,

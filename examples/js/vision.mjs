@@ -4,6 +4,8 @@
  * @typedef {{x_px: number, width_px: number, share: number}} Target in pixels of the encoded picture
  */
 
+import { ProofChain } from "./proof.mjs";
+
 const GAIN_PER_S = 2; // turn rate per radian of bearing; times a total latency of 0.2 s it stays below 0.9
 const MAX_ANGULAR_RAD_S = 1.2;
 const SEARCH_RAD_S = 0.4;
@@ -62,6 +64,7 @@ export class Vision {
   constructor(session, source = "vision") {
     this.session = session;
     this.source = source;
+    this.proofs = new ProofChain();
     this.robotSession = "";
     this.camera = null;
     this.lastSeq = this.last_us = -1;
@@ -125,10 +128,10 @@ export class Vision {
    * @param {{session: string, seq: number, t_us: number}} frame its header, cited field for field
    * @param {number} compute_us from receiving the frame to sending the answer
    */
-  answerHeader({ session, seq, t_us }, compute_us) {
+  answerHeader({ session, seq, t_us }, compute_us, proof = {}) {
     this.seq += 1;
     const echo = { channel: "frame", session, seq, t_us };
-    return { v: 1, source: this.source, session: this.session, seq: this.seq, echo, compute_us: Math.max(0, Math.round(compute_us)) };
+    return { v: 1, source: this.source, session: this.session, seq: this.seq, echo, compute_us: Math.max(0, Math.round(compute_us)), ...proof };
   }
 
   /**
@@ -141,7 +144,7 @@ export class Vision {
     this.requestId += 1;
     const stamp = this.status?.header;
     const echo = stamp ? { channel: "status", session: stamp.session, seq: stamp.seq, t_us: stamp.t_us } : null;
-    const header = { v: 1, source: this.source, session: this.session, seq: this.requestSeq, echo };
+    const header = { v: 1, source: this.source, session: this.session, seq: this.requestSeq, echo, ...this.proofs.next() };
     return { header, payload: { id: this.requestId, verb } };
   }
 }

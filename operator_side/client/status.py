@@ -67,7 +67,7 @@ def _next_step(robot: str, status: Status) -> str:
 def status_lines(robot: str, status: Status) -> Iterator[str]:
     """Format every field of a status."""
     stream = status.stream
-    holder = f"{status.holder.source} {status.holder.session}" if status.holder else "none"
+    holder = f"{status.holder.source} {status.holder.digest}" if status.holder else "none"
     yield f"robot     {robot}"
     yield f"state     {status.state}: {status.reason}"
     yield f"driver    {holder}" + ("; arms automatically" if status.auto_arm else "")

@@ -59,7 +59,7 @@ def state_of(robot: str, missions: MissionClient, is_online: bool) -> dict[str, 
 
 def _robot_lines(status: Status) -> list[tuple[str, str]]:
     stream = status.stream
-    driver = f"{status.holder.source} {status.holder.session}" if status.holder else "none"
+    driver = f"{status.holder.source} {status.holder.digest}" if status.holder else "none"
     age = f"{millis(status.frame_age_us)} old, capture to command {millis(status.latency_us)}"
     return [
         ("driver", driver),

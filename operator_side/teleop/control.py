@@ -1,5 +1,6 @@
 """The logic of teleop: held keys, speeds, hand-over to vision, and the messages for the robot. Pure."""
 
+import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
@@ -14,6 +15,7 @@ from sightline.protocol.messages import (
     AnswerHeader,
     Echo,
     FrameHeader,
+    LeaseHolder,
     Reply,
     Request,
     RequestHeader,
@@ -22,6 +24,7 @@ from sightline.protocol.messages import (
     Twist,
     Verb,
 )
+from sightline.protocol.proof import NO_PROOF, Proof, ProofChain
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import Message
 
@@ -259,8 +262,10 @@ PERIOD_US: Final = 30_000
 _REPEAT_AFTER_US: Final = 60_000
 _ARM_FOR_US: Final = 2_000_000
 """A press requests arming for this time; five valid commands and a request take a fraction of it."""
-_RETRIED: Final = (RejectReason.NOT_ALLOWED, RejectReason.STALE, RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME)
-"""Rejections that end by themselves: missing valid commands, or a status from before the link or robot returned."""
+_RETRIED: Final = (RejectReason.NOT_ALLOWED, RejectReason.STALE, RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME,
+                   RejectReason.NOT_PROVEN)
+"""Rejections that end by themselves: missing valid commands, a status from before the link or robot returned, or a
+command that overtook the request."""
 _HAND_OVER_FOR_US: Final = 5_000_000
 """After this time there is no vision service to take over."""
 
@@ -278,6 +283,7 @@ class Teleop:
 
     def __init__(self, session: str, speeds: Speeds, layout: Layout = WASD) -> None:
         self.session = session
+        self._proofs = ProofChain(secrets.token_bytes)
         self.speeds = speeds
         self.layout = layout
         self.mode = Mode.WATCHING
@@ -514,22 +520,26 @@ class Teleop:
     def _other_drives(self) -> bool:
         status = self.report.status if self.report else None
         armed = status is not None and status.state in (State.ACTIVE, State.DEGRADED)
-        return armed and status is not None and status.holder is not None and status.holder.session != self.session
+        own = LeaseHolder.of(SOURCE, self.session)
+        return armed and status is not None and status.holder is not None and status.holder != own
 
     # --- messages ------------------------------------------------------------------------------------------------
 
-    def _answer(self, echo: Echo) -> AnswerHeader:
+    def _answer(self, echo: Echo, proof: Proof = NO_PROOF) -> AnswerHeader:
         self._seq += 1
-        return AnswerHeader(source=SOURCE, session=self.session, seq=self._seq, echo=echo)
+        return AnswerHeader(source=SOURCE, session=self.session, seq=self._seq, echo=echo, proof=proof.proof,
+                            next_proof=proof.next_proof)
 
     def _command(self, twist: Twist, echo: Echo) -> Message:
-        return self._message(TWIST, encode(self._answer(echo)), format_twist(twist))
+        return self._message(TWIST, encode(self._answer(echo, self._proofs.next())), format_twist(twist))
 
     def _request(self, verb: Verb) -> Message:
         self._id += 1
         self._seq += 1
         echo = None if self.report is None else Echo.of(self.report.stamp)
-        header = RequestHeader(source=SOURCE, session=self.session, seq=self._seq, echo=echo)
+        proof = self._proofs.next()
+        header = RequestHeader(source=SOURCE, session=self.session, seq=self._seq, echo=echo, proof=proof.proof,
+                               next_proof=proof.next_proof)
         return self._message(REQUEST, encode(header), encode(Request(id=self._id, verb=verb)))
 
     @staticmethod

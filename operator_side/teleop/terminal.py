@@ -15,12 +15,12 @@ from typing import Final
 
 from sightline.operator_side.client.status import millis, twist_text
 from sightline.operator_side.client.stop import StopSender
-from sightline.operator_side.teleop.control import Mode, Teleop
+from sightline.operator_side.teleop.control import SOURCE, Mode, Teleop
 from sightline.operator_side.teleop.gamepad import Gamepad, PadKey
 from sightline.protocol.channels import FRAME, REPLY, STATUS, Channel
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError
-from sightline.protocol.messages import Status
+from sightline.protocol.messages import LeaseHolder, Status
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 
 _SILENT_US: Final = 1_000_000
@@ -60,7 +60,7 @@ def _driver(teleop: Teleop, status: Status) -> str:
     holder = status.holder
     if holder is None:
         return "no driver" if teleop.mode is not Mode.HANDING_OVER else Mode.HANDING_OVER.value
-    if holder.session == teleop.session:
+    if holder == LeaseHolder.of(SOURCE, teleop.session):
         return "you drive"
     return f"{holder.source} drives"
 

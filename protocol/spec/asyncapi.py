@@ -4,9 +4,9 @@ from typing import Any, Final
 
 from sightline.protocol import VERSION
 from sightline.protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REPLY, REQUEST, Channel, Direction
-from sightline.protocol.legacy_text import MAX_BOXES_BYTES
 from sightline.protocol.text import MAX_TWIST_BYTES
 from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL
+from sightline.protocol.transports.websocket.legacy_text import MAX_BOXES_BYTES
 
 Node = dict[str, Any]
 ROBOT_ID: Final = "^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from sightline.protocol.errors import WireError
-from sightline.protocol.legacy_text import decode_picture, encode_picture, parse_boxes, parse_dashed
 from sightline.protocol.spec.message_cases import (
     ANSWER,
     ECHO,
@@ -40,6 +39,12 @@ from sightline.protocol.transports.stop_datagram import (
     unpack_stop,
 )
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, parse_hello, unpack
+from sightline.protocol.transports.websocket.legacy_text import (
+    decode_picture,
+    encode_picture,
+    parse_boxes,
+    parse_dashed,
+)
 
 Fields = dict[str, Any]
 WRONG_KEY: Final = "WRONG_KEY"

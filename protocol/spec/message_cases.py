@@ -232,6 +232,11 @@ def answers() -> list[MessageCase]:
         case("twist", "no_compute", "compute_us may be left out", header=without(ANSWER, "compute_us")),
         case("twist", "with_scan_and_mission", "what else it went by",
              header=ANSWER | {"scan": 12, "mission": {"session": PEER, "id": 5}}),
+        case("twist", "with_proof", "an element of the sender's chain", header=ANSWER | {"proof": "0f" * 16}),
+        case("twist", "with_next_proof", "near the end of the chain",
+             header=ANSWER | {"proof": "0f" * 16, "next_proof": "a5" * 16}),
+        case("twist", "proof_upper", "lower-case digits", MALFORMED, header=ANSWER | {"proof": "0F" * 16}),
+        case("twist", "proof_31", "32 digits", MALFORMED, header=ANSWER | {"proof": "0f" * 15 + "0"}),
         case("twist", "scan_negative", "integers are bounded below", MALFORMED, header=ANSWER | {"scan": -1}),
         case("twist", "mission_no_id", "named in full", MALFORMED, header=ANSWER | {"mission": {"session": PEER}}),
         case("twist", "no_echo", "a twist must cite what it answers", MALFORMED, header=without(ANSWER, "echo")),
@@ -252,12 +257,13 @@ def answers() -> list[MessageCase]:
 
 
 def payloads() -> list[MessageCase]:
-    status = {"state": "ACTIVE", "reason": "driving", "holder": {"source": "vision", "session": PEER}}
+    status = {"state": "ACTIVE", "reason": "driving", "holder": {"source": "vision", "digest": PEER}}
     last = {"source": "vision", "reason": "STALE", "detail": "frame 41 is 410 ms old"}
     counted = status | {"refused": {"STALE": 3}, "last_refusal": last}
     stop = {"id": 1, "verb": "stop"}
     return [
         case("request", "stop_without_echo", "stop needs no echo", header=without(ASK, "echo"), payload=stop),
+        case("request", "with_proof", "of the driver", header=ASK | {"proof": "0f" * 16}),
         case("request", "unknown_verb", "verbs are a closed list", MALFORMED, payload={"id": 1, "verb": "dance"}),
         case("request", "verb_upper", "verbs are lower-case", MALFORMED, payload={"id": 1, "verb": "STOP"}),
         case("request", "no_id", "a request has an id", MALFORMED, payload={"verb": "stop"}),

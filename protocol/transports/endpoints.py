@@ -68,7 +68,7 @@ def check_zenoh_endpoints(listen: Sequence[str], connect: Sequence[str]) -> None
 #         swapped                        angular-linear, with dashed
 #         nonnegative                    zero in place of each negative number, with dashed: toward a legacy robot
 #         oneline                        base64 without newlines
-#         boxes                          accept boxes next to twists, see `sightline.protocol.legacy_text`; toward a
+#         boxes                          accept boxes next to twists, see `transports.websocket.legacy_text`; toward a
 #                                        legacy robot: send the box of the target in place of twists
 #         from=192.168.1.7,10.0.0.0/24   addresses that may connect
 

@@ -10,6 +10,7 @@ from sightline.protocol.messages import (
     STILL,
     AnswerHeader,
     Holder,
+    LeaseHolder,
     Odometry,
     Planar,
     Pose,
@@ -33,7 +34,9 @@ from sightline.robot_side.safety.gate import SafetyGate
 from sightline.robot_side.safety.guard import RangeGuard
 
 _PERIODS_US = {STATUS.name: 100_000, ODOMETRY.name: 50_000}
-_CITES_NOTHING_OF_OURS = (RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME, RejectReason.FROM_FUTURE)
+_RETURNS_NO_CREDIT = (
+    RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME, RejectReason.FROM_FUTURE, RejectReason.NOT_PROVEN,
+)  # fmt: skip
 
 
 _WIRE_LIMIT = 1e6  # of every number on the wire: an encoder that wraps around must not end anything
@@ -59,7 +62,10 @@ class DriverCore:
         self.session = session
         self._guard = RangeGuard(config.guard) if config.ranging else None
         self.battery = BatteryMonitor(config.safety) if config.battery else None
-        self.gate = SafetyGate(config.safety, session, stopped=stopped, guard=self._guard, battery=self.battery)
+        self.gate = SafetyGate(
+            config.safety, session, stopped=stopped, guard=self._guard, battery=self.battery,
+            needs_proof=bool(config.secure),
+        )
         self.odometer = Odometer(config.wheels)
         self.stream = StreamStatus()
         self.tick_late_max_us = 0
@@ -93,7 +99,7 @@ class DriverCore:
             self.gate.reject(message.source, error)
             return None
         result = self.gate.offer(message.source, header, twist, now_us)
-        if header is None or result.reason in _CITES_NOTHING_OF_OURS:
+        if header is None or result.reason in _RETURNS_NO_CREDIT:
             return None
         sender = Holder(source=header.source, session=header.session)
         return CommandAck(sender, header.echo.seq, header.compute_us, self.gate.holder(now_us))
@@ -154,11 +160,11 @@ class DriverCore:
 
     def status(self, now_us: int) -> Status:
         """Everything that an operator needs to know why the robot moves or does not."""
-        gate, limits = self.gate, self.config.safety
+        gate, limits, holder = self.gate, self.config.safety, self.gate.holder(now_us)
         return Status(
             state=gate.state,
             reason=gate.reason[:200],
-            holder=gate.holder(now_us),
+            holder=LeaseHolder.of(holder.source, holder.session) if holder else None,
             applied=(gate.applied.linear_mps, gate.applied.angular_rad_s),
             frame_age_us=gate.frame_age_us(now_us),
             latency_us=gate.latency_us,

@@ -20,6 +20,7 @@ from sightline.protocol.messages import (
     Twist,
     Verb,
 )
+from sightline.protocol.proof import NO_PROOF, Proof, session_digest
 from sightline.robot_side.safety.battery import BatteryMonitor
 from sightline.robot_side.safety.guard import RangeGuard
 from sightline.robot_side.safety.lease import HUMANS, RANKS, Lease
@@ -41,6 +42,15 @@ _MAX_REQUEST_AGE_US = 2_000_000
 _NEEDS_NO_ECHO = (Verb.STOP, Verb.DISARM, Verb.RELEASE)
 
 
+def _proof_of(header: AnswerHeader | RequestHeader | None) -> Proof:
+    return NO_PROOF if header is None else Proof(header.proof, header.next_proof)
+
+
+def _shown(holder: Holder | None) -> str:
+    """Name a driver to another one without its session, which a peer could copy."""
+    return f"{holder.source} {session_digest(holder.source, holder.session)}" if holder else ""
+
+
 class SafetyGate:
     """The only path from a command to the wheels. The caller steps it at 50 Hz.
 
@@ -50,6 +60,7 @@ class SafetyGate:
         stopped: True if the STOP latch was set when the robot last ended.
         guard: speed limits near obstacles, or None without a range sensor.
         battery: speed limits of the battery, or None without one.
+        needs_proof: True to accept only drivers that prove their identity, as on links with keys.
 
     All times are microseconds of the robot's monotonic clock and never decrease.
     """
@@ -62,6 +73,7 @@ class SafetyGate:
         stopped: bool = False,
         guard: RangeGuard | None = None,
         battery: BatteryMonitor | None = None,
+        needs_proof: bool = False,
     ) -> None:
         self.config = config
         self.issued = IssuedRecord(session)
@@ -78,6 +90,7 @@ class SafetyGate:
         self._ramp = Ramp(config)
         self._guard = guard
         self._battery = battery
+        self._needs_proof = needs_proof
         self._command: AcceptedCommand | None = None
         self._live_commands = 0
         self.arms_itself = config.auto_arm and not stopped
@@ -125,10 +138,10 @@ class SafetyGate:
         self._notice_lost_human(now_us)
         holder = self._lease.live_holder(now_us)
         if not self._lease.may_take(who, now_us):
-            raise WireError(RejectReason.NOT_HOLDER, f"{holder.source} {holder.session} drives" if holder else "")
+            raise WireError(RejectReason.NOT_HOLDER, f"{_shown(holder)} drives")
         # The lease is renewed in DISARMED too. Otherwise arming would never find a live driver.
         self._live_commands = self._live_commands + 1 if holder == who else 1
-        self._lease.take(who, now_us)
+        self._lease.take(who, now_us, _proof_of(header))
         self._sequence.promote((who.source, who.session))
         if not is_armed(self.state):
             raise WireError(RejectReason.DISARMED, self.reason)
@@ -152,8 +165,17 @@ class SafetyGate:
         age_us = now_us - self.pictures.shown_since_us(header.echo.t_us)
         if age_us > self.config.max_age_us:
             raise WireError(RejectReason.STALE, f"the camera image has not changed for {age_us / 1e3:.0f} ms")
+        who = Holder(source=header.source, session=header.session)
+        # Before the number: a copied identity must not use up the numbers of the driver.
+        self._check_proof(who, header, now_us)
         self._sequence.check(header, now_us)
-        return Holder(source=header.source, session=header.session), age_us
+        return who, age_us
+
+    def _check_proof(self, who: Holder, header: AnswerHeader | RequestHeader, now_us: int) -> None:
+        """Check that the sender is the driver whose session it states."""
+        if self._needs_proof and header.proof is None:
+            raise WireError(RejectReason.NOT_PROVEN, "a robot with keys needs a proof in each command")
+        self._lease.check_proof(who, _proof_of(header), now_us)
 
     def _accept(self, source: str, twist: Twist, now_us: int, age_us: int) -> None:
         config, guest = self.config, source == "guest"
@@ -263,7 +285,12 @@ class SafetyGate:
             return self.stop(f"STOP by {who.source}")
         if request.verb is Verb.DISARM:
             return self.disarm(f"disarmed by {who.source}")
-        handlers = {Verb.ARM: self.arm, Verb.RESET: self.reset, Verb.ACQUIRE: self.acquire, Verb.RELEASE: self.release}
+        if request.verb is Verb.ACQUIRE or self._lease.live_holder(now_us) == who:
+            self._check_proof(who, header, now_us)
+        if request.verb is Verb.ACQUIRE:
+            return self.acquire(who, now_us, _proof_of(header))
+        self._lease.advance(who, _proof_of(header), now_us)
+        handlers = {Verb.ARM: self.arm, Verb.RESET: self.reset, Verb.RELEASE: self.release}
         return handlers[request.verb](who, now_us)
 
     def stop(self, reason: str = "STOP") -> str:
@@ -313,17 +340,18 @@ class SafetyGate:
         self._begin(f"armed by {who.source}", now_us)
         return "armed"
 
-    def acquire(self, who: Holder, now_us: int) -> str:
-        """Take the lease ahead of the first command. Only commands renew it."""
+    def acquire(self, who: Holder, now_us: int, proof: Proof = NO_PROOF) -> str:
+        """Take the lease ahead of the first command, and commit to a chain of proofs. Only commands renew it."""
         if who.source not in RANKS or not self._lease.may_take(who, now_us):
             holder = self._lease.live_holder(now_us)
             detail = f"{holder.source} drives" if holder else f"{who.source} may not drive"
             raise WireError(RejectReason.NOT_HOLDER, detail)
         if self._lease.live_holder(now_us) == who:
+            self._lease.advance(who, proof, now_us)
             return "already held"
         # The commands of the previous driver must neither arm the robot nor move it for the new one.
         self._live_commands, self._command = 0, None
-        self._lease.take(who, now_us)
+        self._lease.take(who, now_us, proof)
         return "acquired"
 
     def release(self, who: Holder, now_us: int) -> str:
@@ -349,7 +377,7 @@ class SafetyGate:
         # While a human drives, no other operator may arm or reset.
         holder = self._lease.live_holder(now_us)
         if holder is not None and holder.source in HUMANS and holder != who:
-            raise WireError(RejectReason.NOT_ALLOWED, f"{holder.source} {holder.session} drives")
+            raise WireError(RejectReason.NOT_ALLOWED, f"{_shown(holder)} drives")
 
     def _missing_to_arm(self, now_us: int) -> str:
         """Return the condition that still prevents arming, or an empty string."""

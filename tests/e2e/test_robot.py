@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.messages import State
+from sightline.protocol.messages import LeaseHolder, State
 from sightline.robot_side.driver.persistence import StopLatch
 from tests.fixtures.links import until
 from tests.fixtures.ports import port_of
@@ -26,7 +26,7 @@ def test_robot_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
             assert driving(robot)
             assert until(lambda: vision.status().applied[0] == pytest.approx(0.4))
             status = vision.status()
-            assert status.state is State.ACTIVE and status.holder.session == vision.session
+            assert status.state is State.ACTIVE and status.holder == LeaseHolder.of("vision", vision.session)
             assert until(lambda: vision.status().stream.fps >= 25)
             frames = vision.headers
         since = monotonic_us()

@@ -11,7 +11,8 @@ from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError
-from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, LeaseHolder
+from sightline.protocol.proof import ProofChain
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.fixtures.commands import run, sightline
 from tests.fixtures.links import until
@@ -40,6 +41,29 @@ def test_vision_drives_an_operator_stops_it_and_a_viewer_sees_that(robot, tmp_pa
         (tmp_path / "viewer" / name).write_bytes(Path(folder, name).read_bytes())
     looked = run(capsys, "status", "r1", "--connect", robot.endpoint, "--secure", str(tmp_path / "viewer"))
     assert "STOPPED" in looked[1], "to look, a viewer's keys are enough"
+
+
+def test_second_connection_with_a_vision_certificate_does_not_drive_by_a_copied_identity(robot):
+    """It has read the driver's session, and answers each frame at once with a higher number."""
+    folder = robot.config["secure"]
+    with Vision(robot.endpoint, secure=folder) as vision, \
+         open_zenoh("r1", connect=[robot.endpoint], role="vision", secure=folder) as rogue:
+        assert driving(robot)
+        frames, seq, ends_s = rogue.latest(FRAME), 10_000, time.monotonic() + 1.0
+        proof, sent = ProofChain(secrets.token_bytes), 0
+        while time.monotonic() < ends_s:
+            message = frames.take(0.2)
+            if message is None:
+                continue
+            seq, sent = seq + 1, sent + 1
+            echo = Echo.of(decode(FrameHeader, message.header))
+            answer = AnswerHeader(source="vision", session=vision.session, seq=seq, echo=echo, proof=proof.next().proof)
+            rogue.publish(TWIST, encode(answer), b"-0.4000|0.0000", "vision")
+        status = vision.status()
+        assert sent > 5 and status.refused["NOT_PROVEN"] >= 0.5 * sent
+        assert status.holder == LeaseHolder.of("vision", vision.session)
+        assert all(left >= 0.0 for _, left, _ in robot.motor_rows()), "no motor log line is caused by the copy"
+        assert driving(robot)
 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])

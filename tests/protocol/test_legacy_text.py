@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import JpegSize
-from sightline.protocol.legacy_text import (
+from sightline.protocol.text import parse_twist
+from sightline.protocol.transports.websocket.legacy_text import (
     MAX_BOXES,
     LegacyBox,
     decode_picture,
@@ -19,7 +20,6 @@ from sightline.protocol.legacy_text import (
     parse_dashed,
     text_bound,
 )
-from sightline.protocol.text import parse_twist
 
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 UNIT = st.floats(0, 1)

@@ -15,7 +15,10 @@ from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, SCAN, check_
 from sightline.protocol.codec import decode, decode_ranges, encode, encode_ranges
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.legacy_text import (
+from sightline.protocol.messages import WireModel
+from sightline.protocol.text import MAX_TWIST_BYTES, format_twist, parse_twist
+from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
+from sightline.protocol.transports.websocket.legacy_text import (
     MAX_BOXES,
     MAX_BOXES_BYTES,
     decode_picture,
@@ -25,9 +28,6 @@ from sightline.protocol.legacy_text import (
     parse_dashed,
     text_bound,
 )
-from sightline.protocol.messages import WireModel
-from sightline.protocol.text import MAX_TWIST_BYTES, format_twist, parse_twist
-from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
 
 CORPUS = Path(__file__).parent / "fuzz_corpus"
 MOST_PICTURE_BYTES = 120

@@ -15,6 +15,7 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import CameraModel, FrameHeader, Stamp
+from sightline.protocol.proof import NO_PROOF, ProofChain
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.vision_side.config import VisionConfig
@@ -162,6 +163,7 @@ class Service:
         self._camera: CameraModel | None = None
         self._pipeline: Pipeline | None = None
         self._session = secrets.token_hex(4)
+        self._proofs = ProofChain(secrets.token_bytes)
         self._is_legacy = any(is_legacy(one) for one in config.connect)
         self._robot_session = ""
         self._sessions = SessionSelector()
@@ -295,7 +297,8 @@ class Service:
         self.answered += 1
         self.steered += answer.twist is not None
         self._newest = (compute_us, header.latency_us)
-        stamp = encode(answer_header(header, self._session, self.answered, compute_us, answer))
+        proof = NO_PROOF if answer.twist is None else self._proofs.next()
+        stamp = encode(answer_header(header, self._session, self.answered, compute_us, answer, proof=proof))
         if answer.twist is None:
             self._link.publish(ACK, stamp, b"")
         else:

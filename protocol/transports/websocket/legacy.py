@@ -10,7 +10,12 @@ from sightline.protocol.channels import ACK, DETECTIONS, FRAME, KEY_PREFIX, TWIS
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.legacy_text import (
+from sightline.protocol.messages import AnswerHeader, Detections, DetectionsHeader, Echo, FrameHeader
+from sightline.protocol.text import format_twist, parse_twist
+from sightline.protocol.transports.endpoints import LegacyOptions
+from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.websocket.framing import BAD_FRAMING, IncomingMessage, PeerError
+from sightline.protocol.transports.websocket.legacy_text import (
     MAX_BOXES_BYTES,
     boxes_from_detections,
     decode_picture,
@@ -22,11 +27,6 @@ from sightline.protocol.legacy_text import (
     parse_dashed,
     text_bound,
 )
-from sightline.protocol.messages import AnswerHeader, Detections, DetectionsHeader, Echo, FrameHeader
-from sightline.protocol.text import format_twist, parse_twist
-from sightline.protocol.transports.endpoints import LegacyOptions
-from sightline.protocol.transports.link import Message
-from sightline.protocol.transports.websocket.framing import BAD_FRAMING, IncomingMessage, PeerError
 
 # Time without a valid command after which a driver loses the slot. Equal to the robot's lease.
 DRIVER_SLOT_US: Final = 1_000_000

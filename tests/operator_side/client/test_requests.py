@@ -10,7 +10,7 @@ from sightline.operator_side.client.status import reply_line, short_lines, statu
 from sightline.protocol.channels import REQUEST, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError
-from sightline.protocol.messages import AnswerHeader, Echo, Holder, Reply, State, Status, Verb
+from sightline.protocol.messages import AnswerHeader, Echo, LeaseHolder, Reply, State, Status, Verb
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.robot_side.config import PluginChoice, RobotConfig
@@ -182,7 +182,7 @@ def test_reply_names_the_next_command(verb, reply, expected):
     (State.STOPPED, True, "next      sightline reset r1"), (State.ACTIVE, True, ""),
 ])
 def test_short_status_fits_a_glance_and_names_the_next_command(state, holder, expected):
-    driver = Holder(source="vision", session="0000000a") if holder else None
+    driver = LeaseHolder(source="vision", digest="0000000a") if holder else None
     lines = list(short_lines("r1", Status(state=state, reason="why", holder=driver, frame_age_us=84_000)))
     assert lines[1] == f"state     {state}: why" and len(lines) <= 7
     assert "frame age 84 ms" in lines[4]

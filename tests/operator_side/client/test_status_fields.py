@@ -5,7 +5,7 @@ import pytest
 from sightline.operator_side.client.status import status_lines
 from sightline.operator_side.cockpit.metrics import Watched
 from sightline.protocol.codec import encode
-from sightline.protocol.messages import Holder, LastRejection, Stamp, State, Status, StreamStatus
+from sightline.protocol.messages import LastRejection, LeaseHolder, Stamp, State, Status, StreamStatus
 from sightline.protocol.transports.link import Message
 
 OTHERS = {"state": State.HOLD, "reason": "other"}
@@ -13,7 +13,7 @@ OTHERS = {"state": State.HOLD, "reason": "other"}
 GIVEN = {
     "state": State.DEGRADED,
     "reason": "slow",
-    "holder": Holder(source="vision", session="0000000a"),
+    "holder": LeaseHolder(source="vision", digest="0000000a"),
     "applied": (0.25, 0.5),
     "refused": {"STALE": 24},
     "last_refusal": LastRejection(source="teleop", reason="STALE", detail="too old"),

@@ -13,6 +13,7 @@ from sightline.protocol.messages import (
     Echo,
     Holder,
     LastRejection,
+    LeaseHolder,
     Odometry,
     Reply,
     Request,
@@ -284,7 +285,7 @@ def test_status_shows_everything():
     before = core.gate.counters["DISARMED"]
     status = status_of(core, NOW_US + 10_000)
     assert (status.state, status.reason) == (core.gate.state, core.gate.reason)
-    assert status.holder == Holder(source="vision", session=VISION) and status.applied == core.motion().applied
+    assert status.holder == LeaseHolder.of("vision", VISION) and status.applied == core.motion().applied
     assert (status.frame_age_us, status.latency_us, status.accepted) == (40_000, 30_000, 1)
     assert status.refused == {"DISARMED": before + 1, "MALFORMED": 3}
     assert status.last_refusal.reason == "DISARMED" and status.stream == StreamStatus(sent=12)

@@ -181,7 +181,7 @@ def test_guests_are_off_unless_switched_on_and_slow_then():
 def test_one_vision_drives_at_a_time_and_the_next_takes_over_when_it_is_silent():
     rig = Rig().armed().drive(200)
     verdict = rig.offer(session=OTHER)
-    assert verdict.reason is RejectReason.NOT_HOLDER and VISION in verdict.detail
+    assert verdict.reason is RejectReason.NOT_HOLDER and VISION not in verdict.detail
     rig.silence(960)
     assert rig.offer(session=OTHER).reason is RejectReason.NOT_HOLDER
     rig.silence(40)

@@ -6,6 +6,7 @@ import pytest
 
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import STILL, Echo, LastRejection, State, Twist, Verb
+from sightline.protocol.proof import session_digest
 from sightline.robot_side.safety.gate import Decision, SafetyGate
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.states import TRANSITIONS, Event, is_armed, next_state
@@ -131,10 +132,11 @@ def test_disarmed_commands_are_validated_and_form_the_lease():
 
 def test_rejected_driver_receives_holder():
     rig = driving()
-    assert rig.offer(session=OTHER).detail == f"vision {VISION} drives"
+    assert rig.offer(session=OTHER).detail == f"vision {session_digest('vision', VISION)} drives"
     rig.drive(20, source="teleop", session=HUMAN)
     verdict = rig.offer()
-    assert (verdict.reason, verdict.detail) == (RejectReason.NOT_HOLDER, f"teleop {HUMAN} drives")
+    assert verdict.reason is RejectReason.NOT_HOLDER
+    assert verdict.detail == f"teleop {session_digest('teleop', HUMAN)} drives"
 
 
 def test_key_and_header_name_one_known_driver():

@@ -1,6 +1,10 @@
 """Robots that are wrong about who drives. Pure."""
 
-from sightline.protocol.messages import Holder, State, Twist
+from hashlib import sha256
+
+from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.messages import Holder, State, Twist, Verb
+from sightline.protocol.proof import NO_PROOF, Proof
 from sightline.robot_side.safety.lease import RANKS, Lease
 from tests.conformance.robot.broken.breaking import bend_out, breaks, fields_of, wrap
 
@@ -133,10 +137,10 @@ def humans_let_go_without_effect(robot):
 def acquire_is_a_word(robot):
     gate = robot.driving.gate
 
-    def around(inner, who, now_us):
+    def around(inner, who, now_us, *proof):
         if who.source in RANKS and gate._lease.may_take(who, now_us):
             return "acquired"
-        return inner(who, now_us)
+        return inner(who, now_us, *proof)
 
     wrap(gate, "acquire", around)
 
@@ -145,9 +149,9 @@ def acquire_is_a_word(robot):
 def acquire_renews(robot):
     gate = robot.driving.gate
 
-    def around(inner, who, now_us):
-        detail = inner(who, now_us)
-        gate._lease.take(who, now_us)
+    def around(inner, who, now_us, *proof):
+        detail = inner(who, now_us, *proof)
+        gate._lease.take(who, now_us, *proof)
         return detail
 
     wrap(gate, "acquire", around)
@@ -171,9 +175,9 @@ def anybody_releases(robot):
 def acquire_of_an_equal(robot):
     gate = robot.driving.gate
 
-    def around(inner, who, now_us):
+    def around(inner, who, now_us, *proof):
         holder = gate.holder(now_us)
-        return "acquired" if holder and holder.source == who.source else inner(who, now_us)
+        return "acquired" if holder and holder.source == who.source else inner(who, now_us, *proof)
 
     wrap(gate, "acquire", around)
 
@@ -182,5 +186,96 @@ def acquire_of_an_equal(robot):
 def acquire_of_a_watcher(robot):
     wrap(
         robot.driving.gate, "acquire",
-        lambda inner, who, now_us: inner(who, now_us) if who.source in RANKS else "acquired",
+        lambda inner, who, now_us, *proof: inner(who, now_us, *proof) if who.source in RANKS else "acquired",
     )  # fmt: skip
+
+
+# --- proof of identity -----------------------------------------------------------------------------------------------
+
+
+def proofs_of(robot, check):
+    """`check(lease, who, proof, now_us)`: True for a proof that is accepted; else the reference checks it."""
+
+    def check_proof(self, who, proof, now_us):
+        if not check(self, who, proof, now_us):
+            Lease.check_proof(self, who, proof, now_us)
+
+    lease_of(robot, check_proof=check_proof)
+
+
+@breaks("R-PROOF-01")
+def any_proof_will_do(robot):
+    proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is not None)
+
+
+@breaks("R-PROOF-02")
+def no_proof_will_do(robot):
+    proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is None)
+
+
+@breaks("R-PROOF-03")
+def the_last_proof_will_do(robot):
+    proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is not None and proof.proof == lease.proof.proof)
+
+
+@breaks("R-PROOF-04")
+def forged_seq_is_used_up(robot):
+    gate = robot.driving.gate
+
+    def around(inner, who, header, now_us):
+        try:
+            inner(who, header, now_us)
+        except WireError:
+            gate._sequence.check(header, now_us)
+            raise
+
+    wrap(gate, "_check_proof", around)
+
+
+@breaks("R-PROOF-05")
+def each_command_must_arrive(robot):
+    def check(lease, who, proof, now_us):
+        if lease.live_holder(now_us) == who and proof.proof and not follows_at_once(proof.proof, lease.proof):
+            raise WireError(RejectReason.NOT_PROVEN, "a command is missing")
+        return False
+
+    proofs_of(robot, check)
+
+
+def follows_at_once(proof, last):
+    element = bytes.fromhex(proof)
+    for _ in range(20):
+        element = sha256(element).digest()[:16]
+        if element.hex() in last:
+            return True
+    return False
+
+
+@breaks("R-PROOF-06")
+def ignores_the_next_chain(robot):
+    def take(self, who, now_us, proof=NO_PROOF):
+        Lease.take(self, who, now_us, Proof(proof.proof))
+
+    lease_of(robot, take=take)
+
+
+@breaks("R-PROOF-07")
+def releases_for_anyone(robot):
+    gate = robot.driving.gate
+
+    def around(inner, header, request, now_us):
+        if request.verb is Verb.RELEASE:
+            return gate.release(Holder(source=header.source, session=header.session), now_us)
+        return inner(header, request, now_us)
+
+    wrap(gate, "request", around)
+
+
+@breaks("R-PROOF-08")
+def shows_the_session(robot):
+    def bend(_header, payload):
+        holder = robot.driving.gate.holder(robot.now())
+        if holder is not None:
+            payload["reason"] = f"driven by {holder.session}"
+
+    bend_out(robot, "status", bend)

@@ -7,12 +7,12 @@ import pytest
 
 from sightline.protocol.channels import CHANNELS, DETECTIONS, FRAME, KNOWN_SOURCES, REPLY, REQUEST, SCAN, STATUS, TWIST
 from sightline.protocol.codec import encode
-from sightline.protocol.legacy_text import encode_picture
 from sightline.protocol.messages import Request
 from sightline.protocol.transports.endpoints import LegacyOptions
 from sightline.protocol.transports.link import MAX_UNKNOWN_SOURCES, Message, OutgoingQueue
 from sightline.protocol.transports.websocket.framing import SightlineV1
 from sightline.protocol.transports.websocket.legacy import DriverSlot, LegacyClient, LegacyToVision
+from sightline.protocol.transports.websocket.legacy_text import encode_picture
 from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.peer import Publication
 from tests.fixtures.links import until

@@ -1,0 +1,80 @@
+"""Prove that commands are of one sender: each reveals one more element of a hash chain. Pure.
+
+An element is the hash of the one that follows it. Only the sender knows the elements that it has not revealed, so
+nothing secret crosses the network. A receiver hashes a new element until it meets the last one that it accepted.
+"""
+
+from collections.abc import Callable
+from hashlib import sha256
+from typing import Final, NamedTuple
+
+ELEMENT_BYTES: Final = 16
+"""Security level: 128 bits."""
+MAX_LOST: Final = 64
+"""Security limit: hashes for one command. So many commands may be lost in a row, more than in the life of a lease."""
+_LENGTH: Final = 1024
+_ANNOUNCED: Final = 2 * MAX_LOST
+"""The next chain is announced in so many commands, so that the robot receives one of them."""
+
+
+class Proof(NamedTuple):
+    """Fields of a command's header."""
+
+    proof: str | None
+    next_proof: str | None = None
+
+
+NO_PROOF: Final = Proof(None)
+
+
+class ProofChain:
+    """The chain of one sender. It continues in another chain before it ends.
+
+    Args:
+        draw: returns ELEMENT_BYTES random bytes.
+    """
+
+    def __init__(self, draw: Callable[[int], bytes]) -> None:
+        self._draw = draw
+        self._elements = self._new()
+        self._following: list[bytes] = []
+        self._announced: str | None = None
+
+    def next(self) -> Proof:
+        """Return the proof of the next command."""
+        if not self._elements:
+            self._elements, self._following, self._announced = self._following, [], None
+        proof = self._elements.pop().hex()
+        if self._announced is None and len(self._elements) < _ANNOUNCED:
+            self._following = self._new()
+            # The announced element is known from now on, so it proves nothing.
+            self._announced = self._following.pop().hex()
+        return Proof(proof, self._announced)
+
+    def _new(self) -> list[bytes]:
+        elements = [self._draw(ELEMENT_BYTES)]
+        for _ in range(_LENGTH - 1):
+            elements.append(_hashed(elements[-1]))
+        return elements
+
+
+def continues(proof: str | None, last: Proof) -> bool:
+    """Return True if `proof` was revealed by the sender of `last`, at most MAX_LOST commands later."""
+    if proof is None or last.proof is None:
+        return False
+    known = {bytes.fromhex(one) for one in last if one is not None}
+    element = bytes.fromhex(proof)
+    for _ in range(MAX_LOST):
+        element = _hashed(element)
+        if element in known:
+            return True
+    return False
+
+
+def _hashed(element: bytes) -> bytes:
+    return sha256(element).digest()[:ELEMENT_BYTES]
+
+
+def session_digest(source: str, session: str) -> str:
+    """Return what a robot shows of a driver's session: 8 hex digits that the driver can compute too."""
+    return sha256(f"{source}/{session}".encode()).hexdigest()[:8]
