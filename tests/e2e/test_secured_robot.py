@@ -43,7 +43,7 @@ def test_vision_drives_an_operator_stops_it_and_a_viewer_sees_that(robot, tmp_pa
     assert "STOPPED" in looked[1], "to look, a viewer's keys are enough"
 
 
-def test_second_connection_with_a_vision_certificate_does_not_drive_by_a_copied_identity(robot):
+def test_second_connection_of_the_same_role_does_not_drive_by_a_copied_identity(robot):
     """It has read the driver's session, and answers each frame at once with a higher number."""
     folder = robot.config["secure"]
     with Vision(robot.endpoint, secure=folder) as vision, \
