@@ -9,11 +9,11 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import INJECTED, REQUESTED, MotorRow, most_gain_mps2, wheel_mps
-from sightline.evaluation.faults.fixture import RobotFixture, Setup
+from sightline.evaluation.faults.fixture import SESSION, RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.evaluation.faults.sampler import Hole
@@ -333,6 +333,44 @@ def _two_visions(rig: RobotFixture) -> Injected:
     return Injected(len(rig.sent("second")), at_us, checks=checks)
 
 
+def _impersonate(rig: RobotFixture, **attacker: Any) -> Injected:
+    """An attacker that knows the driver's session sends the opposite commands; then the driver dies."""
+    rig.start_peer("attacker", "driver", fault="copied", linear_mps=-0.5, angular_rad_s=0.0, **attacker)
+    rig.until(lambda: bool(rig.sent("attacker")), 15.0, "the attacker's link")
+    rig.trigger("attacker")
+    rig.until(lambda: rig.injected("attacker") > ENOUGH, 15.0, "an attack")
+    began_us = rig.noted("attacker", INJECTED)[0].t_us
+    rig.watch(ATTACKED_S)
+    rows = [row for row in rig.motors() if row.t_us >= began_us]
+    backwards = sum(row.left_rad_s + row.right_rad_s < 0 for row in rows)
+    at_us = monotonic_us()
+    rig.processes.kill("peer")
+    rig.watch(0.5)
+    rig.processes.kill("attacker")
+    rig.watch(SETTLED_S)
+    checks = (
+        at_most("motor log lines of the attacker", backwards, "lines", 0),
+        at_least("speed kept", min(map(wheel_mps, rows)), "m/s", 0.4),
+    )
+    return Injected(rig.injected("attacker"), at_us, checks=checks)
+
+
+def _forge_frames(rig: RobotFixture) -> Injected:
+    """Frames of the future in the robot's name for three seconds: vision drives again within one second after."""
+    rig.start_peer("attacker", "driver", source="guest", fault="future_frames")
+    rig.until(lambda: bool(rig.sent("attacker")), 15.0, "the attacker's link")
+    rig.trigger("attacker")
+    rig.until(lambda: rig.injected("attacker") > ENOUGH, 15.0, "forged frames")
+    rig.watch(ATTACKED_S)
+    times = rig.injected("attacker")
+    rig.processes.kill("attacker")
+    at_us = monotonic_us()
+    rig.until(lambda: wheel_mps(rig.motors()[-1]) > 0 and rig.motors()[-1].t_us > at_us, 5.0, "vision driving again")
+    again_ms = (next(row.t_us for row in rig.motors() if row.t_us > at_us and wheel_mps(row) > 0) - at_us) / 1000
+    rig.watch(1.0)
+    return Injected(times, at_us, checks=(at_most("drives again after", again_ms, "ms", 1000.0),))
+
+
 def _take_over(rig: RobotFixture) -> Injected:
     """An operator takes over at full speed and drives back, then is lost: a stop that vision does not end."""
     rig.start_peer("person", "driver", source="teleop", linear_mps=-0.4, angular_rad_s=0.0)
@@ -389,6 +427,13 @@ COMMAND_CASES: Final = (
     _command_case("heartbeat", "none, but frames are acknowledged and the link is alive", short=True),
     FaultCase("driver.two", "drivers: two vision services, then none", _two_visions, Setup(),
               also="the second is not applied"),
+    FaultCase("identity.copied", "drivers: a copied identity, certificate of the same role; then the driver dies",
+              partial(_impersonate, session=SESSION), Setup(secure=True), also="0 motor log lines of the copy"),
+    FaultCase("identity.role", "drivers: a copied identity, certificate of an operator; then the driver dies",
+              partial(_impersonate, session=SESSION, certificate="operator"), Setup(secure=True),
+              also="0 motor log lines of the copy"),
+    FaultCase("frame.future", "vision: forged frames of the future for 3 s", _forge_frames, _VISION, stops=False,
+              also="drives again <= 1000 ms after they end"),
     FaultCase(
         "driver.person", "drivers: an operator takes over at full speed, and is lost", _take_over, Setup(), blind=True,
         also="applied <= 1000 ms; vision does not resume by itself"

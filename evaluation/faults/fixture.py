@@ -20,6 +20,7 @@ from sightline.evaluation.faults.peer import PeerOptions, Role
 from sightline.evaluation.faults.sampler import Hole, read_holes, stalled_us
 from sightline.evaluation.processes import Processes, free_port
 from sightline.operator_side.config.toml_text import toml_text
+from sightline.operator_side.setup import keys
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import HardwareError, SightlineError
 from sightline.robot_side.safety.limits import TICK_US
@@ -139,6 +140,7 @@ with open({str(folder / "clock.ledger")!r}, "a") as ledger:
 
 ROBOT: Final = "r1"
 AT_SPEED_S: Final = 25.0
+SESSION: Final = "5eed5eed"
 STEADY_US: Final = 500_000
 PORT: Final = 7447
 _POLL_S: Final = 0.01
@@ -167,6 +169,8 @@ class Setup:
     """Python expression that is added to the wall clock of vision and robot, in seconds; "" leaves it."""
     camera: str = ""
     """Camera mode from the beginning."""
+    secure: bool = False
+    """The links have keys, and the driver has the session `SESSION`, which an attacker knows."""
     web: bool = False
     """The robot listens for WebSocket clients too."""
 
@@ -206,7 +210,10 @@ class RobotFixture:
         self._sockets = self.processes.temporary_folder()
         if self.setup.wired:
             self.wire = self._ending.enter_context(BenchWire(self.folder / "wire.log"))
-        self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"tcp/127.0.0.1:{free_port()}"
+        transport = "tls" if self.setup.secure else "tcp"
+        self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"{transport}/127.0.0.1:{free_port()}"
+        if self.setup.secure:
+            keys.make(self.folder / "keys", ["127.0.0.1"])
         self.web_endpoint = f"ws://127.0.0.1:{free_port()}" if self.setup.web else ""
         self._write_files(self._sockets)
         self.processes.start("sim", ["sim", "--config", str(self.folder / "sim.toml")])
@@ -216,7 +223,8 @@ class RobotFixture:
         for name in ("sim", "sampler"):
             raise_priority(self.processes.pid(name))
         self.start_robot()
-        self.start_peer("peer", self.setup.driver, fault=self.setup.fault)
+        session = {"session": SESSION} if self.setup.secure else {}
+        self.start_peer("peer", self.setup.driver, fault=self.setup.fault, **session)
         self.wait_speed(self.setup.at_speed_mps)
         self._before_kib = memory_kib(self.processes, self._judged)
 
@@ -245,15 +253,21 @@ class RobotFixture:
         """Start the robot and wait until it listens."""
         arguments = ["robot", "--config", str(self.folder / "robot.toml"), "--listen", self.endpoint]
         arguments += ["--listen", self.web_endpoint] if self.web_endpoint else []
+        arguments += ["--secure", self.keys] if self.keys else []
         self.processes.start("robot", arguments, namespace=self.wire.robot_side if self.wire else "",
                              environment=self._environment())
         self.processes.wait_line("robot", f"robot {ROBOT}: on")
+
+    @property
+    def keys(self) -> str:
+        """The folder of keys, or "" without them."""
+        return str(self.folder / "keys") if self.setup.secure else ""
 
     def start_peer(self, name: str, role: Role, **changes: Any) -> None:
         """Start a vision service, a scripted driver or an operator."""
         options = PeerOptions(
             role=role, endpoint=self.endpoint, ledger=self.folder / f"{name}.ledger",
-            config=self.folder / "vision.toml" if role == "vision" else None, **changes,
+            config=self.folder / "vision.toml" if role == "vision" else None, secure=self.keys, **changes,
         )
         self._peers.append(name)
         self.processes.start(name, [options.model_dump_json()], module="sightline.evaluation.faults.peer",

@@ -26,6 +26,7 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.config import Config
 from sightline.protocol.messages import MAX_INTEGER, AnswerHeader, Echo, FrameHeader, Twist, Verb
+from sightline.protocol.proof import ProofChain
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import LatestSlot, Link, LinkWrapper, Message
 from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
@@ -54,6 +55,11 @@ class PeerOptions(Config):
     angular_rad_s: float = 0.4
     recording: Path | None = None
     """A driver writes what it sent here; a replay reads it."""
+    secure: str = ""
+    """Folder of keys, and the role of the certificate, if it differs from `source`."""
+    certificate: str = ""
+    session: str = ""
+    """The session to drive with; random without one."""
     seconds: float | None = None
     """End by itself after this long."""
 
@@ -100,7 +106,8 @@ class Script:
 
     def __init__(self, options: "PeerOptions", link: ZenohLink, ledger: EventLog) -> None:
         self.options, self.link = options, link
-        self.session = secrets.token_hex(4)
+        self.session = options.session or secrets.token_hex(4)
+        self.proofs = ProofChain(secrets.token_bytes)
         self.seq = 0
         self.sent: deque[tuple[bytes, bytes]] = deque(maxlen=KEPT)
         self.twist = Twist(linear_mps=options.linear_mps, angular_rad_s=options.angular_rad_s)
@@ -118,7 +125,8 @@ class Script:
         cited = {"session": frame.session, "seq": frame.seq, "t_us": frame.t_us, **changes}
         echo = Echo.model_validate({"channel": "frame", **cited})
         self.seq += 1
-        return AnswerHeader(source=self.options.source, session=self.session, seq=self.seq, echo=echo)
+        proof = self.proofs.next()._asdict()
+        return AnswerHeader(source=self.options.source, session=self.session, seq=self.seq, echo=echo, **proof)
 
     def drive(self, frame: FrameHeader, twist: Twist | None = None) -> None:
         """Send a good command."""
@@ -150,7 +158,8 @@ def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog
     """Drive, then do what `options.fault` names, for ever or for `options.seconds`."""
 
     end_s = time.monotonic() + options.seconds if options.seconds else float("inf")
-    with open_zenoh(options.robot, connect=[options.endpoint], role=options.source, timeout_s=15) as link:
+    with open_zenoh(options.robot, connect=[options.endpoint], role=options.certificate or options.source,
+                    timeout_s=15, secure=options.secure) as link:
         script = Script(options, link, ledger)
         while not (pulled.is_set() and options.fault) and time.monotonic() < end_s:
             frame = script.frame()
@@ -165,6 +174,7 @@ def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog
 
 
 LATE_S: Final = 0.5
+HOUR_US: Final = 3_600_000_000
 FLOOD_HZ: Final = 10_000
 FLOOD_BATCH: Final = 50
 FLOOD_S: Final = 3.0
@@ -228,13 +238,28 @@ def from_future(script: Script) -> None:
 
 
 def wrapped(script: Script) -> None:
-    """The highest number of all, then from zero again."""
-    frames = _frames(script)
-    script.seq = MAX_INTEGER - 1
-    script.drive(next(frames))
-    script.seq = -1
-    for frame in frames:
+    """The highest number of all, and numbers from zero again."""
+    for count, frame in enumerate(_frames(script)):
+        script.seq = MAX_INTEGER - 1 if count % 2 else min(count, 10) - 1
         script.attack(script.answer(frame))
+
+def copied(script: Script) -> None:
+    """Commands in the driver's name: with a chain of proofs of its own, without one, and with a far number."""
+    for frame in _frames(script):
+        header = script.answer(frame)
+        for changes in ({}, {"proof": None, "next_proof": None}, {"seq": header.seq + 2**19}):
+            script.attack(header.model_copy(update=changes))
+
+
+def future_frames(script: Script) -> None:
+    """Frames in the robot's name: the largest time, an hour ahead, and the largest number."""
+    with open_session((), [script.options.endpoint], 5.0) as third_party:
+        for frame in _frames(script):
+            for changes in ({"t_us": MAX_INTEGER}, {"t_us": frame.t_us + HOUR_US}, {"seq": MAX_INTEGER}):
+                header = encode(frame.model_copy(update=changes))
+                script.injected()
+                third_party.put(key_for(script.link.robot, FRAME), b"no image", attachment=header)
+            time.sleep(0.05)
 
 
 def malformed(script: Script) -> None:
@@ -292,7 +317,8 @@ def thousand(script: Script) -> None:
 
 ATTACKS: Final[dict[str, Callable[[Script], None]]] = {
     attack.__name__: attack
-    for attack in (late, replay, never_issued, from_future, wrapped, malformed, flood, reversal, heartbeat, thousand)
+    for attack in (late, replay, never_issued, from_future, wrapped, malformed, flood, reversal, heartbeat, thousand,
+                   copied, future_frames)
 }
 
 
