@@ -629,6 +629,13 @@ def _reset_moving(rig: RobotFixture) -> Injected:
 # --- clocks ------------------------------------------------------------------------------------------------------
 
 
+def _suspend(rig: RobotFixture) -> Injected:
+    """The robot's clock leaps while commands go on: each cites a frame from before the suspend."""
+    at_us = rig.suspend()
+    rig.watch(ATTACKED_S)
+    return Injected(1, at_us)
+
+
 def _drive_on(rig: RobotFixture) -> Injected:
     """Drive with the wrong clock for a while, then let vision die."""
     rig.watch(BAD_S)
@@ -683,6 +690,8 @@ OPERATOR_CASES: Final = (
     FaultCase(
         "stop.reset", "STOP: then reset while moving", _reset_moving, _SCRIPT, blind=True, also="rejected; " + _STAYS
     ),
+    FaultCase("clock.suspend", "clocks: a suspend of a minute between a frame and its twist, simulated", _suspend,
+              Setup(sleeps=True), blind=True, short=True),
     FaultCase("clock.ahead", "clocks: a day ahead, then vision: SIGKILL", _drive_on, Setup(clock=f"{DAY_S}")),
     FaultCase("clock.behind", "clocks: a day behind, then vision: SIGKILL", _drive_on, Setup(clock=f"-{DAY_S}")),
     FaultCase(

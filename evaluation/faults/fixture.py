@@ -135,6 +135,24 @@ with open({str(folder / "clock.ledger")!r}, "a") as ledger:
     )
 
 
+ASLEEP: Final = "asleep"
+"""While this file exists, the clock of the robot that counts suspend is a minute ahead."""
+
+
+def write_sleeping_clock(folder: Path) -> None:
+    """Leave a `sitecustomize` for the robot, whose clock leaps as after a suspend when the file ASLEEP appears."""
+    (folder / "sitecustomize.py").write_text(
+        f"""import os, time
+right_ns = time.clock_gettime_ns
+def clock_gettime_ns(clock):
+    leaps = clock == time.CLOCK_BOOTTIME and os.path.exists({str(folder / ASLEEP)!r})
+    return right_ns(clock) + (60_000_000_000 if leaps else 0)
+time.clock_gettime_ns = clock_gettime_ns
+""",
+        "utf-8",
+    )
+
+
 # One robot at speed, about to be hurt: simulation, robot and who drives, as processes of their own. Shell.
 
 
@@ -167,6 +185,8 @@ class Setup:
     wired: bool = False
     clock: str = ""
     """Python expression that is added to the wall clock of vision and robot, in seconds; "" leaves it."""
+    sleeps: bool = False
+    """The robot's clock leaps as after a suspend once `RobotFixture.suspend` is called."""
     camera: str = ""
     """Camera mode from the beginning."""
     secure: bool = False
@@ -246,6 +266,8 @@ class RobotFixture:
             (self.folder / f"{name}.toml").write_text(toml_text(table), "utf-8")
         if self.setup.clock:
             write_wrong_clock(self.folder, self.setup.clock)
+        if self.setup.sleeps:
+            write_sleeping_clock(self.folder)
 
     # --- processes -----------------------------------------------------------------------------------------------
 
@@ -255,7 +277,7 @@ class RobotFixture:
         arguments += ["--listen", self.web_endpoint] if self.web_endpoint else []
         arguments += ["--secure", self.keys] if self.keys else []
         self.processes.start("robot", arguments, namespace=self.wire.robot_side if self.wire else "",
-                             environment=self._environment())
+                             environment=self._environment(self.setup.sleeps))
         self.processes.wait_line("robot", f"robot {ROBOT}: on")
 
     @property
@@ -278,8 +300,14 @@ class RobotFixture:
         arguments = [kind, self.web_endpoint, str(self.folder / "crowd.ledger")]
         self.processes.start("crowd", arguments, module="sightline.evaluation.faults.load_clients")
 
-    def _environment(self) -> dict[str, str]:
-        return {"PYTHONPATH": str(self.folder)} if self.setup.clock else {}
+    def _environment(self, sleeps: bool = False) -> dict[str, str]:
+        return {"PYTHONPATH": str(self.folder)} if self.setup.clock or sleeps else {}
+
+    def suspend(self) -> int:
+        """Let the robot's clock leap by a minute. Returns the time of the leap."""
+        at_us = monotonic_us()
+        (self.folder / ASLEEP).touch()
+        return at_us
 
     def trigger(self, name: str = "peer") -> int:
         """Let a peer's fault begin; returns when that was."""
