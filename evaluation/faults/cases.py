@@ -333,9 +333,9 @@ def _two_visions(rig: RobotFixture) -> Injected:
     return Injected(len(rig.sent("second")), at_us, checks=checks)
 
 
-def _impersonate(rig: RobotFixture, **attacker: Any) -> Injected:
+def _impersonate(rig: RobotFixture, fault: str = "copied", **attacker: Any) -> Injected:
     """An attacker that knows the driver's session sends the opposite commands; then the driver dies."""
-    rig.start_peer("attacker", "driver", fault="copied", linear_mps=-0.5, angular_rad_s=0.0, **attacker)
+    rig.start_peer("attacker", "driver", fault=fault, linear_mps=-0.5, angular_rad_s=0.0, **attacker)
     rig.until(lambda: bool(rig.sent("attacker")), 15.0, "the attacker's link")
     rig.trigger("attacker")
     rig.until(lambda: rig.injected("attacker") > ENOUGH, 15.0, "an attack")
@@ -432,6 +432,9 @@ COMMAND_CASES: Final = (
     FaultCase("identity.role", "drivers: a copied identity, certificate of an operator; then the driver dies",
               partial(_impersonate, session=SESSION, certificate="operator"), Setup(secure=True),
               also="0 motor log lines of the copy"),
+    FaultCase("identity.requests", "drivers: release, acquire, arm and reset in an operator's name; then it dies",
+              partial(_impersonate, fault="copied_requests", source="teleop", session=SESSION),
+              Setup(source="teleop", secure=True), also="0 motor log lines of the copy"),
     FaultCase("frame.future", "vision: forged frames of the future for 3 s", _forge_frames, _VISION, stops=False,
               also="drives again <= 1000 ms after they end"),
     FaultCase(

@@ -189,6 +189,8 @@ class Setup:
     """The robot's clock leaps as after a suspend once `RobotFixture.suspend` is called."""
     camera: str = ""
     """Camera mode from the beginning."""
+    source: str = "vision"
+    """The role that a scripted driver takes."""
     secure: bool = False
     """The links have keys, and the driver has the session `SESSION`, which an attacker knows."""
     web: bool = False
@@ -244,7 +246,7 @@ class RobotFixture:
             raise_priority(self.processes.pid(name))
         self.start_robot()
         session = {"session": SESSION} if self.setup.secure else {}
-        self.start_peer("peer", self.setup.driver, fault=self.setup.fault, **session)
+        self.start_peer("peer", self.setup.driver, fault=self.setup.fault, source=self.setup.source, **session)
         self.wait_speed(self.setup.at_speed_mps)
         self._before_kib = memory_kib(self.processes, self._judged)
 

@@ -5,6 +5,7 @@
 It does its part until SIGUSR1, and from then on what `fault` names.
 """
 
+import itertools
 import os
 import secrets
 import signal
@@ -21,12 +22,22 @@ from sightline.evaluation.faults.evidence import GOOD, INJECTED, REQUESTED, Even
 from sightline.operator_side.client.requests import SOURCE as OPERATOR_SOURCE
 from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.config.loading import load_service
-from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, TWIST, Channel, key_for
+from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST, Channel, key_for
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.config import Config
-from sightline.protocol.messages import MAX_INTEGER, AnswerHeader, Echo, FrameHeader, Twist, Verb
-from sightline.protocol.proof import ProofChain
+from sightline.protocol.messages import (
+    MAX_INTEGER,
+    AnswerHeader,
+    Echo,
+    FrameHeader,
+    Request,
+    RequestHeader,
+    Stamp,
+    Twist,
+    Verb,
+)
+from sightline.protocol.proof import NO_PROOF, ProofChain
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import LatestSlot, Link, LinkWrapper, Message
 from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
@@ -251,6 +262,23 @@ def copied(script: Script) -> None:
             script.attack(header.model_copy(update=changes))
 
 
+def copied_requests(script: Script) -> None:
+    """Requests in the driver's name, each with an echo of the newest status: with a foreign proof, and without one."""
+    reports = script.link.latest(STATUS)
+    for number in itertools.count(1):
+        report = reports.take(1.0)
+        if report is None:
+            continue
+        echo = Echo.of(decode(Stamp, report.header))
+        for verb in (Verb.RELEASE, Verb.ACQUIRE, Verb.ARM, Verb.RESET):
+            for proof in (script.proofs.next(), NO_PROOF):
+                header = RequestHeader(source=script.options.source, session=script.session, seq=number, echo=echo,
+                                       **proof._asdict())
+                script.injected()
+                payload = encode(Request(id=number, verb=verb))
+                script.link.publish(REQUEST, encode(header), payload, script.options.source)
+
+
 def future_frames(script: Script) -> None:
     """Frames in the robot's name: the largest time, an hour ahead, and the largest number."""
     with open_session((), [script.options.endpoint], 5.0) as third_party:
@@ -318,7 +346,7 @@ def thousand(script: Script) -> None:
 ATTACKS: Final[dict[str, Callable[[Script], None]]] = {
     attack.__name__: attack
     for attack in (late, replay, never_issued, from_future, wrapped, malformed, flood, reversal, heartbeat, thousand,
-                   copied, future_frames)
+                   copied, copied_requests, future_frames)
 }
 
 
