@@ -1,0 +1,184 @@
+"""Rows: commands with a false echo, invalid commands, too many commands, copied identities, several drivers. Shell."""
+
+from functools import partial
+from typing import Any, Final
+
+from sightline.evaluation.checks import at_least, at_most
+from sightline.evaluation.faults.evidence import INJECTED, most_gain_mps2, wheel_mps
+from sightline.evaluation.faults.fixture import SESSION, RobotFixture, Setup
+from sightline.evaluation.faults.runner import FaultCase, Injected
+from sightline.protocol.clock import monotonic_us
+from sightline.robot_side.safety.limits import SafetyConfig
+
+SETTLED_S: Final = 1.5
+VISION: Final = Setup(driver="vision")
+ATTACKED_S: Final = 3.0
+LEASE_US: Final = SafetyConfig().lease_ms * 1000
+GAIN_MPS2: Final = SafetyConfig().max_acceleration_mps2 * 1.05
+"""Five percent for rounding in the log."""
+ENOUGH: Final = 30
+FLOOD_AT_LEAST: Final = 20_000
+
+
+def _attack(rig: RobotFixture, at_least_times: int = ENOUGH) -> Injected:
+    """From the trigger on, send only commands that must be rejected."""
+    at_us = rig.trigger()
+    rig.watch(ATTACKED_S)
+    times = rig.injected()
+    return Injected(times, at_us, checks=(at_least("sent", times, "times", at_least_times),))
+
+
+def _reverse(rig: RobotFixture) -> Injected:
+    at_us = rig.trigger()
+    rig.watch(2.0 + SETTLED_S)
+    gain = at_most("hardest change", most_gain_mps2(rig.motors(), at_us), "m/s2", GAIN_MPS2)
+    return Injected(rig.injected(), at_us, checks=(gain,))
+
+
+def _replay_earlier(rig: RobotFixture) -> Injected:
+    """Record a session, restart the robot, drive, and then replay the recording."""
+    recording = rig.folder / "earlier.txt"
+    rig.start_peer("recorder", "driver", source="teleop", recording=recording, seconds=3.0)
+    rig.until(lambda: recording.exists() and len(recording.read_text("ascii").splitlines()) > 30, 15.0, "a recording")
+    rig.processes.exit_code("recorder", 15.0)
+    rig.processes.kill("peer")
+    rig.processes.end_one("robot")
+    rig.start_robot()
+    rig.start_peer("replayer", "driver", fault="replay", recording=recording)
+    rig.wait_speed(rig.setup.at_speed_mps)
+    at_us = rig.trigger("replayer")
+    rig.watch(ATTACKED_S)
+    return Injected(rig.injected("replayer"), at_us)
+
+
+def _two_visions(rig: RobotFixture) -> Injected:
+    """A second vision service sends the opposite commands; then both die."""
+    rig.start_peer("second", "driver", linear_mps=-0.5, angular_rad_s=0.0)
+    rig.until(lambda: len(rig.sent("second")) > 30, 15.0, "a second vision service")
+    last = [row for row in rig.motors() if row.t_us >= rig.sent("second")[0].t_us]
+    backwards = sum(row.left_rad_s + row.right_rad_s < 0 for row in last)
+    slowest_mps = min(map(wheel_mps, last))
+    at_us = monotonic_us()
+    rig.processes.kill("second")
+    rig.processes.kill("peer")
+    rig.watch(SETTLED_S)
+    checks = (
+        at_most("applied from the second", backwards, "lines", 0),
+        at_least("speed kept", slowest_mps, "m/s", 0.4),
+    )
+    return Injected(len(rig.sent("second")), at_us, checks=checks)
+
+
+def _impersonate(rig: RobotFixture, fault: str = "copied", **attacker: Any) -> Injected:
+    """An attacker that knows the driver's session sends the opposite commands; then the driver dies."""
+    rig.start_peer("attacker", "driver", fault=fault, linear_mps=-0.5, angular_rad_s=0.0, **attacker)
+    rig.until(lambda: bool(rig.sent("attacker")), 15.0, "the attacker's link")
+    rig.trigger("attacker")
+    rig.until(lambda: rig.injected("attacker") > ENOUGH, 15.0, "an attack")
+    began_us = rig.noted("attacker", INJECTED)[0].t_us
+    rig.watch(ATTACKED_S)
+    rows = [row for row in rig.motors() if row.t_us >= began_us]
+    backwards = sum(row.left_rad_s + row.right_rad_s < 0 for row in rows)
+    at_us = monotonic_us()
+    rig.processes.kill("peer")
+    rig.watch(0.5)
+    rig.processes.kill("attacker")
+    rig.watch(SETTLED_S)
+    checks = (
+        at_most("motor log lines of the attacker", backwards, "lines", 0),
+        at_least("speed kept", min(map(wheel_mps, rows)), "m/s", 0.4),
+    )
+    return Injected(rig.injected("attacker"), at_us, checks=checks)
+
+
+def _forge_frames(rig: RobotFixture) -> Injected:
+    """Frames of the future in the robot's name for three seconds: vision drives again within one second after."""
+    rig.start_peer("attacker", "driver", source="guest", fault="future_frames")
+    rig.until(lambda: bool(rig.sent("attacker")), 15.0, "the attacker's link")
+    rig.trigger("attacker")
+    rig.until(lambda: rig.injected("attacker") > ENOUGH, 15.0, "forged frames")
+    rig.watch(ATTACKED_S)
+    times = rig.injected("attacker")
+    rig.processes.kill("attacker")
+    at_us = monotonic_us()
+    rig.until(lambda: wheel_mps(rig.motors()[-1]) > 0 and rig.motors()[-1].t_us > at_us, 5.0, "vision driving again")
+    again_ms = (next(row.t_us for row in rig.motors() if row.t_us > at_us and wheel_mps(row) > 0) - at_us) / 1000
+    rig.watch(1.0)
+    return Injected(times, at_us, checks=(at_most("drives again after", again_ms, "ms", 1000.0),))
+
+
+def _take_over(rig: RobotFixture) -> Injected:
+    """An operator takes over at full speed and drives back, then is lost: a stop that vision does not end."""
+    rig.start_peer("person", "driver", source="teleop", linear_mps=-0.4, angular_rad_s=0.0)
+    rig.until(lambda: _goes_back(rig), 15.0, "a takeover")
+    took_ms = (monotonic_us() - rig.sent("person")[0].t_us) / 1000
+    rig.watch(0.5)
+    at_us = monotonic_us()
+    rig.processes.kill("person")
+    rig.watch(SETTLED_S + 1.0)
+    return Injected(1, at_us, checks=(at_most("operator applied after", took_ms, "ms", 1000.0),))
+
+
+def _goes_back(rig: RobotFixture) -> bool:
+    last = rig.motors()[-1]
+    return last.left_rad_s < 0 and last.right_rad_s < 0 and wheel_mps(last) > 0.39
+
+
+def _holder_dies(rig: RobotFixture) -> Injected:
+    """The driver dies while another waits: a stop first, the other only when the lease is over."""
+    rig.start_peer("second", "driver", linear_mps=0.3)
+    rig.until(lambda: len(rig.sent("second")) > 10, 15.0, "a second driver")
+    at_us = monotonic_us()
+    rig.processes.kill("peer")
+    rig.watch(ATTACKED_S)
+    last_us = rig.sent("peer")[-1].t_us
+    moving = [row.t_us for row in rig.motors() if row.t_us > last_us + LEASE_US // 2 and wheel_mps(row) > 0]
+    waited_ms = (moving[0] - last_us) / 1000 if moving else 0.0
+    checks = (at_least("next driver after", waited_ms, "ms", LEASE_US / 1000 - 20),)
+    return Injected(1, at_us, last_us + LEASE_US - 20_000, bool(moving), checks)
+
+
+def _command_case(name: str, what: str, *, short: bool = False) -> FaultCase:
+    return FaultCase(f"command.{name}", f"commands: {what}", _attack, Setup(fault=name), short=short)
+
+
+COMMAND_CASES: Final = (
+    _command_case("late", "each 500 ms after its frame"),
+    _command_case("replay", "this session's, replayed", short=True),
+    FaultCase("command.earlier", "commands: an earlier session's, replayed", _replay_earlier, Setup()),
+    _command_case("never_issued", "citing frames never issued"),
+    _command_case("from_future", "citing frames from the future"),
+    _command_case("wrapped", "their numbers wrap"),
+    _command_case(
+        "malformed", "nan, inf, 1e400, underscores, full-width, empty, 3 fields, 257 bytes, 10 MB, binary ..."
+    ),
+    FaultCase(
+        "command.flood", "commands: an old one at 10 kHz", partial(_attack, at_least_times=FLOOD_AT_LEAST),
+        Setup(fault="flood"), also=f">= {FLOOD_AT_LEAST} sent", short=True, alone=True
+    ),
+    FaultCase(
+        "command.reversal", "commands: full speed ahead and back at 50 Hz", _reverse, Setup(fault="reversal"),
+        also=f"speed changes by <= {GAIN_MPS2:g} m/s2"
+    ),
+    _command_case("heartbeat", "none, but frames are acknowledged and the link is alive", short=True),
+    FaultCase("driver.two", "drivers: two vision services, then none", _two_visions, Setup(),
+              also="the second is not applied"),
+    FaultCase("identity.copied", "drivers: a copied identity, certificate of the same role; then the driver dies",
+              partial(_impersonate, session=SESSION), Setup(secure=True), also="0 motor log lines of the copy"),
+    FaultCase("identity.role", "drivers: a copied identity, certificate of an operator; then the driver dies",
+              partial(_impersonate, session=SESSION, certificate="operator"), Setup(secure=True),
+              also="0 motor log lines of the copy"),
+    FaultCase("identity.requests", "drivers: release, acquire, arm and reset in an operator's name; then it dies",
+              partial(_impersonate, fault="copied_requests", source="teleop", session=SESSION),
+              Setup(source="teleop", secure=True), also="0 motor log lines of the copy"),
+    FaultCase("frame.future", "vision: forged frames of the future for 3 s", _forge_frames, VISION, stops=False,
+              also="drives again <= 1000 ms after they end"),
+    FaultCase(
+        "driver.person", "drivers: an operator takes over at full speed, and is lost", _take_over, Setup(), blind=True,
+        also="applied <= 1000 ms; vision does not resume by itself"
+    ),
+    FaultCase(
+        "driver.dies", "drivers: the holder dies while another waits", _holder_dies, Setup(), blind=True, again=True,
+        also="the other drives only after the lease"
+    ),
+)
