@@ -18,6 +18,7 @@ from sightline.evaluation.faults.fixture import RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.evaluation.faults.sampler import Hole
+from sightline.evaluation.faults.stop_cases import STOP_CASES
 from sightline.operator_side.config.errors import no_such_name
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError
@@ -534,7 +535,7 @@ OPERATOR_CASES: Final = (
 
 
 CASES: Final[tuple[FaultCase, ...]] = (
-    *PROCESS_CASES, *NETWORK_CASES, *COMMAND_CASES, *CLIENT_CASES, *OPERATOR_CASES,
+    *PROCESS_CASES, *NETWORK_CASES, *COMMAND_CASES, *CLIENT_CASES, *OPERATOR_CASES, *STOP_CASES,
 )
 
 

@@ -195,6 +195,8 @@ class Setup:
     """The links have keys, and the driver has the session `SESSION`, which an attacker knows."""
     web: bool = False
     """The robot listens for WebSocket clients too."""
+    routed: bool = False
+    """The robot connects to a router, and all others know only that one."""
 
     @property
     def at_speed_mps(self) -> float:
@@ -244,6 +246,9 @@ class RobotFixture:
         self.processes.wait_line("sampler", "sampling")
         for name in ("sim", "sampler"):
             raise_priority(self.processes.pid(name))
+        if self.setup.routed:
+            self.processes.start("router", ["router", "--listen", self.endpoint, *(["--secure", self.keys] if self.keys else [])])
+            self.processes.wait_line("router", "router: on")
         self.start_robot()
         session = {"session": SESSION} if self.setup.secure else {}
         self.start_peer("peer", self.setup.driver, fault=self.setup.fault, source=self.setup.source, **session)
@@ -261,7 +266,7 @@ class RobotFixture:
             "sim": {"scenario": str(self.folder / "scenario.toml"), "socket_dir": sockets, "seed": 1,
                     "motor_log": str(self.folder / "motors.csv")},
             "robot": {"robot": ROBOT, "state_dir": str(self.folder / "state"), "camera": eye, "drive": device,
-                      "range_sensor": device, "safety": {"auto_arm": True}},
+                      "range_sensor": device, "safety": {"auto_arm": True}, "listen": []},
             "vision": {"robot": ROBOT},
         }
         for name, table in files.items():
@@ -275,7 +280,8 @@ class RobotFixture:
 
     def start_robot(self) -> None:
         """Start the robot and wait until it listens."""
-        arguments = ["robot", "--config", str(self.folder / "robot.toml"), "--listen", self.endpoint]
+        side = "--connect" if self.setup.routed else "--listen"
+        arguments = ["robot", "--config", str(self.folder / "robot.toml"), side, self.endpoint]
         arguments += ["--listen", self.web_endpoint] if self.web_endpoint else []
         arguments += ["--secure", self.keys] if self.keys else []
         self.processes.start("robot", arguments, namespace=self.wire.robot_side if self.wire else "",
@@ -297,9 +303,9 @@ class RobotFixture:
         self.processes.start(name, [options.model_dump_json()], module="sightline.evaluation.faults.peer",
                              namespace=self.wire.far_side if self.wire else "", environment=self._environment())
 
-    def start_crowd(self, kind: str) -> None:
-        """Let many WebSocket clients come; what they do is noted as by a peer called `crowd`."""
-        arguments = [kind, self.web_endpoint, str(self.folder / "crowd.ledger")]
+    def start_crowd(self, kind: str, endpoint: str = "") -> None:
+        """Let many clients come, WebSocket ones by default; what they do is noted as by a peer called `crowd`."""
+        arguments = [kind, endpoint or self.web_endpoint, str(self.folder / "crowd.ledger")]
         self.processes.start("crowd", arguments, module="sightline.evaluation.faults.load_clients")
 
     def _environment(self, sleeps: bool = False) -> dict[str, str]:

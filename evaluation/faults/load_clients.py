@@ -1,11 +1,12 @@
-"""Many WebSocket viewers, or handshakes that are begun and abandoned. Shell.
+"""Floods: many viewers, connections that are begun and abandoned, sessions, and invalid STOP datagrams. Shell.
 
-    python -m sightline.evaluation.faults.load_clients viewers|handshakes ENDPOINT LEDGER
+    python -m sightline.evaluation.faults.load_clients KIND ENDPOINT LEDGER
 
 It represents other machines, so it uses little of this processor. A client that is rejected or dropped connects again,
 forever. The first viewers have the role of an operator, for which places are reserved.
 """
 
+import itertools
 import os
 import secrets
 import socket
@@ -13,13 +14,17 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from sightline.evaluation.faults.evidence import INJECTED, EventLog
 from sightline.protocol.channels import FRAME
 from sightline.protocol.codec import encode
-from sightline.protocol.transports.endpoints import parse_websocket_endpoint
+from sightline.protocol.errors import LinkError
+from sightline.protocol.transports.endpoints import parse_websocket_endpoint, parse_zenoh_endpoint, stop_addresses
+from sightline.protocol.transports.stop_datagram import StopRequests
 from sightline.protocol.transports.websocket.client import Client
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, Hello
 from sightline.protocol.transports.websocket.peer import OPEN_S
@@ -116,7 +121,114 @@ def _is_open(one: socket.socket) -> bool:
     return False
 
 
-_KINDS: Final[dict[str, Callable[[str, EventLog], None]]] = {"viewers": view, "handshakes": leave_handshakes}
+# Floods at the port of a Zenoh link, by a program that has no keys.
+
+
+FEW_HZ: Final = 25
+MANY_HZ: Final = 500
+HALF_OPEN: Final = 700
+SESSIONS: Final = 63
+
+
+def _place(endpoint: str) -> tuple[str, int]:
+    _, host, port = parse_zenoh_endpoint(endpoint)
+    return host, port
+
+
+def connect_often(endpoint: str, ledger: EventLog, rate_hz: int) -> None:
+    """Open connections at a rate and close them immediately."""
+    print(READY, flush=True)
+    started_s, count = time.monotonic(), 0
+    while True:
+        with suppress(OSError):  # e.g. the backlog of the port is full
+            socket.create_connection(_place(endpoint), 1.0).close()
+            ledger.note(INJECTED)
+        count += 1
+        time.sleep(max(0.0, started_s + count / rate_hz - time.monotonic()))
+
+
+def leave_half_open(endpoint: str, ledger: EventLog) -> None:
+    """Open connections, send nothing, and open again what the other end closes."""
+    begun: list[socket.socket] = []
+    is_reported = False
+    while True:
+        begun = [one for one in begun if _is_open(one)]
+        with suppress(OSError):
+            while len(begun) < HALF_OPEN:
+                one = socket.socket()
+                one.setblocking(False)
+                one.connect_ex(_place(endpoint))
+                begun.append(one)
+                ledger.note(INJECTED)
+        if not is_reported:
+            is_reported = True
+            print(READY, flush=True)
+        time.sleep(_AGAIN_S)
+
+
+def open_sessions(endpoint: str, ledger: EventLog) -> None:
+    """Hold as many Zenoh sessions as the other end accepts beside one more."""
+    from sightline.protocol.transports.zenoh.session import open_session
+
+    sessions = []
+    for number in range(SESSIONS):
+        with suppress(LinkError):
+            sessions.append(open_session((), [endpoint], 1.0))
+            ledger.note(INJECTED)
+        if number == SESSIONS // 2:
+            print(READY, flush=True)
+    threading.Event().wait()
+
+
+# Invalid STOP datagrams, as fast as this process can send.
+
+
+LONGEST: Final = 2000
+FLOOD_S: Final = 10.0
+
+
+def send_garbage(endpoint: str, ledger: EventLog) -> None:
+    """Send datagrams of every length for 10 s; print the rate."""
+    [place] = stop_addresses([endpoint])
+    other = StopRequests("r2", b"", 7)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        print(READY, flush=True)
+        ledger.note(INJECTED)
+        started_s, sent = time.monotonic(), 0
+        while time.monotonic() - started_s < FLOOD_S:
+            for data in (os.urandom(LONGEST)[: sent % (LONGEST + 1)], *other.datagrams()):
+                with suppress(OSError):
+                    one.sendto(data, place)
+                sent += 1
+    print(f"{sent / FLOOD_S:.0f} datagrams a second", flush=True)
+    threading.Event().wait()
+
+
+def replay_stops(endpoint: str, ledger: EventLog) -> None:
+    """Send the recorded datagrams of an earlier STOP repeatedly."""
+    [place] = stop_addresses([endpoint])
+    recording = Path(sys.argv[3]).with_name(STOPS)
+    datagrams = [bytes.fromhex(line) for line in recording.read_text("ascii").splitlines()]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        print(READY, flush=True)
+        for data in itertools.cycle(datagrams):
+            one.sendto(data, place)
+            ledger.note(INJECTED)
+            time.sleep(0.005)
+
+
+STOPS: Final = "stops.txt"
+"""The recording, beside the event log."""
+_KINDS: Final[dict[str, Callable[[str, EventLog], None]]] = {
+    "viewers": view,
+    "handshakes": leave_handshakes,
+    "connect_25": partial(connect_often, rate_hz=FEW_HZ),
+    "connect_500": partial(connect_often, rate_hz=MANY_HZ),
+    "half_open": leave_half_open,
+    "sessions": open_sessions,
+    "garbage": send_garbage,
+    "replayed": replay_stops,
+}
 
 
 def main(kind: str, endpoint: str, ledger: str) -> None:

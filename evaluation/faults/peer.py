@@ -21,11 +21,13 @@ from typing import Any, Final, Literal
 from sightline.evaluation.faults.evidence import GOOD, INJECTED, REQUESTED, EventLog
 from sightline.operator_side.client.requests import SOURCE as OPERATOR_SOURCE
 from sightline.operator_side.client.requests import Operator
+from sightline.operator_side.client.stop import stop_robot
 from sightline.operator_side.config.loading import load_service
 from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST, Channel, key_for
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.config import Config
+from sightline.protocol.errors import SightlineError
 from sightline.protocol.messages import (
     MAX_INTEGER,
     AnswerHeader,
@@ -40,6 +42,8 @@ from sightline.protocol.messages import (
 from sightline.protocol.proof import NO_PROOF, ProofChain
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import LatestSlot, Link, LinkWrapper, Message
+from sightline.protocol.transports.security import stop_secret_file
+from sightline.protocol.transports.stop_datagram import StopRequests
 from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
 from sightline.vision_side.config import VisionConfig
@@ -47,7 +51,7 @@ from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
 from sightline.vision_side.serving.process import serve
 
-Role = Literal["vision", "driver", "operator"]
+Role = Literal["vision", "driver", "operator", "stop"]
 
 
 class PeerOptions(Config):
@@ -101,6 +105,10 @@ def _entry(role: Role) -> Callable[[PeerOptions, threading.Event, EventLog], int
     if role == "driver":
 
         return run_driver
+
+    if role == "stop":
+
+        return run_stop
 
     return run_operator
 
@@ -371,6 +379,38 @@ def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventL
             reply = operator.request(Verb.RESET)
             print(f"reset {reply.ok}: {reply.detail}", flush=True)
     return 0
+
+
+# A new operator: what `sightline stop` runs, in this process so that its first packet is noted. Shell.
+
+
+def run_stop(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
+    """Wait for the trigger, stop the robot, and exit as the command does. A recording gets the datagrams."""
+    datagrams, sent = StopRequests.datagrams, 0
+
+    def noted(self: StopRequests) -> list[bytes]:
+        nonlocal sent
+        if not sent:
+            ledger.note(REQUESTED)
+        made = datagrams(self)
+        sent += len(made)
+        if options.recording is not None:
+            with options.recording.open("a") as recording:
+                recording.writelines(f"{data.hex()}\n" for data in made)
+        return made
+
+    StopRequests.datagrams = noted  # type: ignore[method-assign]
+    secret_file = stop_secret_file(options.secure) if options.secure else ""
+    print("stop ready", flush=True)
+    pulled.wait()
+    code = 0
+    try:
+        print(stop_robot(options.robot, [options.endpoint], options.secure, secret_file, lambda: None), flush=True)
+    except SightlineError as error:
+        code = error.exit_code
+        print(error, flush=True)
+    print(f"stop ended with {code} after {sent} datagrams", flush=True)
+    os._exit(code)  # the link may still be opened
 
 
 # The real vision service with a ledger between it and the link, and a detector that can be made to fail. Shell.

@@ -9,7 +9,7 @@ from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from sightline.protocol.channels import ACK, Channel
-from sightline.protocol.clock import heartbeat_us
+from sightline.protocol.clock import heartbeat_us, monotonic_us
 from sightline.protocol.errors import WireError
 from sightline.protocol.transports.link import OVERSIZE, Message, OutgoingQueue
 from sightline.protocol.transports.websocket.connection import CLOSE_S, Connection, Keepalive
@@ -223,10 +223,10 @@ class Peer:
 
     def _has_more(self) -> bool:
         commands = self._commands
-        return not self._ended and bool(len(self.queue) or (commands and commands.rest_due(heartbeat_us())))
+        return not self._ended and bool(len(self.queue) or (commands and commands.rest_due(monotonic_us())))
 
     def _take(self) -> tuple[Sequence[bytes], bool] | None:
-        commands, now_us = self._commands, heartbeat_us()
+        commands, now_us = self._commands, monotonic_us()
         if commands is not None and not self._ended and commands.rest_due(now_us):
             commands.sent(commands.zero, now_us)
             return (commands.zero,), True
