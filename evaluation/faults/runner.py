@@ -65,6 +65,7 @@ class FaultCase:
     again: bool = False
     zero_ms: float = ZERO_MS
     distance_m: float = DISTANCE_M
+    memory_mb: float = MEMORY_MB
     also: str = ""
     """In words, what `Injected.checks` demand."""
     short: bool = False
@@ -138,7 +139,7 @@ def _run_once(row: FaultCase, place: Path) -> tuple[tuple[Check, ...], int]:
         checks = (
             at_least("injected", injected.count, "times", 1),
             *_motion_checks(row, rig, injected),
-            at_most("memory", grown_mb, "MB", MEMORY_MB),
+            at_most("memory", grown_mb, "MB", row.memory_mb),
             *injected.checks,
         )
         return checks, rig.stalled_us(injected.at_us, injected.at_us + watched_us(checks))

@@ -4,7 +4,7 @@ from functools import partial
 from typing import Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
-from sightline.evaluation.faults.evidence import INJECTED, REQUESTED, ZERO_MS, measure_stop, wheel_mps
+from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, REQUESTED, ZERO_MS, measure_stop, wheel_mps
 from sightline.evaluation.faults.fixture import RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import FEW_HZ, HALF_OPEN, MANY_HZ, READY, SESSIONS, STOPS
 from sightline.evaluation.faults.runner import FaultCase, Injected
@@ -96,6 +96,8 @@ _FLOODS: Final = {
     "tcp_half": ("half_open", f"{HALF_OPEN} half-open connections", False),
     "sessions": ("sessions", f"{SESSIONS} more sessions", False),
 }
+HALF_OPEN_MB: Final = 16.0
+"""Zenoh holds about 10 kB for each TLS connection that it has accepted; the descriptors of the process bound them."""
 _DEMANDED: Final = f"zero <= {ZERO_MS:g} ms after the first packet; exit code 0"
 
 
@@ -103,10 +105,12 @@ def _flood_case(name: str, *, routed: bool = False, after_s: float | None = None
     kind, what, secured = _FLOODS[name]
     where = ", behind a router" if routed else ""
     when = "" if after_s is None else f", {after_s:g} s after it"
-    ending = (".router" if routed else "") + ("" if after_s is None else f".after{after_s:g}")
+    ending = ("_router" if routed else "") + ("" if after_s is None else f"_after{after_s:g}")
     return FaultCase(
         f"flood.{name}{ending}", f"flood: {what}{where}; STOP by a new operator{when}",
-        partial(_flood, kind=kind, after_s=after_s), Setup(secure=secured, routed=routed), blind=True, also=_DEMANDED,
+        partial(_flood, kind=kind, after_s=after_s), Setup(secure=secured, routed=routed), blind=True,
+        memory_mb=HALF_OPEN_MB if kind == "half_open" else MEMORY_MB,
+        also=_DEMANDED + (f"; memory <= {HALF_OPEN_MB:g} MB" if kind == "half_open" else ""),
         short=ending == "" and name in ("tls25", "tcp500"), alone=True,
     )
 

@@ -16,7 +16,8 @@ from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, stop_addresses
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys, stop_secret_file
 from sightline.protocol.transports.stop_port import StopProcess, read_packets
-from sightline.protocol.transports.zenoh.session import open_session, report_floods
+from sightline.protocol.transports.zenoh.flood_limits import limit_floods
+from sightline.protocol.transports.zenoh.session import open_session
 from sightline.robot_side.guardian import stop_forwarder
 from sightline.robot_side.guardian.stop_core import unpack_ignored
 
@@ -34,7 +35,7 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
     ending = threading.Event()
     with (
         ExitStack() as closing_all,
-        report_floods(listen, lambda line: _log.info("router: %s", line)),
+        limit_floods(listen, lambda line: _log.info("router: %s", line)),
         closing(open_session(listen, connect, _REACH_S, secured)),
     ):
         for number in (signal.SIGTERM, signal.SIGINT):

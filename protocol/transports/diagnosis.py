@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -60,22 +60,29 @@ def unresolved_host(hosts: Iterable[str]) -> str:
     return ""
 
 
-def connections(ports: Collection[int]) -> Counter[str]:
-    """Count the TCP connections of each host to `ports` of this machine, including those that are closing."""
+def connection_ends(ports: Collection[int]) -> dict[tuple[str, str], str]:
+    """List the TCP connections to `ports` of this machine, including those that are closing.
+
+    Returns:
+        Both ends of each connection, as in the table, and its remote host.
+    """
     # The kernel writes the table in pieces, so a row can come twice while other sockets open and close.
-    ends = {(row[1], row[2]) for row in _rows(ports) if row[3] != _LISTEN}
-    return Counter(_host(remote) for _, remote in ends)
+    return {(row[1], row[2]): _host(row[2]) for row in _rows(ports) if row[3] != _LISTEN}
 
 
-def _rows(ports: Collection[int]) -> list[list[str]]:
-    """Return the rows of the table whose local port is one of `ports`."""
-    rows: list[list[str]] = []
-    for table in ("tcp", "tcp6"):
-        try:
-            rows += [line.split() for line in (TABLES / table).read_text("ascii").splitlines()[1:]]
-        except OSError:  # another system, or no IPv6
-            continue
-    return [row for row in rows if int(row[1].rpartition(":")[2], 16) in ports]
+def listening_inodes(ports: Collection[int]) -> set[str]:
+    """Return the inodes of the sockets that listen on `ports`."""
+    return {row[9] for row in _rows(ports) if row[3] == _LISTEN}
+
+
+def _rows(ports: Collection[int]) -> Iterator[list[str]]:
+    """Yield the rows of the table whose local port is one of `ports`. Other rows of a long table cost no memory."""
+    endings = tuple(f":{port:04X}" for port in ports)
+    for name in ("tcp", "tcp6"):
+        with suppress(OSError), (TABLES / name).open(encoding="ascii") as table:  # another system, or no IPv6
+            for line in table:
+                if line.split(None, 2)[1].endswith(endings):
+                    yield line.split()
 
 
 def _host(address: str) -> str:

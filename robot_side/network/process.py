@@ -22,7 +22,7 @@ from sightline.protocol.errors import HardwareError, SightlineError, WireError
 from sightline.protocol.log import start_log
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
-from sightline.protocol.transports.zenoh.session import report_floods
+from sightline.protocol.transports.zenoh.flood_limits import limit_floods
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.pipe import KEYS, NetworkEnd, NetworkSetup
@@ -205,7 +205,7 @@ def _run(driver: NetworkEnd) -> None:
     with ExitStack() as ending:
         camera = CAMERAS.build(config.camera)
         ending.callback(camera.close)
-        ending.enter_context(report_floods(config.doors, lambda line: _log.info("robot %s: %s", config.robot, line)))
+        ending.enter_context(limit_floods(config.doors, lambda line: _log.info("robot %s: %s", config.robot, line)))
         link = ending.enter_context(
             open_link(
                 config.robot, listen=config.doors, connect=config.connect, role="robot", secure=config.secure,

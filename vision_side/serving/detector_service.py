@@ -147,11 +147,11 @@ class ServingOptions:
 
 def run(config: VisionConfig, detector: Detector, options: ServingOptions) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code 0. Raises ConfigError, LinkError as `open_fleet` does."""
+    from sightline.protocol.transports.zenoh.flood_limits import limit_floods
     from sightline.protocol.transports.zenoh.link import open_fleet
-    from sightline.protocol.transports.zenoh.session import report_floods
 
     ending, services = threading.Event(), list[DetectorService]()
-    with report_floods(config.listen, lambda line: _log.info("detector: %s", line)):
+    with limit_floods(config.listen, lambda line: _log.info("detector: %s", line)):
         opened = open_fleet(
             config.robot, listen=config.listen, connect=config.connect, role=ROLE, secure=config.secure,
             max_frame_bytes=config.max_frame_bytes,

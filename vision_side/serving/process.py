@@ -44,13 +44,13 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 
     Raises ConfigError for an invalid endpoint or mission, LinkError if the link cannot be opened.
     """
-    from sightline.protocol.transports.zenoh.session import report_floods
+    from sightline.protocol.transports.zenoh.flood_limits import limit_floods
 
     configured_mission(config)  # report an unknown mission before any endpoint is opened
     ending, detector = threading.Event(), configured_detector(config)
     run_it = _run_fleet if set("*?") & set(config.robot) else _run_one
     try:
-        with report_floods(config.listen, lambda line: _log.info("vision: %s", line)):
+        with limit_floods(config.listen, lambda line: _log.info("vision: %s", line)):
             return run_it(config, ending, observe, detector)
     finally:
         close_detector(detector)

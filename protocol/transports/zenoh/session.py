@@ -10,15 +10,11 @@ import json
 import logging
 import re
 import socket
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError, install_command
-from sightline.protocol.log import RepeatLimiter
-from sightline.protocol.transports.diagnosis import connections, diagnose_tls, port_owner, unresolved_host
+from sightline.protocol.transports.diagnosis import diagnose_tls, port_owner, unresolved_host
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
 from sightline.protocol.transports.security import RoleKeys, size_limit_section
 
@@ -59,7 +55,6 @@ HANDSHAKE_MS: Final = 3000
 # Sessions at a listening end: a fleet of twenty robots, their vision services, and viewers.
 MAX_SESSIONS: Final = 64
 _OVER_UDP: Final = ("udp", "quic")
-_FLOOD_CHECK_S: Final = 0.5
 _PROBE_TIMEOUT_S: Final = 0.3
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
@@ -213,26 +208,3 @@ def _port_in_use(endpoint: str) -> LinkError:
     owner = port_owner(port)
     by = f" by {owner}" if owner else " by another process"
     return LinkError(f"cannot listen on {endpoint}: port {port} is in use{by}; end it or choose another port")
-
-
-@contextmanager
-def report_floods(listen: Sequence[str], report: Callable[[str], None]) -> Iterator[None]:
-    """Report each host with more connections to `listen` than Zenoh accepts in total, until the end of the `with`."""
-    ports = {parse_zenoh_endpoint(endpoint)[2] for endpoint in listen if "://" not in endpoint}
-    ending = threading.Event()
-    if ports:
-        arguments = (ports, report, ending)
-        threading.Thread(target=_watch_floods, args=arguments, name="zenoh-floods", daemon=True).start()
-    try:
-        yield
-    finally:
-        ending.set()
-
-
-def _watch_floods(ports: set[int], report: Callable[[str], None], ending: threading.Event) -> None:
-    limiter = RepeatLimiter()
-    while not ending.wait(_FLOOD_CHECK_S):
-        for host, count in connections(ports).most_common(1):
-            if count > MAX_SESSIONS and limiter.due(host, monotonic_us()):
-                report(f"{count} connections from {host}, more than the total limit of {MAX_SESSIONS}; "
-                       "block that address or end the program there")

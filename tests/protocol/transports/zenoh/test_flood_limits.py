@@ -1,0 +1,133 @@
+"""Limits of connections per address at the ports of Zenoh: a flood is dropped by the kernel, open sessions go on."""
+
+import socket
+from contextlib import ExitStack, closing, suppress
+
+import pytest
+
+from sightline.protocol.transports.zenoh.flood_limits import (
+    BLOCKED_US,
+    MAX_BLOCKED,
+    MAX_OPEN,
+    WINDOW_US,
+    FloodDetector,
+    limit_floods,
+)
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
+
+SAMPLE_US = 200_000
+
+
+def ends(host, numbers):
+    return {("port", f"{host}:{number}"): host for number in numbers}
+
+
+def run(rate_hz, seconds, open_for=1):
+    """Sample a host that opens connections at a rate and holds each for some samples; return all floods."""
+    detector, found = FloodDetector(), []
+    for number in range(round(seconds * 1e6 / SAMPLE_US)):
+        last = round(number * SAMPLE_US * rate_hz / 1e6)
+        first = round(max(0, number - open_for) * SAMPLE_US * rate_hz / 1e6)
+        found += detector.sample(ends("10.0.0.9", range(first, last)), number * SAMPLE_US)
+    return detector, found
+
+
+def test_as_many_connections_as_zenoh_accepts_are_not_a_flood():
+    detector = FloodDetector()
+    for number in range(50):
+        assert detector.sample(ends("10.0.0.9", range(MAX_OPEN)), number * SAMPLE_US) == []
+    [flood] = detector.sample(ends("10.0.0.9", range(MAX_OPEN + 1)), 50 * SAMPLE_US)
+    assert (flood.host, flood.open) == ("10.0.0.9", MAX_OPEN + 1)
+
+
+def test_25_short_connections_a_second_are_a_flood_and_20_are_not():
+    detector, floods = run(25, 6.0)
+    assert floods and floods[0].open <= 10 and 20 <= floods[-1].new_per_s <= 27
+    assert detector.blocked(6_000_000) == ["10.0.0.9"]
+    assert run(20, 60.0)[1] == []
+
+
+def test_many_hosts_together_are_not_a_flood_of_one():
+    detector = FloodDetector()
+    crowd = {end: host for number in range(200) for end, host in ends(f"10.0.1.{number}", range(2)).items()}
+    assert detector.sample(crowd, 0) == [] and detector.blocked(0) == []
+
+
+def test_a_block_ends_when_the_flood_does():
+    detector, _ = run(100, 3.0)
+    assert detector.blocked(3_000_000) == ["10.0.0.9"]
+    assert [flood.begins for flood in run(100, 30.0)[1]].count(True) == 1
+    assert detector.sample({}, 3_000_000 + WINDOW_US) == []
+    assert detector.blocked(3_000_000 + BLOCKED_US + SAMPLE_US) == []
+
+
+def test_this_machine_is_reported_and_not_blocked_and_the_list_is_bounded():
+    detector = FloodDetector()
+    assert detector.sample(ends("127.0.0.1", range(MAX_OPEN + 1)), 0) and detector.blocked(0) == []
+    many = {end: host for number in range(MAX_BLOCKED + 5)
+            for end, host in ends(f"10.0.2.{number}", range(MAX_OPEN + 1)).items()}
+    detector.sample(many, 0)
+    assert len(detector.blocked(0)) == MAX_BLOCKED
+
+
+def test_the_memory_of_a_fast_flood_is_bounded():
+    detector, floods = run(5000, 4.0)
+    assert len(detector._new["10.0.0.9"]) <= WINDOW_US // SAMPLE_US + 1
+    assert floods[-1].new_per_s == pytest.approx(5000, rel=0.1)
+
+
+def connect(address, source, timeout_s=0.3):
+    one = socket.socket()
+    one.settimeout(timeout_s)
+    one.bind((source, free_port()))
+    one.connect(address)
+    return one
+
+
+@pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6])
+def test_new_connections_of_the_flooding_address_are_dropped_and_all_others_go_on(family):
+    reported = []
+    with ExitStack() as ending:
+        server = ending.enter_context(socket.create_server(
+            ("127.0.0.1" if family is socket.AF_INET else "::", free_port()), family=family, backlog=256,
+            dualstack_ipv6=family is socket.AF_INET6,
+        ))
+        address = ("127.0.0.1", server.getsockname()[1])
+        session = ending.enter_context(connect(address, "127.0.0.2"))
+        session.sendall(b"hello")
+        accepted = ending.enter_context(server.accept()[0])
+        ending.enter_context(limit_floods([f"tcp/127.0.0.1:{address[1]}"], reported.append))
+        for _ in range(MAX_OPEN + 1):
+            ending.enter_context(connect(address, "127.0.0.2"))
+        assert until(lambda: reported, 5.0)
+        assert f"connections from 127.0.0.2, {(MAX_OPEN + 2) * 1e6 / WINDOW_US:.0f} new ones" in reported[0]
+        with pytest.raises(TimeoutError), suppress(ConnectionError), closing(connect(address, "127.0.0.2")):
+            pass
+        connect(address, "127.0.0.3").close()
+        session.sendall(b"x" * 100_000)
+        assert accepted.recv(10) == b"helloxxxxx"
+        assert len(reported) == 1
+
+
+def test_half_open_connections_of_a_flood_end_and_a_peer_that_has_sent_a_byte_stays():
+    with ExitStack() as ending:
+        server = ending.enter_context(socket.create_server(("127.0.0.1", free_port()), backlog=256))
+        address = server.getsockname()
+        session = ending.enter_context(connect(address, "127.0.0.2"))
+        session.sendall(b"x")
+        accepted = [ending.enter_context(server.accept()[0])]
+        ending.enter_context(limit_floods([f"tcp/127.0.0.1:{address[1]}"], lambda _line: None))
+        flood = [ending.enter_context(connect(address, "127.0.0.2")) for _ in range(MAX_OPEN + 1)]
+        accepted += [ending.enter_context(server.accept()[0]) for _ in flood]
+
+        def ended(one):
+            one.setblocking(False)
+            try:
+                return one.recv(1) == b""
+            except BlockingIOError:
+                return False
+
+        assert until(lambda: all(map(ended, flood)), 5.0)
+        session.sendall(b"y")
+        assert accepted[0].recv(2) == b"xy" and not ended(session)
