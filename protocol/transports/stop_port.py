@@ -86,6 +86,7 @@ class StopPort:
 
     def send_to(self, data: bytes, origin: Origin) -> None:
         """Send a datagram or drop it."""
+        # Drop rather than wait: the sender of a STOP repeats it, and is answered then.
         with suppress(OSError, KeyError):
             self._sockets[origin[0]].sendto(data, origin[1])
 

@@ -71,6 +71,7 @@ class FloodDetector:
                 samples.popleft()
             if not samples:
                 del self._new[host]
+        # Both limits: short connections are few at a time, and half-open ones are not new.
         open_now = Counter(ends.values())
         floods = []
         for host in open_now.keys() | self._new.keys():
@@ -107,6 +108,7 @@ def _watch(ports: set[int], report: Callable[[str], None], ending: threading.Eve
     while not ending.wait(_CHECK_S):
         now_us = heartbeat_us()
         floods = detector.sample(connection_ends(ports), now_us)
+        # Before the report, so that what the log states is true.
         if detector.blocked(now_us) != blocked:
             blocked = detector.blocked(now_us)
             _block(ports, blocked)
