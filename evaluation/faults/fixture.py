@@ -247,7 +247,8 @@ class RobotFixture:
         for name in ("sim", "sampler"):
             raise_priority(self.processes.pid(name))
         if self.setup.routed:
-            self.processes.start("router", ["router", "--listen", self.endpoint, *(["--secure", self.keys] if self.keys else [])])
+            secure = ["--secure", self.keys] if self.keys else []
+            self.processes.start("router", ["router", "--listen", self.endpoint, *secure])
             self.processes.wait_line("router", "router: on")
         self.start_robot()
         session = {"session": SESSION} if self.setup.secure else {}
