@@ -188,7 +188,6 @@ PROCESS_CASES: Final = (
 
 # Rows: what a radio does to packets, through the wire between two network namespaces. Shell.
 
-
 DISTURBED_S: Final = 6.0
 CUT: Final = LinkShape(cut=True)
 LOSSY: Final = LinkShape(loss=0.2)
@@ -274,7 +273,6 @@ NETWORK_CASES: Final = (
 
 
 # Rows: many viewers, some of them faulty, while a driver drives; and the timing of the driver process. Shell.
-
 
 LOADED_S: Final = 6.0
 KEPT_MPS: Final = 0.4
@@ -362,7 +360,6 @@ CLIENT_CASES: Final = (
 
 
 # Rows: the camera fails; STOP in every situation; wall clocks that are wrong. Shell.
-
 
 BAD_S: Final = 3.0
 STOP_ZERO_MS: Final = 700.0
@@ -532,7 +529,6 @@ OPERATOR_CASES: Final = (
 
 
 # All rows of the fault bench, and the choice among them. Shell (what the rows inject is).
-
 
 CASES: Final[tuple[FaultCase, ...]] = (
     *PROCESS_CASES, *NETWORK_CASES, *COMMAND_CASES, *CLIENT_CASES, *OPERATOR_CASES, *STOP_CASES,
