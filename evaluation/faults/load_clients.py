@@ -180,6 +180,25 @@ def open_sessions(endpoint: str, ledger: EventLog) -> None:
     threading.Event().wait()
 
 
+HUGE_BYTES: Final = 1_000_000
+
+
+def publish_much(endpoint: str, ledger: EventLog) -> None:
+    """Publish small twists as often as possible, up to 10 kHz, and payloads of 1 MB; all attachments are malformed."""
+    from sightline.protocol.transports.zenoh.session import open_session
+
+    with open_session((), [endpoint], 5.0) as session:
+        print(READY, flush=True)
+        started_s, count = time.monotonic(), 0
+        while True:
+            session.put("sightline/r1/twist/vision", b"0.5|0.0", attachment=b"{" * 100)
+            count += 1
+            if count % 1000 == 0:
+                session.put("sightline/r1/twist/vision", bytes(HUGE_BYTES), attachment=b"{" * 100)
+                ledger.note(INJECTED)
+            time.sleep(max(0.0, started_s + count / 10_000 - time.monotonic()))
+
+
 # Invalid STOP datagrams, as fast as this process can send.
 
 
@@ -226,6 +245,7 @@ _KINDS: Final[dict[str, Callable[[str, EventLog], None]]] = {
     "connect_500": partial(connect_often, rate_hz=MANY_HZ),
     "half_open": leave_half_open,
     "sessions": open_sessions,
+    "publisher": publish_much,
     "garbage": send_garbage,
     "replayed": replay_stops,
 }

@@ -1,6 +1,10 @@
 """Rows: a new operator sends STOP while a flood occupies the ports of the robot or of its router. Shell."""
 
+import resource
+import subprocess
+import sys
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
@@ -8,6 +12,7 @@ from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, REQUESTED,
 from sightline.evaluation.faults.fixture import RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import FEW_HZ, HALF_OPEN, MANY_HZ, READY, SESSIONS, STOPS
 from sightline.evaluation.faults.runner import FaultCase, Injected
+from sightline.evaluation.processes import children_of
 from sightline.protocol.clock import monotonic_us
 
 AT_WORK_S: Final = 3.0
@@ -89,6 +94,35 @@ def _replay(rig: RobotFixture) -> Injected:
     return Injected(len(rig.noted("crowd", INJECTED)), at_us, checks=checks)
 
 
+BUSY: Final = 8
+
+
+def _busy(rig: RobotFixture) -> Injected:
+    """Send STOP while more processes than processors want all of them."""
+    _prepare_operator(rig)
+    busy = [subprocess.Popen([sys.executable, "-P", "-c", "while True: pass"]) for _ in range(BUSY)]
+    try:
+        rig.watch(AT_WORK_S)
+        at_us, checks = _new_operator(rig)
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    return Injected(BUSY, at_us, checks=checks)
+
+
+def _no_descriptors(rig: RobotFixture) -> Injected:
+    """Send STOP while no process of the robot may open a file or a socket."""
+    _prepare_operator(rig)
+    driver = rig.processes.pid("robot")
+    for pid in (driver, *children_of(driver)):
+        held = max(int(link.name) for link in Path(f"/proc/{pid}/fd").iterdir()) + 1
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, (held, held))
+    # At once: the camera of the bench opens a file for each image, so that the robot would soon stop by itself.
+    at_us, checks = _new_operator(rig)
+    return Injected(1, at_us, checks=checks)
+
+
 _FLOODS: Final = {
     "tls25": ("connect_25", f"{FEW_HZ} connections a second without keys", True),
     "tls_half": ("half_open", f"{HALF_OPEN} half-open connections without keys", True),
@@ -118,6 +152,12 @@ def _flood_case(name: str, *, routed: bool = False, after_s: float | None = None
 STOP_CASES: Final = (
     *(_flood_case(name, routed=routed) for routed in (False, True) for name in _FLOODS),
     *(_flood_case("tls_half", after_s=after_s) for after_s in AFTER_S),
+    FaultCase("stop.busy", f"STOP by a new operator: {BUSY} busy processes beside it", _busy, Setup(), blind=True,
+              also=_DEMANDED, alone=True),
+    FaultCase("stop.no_descriptors", "STOP by a new operator: the robot has no file descriptor left", _no_descriptors,
+              Setup(), blind=True, also=_DEMANDED),
+    FaultCase("stop.publisher", "STOP by a new operator: twists at 10 kHz and of 1 MB, with malformed attachments",
+              partial(_flood, kind="publisher"), Setup(), blind=True, also=_DEMANDED, alone=True),
     FaultCase(
         "stop.garbage", "STOP port: datagrams of 0 to 2000 bytes and for another robot, as fast as possible; then STOP",
         _garbage, Setup(), blind=True, also=f"no effect but a count; {_DEMANDED}", alone=True,
