@@ -19,6 +19,7 @@ _GATE = (
     "tests/robot_side/safety/test_gate_step.py",
     "tests/robot_side/safety/test_gate_requests.py",
     "tests/robot_side/safety/test_gate_lease.py",
+    "tests/robot_side/safety/test_gate_proof.py",
 )
 _SAFETY = sorted(path.stem for path in Path("robot_side/safety").glob("[!_]*.py"))
 TABLES = {

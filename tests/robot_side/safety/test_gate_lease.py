@@ -173,3 +173,13 @@ def test_a_guest_with_a_header_is_a_guest(guests, reason):
     if not guests:
         return
     assert gate.holder(0) == Holder(source="guest", session="0000eeee")
+
+
+def test_replayed_twist_is_rejected_after_any_number_of_rejected_sessions():
+    rig = Rig().armed().drive(60)
+    sent = rig.header()
+    assert rig.offer(header=sent).accepted
+    for number in range(200):
+        rejected = rig.offer(header=rig.header(session=f"{number:08x}", seq=1))
+        assert rejected.reason is RejectReason.NOT_HOLDER
+    assert rig.offer(header=sent).reason is RejectReason.OUT_OF_ORDER

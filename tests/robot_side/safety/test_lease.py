@@ -1,8 +1,12 @@
 """Every number of the lease and the ranks of those who may hold it: at it, before, after."""
 
+from random import Random
+
 import pytest
 
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import Holder
+from sightline.protocol.proof import NO_PROOF, Proof, ProofChain
 from sightline.robot_side.safety.lease import HUMANS, RANKS, Lease
 
 ROBOT, OTHER = "0000aaaa", "0000cccc"
@@ -67,3 +71,44 @@ def test_taking_again_renews():
 )  # fmt: skip
 def test_holder_and_higher_rank_may_take_the_lease(holder, who, may):
     assert held_by(holder).may_take(who, 1_200) == may
+
+
+# --- proof of identity -------------------------------------------------------------------------------------------
+
+
+def proven(seed=1):
+    """A lease that the vision service holds until 1000 us, its chain, and the proof that it committed with."""
+    proofs, lease = ProofChain(Random(seed).randbytes), Lease(life_us=1_000)
+    first = proofs.next()
+    lease.take(VISION, 0, first)
+    return lease, proofs, first
+
+
+def test_message_of_the_holder_must_continue_its_proof():
+    lease, proofs, first = proven()
+    lease.check_proof(VISION, proofs.next(), 999)
+    for forged in (first, NO_PROOF, Proof("ab" * 16)):
+        with pytest.raises(WireError) as caught:
+            lease.check_proof(VISION, forged, 999)
+        assert caught.value.reason is RejectReason.NOT_PROVEN
+        assert caught.value.detail == "its proof does not continue that of the vision that drives"
+
+
+def test_no_proof_is_checked_of_another_driver_after_the_lease_or_without_commitment():
+    lease, _, _ = proven()
+    lease.check_proof(HUMAN, NO_PROOF, 999)
+    lease.check_proof(VISION, NO_PROOF, 1_000)
+    lease.drop()
+    assert lease.proof == NO_PROOF
+    lease.take(VISION, 0)
+    lease.check_proof(VISION, NO_PROOF, 1)
+
+
+def test_request_uses_up_the_proof_of_the_holder_alone():
+    lease, proofs, first = proven()
+    lease.advance(HUMAN, NO_PROOF, 999)
+    lease.advance(VISION, NO_PROOF, 1_000)
+    assert lease.proof == first
+    second = proofs.next()
+    lease.advance(VISION, second, 999)
+    assert lease.proof == second and lease.expires_us == 1_000
