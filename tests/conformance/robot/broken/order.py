@@ -222,7 +222,7 @@ def acquires_without_echo(robot):
 def guests_are_many(robot):
     def bend(_header, payload):
         if (payload.get("holder") or {}).get("source") == "guest":
-            payload["holder"]["session"] = "0000beef"
+            payload["holder"]["digest"] = "0000beef"
 
     bend_out(robot, "status", bend)
 

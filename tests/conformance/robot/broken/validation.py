@@ -50,7 +50,7 @@ def newest(robot):
 
 @breaks("R-HEAD-01")
 def refuses_unknown_fields(robot):
-    known = {"v", "source", "session", "seq", "echo", "compute_us", "scan", "mission"}
+    known = {"v", "source", "session", "seq", "echo", "compute_us", "scan", "mission", "proof", "next_proof"}
     refuses(robot, lambda fields, message: set(fields) - known)
 
 
