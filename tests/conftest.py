@@ -46,9 +46,16 @@ def pytest_xdist_auto_num_workers(config):
     return (1 if config.option.markexpr.startswith("slow") else 3) * len(os.sched_getaffinity(0))
 
 
-@pytest.hookimpl(tryfirst=True)
+@pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_collection_modifyitems(session, items):
-    """Mark as slow what `second_tier.txt` lists: single cases of a parametrized test, and tests near the bound."""
+    """Mark as slow what `second_tier.txt` lists, before tests are deselected; then order the rest."""
+    _mark_second_tier(session, items)
+    yield
+    _spread_waits(items, session.config)
+
+
+def _mark_second_tier(session, items):
+    """It lists single cases of a parametrized test, and tests near the bound."""
     slow = set(SECOND_TIER.read_text(encoding="utf-8").splitlines())
     names = {item.nodeid for item in items}
     for item in items:
@@ -58,6 +65,21 @@ def pytest_collection_modifyitems(session, items):
     unknown = sorted(name for name in slow - names if name.partition("::")[0] in files)
     if unknown and not any("::" in arg for arg in session.config.args):
         raise pytest.UsageError(f"{SECOND_TIER.name} lists tests that do not exist: {', '.join(unknown)}")
+
+
+def _spread_waits(items, config):
+    """Spread the tests that wait for seconds over the first halves of the workers' shares.
+
+    So none is the last one, and the others compute meanwhile.
+    """
+    workers = getattr(config, "workerinput", {}).get("workercount", 1)
+    waits = [item for item in items if item.get_closest_marker("waits")]
+    others = [item for item in items if not item.get_closest_marker("waits")]
+    share = len(others) // workers
+    places = [(n % workers) * share + share * (n + 1) // (2 * len(waits) + 2) for n in range(len(waits))]
+    for place, item in sorted(zip(places, waits, strict=True), key=lambda one: one[0], reverse=True):
+        others.insert(place, item)
+    items[:] = others
 
 
 @pytest.fixture(autouse=True)

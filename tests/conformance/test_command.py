@@ -143,6 +143,7 @@ def test_a_robot_behind_keys_conforms(capsys, tmp_path, scheme):
 # --- mistakes --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.waits
 def test_missing_robot_exits_with_4(capsys):
     code, out, err = run(capsys, "robot", free_endpoint("ws://"), "--only", "R-CAUS-02")
     assert (code, out) == (4, "")

@@ -37,6 +37,7 @@ def test_robot_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
         assert frames[-1].pose[0] > 0.05 and frames[-1].latency_us < 100_000
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_the_wheels_stop_when_the_network_process_dies_or_hangs(tmp_path, number):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):

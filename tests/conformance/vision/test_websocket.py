@@ -37,6 +37,7 @@ def started_before(endpoint):
     running.join(2)
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize("vision", [our_vision, plain_vision], ids=["ours", "plain"])
 def test_a_good_vision_passes_them_all(vision):
     with played_robot(vision) as (bench, _prepare):

@@ -108,6 +108,7 @@ def test_boxes_reach_subscribers_and_name_a_frame_of_the_robot(tmp_path):
             assert until(lambda: decode(DetectionsHeader, heard.take(2.0).header).seq > header.seq)
 
 
+@pytest.mark.waits
 def test_programs_without_a_robot_print_an_error():
     with (
         program("detector_service.py", free_endpoint()) as detector,

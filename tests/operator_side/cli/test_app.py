@@ -262,6 +262,7 @@ def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
     assert result.returncode == 0, result.stderr
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize("arguments", [["stop"], ["status"], ["teleop"]], ids=" ".join)
 def test_operator_commands_import_their_own_group_and_no_image_library(arguments):
     script = (

@@ -103,6 +103,7 @@ def test_invalid_requests_do_not_end_the_server(port):
         assert answer.status == 200
 
 
+@pytest.mark.waits
 def test_excess_connections_are_closed_and_places_return(port):
     held = [socket.create_connection(("127.0.0.1", port), 5) for _ in range(MAX_CONNECTIONS)]
     assert until(lambda: _is_closed(port), 5.0)

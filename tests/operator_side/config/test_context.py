@@ -203,6 +203,7 @@ def test_address_that_does_not_answer_is_one_line_and_is_not_saved(capsys, home,
     assert not (home / "sightline/context.toml").exists()
 
 
+@pytest.mark.waits
 def test_address_of_a_robot_is_saved_and_used(capsys, home):
     endpoint = free_endpoint()
     with open_link("r7", listen=[endpoint]) as robot:

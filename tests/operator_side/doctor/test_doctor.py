@@ -171,6 +171,7 @@ def test_closed_port_and_unknown_host_have_different_fixes(capsys, monkeypatch):
     assert not refused["ok"] and not unknown["ok"]
 
 
+@pytest.mark.waits
 def test_other_program_on_the_port_is_reported(capsys):
     with socket.create_server(("127.0.0.1", free_port())) as server:
         port = server.getsockname()[1]

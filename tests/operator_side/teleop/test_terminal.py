@@ -233,6 +233,7 @@ def test_teleop_without_a_terminal_is_one_line(capsys):
     )
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize(("arguments", "code", "expected"), [
     (("teleop", "r1", "--connect", "tcp/127.0.0.1:1"), 4, "no answer from tcp/127.0.0.1:1"),
     (("teleop", "a/b"), 2, "'a/b'"), (("teleop", "--linear", "9"), 2, "--linear"),

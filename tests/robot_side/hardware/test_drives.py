@@ -76,6 +76,7 @@ class ClosesOnce(Broken):
         self.closed = True
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize("broken", [Slow, Forgets, Crossed, Coasts, Ahead, ClosesOnce])
 def test_drive_contract_finds_each_broken_promise(broken):
     with pytest.raises(AssertionError):

@@ -114,6 +114,7 @@ def shown():
         yield show
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize("eyes", [_by_http, _by_zenoh])
 def test_unanswered_robot_does_not_delay_others(shown, eyes):
     robots, shares = shown(eyes, "")
@@ -122,6 +123,7 @@ def test_unanswered_robot_does_not_delay_others(shown, eyes):
     assert shares.pop(MUTE) == 0 and min(shares.values()) > 0.7, shares
 
 
+@pytest.mark.waits
 @pytest.mark.parametrize("eyes", [_by_http, _by_zenoh])
 def test_with_a_fallback_every_robot_is_steered(shown, eyes):
     _, shares = shown(eyes, "hsv")

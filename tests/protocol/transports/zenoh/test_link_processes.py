@@ -104,6 +104,7 @@ def test_a_client_reconnects_after_being_away_longer_than_its_timeout(start):
         assert frames.take(4) is not None
 
 
+@pytest.mark.waits
 @pytest.mark.own_process
 def test_a_stopped_peer_costs_neither_time_nor_memory_nor_others(start):
     endpoint = free_endpoint()

@@ -286,8 +286,8 @@ def test_a_plain_file_is_not_a_camera(tmp_path):
 
 
 def test_a_device_that_is_not_a_camera_does_not_open():
-    with pytest.raises(HardwareError, match=r"/dev/full does not open"):
-        CAMERAS.build(PluginChoice(kind="v4l2", options={"device": "/dev/full"}))
+    with pytest.raises(HardwareError, match=r"/dev/random does not open"):
+        CAMERAS.build(PluginChoice(kind="v4l2", options={"device": "/dev/random"}))
 
 
 def test_no_permission_names_the_group_and_the_command():

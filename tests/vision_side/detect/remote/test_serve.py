@@ -32,6 +32,7 @@ def test_invalid_service_is_one_line_and_exit_code_2(capsys, arguments, what):
     assert what in error and error.count("\n") == 1 and error.startswith("error: ")
 
 
+@pytest.mark.waits
 def test_endpoint_without_a_peer_exits_with_4(capsys):
     assert cli.run(["detector", "--serve", "hsv", "--connect", free_endpoint()]) == 4
     assert capsys.readouterr().err.count("\n") == 1
