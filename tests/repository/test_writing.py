@@ -70,8 +70,8 @@ def texts(path: Path) -> Iterator[tuple[str, int, str]]:
     """Yield (kind, line, text) of a module: docstrings, names of tests, strings with a space, and comments."""
     source = path.read_text(encoding="utf-8")
     seen: set[int] = set()
-    tree = ast.parse(source)
-    for node in ast.walk(tree):
+    nodes = list(ast.walk(ast.parse(source)))
+    for node in nodes:
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and node.body:
             first = node.body[0]
             doc = first.value if isinstance(first, ast.Expr) else None
@@ -85,7 +85,7 @@ def texts(path: Path) -> Iterator[tuple[str, int, str]]:
             yield "string", node.lineno, "".join(
                 str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values
             )
-    for node in ast.walk(tree):
+    for node in nodes:
         if not isinstance(node, ast.Constant) or id(node) in seen:
             continue
         if isinstance(node.value, str) and " " in node.value:
@@ -144,9 +144,11 @@ def unknown_arguments(tree: ast.Module) -> Iterator[str]:
             continue
         _, _, section = ("\n" + (ast.get_docstring(node) or "")).partition("\nArgs:\n")
         entries = re.findall(r"^    (\w+):", re.split(r"^\S", section, maxsplit=1, flags=re.MULTILINE)[0], re.MULTILINE)
-        known = {one.arg for one in ast.walk(node) if isinstance(one, ast.arg)}
-        known |= {one.target.id for one in ast.walk(node)
-                  if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)}
+        if not entries:
+            continue
+        parts = list(ast.walk(node))
+        known = {one.arg for one in parts if isinstance(one, ast.arg)}
+        known |= {one.target.id for one in parts if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)}
         yield from (f"{node.lineno} {node.name}: {name}" for name in entries if name not in known)
 
 
