@@ -1,6 +1,7 @@
 /** @file The gate, at the boundaries of every rule in the order of judging; times are made up. */
 
 import assert from "node:assert/strict";
+import { createHash } from "node:crypto";
 import test from "node:test";
 import { WireError } from "./codec.mjs";
 import { Gate } from "./gate.mjs";
@@ -267,8 +268,7 @@ test("the ramp is per elapsed time and never overshoots", () => {
   assert.equal(seldom.step(FORWARD, 900_000).linear_mps, 0.4);
 });
 
-test("proofs: SHA-256 as Node's, a chain that is renewed, and nothing that was revealed continues it", async () => {
-  const { createHash } = await import("node:crypto");
+test("proofs: SHA-256 as Node's, a chain that is renewed, and nothing that was revealed continues it", () => {
   for (const text of ["", "abc", "x".repeat(55)]) {
     assert.equal(Buffer.from(sha256(Buffer.from(text))).toString("hex"), createHash("sha256").update(text).digest("hex"));
   }

@@ -19,7 +19,7 @@ MAX_RSS_KIB = 15_000
 FOREIGN = """
 import sys
 import sightline.robot_side.guardian.stop_receiver, sightline.robot_side.guardian.stop_forwarder
-names = {name.partition(".")[0] for name in sys.modules} - sys.stdlib_module_names - {"__main__"}
+names = {name.partition(".")[0] for name in sys.modules} - sys.stdlib_module_names - {"__main__", "_distutils_hack"}
 print(*sorted(name for name in names if not name.startswith("__editable__")))
 """
 
