@@ -59,7 +59,8 @@ def measure_light_robot(seconds: float) -> LightRobot:
         link = ending.enter_context(open_zenoh("r1", connect=[ENDPOINT], role="operator"))
         ending.enter_context(_service(sys.executable, ["vision", "--connect", ENDPOINT], folder, "target seen"))
         fps, driving = _watch(link.latest(STATUS), seconds)
-        network = int(Path(f"/proc/{robot.pid}/task/{robot.pid}/children").read_text())
+        children = Path(f"/proc/{robot.pid}/task/{robot.pid}/children").read_text().split()
+        network, = (int(pid) for pid in children if "robot_side.network" in Path(f"/proc/{pid}/cmdline").read_text())
         size = sum(path.stat().st_size for path in (folder / "venv").rglob("*") if path.is_file())
         return LightRobot(_heavy(python), size / 1e6, fps, driving, _high_water_mb(network), _high_water_mb(robot.pid))
 
