@@ -32,6 +32,7 @@ from sightline.robot_side.safety.validation import (
     Decision,
     FreshnessRecord,
     IssuedRecord,
+    RepeatRecord,
     SequenceRecord,
 )
 
@@ -86,6 +87,7 @@ class SafetyGate:
         self.reason = "STOP was set before the restart" if stopped else "not armed"
         self.applied = STILL
         self._sequence = SequenceRecord()
+        self._repeats = RepeatRecord()
         self._lease = Lease(config.lease_ms * 1000)
         self._ramp = Ramp(config)
         self._guard = guard
@@ -145,7 +147,7 @@ class SafetyGate:
         self._sequence.promote((who.source, who.session))
         if not is_armed(self.state):
             raise WireError(RejectReason.DISARMED, self.reason)
-        self._accept(source, twist, now_us, age_us)
+        self._accept(source, twist, now_us, age_us if header else None)
         return age_us
 
     def _identify(self, source: str, header: AnswerHeader | None, now_us: int) -> tuple[Holder, int]:
@@ -177,7 +179,7 @@ class SafetyGate:
             raise WireError(RejectReason.NOT_PROVEN, "a robot with keys needs a proof in each command")
         self._lease.check_proof(who, _proof_of(header), now_us)
 
-    def _accept(self, source: str, twist: Twist, now_us: int, age_us: int) -> None:
+    def _accept(self, source: str, twist: Twist, now_us: int, age_us: int | None) -> None:
         config, guest = self.config, source == "guest"
         limited = clamp_twist(
             twist,
@@ -187,8 +189,10 @@ class SafetyGate:
         if limited != twist:
             self.counters[CLAMPED] += 1
         life_ms = min(config.silence_ms, config.guest_life_ms) if guest else config.silence_ms
-        # A guest cites no frame, so its age counts from arrival and its life is shorter.
-        self._command = AcceptedCommand(limited, now_us - age_us, now_us, life_ms * 1000)
+        # Without a header the age of the image is unknown: the command counts from its arrival, and may not repeat long.
+        if age_us is None:
+            self._repeats.add(twist, now_us)
+        self._command = AcceptedCommand(limited, now_us - (age_us or 0), now_us, life_ms * 1000, age_us is not None)
         if not guest:
             self.latency_us = age_us
 
@@ -208,6 +212,7 @@ class SafetyGate:
         goal = self._goal(now_us) if is_armed(self.state) else STILL
         elapsed_us = 0 if self._last_step_us is None else max(0, now_us - self._last_step_us)
         self._last_step_us = now_us
+        self._repeats.drive(self.applied.linear_mps, elapsed_us)
         twist = self._ramp.step(goal, elapsed_us)
         # The guard comes last and cuts at once: a ramp toward an obstacle would still move the robot closer.
         if self._guard is not None:
@@ -248,11 +253,18 @@ class SafetyGate:
             return
         if now_us - command.arrival_us > command.life_us:
             yield Cause(0.0, f"no accepted command for more than {command.life_us // 1000} ms")
+        if self._repeats_too_long(command, now_us):
+            yield Cause(0.0, f"the same command without a frame for more than {config.guest_unchanged_ms} ms or "
+                             f"{config.guest_unchanged_m:g} m")
         factor = age_factor(config, now_us - command.echo_us)
         if factor == 0.0:
             yield Cause(factor, f"the frame behind the command is {config.zero_speed_age_ms} ms old")
         else:
             yield Cause(factor, "the frame is aging; slower" if factor < 1.0 else "driving")
+
+    def _repeats_too_long(self, command: AcceptedCommand, now_us: int) -> bool:
+        max_us, max_m = self.config.guest_unchanged_ms * 1000, self.config.guest_unchanged_m
+        return not command.cites_frame and command.twist != STILL and self._repeats.is_over(max_us, max_m, now_us)
 
     def _hold(self, reason: str, now_us: int) -> None:
         if self.state is not State.HOLD:
@@ -337,6 +349,7 @@ class SafetyGate:
         if missing:
             raise WireError(RejectReason.NOT_ALLOWED, missing)
         self.arms_itself = self.config.auto_arm
+        self._repeats = RepeatRecord()
         self._begin(f"armed by {who.source}", now_us)
         return "armed"
 
@@ -370,8 +383,9 @@ class SafetyGate:
         return self._lease.live_holder(now_us)
 
     def frame_age_us(self, now_us: int) -> int | None:
-        """Return the age in us of the frame behind the current command, or None without a command."""
-        return None if self._command is None else max(0, now_us - self._command.echo_us)
+        """Return the age in us of the frame behind the current command, or None if the command cites no frame."""
+        command = self._command
+        return max(0, now_us - command.echo_us) if command is not None and command.cites_frame else None
 
     def _reject_beside_human(self, who: Holder, now_us: int) -> None:
         # While a human drives, no other operator may arm or reset.

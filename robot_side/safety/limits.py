@@ -54,6 +54,13 @@ class SafetyConfig(BatteryLimits):
     guest_life_ms: Millis = Field(default=250, description="a guest's command ends this long after its arrival")
     guest_max_linear_mps: float = Field(default=0.2, gt=0, le=3.0, description="forward speed of a guest, at most")
     guest_max_angular_rad_s: float = Field(default=1.0, gt=0, le=10.0, description="turn rate of a guest, at most")
+    guest_unchanged_ms: Millis = Field(
+        default=2_000, description="a guest that repeats one command for this long holds: it names no image, so that "
+        "only a changed command shows a new one"
+    )
+    guest_unchanged_m: float = Field(
+        default=0.25, gt=0, le=5.0, description="the same after this distance, equal to that of a stop from 0.5 m/s"
+    )
 
     @model_validator(mode="after")
     def _stops_in_time(self) -> Self:

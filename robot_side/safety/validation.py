@@ -44,12 +44,14 @@ class AcceptedCommand:
         echo_us: capture time of the cited frame; for a guest the arrival time.
         arrival_us: arrival time.
         life_us: time after arrival for which the command is valid.
+        cites_frame: False for a command without a header, whose image has an unknown age.
     """
 
     twist: Twist
     echo_us: int
     arrival_us: int
     life_us: int
+    cites_frame: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,6 +174,28 @@ class FreshnessRecord:
     def shown_since_us(self, t_us: int) -> int:
         """Return the time at which the image of the frame captured at `t_us` first appeared."""
         return min(t_us, self._changed_us) if self._fingerprints else t_us
+
+
+class RepeatRecord:
+    """Stores since when, and how far, the robot drives by one unchanged command without a header."""
+
+    def __init__(self) -> None:
+        self._twist: Twist | None = None
+        self._since_us = 0
+        self._driven_m = 0.0
+
+    def add(self, twist: Twist, now_us: int) -> None:
+        """Record an accepted command, as it arrived. Only a different one starts again."""
+        if twist != self._twist:
+            self._twist, self._since_us, self._driven_m = twist, now_us, 0.0
+
+    def drive(self, linear_mps: float, elapsed_us: int) -> None:
+        """Add the distance of one step."""
+        self._driven_m += abs(linear_mps) * elapsed_us / 1e6
+
+    def is_over(self, max_us: int, max_m: float, now_us: int) -> bool:
+        """Return True if the command has been the same for more than `max_us` or `max_m`."""
+        return now_us - self._since_us > max_us or self._driven_m > max_m
 
 
 class SequenceRecord:

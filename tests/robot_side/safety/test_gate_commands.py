@@ -235,4 +235,87 @@ def test_the_age_of_the_frame_is_never_negative():
 
 def test_a_guest_has_no_latency():
     rig = guest_driving(40)
-    assert rig.gate.latency_us is None and rig.gate.frame_age_us(rig.now_us + 7) == 20_007
+    assert rig.gate.latency_us is None
+
+
+def test_without_a_header_no_frame_age_is_shown():
+    rig = guest_driving(40)
+    assert rig.gate.frame_age_us(rig.now_us) is None
+    rig.offer(source="guest", session=OTHER)
+    rig.step(1_100)
+    assert rig.offer(source="guest", session=OTHER).accepted
+    assert rig.gate.frame_age_us(rig.now_us + 7) == 7, "with a header its echo proves the age"
+
+
+def repeat(rig, ms, linear, angular=0.0):
+    """One command without a header at each tick; the state after each."""
+    states = []
+    for _ in range(ms // 20):
+        guest(rig, linear, angular)
+        states.append(rig.step().state)
+    return states
+
+
+def driven_m(rig):
+    return sum(abs(twist.linear_mps) * 0.02 for _, twist in rig.applied)
+
+
+@pytest.mark.parametrize(("linear", "config", "most_m"), [
+    (9.0, {}, 0.275), (-9.0, {}, 0.275), (9.0, {"guest_unchanged_m": 0.1}, 0.125),
+    (0.05, {}, 0.105), (0.05, {"guest_unchanged_ms": 1_000}, 0.055),
+])
+def test_one_repeated_command_without_a_header_drives_a_bounded_distance(linear, config, most_m):
+    rig = guest_driving(20, linear=linear, **config)
+    states = repeat(rig, 5_000, linear)
+    assert states[0] is State.ACTIVE and states[-1] is State.HOLD
+    assert rig.gate.applied == STILL
+    assert most_m - 0.03 < driven_m(rig) <= most_m
+    assert "the same command without a frame" in rig.gate.reason
+
+
+def test_one_repeated_turn_without_a_header_takes_a_bounded_time():
+    rig = guest_driving(20, 0.0, 0.5)
+    assert set(repeat(rig, 1_980, 0.0, 0.5)) == {State.ACTIVE}, "up to 2000 ms after its arrival"
+    guest(rig, 0.0, 0.5)
+    rig.now_us += 1
+    assert rig.gate.step(rig.now_us).state is State.HOLD
+
+
+def test_a_changed_command_drives_on_and_counts_as_it_was_sent():
+    rig = guest_driving(20, linear=9.0)
+    for step in range(200):
+        assert guest(rig, 9.0 + step).accepted
+        assert rig.step().state is State.ACTIVE
+    assert driven_m(rig) > 0.7
+    repeat(rig, 2_000, 9.0)
+    assert rig.gate.state is State.HOLD
+    guest(rig, 9.1)
+    assert rig.step().state is State.ACTIVE
+
+
+def test_standing_still_may_repeat():
+    assert set(repeat(guest_driving(20), 4_000, 0.0)) == {State.ACTIVE}
+
+
+def test_the_distance_starts_again_with_each_command():
+    rig = guest_driving(20)
+    repeat(rig, 1_000, 9.0)
+    assert set(repeat(rig, 1_000, 8.0)) == {State.ACTIVE}
+
+
+def test_a_header_exempts_from_the_bound():
+    rig = driving(A)
+    for _ in range(200):
+        rig.offer()
+        assert rig.step().state is State.ACTIVE
+    assert driven_m(rig) > 1
+
+
+def test_arming_by_an_operator_starts_the_bound_again():
+    rig = guest_driving(20)
+    repeat(rig, 5_000, 9.0)
+    rig.request(Verb.DISARM)
+    repeat(rig, 400, 9.0)
+    rig.request(Verb.ARM)
+    assert rig.gate.state is State.HOLD
+    assert repeat(rig, 100, 9.0)[-1] is State.ACTIVE

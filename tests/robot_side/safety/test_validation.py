@@ -3,8 +3,14 @@
 import pytest
 
 from sightline.protocol.errors import RejectReason, WireError
-from sightline.protocol.messages import AnswerHeader, Echo, Holder
-from sightline.robot_side.safety.validation import CommandResult, FreshnessRecord, IssuedRecord, SequenceRecord
+from sightline.protocol.messages import AnswerHeader, Echo, Holder, Twist
+from sightline.robot_side.safety.validation import (
+    CommandResult,
+    FreshnessRecord,
+    IssuedRecord,
+    RepeatRecord,
+    SequenceRecord,
+)
 
 ROBOT, OTHER = "0000aaaa", "0000cccc"
 VISION, OTHER_VISION = Holder(source="vision", session="0000bbbb"), Holder(source="vision", session="0000cccc")
@@ -311,3 +317,25 @@ def test_promoted_sender_counts_on():
     record.promote(("vision", "0000bbbb"))
     refusal(record.check, header(6), 0)
     record.check(header(0, "0000dddd"), 0)
+
+def test_the_longest_silent_sender_is_forgotten_first():
+    record = SequenceRecord()
+    for index in range(64):
+        record.check(header(5, f"{index:08x}"))
+    record.check(header(6, "00000000"))
+    record.check(header(5, "0000ffff"))
+    refusal(record.check, header(6, "00000000"))
+    record.check(header(5, "00000001"))
+
+
+def test_a_repeated_command_counts_from_the_first_until_it_changes():
+    record, ahead = RepeatRecord(), Twist(linear_mps=0.2, angular_rad_s=0.0)
+    record.add(ahead, 1_000)
+    record.add(ahead, 3_000)
+    assert [record.is_over(500, 1.0, now_us) for now_us in (1_499, 1_500, 1_501)] == [False, False, True]
+    record.drive(-0.5, 1_000_000)
+    record.drive(0.25, 2_000_000)
+    assert [record.is_over(10_000, most_m, 3_000) for most_m in (0.99, 1.0)] == [True, False]
+    record.add(Twist(linear_mps=0.2, angular_rad_s=0.1), 5_000)
+    assert not record.is_over(0, 0.0, 5_000)
+    assert record.is_over(0, 0.0, 5_001)
