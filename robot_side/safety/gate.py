@@ -189,7 +189,7 @@ class SafetyGate:
         if limited != twist:
             self.counters[CLAMPED] += 1
         life_ms = min(config.silence_ms, config.guest_life_ms) if guest else config.silence_ms
-        # Without a header the age of the image is unknown: the command counts from its arrival, and may not repeat long.
+        # Without a header the age of the image is unknown: the command counts from its arrival, and repeats briefly.
         if age_us is None:
             self._repeats.add(twist, now_us)
         self._command = AcceptedCommand(limited, now_us - (age_us or 0), now_us, life_ms * 1000, age_us is not None)
@@ -349,6 +349,7 @@ class SafetyGate:
         if missing:
             raise WireError(RejectReason.NOT_ALLOWED, missing)
         self.arms_itself = self.config.auto_arm
+        # An operator who arms has looked at the robot. `auto_arm` has not.
         self._repeats = RepeatRecord()
         self._begin(f"armed by {who.source}", now_us)
         return "armed"

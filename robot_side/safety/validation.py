@@ -186,6 +186,7 @@ class RepeatRecord:
 
     def add(self, twist: Twist, now_us: int) -> None:
         """Record an accepted command, as it arrived. Only a different one starts again."""
+        # A pause does not start it again: a client that sends in bursts may repeat one old image too.
         if twist != self._twist:
             self._twist, self._since_us, self._driven_m = twist, now_us, 0.0
 

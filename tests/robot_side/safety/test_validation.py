@@ -318,15 +318,6 @@ def test_promoted_sender_counts_on():
     refusal(record.check, header(6), 0)
     record.check(header(0, "0000dddd"), 0)
 
-def test_the_longest_silent_sender_is_forgotten_first():
-    record = SequenceRecord()
-    for index in range(64):
-        record.check(header(5, f"{index:08x}"))
-    record.check(header(6, "00000000"))
-    record.check(header(5, "0000ffff"))
-    refusal(record.check, header(6, "00000000"))
-    record.check(header(5, "00000001"))
-
 
 def test_a_repeated_command_counts_from_the_first_until_it_changes():
     record, ahead = RepeatRecord(), Twist(linear_mps=0.2, angular_rad_s=0.0)
