@@ -15,6 +15,7 @@ NOT_APPLICABLE = (
     "the kit has no way to send on this transport",
     "this robot publishes no scans",
     "no port of the legacy protocol was named",
+    "the program does not know questions of kind stop",
 )
 
 
