@@ -1,10 +1,10 @@
 """A legacy robot in any of several WebSocket libraries: base64 images out, text in, motors that latch, no watchdog.
 
-    python legacy_robot.py LIBRARY FORMAT PORT PICTURES MOTORS.csv
+    python legacy_robot.py LIBRARY FORMAT PORT PICTURES MOTORS.csv [PAGE]
 
 FORMAT is `bar`, `dashed` (which reads the axes swapped, as the article's robot did) or `boxes`. As there, text that the
 format does not contain raises an error, and the library then closes the connection as it always does. It writes
-`t_us,linear,angular` for each command.
+`t_us,linear,angular` for each command. With the how-to PAGE of legacy robots it runs the watchdog of that page.
 """
 
 import asyncio
@@ -21,15 +21,19 @@ FPS = 20
 
 
 class Motors:
-    """The last command, for ever."""
+    """The last command, for ever, unless there is a watchdog."""
 
-    def __init__(self, form, path):
+    def __init__(self, form, path, page=None):
+        self._feed = watchdog_of(page)(lambda: self._set(0.0, 0.0)) if page else lambda: None
         self._apply = {"bar": self._bar, "dashed": self._dashed, "boxes": self._boxes}[form]
         self._log = open(path, "a", buffering=1)  # noqa: PTH123, SIM115
 
     def on_text(self, text):
         """Apply one message."""
-        linear, angular = self._apply(text)
+        self._set(*self._apply(text))
+        self._feed()
+
+    def _set(self, linear, angular):
         self._log.write(f"{time.monotonic_ns() // 1000},{linear},{angular}\n")
 
     @staticmethod
@@ -52,6 +56,13 @@ class Motors:
                 left, right = float(x[1]), float(x[3])
                 widest = max(widest or (0, 0), (right - left, (left + right) / 2))
         return (0.3, 0.5 - widest[1]) if widest else (0.0, 0.0)
+
+
+def watchdog_of(page):
+    """Run the block of the page."""
+    names = {}
+    exec(Path(page).read_text("utf-8").partition("<!-- watchdog -->\n```python\n")[2].partition("```")[0], names)
+    return names["watchdog"]
 
 
 def texts_of(folder):
@@ -204,4 +215,4 @@ LIBRARIES = {one.__name__: one for one in (
     article, successor, websockets, uvicorn, websocket_server, aiohttp, tornado)}
 
 if __name__ == "__main__":
-    LIBRARIES[sys.argv[1]](Motors(sys.argv[2], sys.argv[5]), int(sys.argv[3]), texts_of(sys.argv[4]))
+    LIBRARIES[sys.argv[1]](Motors(sys.argv[2], *sys.argv[5:]), int(sys.argv[3]), texts_of(sys.argv[4]))

@@ -213,11 +213,11 @@ LIBRARIES = ("article", "websockets", "uvicorn")
 
 
 @contextmanager
-def driven_legacy_robot(folder: Path, pictures: Path, library: str, form: str):
+def driven_legacy_robot(folder: Path, pictures: Path, library: str, form: str, *watchdog: Path):
     """A robot in `library` that drives, the README's line, and the motor log. Its connection is the only option."""
     port, operator = free_port(), free_endpoint()
     motors = folder / "motors.csv"
-    robot = (STRANGERS / "legacy_robot.py", library, form, port, pictures, motors)
+    robot = (STRANGERS / "legacy_robot.py", library, form, port, pictures, motors, *watchdog)
     line = ("-P", "-m", "sightline.operator_side.cli.app", "vision", "--robot",
             f"ws-legacy://127.0.0.1:{port}{FORMATS[form]}", "--listen", operator)
     with running(*robot), running(*line) as vision:
@@ -250,3 +250,13 @@ def test_an_operator_stops_a_legacy_robot(tmp_path, pictures, verb, form):
         assert subprocess.run(command, check=False, timeout=20).returncode == 0
         assert is_at_rest(motors)
         assert vision.poll() is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("has_watchdog", [True, False])
+def test_only_the_watchdog_of_the_page_stops_a_legacy_robot_whose_vision_is_killed(tmp_path, pictures, has_watchdog):
+    page = [STRANGERS.parents[2] / "docs/how-to/legacy-robots.md"] if has_watchdog else []
+    with driven_legacy_robot(tmp_path, pictures, "article", "bar", *page) as (vision, _, motors):
+        vision.kill()
+        time.sleep(0.5)
+        assert is_at_rest(motors) is has_watchdog

@@ -326,7 +326,15 @@ def test_a_repeated_command_counts_from_the_first_until_it_changes():
     assert [record.is_over(500, 1.0, now_us) for now_us in (1_499, 1_500, 1_501)] == [False, False, True]
     record.drive(-0.5, 1_000_000)
     record.drive(0.25, 2_000_000)
-    assert [record.is_over(10_000, most_m, 3_000) for most_m in (0.99, 1.0)] == [True, False]
+    assert [record.is_over(10_000, most_m, 3_000) for most_m in (0.999, 1.0)] == [True, False]
     record.add(Twist(linear_mps=0.2, angular_rad_s=0.1), 5_000)
     assert not record.is_over(0, 0.0, 5_000)
     assert record.is_over(0, 0.0, 5_001)
+
+
+def test_before_the_first_command_without_a_header_time_and_distance_are_zero():
+    record = RepeatRecord()
+    assert [record.is_over(5, 0.0, now_us) for now_us in (5, 6)] == [False, True]
+    assert [record.is_over(9, most_m, 0) for most_m in (-0.001, 0.0)] == [True, False]
+    record.drive(1.0, 1_000_000)
+    assert [record.is_over(9, most_m, 0) for most_m in (0.999, 1.0)] == [True, False]
