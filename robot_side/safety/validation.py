@@ -51,7 +51,7 @@ class AcceptedCommand:
     echo_us: int
     arrival_us: int
     life_us: int
-    cites_frame: bool = True
+    cites_frame: bool
 
 
 @dataclass(frozen=True, slots=True)
