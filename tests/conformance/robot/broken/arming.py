@@ -147,7 +147,7 @@ def obeys_what_came_before(robot):
 
     def around(inner, reason, now_us):
         inner(reason, now_us)
-        gate._command = AcceptedCommand(Twist(linear_mps=0.2, angular_rad_s=0.0), now_us, now_us, 300_000)
+        gate._command = AcceptedCommand(Twist(linear_mps=0.2, angular_rad_s=0.0), now_us, now_us, 300_000, True)
 
     wrap(gate, "_begin", around)
 

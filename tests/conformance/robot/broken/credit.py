@@ -167,7 +167,7 @@ def guests_live_long(robot):
     def around(inner, source, twist, now_us, age_us):
         inner(source, twist, now_us, age_us)
         if source == "guest":
-            gate._command = AcceptedCommand(gate._command.twist, now_us + 60_000_000, now_us, 60_000_000)
+            gate._command = AcceptedCommand(gate._command.twist, now_us + 60_000_000, now_us, 60_000_000, True)
 
     wrap(gate, "_accept", around)
 
@@ -322,7 +322,7 @@ def goes_on_where_it_was(robot):
     def resume():
         now_us = robot.now()
         gate._command = AcceptedCommand(
-            Twist(linear_mps=0.2, angular_rad_s=0.0), now_us + 300_000, now_us + 300_000, 500_000
+            Twist(linear_mps=0.2, angular_rad_s=0.0), now_us + 300_000, now_us + 300_000, 500_000, True
         )
 
     on_return(robot, resume)

@@ -99,7 +99,8 @@ def revive(robot):
     """Restart the command in force at the current time."""
     gate = robot.driving.gate
     if gate._command is not None:
-        gate._command = AcceptedCommand(gate._command.twist, robot.now(), robot.now(), gate._command.life_us)
+        gate._command = AcceptedCommand(gate._command.twist, robot.now(), robot.now(), gate._command.life_us,
+                                        gate._command.cites_frame)
 
 
 def revived_by(robot, reason):
