@@ -12,7 +12,7 @@ ifneq ($(and $(ARGS),$(word 2,$(MAKECMDGOALS))),)
 $(error ARGS is for one goal, but there are $(words $(MAKECMDGOALS)) ($(MAKECMDGOALS)): run `make` once for each)
 endif
 
-.PHONY: demo test test-all test-long mutation lint docs lock clean python demo-environment test-environment
+.PHONY: demo test test-all test-long mutation lint docs release lock clean python demo-environment test-environment
 
 demo: demo-environment
 	$(BIN)/sightline demo $(ARGS)
@@ -35,6 +35,14 @@ docs: test-environment  ## the docs site in site/, with strict links; its genera
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements-docs.lock
 	$(BIN)/python -m docs.make.reference --check
 	$(BIN)/zensical build --strict --clean
+
+release: python  ## before a release: the SBOM (CycloneDX) in dist/; an audit, which also fails where it cannot look up a package
+	$(PYTHON) -m venv $(VENV)-release
+	$(VENV)-release/bin/python -m pip install --quiet cyclonedx-bom==7.5.0 pip-audit==2.10.1
+	mkdir -p dist
+	$(VENV)-release/bin/cyclonedx-py requirements requirements.lock --pyproject pyproject.toml \
+	  --output-reproducible --output-file dist/sbom.cdx.json
+	$(VENV)-release/bin/pip-audit --disable-pip --require-hashes --strict --requirement requirements.lock
 
 python:
 	@[ -n "$(PYTHON)" ] || { echo "error: no Python found: install Python 3.11, or pass PYTHON=/path/to/python3.11"; exit 2; }

@@ -130,6 +130,21 @@ def test_no_text_contains_a_banned_pattern(folder):
     assert hits == [], "\n".join([f"{folder}: {len(hits)} hits", *hits[:40]])
 
 
+def sentences_without_a_figure(text: str) -> list[str]:
+    """Return the sentences that call something safe or certified and state no figure."""
+    sentences = re.split(r"(?<=[.!?|])\s", " ".join(text.split()))
+    claim = re.compile(r"\b(safe|safely|certified)\b", re.IGNORECASE)
+    return [one for one in sentences if claim.search(one) and not re.search(r"\d", one)]
+
+
+def test_no_page_calls_anything_safe_or_certified_without_a_figure():
+    assert len(sentences_without_a_figure("It is safe. It is certified. Safe within 0.25 m. A safety gate.")) == 2
+    pages = [*ROOT.glob("*.md"), ROOT / "protocol/README.md", *(ROOT / "docs").rglob("*.md")]
+    hits = {page.relative_to(ROOT).as_posix(): found for page in pages
+            if (found := sentences_without_a_figure(page.read_text("utf-8")))}
+    assert hits == {}
+
+
 @pytest.mark.parametrize("place", COMMENTED)
 def test_a_place_with_hidden_reasons_has_comment_lines(place):
     paths = sorted((ROOT / place).rglob("*.py")) or [ROOT / place]
