@@ -169,6 +169,13 @@ def test_stop_cites_no_status(robot, operator):
     assert robot.cited() == [None] and robot.verbs() == [Verb.STOP]
 
 
+@pytest.mark.parametrize("sent", [0, 3])
+def test_stop_ends_as_soon_as_it_is_proven_in_another_way(robot, operator, sent):
+    robot.receives = False
+    assert operator.stop(lambda: None, is_proven=lambda: len(robot.sent) >= sent) is None
+    assert robot.verbs() == [Verb.STOP] * sent
+
+
 def test_request_before_the_first_status_cites_none(robot):
     made = Operator(robot)
     made._changed = VirtualCondition(robot)
