@@ -1,5 +1,6 @@
 """Cases on guests, on what no peer should send, and on peers that come and go. Pure."""
 
+from itertools import cycle
 from typing import Final
 
 from sightline.conformance.case import Bench, Suite
@@ -47,7 +48,8 @@ def guests(bench: Bench) -> None:
 @SUITE.must("R-DIAL-02", "4.6 Guests", _guest)
 def guests_crawl(bench: Bench, watcher: Sender) -> None:
     """A guest's twist is limited to 0.2 m/s and 1 rad/s."""
-    bench.on(FRAME, lambda _one: _bare(bench, b"3.0000|0.0000"))
+    twists = cycle((b"3.0000|0.0000", b"2.0000|0.0000"))  # a robot may stop a guest that repeats one twist
+    bench.on(FRAME, lambda _one: _bare(bench, next(twists)))
     _arm_guest(watcher)
     bench.rest(1_000_000)
     linear_mps = watcher.robot.next_status(2).applied[0]
