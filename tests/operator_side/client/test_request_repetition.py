@@ -169,6 +169,29 @@ def test_stop_cites_no_status(robot, operator):
     assert robot.cited() == [None] and robot.verbs() == [Verb.STOP]
 
 
+def test_stop_ends_with_the_wheels_at_zero_and_a_latched_one_is_not_slow(robot, operator):
+    keep, warned = robot.driving.tick, []
+
+    def turning(*arguments):
+        if elapsed_ms(robot) < 500:
+            robot.wheels(0.2)
+        keep(*arguments)
+
+    robot.driving.tick = turning
+    assert operator.stop(lambda: warned.append(True)).applied == (0.0, 0.0)
+    assert elapsed_ms(robot) >= 500 and not warned
+
+
+def test_stop_is_slow_if_only_a_status_from_before_it_shows_stopped(robot, operator):
+    robot.driving.gate.stop()
+    operator.wait_report()
+    robot.receives = robot.publishes = False
+    warned = []
+    with pytest.raises(LinkError):
+        operator.stop(lambda: warned.append(True), timeout_s=0.6)
+    assert operator.report.status.state is State.STOPPED and warned == [True]
+
+
 @pytest.mark.parametrize("sent", [0, 3])
 def test_stop_ends_as_soon_as_it_is_proven_in_another_way(robot, operator, sent):
     robot.receives = False

@@ -235,6 +235,7 @@ def test_the_age_of_the_frame_is_never_negative():
 
 def test_a_guest_has_no_latency():
     rig = guest_driving(40)
+    assert rig.gate.offer("guest", None, STILL, rig.now_us).age_us == 0, "it counts from its arrival"
     assert rig.gate.latency_us is None
 
 
