@@ -146,10 +146,11 @@ class IssuedRecord:
 
 
 class FreshnessRecord:
-    """Stores the time since which the camera has delivered no new image, byte for byte."""
+    """Stores when the image of each frame first appeared, byte for byte, and the time of the newest new image."""
 
     def __init__(self) -> None:
-        self._fingerprints: OrderedDict[int, None] = OrderedDict()
+        self._first_us: OrderedDict[int, int] = OrderedDict()  # by fingerprint
+        self._shown_us: OrderedDict[int, int] = OrderedDict()  # by capture time
         self._newest_us = self._changed_us = 0
 
     def add(self, t_us: int, fingerprint: int) -> None:
@@ -160,12 +161,15 @@ class FreshnessRecord:
             fingerprint: checksum of the image; 0 for a source that is not live and may repeat an image.
         """
         # The noise of a live sensor never repeats, so an earlier image means a frozen camera or repeated buffers.
-        if fingerprint == 0 or fingerprint not in self._fingerprints:
-            self._changed_us = t_us
-            self._fingerprints[fingerprint] = None
-            if len(self._fingerprints) > _KEPT_IMAGES:
-                self._fingerprints.popitem(last=False)
+        if fingerprint == 0 or fingerprint not in self._first_us:
+            self._changed_us = self._first_us[fingerprint] = t_us
+            if len(self._first_us) > _KEPT_IMAGES:
+                self._first_us.popitem(last=False)
         self._newest_us = t_us
+        # Of each frame: a late command may cite the frozen image after the camera delivers new ones again.
+        self._shown_us[t_us] = self._first_us[fingerprint]
+        if len(self._shown_us) > _KEPT_IMAGES:
+            self._shown_us.popitem(last=False)
 
     def unchanged_us(self) -> int:
         """Return the time in us since the last new image."""
@@ -173,7 +177,7 @@ class FreshnessRecord:
 
     def shown_since_us(self, t_us: int) -> int:
         """Return the time at which the image of the frame captured at `t_us` first appeared."""
-        return min(t_us, self._changed_us) if self._fingerprints else t_us
+        return self._shown_us.get(t_us, t_us)
 
 
 class RepeatRecord:

@@ -114,7 +114,20 @@ def test_camera_that_repeats_its_buffers_holds_the_robot():
         rig.gate.pictures.add(rig.now_us, 1 + index % 2)
         rig.drive(20)
     assert rig.gate.state is State.HOLD
+    rig.gate.pictures.add(rig.now_us, 1)
     assert rig.offer().reason is RejectReason.STALE
+
+
+def test_late_command_on_a_repeated_image_is_stale_after_the_camera_delivers_new_ones():
+    rig = Rig().armed().drive(60)
+    rig.gate.pictures.add(rig.now_us, 1)
+    rig.silence(500)
+    repeated = rig.frame()
+    rig.gate.pictures.add(rig.now_us, 1)
+    rig.silence(20)
+    rig.gate.pictures.add(rig.now_us, 2)
+    assert rig.offer(header=rig.header(repeated)).reason is RejectReason.STALE
+    assert rig.offer().accepted
 
 
 def test_a_restarted_vision_starts_its_numbers_over():

@@ -194,14 +194,20 @@ def test_a_camera_that_repeats_up_to_256_images_is_frozen(buffers, unchanged_us)
         ([], 5, 5),
         ([(10, 7)], 10, 10),
         ([(10, 7)], 9, 9),
-        ([(10, 7)], 11, 10),
+        ([(10, 7)], 11, 11),
         ([(10, 7), (20, 7)], 20, 10),
+        ([(10, 7), (20, 7), (30, 8)], 20, 10),
+        ([(10, 7), (20, 8), (30, 7)], 30, 10),
+        ([(10, 7), (20, 7), *((at_us, 8) for at_us in range(21, 276))], 20, 10),
+        ([(10, 7), (20, 7), *((at_us, 8) for at_us in range(21, 277))], 20, 20),
+        ([(10, 7), *((at_us, at_us) for at_us in range(11, 266)), (300, 7)], 300, 10),
+        ([(10, 7), *((at_us, at_us) for at_us in range(11, 267)), (300, 7)], 300, 300),
         ([(10, 7), (20, 8)], 20, 20),
         ([(10, 7), (20, 8)], 15, 15),
         ([(10, 0), (20, 0)], 20, 20),
     ],
 )
-def test_image_of_a_frame_is_as_old_as_its_last_change(pictures, t_us, since_us):
+def test_image_of_a_frame_is_as_old_as_its_first_copy(pictures, t_us, since_us):
     record = FreshnessRecord()
     for at_us, fingerprint in pictures:
         record.add(at_us, fingerprint)
