@@ -117,6 +117,14 @@ def test_command_for_a_frame_of_the_future_returns_no_credit_and_for_a_stale_one
     assert core.gate.last_rejection.reason == "STALE"
 
 
+def test_command_without_a_proof_returns_no_credit():
+    core = core_of()
+    core.gate._needs_proof = True
+    core.on_issued(7, NOW_US, 0)
+    assert core.on_twist(twist(), NOW_US) is None
+    assert core.gate.last_rejection.reason == "NOT_PROVEN"
+
+
 def test_large_header_is_rejected_by_its_size():
     """Spaces after the object are valid JSON, so only the bound rejects it."""
     core = core_of()
