@@ -10,7 +10,7 @@ Packets between receiver and driver process, over one `SOCK_SEQPACKET` pair that
 
 import struct
 from collections import Counter, OrderedDict
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from typing import Final, NamedTuple
 
 from sightline.protocol.errors import RejectReason, WireError
@@ -26,6 +26,7 @@ from sightline.protocol.transports.stop_datagram import (
 
 _NUMBER: Final = struct.Struct(">cQ")
 _REPORT: Final = struct.Struct(">cQB??")
+_REPORT_US: Final = 1_000_000
 _SILENT_US: Final = 500_000
 """A driver process reports ten times a second. After this time its state is unknown."""
 _LOST_US: Final = 50_000
@@ -57,13 +58,31 @@ def unpack_number(packet: bytes) -> int:
     return int(_NUMBER.unpack(packet)[1])
 
 
-def pack_ignored(counts: Counter[str], address: str) -> bytes:
-    """Encode how many datagrams were ignored, by reason, and the address of the last one."""
-    return b"C" + " ".join([*(f"{reason} {count}" for reason, count in counts.items()), address]).encode()
+class IgnoredDatagrams:
+    """Counts the datagrams that were ignored, by reason, and reports them once a second."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._address = ""
+        self._report_us = 0
+
+    def add(self, error: WireError, address: str) -> None:
+        """Count a datagram from `address`."""
+        self._counts[error.reason] += 1
+        self._address = address
+
+    def report(self, send: Callable[[bytes], bool], now_us: int) -> None:
+        """Send the counts, with the address of the last datagram; without room for them, again after a second."""
+        if not self._counts or now_us < self._report_us:
+            return
+        self._report_us = now_us + _REPORT_US
+        words = [*(f"{reason} {count}" for reason, count in self._counts.items()), self._address]
+        if send(b"C" + " ".join(words).encode()):
+            self._counts.clear()
 
 
 def unpack_ignored(packet: bytes) -> tuple[dict[str, int], str]:
-    """Decode a packet of `pack_ignored`."""
+    """Decode a packet of `IgnoredDatagrams`."""
     *words, address = packet[1:].decode().split(" ")
     return dict(zip(words[::2], map(int, words[1::2]), strict=True)), address
 

@@ -4,9 +4,7 @@ Behind a router an operator knows only the address of the router. It imports the
 """
 
 import os
-from collections import Counter
 from collections.abc import Sequence
-from typing import Final
 
 from sightline.protocol.errors import WireError
 from sightline.protocol.transports.stop_datagram import CHALLENGE_BYTES
@@ -20,9 +18,7 @@ from sightline.protocol.transports.stop_port import (
     read_arguments,
     read_secret,
 )
-from sightline.robot_side.guardian.stop_core import ForwarderCore, pack_ignored
-
-_REPORT_US: Final = 1_000_000
+from sightline.robot_side.guardian.stop_core import ForwarderCore, IgnoredDatagrams
 
 
 def start(addresses: Sequence[Address], secret_file: str) -> StopProcess:
@@ -41,25 +37,19 @@ class StopForwarder:
     def __init__(self, port: StopPort, secret: bytes) -> None:
         self._port = port
         self._core = ForwarderCore(secret, os.urandom(CHALLENGE_BYTES))
-        self._ignored: Counter[str] = Counter()
-        self._ignored_from = ""
-        self._report_us = 0
+        self._ignored = IgnoredDatagrams()
 
     def on_datagram(self, data: bytes, origin: Origin) -> Replies:
         """Forward a datagram, or ignore and count it."""
         try:
             return self._core.on_datagram(data, origin, now_us())
         except WireError as error:
-            self._ignored[error.reason] += 1
-            self._ignored_from = origin[1][0]
+            self._ignored.add(error, origin[1][0])
             return ()
 
     def on_turn(self) -> None:
         """Report the ignored datagrams once a second."""
-        if self._ignored and now_us() >= self._report_us:
-            self._report_us = now_us() + _REPORT_US
-            if self._port.send(pack_ignored(self._ignored, self._ignored_from)):
-                self._ignored.clear()
+        self._ignored.report(self._port.send, now_us())
 
 
 def main() -> None:

@@ -5,7 +5,6 @@ Load on the links cannot hold it up. It imports the standard library only. `star
 
 import os
 import time
-from collections import Counter
 from collections.abc import Sequence
 from typing import Final
 
@@ -21,10 +20,9 @@ from sightline.protocol.transports.stop_port import (
     read_arguments,
     read_secret,
 )
-from sightline.robot_side.guardian.stop_core import ReceiverCore, Registration, pack_ignored
+from sightline.robot_side.guardian.stop_core import IgnoredDatagrams, ReceiverCore, Registration
 
 _REGISTER_S: Final = 1.0
-_REPORT_US: Final = 1_000_000
 
 
 def start(robot: str, addresses: Sequence[Address], routers: Sequence[Address], secret_file: str) -> StopProcess:
@@ -47,9 +45,7 @@ class StopReceiver:
         self._port = port
         self._core = ReceiverCore(robot, secret, os.urandom(CHALLENGE_BYTES), now_us())
         self._routers = [(address, Registration(robot, secret, _random())) for address in routers]
-        self._ignored: Counter[str] = Counter()
-        self._ignored_from = ""
-        self._report_us = 0
+        self._ignored = IgnoredDatagrams()
         if routers:
             import threading  # for a robot that connects to a router only
 
@@ -71,8 +67,7 @@ class StopReceiver:
                 return [(answer, origin) for answer in answers if answer is not None]
             return [(self._core.on_stop(data, one, now_us()), origin)]
         except WireError as error:
-            self._ignored[error.reason] += 1
-            self._ignored_from = origin[1][0]
+            self._ignored.add(error, origin[1][0])
             return ()
 
     def on_report(self, packet: bytes) -> None:
@@ -84,10 +79,7 @@ class StopReceiver:
         packet = self._core.packet(now_us())
         if packet is not None:
             self._port.send(packet)
-        if self._ignored and now_us() >= self._report_us:
-            self._report_us = now_us() + _REPORT_US
-            if self._port.send(pack_ignored(self._ignored, self._ignored_from)):
-                self._ignored.clear()
+        self._ignored.report(self._port.send, now_us())
 
 
 def _random() -> int:

@@ -16,7 +16,7 @@ from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.persistence import StopLatch
 from sightline.robot_side.driver.process import Driver, stop_receiver_of
-from sightline.robot_side.guardian.stop_core import _REPORT, pack_ignored, pack_number
+from sightline.robot_side.guardian.stop_core import _REPORT, pack_number
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_port
 from tests.fixtures.robot_process import RobotProcess, Vision
@@ -97,7 +97,7 @@ def test_a_state_is_reported_when_it_changes_and_ten_times_a_second(driver):
 
 
 def test_ignored_datagrams_are_counted_in_the_status(driver):
-    driver.far.send(pack_ignored({"MALFORMED": 7, "WRONG_KEY": 2}, "10.0.0.9"))
+    driver.far.send(b"CMALFORMED 7 WRONG_KEY 2 10.0.0.9")
     assert not driver._drain()
     assert driver._driver_core.status(0).refused == {"MALFORMED": 7, "WRONG_KEY": 2}
     assert driver._driver_core.gate.state is State.DISARMED

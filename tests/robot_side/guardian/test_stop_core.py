@@ -1,7 +1,5 @@
 """Logic of the STOP receiver and of the forwarder beside a router."""
 
-from collections import Counter
-
 import pytest
 
 from sightline.protocol.errors import RejectReason, WireError
@@ -21,9 +19,9 @@ from sightline.robot_side.guardian.stop_core import (
     MAX_WAITING,
     DriverReport,
     ForwarderCore,
+    IgnoredDatagrams,
     ReceiverCore,
     Registration,
-    pack_ignored,
     pack_report,
     unpack_ignored,
     unpack_number,
@@ -157,10 +155,23 @@ def test_with_keys_a_stop_of_this_start_is_applied_and_its_answer_is_signed():
     assert number(core, 0) == 1
 
 
-def test_counts_of_ignored_datagrams_keep_their_names():
-    counts = Counter({"MALFORMED": 3, "OTHER_ROBOT": 1})
-    assert unpack_ignored(pack_ignored(counts, "192.168.1.7")) == (counts, "192.168.1.7")
-    assert unpack_ignored(pack_ignored(counts, "fe80::1%eth0")) == (counts, "fe80::1%eth0")
+@pytest.mark.parametrize("address", ["192.168.1.7", "fe80::1%eth0"])
+def test_ignored_datagrams_are_reported_once_a_second_until_there_was_room(address):
+    ignored, sent, has_room = IgnoredDatagrams(), [], False
+    for reason in ("MALFORMED", "OTHER_ROBOT", "MALFORMED"):
+        ignored.add(WireError(RejectReason(reason), ""), address)
+
+    def send(packet):
+        sent.append(unpack_ignored(packet))
+        return has_room
+
+    for now_us, count in ((0, 1), (999_999, 1), (1_000_000, 2)):
+        ignored.report(send, now_us)
+        assert len(sent) == count
+    has_room = True
+    for now_us in (2_000_000, 3_000_000):
+        ignored.report(send, now_us)
+    assert sent == [({"MALFORMED": 2, "OTHER_ROBOT": 1}, address)] * 3, "none after there was room"
 
 
 # --- the forwarder -------------------------------------------------------------------------------------------------
