@@ -38,6 +38,16 @@ def test_files_are_short_and_state_their_purpose(path):
             assert not re.search(r'from "node:|\bperformance\b|Date\.now|setTimeout|Math\.random', source)
 
 
+def test_viewer_is_served_with_each_module_that_it_imports():
+    needed, left = set(), {"page"}
+    while left:
+        needed |= left
+        sources = "".join((EXAMPLES / f"{name}.mjs").read_text("utf-8") for name in left)
+        left = set(re.findall(r'^(?:import\b|\}).*?\bfrom "\./(\w+)\.mjs"', sources, re.MULTILINE)) - needed
+    (served,) = re.findall(r"MODULES = \[(.*?)\]", (EXAMPLES / "pages.mjs").read_text("utf-8"))
+    assert needed == set(re.findall(r'"(\w+)"', served))
+
+
 def test_javascript_imports_only_the_platform():
     for path in SOURCES:
         source = re.sub(r"/\*.*?\*/", "", path.read_text("utf-8"), flags=re.DOTALL)
