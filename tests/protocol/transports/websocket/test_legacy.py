@@ -343,8 +343,16 @@ ZEROS = [("", "0.0000|0.0000"), ("?dashed", "0.0000-0.0000"), ("?dashed&swapped"
 def test_a_link_that_closes_leaves_two_zeros(options, zero):
     with old_robot_and_vision(options) as (robot, vision):
         vision.publish(TWIST, b"{}", b"0.2000|0.3500")
+        assert until(lambda: robot.said)
     assert until(lambda: not robot.clients)
     assert robot.said[1:] == [zero, zero]
+
+
+def test_a_link_that_closes_at_once_sends_a_command_with_two_zeros_or_not_at_all():
+    with old_robot_and_vision() as (robot, vision):
+        vision.publish(TWIST, b"{}", b"0.2000|0.3500")
+    assert until(lambda: not robot.clients)
+    assert robot.said in ([], ["0.2000|0.3500", "0.0000|0.0000", "0.0000|0.0000"])
 
 
 def test_a_link_that_never_drove_sends_nothing():
