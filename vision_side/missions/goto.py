@@ -1,10 +1,10 @@
 """Mission `goto`: footprint, progress checker, and driving to waypoints. Pure."""
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from sightline.protocol.config import Config
 from sightline.protocol.messages import STILL, CameraModel, Pose, Twist
@@ -164,10 +164,18 @@ class GotoConfig(Config):
     brake_mps2: Annotated[float, Field(gt=0, le=10)] = 0.8
     """What stopping counts on; below what the robot can."""
     creep_mps: Annotated[float, Field(gt=0, le=1)] = 0.1
-    """For backing out, and where the delay leaves no faster."""
+    """For backing out."""
     max_scan_age_s: Annotated[float, Field(gt=0, le=2)] = 0.4
     patience: ProgressCheckerConfig = ProgressCheckerConfig()
     latency: LatencyConfig = LatencyConfig()
+
+    @model_validator(mode="after")
+    def _must_see_beyond_the_clearance(self) -> Self:
+        least_m = self.clearance_m + _BRAKE_SLACK_M
+        if self.sight_m <= least_m:
+            raise ValueError(f"sight_m of {self.sight_m:g} m must be more than {least_m:g} m, that is clearance_m and "
+                             f"{_BRAKE_SLACK_M:g} m: with less the robot would never move")
+        return self
 
 
 class Goto:
@@ -314,7 +322,7 @@ class Goto:
         config = self._config
         fade = max(0.0, 1.0 - (bearing_rad / config.drive_within_rad) ** 2)
         arriving = max(0.03, min(braking_mps(goal_m, 0.1, config.brake_mps2 / 2), 2.0 * goal_m))
-        return min(arriving, fade * config.max_linear_mps, fade * max(sight_mps, config.creep_mps))
+        return min(arriving, fade * config.max_linear_mps, fade * sight_mps)
 
     def _sight_mps(self, then: PredictedMotion) -> float:
         """Limit the speed so that an obstacle just beyond the sensor range still leaves the clearance.

@@ -172,6 +172,22 @@ def test_without_ranges_nothing_moves() -> None:
     assert end_of(run).phase == "no ranges"
 
 
+@pytest.mark.parametrize("latency_s", [0.05, 0.2])
+def test_without_a_new_scan_the_robot_goes_no_farther_than_the_last_one_saw_free(latency_s: float) -> None:
+    seen_from_m = [0.0]
+
+    class Late(Eyes):
+        def scan(self, course, pose, t_us):  # type: ignore[no-untyped-def]
+            if t_us > 2_000_000:
+                return None
+            seen_from_m[0] = pose[0]
+            return super().scan(course, pose, t_us)
+
+    options = {"sight_m": 0.2, "clearance_m": 0.112, "max_scan_age_s": 2.0}
+    run = drive(Course(), (3.0, 0.0), sensor=Late(), seconds=5, loss=0.0, latency_s=latency_s, options=options)
+    assert 0.2 < run[-1].pose[0] <= seen_from_m[0] + 0.2 - 0.112
+
+
 def test_ranges_that_end_stop_the_robot() -> None:
     class Dying(Eyes):
         def scan(self, course, pose, t_us):  # type: ignore[no-untyped-def]
@@ -212,3 +228,8 @@ def test_the_same_frames_give_the_same_plans() -> None:
 def test_waypoints_out_of_the_world_are_rejected(waypoints: list) -> None:
     with pytest.raises(ValidationError):
         Goto.Config.model_validate({"waypoints": waypoints})
+
+
+def test_sensors_that_see_no_farther_than_the_clearance_are_rejected() -> None:
+    with pytest.raises(ValidationError, match=r"sight_m of 0\.1 m must be more than 0\.129 m"):
+        mission((1.0, 0.0), sight_m=0.1)
