@@ -77,7 +77,7 @@ def _between(rows: Sequence[tuple[float, float]], at: float, below: float) -> fl
         return below
     for (x, y), (next_x, next_y) in itertools.pairwise(rows):
         if at <= next_x:
-            return y + (next_y - y) * (at - x) / (next_x - x)
+            return min(y + (next_y - y) * (at - x) / (next_x - x), next_y)  # a sum may round to more than 1
     return rows[-1][1]
 
 

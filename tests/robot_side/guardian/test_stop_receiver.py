@@ -96,7 +96,7 @@ def test_both_processes_import_only_the_standard_library():
 
 
 def waiting_bytes(port):
-    """Return the size of the datagrams that the UDP socket of `port` on this machine holds and nobody has read."""
+    """Return the size of the datagrams that the UDP socket of `port` on this machine holds unread."""
     sockets = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
     waiting, = (queues for _, local, _, _, queues, *_ in sockets if int(local.partition(":")[2], 16) == port)
     return int(waiting.partition(":")[2], 16)
