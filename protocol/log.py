@@ -14,6 +14,8 @@ import os
 import queue
 import sys
 import threading
+import traceback
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -142,9 +144,48 @@ def start_log(form: str | None, service: str) -> None:
 
 
 def _log_thread_error(error: threading.ExceptHookArgs) -> None:
-    name = error.thread.name if error.thread else "unknown"
-    raised = error.exc_value or error.exc_type()
-    logging.getLogger("sightline").error("thread %s ended", name, exc_info=raised)
+    report_fault("thread", error.exc_value or error.exc_type(), error.thread.name if error.thread else "")
+
+
+_MAX_KINDS: Final = 64
+_faults: Final[Counter[str]] = Counter()
+_kinds: Final[set[tuple[object, ...]]] = set()
+_counting: Final = threading.Lock()
+
+
+def count_fault(part: str) -> None:
+    """Count a fault that the caller logs, e.g. a failed write."""
+    with _counting:
+        _faults[part] += 1
+
+
+def report_fault(part: str, error: BaseException, name: str = "") -> bool:
+    """Count an exception of a plug-in, callback or thread, and log the traceback of each kind once.
+
+    Args:
+        part: where it was raised, e.g. `camera`; `status` shows the counts by part.
+        error: the exception. Its kind is its class and the line that raised it.
+        name: which one, e.g. the name of the thread.
+
+    Returns:
+        True if it was logged now.
+    """
+    *_, last = traceback.walk_tb(error.__traceback__) if error.__traceback__ else ((None, 0),)
+    kind = (part, type(error), last[0] and last[0].f_code, last[1])
+    count_fault(part)
+    with _counting:
+        if kind in _kinds or len(_kinds) >= _MAX_KINDS:
+            return False
+        _kinds.add(kind)
+    what = " ".join(f"{part} {name}".split())
+    logging.getLogger("sightline").error("%s raised %s: %s", what, type(error).__name__, error, exc_info=error)
+    return True
+
+
+def faults() -> Counter[str]:
+    """Return how often each part of this process raised an exception since the start."""
+    with _counting:
+        return Counter(_faults)
 
 
 def error_line(text: str) -> str:

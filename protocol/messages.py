@@ -249,6 +249,9 @@ class StreamStatus(WireModel):
     missed_captures: Counter = Field(default=0, description="images of the camera that were not requested in time")
     quality_percent: Percent = Field(default=100, description="share of the configured JPEG quality, to fit the link")
     scale_percent: Percent = Field(default=100, description="share of the configured side lengths, to fit the link")
+    camera_fault: str = Field(
+        default="", max_length=200, description="why no image comes from the camera; empty while images come"
+    )
 
 
 class Status(WireModel):
@@ -273,6 +276,9 @@ class Status(WireModel):
     auto_arm: bool = Field(default=False, description="whether the robot arms without an operator")
     tick_late_max_us: Microseconds = Field(default=0, description="the latest tick of the driver's loop")
     network_restarts: Counter = Field(default=0, description="how often the network process was started again")
+    faults: dict[str, Counter] = Field(
+        default={}, description="exceptions and failed writes since the start, by part; the log has the tracebacks"
+    )
     battery_v: Number | None = Field(
         default=None, description="voltage of the battery; null without a battery or a reading of the last 5 s"
     )
@@ -395,4 +401,7 @@ class MissionReport(WireModel):
     model: str = Field(default="", max_length=64, description="hash of its model")
     inference_us: Microseconds | None = Field(
         default=None, description="of the newest image; null where the detector does not report it"
+    )
+    faults: dict[str, Counter] = Field(
+        default={}, description="exceptions of the vision service since the start, by part; its log has the tracebacks"
     )

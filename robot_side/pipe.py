@@ -3,6 +3,7 @@
     network -> driver   RAW          bytes of a twist or request as they came: channel, source, header, payload
                         STREAM       stream counters, JSON
                         REJECTED     what the transport rejected so far: how often, by reason
+                        FAULTS       exceptions so far: how often, by part
                         READY        the endpoint is open
               aside     ISSUED       a frame is about to be published: seq, capture time, fingerprint
     driver -> network   COMMAND_ACK  a twist was validated: whose, which frame, computing time, and the holder
@@ -56,6 +57,7 @@ class PacketKind(IntEnum):
     COMMAND_ACK = 6
     PUBLISH = 7
     REJECTED = 8
+    FAULTS = 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,13 +134,13 @@ def _unpack_holder(source: bytes, session: bytes) -> Holder | None:
     return Holder(source=name, session=session.decode()) if name else None
 
 
-def pack_rejected(counts: Mapping[str, int]) -> bytes:
-    """Pack the counts of messages that never reached the driver, by reason."""
-    return bytes([PacketKind.REJECTED]) + json.dumps(dict(counts)).encode()
+def pack_counts(kind: PacketKind, counts: Mapping[str, int]) -> bytes:
+    """REJECTED or FAULTS: counts that begin at zero in each network process."""
+    return bytes([kind]) + json.dumps(dict(counts)).encode()
 
 
-def unpack_rejected(packet: bytes) -> dict[str, int]:
-    """Decode a packet of `pack_rejected`."""
+def unpack_counts(packet: bytes) -> dict[str, int]:
+    """Decode a packet of `pack_counts`."""
     counts = json.loads(packet[1:])
     return {str(reason): int(count) for reason, count in counts.items()}
 
@@ -242,6 +244,9 @@ _LONGEST_BACKOFF_US = 2_000_000
 _WEDGED_US = 2_000_000
 _STARTS_WITHIN_US = 30_000_000  # a first start reads its packages from a slow card
 _END_S = 1.0
+_FIRST_PATIENCE_US, _LONGEST_PATIENCE_US = 2_000_000, 60_000_000
+CAMERA_EXIT: Final = 71
+"""Exit code of a network process whose camera hangs or gives no image. A new process opens the camera again."""
 KEYS: Final = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP)
 """Ctrl-C, Ctrl-\\ and Ctrl-Z reach the network process too. It ignores them; the driver ends it, after zero."""
 _CHILD: Final = (
@@ -258,6 +263,12 @@ class NetworkSetup(Config):
     config: RobotConfig
     session: SessionId
     first_seq: int
+    is_restart: bool = False
+    """The camera is opened after the link then: without a camera, too, the robot remains reachable."""
+    camera_fault: str = ""
+    """Why the last process had no image."""
+    camera_patience_us: int = _FIRST_PATIENCE_US
+    """Time without an image after which the process ends with CAMERA_EXIT."""
 
 
 class DriverEnd:
@@ -277,6 +288,8 @@ class DriverEnd:
         self._start_at_us = 0
         self._backoff_us = _FIRST_BACKOFF_US
         self._was_ready = False
+        self._camera_fault = ""
+        self._camera_patience_us = _FIRST_PATIENCE_US
         self.restarts = -1
         self.exit_code = 0
         self.failed_at_start = False
@@ -304,7 +317,10 @@ class DriverEnd:
             for end in (ours, aside):
                 undo.callback(end.close)
                 end.setblocking(False)
-            setup = NetworkSetup(config=self._config, session=self._session, first_seq=first_seq)
+            setup = NetworkSetup(
+                config=self._config, session=self._session, first_seq=first_seq, is_restart=self._was_ready,
+                camera_fault=self._camera_fault, camera_patience_us=self._camera_patience_us,
+            )
             ours.send(setup.model_dump_json().encode())
             ends = (theirs.fileno(), their_aside.fileno())
             # The child inherits the mask, so a key does not interrupt its imports; later it ignores these signals.
@@ -325,7 +341,9 @@ class DriverEnd:
         if not self._was_ready:  # it reported why itself
             self.failed_at_start, self.exit_code = True, code if code > 0 else 1
             return
-        _log.info("network process ended (%d); starting it again", code)
+        if code == CAMERA_EXIT:  # each time later, because a restart also interrupts the link
+            self._camera_patience_us = min(2 * self._camera_patience_us, _LONGEST_PATIENCE_US)
+        _log.info("network process ended (%s); starting it again", "camera" if code == CAMERA_EXIT else code)
         self._start_at_us = now_us + self._backoff_us
         self._backoff_us = min(2 * self._backoff_us, _LONGEST_BACKOFF_US)
 
@@ -333,6 +351,12 @@ class DriverEnd:
         """Note that its endpoint is open. From now on it is restarted after each end."""
         self._was_ready = True
         self._backoff_us = _FIRST_BACKOFF_US
+
+    def on_camera(self, fault: str) -> None:
+        """Note why no image comes, "" while images come."""
+        self._camera_fault = fault
+        if not fault:
+            self._camera_patience_us = _FIRST_PATIENCE_US
 
     def send(self, packet: bytes) -> None:
         """Hand over a packet or drop it: a network process that does not read must not slow the driver."""

@@ -135,6 +135,7 @@ export const StreamStatus = {
   missed_captures: [counter, 0],
   quality_percent: [integer(0, 100), 100],
   scale_percent: [integer(0, 100), 100],
+  camera_fault: [text(200), ""],
 };
 export const Status = {
   state: [oneOf(...STATES)],
@@ -150,6 +151,7 @@ export const Status = {
   auto_arm: [boolean, false],
   tick_late_max_us: [counter, 0],
   network_restarts: [counter, 0],
+  faults: [map(counter), {}],
   battery_v: [orNull(real), null],
   max_linear_mps: [real, 0],
   max_angular_rad_s: [real, 0],
@@ -207,6 +209,7 @@ export const MissionReport = {
   device: [text(32), ""],
   model: [text(64), ""],
   inference_us: [orNull(counter), null],
+  faults: [map(counter), {}],
 };
 export const Hello = {
   v: [version, VERSION],

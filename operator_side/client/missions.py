@@ -13,6 +13,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from sightline.operator_side.client.requests import SOURCE, Operator
+from sightline.operator_side.client.status import counts_text
 from sightline.protocol.channels import MISSION, REPORT
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError, LinkError, WireError
@@ -235,6 +236,8 @@ def mission_lines(report: MissionReport) -> Iterator[str]:
         yield f"          last mission request rejected: {report.refused}"
     if report.detector:
         yield f"detector  {detector_line(report)}"
+    if report.faults:
+        yield f"faults    {counts_text(report.faults)}; the log of the vision service has the tracebacks"
 
 
 def detector_line(report: MissionReport) -> str:

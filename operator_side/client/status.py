@@ -1,6 +1,6 @@
 """A robot's status and replies as text. Pure."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 from sightline.protocol.errors import RejectReason
@@ -49,6 +49,7 @@ def short_lines(robot: str, status: Status) -> Iterator[str]:
     yield f"driver    {status.holder.source if status.holder else 'none'}"
     yield f"wheels    {twist_text(status.applied)}"
     yield f"image     frame age {millis(status.frame_age_us)}, {status.stream.fps:.0f} fps"
+    yield from fault_lines(status)
     if status.battery_v is not None:
         yield f"battery   {status.battery_v:.2f} V"
     if next_step := _next_step(robot, status):
@@ -78,6 +79,7 @@ def status_lines(robot: str, status: Status) -> Iterator[str]:
     yield f"image     frame age {millis(status.frame_age_us)}, capture to command {millis(status.latency_us)}"
     camera = "calibrated" if stream.calibrated else "not calibrated"
     counts = f"{stream.sent} sent, {stream.credit_timeouts} unanswered"
+    yield from fault_lines(status)
     yield f"stream    {stream.fps:.0f} fps, {counts}, window {stream.window}, camera {camera}"
     yield f"encoding  {encoding_text(stream)}"
     yield f"dropped   {drops_text(stream)}"
@@ -86,6 +88,19 @@ def status_lines(robot: str, status: Status) -> Iterator[str]:
         last = status.last_refusal
         yield f"rejected  last: {last.reason} from {last.source}: {last.detail}"
     yield f"loop      at most {millis(status.tick_late_max_us)} late; {status.network_restarts} network restarts"
+
+
+def fault_lines(status: Status) -> Iterator[str]:
+    """Format the fault of the camera and the exceptions so far; nothing without them."""
+    if status.stream.camera_fault:
+        yield f"camera    {status.stream.camera_fault}"
+    if status.faults:
+        yield f"faults    {counts_text(status.faults)}; the robot's log has the tracebacks"
+
+
+def counts_text(counts: Mapping[str, int]) -> str:
+    """List counts by name, most frequent first."""
+    return ", ".join(f"{name} {count}" for name, count in sorted(counts.items(), key=lambda item: -item[1]))
 
 
 def stream_is_whole(stream: StreamStatus) -> bool:
@@ -113,8 +128,7 @@ def drops_text(stream: StreamStatus) -> str:
 
 def rejections_text(status: Status) -> str:
     """List the rejection counters, most frequent first."""
-    counted = sorted(status.refused.items(), key=lambda item: -item[1])
-    return "rejected: " + ", ".join(f"{name} {count}" for name, count in counted) if counted else "0 rejected"
+    return "rejected: " + counts_text(status.refused) if status.refused else "0 rejected"
 
 
 def twist_text(twist: tuple[float, float]) -> str:

@@ -99,9 +99,10 @@ _COUNTERS: Final = {
     "overtaken": "frames_overtaken",
     "refused_pictures": "pictures_refused",
     "dropped": "messages_dropped",
+    "faults": "faults",
 }
 """Fields of a status that only count up -> names of their metrics. Every other number is a gauge of its own name."""
-_LABELS: Final = {"refused": "reason", "dropped": "channel"}
+_LABELS: Final = {"refused": "reason", "dropped": "channel", "faults": "part"}
 _GAUGES: Final = {"fps": "stream_fps", "window": "stream_window"}
 
 

@@ -27,6 +27,7 @@ from sightline.protocol.channels import (
 )
 from sightline.protocol.codec import request_verb
 from sightline.protocol.errors import ConfigError
+from sightline.protocol.log import report_fault
 from sightline.protocol.messages import Verb
 
 Item = TypeVar("Item")
@@ -239,8 +240,8 @@ class Link(Closing):
 
         Args:
             channel: the channel.
-            callback: called on a transport thread, so it must only store the message. The link counts an error in it
-                and continues.
+            callback: called on a transport thread, so it must only store the message. The link logs and counts an
+                error in it, and continues.
         """
 
     @abstractmethod
@@ -424,7 +425,8 @@ class LinkRules:
         try:
             callback(message)
         # An error in a callback must not end the thread of the transport, which serves all channels.
-        except Exception:
+        except Exception as error:
+            report_fault("callback", error, message.channel.name)
             with self._counting:
                 self.callback_errors += 1
 

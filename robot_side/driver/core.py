@@ -72,6 +72,10 @@ class DriverCore:
         self.network_restarts = 0
         self.rejected_by_transport: Counter[str] = Counter()
         """How often the transport rejected something before the gate, by reason."""
+        self.faults: Counter[str] = Counter()
+        """How often each part raised an exception, in this process and in the network processes."""
+        self.latch_failed = ""
+        """Why the STOP latch is not on disk as it should be, or empty."""
         self._seqs: dict[str, int] = {}
         self._due_us: dict[str, int] = {}
         self._outbox: list[Message] = []
@@ -163,7 +167,7 @@ class DriverCore:
         gate, limits, holder = self.gate, self.config.safety, self.gate.holder(now_us)
         return Status(
             state=gate.state,
-            reason=gate.reason[:200],
+            reason=self._reason(),
             holder=LeaseHolder.of(holder.source, holder.session) if holder else None,
             applied=(gate.applied.linear_mps, gate.applied.angular_rad_s),
             frame_age_us=gate.frame_age_us(now_us),
@@ -175,6 +179,7 @@ class DriverCore:
             auto_arm=gate.arms_itself,
             tick_late_max_us=self.tick_late_max_us,
             network_restarts=self.network_restarts,
+            faults=dict(self.faults),
             battery_v=self._battery_v(now_us),
             max_linear_mps=limits.max_linear_mps,
             max_angular_rad_s=limits.max_angular_rad_s,
@@ -203,6 +208,10 @@ class DriverCore:
         payload = encode_ranges(scan.ranges_m)
         if len(payload) <= SCAN.max_payload_bytes:
             self._outbox.append(Message(SCAN, "", encode(header), payload))
+
+    def _reason(self) -> str:
+        stored = f"; not stored for a restart: {self.latch_failed}" if self.latch_failed else ""
+        return (self.gate.reason[: 200 - len(stored)] + stored)[:200]
 
     def _battery_v(self, now_us: int) -> float | None:
         volts = self.battery.volts(now_us) if self.battery else None

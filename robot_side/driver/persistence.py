@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from sightline.protocol.errors import ConfigError
+from sightline.protocol.log import count_fault
 
 _log: Final = logging.getLogger(__name__)
 
@@ -64,6 +65,8 @@ class LatchWriter:
         self._wanted = latch.is_set()
         self._stored: bool | None = self._wanted
         """What is on disk; None where that is not known: a write failed half-way."""
+        self.failed = ""
+        """Why the disk does not have what is wanted, while that lasts."""
         self._changed = threading.Event()
         self._closing = False
         self._thread = threading.Thread(target=self._write_all, name="latch", daemon=True)
@@ -99,6 +102,11 @@ class LatchWriter:
         try:
             self._stored = None
             self._latch.write(wanted)
-            self._stored = wanted
+            self._stored, self.failed = wanted, ""
         except OSError as error:
-            _log.info("the STOP mark is not kept over a restart: %s; is the disk full or read-only?", error.strerror)
+            count_fault("STOP mark")
+            if not self.failed:
+                _log.warning(
+                    "the STOP mark is not kept over a restart: %s; is the disk full or read-only?", error.strerror
+                )
+            self.failed = error.strerror or str(error)

@@ -17,7 +17,7 @@ from sightline.protocol.clock import heartbeat_us, monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import ConfigError, RejectReason, WireError
-from sightline.protocol.log import RepeatLimiter, start_log_thread
+from sightline.protocol.log import RepeatLimiter, faults, report_fault, start_log_thread
 from sightline.protocol.messages import LastRejection, State, StreamStatus
 from sightline.protocol.transports.endpoints import stop_addresses
 from sightline.protocol.transports.security import stop_secret_file
@@ -121,7 +121,6 @@ class BatteryReader:
     def __init__(self, battery: Battery) -> None:
         self._battery = battery
         self._closing = threading.Event()
-        self._failed = False
         self.newest: tuple[float, int] | None = None
         """Volts, and when they were read."""
         self._thread = threading.Thread(target=self._read_all, name="battery", daemon=True)
@@ -144,10 +143,9 @@ class BatteryReader:
             begin_us = monotonic_us()  # a reading that hung is as old as its begin
             try:
                 self.newest = self._read(), begin_us
-            except PLUGIN_ERRORS:
-                if not self._failed and not self._closing.is_set():
-                    _log.exception("the battery cannot be read")
-                self._failed = True
+            except PLUGIN_ERRORS as error:
+                if not self._closing.is_set():
+                    report_fault("battery", error)
             self._closing.wait(_BATTERY_PERIOD_S)
 
     def _read(self) -> float:
@@ -181,6 +179,8 @@ class Driver:
         self._command_acks: list[ipc.CommandAck] = []
         self._rejection_limiter = RepeatLimiter()
         self._rejected_by_network: Counter[str] = Counter()
+        self._faults_of_network: Counter[str] = Counter()
+        self._earlier_faults: Counter[str] = Counter()
         self.driver_end = DriverEnd(config, self._driver_core.session)
         self._receiver = receiver
         self._stop_applied = 0
@@ -248,6 +248,8 @@ class Driver:
         self._move()
         self._answer()
         if punctual:
+            self._driver_core.faults = faults() + self._earlier_faults + self._faults_of_network
+            self._driver_core.latch_failed = self.latch_writer.failed
             for message in self._driver_core.messages(now_us):
                 self.driver_end.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
             if self._receiver is not None:
@@ -284,28 +286,36 @@ class Driver:
         wheels: WheelAngles | None = None
         scan: Ranges | None = None
         self._speeds_are_set = False
+        part = "drive"
         try:
             wheels = self._drive.wheels()
+            part = "range sensor"
             scan = self._scanned()
+            part = "control loop"
             if self._battery_reader is not None and self._battery_reader.newest is not None:
                 self._driver_core.on_battery(*self._battery_reader.newest)
             speeds = self._driver_core.tick(monotonic_us(), wheels, scan)
         except BlindZoneError:  # with the first scan, and without one nothing moves
             raise
-        except Exception as error:  # a plug-in is foreign code; a reading may be no number
-            self._driver_core.gate.fault(f"{error or type(error).__name__}")
+        except PLUGIN_ERRORS as error:  # a plug-in is foreign code; a reading may be no number
+            self._fault(part, error)
             speeds = self._without_sensors()
         try:
             self._drive.set(*speeds)
             self._speeds_are_set = True
-        except Exception as error:
-            self._driver_core.gate.fault(f"{error or type(error).__name__}")
+        except PLUGIN_ERRORS as error:
+            self._fault("drive", error)
+
+    def _fault(self, part: str, error: BaseException) -> None:
+        report_fault(part, error)
+        self._driver_core.gate.fault(f"{error or type(error).__name__}")
 
     def _without_sensors(self) -> tuple[float, float]:
         """Return the gate's ramp to zero, or zero if the gate cannot step either, because this loop must not end."""
         try:
             return self._driver_core.tick(monotonic_us(), None, None)
         except Exception as error:
+            report_fault("control loop", error)
             self._driver_core.gate.halt(f"{error or type(error).__name__}")
             return 0.0, 0.0
 
@@ -388,10 +398,15 @@ class Driver:
             self._driver_core.on_issued(*ipc.unpack_issued(packet))
         elif kind is ipc.PacketKind.STREAM:
             self._driver_core.stream = decode(StreamStatus, packet[1:])
+            self.driver_end.on_camera(self._driver_core.stream.camera_fault)
         elif kind is ipc.PacketKind.REJECTED:
-            self._on_rejected(ipc.unpack_rejected(packet))
+            self._on_rejected(ipc.unpack_counts(packet))
+        elif kind is ipc.PacketKind.FAULTS:
+            self._faults_of_network = Counter(ipc.unpack_counts(packet))
         elif kind is ipc.PacketKind.READY:
             self._rejected_by_network.clear()
+            self._earlier_faults += self._faults_of_network
+            self._faults_of_network = Counter()
             self.driver_end.on_ready()
         return False
 

@@ -139,13 +139,15 @@ class NetworkCore:
         return Message(CAMERA, "", encode(stamp), encode(model))
 
     def status(
-        self, now_us: int, dropped_commands: int = 0, dropped: Mapping[str, int] | None = None, missed_captures: int = 0
+        self, now_us: int, dropped_commands: int = 0, dropped: Mapping[str, int] | None = None,
+        missed_captures: int = 0, camera_fault: str = "",
     ) -> StreamStatus:
         """Return the counters of the stream and of the camera.
 
         Args:
             dropped: by channel, what the slots of the link dropped.
             missed_captures: what the slot of the camera dropped.
+            camera_fault: why no image comes.
         """
         stream = self._stream
         counted = sorted(((name, count) for name, count in (dropped or {}).items() if count), key=lambda item: -item[1])
@@ -162,6 +164,7 @@ class NetworkCore:
             missed_captures=missed_captures,
             quality_percent=self._applied.quality_percent,
             scale_percent=self._applied.scale_percent,
+            camera_fault=camera_fault[:200],
         )
 
 

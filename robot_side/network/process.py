@@ -18,14 +18,15 @@ from typing import Final
 from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
+from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, SightlineError, WireError
-from sightline.protocol.log import start_log
+from sightline.protocol.log import faults, report_fault, start_log
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
 from sightline.protocol.transports.zenoh.flood_limits import limit_floods
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.network.core import NetworkCore
-from sightline.robot_side.pipe import KEYS, NetworkEnd, NetworkSetup
+from sightline.robot_side.pipe import CAMERA_EXIT, KEYS, NetworkEnd, NetworkSetup
 from sightline.robot_side.plugins import CAMERAS
 from sightline.robot_side.ports import Camera, Picture
 
@@ -61,6 +62,8 @@ def own_addresses() -> list[str]:
 _STREAM_STATUS_US = 200_000
 _CAMERA_TIMEOUT_S = 0.2
 _CAMERA_RETRY_S = 0.5
+_CHECK_STEP_US = 200_000
+_RESTARTED = "; its process was started again"
 _LONGEST_NAP_S = 0.1
 _LEAVES_WITHIN_S = 3.0
 
@@ -68,15 +71,21 @@ _LEAVES_WITHIN_S = 3.0
 class NetworkProcess:
     """Runs the camera loop (main thread), the driver's packets (a thread) and the link's callbacks (its thread)."""
 
-    def __init__(self, setup: NetworkSetup, driver: NetworkEnd, link: Link, camera: Camera) -> None:
+    def __init__(self, setup: NetworkSetup, driver: NetworkEnd, link: Link, camera: Camera | None) -> None:
+        """Without a `camera` the camera loop opens it."""
         self._network_end = driver
         self._link = link
-        self._camera = camera
+        self.camera = camera
+        self._setup = setup
         config = setup.config
         self._network_core = NetworkCore(config.stream, setup.session, setup.first_seq, config.max_frame_bytes)
         self._lock = threading.Lock()
         self._credit = threading.Event()
-        self._camera_fault = ""
+        self._camera_fault = setup.camera_fault
+        self._no_image_since_us = 0
+        """Begin of the wait for an image that is due; 0 without one. Another thread watches it."""
+        self._watched_since_us = self._waited_us = self._checked_us = 0
+        self._faults_reported: Counter[str] = Counter()
         self._rejected_acks: Counter[str] = Counter()
         self._rejected_reported: Counter[str] = Counter()
         self.running = True
@@ -103,14 +112,15 @@ class NetworkProcess:
         self._network_core.motion = self._network_end.motion(self._network_core.motion)
         with self._lock:
             sent = self._network_core.on_camera(picture, monotonic_us()) if picture else None
-            camera = self._network_core.announce_camera(self._camera.model, monotonic_us())
+            model = self.camera.model if self.camera else None
+            camera = self._network_core.announce_camera(model, monotonic_us()) if model else None
         if camera is not None:
             self._link.publish(camera.channel, camera.header, camera.payload)
         if picture is None or sent is None:
             return
         header, message = sent
         # The driver process must know a frame before a peer can answer it.
-        fingerprint = zlib.crc32(picture.jpeg) if self._camera.live else 0
+        fingerprint = zlib.crc32(picture.jpeg) if self.camera and self.camera.live else 0
         if self._network_end.send_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
             self._link.publish(message.channel, message.header, message.payload)
 
@@ -121,25 +131,60 @@ class NetworkProcess:
             due = self._network_core.may_capture(monotonic_us(), listening)
             nap_s = self._network_core.wait_us(monotonic_us()) / 1e6
         if not due:
+            self._no_image_since_us = 0
             self._credit.wait(min(nap_s, _LONGEST_NAP_S) if listening and nap_s > 0 else _LONGEST_NAP_S)
             self._credit.clear()
         return due
 
     def _read_camera(self) -> Picture | None:
         """Return an image or None. A lost camera is logged once and opened again."""
-        self._network_core.adapt(self._camera)
+        self._no_image_since_us = self._no_image_since_us or monotonic_us()
         try:
-            picture = self._camera.read(_CAMERA_TIMEOUT_S)
-        except HardwareError as error:
-            if not self._camera_fault:
-                _log.warning("camera: %s", error)
-            self._camera_fault = str(error)
-            time.sleep(_CAMERA_RETRY_S)
+            if self.camera is None:
+                self.camera = CAMERAS.build(self._setup.config.camera)
+            self._network_core.adapt(self.camera)
+            picture = self.camera.read(_CAMERA_TIMEOUT_S)
+        except PLUGIN_ERRORS as error:
+            self._on_camera_error(error)
             return None
-        if self._camera_fault and picture is not None:
-            _log.info("camera: back")
-            self._camera_fault = ""
+        if picture is not None:
+            self._no_image_since_us = 0
+            if self._camera_fault:
+                _log.info("camera: back")
+                self._camera_fault = ""
         return picture
+
+    def _on_camera_error(self, error: BaseException) -> None:
+        is_logged = report_fault("camera", error)
+        if not self._camera_fault and not is_logged:
+            _log.warning("camera: %s", error)
+        self._camera_fault = " ".join(str(error).split()) or type(error).__name__
+        # A plug-in that reports the loss opens its device again itself. A restart would only interrupt the link.
+        if isinstance(error, HardwareError):
+            self._no_image_since_us = 0
+        time.sleep(_CAMERA_RETRY_S)
+
+    def _check_camera(self, now_us: int) -> None:
+        """End this process if an image that is due did not come in time: the next one opens the camera again."""
+        step_us, self._checked_us = min(now_us - self._checked_us, _CHECK_STEP_US), now_us
+        if self._no_image_since_us != self._watched_since_us:
+            self._watched_since_us, self._waited_us = self._no_image_since_us, 0
+        # Short steps, so that the time in which this process was stopped does not count.
+        self._waited_us += step_us * bool(self._watched_since_us)
+        if self._waited_us <= self._setup.camera_patience_us:
+            return
+        kind = self._setup.config.camera.kind
+        why = self._camera_fault or f"camera {kind} gives no image"
+        self._camera_fault = why if why.endswith(_RESTARTED) else why + _RESTARTED
+        _log.error("camera %s: no image for %.1f s; starting it again", kind, self._waited_us / 1e6)
+        self._report(now_us)
+        logging.shutdown()
+        os._exit(CAMERA_EXIT)
+
+    def close_camera(self) -> None:
+        """Release the camera, if it is open."""
+        if self.camera:
+            self.camera.close()
 
     # --- the driver ----------------------------------------------------------------------------------------------
 
@@ -152,6 +197,7 @@ class NetworkProcess:
                 with suppress(ValueError):  # a message over its bounds: one lost message
                     self._on_packet(packet)
                 now_us = monotonic_us()
+                self._check_camera(now_us)
                 if now_us >= status_due_us:
                     status_due_us = now_us + _STREAM_STATUS_US
                     self._report(now_us)
@@ -173,20 +219,26 @@ class NetworkProcess:
 
     def _report(self, now_us: int) -> None:
         """Send the driver process the state of the stream, and the rejections before the gate."""
-        missed = getattr(self._camera, "missed_captures", None)  # of cameras that capture by themselves
+        missed = getattr(self.camera, "missed_captures", None)  # of cameras that capture by themselves
         with self._lock:
             status = self._network_core.status(
-                now_us, self._network_end.dropped_commands, self._link.dropped, missed() if missed else 0
+                now_us, self._network_end.dropped_commands, self._link.dropped, missed() if missed else 0,
+                self._camera_fault,
             )
         self._network_end.send(bytes([ipc.PacketKind.STREAM]) + encode(status))
         self._relay.look()
         self._report_rejected()
+        raised = faults()
+        if raised != self._faults_reported and self._network_end.send(ipc.pack_counts(ipc.PacketKind.FAULTS, raised)):
+            self._faults_reported = raised
 
     def _report_rejected(self) -> None:
         """Send the driver the counts of messages that never reached it, so that `status` shows them."""
         by_link: dict[str, int] = dict(self._link.rejected)  # copied at once: other threads count in it
         rejected = Counter(dict(self._rejected_acks)) + Counter(by_link)
-        if rejected != self._rejected_reported and self._network_end.send(ipc.pack_rejected(rejected)):
+        if rejected != self._rejected_reported and self._network_end.send(
+            ipc.pack_counts(ipc.PacketKind.REJECTED, rejected)
+        ):
             self._rejected_reported = rejected
 
     def _on_ack(self, message: Message) -> None:
@@ -203,8 +255,8 @@ def _run(driver: NetworkEnd) -> None:
     setup = NetworkSetup.model_validate_json(driver.receive())
     config = setup.config
     with ExitStack() as ending:
-        camera = CAMERAS.build(config.camera)
-        ending.callback(camera.close)
+        # After a restart the link comes first, so that a robot without a camera can be reached.
+        camera = None if setup.is_restart else CAMERAS.build(config.camera)
         ending.enter_context(limit_floods(config.doors, lambda line: _log.info("robot %s: %s", config.robot, line)))
         link = ending.enter_context(
             open_link(
@@ -217,7 +269,9 @@ def _run(driver: NetworkEnd) -> None:
         _log.info("robot %s: on %s, camera %s", config.robot, where, config.camera.kind)
         if reached := reachable_endpoints(config.listen):
             _log.info("robot %s: others reach it at %s", config.robot, ", ".join(reached))
-        NetworkProcess(setup, driver, link, camera).run()
+        process = NetworkProcess(setup, driver, link, camera)
+        ending.callback(process.close_camera)
+        process.run()
 
 
 def main() -> None:
@@ -235,7 +289,7 @@ def main() -> None:
         _log.error("%s", error)
         code = error.exit_code
     except Exception as error:
-        _log.error("network process: %s: %s", type(error).__name__, error)
+        report_fault("network process", error)
     finally:
         logging.shutdown()
         os._exit(code)  # daemon threads of a transport must not keep a finished process

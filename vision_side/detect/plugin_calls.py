@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import ConfigError, SightlineError
+from sightline.protocol.log import report_fault
 from sightline.protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.detect.port import (
@@ -94,6 +95,7 @@ def notices_of(detector: Any) -> list[str]:
     try:
         return [" ".join(str(line).split()) for line in notices()]
     except PLUGIN_ERRORS as error:  # a detector that only reports badly may still detect well
+        report_fault("detector", error)
         return [_raises("the detector's notices()", error)]
 
 
@@ -149,6 +151,7 @@ def checked_results(
         if len(results) != len(frames):
             raise ValueError(f"{len(results)} results for {len(frames)} frames")
     except PLUGIN_ERRORS as error:
+        report_fault("detector", error)
         if len(frames) > 1:  # the frame that it failed on is not known, and should cost no other robot its answer
             why = _why(error)
             return [
@@ -162,6 +165,7 @@ def _answer(frame: DetectFrame, result: DetectionResult | None) -> DetectionResu
     try:
         return validated(frame, result) if result is not None else NO_ANSWER_IN_TIME
     except Exception as error:  # the result may be anything
+        report_fault("detector", error)
         return _why(error)
 
 

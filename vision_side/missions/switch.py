@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from sightline.protocol.config import PLUGIN_ERRORS
+from sightline.protocol.log import report_fault
 from sightline.protocol.messages import STILL, CameraModel
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.registry import MissionSpec
@@ -74,4 +75,5 @@ class MissionSwitch:
 
 
 def _failed(error: BaseException) -> Plan:
+    report_fault("mission", error)
     return Plan(STILL, "failed", " ".join(f"{type(error).__name__}: {error}".split())[:200], done=True)

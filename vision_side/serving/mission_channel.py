@@ -12,6 +12,7 @@ from sightline.protocol.channels import MISSION, REPORT, SCAN
 from sightline.protocol.clock import AHEAD_US
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError, RejectReason, WireError
+from sightline.protocol.log import faults
 from sightline.protocol.messages import (
     DetectionsHeader,
     Echo,
@@ -119,7 +120,8 @@ class Reporter:
         return MissionReport(
             mission=mission[:_NAME_LENGTH], phase=_line(seen.phase, _PHASE_LENGTH),
             note=_line(seen.note, _TEXT_LENGTH), done=seen.done,
-            asked=newest, refused=rejection[:_TEXT_LENGTH], **self._detector_fields(result, beside),
+            asked=newest, refused=rejection[:_TEXT_LENGTH], faults=dict(faults()),
+            **self._detector_fields(result, beside),
         )
 
     def _detector_fields(self, result: DetectionResult | None, beside: str) -> dict[str, Any]:

@@ -18,6 +18,8 @@ GIVEN = {
     "refused": {"STALE": 24},
     "last_refusal": LastRejection(source="teleop", reason="STALE", detail="too old"),
     "dropped": {"scan": 18},
+    "camera_fault": "camera v4l2 gives no image",
+    "faults": {"callback": 3},
 }
 NUMBERS = {"boolean": lambda _count: True, "integer": lambda count: 11 + count, "number": lambda count: 11.5 + count}
 
@@ -37,7 +39,7 @@ def sample(model, **given):
 STREAM = sample(StreamStatus)
 STATUS = sample(Status, stream=STREAM)
 FIELDS = [*Status.model_fields, *(f"stream.{field}" for field in StreamStatus.model_fields)]
-NO_NUMBERS = ("reason", "holder", "last_refusal")
+NO_NUMBERS = ("reason", "holder", "last_refusal", "stream.camera_fault")
 
 
 def without(path: str) -> Status:

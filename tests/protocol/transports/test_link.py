@@ -7,7 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from sightline.protocol import log
 from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST
+from sightline.protocol.log import faults
 from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE, LinkRules, Message
 from tests.fixtures.links import RIGS, MemoryRig
 from tests.fixtures.websocket import resident_kib
@@ -115,7 +117,9 @@ def test_a_consumer_that_never_takes_costs_no_memory(rig):
     assert resident_kib() - before_kib < 25_000
 
 
-def test_callback_that_raises_does_not_end_the_link(rig):
+def test_callback_that_raises_does_not_end_the_link(rig, caplog, monkeypatch):
+    monkeypatch.setattr(log, "_kinds", set())
+    before = faults()["callback"]
     robot, peer, _, _ = _pair(rig)
     calls: list[bytes] = []
 
@@ -131,6 +135,9 @@ def test_callback_that_raises_does_not_end_the_link(rig):
         assert _take(rig, beside).payload == text
     assert rig.until(lambda: peer.callback_errors == 3)
     assert calls == [b"1", b"2", b"3"]
+    assert faults()["callback"] == before + 3
+    (record,) = [one for one in caplog.records if "callback" in one.message]
+    assert record.message == "callback status raised RuntimeError: from a callback" and record.exc_info
 
 
 WRONG_KEYS = (

@@ -5,6 +5,8 @@ import struct
 
 import pytest
 
+from sightline.operator_side.client.missions import mission_lines
+from sightline.protocol import log
 from sightline.protocol.channels import CAMERA, FRAME, MISSION, REPORT, SCAN, TWIST
 from sightline.protocol.codec import decode, encode, encode_ranges
 from sightline.protocol.messages import (
@@ -165,6 +167,33 @@ def test_report_contains_the_mission_text_on_one_bounded_line():
         0.0, "m" * 90, Observation("two\nlines" + "x" * 90, note="a\n" * 300), None, ""
     )
     assert "\n" not in report.phase + report.note and decode(MissionReport, encode(report), 2048) == report
+
+
+class Raising:
+    """A detector with a bug, or a mission with one."""
+
+    def detect(self, frames, deadline_us):
+        raise RuntimeError("no such layer")
+
+    def step(self, view):
+        raise RuntimeError("no such step")
+
+
+@pytest.mark.parametrize("part", ["detector", "mission"])
+def test_an_exception_of_a_plug_in_is_logged_once_counted_and_in_the_report(part, caplog, monkeypatch):
+    monkeypatch.setattr(log, "_faults", log.Counter())
+    monkeypatch.setattr(log, "_kinds", set())
+    bench = Bench().frames()
+    pipeline = bench.service._pipeline
+    if part == "detector":
+        pipeline._detector = Raising()
+    else:
+        pipeline._mission_switch._mission = Raising()
+    report = bench.frames(5).report()
+    assert report.faults == {part: 6 if part == "detector" else 1}, "a mission that failed is over"
+    (record,) = [one for one in caplog.records if one.levelname == "ERROR"]
+    assert record.message.startswith(f"{part} raised RuntimeError: no such") and record.exc_info
+    assert f"faults    {part} " in "\n".join(mission_lines(report))
 
 
 # --- scans -----------------------------------------------------------------------------------------------------------
