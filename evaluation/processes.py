@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -46,6 +47,7 @@ READY_S: Final = 30.0
 _END_S: Final = 4.0
 """A process that has not ended this long after SIGTERM is killed; the robot takes up to 2 s to bring wheels to zero."""
 _POLL_S: Final = 0.02
+_MARK: Final = re.compile(r"^(error: |\S+Z (info|warning|error) )")
 _REAPER: Final = Path(__file__).with_name("reaper.py")
 
 
@@ -204,9 +206,9 @@ def children_of(pid: int) -> list[int]:
 
 
 def last_line(log: Path) -> str:
-    """Return the last line of a log, without `error: `."""
+    """Return the last line of a log, without time, level and `error: `."""
     lines = [line for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
-    return lines[-1].removeprefix("error: ") if lines else "nothing"
+    return _MARK.sub("", lines[-1]) if lines else "nothing"
 
 
 def free_port() -> int:

@@ -1,5 +1,6 @@
 """The log of a service: standard `logging` through one handler that never blocks its caller, as text or JSON. Shell.
 
+    sightline robot                   2026-03-01T10:00:00.123Z info robot r1: on tcp/127.0.0.1:7447
     sightline robot --log json        {"time":"2026-03-01T10:00:00.123Z","level":"info","service":"robot","message":...}
 
 Information goes to the standard output; warnings and errors go to the standard error. The choice of the form is in the
@@ -30,12 +31,16 @@ _MAX_WAITING_LINES: Final = 256
 _FLUSH_S: Final = 1.0
 
 
+def _time_of(record: logging.LogRecord) -> str:
+    return datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
 class TextFormatter(logging.Formatter):
-    """The message as it is, an error after `error: `."""
+    """Time, level and message."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line of `record`, with its traceback if it has one."""
-        return ("error: " if record.levelno >= logging.ERROR else "") + super().format(record)
+        return f"{_time_of(record)} {record.levelname.lower()} {super().format(record)}"
 
 
 class JsonFormatter(logging.Formatter):
@@ -47,9 +52,8 @@ class JsonFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the object of `record`; a traceback is part of its message."""
-        time = datetime.fromtimestamp(record.created, UTC)
         return json.dumps({
-            "time": f"{time:%Y-%m-%dT%H:%M:%S}.{time.microsecond // 1000:03}Z",
+            "time": _time_of(record),
             "level": record.levelname.lower(),
             "service": self._service,
             "message": super().format(record),
@@ -189,8 +193,9 @@ def faults() -> Counter[str]:
 
 
 def error_line(text: str) -> str:
-    """Return what the log would write for an error, for a program that ends with it."""
-    return _HANDLER.format(logging.makeLogRecord({"msg": text, "levelno": logging.ERROR, "levelname": "ERROR"}))
+    """Return the last line of a program that ends with an error, in the form of its log."""
+    record = logging.makeLogRecord({"msg": text, "levelno": logging.ERROR, "levelname": "ERROR"})
+    return _HANDLER.format(record) if isinstance(_HANDLER.formatter, JsonFormatter) else f"error: {text}"
 
 
 _FIRST_PERIOD_US: Final = 1_000_000

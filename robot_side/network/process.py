@@ -20,7 +20,7 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, SightlineError, WireError
-from sightline.protocol.log import faults, report_fault, start_log
+from sightline.protocol.log import error_line, faults, report_fault, start_log
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
 from sightline.protocol.transports.zenoh.flood_limits import limit_floods
@@ -286,7 +286,8 @@ def main() -> None:
         _run(driver)
         code = 0
     except SightlineError as error:
-        _log.error("%s", error)
+        logging.shutdown()
+        print(error_line(str(error)), file=sys.stderr)
         code = error.exit_code
     except Exception as error:
         report_fault("network process", error)

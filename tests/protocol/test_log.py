@@ -44,9 +44,17 @@ def test_an_object_has_time_level_service_and_message():
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(("form", "begin"), [("text", "error: it broke\n"), ("json", '{"time":')])
+def test_a_line_has_time_level_and_message():
+    record = _record("robot r1: ACTIVE", logging.WARNING)
+    record.created = datetime(2026, 3, 1, 10, 0, 0, 123_456, UTC).timestamp()
+    assert TextFormatter().format(record) == "2026-03-01T10:00:00.123Z warning robot r1: ACTIVE"
+
+
+@pytest.mark.parametrize(("form", "begin"), [("text", "2026-03-01T10:00:00.123Z error it broke\n"),
+                                             ("json", '{"time":"2026-03-01T10:00:00.123Z"')])
 def test_an_error_is_marked_and_keeps_its_traceback(form, begin):
     record = _record("it broke", logging.ERROR)
+    record.created = datetime(2026, 3, 1, 10, 0, 0, 123_456, UTC).timestamp()
     record.exc_info = (ValueError, ValueError("no such wheel"), None)
     line = (JsonFormatter("robot") if form == "json" else TextFormatter()).format(record)
     assert line.startswith(begin) and "ValueError: no such wheel" in line
@@ -119,7 +127,7 @@ def test_a_stream_that_is_not_read_costs_no_time_and_its_lines_come_later(unread
     while b"once more" not in received:  # once it is read, what waited comes, and what is logged then
         received += read.read(1 << 16)
         handler.handle(_record("once more"))
-    assert received.startswith(b'{"time"' if isinstance(formatter, JsonFormatter) else b"0 ")
+    assert received.startswith(b'{"time"' if isinstance(formatter, JsonFormatter) else b"20")
     waited = [line for line in received.splitlines() if b"once more" not in line]
     held = 65536 // min(map(len, waited[:-1]))  # a terminal or a pipe stores at most 64 KiB, Linux: tty(4), pipe(7)
     assert len(waited) <= log._MAX_WAITING_LINES + held + 2, "no more lines wait than the queue and the stream hold"
