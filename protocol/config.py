@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
 from sightline.protocol.errors import ConfigError
+from sightline.protocol.log import report_ending
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -111,6 +112,7 @@ class PluginRegistry:
                 if _CLASS.fullmatch(kind):
                     return _imported(kind)
         except PLUGIN_ERRORS as error:  # in a plug-in's own import
+            report_ending(self.noun, error)
             hint = "" if entry is not None else self._hint(kind)
             raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {_why(error, kind)}{hint}") from None
         there = f"there are {', '.join(self.names())}, or package.module:Name"

@@ -40,7 +40,14 @@ class TextFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line of `record`, with its traceback if it has one."""
-        return f"{_time_of(record)} {record.levelname.lower()} {super().format(record)}"
+        text = super().format(record)
+        shown = text if text.isprintable() else "".join(map(_shown, text))
+        return f"{_time_of(record)} {record.levelname.lower()} {shown}"
+
+
+def _shown(letter: str) -> str:
+    """Escape what may not reach a terminal: control characters, and what is not text, e.g. of a file's name."""
+    return letter if letter.isprintable() or letter in "\n\t" else letter.encode("unicode_escape").decode()
 
 
 class JsonFormatter(logging.Formatter):
@@ -65,7 +72,7 @@ class QueueHandler(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__()
-        self._lines: queue.Queue[tuple[str, TextIO | None]] = queue.Queue(_MAX_WAITING_LINES)
+        self._lines: queue.Queue[tuple[str | logging.LogRecord, TextIO | None]] = queue.Queue(_MAX_WAITING_LINES)
         self._is_started = False
         self._starting = threading.Lock()
 
@@ -85,14 +92,18 @@ class QueueHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Queue the line of `record`, or drop it where no more lines may wait. Never raises into its caller."""
-        try:
-            line = self.format(record)
-        except Exception:  # arguments that do not fit the message
-            line = f"{record.name}: invalid log call {record.msg!r}"
+        # A traceback quotes source files. A control loop must not wait for the disk that has them.
+        line = record if record.exc_info else self._line_of(record)
         with suppress(queue.Full, RuntimeError):
             if not self._is_started:
                 self.start()
             self._lines.put_nowait((line, sys.stderr if record.levelno >= logging.WARNING else sys.stdout))
+
+    def _line_of(self, record: logging.LogRecord) -> str:
+        try:
+            return self.format(record)
+        except Exception:  # arguments that do not fit the message
+            return f"{record.name}: invalid log call {record.msg!r}"
 
     def flush(self) -> None:
         """Wait until all lines are written, for a second at most. `logging` calls it when the process ends."""
@@ -101,7 +112,9 @@ class QueueHandler(logging.Handler):
 
     def _write_all(self) -> None:
         while True:
-            _write(*self._lines.get())
+            line, stream = self._lines.get()
+            _write(line if isinstance(line, str) else self._line_of(line), stream)
+            del line  # its traceback holds the values of each frame
             self._lines.task_done()
 
 
@@ -163,8 +176,8 @@ def count_fault(part: str) -> None:
         _faults[part] += 1
 
 
-def report_fault(part: str, error: BaseException, name: str = "") -> bool:
-    """Count an exception of a plug-in, callback or thread, and log the traceback of each kind once.
+def report_fault(part: str, error: BaseException, name: str = "") -> str:
+    """Count an exception of a plug-in, callback or thread, and log the traceback of each kind once. Never raises.
 
     Args:
         part: where it was raised, e.g. `camera`; `status` shows the counts by part.
@@ -172,18 +185,40 @@ def report_fault(part: str, error: BaseException, name: str = "") -> bool:
         name: which one, e.g. the name of the thread.
 
     Returns:
-        True if it was logged now.
+        The text of the exception, see `error_text`.
     """
-    *_, last = traceback.walk_tb(error.__traceback__) if error.__traceback__ else ((None, 0),)
-    kind = (part, type(error), last[0] and last[0].f_code, last[1])
     count_fault(part)
+    *_, raised_at = None, *((frame.f_code, line) for frame, line in traceback.walk_tb(error.__traceback__))
+    kind = (part, type(error), raised_at)
+    text = error_text(error)
     with _counting:
-        if kind in _kinds or len(_kinds) >= _MAX_KINDS:
-            return False
-        _kinds.add(kind)
-    what = " ".join(f"{part} {name}".split())
-    logging.getLogger("sightline").error("%s raised %s: %s", what, type(error).__name__, error, exc_info=error)
-    return True
+        is_new = kind not in _kinds and len(_kinds) < _MAX_KINDS
+        if is_new:
+            _kinds.add(kind)
+    if is_new:
+        what = " ".join(f"{part} {name}".split())
+        logging.getLogger("sightline").error("%s raised %s: %s", what, type(error).__name__, text, exc_info=error)
+    return text
+
+
+def report_ending(part: str, error: BaseException) -> None:
+    """Report an exception that ends the program, if it has a log. A command only prints its last line."""
+    if logging.getLogger().handlers:
+        report_fault(part, error)
+
+
+def error_text(error: BaseException) -> str:
+    """Return the message of an exception, or its class, in printable letters on one line, whatever its `str` does."""
+    try:
+        text = " ".join(str(error).split())
+    except Exception:
+        text = ""
+    return printable(text) or type(error).__name__
+
+
+def printable(text: str) -> str:
+    """Return `text` with `?` for each letter that a terminal or a message may not get."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def faults() -> Counter[str]:

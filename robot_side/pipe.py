@@ -3,7 +3,7 @@
     network -> driver   RAW          bytes of a twist or request as they came: channel, source, header, payload
                         STREAM       stream counters, JSON
                         REJECTED     what the transport rejected so far: how often, by reason
-                        FAULTS       exceptions so far: how often, by part
+                        FAULTS       exceptions since the last such packet: how often, by part
                         READY        the endpoint is open
               aside     ISSUED       a frame is about to be published: seq, capture time, fingerprint
     driver -> network   COMMAND_ACK  a twist was validated: whose, which frame, computing time, and the holder
@@ -135,7 +135,7 @@ def _unpack_holder(source: bytes, session: bytes) -> Holder | None:
 
 
 def pack_counts(kind: PacketKind, counts: Mapping[str, int]) -> bytes:
-    """REJECTED or FAULTS: counts that begin at zero in each network process."""
+    """Pack counts by name: REJECTED or FAULTS."""
     return bytes([kind]) + json.dumps(dict(counts)).encode()
 
 

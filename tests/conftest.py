@@ -82,10 +82,20 @@ def _spread_waits(items, config):
     items[:] = others
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport():
+    """Escape what is not text in the output of a test, e.g. an odd file name: a worker could not send it on."""
+    report = yield
+    report.sections = [(name, text.encode(errors="backslashreplace").decode()) for name, text in report.sections]
+    return report
+
+
 @pytest.fixture(autouse=True)
 def no_log_of_an_earlier_command():
     """A command that runs in this process sets up the log of the process."""
     hook = threading.excepthook
+    log._faults.clear()
+    log._kinds.clear()
     yield
     logging.getLogger().removeHandler(log._HANDLER)
     logging.getLogger("sightline").setLevel(logging.NOTSET)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sightline.protocol.channels import OVERLAY, PREVIEW, Channel
 from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import encode
+from sightline.protocol.log import report_fault
 from sightline.protocol.messages import CameraModel, DetectionsHeader, Echo, FrameHeader
 from sightline.protocol.transports.link import LatestSlot, Link
 from sightline.vision_side.config import VisionConfig
@@ -133,7 +134,7 @@ class ViewPublisher:
             try:
                 self._publish(job)
             except Exception as error:  # whatever a plug-in's detections hold: people see less, the robot drives on
-                self._log_change("viewing", f"cannot show an image: {type(error).__name__}: {error}")
+                self._log_change("viewing", f"cannot show an image: {report_fault('viewing', error)}")
 
     def _next(self) -> _Job | None:
         job = self._jobs.take(IDLE_S)

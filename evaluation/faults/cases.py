@@ -1,6 +1,7 @@
 """Every case of the fault bench: processes, network, commands, clients, operators. Shell."""
 
 import itertools
+import resource
 import signal
 import socket
 import subprocess
@@ -9,16 +10,19 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
+from sightline.evaluation.faults.devices import DRIVE_ERROR
 from sightline.evaluation.faults.drivers import ATTACKED_S, COMMAND_CASES, SETTLED_S, VISION
 from sightline.evaluation.faults.evidence import INJECTED, REQUESTED, MotorRow, wheel_mps
-from sightline.evaluation.faults.fixture import RobotFixture, Setup
+from sightline.evaluation.faults.fixture import AT_SPEED_S, ROBOT, RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.evaluation.faults.sampler import Hole
 from sightline.evaluation.faults.stop_cases import STOP_CASES
+from sightline.evaluation.processes import children_of
 from sightline.operator_side.config.errors import no_such_name
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError
@@ -367,6 +371,11 @@ LOSSY_STOP_ZERO_MS: Final = 2000.0
 """A lost packet is sent again after 200 ms at the earliest, and the next loss doubles that."""
 COASTED_MS: Final = TrackConfig().coast_s * 1000 + 700.0
 DAY_S: Final = 86_400
+RESTARTED_S: Final = 3.5
+"""2 s without an image, and a busy machine."""
+TICKS_OF_A_SECOND: Final = 50
+DEMO_S: Final = 2.0
+DEMO_ENDS_S: Final = 2.0
 
 
 # --- the camera --------------------------------------------------------------------------------------------------
@@ -377,6 +386,79 @@ def _spoil_camera(rig: RobotFixture, mode: str) -> Injected:
     rig.watch(BAD_S)
     times, resumed_us = rig.injected("camera"), rig.camera_mode("")
     return Injected(times, at_us, resumed_us, drives_again(rig))
+
+
+def _lose_camera(rig: RobotFixture, mode: str) -> Injected:
+    """The camera gives no image until its process was started again and `status` names it."""
+    before = rig.processes.child("robot")
+    at_us = rig.camera_mode(mode)
+    rig.until(lambda: rig.processes.child("robot") not in (0, before), AGAIN_S, "a new network process")
+    since_s = (monotonic_us() - at_us) / 1e6
+    rig.until(lambda: rig.logged(f"robot {ROBOT}: on") > 1, AGAIN_S, "a new endpoint")
+    named = rig.status()["stream"]["camera_fault"]
+    times, resumed_us = rig.injected("camera"), rig.camera_mode("")
+    again = drives_again(rig)
+    checks = at_most("started again after", since_s, "s", RESTARTED_S), at_least("named in status", bool(named), "", 1)
+    return Injected(times, at_us, resumed_us, again, checks)
+
+
+def _fail_drive(rig: RobotFixture) -> Injected:
+    """The drive plug-in raises at each tick: zero at once, and FAULT until an operator resets it."""
+    at_us = rig.fail_drive()
+    rig.watch(BAD_S)
+    status, times = rig.status(), rig.injected("drive")
+    return Injected(times, at_us, checks=(
+        at_least("counted in status", status["faults"].get("drive", 0), "", TICKS_OF_A_SECOND),
+        at_least("state FAULT", status["state"] == "FAULT", "", 1),
+        *_one_traceback(rig, f"error drive raised ArithmeticError: {DRIVE_ERROR}\nTraceback "),
+    ))
+
+
+def _one_traceback(rig: RobotFixture, text: str) -> tuple[Check, Check]:
+    count = rig.logged(text)
+    return at_least("tracebacks", count, "", 1), at_most("no more", count, "", 1)
+
+
+def _fill_disk(rig: RobotFixture) -> Injected:
+    """No process of the robot can write a byte to a file any more. It drives on, and stops when vision dies."""
+    driver = rig.processes.pid("robot")
+    for pid in (driver, *children_of(driver)):
+        resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, 0))
+    since_us = monotonic_us()
+    rig.watch(BAD_S)
+    slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > since_us)
+    at_us = monotonic_us()
+    rig.processes.kill("peer")
+    rig.watch(SETTLED_S)
+    return Injected(1, at_us, checks=(at_least("speed kept", slowest_mps, "m/s", KEPT_MPS),))
+
+
+def _kill_demo(rig: RobotFixture) -> Injected:
+    """A demo beside the robot is killed while it drives; what it started must end by itself."""
+    folder = rig.folder / "demo"
+    rig.processes.start("demo", ["demo", "--seconds", "600", "--out", str(folder)])
+    vision = folder / "vision.log"
+    rig.until(lambda: vision.exists() and "target seen" in vision.read_text("utf-8"), AT_SPEED_S, "a demo that drives")
+    rig.watch(DEMO_S)
+    started = list(_descendants(rig.processes.pid("demo")))
+    at_us = monotonic_us()
+    rig.processes.kill("demo")
+    rig.watch(DEMO_ENDS_S)
+    left = sum(map(_is_alive, started))
+    return Injected(len(started), at_us, checks=(at_most("processes after 2 s", left, "", 0),))
+
+
+def _descendants(pid: int) -> Iterator[int]:
+    for child in children_of(pid):
+        yield child
+        yield from _descendants(child)
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        return bool(Path(f"/proc/{pid}/cmdline").read_bytes())  # a zombie has none
+    except OSError:
+        return False
 
 
 def _blacken(rig: RobotFixture) -> Injected:
@@ -499,6 +581,25 @@ OPERATOR_CASES: Final = (
     FaultCase(
         "camera.resized", "camera: the picture changes size, 3 s", partial(_spoil_camera, mode="resized"), VISION,
         blind=True, again=True
+    ),
+    *(
+        FaultCase(
+            f"camera.{mode}", f"camera: {what} until its process is started again", partial(_lose_camera, mode=mode),
+            VISION, again=True, also=f"started again <= {RESTARTED_S:g} s, named in status", short=mode == "hangs",
+        )
+        for mode, what in (("hangs", "its `read` hangs"), ("nothing", "no image"))
+    ),
+    FaultCase(
+        "drive.raises", "drive: the plug-in raises an exception", _fail_drive, _SCRIPT, blind=True, short=True,
+        also="FAULT, counted in status, one traceback in the log",
+    ),
+    FaultCase(
+        "disk.full", "robot: its disk is full; 3 s later vision: SIGKILL", _fill_disk, _SCRIPT,
+        also=f"speed stays >= {KEPT_MPS:g} m/s",
+    ),
+    FaultCase(
+        "demo.kill", "demo beside the robot: SIGKILL", _kill_demo, _SCRIPT, stops=False, alone=True,
+        also=f"0 processes after {DEMO_ENDS_S:g} s",
     ),
     FaultCase("stop.driving", "STOP: while driving", _stop, _SCRIPT, blind=True, also=_STAYS, short=True),
     FaultCase(

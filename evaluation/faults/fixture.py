@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Final, Self
 
-from sightline.evaluation.faults import camera
+from sightline.evaluation.faults import devices
 from sightline.evaluation.faults import evidence as judge
 from sightline.evaluation.faults.evidence import GOOD, INJECTED, MotorRow, SentCommand, read_events, wheel_mps
 from sightline.evaluation.faults.peer import PeerOptions, Role
@@ -258,15 +258,16 @@ class RobotFixture:
 
     def _write_files(self, sockets: str) -> None:
         device = {"kind": "sim", "options": {"socket_dir": sockets}}
-        eye = {"kind": "sightline.evaluation.faults.camera:FaultyCamera",
+        eye = {"kind": "sightline.evaluation.faults.devices:FaultyCamera",
                "options": {"socket_dir": sockets, "folder": str(self.folder)}}
-        camera.write_spares(self.folder)
+        devices.write_spares(self.folder)
         self.camera_mode(self.setup.camera)
+        wheels = {"kind": "sightline.evaluation.faults.devices:FaultyDrive", "options": eye["options"]}
         files: dict[str, dict[str, Any]] = {
             "scenario": _CHASE if self.setup.driver == "vision" else _EMPTY,
             "sim": {"scenario": str(self.folder / "scenario.toml"), "socket_dir": sockets, "seed": 1,
                     "motor_log": str(self.folder / "motors.csv")},
-            "robot": {"robot": ROBOT, "state_dir": str(self.folder / "state"), "camera": eye, "drive": device,
+            "robot": {"robot": ROBOT, "state_dir": str(self.folder / "state"), "camera": eye, "drive": wheels,
                       "range_sensor": device, "safety": {"auto_arm": True}, "listen": []},
             "vision": {"robot": ROBOT},
         }
@@ -328,7 +329,13 @@ class RobotFixture:
         """Set the mode of the camera from the next image on. Returns the time of the change."""
         at_us, new = monotonic_us(), self.folder / "camera.new"
         new.write_text(mode, "ascii")
-        new.replace(self.folder / camera.MODE)
+        new.replace(self.folder / devices.MODE)
+        return at_us
+
+    def fail_drive(self) -> int:
+        """Let the drive raise from the next tick on. Returns the time of the change."""
+        at_us = monotonic_us()
+        (self.folder / devices.DRIVE_MODE).touch()
         return at_us
 
     def signal_network(self, number: signal.Signals) -> int:
@@ -405,6 +412,20 @@ class RobotFixture:
     def _judged(self) -> tuple[str, ...]:
         """Sightline's own processes; what a scripted driver needs to send 10 MB is its own affair."""
         return ("sim", "robot", "peer") if self.setup.driver == "vision" else ("sim", "robot")
+
+    def status(self) -> dict[str, Any]:
+        """Return what `sightline status --json` prints."""
+        self.processes.start("status", ["status", ROBOT, "--connect", self.endpoint, "--json"])
+        self.processes.exit_code("status", AT_SPEED_S)
+        printed = self.processes.log("status").read_text("utf-8")
+        if not printed.startswith("{"):
+            raise SightlineError(f"fault bench: no status: {printed.strip()}; see {self.folder}")
+        status: dict[str, Any] = json.loads(printed)
+        return status
+
+    def logged(self, text: str) -> int:
+        """Return the number of times that the log of the robot contains `text`."""
+        return self.processes.log("robot").read_text("utf-8", "replace").count(text)
 
     def grown_mb(self) -> float:
         """Return the largest growth of a measured process since the wheels were at speed, in MB."""

@@ -18,7 +18,7 @@ import typer
 from typer.core import TyperGroup
 
 from sightline.protocol.errors import SightlineError
-from sightline.protocol.log import error_line
+from sightline.protocol.log import error_line, report_ending
 
 INTERRUPTED: Final = 130
 UNEXPECTED: Final = 1
@@ -174,6 +174,7 @@ def _unexpected(error: Exception) -> int:
         return _print_error(line, getattr(error, "exit_code", USAGE))
     if os.environ.get("SIGHTLINE_DEBUG") == "1":
         raise error
+    report_ending("program", error)
     where = f"{type(error).__name__}: {' '.join(str(error).split())}"
     return _print_error(f"unexpected {where}; SIGHTLINE_DEBUG=1 shows where, please report it", UNEXPECTED)
 

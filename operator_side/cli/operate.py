@@ -88,7 +88,8 @@ def status(
             return follow_status(missions, verbose=verbose, as_json=as_json)
         state = missions.operator.wait_report().status
         is_seen_to = state.holder is not None and state.holder.source == "vision"
-        report = missions.newest(_REPORT_S if is_seen_to else 0.0)
+        # In HOLD the driver may be a vision service whose detector raises, so that it sends no command.
+        report = missions.newest(_REPORT_S if is_seen_to or state.state is State.HOLD else 0.0)
         if as_json:
             typer.echo(_status_json(target.robot, state, report))
         else:
@@ -127,11 +128,13 @@ def _status_json(robot: str, state: Status, report: MissionReport | None) -> str
 
 
 def _status_block(robot: str, state: Status, report: MissionReport | None, verbose: bool) -> list[str]:
-    from sightline.operator_side.client.missions import mission_line, mission_lines
+    from sightline.operator_side.client.missions import mission_line, mission_lines, vision_fault_lines
 
     if verbose:
         return [*status_lines(robot, state), *(mission_lines(report) if report else ())]
-    return [*short_lines(robot, state), *([f"mission   {mission_line(report)}"] if report else [])]
+    if report is None:
+        return list(short_lines(robot, state))
+    return [*short_lines(robot, state), f"mission   {mission_line(report)}", *vision_fault_lines(report)]
 
 
 def arm(

@@ -236,6 +236,11 @@ def mission_lines(report: MissionReport) -> Iterator[str]:
         yield f"          last mission request rejected: {report.refused}"
     if report.detector:
         yield f"detector  {detector_line(report)}"
+    yield from vision_fault_lines(report)
+
+
+def vision_fault_lines(report: MissionReport) -> Iterator[str]:
+    """Format the exceptions of the vision service so far; nothing without them."""
     if report.faults:
         yield f"faults    {counts_text(report.faults)}; the log of the vision service has the tracebacks"
 

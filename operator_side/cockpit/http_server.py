@@ -19,6 +19,7 @@ from typing import Any, Final
 from urllib.parse import parse_qsl, urlsplit
 
 from sightline.protocol.errors import LinkError, SightlineError
+from sightline.protocol.log import report_fault
 from sightline.protocol.transports.diagnosis import port_owner
 
 MAX_CONNECTIONS: Final = 32
@@ -122,10 +123,11 @@ class _Server(ThreadingMixIn, HTTPServer):
         finally:
             self._places.release()
 
-    def handle_error(self, request: Any, client_address: Any) -> None:
+    def handle_error(self, _request: Any, _client_address: Any) -> None:
         """Ignore a client that disconnects or sends nothing."""
-        if not isinstance(sys.exception(), OSError):
-            super().handle_error(request, client_address)
+        error = sys.exception()
+        if error is not None and not isinstance(error, OSError):
+            report_fault("web page", error)
 
 
 class _Handler(BaseHTTPRequestHandler):

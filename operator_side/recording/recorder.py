@@ -34,6 +34,7 @@ from sightline.protocol.channels import (
     Channel,
 )
 from sightline.protocol.errors import ConfigError
+from sightline.protocol.log import report_fault
 from sightline.protocol.transports.link import Link, Message
 
 if TYPE_CHECKING:
@@ -112,7 +113,8 @@ class Recorder:
         try:
             yield
         except Exception as error:  # the library's own too: whatever it is, `close` must not wait for it
-            self._fail(getattr(error, "strerror", None) or f"{type(error).__name__}: {error}")
+            cause = getattr(error, "strerror", None)  # of the disk; any other is a defect
+            self._fail(cause or f"{type(error).__name__}: {report_fault('recorder', error)}")
 
     def _fail(self, why: str) -> None:
         if not self.failed:

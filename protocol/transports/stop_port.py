@@ -192,8 +192,14 @@ class StopProcess:
         self._start_at_us = at_us + _RESTART_US
         if self._process is None or self._process.poll() is not None:
             # Here, because the process itself would pay for it too.
+            import logging
             import subprocess
 
+            from sightline.protocol.log import count_fault
+
+            if self._process is not None:
+                count_fault("STOP receiver")
+                logging.getLogger(__name__).error("STOP receiver ended (%d); starting it again", self._process.poll())
             root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
             number = self._far.fileno()
             command = [sys.executable, "-I", "-S", "-c", _CHILD.format(self._module), root, str(number), self._options]

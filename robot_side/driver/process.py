@@ -88,8 +88,10 @@ def run(config: RobotConfig) -> int:
 
 
 def _zero(drive: Drive) -> None:
-    with suppress(Exception):  # nothing may keep what ends after it from ending
+    try:
         drive.set(0.0, 0.0)
+    except PLUGIN_ERRORS as error:  # nothing may keep what ends after it from ending
+        report_fault("drive", error)
 
 
 def stop_receiver_of(config: RobotConfig) -> StopProcess | None:
@@ -135,8 +137,10 @@ class BatteryReader:
         try:
             self._read_until_closing()
         finally:
-            with suppress(*PLUGIN_ERRORS):
+            try:
                 self._battery.close()
+            except PLUGIN_ERRORS as error:
+                report_fault("battery", error)
 
     def _read_until_closing(self) -> None:
         while not self._closing.is_set():
@@ -180,7 +184,6 @@ class Driver:
         self._rejection_limiter = RepeatLimiter()
         self._rejected_by_network: Counter[str] = Counter()
         self._faults_of_network: Counter[str] = Counter()
-        self._earlier_faults: Counter[str] = Counter()
         self.driver_end = DriverEnd(config, self._driver_core.session)
         self._receiver = receiver
         self._stop_applied = 0
@@ -248,7 +251,7 @@ class Driver:
         self._move()
         self._answer()
         if punctual:
-            self._driver_core.faults = faults() + self._earlier_faults + self._faults_of_network
+            self._driver_core.faults = faults() + self._faults_of_network
             self._driver_core.latch_failed = self.latch_writer.failed
             for message in self._driver_core.messages(now_us):
                 self.driver_end.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
@@ -307,16 +310,14 @@ class Driver:
             self._fault("drive", error)
 
     def _fault(self, part: str, error: BaseException) -> None:
-        report_fault(part, error)
-        self._driver_core.gate.fault(f"{error or type(error).__name__}")
+        self._driver_core.gate.fault(report_fault(part, error))
 
     def _without_sensors(self) -> tuple[float, float]:
         """Return the gate's ramp to zero, or zero if the gate cannot step either, because this loop must not end."""
         try:
             return self._driver_core.tick(monotonic_us(), None, None)
         except Exception as error:
-            report_fault("control loop", error)
-            self._driver_core.gate.halt(f"{error or type(error).__name__}")
+            self._driver_core.gate.halt(report_fault("control loop", error))
             return 0.0, 0.0
 
     def _scanned(self) -> Ranges | None:
@@ -402,11 +403,9 @@ class Driver:
         elif kind is ipc.PacketKind.REJECTED:
             self._on_rejected(ipc.unpack_counts(packet))
         elif kind is ipc.PacketKind.FAULTS:
-            self._faults_of_network = Counter(ipc.unpack_counts(packet))
+            self._faults_of_network += Counter(ipc.unpack_counts(packet))
         elif kind is ipc.PacketKind.READY:
             self._rejected_by_network.clear()
-            self._earlier_faults += self._faults_of_network
-            self._faults_of_network = Counter()
             self.driver_end.on_ready()
         return False
 

@@ -19,8 +19,8 @@ from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.config import PLUGIN_ERRORS
-from sightline.protocol.errors import HardwareError, SightlineError, WireError
-from sightline.protocol.log import error_line, faults, report_fault, start_log
+from sightline.protocol.errors import SightlineError, WireError
+from sightline.protocol.log import count_fault, error_line, error_text, faults, report_fault, start_log
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
 from sightline.protocol.transports.zenoh.flood_limits import limit_floods
@@ -155,13 +155,14 @@ class NetworkProcess:
         return picture
 
     def _on_camera_error(self, error: BaseException) -> None:
-        is_logged = report_fault("camera", error)
-        if not self._camera_fault and not is_logged:
-            _log.warning("camera: %s", error)
-        self._camera_fault = " ".join(str(error).split()) or type(error).__name__
-        # A plug-in that reports the loss opens its device again itself. A restart would only interrupt the link.
-        if isinstance(error, HardwareError):
-            self._no_image_since_us = 0
+        text = error_text(error)
+        if text in self._setup.camera_fault:  # an earlier process has logged it
+            count_fault("camera")
+        else:
+            report_fault("camera", error)
+        if not self._camera_fault:
+            _log.warning("camera: %s", text)
+        self._camera_fault = text
         time.sleep(_CAMERA_RETRY_S)
 
     def _check_camera(self, now_us: int) -> None:
@@ -228,9 +229,9 @@ class NetworkProcess:
         self._network_end.send(bytes([ipc.PacketKind.STREAM]) + encode(status))
         self._relay.look()
         self._report_rejected()
-        raised = faults()
-        if raised != self._faults_reported and self._network_end.send(ipc.pack_counts(ipc.PacketKind.FAULTS, raised)):
-            self._faults_reported = raised
+        more = faults() - self._faults_reported
+        if more and self._network_end.send(ipc.pack_counts(ipc.PacketKind.FAULTS, more)):
+            self._faults_reported += more
 
     def _report_rejected(self) -> None:
         """Send the driver the counts of messages that never reached it, so that `status` shows them."""
@@ -251,8 +252,7 @@ class NetworkProcess:
         self._credit.set()
 
 
-def _run(driver: NetworkEnd) -> None:
-    setup = NetworkSetup.model_validate_json(driver.receive())
+def _run(setup: NetworkSetup, driver: NetworkEnd) -> None:
     config = setup.config
     with ExitStack() as ending:
         # After a restart the link comes first, so that a robot without a camera can be reached.
@@ -281,16 +281,21 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, KEYS)
     driver = NetworkEnd(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
+    setup = NetworkSetup.model_validate_json(driver.receive())
     code = 1
     try:
-        _run(driver)
+        _run(setup, driver)
         code = 0
     except SightlineError as error:
-        logging.shutdown()
-        print(error_line(str(error)), file=sys.stderr)
         code = error.exit_code
+        if setup.is_restart:
+            _log.error("robot %s: %s", setup.config.robot, error)
+        else:  # the program ends by it
+            logging.shutdown()
+            print(error_line(str(error)), file=sys.stderr)
     except Exception as error:
         report_fault("network process", error)
+        driver.send(ipc.pack_counts(ipc.PacketKind.FAULTS, {"network process": 1}))
     finally:
         logging.shutdown()
         os._exit(code)  # daemon threads of a transport must not keep a finished process

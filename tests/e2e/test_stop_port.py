@@ -31,7 +31,7 @@ def test_stop_ends_with_zero_wheels_and_a_latch_on_disk(tmp_path, routed, secure
                 subprocess.Popen([*COMMAND, "router", "--listen", endpoint, *secure], stdout=subprocess.PIPE, text=True)
             )
             ending.callback(router.terminate)
-            assert router.stdout.readline().startswith("router: on ")
+            assert " info router: on " in router.stdout.readline()
         robot = ending.enter_context(RobotProcess(tmp_path, endpoint=endpoint, **changes))
         robot.wait_until_on()
         ending.enter_context(Vision(endpoint, secure=changes.get("secure", "")))

@@ -32,6 +32,34 @@ from tests.fixtures.robot_process import RobotProcess
 SECOND_US = 1_000_000
 
 
+class SlowToShowError(ValueError):
+    """An exception whose text takes long, as the source lines of a traceback do on a bad disk."""
+
+    def __str__(self):
+        time.sleep(0.3)
+        return "slow"
+
+
+def test_a_traceback_is_formatted_without_its_caller():
+    handler = QueueHandler()
+    handler.setFormatter(TextFormatter())
+    record = _record("broken", logging.ERROR)
+    record.exc_info = (SlowToShowError, SlowToShowError(), None)
+    begin_s = time.monotonic()
+    handler.handle(record)
+    assert time.monotonic() - begin_s < 0.3
+    handler.flush()
+
+
+@pytest.mark.parametrize("formatter", [TextFormatter(), JsonFormatter("robot")])
+def test_no_text_of_a_peer_reaches_the_terminal_as_a_command(formatter):
+    record = _record("from \x1b[2J and ball\udce9.onnx")
+    record.exc_info = (OSError, OSError("\x1b[2J\udce9"), None)
+    line = formatter.format(record)
+    line.encode()
+    assert "\x1b" not in line and "\\udce9" in line and "OSError" in line
+
+
 def _record(message, level=logging.INFO):
     return logging.makeLogRecord({"msg": message, "levelno": level, "levelname": logging.getLevelName(level)})
 

@@ -27,13 +27,6 @@ from tests.robot_side.network.test_process import ROBOT, Camera, Link, Relay
 SECOND_US = 1_000_000
 
 
-@pytest.fixture(autouse=True)
-def own_counts(monkeypatch):
-    """Counts of this test alone."""
-    monkeypatch.setattr(log, "_faults", log.Counter())
-    monkeypatch.setattr(log, "_kinds", set())
-
-
 def raised(error):
     try:
         raise error
@@ -98,10 +91,29 @@ def test_exceptions_of_drive_and_range_sensor_are_in_the_status(driver, caplog, 
                                               "range sensor raised OSError: no such sensor"]
 
 
+class UnprintableError(RuntimeError):
+    def __str__(self):
+        raise ValueError("no text either")
+
+
+@pytest.mark.parametrize(("error", "reason"), [
+    (OSError("pin\udce9\x1b[2J\nis gone"), "pin??[2J is gone"), (UnprintableError(), "UnprintableError"),
+    (SystemExit(3), "3"),
+])
+def test_an_odd_exception_of_a_drive_ends_no_loop_and_is_in_the_status(driver, monkeypatch, error, reason):  # noqa: F811
+    monkeypatch.setattr(driver.driver_end, "keep_alive", lambda *_: None)
+
+    def fails(*_):
+        raise error
+
+    monkeypatch.setattr(driver._drive, "set", fails)
+    status = status_of(driver)
+    assert (status.state, status.reason, status.faults) == ("FAULT", reason, {"drive": 1})
+
+
 def test_counts_of_network_processes_add_up_in_the_status(driver, monkeypatch):  # noqa: F811
     monkeypatch.setattr(driver.driver_end, "keep_alive", lambda *_: None)
-    for counts in ({"camera": 2}, {"camera": 3}):
-        driver._on_packet(ipc.pack_counts(ipc.PacketKind.FAULTS, counts))
+    driver._on_packet(ipc.pack_counts(ipc.PacketKind.FAULTS, {"camera": 3}))
     driver._on_packet(bytes([ipc.PacketKind.READY]))
     driver._on_packet(ipc.pack_counts(ipc.PacketKind.FAULTS, {"camera": 1, "callback": 5}))
     assert status_of(driver).faults == {"camera": 4, "callback": 5}
@@ -203,30 +215,63 @@ def test_a_process_that_stood_still_does_not_blame_its_camera(process):
     watched(process, SECOND_US, 12 * SECOND_US, step_us=3 * SECOND_US)
 
 
-def test_a_camera_that_reports_its_own_loss_is_named_and_not_started_again(process, caplog):
-    def gone(_timeout_s):
-        raise HardwareError("camera /dev/video0 was unplugged; plug it in again")
+UNPLUGGED = "camera /dev/video0 was unplugged; plug it in again"
 
-    process.camera.read = gone
-    for number in range(80):
+
+def unplugged(_timeout_s):
+    raise HardwareError(UNPLUGGED)
+
+
+def test_a_camera_that_reports_its_own_loss_is_named_and_its_process_ends_after_2_s(process, caplog):
+    caplog.set_level("INFO")
+    process._network_core.may_capture = lambda *_: True
+    process.camera.read = unplugged
+    for number in range(34):
         process._stream_one()
         process._check_camera(SECOND_US + number * 50_000)
     process._report(1)
-    assert reported(process) == "camera /dev/video0 was unplugged; plug it in again"
-    assert faults() == {"camera": 80} and len(caplog.records) == 1 and caplog.records[0].exc_info
+    assert reported(process) == UNPLUGGED and faults() == {"camera": 34}
+    logged = [one for one in caplog.records if one.levelname == "ERROR"]
+    assert [one.message for one in logged] == [f"camera raised HardwareError: {UNPLUGGED}"] and logged[0].exc_info
     del process.camera.read
     process._stream_one()
     process._report(1)
-    assert reported(process) == ""
-
-
-def test_any_exception_of_a_camera_is_reported_and_ends_no_loop(process):
-    process.camera.read = lambda _timeout_s: 1 / 0
+    assert reported(process) == "" and caplog.messages[1:] == [f"camera: {UNPLUGGED}", "camera: back"]
+    process.camera.read = unplugged
     process._stream_one()
-    process._report(1)
+    with pytest.raises(Ended):
+        watched(process, 3 * SECOND_US, 6 * SECOND_US)
+    assert reported(process) == f"{UNPLUGGED}; its process was started again"
+
+
+def test_a_loss_that_an_earlier_process_logged_is_only_counted(process, caplog):
+    process.camera.read = unplugged
+    process._setup = process._setup.model_copy(update={"camera_fault": f"{UNPLUGGED}; its process was started again"})
+    process._camera_fault = process._setup.camera_fault
+    process._stream_one()
+    assert faults() == {"camera": 1} and not caplog.records
+
+
+def test_exceptions_of_a_camera_are_reported_as_they_come_and_end_no_loop(process):
+    process.camera.read = lambda _timeout_s: 1 / 0
+    for times in (1, 2):
+        for _ in range(times):
+            process._stream_one()
+        process._report(1)
     counts = [ipc.unpack_counts(one) for one in process._network_end.sent
               if ipc.packet_kind(one) is ipc.PacketKind.FAULTS]
-    assert counts == [{"camera": 1}] and reported(process) == "division by zero"
+    assert counts == [{"camera": 1}, {"camera": 2}] and reported(process) == "division by zero"
+
+
+@pytest.mark.parametrize("odd", ["ball\udce9.jpg\x1b[2J", "two\nlines"])
+def test_a_camera_with_an_odd_message_is_named_in_letters(process, odd):
+    def fails(_timeout_s):
+        raise OSError(odd)
+
+    process.camera.read = fails
+    process._stream_one()
+    process._report(1)
+    assert reported(process) in ("ball?.jpg?[2J", "two lines")
 
 
 def test_each_restart_for_the_camera_waits_longer_until_an_image_came(tmp_path):

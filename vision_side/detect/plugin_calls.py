@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import ConfigError, SightlineError
-from sightline.protocol.log import report_fault
+from sightline.protocol.log import error_text, printable, report_ending, report_fault
 from sightline.protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.detect.port import (
@@ -121,11 +121,12 @@ def plugin_guard(what: str) -> Iterator[None]:
     except SightlineError:
         raise
     except PLUGIN_ERRORS as error:
+        report_ending("detector", error)
         raise ConfigError(f"{_raises(what, error)}; fix the plug-in") from error
 
 
 def _raises(what: str, error: BaseException) -> str:
-    return f"{what} raises {type(error).__name__}: {' '.join(str(error).split())}"[:_LONGEST]
+    return f"{what} raises {type(error).__name__}: {error_text(error)}"[:_LONGEST]
 
 
 # Validates a detector's answer: of this frame, finite, within the image, not too many. Pure.
@@ -170,8 +171,7 @@ def _answer(frame: DetectFrame, result: DetectionResult | None) -> DetectionResu
 
 
 def _why(error: BaseException) -> str:
-    why = " ".join(f"invalid answer of the detector: {type(error).__name__}: {error}".split())
-    return _printable(why[:_LONGEST_WHY])
+    return f"invalid answer of the detector: {type(error).__name__}: {error_text(error)}"[:_LONGEST_WHY]
 
 
 def validated(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
@@ -204,17 +204,13 @@ def _repaired_maker(result: DetectionResult) -> dict[str, Any]:
         if not isinstance(text, str):
             raise ValueError(f"invalid {what} {text!r}: not text")
         if not text.isprintable():
-            repaired[what] = _printable(text)
+            repaired[what] = printable(text)
     took_us = result.compute_us
     if type(took_us) is int and 0 <= took_us <= MAX_INTEGER:
         return repaired
     if not isinstance(took_us, Real) or math.isnan(took_us):
         raise ValueError(f"it took {took_us!r} microseconds")
     return repaired | {"compute_us": int(min(max(took_us, 0), MAX_INTEGER))}
-
-
-def _printable(text: str) -> str:
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
 def _validated(one: Detection, width_px: int, height_px: int) -> Detection | None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from sightline.protocol.clock import monotonic_us
+from sightline.protocol.log import report_fault
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.detect.per_robot import MAX_ROBOTS, DecoderPool, PerSession
 from sightline.vision_side.detect.plugin_calls import Notices, attach_detector, close_detector, notices_of, validated
@@ -166,7 +167,8 @@ class ShadowDetector:
             try:
                 self._compare(task)
             except Exception as error:  # a plug-in's own fault, which must not end the shadow for good
-                self._notices.add(f"{self._name} failed: {type(error).__name__}: {error}"[:160])
+                text = report_fault("detector", error, self._name)
+                self._notices.add(f"{self._name} failed: {type(error).__name__}: {text}"[:160])
 
     def _compare(self, task: _Task) -> None:
         frame = self._decoders.again(task.frame)

@@ -75,5 +75,4 @@ class MissionSwitch:
 
 
 def _failed(error: BaseException) -> Plan:
-    report_fault("mission", error)
-    return Plan(STILL, "failed", " ".join(f"{type(error).__name__}: {error}".split())[:200], done=True)
+    return Plan(STILL, "failed", f"{type(error).__name__}: {report_fault('mission', error)}"[:200], done=True)

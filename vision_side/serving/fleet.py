@@ -11,6 +11,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from sightline.protocol.channels import Channel
+from sightline.protocol.log import report_fault
 from sightline.protocol.transports.link import FleetLink, Link, LinkWrapper, Message
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector
@@ -109,6 +110,7 @@ class Fleet:
                 while not self._ending.is_set():
                     service.turn(_LONGEST_WAIT_S)
         except Exception as error:
+            report_fault("vision", error)
             self._failed = error
             self._bell.set()
 

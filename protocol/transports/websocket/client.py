@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
+from sightline.protocol.log import report_fault
 from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES, WebSocketEndpoint
 from sightline.protocol.transports.security import bearer_header, own_token
 from sightline.protocol.transports.websocket.connection import Connection
@@ -99,7 +100,7 @@ class Client:
             self.trouble = ""
         # A broken peer can make the library raise any error. This thread must continue.
         except Exception as error:
-            self._turned_away(f"{type(error).__name__}: {error}"[:200], False)
+            self._turned_away(f"{type(error).__name__}: {report_fault('websocket', error)}"[:200], False)
         return False
 
     def _hangs_up(self) -> str:

@@ -16,6 +16,7 @@ from pydantic import Field
 
 from sightline.protocol.errors import ConfigError, HardwareError, install_command
 from sightline.protocol.jpeg import JpegSize
+from sightline.protocol.log import report_fault
 from sightline.protocol.messages import CameraModel
 from sightline.protocol.transports.diagnosis import process_with_open
 from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
@@ -319,7 +320,7 @@ class V4l2Camera:
             except HardwareError as error:
                 self._fail(error)
             except Exception as error:  # OpenCV raises its own for what a broken driver hands over
-                self._fail(HardwareError(f"camera {self._config.device} failed: {' '.join(str(error).split())}"))
+                self._fail(HardwareError(f"camera {self._config.device} failed: {report_fault('camera', error)}"))
         self._release()
 
     def _fail(self, fault: HardwareError) -> None:

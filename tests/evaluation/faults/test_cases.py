@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from docs.make.faults import describe_machine, report_page
 from sightline.evaluation.checks import Check, at_most, worst_checks
-from sightline.evaluation.faults import camera
+from sightline.evaluation.faults import devices
 from sightline.evaluation.faults.cases import CASES, chosen
 from sightline.evaluation.faults.evidence import (
     GOOD,
@@ -202,10 +202,10 @@ def test_oversized_messages_exceed_the_channel_bound():
 
 
 def test_spare_images_have_the_defects_of_their_names(tmp_path):
-    camera.write_spares(tmp_path)
+    devices.write_spares(tmp_path)
     for name in ("black", "resized"):
         size = read_jpeg_size((tmp_path / f"{name}.jpg").read_bytes())
-        assert (size.width_px, size.height_px) == camera.SPARE[name]
+        assert (size.width_px, size.height_px) == devices.SPARE[name]
     bomb = (tmp_path / "bomb.jpg").read_bytes()
     assert len(bomb) < 2000 and read_jpeg_size(bomb, max_pixels=2**33).width_px == 65_500
     with pytest.raises(WireError):
@@ -305,7 +305,7 @@ def by_tier(rows):
     """Put the rows that compute for more than 1.5 s into the second tier."""
     costly = {"command.flood", "command.heartbeat", "command.replay", "camera.frozen", "stop.driving", "wire.cut3",
               "end.sigterm", "network.kill", "network.gil", "vision.hangs", "vision.kill", "flood.tls25",
-              "flood.tcp500"}
+              "flood.tcp500", "camera.hangs", "drive.raises"}
     assert costly <= {row.id for row in rows}
     return [pytest.param(row, marks=pytest.mark.slow if row.id in costly else (), id=row.id) for row in rows]
 

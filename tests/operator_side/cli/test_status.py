@@ -7,9 +7,10 @@ import threading
 
 import pytest
 
+from sightline.operator_side.cli.operate import _status_block
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import encode
-from sightline.protocol.messages import Stamp, State, Status
+from sightline.protocol.messages import MissionReport, Stamp, State, Status, StreamStatus
 from sightline.protocol.transports.open import open_link
 from tests.fixtures.commands import run
 from tests.fixtures.links import until
@@ -43,6 +44,19 @@ def test_status_is_short_and_verbose_shows_every_field(capsys, endpoint):
     assert "state     STOPPED: test\n" in short and "next      sightline reset r1\n" in short
     code, full, _ = run(capsys, "status", "--verbose", "--connect", endpoint)
     assert "network restarts" in full and len(full.splitlines()) > len(short.splitlines())
+
+
+@pytest.mark.parametrize("verbose", [False, True])
+def test_status_shows_the_faults_of_robot_and_vision_service(verbose):
+    stream = StreamStatus(camera_fault="camera sim gives no image")
+    state = Status(state=State.HOLD, reason="no command", faults={"callback": 1, "drive": 2}, stream=stream)
+    lines = _status_block("r1", state, MissionReport(mission="follow", phase="x", faults={"detector": 3}), verbose)
+    assert "camera    camera sim gives no image" in lines
+    assert "faults    drive 2, callback 1; the robot's log has the tracebacks" in lines
+    assert "faults    detector 3; the log of the vision service has the tracebacks" in lines
+    state = Status(state=State.HOLD, reason="")
+    lines = _status_block("r1", state, MissionReport(mission="follow", phase="x"), verbose)
+    assert not any(line.startswith(("faults", "camera  ")) for line in lines)
 
 
 @pytest.mark.parametrize(("no_color", "colored"), [("", True), ("1", False)])

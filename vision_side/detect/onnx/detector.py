@@ -16,6 +16,7 @@ from pydantic import Field
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.log import report_fault
 from sightline.vision_side.config import Device
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.refine import refined
@@ -101,8 +102,9 @@ class OnnxDetector:
         except Exception as error:  # an engine that fails on an image gives no answer, and reports that once
             if len(frames) > 1:
                 return self._fewer_at_once(frames, deadline_us, error)
+            text = report_fault("detector", error)
             if not self._failed:
-                self._notices.append(f"{self.maker.detector} gives no answer: {str(error)[:160]}")
+                self._notices.append(f"{self.maker.detector} gives no answer: {text[:160]}")
             self._failed = True
             return [None]
 

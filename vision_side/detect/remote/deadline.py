@@ -13,6 +13,7 @@ from pydantic import Field
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import SightlineError
+from sightline.protocol.log import report_fault
 from sightline.protocol.transports.link import LatestSlot, Link
 from sightline.vision_side.detect.per_robot import DecoderPool
 from sightline.vision_side.detect.plugin_calls import (
@@ -119,7 +120,7 @@ class DeadlineDetector:
                 try:
                     self._answer(pending)
                 except Exception as error:  # no memory for another decoder: this thread must not end by it
-                    self._fail(f"{type(error).__name__}: {error}")
+                    self._fail(f"{type(error).__name__}: {report_fault('detector', error)}")
         try:
             close_detector(self._inner)
         except SightlineError as error:

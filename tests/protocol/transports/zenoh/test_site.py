@@ -111,7 +111,7 @@ def _router(endpoint):
     command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "router", "--listen", endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
-            assert process.stdout.readline().startswith("router: on ")
+            assert " info router: on " in process.stdout.readline()
             yield process
         finally:
             process.kill()

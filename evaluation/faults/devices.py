@@ -1,21 +1,26 @@
-"""A camera plug-in that fails on command. Shell (files).
+"""A camera and a drive, plug-ins that fail on command. Shell (files).
 
-Every image that was spoiled is noted in `camera.ledger` beside it.
+Every image that was spoiled is noted in `camera.ledger` beside it, every failure of the drive in `drive.ledger`.
 """
 
 import ctypes
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from sightline.evaluation.faults.evidence import INJECTED, EventLog
 from sightline.protocol.errors import HardwareError
-from sightline.robot_side.ports import Picture
-from sightline.sim.bus import SimCamera, SimSocketConfig
+from sightline.robot_side.ports import Picture, WheelAngles
+from sightline.sim.bus import SimCamera, SimDrive, SimSocketConfig
 
 MODE: Final = "camera.mode"
 EVENTS: Final = "camera.ledger"
+DRIVE_MODE: Final = "drive.mode"
+"""While this file exists, the drive raises an exception of its own instead of reading its encoders."""
+DRIVE_EVENTS: Final = "drive.ledger"
+DRIVE_ERROR: Final = "no encoder (injected by the bench)"
 GIL_HELD_S: Final = 1
 SLOW_S: Final = 0.2
 HEAVY_BYTES: Final = 16_700
@@ -51,6 +56,8 @@ class FaultyCamera:
             return picture
         self._held = mode == "gil"
         self._ledger.note(INJECTED)
+        while mode == "hangs" and self._mode.read_text("ascii") == mode:
+            time.sleep(0.05)
         if mode in SPARE:
             return replace(picture, jpeg=self._spares[mode])
         return FAULTS[mode](picture, self._last or picture)
@@ -58,6 +65,27 @@ class FaultyCamera:
     def close(self) -> None:
         """Close the camera."""
         self._camera.close()
+
+
+class FaultyDrive(SimDrive):
+    """A `Drive` that raises while the file DRIVE_MODE exists."""
+
+    class Config(SimSocketConfig):
+        """`folder` holds the mode and the ledger."""
+
+        folder: Path
+
+    def __init__(self, config: Config) -> None:
+        super().__init__(SimSocketConfig(socket_dir=config.socket_dir))
+        self._mode, self._ledger = config.folder / DRIVE_MODE, EventLog(config.folder / DRIVE_EVENTS)
+
+    def wheels(self) -> WheelAngles | None:
+        """Read the encoders, see `Drive`."""
+        angles = super().wheels()
+        if self._mode.exists():
+            self._ledger.note(INJECTED)
+            raise ArithmeticError(DRIVE_ERROR)
+        return angles
 
 
 def _hold_gil(now: Picture, _last: Picture) -> Picture:
@@ -82,7 +110,14 @@ def _heavy(now: Picture, _last: Picture) -> Picture:
     return replace(now, jpeg=now.jpeg.ljust(HEAVY_BYTES, b"\0"))
 
 
-FAULTS: Final = {"gil": _hold_gil, "unplugged": _unplugged, "frozen": _frozen, "slow": _slow, "heavy": _heavy}
+def _nothing(_now: Picture, _last: Picture) -> None:
+    time.sleep(SLOW_S)
+
+
+FAULTS: Final[dict[str, Callable[[Picture, Picture], Picture | None]]] = {
+    "gil": _hold_gil, "unplugged": _unplugged, "frozen": _frozen, "slow": _slow, "heavy": _heavy, "nothing": _nothing,
+    "hangs": lambda now, _last: now,
+}
 
 
 def write_spares(folder: Path) -> None:
