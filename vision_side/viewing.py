@@ -134,7 +134,8 @@ class ViewPublisher:
             try:
                 self._publish(job)
             except Exception as error:  # whatever a plug-in's detections hold: people see less, the robot drives on
-                self._log_change("viewing", f"cannot show an image: {report_fault('viewing', error)}")
+                text = report_fault("viewing", error)
+                self._log_change("viewing", f"cannot show an image: {type(error).__name__}: {text}")
 
     def _next(self) -> _Job | None:
         job = self._jobs.take(IDLE_S)

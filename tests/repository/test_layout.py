@@ -65,7 +65,6 @@ SMALL_FILES = {  # with one importer, in their own folder: the reason why each i
     "benchmarks/network/watch.py": "a process of its own: python -m",
     "benchmarks/peers/classic_detector.py": "what a rival would write, kept apart from what all are given",
     "evaluation/demo/relay.py": "a process of its own: python -m",
-    "evaluation/faults/devices.py": "plug-ins that the robot's process loads by its name",
     "robot_side/hardware/gpio_low.py": "runs in the guardian of the pins, without what gpio.py imports",
     "robot_side/driver/persistence.py": "the STOP latch on disk: the one place that a restart depends on",
     "robot_side/safety/lease.py": "a rule set of its own in the safety core, under strict limits",

@@ -222,4 +222,5 @@ def test_an_error_of_the_file_format_ends_the_recording_and_close_comes_back(tmp
     closing.start()
     closing.join(5)
     assert not closing.is_alive()
-    assert recorder.failed == "ZeroDivisionError: division by zero" and len(caplog.messages) == 1
+    assert recorder.failed == "ZeroDivisionError: division by zero"
+    assert [one.levelname for one in caplog.records] == ["ERROR", "WARNING"] and caplog.records[0].exc_info
