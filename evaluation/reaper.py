@@ -14,10 +14,13 @@ import sys
 import time
 from contextlib import suppress
 
-ENDS_WITHIN_S = 1.1
+ENDS_WITHIN_S = 0.8
 """For all but the oldest process after SIGTERM. The oldest is the simulation, where the robot brings wheels to zero."""
-KILLED_AFTER_S = 1.6
-"""From the end of the program to SIGKILL for each process that is left, with all that it started."""
+KILLED_AFTER_S = 1.2
+"""From the end of the program to SIGKILL for each process that is left, with all that it started.
+
+On a busy machine a vision service does not end within this, and a killed process takes 0.5 s to be gone.
+"""
 
 
 class Reaper:

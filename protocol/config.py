@@ -112,7 +112,8 @@ class PluginRegistry:
                 if _CLASS.fullmatch(kind):
                     return _imported(kind)
         except PLUGIN_ERRORS as error:  # in a plug-in's own import
-            report_ending(self.noun, error)
+            if not isinstance(error, ImportError | AttributeError):  # those name what is missing
+                report_ending(self.noun, error)
             hint = "" if entry is not None else self._hint(kind)
             raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {_why(error, kind)}{hint}") from None
         there = f"there are {', '.join(self.names())}, or package.module:Name"

@@ -393,7 +393,7 @@ class Simulation:
 def run(config: SimConfig) -> int:
     """Simulate until SIGTERM, SIGINT or `seconds`; call it from the main thread.
 
-    Prints one line that begins with `simulation ready` once everything accepts. Raises ConfigError for an unknown
+    Logs `simulation ready: ...` once everything accepts. Raises ConfigError for an unknown
     scenario or robot, a `socket_dir` in use, a missing extra.
     """
     scenario = load_scenario(config.scenario)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from sightline.evaluation import reaper
 from sightline.evaluation.processes import Processes, worker_pool
 from sightline.protocol.errors import HardwareError
 from tests.fixtures.links import until
@@ -95,6 +96,30 @@ def test_a_parent_that_is_killed_leaves_no_process_and_no_folder_after_2_s(tmp_p
     assert until(lambda: not naming(str(tmp_path)) and not folder.exists(), 5)
     assert time.monotonic() - killed_s < 2.0
     assert (tmp_path / "ended").read_text() == "stopped oldest "
+
+
+def test_processes_that_do_not_end_are_killed_so_early_that_they_are_gone_after_2_s(monkeypatch):
+    """The robot has the time to bring the wheels to zero, which the simulation logs until then."""
+    now_s, sent = [100.0], []
+
+    def select(_reading, _writing, _failed, wait_s):
+        now_s[0] += wait_s
+        return [], [], []
+
+    def send(pid, number):
+        sent.append((pid, number, now_s[0]))
+
+    made = reaper.Reaper()
+    made._running = {1: 1, 2: 2}
+    with monkeypatch.context() as patch:
+        patch.setattr(reaper.time, "monotonic", lambda: now_s[0])
+        patch.setattr(reaper.select, "select", select)
+        patch.setattr(reaper.signal, "pidfd_send_signal", send)
+        patch.setattr(reaper.os, "killpg", send)
+        made.end()
+    at_s = {(pid, number): round(when_s - 100.0, 3) for pid, number, when_s in sent}
+    assert at_s[2, signal.SIGTERM] == 0.0 and 0.7 <= at_s[1, signal.SIGTERM] <= 0.8
+    assert at_s[1, signal.SIGKILL] == at_s[2, signal.SIGKILL] <= 1.2
 
 
 def test_a_temporary_folder_is_removed_after_the_processes_ended(tmp_path):

@@ -78,7 +78,7 @@ def eventually(condition: Callable[[], object], timeout_s: float = 5.0) -> None:
 
 
 def test_ready_line_and_ports(sim):
-    assert sim.ready.startswith("simulation ready")
+    assert "simulation ready" in sim.ready
     camera: Camera = SimCamera(sim.config())
     drive: Drive = SimDrive(sim.config())
     lidar: RangeSensor = SimRange(sim.config())
@@ -196,7 +196,7 @@ def test_a_dead_simulations_sockets_are_replaced_and_a_living_ones_are_not(sim, 
     sim.process.wait(10)
     assert (tmp_path / "motion.sock").exists()
     again = started(tmp_path, seconds=0.2)
-    assert again.ready.startswith("simulation ready")
+    assert "simulation ready" in again.ready
     assert again.process.wait(10) == 0
 
 

@@ -33,7 +33,7 @@ def test_robot_and_vision_meet_at_a_router_that_ends_on_a_signal(tmp_path, secur
         keys.make(tmp_path / "keys", [])
         endpoint = endpoint.replace("tcp/", "tls/")
     with _router("--listen", endpoint, *(["--secure", secure] if secured else [])) as router:
-        assert router.stdout.readline().startswith(f"router: on {endpoint}; ")
+        assert f" info router: on {endpoint}; " in router.stdout.readline()
         with (
             open_zenoh("r1", connect=[endpoint], role="robot", secure=secure) as robot,
             open_zenoh("r1", connect=[endpoint], role="vision", secure=secure) as vision,

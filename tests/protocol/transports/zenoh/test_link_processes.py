@@ -144,7 +144,7 @@ def test_process_ends_after_with(start):
         assert process.stdout.read() + process.stderr.read() == ""
 
 
-def test_zenoh_prints_nothing_to_the_terminal(start):
+def test_a_program_without_a_log_prints_the_traceback_of_its_callback_and_nothing_of_zenoh(start):
     code = """
     from sightline.protocol.errors import LinkError
     with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as peer:
@@ -161,5 +161,8 @@ def test_zenoh_prints_nothing_to_the_terminal(start):
                 pass
     """
     process = start(code, free_endpoint())
-    assert process.communicate(timeout=15) == ("", "")
-    assert process.returncode == 0
+    printed, errors = process.communicate(timeout=15)
+    first, *trace, last = errors.splitlines()
+    assert (printed, process.returncode) == ("", 0) and trace[0].startswith("Traceback ")
+    assert (first, last) == ("callback frame raised ZeroDivisionError: division by zero",
+                             "ZeroDivisionError: division by zero")
