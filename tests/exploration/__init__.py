@@ -1,0 +1,1 @@
+"""Exhaustive exploration of the real gate, lease and STOP latch: every order of events, both promises in each state."""
