@@ -237,7 +237,7 @@ def _seen(*seen: bool) -> OrderedDict[tuple[str, str], tuple[int, int]]:
 
 @cache
 def _command(speed: float, echo: int, arrival: int) -> AcceptedCommand:
-    return AcceptedCommand(_twist(speed), NOW_US - echo * TICK_US, NOW_US - arrival * TICK_US, 300_000)
+    return AcceptedCommand(_twist(speed), NOW_US - echo * TICK_US, NOW_US - arrival * TICK_US, 300_000, True)
 
 
 @cache
