@@ -24,7 +24,7 @@ test-all: test-environment  ## what is longer: first what can share the machine,
 	$(PYTEST) -m "slow and not alone and not long" --numprocesses auto --dist worksteal; shared=$$?; \
 	$(PYTEST) -m "alone and not long" && exit $$shared
 
-test-long: test-environment  ## once before a release: the fault bench, the kit against every broken peer, all mutants
+test-long: test-environment  ## once before a release: the fault bench, the exploration, the kit against every broken peer, all mutants
 	$(PYTEST) -m long; tests=$$?; $(MAKE) --no-print-directory mutation && exit $$tests
 
 lint: test-environment

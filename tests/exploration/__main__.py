@@ -9,20 +9,24 @@ from tests.exploration.search import PARTS, explore
 
 
 def main() -> int:
+    """Return the exit code: 0, or 5 if a promise breaks."""
     parser = argparse.ArgumentParser(prog="python -m tests.exploration", description=__doc__)
     parser.add_argument("--only", choices=PARTS, action="append", help="a part; repeatable")
     parser.add_argument("--states", type=int, default=10_000_000, help="end a part after so many states")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="processes")
     options = parser.parse_args()
-    for part in options.only or PARTS:
-        began_s = time.monotonic()
-        found = explore(part, options.states, options.jobs)
-        took_s = time.monotonic() - began_s
-        print(f"{part}: {found.states} states, {'all' if found.all_of_them else 'not all'} of them, up to {found.depth} "
-              f"events deep, in {took_s:.0f} s, {found.states / took_s:.0f} a second")
+    total, began_s = 0, time.monotonic()
+    for name in options.only or PARTS:
+        found = explore(name, min(options.states, PARTS[name].most), options.jobs)
+        total += found.states
         if found.promise:
-            print(f"broken: {found.promise}", *found.words, sep="\n")
+            print(f"{name}: broken: {found.promise}", *found.words, sep="\n")
             return 5
+        end = "no event leads to another one" if found.all_of_them else f"all orders of {found.depth} events, and more"
+        print(f"{name}: {found.states} states; {end}", flush=True)
+    used = os.times()
+    cpu_s = used.user + used.system + used.children_user + used.children_system
+    print(f"{total} states break no promise, in {time.monotonic() - began_s:.0f} s ({cpu_s:.0f} s of CPU time)")
     return 0
 
 

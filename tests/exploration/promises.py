@@ -1,15 +1,27 @@
-"""What the robot may do, from the design alone: it uses no record, no lease, no table of states and no ramp of ours.
+"""The permitted actions of a robot, from the design alone, without any record, lease, ramp or table of the robot.
 
-It follows each event with its own bookkeeping in ticks, and raises `Broken` with the promise that the robot broke.
+It follows each event with its own bookkeeping in ticks, and raises `BrokenError` with the promise that the robot broke.
+Of the robot it reads what a user can see: the reason of each rejection, the state, the holder and the wheels' speed.
+
+1. The robot never acts on a stale image: `on_twist` (a command counts only with a frame that was issued lately, whose
+   image is young too) and `_check_wheels` (the age limits the speed at each tick, not only on arrival).
+2. It can always be stopped and has one driver: `on_request` and `_check_state` (STOP, its latch, arming), `_may_take`
+   and `check` (the holder), `_check_wheels` (zero in time and within the distance, only the holder moves the wheels).
+
+Promises without a number keep the others from being true of a robot that never moves.
 """
 
-from sightline.protocol.messages import STILL, Holder, State, Verb
-from tests.exploration.robot import CONFIGS, DRIVERS, FRAMES, HUMAN, LIVE, NOW_US, OLD, SPEEDS, Image, Robot
+import math
+
+from sightline.protocol.messages import State, Verb
+from tests.exploration.robot import DRIVERS, FRAMES, HUMAN, LIVE, OLD, SPEEDS, Image, Robot
 
 RANK = {"vision": 1, "teleop": 2}
-LEASE, SILENCE, STALE, FULL_SPEED, ZERO_SPEED, HOLD = 10, 3, 4, 1, 4, 10  # ticks, of DESIGN.md; HOLD as configured
+LEASE, SILENCE, STALE, FULL_SPEED_TICKS, ZERO_SPEED, HOLD = 10, 3, 4, 1.5, 4, 10  # ticks; HOLD as configured
 RAMP = 4  # ticks from top speed to zero
+STOP_TICKS, STOP_M = 7, 0.25  # from the last valid command to wheels at zero
 TOP_MPS = 0.5
+TICK_S = 0.1
 ARMED = (State.HOLD, State.ACTIVE, State.DEGRADED)
 LATCHED = (State.STOPPED, State.FAULT)
 NOBODY = -1
@@ -17,13 +29,13 @@ _CLOSE = 1e-9
 _OLDER = (*range(1, FRAMES), OLD, NOBODY)  # the age one tick later; -1 is the last
 
 
-class Broken(Exception):
+class BrokenError(Exception):
     """A promise that does not hold."""
 
 
 def demand(condition: bool, promise: str) -> None:
     if not condition:
-        raise Broken(promise)
+        raise BrokenError(promise)
 
 
 class Promises:
@@ -48,13 +60,15 @@ class Promises:
         self.stored = stopped  # STOP is on the disk
         self.held = 0
         self.idle = RAMP
-        self.speed_mps = 0.0
+        self.quiet = 0  # ticks since the last accepted command, while the wheels turn
+        self.speed_mps = self.way_m = 0.0  # and the distance since then
 
     def save(self) -> tuple[float, ...]:
         """Return all of it."""
         return (
-            _STATES[self.state], *self.images, self.last, self.previous, self.since_new, self.frozen, self.started, self.ended, *self.seen, self.holder, self.left,
-            self.live, *self.command, self.auto, self.stored, self.held, self.idle, self.speed_mps,
+            _STATES[self.state], *self.images, self.last, self.previous, self.since_new, self.frozen, self.started,
+            self.ended, *self.seen, self.holder, self.left, self.live, *self.command, self.auto,
+            self.stored, self.held, self.idle, self.quiet, self.speed_mps, self.way_m,
         )
 
     def load(self, saved: tuple[float, ...]) -> None:
@@ -64,7 +78,7 @@ class Promises:
         self.seen = saved[13:16]
         self.holder, self.left, self.live = saved[16:19]
         self.command = saved[19:22]
-        self.auto, self.stored, self.held, self.idle, self.speed_mps = saved[22:]
+        self.auto, self.stored, self.held, self.idle, self.quiet, self.speed_mps, self.way_m = saved[22:]
 
     # --- what happens ----------------------------------------------------------------------------------------------
 
@@ -91,11 +105,11 @@ class Promises:
         demand((reason == "") >= (self.state in ARMED), "an honest command is applied")
         if not reason:
             self.command = (image, 0, driver)
+            self.quiet, self.way_m = 0, 0.0
 
-    def on_request(self, who: Holder, verb: Verb, age: int, reason: str, auto: bool) -> None:
+    def on_request(self, driver: int, verb: Verb, age: int, reason: str, auto: bool) -> None:
         """A request arrived that cites the status of this age."""
         granted, cited = not reason, age < self.ended and age <= self.started
-        driver = DRIVERS.index(who) if who in DRIVERS else NOBODY
         if verb is Verb.STOP:
             demand(granted, "2: STOP is always granted")
             self._leave(State.STOPPED)
@@ -118,7 +132,7 @@ class Promises:
             if may and self.holder != driver:
                 self.holder, self.left, self.live, self.command = driver, LEASE, 0, (NOBODY,) * 3
         elif self._is_beside_human(driver):
-            demand(not granted, "2: while a human drives nobody else arms or resets")
+            demand(not granted, "2: while a human drives no other operator arms or resets")
             return
         elif verb is Verb.ARM:
             ready = self.state is State.DISARMED and self.holder != NOBODY and self.live >= LIVE and still
@@ -168,10 +182,10 @@ class Promises:
         self.left = max(0, self.left - 1)
         if self.left == 0 and self.holder != NOBODY:
             self._lose_holder()
-        if self.auto and self.state is State.DISARMED and self.holder != NOBODY and self.live >= LIVE:
-            if self.speed_mps == 0.0:
-                self._arm()
-                self.held = -1  # this tick is the first in HOLD
+        may_arm = self.state is State.DISARMED and self.holder != NOBODY and self.live >= LIVE
+        if self.auto and may_arm and self.speed_mps == 0.0:
+            self._arm()
+            self.held = -1  # this tick is the first in HOLD
         if self.state in ARMED:
             self._step()
         # The status of this tick follows its step, so it shows what ended in it.
@@ -214,11 +228,12 @@ class Promises:
     @property
     def _is_permitted(self) -> bool:
         image, arrival, driver = self.command
-        return not self.frozen and self.state in ARMED and driver != NOBODY and image < ZERO_SPEED and arrival <= SILENCE
+        is_young = image < ZERO_SPEED and arrival <= SILENCE
+        return not self.frozen and self.state in ARMED and driver != NOBODY and is_young
 
     def _step(self) -> None:
         if self._is_permitted:
-            self.state, self.held = State.ACTIVE if self.command[0] <= FULL_SPEED else State.DEGRADED, 0
+            self.state, self.held = State.ACTIVE if self.command[0] <= FULL_SPEED_TICKS else State.DEGRADED, 0
             return
         self.held = self.held + 1 if self.state is State.HOLD else 0
         self.state = State.HOLD
@@ -240,29 +255,38 @@ class Promises:
         if state is not self.state:
             self._check_state(state)
         promised = None if self.holder == NOBODY else DRIVERS[self.holder]
-        demand(holder == promised, f"2: the driver is {promised and promised.source}")
+        demand(holder == promised, f"2: the lease belongs to {promised.source if promised else 'no driver'}")
 
     def _check_wheels(self, before_mps: float, speed_mps: float) -> None:
+        """Check a tick: the wheels approach what is permitted, without going beyond it, and stop in time."""
         image, _, driver = self.command
+        permitted, limit_mps = self._is_permitted, 0.0
+        if permitted:
+            limit_mps = TOP_MPS * min(1.0, (ZERO_SPEED - image) / (ZERO_SPEED - FULL_SPEED_TICKS))
+        goal_mps = math.copysign(limit_mps, SPEEDS[DRIVERS[driver]]) if permitted else 0.0
+        left_mps, before_left_mps = goal_mps - speed_mps, goal_mps - before_mps
+        arrived = abs(left_mps) <= _CLOSE
+        nearer = abs(left_mps) < abs(before_left_mps) - _CLOSE and left_mps * before_left_mps > 0
         faster = abs(speed_mps) > abs(before_mps) + _CLOSE or speed_mps * before_mps < 0
-        if not self._is_permitted:
-            self.idle = min(self.idle + 1, RAMP)
-            demand(not faster, "1: no motion without an accepted command on a young frame")
-            demand(speed_mps == 0.0 or self.idle < RAMP, "2: the wheels are at zero within the bound")
-            return
-        self.idle = 0
-        limit_mps = TOP_MPS * min(1.0, (ZERO_SPEED - image) / (ZERO_SPEED - 1.5))
-        demand(abs(speed_mps) <= max(abs(before_mps), limit_mps) + _CLOSE, "1: the age of the frame limits the speed")
-        demand(not faster or speed_mps * SPEEDS[DRIVERS[driver]] > 0, "2: the wheels follow the holder")
-        demand(driver == self.holder or self.holder == NOBODY, "2: the wheels follow the holder")
+        demand(permitted or not faster, "1: no motion without an accepted command on a young frame")
+        demand(permitted or nearer or arrived, "2: without a permitted command the wheels brake")
+        beyond = abs(speed_mps) > limit_mps + _CLOSE
+        demand(not beyond or (nearer and not faster), "1: the age of the frame limits the speed")
+        demand(nearer or arrived, "2: the wheels follow the holder")
+        demand(not permitted or self.holder in (driver, NOBODY), "2: the wheels follow the holder")
+        self.idle = 0 if permitted else min(self.idle + 1, RAMP)
+        self.quiet, self.way_m = self.quiet + 1, self.way_m + abs(before_mps) * TICK_S
+        if speed_mps == 0.0:
+            self.quiet, self.way_m = 0, 0.0
+        stopped_in_time = self.idle < RAMP and self.quiet < STOP_TICKS and self.way_m <= STOP_M
+        demand(speed_mps == 0.0 or stopped_in_time, "2: the wheels are at zero within the bounds")
 
     def _check_state(self, state: State) -> None:
         demand(self.state is not State.STOPPED, "2: STOPPED is latched until reset, over restarts too")
         demand(state not in (State.ACTIVE, State.DEGRADED) or self.state in ARMED, "2: only arming permits motion")
         demand(state not in ARMED or self.state in ARMED, "2: only arming permits motion")
-        raise Broken(f"the state is {self.state}, not {state}")
+        raise BrokenError(f"the state is {self.state}, not {state}")
 
 
 _STATES = {state: index for index, state in enumerate(State)}
 _STATE = tuple(State)
-__all__ = ["CONFIGS", "NOW_US", "STILL", "Broken", "Promises"]

@@ -12,12 +12,12 @@ from pathlib import Path
 
 from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.codec import encode
-from sightline.protocol.errors import RejectReason
 from sightline.protocol.messages import STILL, AnswerHeader, Echo, Holder, Request, RequestHeader, State, Twist, Verb
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver import core as driver_core
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
+from sightline.robot_side.safety import gate as safety_gate
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.validation import AcceptedCommand
 
@@ -26,33 +26,32 @@ NOW_US = 1_000_000_000
 NOW_SEQ = 10_000
 """The present, in each state: the newest frame and status have this number."""
 ROBOT, EARLIER = "0000aaaa", "0000eeee"
+_holder = cache(Holder)
 VISION, SECOND, HUMAN = (
-    Holder(source="vision", session="0000bbbb"),
-    Holder(source="vision", session="0000cccc"),
-    Holder(source="teleop", session="0000dddd"),
+    _holder(source="vision", session="0000bbbb"),
+    _holder(source="vision", session="0000cccc"),
+    _holder(source="teleop", session="0000dddd"),
 )
 DRIVERS = (VISION, SECOND, HUMAN)
 _SENDERS = tuple((who.source, who.session) for who in DRIVERS)
-OPERATOR = Holder(source="operator", session="0000ffff")
+_PLACE = {sender: place for place, sender in enumerate(_SENDERS)}
+OPERATOR = _holder(source="operator", session="0000ffff")
 SPEEDS = {VISION: 0.5, SECOND: 0.5, HUMAN: -0.5}
 STATES = tuple(State)
+_STATE_INDEX = {state: index for index, state in enumerate(STATES)}
 FRAMES = 6  # of age 0 to 5 ticks
 OLD = FRAMES - 1  # an image of this age or above is stale
 STATUSES = (0, 2, 21)
 """Ages of the statuses that an operator cites; the last one is too old for any request."""
 LIVE = 2
 SAFETY = {"live_commands_to_arm": LIVE, "disarm_after_hold_s": 1}
-ROBOT_FIELDS = 35
 HELD = 11  # ticks in HOLD until it ends
-
-
-# Both are pure, and each message here arrives in many states.
-driver_core.decode = cache(driver_core.decode)
-driver_core.parse_twist = cache(driver_core.parse_twist)
+RECORD_FIELDS = 2 * FRAMES + 4
+ROBOT_FIELDS = RECORD_FIELDS + 19
 
 
 class Image(Enum):
-    """What the camera delivers: fingerprints of the image."""
+    """Fingerprints of the images that the camera delivers."""
 
     MISSING = 0
     LAST = 1
@@ -61,89 +60,158 @@ class Image(Enum):
 
 
 def _config(auto_arm: bool) -> RobotConfig:
-    return RobotConfig(
-        camera=PluginChoice(kind="log"), drive=PluginChoice(kind="log"), safety=SafetyConfig(**SAFETY, auto_arm=auto_arm)
-    )
+    none = PluginChoice(kind="log")
+    return RobotConfig(camera=none, drive=none, safety=SafetyConfig(**SAFETY, auto_arm=auto_arm))
 
 
 CONFIGS = (_config(False), _config(True))
+
+# All of these are pure, and the same arguments come in many states. Without this most of the time is spent in them.
+driver_core.decode = cache(driver_core.decode)
+driver_core.parse_twist = cache(driver_core.parse_twist)
+safety_gate.LastRejection = cache(safety_gate.LastRejection)
+safety_gate.Holder = driver_core.Holder = _holder
+Holder.__eq__ = object.__eq__  # of each value there is one
+driver_core.Reply = lambda **_fields: None
+_ramp = safety_gate.Ramp(CONFIGS[0].safety)
+
+
+@cache
+def _after_ramp(speed: float, acceleration: float, goal: float, elapsed_us: int) -> tuple[Twist, float]:
+    axis = _ramp._linear
+    axis.speed, axis._acceleration = speed, acceleration
+    return _ramp.step(_twist(goal), elapsed_us), axis._acceleration
+
+
+class _Ramp(safety_gate.Ramp):
+    """The ramp, which computes each of its steps once."""
+
+    def step(self, goal: Twist, elapsed_us: int) -> Twist:
+        axis = self._linear
+        assert not goal.angular_rad_s, "no command of the exploration turns the robot"
+        twist, axis._acceleration = _after_ramp(axis.speed, axis._acceleration, goal.linear_mps, elapsed_us)
+        axis.speed = twist.linear_mps
+        return twist
+
+
+class _Core(driver_core.DriverCore):
+    """The core, without its replies and with a ramp of short memory."""
+
+    def __init__(self, config: RobotConfig, *, stopped: bool) -> None:
+        super().__init__(config, ROBOT, stopped=stopped)
+        self.gate._ramp = _Ramp(config.safety)
+
+    def _post(self, *_reply: object) -> None:
+        pass
+
+
+class _Record(OrderedDict[int, int]):
+    """Times of frames, images or statuses that many states share, so that only a tick may change a copy of it."""
+
+    @classmethod
+    def of(cls, times: list[tuple[int, int]]) -> "_Record":
+        record = cls()
+        for key, t_us in times:
+            OrderedDict.__setitem__(record, key, t_us)
+        return record
+
+    def __setitem__(self, key: int, t_us: int) -> None:
+        raise TypeError("the robot changed its record of frames, images or statuses between two ticks")
+
+    popitem = pop = clear = move_to_end = __delitem__ = __setitem__
 
 
 class Robot:
     """One robot whose state can be replaced."""
 
     def __init__(self) -> None:
-        self._cores = [driver_core.DriverCore(config, ROBOT) for config in CONFIGS]
+        self._cores = [_Core(config, stopped=False) for config in CONFIGS]
         self._after_write = latch_on_disk()
-        self._auto = self._disk = 0
-        self.now_us = NOW_US
+        self._starts = {(auto, disk): self._start(auto, disk) for auto in range(2) for disk in range(2)}
         self.start(0, 0)
 
-    def start(self, auto: int, disk: int) -> None:
-        """Start the driver process again, with motors at zero, as the guardian leaves them."""
-        self._auto, self._disk = auto, disk
-        self.core = self._cores[auto] = driver_core.DriverCore(CONFIGS[auto], ROBOT, stopped=bool(disk))
+    def _start(self, auto: int, disk: int) -> tuple[float, ...]:
+        """Return the state after a start of the driver process, with motors at zero, as the guardian leaves them."""
+        self._auto, self._disk, self._started, self.now_us = auto, disk, 0, NOW_US
+        self.core = _Core(CONFIGS[auto], stopped=bool(disk))
         self.gate = self.core.gate
         self.core.tick(self.now_us, None, None)
         self.gate.issued.add("status", NOW_SEQ, self.now_us)
-        self._started, self._images = 0, (Image.LAST.value, Image.PREVIOUS.value)
+        self._images = Image.LAST.value, Image.PREVIOUS.value
+        self._record: tuple[int, ...] | None = None
+        self._numbers = _seen(False, False, False)
+        return self.save()
+
+    def start(self, auto: int, disk: int) -> None:
+        """Start the driver process, with what is on the disk."""
+        self.load(self._starts[auto, disk])
 
     # --- states ----------------------------------------------------------------------------------------------------
 
     def save(self) -> tuple[float, ...]:
         """Return everything that decides the future of this robot."""
         gate, now_us = self.gate, self.now_us
-        record, pictures, lease, command, sequence = gate.issued, gate.pictures, gate._lease, gate._command, gate._sequence
-        frames, shown, first = record._times.get("frame", ()), pictures._shown_us, pictures._first_us
+        lease, command, sequence, axis, held = gate._lease, gate._command, gate._sequence, gate._ramp._linear, 0
+        holder, echo, arrival, commanded = -1, -1, -1, 0.0
+        if lease.holder is not None:
+            holder = _PLACE[lease.holder.source, lease.holder.session]
+        if command is not None:
+            echo, arrival = _age(command.echo_us, now_us), min((now_us - command.arrival_us) // TICK_US, 4)
+            commanded = command.twist.linear_mps
+        if gate.state is State.HOLD:
+            held = min((now_us - gate._hold_since_us) // TICK_US, HELD)
         newest = NOW_SEQ + (now_us - NOW_US) // TICK_US
         return (
+            *(self._record or self._save_record()),
             self._auto,
             self._disk,
             min(self._started, STATUSES[1]),
-            STATES.index(gate.state),
+            _STATE_INDEX[gate.state],
+            *[key in sequence._drivers or key in sequence._others for key in _SENDERS],
+            holder,
+            max(0, (lease.expires_us - now_us) // TICK_US),
+            min(gate._live_commands, LIVE),
+            _denied(newest - gate.issued._denied_seq),
+            gate.arms_itself,
+            held,
+            echo,
+            arrival,
+            commanded,
+            gate.applied.linear_mps,
+            axis.speed,
+            axis._acceleration,
+        )
+
+    def _save_record(self) -> tuple[int, ...]:
+        """Return the frames and images."""
+        now_us, pictures, frames = self.now_us, self.gate.pictures, self.gate.issued._times.get("frame", ())
+        shown, first = pictures._shown_us, pictures._first_us
+        newest = NOW_SEQ + (now_us - NOW_US) // TICK_US
+        return (
             *[newest - age in frames for age in range(FRAMES)],
             *[_age(shown.get(now_us - age * TICK_US), now_us) for age in range(FRAMES)],
             _age(first.get(self._images[0]), now_us),
             _age(first.get(self._images[1]), now_us),
             min((pictures._newest_us - pictures._changed_us) // TICK_US, OLD),
             _age(pictures._newest_us, now_us),
-            *[key in sequence._drivers or key in sequence._others for key in _SENDERS],
-            -1 if lease.holder is None else DRIVERS.index(lease.holder),
-            max(0, (lease.expires_us - now_us) // TICK_US),
-            min(gate._live_commands, LIVE),
-            min(newest - record._denied_seq, STATUSES[1] + 1),
-            gate.arms_itself,
-            min((now_us - gate._hold_since_us) // TICK_US, HELD) if gate.state is State.HOLD else 0,
-            -1 if command is None else _age(command.echo_us, now_us),
-            -1 if command is None else min((now_us - command.arrival_us) // TICK_US, 4),
-            0.0 if command is None else command.twist.linear_mps,
-            gate.applied.linear_mps,
-            gate._ramp._linear.speed,
-            gate._ramp._linear._acceleration,
         )
 
     def load(self, state: tuple[float, ...]) -> None:
         """Put the robot into a state of `save`."""
-        self._auto, self._disk, self._started, state_index = state[:4]
+        self._record = saved = state[:RECORD_FIELDS]
         (
-            last, previous, unchanged, newest, seen_vision, seen_second, seen_human, holder, left, live, denied, arms_itself,
-            held, echo, arrival, commanded, applied, speed, acceleration,
-        ) = state[4 + 2 * FRAMES:]  # fmt: skip
+            self._auto, self._disk, self._started, state_index, *seen, holder, left, live, denied, arms_itself, held,
+            echo, arrival, commanded, applied, speed, acceleration,
+        ) = state[RECORD_FIELDS:]  # fmt: skip
         self.now_us, self._images = NOW_US, (1, 2)
         self.core = core = self._cores[self._auto]
         self.gate = gate = core.gate
-        core._outbox = []
-        record, pictures, lease = gate.issued, gate.pictures, gate._lease
-        record._times = {
-            "frame": _frames(state[4 : 4 + FRAMES]).copy(),
-            "status": _statuses(self._started).copy(),
-        }
+        record, pictures, lease, axis = gate.issued, gate.pictures, gate._lease, gate._ramp._linear
+        frames, pictures._shown_us, pictures._first_us, pictures._newest_us, pictures._changed_us = _load_record(saved)
+        record._times = {"frame": frames, "status": _statuses(self._started)}
         record._denied_seq = NOW_SEQ - denied
-        pictures._shown_us = _shown(state[4 + FRAMES : 4 + 2 * FRAMES]).copy()
-        pictures._first_us = _first(last, previous).copy()
-        pictures._newest_us = NOW_US - newest * TICK_US
-        pictures._changed_us = pictures._newest_us - unchanged * TICK_US
-        gate._sequence._drivers = _seen(seen_vision, seen_second, seen_human).copy()
+        self._numbers = _seen(*seen)
+        gate._sequence._drivers = self._numbers.copy()
         gate._sequence._others = OrderedDict()
         lease.holder = None if holder < 0 else DRIVERS[holder]
         lease.expires_us = NOW_US + left * TICK_US
@@ -154,10 +222,7 @@ class Robot:
         gate._command = None if echo < 0 else _command(commanded, echo, arrival)
         gate._last_step_us = NOW_US
         gate.applied = _twist(applied)
-        ramp = gate._ramp._linear
-        ramp.speed, ramp._acceleration = speed, acceleration
-        ramp = gate._ramp._angular
-        ramp.speed = ramp._acceleration = 0.0
+        axis.speed, axis._acceleration = speed, acceleration
 
     # --- what happens ----------------------------------------------------------------------------------------------
 
@@ -167,18 +232,24 @@ class Robot:
 
     def tick(self, image: Image) -> None:
         """Let one tick pass; the robot publishes a frame and a status."""
+        record, pictures = self.gate.issued, self.gate.pictures
+        record._times = {channel: OrderedDict(times) for channel, times in record._times.items()}
+        pictures._shown_us, pictures._first_us = OrderedDict(pictures._shown_us), OrderedDict(pictures._first_us)
+        self._record = None
         self.now_us += TICK_US
         if image is not Image.MISSING:
             self.core.on_issued(NOW_SEQ + 1, self.now_us, image.value)
             if image is not Image.LAST:
                 self._images = (image.value, 1)
         self.core.tick(self.now_us, None, None)
-        self.gate.issued.add("status", NOW_SEQ + 1, self.now_us)
+        record.add("status", NOW_SEQ + 1, self.now_us)
         self._started += 1
 
     def twist(self, who: Holder, age: int, seq: int, session: str = ROBOT, shift_us: int = 0) -> str:
         """Deliver a command; return the reason of its rejection, or an empty string."""
         gate = self.gate
+        # A command that changed nothing else, and was not undone by `load`, has left its number there.
+        gate._sequence._drivers, gate._sequence._others = self._numbers.copy(), OrderedDict()
         accepted, gate.last_rejection = gate.accepted, None
         self.core.on_twist(_twist_message(who, age, seq, session, shift_us), NOW_US)
         if gate.accepted > accepted:
@@ -202,32 +273,38 @@ class Robot:
         self._disk = self._after_write[self._disk, self.gate.state is State.STOPPED]
 
 
+def _denied(age: int) -> int:
+    """Return the age of the newest denied status; the cited old one is denied until a start, once any was."""
+    return age if age <= STATUSES[1] else STATUSES[1] + 1 if age <= STATUSES[2] else STATUSES[2] + 1
+
+
 def _age(t_us: int | None, now_us: int) -> int:
     return -1 if t_us is None else min((now_us - t_us) // TICK_US, OLD)
 
 
 @cache
-def _frames(issued: tuple[bool, ...]) -> OrderedDict[int, int]:
-    ages = [age for age in reversed(range(FRAMES)) if issued[age]]
-    return OrderedDict((NOW_SEQ - age, NOW_US - age * TICK_US) for age in ages)
+def _load_record(saved: tuple[int, ...]) -> tuple[_Record, _Record, _Record, int, int]:
+    """Return the times of frames, images and first images, and those of the newest image and change."""
+    issued, shown, (last, previous, unchanged, newest) = saved[:FRAMES], saved[FRAMES:-4], saved[-4:]
+    ages = list(reversed(range(FRAMES)))
+    newest_us = NOW_US - newest * TICK_US
+    return (
+        _Record.of([(NOW_SEQ - age, NOW_US - age * TICK_US) for age in ages if issued[age]]),
+        _Record.of([(NOW_US - age * TICK_US, NOW_US - shown[age] * TICK_US) for age in ages if shown[age] >= 0]),
+        _Record.of([
+            (image.value, NOW_US - age * TICK_US)
+            for image, age in ((Image.PREVIOUS, previous), (Image.LAST, last))
+            if age >= 0
+        ]),
+        newest_us,
+        newest_us - unchanged * TICK_US,
+    )
 
 
 @cache
-def _statuses(started: int) -> OrderedDict[int, int]:
+def _statuses(started: int) -> _Record:
     ages = [STATUSES[2], *reversed(range(started + 1))]
-    return OrderedDict((NOW_SEQ - age, NOW_US - age * TICK_US) for age in ages)
-
-
-@cache
-def _shown(ages: tuple[int, ...]) -> OrderedDict[int, int]:
-    pairs = [(age, shown) for age, shown in enumerate(ages) if shown >= 0]
-    return OrderedDict((NOW_US - age * TICK_US, NOW_US - shown * TICK_US) for age, shown in reversed(pairs))
-
-
-@cache
-def _first(last: int, previous: int) -> OrderedDict[int, int]:
-    ages = [(Image.PREVIOUS, previous), (Image.LAST, last)]
-    return OrderedDict((image.value, NOW_US - age * TICK_US) for image, age in ages if age >= 0)
+    return _Record.of([(NOW_SEQ - age, NOW_US - age * TICK_US) for age in ages])
 
 
 @cache

@@ -7,10 +7,23 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache, partial
 
 from sightline.protocol.messages import Holder, Verb
-from tests.exploration.promises import Broken, Promises
-from tests.exploration.robot import CONFIGS, DRIVERS, EARLIER, HUMAN, OPERATOR, ROBOT, ROBOT_FIELDS, SECOND, VISION, Image, Robot
+from tests.exploration.promises import NOBODY, BrokenError, Promises
+from tests.exploration.robot import (
+    CONFIGS,
+    DRIVERS,
+    EARLIER,
+    HUMAN,
+    OPERATOR,
+    ROBOT,
+    ROBOT_FIELDS,
+    SECOND,
+    VISION,
+    Image,
+    Robot,
+)
 
 _NAMES = {VISION: "vision", SECOND: "a second vision service", HUMAN: "teleop", OPERATOR: "an operator"}
 _CHUNK = 500  # states that a process expands at once
@@ -33,12 +46,14 @@ def _tick(words: str, image: Image) -> Event:
         promises.on_tick(image)
 
     def possible(promises: Promises) -> bool:
-        return not (image is Image.LAST and promises.last < 0 or image is Image.PREVIOUS and promises.previous < 0)
+        return not ((image is Image.LAST and promises.last < 0) or (image is Image.PREVIOUS and promises.previous < 0))
 
     return Event(f"100 ms pass; {words}", happen, possible, ticks=True)
 
 
-def _twist(who: Holder, age: int, words: str = "", *, fresh: bool = True, session: str = ROBOT, off_us: int = 0) -> Event:
+def _twist(
+    who: Holder, age: int, words: str = "", *, fresh: bool = True, session: str = ROBOT, off_us: int = 0
+) -> Event:
     driver, real = DRIVERS.index(who), session == ROBOT and not off_us
 
     def happen(robot: Robot, promises: Promises) -> None:
@@ -53,9 +68,11 @@ def _twist(who: Holder, age: int, words: str = "", *, fresh: bool = True, sessio
 
 
 def _request(who: Holder, verb: Verb, age: int = 0) -> Event:
+    driver = DRIVERS.index(who) if who in DRIVERS else NOBODY
+
     def happen(robot: Robot, promises: Promises) -> None:
         reason = robot.request(who, verb, age)
-        promises.on_request(who, verb, age, reason, robot.core.config.safety.auto_arm)
+        promises.on_request(driver, verb, age, reason, robot.core.config.safety.auto_arm)
 
     def possible(promises: Promises) -> bool:
         return age <= promises.started or age > 20
@@ -88,59 +105,75 @@ IMAGES = (
 FORGED = (
     _twist(VISION, 0, "that arrived before", fresh=False),
     _twist(HUMAN, 0, "that arrived before", fresh=False),
-    _twist(VISION, 0, "on a frame that was never issued", off_us=1),
+    _twist(VISION, 0, "on a frame that was never issued", off_us=-1),
+    _twist(VISION, 0, "on a frame of the future", off_us=1),
     _twist(VISION, 0, "on a frame of an earlier start", session=EARLIER),
 )
 STOP, DISARM, ARM, RESET = (_request(OPERATOR, verb) for verb in (Verb.STOP, Verb.DISARM, Verb.ARM, Verb.RESET))
 LATE = (_request(OPERATOR, Verb.ARM, 2), _request(OPERATOR, Verb.RESET, 2), _request(OPERATOR, Verb.ARM, 21))
 LEASE = tuple(_request(who, verb) for who in (HUMAN, VISION) for verb in (Verb.ACQUIRE, Verb.RELEASE))
-RESTART = (
-    Event("the driver process is killed and starts again", _restart),
-    Event("the disk stores the latch", _write),
-)
+HUMAN_ARM = _request(HUMAN, Verb.ARM)
+RESTART = Event("the driver process is killed and starts again", _restart)
+WRITE = Event("the disk stores the latch", _write)
 FAULT = Event("the drive fails", _fault)
+V, S, H = (_twist(who, 0) for who in DRIVERS)
+
+LIFE = (
+    NEW, V, NEW, V, ARM, V, NEW, V, NEW, V, NEW, V, NEW, V,  # vision drives at top speed
+    H, NEW, H, NEW, H, NEW, H, NEW, H, NEW, LEASE[1], NEW, NEW, NEW,  # teleop takes over and lets go
+    V, NEW, V, ARM, V, NEW, V, NEW, V, NEW, V, STOP, WRITE, NEW, NEW, NEW, RESTART, NEW, RESET, WRITE,  # STOP
+    NEW, V, NEW, V, ARM, V, NEW, V, NEW, V, NEW, V, *(IMAGES[0],) * 3, *(IMAGES[1],) * 3,  # frames and commands end
+)  # fmt: skip
+"""A usual life of a robot. It leads to states that are far from each start, so that each is a start too."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Events whose interleavings are explored together, in all orders and until no new state comes.
+    """Events whose interleavings are explored together, in all orders.
 
     Args:
         events: what may happen in each state.
         auto_arm: configurations to begin with.
+        life: events that lead to more states to begin with.
+        most: number of states after which it ends.
     """
 
     events: tuple[Event, ...]
     auto_arm: tuple[bool, ...] = (False, True)
+    life: tuple[Event, ...] = ()
+    most: int = 150_000
 
 
 PARTS = {
-    "loss": Part((NEW, _twist(VISION, 0), _twist(SECOND, 0), _twist(HUMAN, 0), ARM)),
-    "lease": Part((
-        NEW, _twist(VISION, 0), _twist(SECOND, 0), _twist(HUMAN, 0), STOP, ARM, RESET, *LEASE,
-    ), auto_arm=(False,)),
-    "latch": Part((
-        NEW, _twist(VISION, 0), _twist(HUMAN, 0), STOP, DISARM, ARM, RESET, *LATE, *RESTART, FAULT,
-    )),
-    "images": Part((
-        NEW, *IMAGES[:2], *(_twist(VISION, age) for age in (0, 2, 4, 5)), ARM,
-    ), auto_arm=(False,)),
     "all": Part((
-        NEW, *IMAGES, *(_twist(VISION, age) for age in (0, 2, 4, 5)), _twist(SECOND, 0), _twist(HUMAN, 0),
-        _twist(HUMAN, 2), *FORGED, STOP, DISARM, ARM, RESET, *LATE, *LEASE, *RESTART, FAULT,
-    )),
+        NEW, *IMAGES, *(_twist(VISION, age) for age in (2, 4, 5)), V, S, H, _twist(HUMAN, 2), *FORGED,
+        STOP, DISARM, ARM, RESET, HUMAN_ARM, *LATE, *LEASE, RESTART, WRITE, FAULT,
+    ), life=LIFE, most=700_000),
+    "loss": Part((NEW, V, S, H, ARM)),
+    "lease": Part((NEW, V, S, H, STOP, ARM, RESET, *LEASE), auto_arm=(False,)),
+    "latch": Part((NEW, V, H, STOP, DISARM, ARM, RESET, *LATE, RESTART, WRITE, FAULT)),
+    "images": Part((NEW, *IMAGES[:2], V, *(_twist(VISION, age) for age in (2, 4, 5)), ARM), auto_arm=(False,)),
 }
+"""The first has each event, for a few events from each state of a life. The others have fewer, and go deeper."""
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The result: the number of states, whether these are all, and the first violation with the events before it."""
+    """The result.
+
+    Args:
+        states: their number.
+        all_of_them: True if no event leads to another state.
+        depth: number of events, from a first state, whose orders were all explored.
+        promise: that breaks; empty if none does.
+        words: the events that lead there.
+    """
 
     states: int
     all_of_them: bool
     depth: int
-    promise: str = ""
-    words: tuple[str, ...] = ()
+    promise: str
+    words: tuple[str, ...]
 
 
 class Explorer:
@@ -162,39 +195,42 @@ class Explorer:
                 state = self._robot.save() + self._promises.save()
                 yield self._packed.pack(*state) if pack else state
 
-    def expand(self, packed: bytes) -> Iterator[tuple[int, bytes | str]]:
+    def expand(self, packed: bytes, only: Event | None = None) -> Iterator[tuple[int, bytes | str]]:
         """Yield each event's number with the state that it leads to, or with the promise that breaks."""
         robot, promises, pack = self._robot, self._promises, self._packed.pack
         state = self._packed.unpack(packed)
         robot_part, promised_part = state[:ROBOT_FIELDS], state[ROBOT_FIELDS:]
+        robot.load(robot_part)
+        promises.load(promised_part)
         for index, event in enumerate(self._part.events):
-            promises.load(promised_part)
-            if not event.possible(promises):
+            if not event.possible(promises) or only not in (None, event):
                 continue
-            robot.load(robot_part)
             try:
                 event.happen(robot, promises)
                 promises.check(robot, ticked=event.ticks)
-            except Broken as broken:
+            except BrokenError as broken:
                 yield index, str(broken)
-            else:
-                yield index, pack(*robot.save(), *promises.save())
+                return
+            after, promised = robot.save(), promises.save()
+            # Most events have no effect in most states. Only another state needs to be replaced.
+            if event.ticks or after != robot_part or promised != promised_part:
+                yield index, pack(*after, *promised)
+                robot.load(robot_part)
+                promises.load(promised_part)
 
 
-_explorer: Explorer
+@cache
+def _explorer(part: str) -> Explorer:
+    return Explorer(PARTS[part])
 
 
-def _begin(part: str) -> None:
-    global _explorer
-    _explorer = Explorer(PARTS[part])
-
-
-def _expand_all(states: bytes) -> tuple[bytes, array.array, bytes, tuple[int, int, str] | None]:
+def _expand_all(part: str, states: bytes) -> tuple[bytes, array.array, bytes, tuple[int, int, str] | None]:
     """Return the following states, their parents' places in `states`, their events, and the first violation."""
     following: dict[bytes, None] = {}
-    parents, events, size = array.array("L"), bytearray(), _explorer.size
+    explorer = _explorer(part)
+    parents, events, size = array.array("L"), bytearray(), explorer.size
     for place in range(len(states) // size):
-        for event, found in _explorer.expand(states[place * size : (place + 1) * size]):
+        for event, found in explorer.expand(states[place * size : (place + 1) * size]):
             if isinstance(found, str):
                 return b"".join(following), parents, bytes(events), (place, event, found)
             if found not in following:
@@ -204,43 +240,78 @@ def _expand_all(states: bytes) -> tuple[bytes, array.array, bytes, tuple[int, in
     return b"".join(following), parents, bytes(events), None
 
 
+class _Known:
+    """The states found so far, each with the state and the event that led to it first."""
+
+    def __init__(self, explorer: Explorer, part: Part) -> None:
+        self._part, self._size = part, explorer.size
+        self.states: dict[bytes, None] = {}
+        self._parents, self._events = array.array("L"), bytearray()
+        self.violation: tuple[int, int, str] | None = None
+        for root in explorer.roots():
+            self._add(root, len(self.states), 0)
+        place, state = 0, next(iter(self.states))
+        for event in part.life:
+            [(number, found)] = explorer.expand(state, event)
+            if isinstance(found, str):
+                self.violation = place, number, found
+                return
+            self._add(found, place, number)
+            state, place = found, len(self.states) - 1
+
+    def _add(self, state: bytes, parent: int, event: int) -> None:
+        self.states[state] = None
+        self._parents.append(parent)
+        self._events.append(event)
+
+    def add_all(self, following: bytes, first: int, places: array.array, events: bytes) -> Iterator[bytes]:
+        """Add the states that follow those from number `first` on, and yield the new ones."""
+        size = self._size
+        for nth, (place, event) in enumerate(zip(places, events, strict=True)):
+            state = following[nth * size : (nth + 1) * size]
+            if state not in self.states:
+                self._add(state, first + place, event)
+                yield state
+
+    def words(self) -> tuple[str, ...]:
+        """Return the events that lead to the violation."""
+        if self.violation is None:
+            return ()
+        place, event, _ = self.violation
+        words = [self._part.events[event].words]
+        while self._parents[place] != place:
+            words.append(self._part.events[self._events[place]].words)
+            place = self._parents[place]
+        return tuple(reversed(words))
+
+
 def explore(part: str, most: int, jobs: int = 1) -> Found:
-    """Explore a part until no new state comes, a promise breaks, or about `most` states are found."""
-    _begin(part)
-    size, frontier = _explorer.size, list(_explorer.roots())
-    known = set(frontier)
-    parents, events = array.array("L", range(len(known))), bytearray(len(known))
+    """Explore a part until no new state comes, a promise breaks, or `most` states are found."""
+    known = _Known(_explorer(part), PARTS[part])
     depth = begin = 0
+    frontier = list(known.states)
     with ExitStack() as ending:
+        expand_all = map
         if jobs > 1:
-            spawn = multiprocessing.get_context("fork")
-            pool = ending.enter_context(ProcessPoolExecutor(jobs, spawn, initializer=_begin, initargs=(part,)))
-        while frontier and len(known) < most:
+            pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("fork"))
+            ending.callback(pool.shutdown, cancel_futures=True)
+            expand_all = pool.map
+        while frontier and known.violation is None and len(known.states) < most:
             chunks = [frontier[start : start + _CHUNK] for start in range(0, len(frontier), _CHUNK)]
-            expanded = (pool.map if jobs > 1 else map)(_expand_all, map(b"".join, chunks))
             following = []
-            for number, (states, places, happened, violation) in enumerate(expanded):
+            for number, (states, places, happened, violation) in enumerate(
+                expand_all(partial(_expand_all, part), map(b"".join, chunks))
+            ):
                 first = begin + number * _CHUNK
-                for nth, (place, event) in enumerate(zip(places, happened, strict=True)):
-                    state = states[nth * size : (nth + 1) * size]
-                    if state not in known:
-                        known.add(state)
-                        following.append(state)
-                        parents.append(first + place)
-                        events.append(event)
+                following += known.add_all(states, first, places, happened)
                 if violation is not None:
                     place, event, promise = violation
-                    words = _words(PARTS[part], parents, events, first + place, event)
-                    return Found(len(known), False, depth + 1, promise, words)
+                    known.violation = first + place, event, promise
+                if known.violation is not None or len(known.states) >= most:
+                    break
+            else:
+                depth += bool(following)
             begin += len(frontier)
             frontier = following
-            depth += bool(frontier)
-    return Found(len(known), not frontier, depth)
-
-
-def _words(part: Part, parents: array.array, events: bytearray, place: int, event: int) -> tuple[str, ...]:
-    words = [part.events[event].words]
-    while parents[place] != place:
-        words.append(part.events[events[place]].words)
-        place = parents[place]
-    return tuple(reversed(words))
+    promise = known.violation[2] if known.violation else ""
+    return Found(len(known.states), not frontier and not promise, depth, promise, known.words())
