@@ -538,9 +538,11 @@ def _reset_moving(rig: RobotFixture) -> Injected:
 
 def _suspend(rig: RobotFixture) -> Injected:
     """The robot's clock leaps while commands go on: each cites a frame from before the suspend."""
+    rig.prepare_operator()
     at_us = rig.suspend()
     rig.watch(ATTACKED_S)
-    return Injected(1, at_us)
+    _, stopped = rig.stop_by_operator()
+    return Injected(1, at_us, checks=stopped)
 
 
 def _drive_on(rig: RobotFixture) -> Injected:
@@ -617,7 +619,7 @@ OPERATOR_CASES: Final = (
         "stop.reset", "STOP: then reset while moving", _reset_moving, _SCRIPT, blind=True, also="rejected; " + _STAYS
     ),
     FaultCase("clock.suspend", "clocks: a suspend of a minute between a frame and its twist, simulated", _suspend,
-              Setup(sleeps=True), blind=True),
+              Setup(sleeps=True), blind=True, also="then STOP: exit code 0"),
     FaultCase("clock.ahead", "clocks: a day ahead, then vision: SIGKILL", _drive_on, Setup(clock=f"{DAY_S}")),
     FaultCase("clock.behind", "clocks: a day behind, then vision: SIGKILL", _drive_on, Setup(clock=f"-{DAY_S}")),
     FaultCase(

@@ -4,7 +4,7 @@ from functools import partial
 from typing import Any, Final
 
 from sightline.evaluation.checks import at_least, at_most
-from sightline.evaluation.faults.evidence import INJECTED, most_gain_mps2, wheel_mps
+from sightline.evaluation.faults.evidence import INJECTED, ZERO_MS, most_gain_mps2, wheel_mps
 from sightline.evaluation.faults.fixture import SESSION, RobotFixture, Setup
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.protocol.clock import monotonic_us
@@ -17,6 +17,8 @@ LEASE_US: Final = SafetyConfig().lease_ms * 1000
 GAIN_MPS2: Final = SafetyConfig().max_acceleration_mps2 * 1.05
 """Five percent for rounding in the log."""
 ENOUGH: Final = 30
+PERSON: Final = "0e0e0e0e"
+_STOPS: Final = f"then STOP: zero <= {ZERO_MS:g} ms after the first packet, exit code 0"
 FLOOD_AT_LEAST: Final = 20_000
 
 
@@ -70,7 +72,8 @@ def _two_visions(rig: RobotFixture) -> Injected:
 
 
 def _impersonate(rig: RobotFixture, fault: str = "copied", **attacker: Any) -> Injected:
-    """An attacker that knows the driver's session sends the opposite commands; then the driver dies."""
+    """An attacker that knows the driver's session sends the opposite commands; the driver dies; then comes STOP."""
+    rig.prepare_operator()
     rig.start_peer("attacker", "driver", fault=fault, linear_mps=-0.5, angular_rad_s=0.0, **attacker)
     rig.until(lambda: bool(rig.sent("attacker")), 15.0, "the attacker's link")
     rig.trigger("attacker")
@@ -81,18 +84,47 @@ def _impersonate(rig: RobotFixture, fault: str = "copied", **attacker: Any) -> I
     backwards = sum(row.left_rad_s + row.right_rad_s < 0 for row in rows)
     at_us = monotonic_us()
     rig.processes.kill("peer")
-    rig.watch(0.5)
-    rig.processes.kill("attacker")
+    rig.watch(LEASE_US / 2e6)
+    rig.processes.kill("attacker")  # once the lease is over it may drive, in its own name
     rig.watch(SETTLED_S)
+    _, stopped = rig.stop_by_operator()
     checks = (
         at_most("motor log lines of the attacker", backwards, "lines", 0),
         at_least("speed kept", min(map(wheel_mps, rows)), "m/s", 0.4),
     )
-    return Injected(rig.injected("attacker"), at_us, checks=checks)
+    return Injected(rig.injected("attacker"), at_us, checks=(*checks, *stopped))
+
+
+def _replay_driver(rig: RobotFixture) -> Injected:
+    """Replay what an operator sent while it drives and afterwards. Vision, which an `arm` would let drive, goes on."""
+    rig.prepare_operator()
+    recording = rig.folder / "driver.txt"
+    rig.start_peer("person", "driver", source="teleop", session=PERSON, recording=recording, fault="turn_round",
+                   linear_mps=-0.5, angular_rad_s=0.0)
+    rig.until(lambda: _goes_back(rig), 15.0, "a takeover")
+    rig.start_peer("attacker", "driver", source="teleop", session=PERSON, recording=recording, fault="replay")
+    rig.until(lambda: bool(rig.sent("attacker")), 15.0, "the attacker's link")
+    rig.trigger("person")
+    rig.until(lambda: rig.motors()[-1].left_rad_s > 0 and wheel_mps(rig.motors()[-1]) > 0.49, 15.0, "driving ahead")
+    began_us = rig.trigger("attacker")
+    rig.watch(ATTACKED_S)
+    rows = [row for row in rig.motors() if row.t_us >= began_us]
+    backwards = sum(row.left_rad_s + row.right_rad_s < 0 for row in rows)
+    at_us = monotonic_us()
+    rig.processes.kill("person")
+    rig.watch(ATTACKED_S)  # after the lease, an `arm` would let vision drive
+    _, stopped = rig.stop_by_operator()
+    rig.watch(SETTLED_S)
+    checks = (
+        at_most("motor log lines of the replay", backwards, "lines", 0),
+        at_least("speed kept", min(map(wheel_mps, rows)), "m/s", 0.4),
+    )
+    return Injected(rig.injected("attacker"), at_us, checks=(*checks, *stopped))
 
 
 def _forge_frames(rig: RobotFixture) -> Injected:
     """Frames of the future in the robot's name for three seconds: vision drives again within one second after."""
+    rig.prepare_operator()
     rig.start_peer("attacker", "driver", source="guest", fault="future_frames")
     rig.until(lambda: bool(rig.sent("attacker")), 15.0, "the attacker's link")
     rig.trigger("attacker")
@@ -103,8 +135,9 @@ def _forge_frames(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
     rig.until(lambda: wheel_mps(rig.motors()[-1]) > 0 and rig.motors()[-1].t_us > at_us, 5.0, "vision driving again")
     again_ms = (next(row.t_us for row in rig.motors() if row.t_us > at_us and wheel_mps(row) > 0) - at_us) / 1000
-    rig.watch(1.0)
-    return Injected(times, at_us, checks=(at_most("drives again after", again_ms, "ms", 1000.0),))
+    rig.wait_speed(rig.setup.at_speed_mps)
+    _, stopped = rig.stop_by_operator()
+    return Injected(times, at_us, checks=(at_most("drives again after", again_ms, "ms", 1000.0), *stopped))
 
 
 def _take_over(rig: RobotFixture) -> Injected:
@@ -164,15 +197,18 @@ COMMAND_CASES: Final = (
     FaultCase("driver.two", "drivers: two vision services, then none", _two_visions, Setup(),
               also="the second is not applied"),
     FaultCase("identity.copied", "drivers: a copied identity, certificate of the same role; then the driver dies",
-              partial(_impersonate, session=SESSION), Setup(secure=True), also="0 motor log lines of the copy"),
+              partial(_impersonate, session=SESSION), Setup(secure=True),
+              also=f"0 motor log lines of the copy; {_STOPS}"),
     FaultCase("identity.role", "drivers: a copied identity, certificate of an operator; then the driver dies",
               partial(_impersonate, session=SESSION, certificate="operator"), Setup(secure=True),
-              also="0 motor log lines of the copy"),
+              also=f"0 motor log lines of the copy; {_STOPS}"),
     FaultCase("identity.requests", "drivers: release, acquire, arm and reset in an operator's name; then it dies",
               partial(_impersonate, fault="copied_requests", source="teleop", session=SESSION),
-              Setup(source="teleop", secure=True), also="0 motor log lines of the copy"),
+              Setup(source="teleop", secure=True), also=f"0 motor log lines of the copy; {_STOPS}"),
+    FaultCase("identity.replayed", "drivers: an operator's twists, acquire, arm and reset, replayed (secured); it dies",
+              _replay_driver, Setup(secure=True), blind=True, also=f"0 motor log lines of the replay; {_STOPS}"),
     FaultCase("frame.future", "vision: forged frames of the future for 3 s", _forge_frames, VISION, stops=False,
-              also="drives again <= 1000 ms after they end"),
+              also=f"drives again <= 1000 ms after they end; {_STOPS}"),
     FaultCase(
         "driver.person", "drivers: an operator takes over at full speed, and is lost", _take_over, Setup(), blind=True,
         also="applied <= 1000 ms; vision does not resume by itself"

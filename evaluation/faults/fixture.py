@@ -13,9 +13,19 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Final, Self
 
+from sightline.evaluation.checks import Check, at_most
 from sightline.evaluation.faults import devices
 from sightline.evaluation.faults import evidence as judge
-from sightline.evaluation.faults.evidence import GOOD, INJECTED, MotorRow, SentCommand, read_events, wheel_mps
+from sightline.evaluation.faults.evidence import (
+    GOOD,
+    INJECTED,
+    REQUESTED,
+    ZERO_MS,
+    MotorRow,
+    SentCommand,
+    read_events,
+    wheel_mps,
+)
 from sightline.evaluation.faults.peer import PeerOptions, Role
 from sightline.evaluation.faults.sampler import Hole, read_holes, stalled_us
 from sightline.evaluation.processes import Processes, free_port
@@ -165,6 +175,8 @@ _POLL_S: Final = 0.01
 _TAIL_BYTES: Final = 8192
 """More than a second of the motors' log."""
 _PROBES: Final = 25
+_OPERATOR_READY_S: Final = 30.0
+_STOP_ENDS_S: Final = 20.0
 _CHASE: Final[dict[str, Any]] = {
     "summary": "a ball on a circle at 0.4 m/s", "stand_off_m": 0.8, "look": "plain",
     "target": {"kind": "path", "speed_mps": 0.4, "path": [{"length_m": 12.566371, "turn_deg": 360.0}]},
@@ -195,13 +207,15 @@ class Setup:
     """The links have keys, and the driver has the session `SESSION`, which an attacker knows."""
     web: bool = False
     """The robot listens for WebSocket clients too."""
+    guests: bool = False
+    """It also accepts legacy clients, in place of WebSocket ones."""
     routed: bool = False
     """The robot connects to a router, and all others know only that one."""
 
     @property
     def at_speed_mps(self) -> float:
-        """Return the speed before a fault. A scripted driver sends 0.5 m/s; vision follows a ball at 0.4 m/s."""
-        return 0.3 if self.driver == "vision" else 0.48
+        """Return the speed before a fault. A script sends 0.5 m/s, a guest 0.2; vision follows a ball at 0.4."""
+        return {"vision": 0.3, "guest": 0.18}.get(self.driver, 0.48)
 
 
 class RobotFixture:
@@ -238,7 +252,8 @@ class RobotFixture:
         self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"{transport}/127.0.0.1:{free_port()}"
         if self.setup.secure:
             keys.make(self.folder / "keys", ["127.0.0.1"])
-        self.web_endpoint = f"ws://127.0.0.1:{free_port()}" if self.setup.web else ""
+        web = "ws-legacy" if self.setup.guests else "ws"
+        self.web_endpoint = f"{web}://127.0.0.1:{free_port()}" if self.setup.web or self.setup.guests else ""
         self._write_files(self._sockets)
         self.processes.start("sim", ["sim", "--config", str(self.folder / "sim.toml")])
         self.processes.start("sampler", [str(self.folder / "holes.csv")], module="sightline.evaluation.faults.sampler")
@@ -268,7 +283,8 @@ class RobotFixture:
             "sim": {"scenario": str(self.folder / "scenario.toml"), "socket_dir": sockets, "seed": 1,
                     "motor_log": str(self.folder / "motors.csv")},
             "robot": {"robot": ROBOT, "state_dir": str(self.folder / "state"), "camera": eye, "drive": wheels,
-                      "range_sensor": device, "safety": {"auto_arm": True}, "listen": []},
+                      "range_sensor": device, "safety": {"auto_arm": True, "guests": self.setup.guests},
+                      "listen": []},
             "vision": {"robot": ROBOT},
         }
         for name, table in files.items():
@@ -298,12 +314,29 @@ class RobotFixture:
     def start_peer(self, name: str, role: Role, **changes: Any) -> None:
         """Start a vision service, a scripted driver or an operator."""
         options = PeerOptions(
-            role=role, endpoint=self.endpoint, ledger=self.folder / f"{name}.ledger",
+            role=role, endpoint=self.endpoint, web_endpoint=self.web_endpoint, ledger=self.folder / f"{name}.ledger",
             config=self.folder / "vision.toml" if role == "vision" else None, secure=self.keys, **changes,
         )
         self._peers.append(name)
         self.processes.start(name, [options.model_dump_json()], module="sightline.evaluation.faults.peer",
                              namespace=self.wire.far_side if self.wire else "", environment=self._environment())
+
+    def prepare_operator(self, **changes: Any) -> None:
+        """Start a new operator, which waits to send STOP."""
+        self.start_peer("operator", "stop", **changes)
+        self.processes.wait_line("operator", "stop ready", _OPERATOR_READY_S)
+
+    def stop_by_operator(self) -> tuple[int, tuple[Check, ...]]:
+        """Let the new operator send STOP. Returns the time of its first packet, and the checks of the stop."""
+        self.trigger("operator")
+        code = self.processes.exit_code("operator", _STOP_ENDS_S)
+        at_us = self.noted("operator", REQUESTED)[0].t_us
+        self.watch(0.2)
+        zero_ms = judge.measure_stop(self.motors(), at_us).zero_ms
+        return at_us, (
+            at_most("zero after the first packet", zero_ms, "ms", ZERO_MS),
+            at_most("exit code of stop", code, "", 0),
+        )
 
     def start_crowd(self, kind: str, endpoint: str = "") -> None:
         """Let many clients come, WebSocket ones by default; what they do is noted as by a peer called `crowd`."""

@@ -24,7 +24,9 @@ from sightline.protocol.channels import FRAME
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint, parse_zenoh_endpoint, stop_addresses
-from sightline.protocol.transports.stop_datagram import StopRequests
+from sightline.protocol.transports.security import stop_secret_file
+from sightline.protocol.transports.stop_datagram import CHALLENGE_BYTES, Kind, StopDatagram, pack_stop, unpack_stop
+from sightline.protocol.transports.stop_port import read_secret
 from sightline.protocol.transports.websocket.client import Client
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, Hello
 from sightline.protocol.transports.websocket.peer import OPEN_S
@@ -207,30 +209,36 @@ FLOOD_S: Final = 10.0
 
 
 def send_garbage(endpoint: str, ledger: EventLog) -> None:
-    """Send datagrams of every length for 10 s; print the rate."""
+    """Send datagrams of every length, for another robot, and with a wrong HMAC for 10 s; print the rate."""
     [place] = stop_addresses([endpoint])
-    other = StopRequests("r2", b"", 7)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.connect(place)
+        one.send(pack_stop(StopDatagram(Kind.STOP, "r1", 1)))
+        challenge = unpack_stop(one.recv(LONGEST)).challenge
+        others = [pack_stop(StopDatagram(Kind.STOP, robot, 7, challenge), b"foreign") for robot in ("r1", "r2")]
+        invalid = [*(os.urandom(length) for length in range(LONGEST + 1)), *others * LONGEST]
         print(READY, flush=True)
         ledger.note(INJECTED)
         started_s, sent = time.monotonic(), 0
         while time.monotonic() - started_s < FLOOD_S:
-            for data in (os.urandom(LONGEST)[: sent % (LONGEST + 1)], *other.datagrams()):
-                with suppress(OSError):
-                    one.sendto(data, place)
-                sent += 1
+            for data in invalid:
+                with suppress(OSError):  # e.g. its queue is full
+                    sent += one.send(data) == len(data)
     print(f"{sent / FLOOD_S:.0f} datagrams a second", flush=True)
     threading.Event().wait()
 
 
 def replay_stops(endpoint: str, ledger: EventLog) -> None:
-    """Send the recorded datagrams of an earlier STOP repeatedly."""
+    """Send the recorded datagrams of an earlier STOP, and such of another robot with the same keys, repeatedly."""
     [place] = stop_addresses([endpoint])
-    recording = Path(sys.argv[3]).with_name(STOPS)
-    datagrams = [bytes.fromhex(line) for line in recording.read_text("ascii").splitlines()]
+    folder = Path(sys.argv[3]).parent
+    datagrams = [bytes.fromhex(line) for line in (folder / STOPS).read_text("ascii").splitlines()]
+    secret, challenge = read_secret(stop_secret_file(str(folder / "keys"))), os.urandom(CHALLENGE_BYTES)
+    of_other = pack_stop(StopDatagram(Kind.STOP, "r2", 7, challenge), secret)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         print(READY, flush=True)
-        for data in itertools.cycle(datagrams):
+        # As it is, and under this robot's name.
+        for data in itertools.cycle([*datagrams, of_other, of_other.replace(b"r2", b"r1", 1)]):
             one.sendto(data, place)
             ledger.note(INJECTED)
             time.sleep(0.005)

@@ -16,14 +16,14 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 from sightline.evaluation.faults.evidence import GOOD, INJECTED, REQUESTED, EventLog
 from sightline.operator_side.client.requests import SOURCE as OPERATOR_SOURCE
 from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.client.stop import stop_robot
 from sightline.operator_side.config.loading import load_service
-from sightline.protocol.channels import ACK, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST, Channel, key_for
+from sightline.protocol.channels import ACK, CHANNELS, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST, Channel, key_for
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.config import Config
@@ -42,16 +42,18 @@ from sightline.protocol.messages import (
 from sightline.protocol.proof import NO_PROOF, ProofChain
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import LatestSlot, Link, LinkWrapper, Message
+from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.security import stop_secret_file
 from sightline.protocol.transports.stop_datagram import StopRequests
 from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
+from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
 from sightline.vision_side.serving.process import serve
 
-Role = Literal["vision", "driver", "operator", "stop"]
+Role = Literal["vision", "driver", "guest", "operator", "stop"]
 
 
 class PeerOptions(Config):
@@ -59,6 +61,8 @@ class PeerOptions(Config):
 
     role: Role
     endpoint: str
+    web_endpoint: str = ""
+    """Of a guest."""
     ledger: Path
     robot: str = "r1"
     source: str = "vision"
@@ -106,6 +110,10 @@ def _entry(role: Role) -> Callable[[PeerOptions, threading.Event, EventLog], int
 
         return run_driver
 
+    if role == "guest":
+
+        return run_guest
+
     if role == "stop":
 
         return run_stop
@@ -118,6 +126,22 @@ def _entry(role: Role) -> Callable[[PeerOptions, threading.Event, EventLog], int
 
 KEPT: Final = 256
 WAIT_S: Final = 0.05
+_REQUESTS_EVERY: Final = 15
+"""Commands between the requests of a driver that records."""
+
+
+class SentMessage(NamedTuple):
+    """A message as it left, for a replay."""
+
+    channel: Channel
+    header: bytes
+    payload: bytes
+
+
+def read_recording(path: Path) -> list[SentMessage]:
+    """Read the messages of a recording. The last line may still be written."""
+    rows = [line.split() for line in path.read_text("ascii").split("\n")[:-1]]
+    return [SentMessage(CHANNELS[name], bytes.fromhex(header), bytes.fromhex(text)) for name, header, text in rows]
 
 
 class Script:
@@ -127,12 +151,13 @@ class Script:
         self.options, self.link = options, link
         self.session = options.session or secrets.token_hex(4)
         self.proofs = ProofChain(secrets.token_bytes)
-        self.seq = 0
-        self.sent: deque[tuple[bytes, bytes]] = deque(maxlen=KEPT)
+        self.seq = self._requests = 0
+        self.sent: deque[SentMessage] = deque(maxlen=KEPT)
         self.twist = Twist(linear_mps=options.linear_mps, angular_rad_s=options.angular_rad_s)
         self._ledger = ledger
         self._frames: LatestSlot[Message] = link.latest(FRAME)
-        self._recording = options.recording.open("a") if options.recording and not options.fault else None
+        self._reports: LatestSlot[Message] = link.latest(STATUS)
+        self._recording = options.recording.open("a") if options.recording and options.fault != "replay" else None
 
     def frame(self, wait_s: float = WAIT_S) -> FrameHeader | None:
         """The header of the newest frame not yet taken, waiting a little for one."""
@@ -150,12 +175,30 @@ class Script:
     def drive(self, frame: FrameHeader, twist: Twist | None = None) -> None:
         """Send a good command."""
         header, text = encode(self.answer(frame)), format_twist(twist or self.twist)
-        self.sent.append((header, text))
-        if self._recording:
-            self._recording.write(f"{header.hex()} {text.hex()}\n")
-            self._recording.flush()
         self._ledger.note(GOOD, frame.t_us)
-        self.link.publish(TWIST, header, text, self.options.source)
+        self._send(TWIST, header, text)
+        if self._recording and self.seq % _REQUESTS_EVERY == 0 and (report := self._reports.take()):
+            self._request_all(Echo.of(decode(Stamp, report.header)))
+
+    def _request_all(self, echo: Echo) -> None:
+        """Send each request that a replay could use."""
+        for verb in (Verb.ACQUIRE, Verb.ARM, Verb.RESET):
+            self._requests += 1
+            header = RequestHeader(source=self.options.source, session=self.session, seq=self._requests, echo=echo,
+                                   **self.proofs.next()._asdict())
+            self._send(REQUEST, encode(header), encode(Request(id=self._requests, verb=verb)))
+
+    def _send(self, channel: Channel, header: bytes, payload: bytes) -> None:
+        self.sent.append(SentMessage(channel, header, payload))
+        if self._recording:
+            self._recording.write(f"{channel.name} {header.hex()} {payload.hex()}\n")
+            self._recording.flush()
+        self.link.publish(channel, header, payload, self.options.source)
+
+    def replay(self, message: SentMessage) -> None:
+        """Send a recorded message again."""
+        self._ledger.note(INJECTED)
+        self.link.publish(*message, self.options.source)
 
     def attack(self, header: AnswerHeader | bytes, text: bytes | None = None) -> None:
         """Send what must not move the wheels."""
@@ -186,6 +229,31 @@ def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog
                 script.drive(frame)
         if options.fault:
             ATTACKS[options.fault](script)
+    return 0
+
+
+# A client of the legacy protocol, which names no image. Shell.
+
+
+GUEST_HZ: Final = 20
+
+
+def run_guest(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
+    """Change the command each time; after the trigger repeat one command. It counts while the robot may apply it."""
+    ends_us = SafetyConfig().guest_unchanged_ms * 1000
+    with open_link(options.robot, connect=[options.web_endpoint], role="guest", timeout_s=15) as link:
+        repeats_since_us = None
+        for number in itertools.count():
+            if pulled.is_set() and repeats_since_us is None:
+                repeats_since_us = monotonic_us()
+            change = 0.0 if repeats_since_us else 0.001 * (number % 2)
+            twist = Twist(linear_mps=options.linear_mps - change, angular_rad_s=options.angular_rad_s - change)
+            if repeats_since_us:
+                ledger.note(INJECTED)
+            if not repeats_since_us or monotonic_us() - repeats_since_us < ends_us:
+                ledger.note(GOOD, monotonic_us())
+            link.publish(TWIST, b"", format_twist(twist))
+            time.sleep(1 / GUEST_HZ)
     return 0
 
 
@@ -233,14 +301,20 @@ def _is_late(frame: FrameHeader) -> bool:
 
 
 def replay(script: Script) -> None:
-    """Replay earlier messages of this session or of a recording, repeatedly."""
+    """Replay earlier messages of this session or of a recording, repeatedly: the first and the newest ones."""
     recording = script.options.recording
-    earlier = [tuple(map(bytes.fromhex, line.split())) for line in recording.open()] if recording else script.sent
-    messages = list(earlier)
     while True:
-        for header, text in messages[-50:]:
-            script.attack(header, text)
+        messages = read_recording(recording) if recording else list(script.sent)
+        for message in (*messages[:50], *messages[-50:]):
+            script.replay(message)
             time.sleep(0.005)
+
+
+def turn_round(script: Script) -> None:
+    """Drive the other way from now on."""
+    forward = Twist(linear_mps=-script.twist.linear_mps, angular_rad_s=0.0)
+    for frame in _frames(script):
+        script.drive(frame, forward)
 
 
 def never_issued(script: Script) -> None:
@@ -313,7 +387,7 @@ def malformed(script: Script) -> None:
 
 def flood(script: Script) -> None:
     """One old command at 10 kHz."""
-    header, text = script.sent[0]
+    _, header, text = script.sent[0]
     started_s, batches = time.monotonic(), 0
     while time.monotonic() - started_s < FLOOD_S:
         for _ in range(FLOOD_BATCH):
@@ -354,7 +428,7 @@ def thousand(script: Script) -> None:
 ATTACKS: Final[dict[str, Callable[[Script], None]]] = {
     attack.__name__: attack
     for attack in (late, replay, never_issued, from_future, wrapped, malformed, flood, reversal, heartbeat, thousand,
-                   copied, copied_requests, future_frames)
+                   copied, copied_requests, future_frames, turn_round)
 }
 
 

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
-from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, REQUESTED, ZERO_MS, measure_stop, wheel_mps
+from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, ZERO_MS, measure_stop, wheel_mps
 from sightline.evaluation.faults.fixture import RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import FEW_HZ, HALF_OPEN, MANY_HZ, READY, SESSIONS, STOPS
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.evaluation.processes import children_of
 from sightline.protocol.clock import monotonic_us
+from sightline.robot_side.safety.limits import SafetyConfig
 
 AT_WORK_S: Final = 3.0
 AFTER_S: Final = (2.0, 20.0, 80.0)
@@ -23,26 +24,9 @@ READY_S: Final = 30.0
 KEPT_MPS: Final = 0.4
 
 
-def _new_operator(rig: RobotFixture) -> tuple[int, tuple[Check, ...]]:
-    """Send STOP by a new operator. Returns the time of its first packet, and the checks of the stop."""
-    rig.trigger("operator")
-    code = rig.processes.exit_code("operator", STOP_ENDS_S)
-    at_us = rig.noted("operator", REQUESTED)[0].t_us
-    rig.watch(0.2)
-    zero_ms = measure_stop(rig.motors(), at_us).zero_ms
-    return at_us, (
-        at_most("zero after the first packet", zero_ms, "ms", ZERO_MS), at_most("exit code of stop", code, "", 0)
-    )
-
-
-def _prepare_operator(rig: RobotFixture, **changes: object) -> None:
-    rig.start_peer("operator", "stop", **changes)
-    rig.processes.wait_line("operator", "stop ready", READY_S)
-
-
 def _flood(rig: RobotFixture, kind: str, after_s: float | None = None) -> Injected:
     """Send STOP during a flood, or some time after its end."""
-    _prepare_operator(rig)
+    rig.prepare_operator()
     rig.start_crowd(kind, rig.endpoint)
     rig.processes.wait_line("crowd", READY, READY_S)
     rig.watch(AT_WORK_S)
@@ -50,31 +34,32 @@ def _flood(rig: RobotFixture, kind: str, after_s: float | None = None) -> Inject
         rig.processes.kill("crowd")
         rig.watch(after_s)
     count = len(rig.noted("crowd", INJECTED))
-    at_us, checks = _new_operator(rig)
+    at_us, checks = rig.stop_by_operator()
     return Injected(count, at_us, checks=checks)
 
 
 def _garbage(rig: RobotFixture) -> Injected:
     """Invalid datagrams for 10 s have no effect; a valid one among them stops the robot."""
-    _prepare_operator(rig)
+    rig.prepare_operator()
     came_us = monotonic_us()
     rig.start_crowd("garbage", rig.endpoint)
     rig.processes.wait_line("crowd", READY, READY_S)
     rig.watch(AT_WORK_S)
     slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > came_us)
-    at_us, checks = _new_operator(rig)
+    at_us, checks = rig.stop_by_operator()
     rig.processes.wait_line("crowd", "datagrams a second", READY_S)
     rate_hz = float(rig.processes.log("crowd").read_text("utf-8").rpartition(READY)[2].split()[0])
-    counted = "rejected MALFORMED" in rig.processes.log("robot").read_text("utf-8")
+    log = rig.processes.log("robot").read_text("utf-8")
+    counted = sum(reason in log for reason in ("MALFORMED", "OTHER_ROBOT", "WRONG_KEY"))
     return Injected(1, at_us, checks=(
         *checks, at_least("speed kept before it", slowest_mps, "m/s", KEPT_MPS), at_least("sent", rate_hz, "1/s", 1000),
-        at_least("logged", counted, "", 1),
+        at_least("reasons logged", counted, "", 3),
     ))
 
 
 def _replay(rig: RobotFixture) -> Injected:
     """Record the datagrams of a STOP, start the robot again without the latch, and replay them."""
-    _prepare_operator(rig, recording=rig.folder / STOPS)
+    rig.prepare_operator(recording=rig.folder / STOPS)
     rig.trigger("operator")
     rig.processes.exit_code("operator", STOP_ENDS_S)
     rig.processes.end_one("robot")
@@ -86,11 +71,12 @@ def _replay(rig: RobotFixture) -> Injected:
     rig.processes.wait_line("crowd", READY, READY_S)
     rig.watch(AT_WORK_S)
     slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > since_us)
-    counted = "rejected OTHER_SESSION" in rig.processes.log("robot").read_text("utf-8")
-    at_us = monotonic_us()
-    rig.processes.kill("peer")
-    rig.watch(1.5)
-    checks = at_least("speed kept", slowest_mps, "m/s", KEPT_MPS), at_least("logged", counted, "", 1)
+    log = rig.processes.log("robot").read_text("utf-8")
+    counted = sum(reason in log for reason in ("OTHER_SESSION", "OTHER_ROBOT"))
+    (rig.folder / "operator.ledger").unlink()
+    rig.prepare_operator()
+    at_us, checks = rig.stop_by_operator()
+    checks += at_least("speed kept", slowest_mps, "m/s", KEPT_MPS), at_least("reasons logged", counted, "", 2)
     return Injected(len(rig.noted("crowd", INJECTED)), at_us, checks=checks)
 
 
@@ -99,11 +85,11 @@ BUSY: Final = 8
 
 def _busy(rig: RobotFixture) -> Injected:
     """Send STOP while more processes than processors want all of them."""
-    _prepare_operator(rig)
+    rig.prepare_operator()
     busy = [subprocess.Popen([sys.executable, "-P", "-c", "while True: pass"]) for _ in range(BUSY)]
     try:
         rig.watch(AT_WORK_S)
-        at_us, checks = _new_operator(rig)
+        at_us, checks = rig.stop_by_operator()
     finally:
         for process in busy:
             process.kill()
@@ -113,16 +99,50 @@ def _busy(rig: RobotFixture) -> Injected:
 
 def _no_descriptors(rig: RobotFixture) -> Injected:
     """Send STOP while no process of the robot may open a file or a socket."""
-    _prepare_operator(rig)
+    rig.prepare_operator()
     driver = rig.processes.pid("robot")
     for pid in (driver, *children_of(driver)):
         held = max(int(link.name) for link in Path(f"/proc/{pid}/fd").iterdir()) + 1
         resource.prlimit(pid, resource.RLIMIT_NOFILE, (held, held))
     # At once: the camera of the bench opens a file for each image, so that the robot would soon stop by itself.
-    at_us, checks = _new_operator(rig)
+    at_us, checks = rig.stop_by_operator()
     return Injected(1, at_us, checks=checks)
 
 
+_GUEST: Final = SafetyConfig()
+_BRAKING_M, _BRAKING_MS = 0.05, 700.0
+"""A guest brakes from 0.2 m/s, slower than the speed for which the bounds of a stop hold."""
+
+
+def _repeat_as_guest(rig: RobotFixture, name: str) -> tuple[Check, ...]:
+    """Let a guest repeat its command on one image, for longer than it may. Then it dies."""
+    at_us = rig.trigger(name)
+    rig.watch(_GUEST.guest_unchanged_ms / 1000 + 2.0)
+    stop = measure_stop(rig.motors(), at_us)
+    rig.processes.kill(name)
+    return (
+        at_most(f"zero on one image ({name})", stop.zero_ms, "ms", _GUEST.guest_unchanged_ms + _BRAKING_MS),
+        at_most(f"distance on one image ({name})", stop.distance_m, "m", _GUEST.guest_unchanged_m + _BRAKING_M),
+    )
+
+
+def _guests(rig: RobotFixture) -> Injected:
+    """Guests answer one image for seconds: one drives ahead, one turns. The next one drives when STOP comes."""
+    checks = list(_repeat_as_guest(rig, "peer"))
+    rig.start_peer("turning", "guest", linear_mps=0.0, angular_rad_s=1.0)
+    rig.wait_speed(_TURNING_MPS)
+    checks += _repeat_as_guest(rig, "turning")
+    count = rig.injected("peer") + rig.injected("turning")
+    rig.prepare_operator()
+    rig.start_peer("third", "guest", linear_mps=0.2, angular_rad_s=0.0)
+    rig.wait_speed(rig.setup.at_speed_mps)
+    at_us, stopped = rig.stop_by_operator()
+    rig.watch(AT_WORK_S)
+    return Injected(count, at_us, checks=(*checks, *stopped))
+
+
+_TURNING_MPS: Final = 0.07
+"""Speed of the wheels at 1 rad/s."""
 _FLOODS: Final = {
     "tls25": ("connect_25", f"{FEW_HZ} connections a second without keys", True),
     "tls_half": ("half_open", f"{HALF_OPEN} half-open connections without keys", True),
@@ -152,6 +172,9 @@ def _flood_case(name: str, *, routed: bool = False, after_s: float | None = None
 STOP_CASES: Final = (
     *(_flood_case(name, routed=routed) for routed in (False, True) for name in _FLOODS),
     *(_flood_case("tls_half", after_s=after_s) for after_s in AFTER_S),
+    FaultCase("guest.one_image", "guests: one command on one image for 4 s, ahead and turning; then STOP", _guests,
+              Setup("guest", guests=True), blind=True, also=f"zero <= {_GUEST.guest_unchanged_ms / 1000:g} s and "
+              f"{_GUEST.guest_unchanged_m:g} m, plus braking; {_DEMANDED}"),
     FaultCase("stop.busy", f"STOP by a new operator: {BUSY} busy processes beside it", _busy, Setup(), blind=True,
               also=_DEMANDED, alone=True),
     FaultCase("stop.no_descriptors", "STOP by a new operator: the robot has no file descriptor left", _no_descriptors,
@@ -159,11 +182,12 @@ STOP_CASES: Final = (
     FaultCase("stop.publisher", "STOP by a new operator: twists at 10 kHz and of 1 MB, with malformed attachments",
               partial(_flood, kind="publisher"), Setup(), blind=True, also=_DEMANDED, alone=True),
     FaultCase(
-        "stop.garbage", "STOP port: datagrams of 0 to 2000 bytes and for another robot, as fast as possible; then STOP",
-        _garbage, Setup(), blind=True, also=f"no effect but a count; {_DEMANDED}", alone=True,
+        "stop.garbage", "STOP port: datagrams of 0 to 2000 bytes, for another robot and with a wrong HMAC, as fast as "
+        "possible for 10 s (secured); then STOP", _garbage, Setup(secure=True), blind=True,
+        also=f"no effect but a count; {_DEMANDED}", alone=True,
     ),
     FaultCase(
-        "stop.replayed", "STOP port: the datagrams of an earlier start, replayed (secured); then vision: SIGKILL",
-        _replay, Setup(secure=True), also="ignored and counted; speed kept",
+        "stop.replayed", "STOP port: datagrams of an earlier start and of another robot, replayed (secured); then STOP",
+        _replay, Setup(secure=True), blind=True, also=f"ignored and counted; speed kept; {_DEMANDED}",
     ),
 )

@@ -30,12 +30,12 @@ from sightline.evaluation.faults.evidence import (
     read_motors,
     stop_checks,
 )
-from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED
+from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED, read_recording
 from sightline.evaluation.faults.report import passed, run_line, to_dict
 from sightline.evaluation.faults.runner import FaultOutcome, run_case, watched_us
 from sightline.evaluation.faults.sampler import read_holes, stalled_us
 from sightline.operator_side.cli import evaluate as cli_faults
-from sightline.protocol.channels import TWIST
+from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.errors import ConfigError, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.text import parse_twist
@@ -182,6 +182,12 @@ def test_event_log_is_read_without_a_torn_line(tmp_path):
         torn.write("good,12")
     assert [one.frame_us for one in read_events(path, GOOD)] == [7] and len(read_events(path, INJECTED)) == 1
     assert read_events(tmp_path / "none", GOOD) == []
+
+
+def test_recording_is_read_without_a_torn_line(tmp_path):
+    path = tmp_path / "driver.txt"
+    path.write_text(f"twist {b'{}'.hex()} {b'0|0'.hex()}\nrequest {b'{}'.hex()} {b'1'.hex()}\ntwist 7b", "ascii")
+    assert read_recording(path) == [(TWIST, b"{}", b"0|0"), (REQUEST, b"{}", b"1")]
 
 
 def test_only_holes_in_the_window_spoil_a_row(tmp_path):
