@@ -20,6 +20,11 @@ TWIST = re.compile(NUMBER + rb"\|" + NUMBER)  # 4.1
 Header = dict[str, Any]
 
 
+def digest_of(source: str, session: str) -> str:
+    """6.7: what others see of a driver or requester."""
+    return hashlib.sha256(f"{source}/{session}".encode()).hexdigest()[:8]
+
+
 class Gate:
     """The only path to the wheels: validates a command on arrival, and again at each step."""
 
@@ -159,8 +164,7 @@ class Gate:
         linear, angular = self.wheels(now)
         commanded = now - self.command[3] <= SILENCE_US
         state = "STOPPED" if self.stopped else "DISARMED" if not self.armed else "ACTIVE" if commanded else "HOLD"
-        digest = hashlib.sha256("/".join(self.holder).encode()).hexdigest()[:8]  # 6.7
-        holder = {"source": self.holder[0], "digest": digest} if self.live(now) else None
+        holder = {"source": self.holder[0], "digest": digest_of(*self.holder)} if self.live(now) else None
         refused = {reason: count for reason, count in self.refused.items() if reason and count}
         return {"state": state, "reason": "a minimal robot", "holder": holder, "applied": [linear, angular],
                 "accepted": self.accepted, "refused": refused, "auto_arm": self.arms_itself,

@@ -19,7 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from minimal_gate import SESSION, Gate, Header
+from minimal_gate import SESSION, Gate, Header, digest_of
 
 ROBOT = "r1"
 CAMERA = {"width_px": 320, "height_px": 240, "fx_px": 190.68, "fy_px": 190.68, "cx_px": 160.0, "cy_px": 120.0}
@@ -81,7 +81,8 @@ class Robot:
         now = now_us()
         wrong = self.gate.request(request["verb"], header, now)
         self.gate.refused[wrong.partition(":")[0]] += bool(wrong)
-        reply = {"to": header["session"], "id": request["id"], "ok": not wrong, "detail": wrong or "done"}
+        to = digest_of(header["source"], header["session"])
+        reply = {"to": to, "id": request["id"], "ok": not wrong, "detail": wrong or "done"}
         reply["state"] = self.gate.status(now)["state"]
         yield "reply", self.stamp("reply", now), json.dumps(reply).encode()
 

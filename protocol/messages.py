@@ -105,10 +105,13 @@ class Echo(WireModel):
         return cls(channel=channel, session=stamp.session, seq=stamp.seq, t_us=stamp.t_us)
 
 
-class RequestId(WireModel):
-    """Names a requested mission: the requester's session, and the id in the payload."""
+_DIGEST: Final = "of the requester: first 8 hex digits of the SHA-256 of `source/session`"
 
-    session: SessionId = Field(description="of the requester")
+
+class RequestId(WireModel):
+    """Names a requested mission: the digest of the requester, and the id in the payload."""
+
+    digest: SessionId = Field(description=_DIGEST)
     id: Counter = Field(description="of the mission")
 
 
@@ -119,6 +122,11 @@ class SenderHeader(WireModel):
     source: Source = Field(description="the sender's role; equal to the one in the key")
     session: SessionId = Field(description="the sender's start: 8 hex digits drawn at random")
     seq: Counter = Field(description="count of the sender's messages on this channel within the session")
+
+    @property
+    def digest(self) -> str:
+        """Return what others are shown of the sender in place of its session."""
+        return session_digest(self.source, self.session)
 
 
 _PROOF: Final = "the next element of the sender's hash chain; of the first command its commitment"
@@ -183,7 +191,7 @@ class Request(WireModel):
 class Reply(WireModel):
     """The answer to the request that `to` and `id` name."""
 
-    to: SessionId = Field(description="session of the requester")
+    to: SessionId = Field(description="digest " + _DIGEST)
     id: Counter = Field(description="of the request")
     ok: bool = Field(description="whether it was done, or was so already")
     state: str = Field(max_length=32, description="of the gate, afterwards")

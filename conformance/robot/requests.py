@@ -17,6 +17,7 @@ from sightline.conformance.robot.fixture import (
 )
 from sightline.protocol.channels import ACK, REPLY, REQUEST, Channel
 from sightline.protocol.messages import Reply, Stamp, State
+from sightline.protocol.proof import session_digest
 
 SUITE: Final = Suite("R")
 
@@ -45,10 +46,11 @@ def reply_names_the_request(bench: Bench, operator: Sender) -> None:
 
 @SUITE.must("R-REQ-03", "8.1 Requests and replies", operator)
 def reply_names_the_requester(bench: Bench, first: Sender) -> None:
-    """`to` of a reply is the session of the requester."""
+    """`to` of a reply is the digest of the requester, not its session."""
     for asker in (first, Sender(first.robot, bench.access.watcher)):
         reply = asker.reply("disarm")
-        bench.expect(reply.to == asker.session, f"to {reply.to}, requested by {asker.session}")
+        digest = session_digest(asker.source, asker.session)
+        bench.expect(reply.to == digest, f"to {reply.to}, requested by {digest}")
 
 
 @SUITE.must("R-REQ-04", "8.2 Requests and replies", operator)

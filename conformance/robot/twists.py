@@ -93,7 +93,7 @@ HEADERS: Final[Sequence[Row]] = (
     ("R-HEAD-21", MUST, "1.4 Sizes", "A header of 512 bytes is read.", GOOD,
      (lambda fields: as_json(fields)[:-1].ljust(MAX_HEADER_BYTES - 1) + b"}",)),
     ("R-HEAD-22", MUST, "18.6 What an answer went by", "A twist may name the scan and the mission that it went by.",
-     GOOD, (_set(scan=7, mission={"session": "0a0b0c0d", "id": 3}),)),
+     GOOD, (_set(scan=7, mission={"digest": "0a0b0c0d", "id": 3}),)),
 )  # fmt: skip
 
 CITED: Final[Sequence[Row]] = (

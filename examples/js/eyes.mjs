@@ -49,7 +49,7 @@ export class Eyes {
     const read = readMessage(channel, source, header, payload);
     if (channel.name === "camera") this.vision.onCamera(read.header, read.payload);
     if (channel.name === "status") this.vision.onStatus(read.header, read.payload);
-    if (channel.name === "reply" && read.payload.to === this.vision.session) this.onReply(read.payload);
+    if (channel.name === "reply" && read.payload.to === this.vision.digest) this.onReply(read.payload);
   }
 
   /** One place for a frame, the newest; whoever was in it is not answered. */

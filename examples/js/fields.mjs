@@ -105,7 +105,7 @@ export const ScanHeader = {
   ...Stamp, angle_min_rad: [real], angle_increment_rad: [real], range_min_m: [real], range_max_m: [real],
 };
 const asker = { v: [version, VERSION], source: [source], session: [session], seq: [counter] };
-export const Asked = { session: [session], id: [counter] };
+export const Asked = { digest: [session], id: [counter] };
 export const AnswerHeader = {
   ...asker, echo: [object(Echo)], compute_us: [counter, 0], scan: [orNull(counter), null],
   mission: [orNull(object(Asked)), null], proof: [orNull(element), null], next_proof: [orNull(element), null],

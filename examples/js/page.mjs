@@ -1,6 +1,5 @@
 /** @file Ties the viewer to the elements of viewer.html. Shell. */
 
-import { sessionDigest } from "./proof.mjs";
 import { Viewer, canvasLook, markTarget } from "./viewer.mjs";
 
 const REFRESH_MS = 100;
@@ -32,7 +31,7 @@ function showStatus({ state, reason, holder, applied, frame_age_us, latency_us, 
   write("reason", reason);
   const side = applied[1] < 0 ? "right" : "left";
   write("wheels", `${applied[0].toFixed(2)} m/s, turning ${side} at ${Math.abs(applied[1]).toFixed(2)} rad/s`);
-  write("driver", holder === null ? "nobody" : holder.digest === sessionDigest(viewer.vision.source, viewer.session) ? "this page" : `${holder.source} ${holder.digest}`);
+  write("driver", holder === null ? "nobody" : holder.digest === viewer.vision.digest ? "this page" : `${holder.source} ${holder.digest}`);
   const ages = [["now", frame_age_us], ["when the last command came", latency_us]].filter(([, age_us]) => age_us !== null);
   write("sight", ages.map(([what, age_us]) => `${Math.round(age_us / 1000)} ms old ${what}`).join(", ") || "none");
   write("pictures", `${stream.sent} sent, ${viewer.eyes.answered} answered here, ${stream.credit_timeouts} unanswered in time`);

@@ -8,6 +8,7 @@ import { CHANNELS, WireError, encode, readJpegSize, readMessage } from "./codec.
 import { Gate } from "./gate.mjs";
 import { isStill } from "./limits.mjs";
 import { shown } from "./judging.mjs";
+import { sessionDigest } from "./proof.mjs";
 import { Stream } from "./stream.mjs";
 
 const PERIODS_US = { status: 100_000, odometry: 50_000, camera: 500_000 };
@@ -78,7 +79,7 @@ export class Robot {
   }
 
   onRequest(source, { header, payload }, now_us) {
-    const reply = { to: header.session, id: payload.id, ok: true };
+    const reply = { to: sessionDigest(header.source, header.session), id: payload.id, ok: true };
     try {
       if (header.source !== source) throw new WireError("UNKNOWN_SOURCE", "key and header disagree on the source");
       reply.detail = this.gate.request(header, payload.verb, now_us);

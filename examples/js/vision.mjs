@@ -4,7 +4,7 @@
  * @typedef {{x_px: number, width_px: number, share: number}} Target in pixels of the encoded picture
  */
 
-import { ProofChain } from "./proof.mjs";
+import { ProofChain, sessionDigest } from "./proof.mjs";
 
 const GAIN_PER_S = 2; // turn rate per radian of bearing; times a total latency of 0.2 s it stays below 0.9
 const MAX_ANGULAR_RAD_S = 1.2;
@@ -64,6 +64,7 @@ export class Vision {
   constructor(session, source = "vision") {
     this.session = session;
     this.source = source;
+    this.digest = sessionDigest(source, session); // what others see of both
     this.proofs = new ProofChain();
     this.robotSession = "";
     this.camera = null;

@@ -27,6 +27,7 @@ from sightline.protocol.messages import (
     RequestHeader,
     RequestId,
 )
+from sightline.protocol.proof import session_digest
 from sightline.protocol.transports.link import Link, Message
 
 Waypoints = tuple[tuple[float, float], ...]
@@ -138,7 +139,7 @@ class MissionClient:
         request = request_of(self._id, name, waypoints, options or {})
         # Repeats cite the same status, so the age of a request counts from the first one.
         echo = Echo.of(self.operator.wait_report().stamp)
-        mine = RequestId(session=self._session, id=self._id)
+        mine = RequestId(digest=session_digest(SOURCE, self._session), id=self._id)
         deadline_s = time.monotonic() + PATIENCE_S
         while (left_s := deadline_s - time.monotonic()) > 0:
             self._seq += 1
@@ -156,7 +157,7 @@ class MissionClient:
         Raises:
             LinkError: no report within `timeout_s`, or another mission replaced the requested one.
         """
-        mine, previous = RequestId(session=self._session, id=self._id), None
+        mine, previous = RequestId(digest=session_digest(SOURCE, self._session), id=self._id), None
         while True:
             report = self.report(timeout_s)
             if report.asked != mine:

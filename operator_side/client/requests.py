@@ -16,6 +16,7 @@ from sightline.protocol.channels import REPLY, REQUEST, STATUS
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError, RejectReason, WireError
 from sightline.protocol.messages import Echo, Reply, Request, RequestHeader, Stamp, State, Status, Verb
+from sightline.protocol.proof import session_digest
 from sightline.protocol.transports.link import Link, Message
 
 SOURCE: Final = "operator"
@@ -56,6 +57,7 @@ class Operator:
         """
         self._link = link
         self._session = secrets.token_hex(4)
+        self._digest = session_digest(SOURCE, self._session)
         self._seq = self._id = 0
         self._changed = threading.Condition()
         self._report: StatusReport | None = None
@@ -237,7 +239,7 @@ class Operator:
             reply = decode(Reply, message.payload, REPLY.max_payload_bytes)
         except WireError:
             return
-        if reply.to != self._session:
+        if reply.to != self._digest:
             return
         with self._changed:
             self._replies.setdefault(reply.id, reply)

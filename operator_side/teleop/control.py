@@ -283,6 +283,7 @@ class Teleop:
 
     def __init__(self, session: str, speeds: Speeds, layout: Layout = WASD) -> None:
         self.session = session
+        self._own = LeaseHolder.of(SOURCE, session)
         self._proofs = ProofChain(secrets.token_bytes)
         self.speeds = speeds
         self.layout = layout
@@ -385,7 +386,7 @@ class Teleop:
             reply = decode(Reply, message.payload, REPLY.max_payload_bytes)
         except WireError:
             return
-        if reply.to != self.session or reply.id < self._requested_from_id:
+        if reply.to != self._own.digest or reply.id < self._requested_from_id:
             return
         if self._leaving:
             self.has_left |= reply.ok
@@ -520,8 +521,7 @@ class Teleop:
     def _other_drives(self) -> bool:
         status = self.report.status if self.report else None
         armed = status is not None and status.state in (State.ACTIVE, State.DEGRADED)
-        own = LeaseHolder.of(SOURCE, self.session)
-        return armed and status is not None and status.holder is not None and status.holder != own
+        return armed and status is not None and status.holder is not None and status.holder != self._own
 
     # --- messages ------------------------------------------------------------------------------------------------
 

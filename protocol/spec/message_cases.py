@@ -36,7 +36,7 @@ DETECTIONS: dict[str, Any] = {"width_px": 640, "height_px": 480, "boxes": [BOX]}
 REPLY = {"to": PEER, "id": 3, "ok": True, "state": "HOLD", "detail": "armed"}
 MISSION: dict[str, Any] = {"id": 5, "name": "goto", "waypoints": [[1.5, 1.5], [0.0, -2.0]]}
 REPORT: dict[str, Any] = {"mission": "goto", "phase": "driving", "note": "to waypoint 1 of 2",
-                          "asked": {"session": PEER, "id": 5}, "detector": "hsv", "device": "cpu"}
+                          "asked": {"digest": PEER, "id": 5}, "detector": "hsv", "device": "cpu"}
 
 
 def packed(value: dict[str, Any]) -> bytes:
@@ -231,14 +231,14 @@ def answers() -> list[MessageCase]:
         case("twist", "no_header", "any other role needs one", MALFORMED, header=b""),
         case("twist", "no_compute", "compute_us may be left out", header=without(ANSWER, "compute_us")),
         case("twist", "with_scan_and_mission", "what else it went by",
-             header=ANSWER | {"scan": 12, "mission": {"session": PEER, "id": 5}}),
+             header=ANSWER | {"scan": 12, "mission": {"digest": PEER, "id": 5}}),
         case("twist", "with_proof", "an element of the sender's chain", header=ANSWER | {"proof": "0f" * 16}),
         case("twist", "with_next_proof", "near the end of the chain",
              header=ANSWER | {"proof": "0f" * 16, "next_proof": "a5" * 16}),
         case("twist", "proof_upper", "lower-case digits", MALFORMED, header=ANSWER | {"proof": "0F" * 16}),
         case("twist", "proof_31", "32 digits", MALFORMED, header=ANSWER | {"proof": "0f" * 15 + "0"}),
         case("twist", "scan_negative", "integers are bounded below", MALFORMED, header=ANSWER | {"scan": -1}),
-        case("twist", "mission_no_id", "named in full", MALFORMED, header=ANSWER | {"mission": {"session": PEER}}),
+        case("twist", "mission_no_id", "named in full", MALFORMED, header=ANSWER | {"mission": {"digest": PEER}}),
         case("twist", "no_echo", "a twist must cite what it answers", MALFORMED, header=without(ANSWER, "echo")),
         case("twist", "echo_of_scan", "no scan is cited", MALFORMED, header=echoing(ECHO | {"channel": "scan"})),
         case("twist", "echo_no_time", "an echo is complete", MALFORMED, header=echoing(without(ECHO, "t_us"))),
@@ -370,7 +370,7 @@ def reports() -> list[MessageCase]:
         case(name, "of_a_path", "a mission of one's own", payload=REPORT | {"mission": "my_missions:Circle"}),
         case(name, "no_phase", "a phase is needed", MALFORMED, payload=without(REPORT, "phase")),
         case(name, "note_201", "at most 200 characters", MALFORMED, payload=REPORT | {"note": "x" * 201}),
-        case(name, "asked_no_id", "an id is needed", MALFORMED, payload=REPORT | {"asked": {"session": PEER}}),
+        case(name, "asked_no_id", "an id is needed", MALFORMED, payload=REPORT | {"asked": {"digest": PEER}}),
         case(name, "done_as_1", "1 is not true", MALFORMED, payload=REPORT | {"done": 1}),
         case(name, "time_negative", "not below 0", MALFORMED, payload=REPORT | {"inference_us": -1}),
         case(name, "payload_2049", "2049 bytes", MALFORMED, payload=packed(REPORT).ljust(2049)),

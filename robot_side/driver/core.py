@@ -129,7 +129,7 @@ class DriverCore:
         except WireError as error:
             self.gate.reject(message.source, error)
             detail, granted = f"{error.reason}: {error.detail}"[:200], False
-        reply = Reply(to=header.session, id=request.id, ok=granted, state=self.gate.state, detail=detail)
+        reply = Reply(to=header.digest, id=request.id, ok=granted, state=self.gate.state, detail=detail)
         self._post(REPLY, reply, now_us)
 
     # --- what leaves ---------------------------------------------------------------------------------------------

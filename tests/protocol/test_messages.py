@@ -63,7 +63,7 @@ headers = st.one_of(
         range_max_m=numbers,
     ),
     st.builds(AnswerHeader, source=sources, session=sessions, seq=integers, echo=echoes, compute_us=integers,
-              scan=st.none() | integers, mission=st.none() | st.builds(RequestId, session=sessions, id=integers)),
+              scan=st.none() | integers, mission=st.none() | st.builds(RequestId, digest=sessions, id=integers)),
     st.builds(RequestHeader, source=sources, session=sessions, seq=integers, echo=st.none() | echoes),
 )
 

@@ -130,7 +130,7 @@ class LegacyRobotLink(LinkWrapper):
             detail, ok = self._carry_out(header, request.verb), True
         except WireError as error:
             detail, ok = f"{error.reason}: {error.detail}"[:200], False
-        reply = Reply(to=header.session, id=request.id, ok=ok, state=self._state, detail=detail)
+        reply = Reply(to=header.digest, id=request.id, ok=ok, state=self._state, detail=detail)
         self._post(REPLY, reply)
         self._post_status()
 

@@ -55,7 +55,7 @@ class MissionRequests:
         except WireError as error:
             self.rejection = str(error)[:_LONGEST]
             raise
-        request_id = RequestId(session=header.session, id=request.id)
+        request_id = RequestId(digest=header.digest, id=request.id)
         if request_id == self.newest:
             return None
         self.newest, self.rejection = request_id, ""

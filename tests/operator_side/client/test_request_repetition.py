@@ -319,7 +319,7 @@ def test_what_arrives_wakes_the_waiting_thread(operator, arrive, woken):
 
 
 def reply_to(operator, number=1, *, to=None, detail="done"):
-    reply = Reply(to=to or operator._session, id=number, ok=True, state="HOLD", detail=detail)
+    reply = Reply(to=to or operator._digest, id=number, ok=True, state="HOLD", detail=detail)
     return Message(REPLY, "", b"", encode(reply))
 
 

@@ -26,6 +26,7 @@ from sightline.protocol.messages import (
     Twist,
     Verb,
 )
+from sightline.protocol.proof import session_digest
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
@@ -209,7 +210,7 @@ def reply_of(core, message, now_us=NOW_US):
 def test_request_is_carried_out_and_replied_to():
     core = core_of()
     message, reply = reply_of(core, request(Verb.STOP, number=4))
-    assert reply == Reply(to="0000000c", id=4, ok=True, state="STOPPED", detail="STOPPED")
+    assert reply == Reply(to=session_digest("operator", "0000000c"), id=4, ok=True, state="STOPPED", detail="STOPPED")
     assert message == Message(REPLY, "", encode(Stamp(session=ROBOT, seq=0, t_us=NOW_US)), encode(reply))
     assert core.gate.state is State.STOPPED
     assert decode(Stamp, reply_of(core, request(Verb.STOP, number=5))[0].header).seq == 1

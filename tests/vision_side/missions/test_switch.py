@@ -16,7 +16,7 @@ from tests.fixtures.vision.vision import jpeg_of, scene
 
 CONFIG = VisionConfig()
 FRAME_US = 33_333
-ASKED = RequestId(session="0000feed", id=1)
+ASKED = RequestId(digest="0000feed", id=1)
 
 
 class Scripted:

@@ -21,6 +21,7 @@ from sightline.protocol.messages import (
     ScanHeader,
     Stamp,
 )
+from sightline.protocol.proof import session_digest
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.pipeline import Observation
@@ -84,10 +85,11 @@ def test_requested_mission_is_applied_cited_and_reported():
     bench = Bench().frames(5)
     assert bench.answer().mission is None
     bench.ask("band", 7, options={"linear_mps": 0.2})
-    assert bench.frames(6).answer().mission == RequestId(session=ASKER, id=7)
+    asked = RequestId(digest=session_digest("operator", ASKER), id=7)
+    assert bench.frames(6).answer().mission == asked
     report = bench.report()
     assert (report.mission, report.phase, report.refused, report.done) == ("band", "forward", "", False)
-    assert (report.asked, report.detector, report.device) == (RequestId(session=ASKER, id=7), "hsv", "cpu")
+    assert (report.asked, report.detector, report.device) == (asked, "hsv", "cpu")
     header = decode(DetectionsHeader, bench.reports[-1].header)
     assert (header.source, header.echo.channel, header.echo.seq) == ("vision", "frame", bench.seq)
     assert any("mission band, requested by operator" in line for line in bench.said)
@@ -99,7 +101,7 @@ def test_repeated_request_is_applied_once():
         bench.ask("band", 1).frames()
         assert decode(MissionReport, bench.reports[-1].payload).phase != "switching"
     bench.ask("band", 2).frames()
-    assert bench.service._pipeline._request == RequestId(session=ASKER, id=2)
+    assert bench.service._pipeline._request == RequestId(digest=session_digest("operator", ASKER), id=2)
 
 
 @pytest.mark.parametrize(("how", "words"), [

@@ -5,6 +5,7 @@ import re
 from sightline.protocol.channels import ACK, REPLY
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import MAX_INTEGER, Reply, State, Verb
+from sightline.protocol.proof import session_digest
 from sightline.protocol.transports.link import Message
 from tests.conformance.robot.broken.arming import absent, forgives
 from tests.conformance.robot.broken.breaking import bend_out, bend_twists, breaks, fields_of, last_seq, wrap
@@ -275,7 +276,8 @@ def answers_what_it_cannot_read(robot):
     def around(inner, message):
         inner(message)
         if isinstance((fields_of(message.payload) or {}).get("id"), str):
-            to = fields_of(message.header)["session"]
+            header = fields_of(message.header)
+            to = session_digest(header["source"], header["session"])
             reply = Reply(to=to, id=0, ok=False, state=robot.driving.gate.state, detail="MALFORMED: id is not a number")
             robot.driving._post(REPLY, reply, robot.now())
 
