@@ -13,6 +13,7 @@ from sightline.protocol.channels import REPLY, REQUEST, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError, RejectReason, WireError
 from sightline.protocol.messages import AnswerHeader, Echo, Reply, Request, RequestHeader, Stamp, State, Twist, Verb
+from sightline.protocol.proof import session_digest
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
@@ -319,7 +320,8 @@ def test_what_arrives_wakes_the_waiting_thread(operator, arrive, woken):
 
 
 def reply_to(operator, number=1, *, to=None, detail="done"):
-    reply = Reply(to=to or operator._digest, id=number, ok=True, state="HOLD", detail=detail)
+    own = session_digest("operator", operator._session)
+    reply = Reply(to=to or own, id=number, ok=True, state="HOLD", detail=detail)
     return Message(REPLY, "", b"", encode(reply))
 
 

@@ -27,6 +27,16 @@ def reply_is_to_nobody(robot):
     bend_out(robot, "reply", lambda _header, payload: payload.update(to="00000000"))
 
 
+@breaks("R-REQ-03")
+def reply_shows_the_session(robot):
+    def around(inner, message):
+        robot.asker = fields_of(message.header).get("session")
+        inner(message)
+
+    wrap(robot, "on_request", around)
+    bend_out(robot, "reply", lambda _header, payload: payload.update(to=robot.asker))
+
+
 @breaks("R-REQ-04")
 def silent_on_what_it_has_answered(robot):
     answered = set()
