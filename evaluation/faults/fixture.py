@@ -207,6 +207,8 @@ class Setup:
     """The links have keys, and the driver has the session `SESSION`, which an attacker knows."""
     web: bool = False
     """The robot listens for WebSocket clients too."""
+    legacy: str | None = None
+    """In place of the robot a legacy one, with this text format in its address. `fault` names its library."""
     guests: bool = False
     """It also accepts legacy clients, in place of WebSocket ones."""
     routed: bool = False
@@ -252,8 +254,10 @@ class RobotFixture:
         self.endpoint = f"tcp/{ADDRESS_A}:{PORT}" if self.wire else f"{transport}/127.0.0.1:{free_port()}"
         if self.setup.secure:
             keys.make(self.folder / "keys", ["127.0.0.1"])
-        web = "ws-legacy" if self.setup.guests else "ws"
-        self.web_endpoint = f"{web}://127.0.0.1:{free_port()}" if self.setup.web or self.setup.guests else ""
+        is_legacy = self.setup.legacy is not None
+        if self.setup.web or self.setup.guests or is_legacy:
+            web = "ws" if self.setup.web else "ws-legacy"
+            self.web_endpoint = f"{web}://127.0.0.1:{free_port()}{self.setup.legacy or ''}"
         self._write_files(self._sockets)
         self.processes.start("sim", ["sim", "--config", str(self.folder / "sim.toml")])
         self.processes.start("sampler", [str(self.folder / "holes.csv")], module="sightline.evaluation.faults.sampler")
@@ -265,11 +269,23 @@ class RobotFixture:
             secure = ["--secure", self.keys] if self.keys else []
             self.processes.start("router", ["router", "--listen", self.endpoint, *secure])
             self.processes.wait_line("router", "router: on")
+        if is_legacy:
+            self._start_legacy()
+        else:
+            self._start_own()
+        self.wait_speed(self.setup.at_speed_mps)
+        self._before_kib = memory_kib(self.processes, self._judged)
+
+    def _start_legacy(self) -> None:
+        """Start a legacy robot, and vision by the README's line. Its address is the only option."""
+        self.start_peer("robot", "legacy", fault=self.setup.fault, sockets=self._sockets)
+        self.processes.wait_line("robot", f"robot {ROBOT}: on")
+        self.processes.start("vision", ["vision", "--robot", self.web_endpoint, "--listen", self.endpoint])
+
+    def _start_own(self) -> None:
         self.start_robot()
         session = {"session": SESSION} if self.setup.secure else {}
         self.start_peer("peer", self.setup.driver, fault=self.setup.fault, source=self.setup.source, **session)
-        self.wait_speed(self.setup.at_speed_mps)
-        self._before_kib = memory_kib(self.processes, self._judged)
 
     def _write_files(self, sockets: str) -> None:
         device = {"kind": "sim", "options": {"socket_dir": sockets}}
@@ -331,7 +347,7 @@ class RobotFixture:
         self.trigger("operator")
         code = self.processes.exit_code("operator", _STOP_ENDS_S)
         at_us = self.noted("operator", REQUESTED)[0].t_us
-        self.watch(0.2)
+        self.watch(ZERO_MS / 1000)
         zero_ms = judge.measure_stop(self.motors(), at_us).zero_ms
         return at_us, (
             at_most("zero after the first packet", zero_ms, "ms", ZERO_MS),

@@ -5,15 +5,19 @@
 It does its part until SIGUSR1, and from then on what `fault` names.
 """
 
+import asyncio
+import importlib
 import itertools
 import os
+import re
 import secrets
 import signal
 import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final, Literal, NamedTuple
@@ -41,19 +45,23 @@ from sightline.protocol.messages import (
 )
 from sightline.protocol.proof import NO_PROOF, ProofChain
 from sightline.protocol.text import format_twist
+from sightline.protocol.transports.endpoints import parse_websocket_endpoint
 from sightline.protocol.transports.link import LatestSlot, Link, LinkWrapper, Message
 from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.security import stop_secret_file
 from sightline.protocol.transports.stop_datagram import StopRequests
+from sightline.protocol.transports.websocket.legacy_text import encode_picture
 from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
-from sightline.robot_side.safety.limits import SafetyConfig
+from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
+from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
+from sightline.sim.bus import SimCamera, SimDrive, SimSocketConfig
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
 from sightline.vision_side.serving.process import serve
 
-Role = Literal["vision", "driver", "guest", "operator", "stop"]
+Role = Literal["vision", "driver", "guest", "legacy", "operator", "stop"]
 
 
 class PeerOptions(Config):
@@ -62,7 +70,9 @@ class PeerOptions(Config):
     role: Role
     endpoint: str
     web_endpoint: str = ""
-    """Of a guest."""
+    """Of a guest, and of a legacy robot. Its query names the text format."""
+    sockets: str = ""
+    """Of a legacy robot: the folder of the simulation's sockets. `fault` names its library."""
     ledger: Path
     robot: str = "r1"
     source: str = "vision"
@@ -113,6 +123,10 @@ def _entry(role: Role) -> Callable[[PeerOptions, threading.Event, EventLog], int
     if role == "guest":
 
         return run_guest
+
+    if role == "legacy":
+
+        return run_legacy_robot
 
     if role == "stop":
 
@@ -254,6 +268,139 @@ def run_guest(options: "PeerOptions", pulled: threading.Event, ledger: EventLog)
                 ledger.note(GOOD, monotonic_us())
             link.publish(TWIST, b"", format_twist(twist))
             time.sleep(1 / GUEST_HZ)
+    return 0
+
+
+# A legacy robot in the simulation: its motors latch, it has no watchdog, and its WebSocket is a third-party library.
+
+
+_TWO_NUMBERS: Final = re.compile(r"(-?[0-9.]+)-(-?[0-9.]+)")
+_IMAGE_S: Final = 0.05
+
+
+class LegacyRobot:
+    """Reads texts as legacy robots do: what it cannot read raises an error, and the library closes the connection."""
+
+    def __init__(self, options: "PeerOptions", ledger: EventLog) -> None:
+        config = SimSocketConfig(socket_dir=options.sockets)
+        self._drive, self._camera, self._ledger = SimDrive(config), SimCamera(config), ledger
+        self._form = options.web_endpoint.partition("?")[2]
+        self._twist = Twist(linear_mps=0.0, angular_rad_s=0.0)
+        threading.Thread(target=self._turn_wheels, name="wheels", daemon=True).start()
+
+    def _turn_wheels(self) -> None:
+        while True:
+            self._drive.set(*wheel_speeds(DiffDriveConfig(), self._twist))
+            time.sleep(TICK_US / 1e6)
+
+    def image(self) -> str:
+        """Return the next image as text."""
+        picture = self._camera.read(1.0)
+        return encode_picture(picture.jpeg if picture else b"").decode("ascii")
+
+    def on_text(self, text: str) -> None:
+        """Apply a command until the next one comes."""
+        linear_mps, angular_rad_s = self._read(text)
+        self._ledger.note(GOOD, monotonic_us())
+        self._twist = Twist(linear_mps=linear_mps, angular_rad_s=angular_rad_s)
+
+    def _read(self, text: str) -> tuple[float, float]:
+        if self._form == "boxes":
+            return self._toward(text)
+        if not self._form:
+            linear, angular = text.split("|")
+        elif self._form.endswith("nonnegative"):
+            linear, angular = text.split("-")
+        elif match := _TWO_NUMBERS.fullmatch(text):
+            linear, angular = reversed(match.groups()) if "swapped" in self._form else match.groups()
+        else:
+            raise ValueError(text)
+        return float(linear), float(angular)
+
+    @staticmethod
+    def _toward(text: str) -> tuple[float, float]:
+        boxes = [tuple(map(float, box.split(","))) for box in text.split("-") if box]
+        if not boxes:
+            return 0.0, 0.0
+        _, left, _, right = max(boxes, key=lambda box: box[3] - box[1])
+        return 0.35, 2.0 * (0.5 - (left + right) / 2)
+
+
+def _serve_article(module: Any, robot: LegacyRobot, port: int) -> None:
+    """Serve with `SimpleWebSocketServer`, the library of the legacy robots."""
+    clients: list[Any] = []
+
+    class Hub(module.WebSocket):  # type: ignore[misc]
+        def handleMessage(self) -> None:  # noqa: N802
+            robot.on_text(self.data)
+
+        def handleConnected(self) -> None:  # noqa: N802
+            clients.append(self)
+
+        def handleClose(self) -> None:  # noqa: N802
+            clients.remove(self)
+
+    def film() -> None:
+        while True:
+            text = robot.image()
+            for client in list(clients):
+                with suppress(Exception):  # gone meanwhile
+                    client.sendMessage(text)
+            time.sleep(_IMAGE_S)
+
+    threading.Thread(target=film, name="images", daemon=True).start()
+    module.SimpleWebSocketServer("127.0.0.1", port, Hub).serveforever()
+
+
+async def _film_to(robot: LegacyRobot, send: Callable[[str], Awaitable[None]]) -> None:
+    while True:
+        await send(robot.image())
+        await asyncio.sleep(_IMAGE_S)
+
+
+def _serve_websockets(_module: Any, robot: LegacyRobot, port: int) -> None:
+    async def handler(client: Any) -> None:
+        filming = asyncio.ensure_future(_film_to(robot, client.send))
+        try:
+            async for text in client:
+                robot.on_text(text)
+        finally:
+            filming.cancel()
+
+    async def main() -> None:
+        async with importlib.import_module("websockets.asyncio.server").serve(handler, "127.0.0.1", port):
+            await asyncio.Future()
+
+    asyncio.run(main())
+
+
+def _serve_uvicorn(module: Any, robot: LegacyRobot, port: int) -> None:
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] != "websocket":
+            return
+        await receive()
+        await send({"type": "websocket.accept"})
+        filming = asyncio.ensure_future(_film_to(robot, lambda text: send({"type": "websocket.send", "text": text})))
+        try:
+            while (event := await receive())["type"] == "websocket.receive":
+                robot.on_text(event["text"])
+        finally:
+            filming.cancel()
+
+    module.run(app, host="127.0.0.1", port=port, log_level="critical", lifespan="off")
+
+
+LEGACY_LIBRARIES: Final[dict[str, Callable[[Any, LegacyRobot, int], None]]] = {
+    "SimpleWebSocketServer": _serve_article, "websockets": _serve_websockets, "uvicorn": _serve_uvicorn,
+}
+
+
+def run_legacy_robot(options: "PeerOptions", _pulled: threading.Event, ledger: EventLog) -> int:
+    """Serve for ever with the library that `fault` names."""
+    robot = LegacyRobot(options, ledger)
+    print("robot r1: on", flush=True)
+    port = parse_websocket_endpoint(options.web_endpoint).port
+    LEGACY_LIBRARIES[options.fault](importlib.import_module(options.fault), robot, port)
     return 0
 
 

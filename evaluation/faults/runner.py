@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -112,6 +113,8 @@ _WATCHED_US: Final = 1_000_000
 
 def run_case(row: FaultCase, folder: Path, run: int = 1) -> FaultOutcome:
     """Run a row, again while its sampler stalled; its files stay in `folder` unless all was well."""
+    if row.setup.legacy is not None and find_spec(row.setup.fault) is None:
+        return FaultOutcome(row, skipped=f"needs the package {row.setup.fault}; run `pip install {row.setup.fault}`")
     if row.setup.wired and (why := why_impossible()):
         return FaultOutcome(row, skipped=why)
     for number in range(1, MOST_TRIES + 1):

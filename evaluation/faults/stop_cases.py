@@ -1,6 +1,7 @@
 """Rows: a new operator sends STOP while a flood occupies the ports of the robot or of its router. Shell."""
 
 import resource
+import signal
 import subprocess
 import sys
 from functools import partial
@@ -11,6 +12,7 @@ from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, ZERO_MS, measure_stop, wheel_mps
 from sightline.evaluation.faults.fixture import RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import FEW_HZ, HALF_OPEN, MANY_HZ, READY, SESSIONS, STOPS
+from sightline.evaluation.faults.peer import LEGACY_LIBRARIES
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.evaluation.processes import children_of
 from sightline.protocol.clock import monotonic_us
@@ -141,6 +143,52 @@ def _guests(rig: RobotFixture) -> Injected:
     return Injected(count, at_us, checks=(*checks, *stopped))
 
 
+def _end_vision(rig: RobotFixture) -> Injected:
+    """Press Ctrl-C at the vision service of a legacy robot."""
+    at_us = monotonic_us()
+    rig.processes.signal("vision", signal.SIGINT)
+    code = rig.processes.exit_code("vision", STOP_ENDS_S)
+    rig.watch(1.0)
+    return Injected(1, at_us, checks=(at_most("exit code of vision", code, "", 0),))
+
+
+def _disarm_legacy(rig: RobotFixture) -> Injected:
+    """Disarm a legacy robot, and then send STOP."""
+    rig.prepare_operator()
+    rig.processes.start("disarm", ["disarm", "--connect", rig.endpoint])
+    code, at_us = rig.processes.exit_code("disarm", STOP_ENDS_S), monotonic_us()
+    rig.watch(0.5)
+    left_mps = wheel_mps(rig.motors()[-1])
+    _, stopped = rig.stop_by_operator()
+    checks = at_most("exit code of disarm", code, "", 0), at_most("speed after disarm", left_mps, "m/s", 0.0)
+    return Injected(1, at_us, checks=(*checks, *stopped))
+
+
+def _stop_legacy(rig: RobotFixture) -> Injected:
+    """Send STOP to a legacy robot."""
+    rig.prepare_operator()
+    at_us, stopped = rig.stop_by_operator()
+    return Injected(1, at_us, checks=stopped)
+
+
+_FORMATS: Final = {
+    "bar": "", "dashed": "?dashed", "swapped": "?dashed&swapped", "nonnegative": "?dashed&nonnegative",
+    "boxes": "?boxes",
+}
+_LEGACY: Final = (
+    ("ctrl_c", "Ctrl-C at vision", _end_vision, "exit code 0"),
+    ("disarm", "disarm; then STOP", _disarm_legacy, "exit codes 0"),
+    ("stop", "STOP by a new operator", _stop_legacy, "exit code 0"),
+)
+LEGACY_CASES: Final = tuple(
+    FaultCase(f"legacy.{action}_{form}", f"legacy robot ({library}), texts {form}: {what}", inject,
+              Setup("vision", library, legacy=query), blind=True, also=demanded)
+    for row, (action, what, inject, demanded) in enumerate(_LEGACY)
+    for column, (form, query) in enumerate(_FORMATS.items())
+    for library in [tuple(LEGACY_LIBRARIES)[(row + column) % len(LEGACY_LIBRARIES)]]
+)
+
+
 _TURNING_MPS: Final = 0.07
 """Speed of the wheels at 1 rad/s."""
 _FLOODS: Final = {
@@ -175,6 +223,7 @@ STOP_CASES: Final = (
     FaultCase("guest.one_image", "guests: one command on one image for 4 s, ahead and turning; then STOP", _guests,
               Setup("guest", guests=True), blind=True, also=f"zero <= {_GUEST.guest_unchanged_ms / 1000:g} s and "
               f"{_GUEST.guest_unchanged_m:g} m, plus braking; {_DEMANDED}"),
+    *LEGACY_CASES,
     FaultCase("stop.busy", f"STOP by a new operator: {BUSY} busy processes beside it", _busy, Setup(), blind=True,
               also=_DEMANDED, alone=True),
     FaultCase("stop.no_descriptors", "STOP by a new operator: the robot has no file descriptor left", _no_descriptors,
