@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from sightline.evaluation.processes import children_of, driver_of
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import HardwareError
@@ -59,10 +60,10 @@ def measure_light_robot(seconds: float) -> LightRobot:
         link = ending.enter_context(open_zenoh("r1", connect=[ENDPOINT], role="operator"))
         ending.enter_context(_service(sys.executable, ["vision", "--connect", ENDPOINT], folder, "target seen"))
         fps, driving = _watch(link.latest(STATUS), seconds)
-        children = Path(f"/proc/{robot.pid}/task/{robot.pid}/children").read_text().split()
-        network, = (int(pid) for pid in children if "robot_side.network" in Path(f"/proc/{pid}/cmdline").read_text())
+        driver = driver_of(robot.pid)
+        network = children_of(driver)[-1]
         size = sum(path.stat().st_size for path in (folder / "venv").rglob("*") if path.is_file())
-        return LightRobot(_heavy(python), size / 1e6, fps, driving, _high_water_mb(network), _high_water_mb(robot.pid))
+        return LightRobot(_heavy(python), size / 1e6, fps, driving, _high_water_mb(network), _high_water_mb(driver))
 
 
 def _bare_environment(folder: Path) -> str:

@@ -114,9 +114,13 @@ class Processes:
         """Return the process id of `name`."""
         return self._running[name].pid
 
-    def child(self, name: str) -> int:
-        """Return the process id of the newest child of `name`, or 0 without one."""
-        return next(reversed(children_of(self.pid(name))), 0)
+    def driver(self, name: str) -> int:
+        """Return the process id of the driver process of robot `name`, or 0 without one. `name` is its guardian."""
+        return driver_of(self.pid(name))
+
+    def network(self, name: str) -> int:
+        """Return the process id of the network process of robot `name`, or 0 without one."""
+        return next(reversed(children_of(self.driver(name))), 0)
 
     @property
     def names(self) -> list[str]:
@@ -202,7 +206,19 @@ class Processes:
 
 def children_of(pid: int) -> list[int]:
     """Process ids of the children that its main thread started, the oldest first."""
-    return [int(text) for text in Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split()]
+    try:
+        return [int(text) for text in Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split()]
+    except OSError:  # it has ended
+        return []
+
+
+def driver_of(guardian: int) -> int:
+    """Return the process id of the driver process of a guardian, or 0 without one: its child that receives no STOP."""
+    for pid in reversed(children_of(guardian)):
+        with suppress(OSError):
+            if b"stop_receiver" not in Path(f"/proc/{pid}/cmdline").read_bytes():
+                return pid
+    return 0
 
 
 def last_line(log: Path) -> str:

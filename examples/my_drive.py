@@ -1,10 +1,13 @@
 """A drive plug-in to copy: two wheels on a motor controller that takes `left right` lines over a serial port.
 
-A drive is a class with a `Config`, `set`, `wheels` and `close` (robot_side/ports.py defines the promises of each).
+A drive is a class with a `Config`, `set`, `wheels`, `close` and `zero` (robot_side/ports.py defines the promises of
+each).
 """
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from sightline.protocol.config import Config
 from sightline.protocol.errors import HardwareError
@@ -29,6 +32,12 @@ class MyDrive:
             raise HardwareError(f"motor controller {config.port}: {error.strerror}; is it plugged in?") from None
         self._speeds = (0.0, 0.0)
         self._angles = WheelAngles(0.0, 0.0, time.monotonic_ns() // 1000)
+
+    @staticmethod
+    def zero(config: Mapping[str, Any]) -> None:
+        """Stop the wheels after the process of the drive has died."""
+        with Path(config["port"]).open("w") as port:
+            port.write("0 0\n")
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
         """Send both speeds."""

@@ -18,7 +18,6 @@ import threading
 import traceback
 from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final, TextIO
 
@@ -72,6 +71,10 @@ class QueueHandler(logging.Handler):
 
     def __init__(self) -> None:
         super().__init__()
+        self.forget_thread()
+
+    def forget_thread(self) -> None:
+        """Start again without a thread and without lines, as in a fork: the thread is in the other process."""
         self._lines: queue.Queue[tuple[str | logging.LogRecord, TextIO | None]] = queue.Queue(_MAX_WAITING_LINES)
         self._is_started = False
         self._starting = threading.Lock()
@@ -134,6 +137,7 @@ def _write(line: str, stream: TextIO | None) -> None:
 
 _HANDLER: Final = QueueHandler()
 _HANDLER.setFormatter(TextFormatter())
+os.register_at_fork(after_in_child=_HANDLER.forget_thread)
 
 
 def start_log_thread() -> None:
@@ -241,12 +245,10 @@ _MAX_KEYS: Final = 16
 _OTHERS: Final = ""
 
 
-@dataclass(slots=True)
-class _Repeat:
-    count: int = 0
-    seen_us: int = 0
-    logged_us: int = 0
-    period_us: int = 0
+class _Repeat:  # the guardian has no memory for `dataclasses`
+    def __init__(self, seen_us: int) -> None:
+        self.seen_us = seen_us
+        self.count = self.logged_us = self.period_us = 0
 
 
 class RepeatLimiter:

@@ -1,5 +1,6 @@
-"""The robot service: a driver process with motors and safety gate, a network process with camera and link.
+"""The robot service: a guardian, a driver process with motors and gate, a network process with camera and link.
 
 May import: `protocol`; no NumPy, OpenCV or PyBullet.
-Interface: `driver.process` is the service; `ports` is what a device plug-in implements; `config.RobotConfig`.
+Interface: `guardian.start` and `driver.process` are the service; `ports` is what a device plug-in implements;
+    `config.RobotConfig`.
 """

@@ -8,8 +8,9 @@ contains the fix.
 from __future__ import annotations
 
 import array
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import CameraModel
@@ -125,6 +126,21 @@ class Adjustable(Protocol):
 
 class Drive(Protocol):
     """Two driven wheels. Motors latch: the last speeds hold until the next call of `set`."""
+
+    @staticmethod
+    def zero(config: Mapping[str, Any]) -> None:
+        """Set the motors to zero without a drive: the process that had it is dead, and its end released the device.
+
+        The guardian calls it. It imports only the module of this function; without pydantic there it stays small. If
+        the module has a function `prepare`, the guardian calls it at its start, e.g. to import a library.
+
+        Args:
+            config: the `Config` of the drive as plain values, `Config.model_dump(mode="json")`.
+
+        Raises:
+            HardwareError: the motors may still turn.
+        """
+        ...
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
         """Set the wheel speeds. Never blocks.

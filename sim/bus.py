@@ -3,8 +3,8 @@
 Imported on the robot: no NumPy, no PyBullet. Each port has its own local SOCK_SEQPACKET socket, so that a slow picture
 never delays a motor. Formats, all little-endian:
 
-    motion.sock   robot -> sim  MOTION_SET      left_rad_s, right_rad_s; latched
-                  sim -> robot  MOTION_ANGLES   left_rad, right_rad, t_us; 100 Hz
+    motion.sock   robot -> sim  MOTION_SET      left_rad_s, right_rad_s; latched; the first to send owns the motors
+                  sim -> robot  MOTION_ANGLES   left_rad, right_rad, t_us; 100 Hz; or MOTION_BUSY
     range.sock    sim -> robot  RANGE_HEAD + float32 ranges
     camera.sock   sim -> robot  first the CameraModel as JSON, then per request PICTURE_HEAD (t_us, scale_percent), JPEG
                   robot -> sim  PICTURE_REQUEST (quality_percent, scale_percent): for the next capture
@@ -35,9 +35,9 @@ from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import CameraModel
 from sightline.robot_side.ports import Picture, Ranges, WheelAngles
 from sightline.sim.truth import Truth
+from sightline.sim.zero import MOTION, MOTION_BUSY, MOTION_SET, zero
 
-MOTION, RANGE, CAMERA, TRUTH = "motion.sock", "range.sock", "camera.sock", "truth.sock"
-MOTION_SET = struct.Struct("<dd")
+RANGE, CAMERA, TRUTH = "range.sock", "camera.sock", "truth.sock"
 MOTION_ANGLES = struct.Struct("<ddq")
 RANGE_HEAD = struct.Struct("<qdddd")
 PICTURE_HEAD = struct.Struct("<qB")
@@ -193,6 +193,8 @@ class SimCamera:
 class SimDrive:
     """The simulated wheels: they latch, whatever becomes of this process."""
 
+    zero = staticmethod(zero)
+
     class Config(SimSocketConfig):
         """Address of the simulation."""
 
@@ -217,6 +219,8 @@ class SimDrive:
         Call it at 20 Hz or more. After a longer pause the first reading is old, see its `t_us`.
         """
         message = self._connection.newest()
+        if message == MOTION_BUSY:
+            raise HardwareError("another process owns the simulated motors; end it")
         if message is not None:
             self._angles = WheelAngles(*MOTION_ANGLES.unpack(message))
         return self._angles

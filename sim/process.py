@@ -26,9 +26,7 @@ from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError, HardwareError, install_command
 from sightline.sim.bus import (
     CAMERA,
-    MOTION,
     MOTION_ANGLES,
-    MOTION_SET,
     PICTURE_HEAD,
     PICTURE_REQUEST,
     RANGE,
@@ -40,6 +38,7 @@ from sightline.sim.bus import (
 )
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import load_scenario
+from sightline.sim.zero import MOTION, MOTION_BUSY, MOTION_SET
 
 if TYPE_CHECKING:
     from sightline.sim.world.world import World
@@ -182,6 +181,7 @@ class BusClients:
         self._lock = threading.Lock()
         self._clients: dict[str, set[socket.socket]] = {name: set() for name in SEND_BYTES}
         self._wanting: dict[socket.socket, tuple[int, int]] = {}
+        self._motor_owner: socket.socket | None = None
         self._selector = selectors.DefaultSelector()
         self._listeners = {name: folder.listen(name) for name in SEND_BYTES}
         for name, listener in self._listeners.items():
@@ -235,23 +235,39 @@ class BusClients:
         with self._lock:
             self._clients[name].add(client)
 
-    def _receive(self, client: socket.socket, name: str) -> None:
+    def _receive(self, client: socket.socket, name: str) -> bool:
+        """Handle the next packet or the end of a client. Returns False if there is neither."""
+        if client not in self._clients[name]:
+            return False
         try:
             data = client.recv(64)
         except BlockingIOError:
-            return
+            return False
         except OSError:
             data = b""
         if not data:
             self._drop(client, name)
         elif name == MOTION:
-            self._on_motion(data)
+            self._command(client, data)
         elif name == CAMERA:
             with self._lock:
                 self._wanting[client] = _wanted(data)
+        return True
+
+    def _command(self, client: socket.socket, data: bytes) -> None:
+        """Set the motors for the connection that owns them until it closes, as a process owns a pin."""
+        while self._motor_owner not in (None, client) and self._receive(self._motor_owner, MOTION):
+            pass  # what the owner sent before, and its end, count first
+        if self._motor_owner not in (None, client):
+            _send(client, MOTION_BUSY)
+            self._drop(client, MOTION)
+            return
+        self._motor_owner = client
+        self._on_motion(data)
 
     def _drop(self, client: socket.socket, name: str) -> None:
         self._selector.unregister(client)
+        self._motor_owner = None if client is self._motor_owner else self._motor_owner
         with self._lock:
             self._clients[name].discard(client)
             self._wanting.pop(client, None)

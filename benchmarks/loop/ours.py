@@ -53,7 +53,7 @@ def running_services(setting: LoopSetting, folder: Path, processes: Processes) -
     """Robot and vision, seen working. Raises HardwareError with a service's own words if one does not start."""
     port = free_port()
     endpoint = endpoint_of(setting.transport, port)
-    driver = processes.start("robot", ["robot", "--config", str(_robot_toml(setting, folder, endpoint))])
+    guardian = processes.start("robot", ["robot", "--config", str(_robot_toml(setting, folder, endpoint))])
     processes.wait_line("robot", f"robot {ROBOT}: on")
     with open_link(ROBOT, connect=[endpoint], role="operator") as link:
         tally = folder / "headers.json"
@@ -61,7 +61,8 @@ def running_services(setting: LoopSetting, folder: Path, processes: Processes) -
         slow = {"delay_ms": setting.detector_delay_ms, "busy_ms": setting.busy_ms}
         settings = {"config": config, "tally": str(tally), **slow}
         vision = processes.start("vision", [json.dumps(settings)], module="sightline.benchmarks.loop.vision")
-        pids = {"driver": driver, "network": processes.child("robot"), "vision": vision}
+        robot = {"guardian": guardian, "driver": processes.driver("robot"), "network": processes.network("robot")}
+        pids = {**robot, "vision": vision}
         ours = Ours(pids, (port,), endpoint, tally)
         link.subscribe(STATUS, ours.note)
         processes.wait_line("vision", "target seen")

@@ -87,9 +87,9 @@ def _restart_vision(rig: RobotFixture) -> Injected:
 
 
 def _kill_network(rig: RobotFixture) -> Injected:
-    before = rig.processes.child("robot")
+    before = rig.processes.network("robot")
     at_us = rig.signal_network(signal.SIGKILL)
-    rig.until(lambda: rig.processes.child("robot") not in (0, before), AGAIN_S, "a new network process")
+    rig.until(lambda: rig.processes.network("robot") not in (0, before), AGAIN_S, "a new network process")
     rig.watch(SETTLED_S)
     again = drives_again(rig)
     first_us = min((one.t_us for one in rig.sent() if one.t_us > at_us + LEFT_OVER_US), default=None)
@@ -517,9 +517,9 @@ def _stop_then_commands(rig: RobotFixture) -> Injected:
 def _stop_then_restart(rig: RobotFixture) -> Injected:
     at_us = _send_stop(rig)
     rig.watch(SETTLED_S)
-    before = rig.processes.child("robot")
+    before = rig.processes.network("robot")
     rig.signal_network(signal.SIGKILL)
-    rig.until(lambda: rig.processes.child("robot") not in (0, before), AGAIN_S, "a new network process")
+    rig.until(lambda: rig.processes.network("robot") not in (0, before), AGAIN_S, "a new network process")
     since_us = monotonic_us()
     rig.until(lambda: rig.sent("peer")[-1].t_us > since_us, AGAIN_S, "commands after the restart")
     rig.watch(BAD_S)

@@ -41,10 +41,10 @@ from sightline.sim.tun_emulator import ADDRESS_A, namespaces
 _RESIDENT: Final = "RssAnon:"
 
 
-def memory_kib(processes: Processes, names: Iterable[str]) -> dict[tuple[str, bool], int]:
-    """Return the private memory of each running process and (True) of its child. A restarted one counts as the same."""
-    pids = {(name, is_child): processes.child(name) if is_child else processes.pid(name)
-            for name in names if name in processes.names for is_child in (False, True)}
+def memory_kib(processes: Processes, names: Iterable[str]) -> dict[tuple[str, str], int]:
+    """Return the private memory of each running process and of what it started. A restarted one counts as the same."""
+    which = {"itself": processes.pid, "driver": processes.driver, "network": processes.network}
+    pids = {(name, role): pid_of(name) for name in names if name in processes.names for role, pid_of in which.items()}
     return {who: held for who, pid in pids.items() if pid and (held := _resident_kib(pid)) is not None}
 
 
@@ -230,7 +230,7 @@ class RobotFixture:
         self.wire: BenchWire | None = None
         self.endpoint = self.web_endpoint = ""
         self._peers: list[str] = []
-        self._before_kib: dict[tuple[str, bool], int] = {}
+        self._before_kib: dict[tuple[str, str], int] = {}
         self._sockets = ""
 
     def __enter__(self) -> Self:
@@ -390,7 +390,7 @@ class RobotFixture:
     def signal_network(self, number: signal.Signals) -> int:
         """Send the robot's network process a signal; returns when that was."""
         at_us = monotonic_us()
-        os.kill(self.processes.child("robot"), number)
+        os.kill(self.processes.network("robot"), number)
         return at_us
 
     # --- waiting -------------------------------------------------------------------------------------------------

@@ -102,8 +102,8 @@ def _busy(rig: RobotFixture) -> Injected:
 def _no_descriptors(rig: RobotFixture) -> Injected:
     """Send STOP while no process of the robot may open a file or a socket."""
     rig.prepare_operator()
-    driver = rig.processes.pid("robot")
-    for pid in (driver, *children_of(driver)):
+    guardian = rig.processes.pid("robot")
+    for pid in (guardian, *children_of(guardian), *children_of(rig.processes.driver("robot"))):
         held = max(int(link.name) for link in Path(f"/proc/{pid}/fd").iterdir()) + 1
         resource.prlimit(pid, resource.RLIMIT_NOFILE, (held, held))
     # At once: the camera of the bench opens a file for each image, so that the robot would soon stop by itself.

@@ -12,16 +12,20 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Final
 
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS
+from sightline.robot_side.guardian.core import IDLE, MOVING
+from sightline.robot_side.guardian.start import GuardianEnd
 from sightline.robot_side.plugins import DRIVES
 from sightline.robot_side.ports import Drive
 
 TURN_S: Final = 1.0
 _SHARE: Final = 0.5
 """Share of the robot's top speed, slow enough to recognize the direction of a wheel."""
+_BEAT_S: Final = 0.02
 Prompt = Callable[[str], str]
+Guard = Callable[[RobotConfig], GuardianEnd]
 Print = Callable[[str], None]
 
 
@@ -49,12 +53,13 @@ TURNS: Final = tuple(Turn(side, way, seen) for side in ("left", "right") for way
 _WRONG: Final = {"w": "the wrong way", "o": "the other wheel", "b": "both wheels", "n": "nothing"}
 
 
-def try_wheels(config: RobotConfig, prompt: Prompt | None, show: Print) -> bool:
+def try_wheels(config: RobotConfig, prompt: Prompt | None, show: Print, guard: Guard | None = None) -> bool:
     """Turn each wheel in each direction and compare it with the operator's answers.
 
     Args:
         prompt: shows a question and returns the answer; None if the wheels are confirmed to be off the ground.
         show: prints a line.
+        guard: makes this process the guardian of its fork, in which this function goes on.
 
     Returns:
         True if all answers are right, or without `prompt`.
@@ -65,10 +70,10 @@ def try_wheels(config: RobotConfig, prompt: Prompt | None, show: Print) -> bool:
         return False
     speed_rad_s = _SHARE * config.safety.max_linear_mps / config.wheels.wheel_radius_m
     advice: list[str] = []
-    with opened_drive(config) as drive:
+    with opened_drive(config, guard) as (drive, guardian):
         for turn in TURNS:
             show(f"{turn.name}: {turn.seen}, for {TURN_S:g} s")
-            turn_for(drive.set, turn.speeds(speed_rad_s), TURN_S)
+            turn_for(drive.set, turn.speeds(speed_rad_s), TURN_S, guardian)
             if prompt is not None and not _is_yes(prompt("is that right? y/n")):
                 advice.append(f"{turn.name}: {_advice(config.motors, turn, _what_instead(prompt))}")
     for line in dict.fromkeys(advice):
@@ -78,20 +83,26 @@ def try_wheels(config: RobotConfig, prompt: Prompt | None, show: Print) -> bool:
 
 
 @contextmanager
-def opened_drive(config: RobotConfig) -> Iterator[Drive]:
+def opened_drive(config: RobotConfig, guard: Guard | None = None) -> Iterator[tuple[Drive, GuardianEnd | None]]:
     """Open the robot's drive; set it to zero and close it at any end: Ctrl-C, Ctrl-Z, a signal, hang-up or an error.
 
-    Motors continue at their last speed when a program is killed, so every signal that can be caught is.
+    Motors continue at their last speed when a program is killed, so every signal that can be caught is. What cannot be
+    caught is the task of the guardian.
     """
+    guardian = guard(config) if guard is not None else None
 
     def end(_number: int, _frame: FrameType | None) -> None:
+        for number in EXIT_SIGNALS:  # a second one, by the guardian, must not interrupt the way to zero
+            signal.signal(number, signal.SIG_IGN)
         raise KeyboardInterrupt
 
     before = {number: signal.signal(number, end) for number in EXIT_SIGNALS}
     try:
         drive = DRIVES.build(config.motors)
+        if guardian is not None:
+            guardian.beat(IDLE)
         try:
-            yield drive
+            yield drive, guardian
         finally:
             try:
                 drive.set(0.0, 0.0)
@@ -102,13 +113,23 @@ def opened_drive(config: RobotConfig) -> Iterator[Drive]:
             signal.signal(number, handler)
 
 
-def turn_for(give: Callable[[float, float], None], values: tuple[float, float], seconds: float) -> None:
-    """Set both values, and zero after that time or at an error."""
+def turn_for(
+    give: Callable[[float, float], None], values: tuple[float, float], seconds: float, guardian: GuardianEnd | None
+) -> None:
+    """Set both values, and zero after that time or at an error. Raises HardwareError when the guardian is gone."""
+    end_s = time.monotonic() + seconds
     try:
         give(*values)
-        time.sleep(seconds)
+        while (left_s := end_s - time.monotonic()) > 0:
+            if guardian is not None:
+                guardian.beat(MOVING)
+                if guardian.is_gone():
+                    raise HardwareError("the guardian of this command has died; start it again")
+            time.sleep(min(left_s, _BEAT_S))
     finally:
         give(0.0, 0.0)
+        if guardian is not None:
+            guardian.beat(IDLE)
 
 
 def _is_yes(answer: str) -> bool:

@@ -41,12 +41,14 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.hardware.gpio import table_of, table_text
+from sightline.robot_side.plugins import DRIVES
 
 if TYPE_CHECKING:
     from sightline.operator_side.calibrate.camera import Ball, Board, Calibration, Mounting
     from sightline.operator_side.calibrate.color import Box, Image, Ranges
     from sightline.operator_side.calibrate.color_page import Gallery
     from sightline.protocol.transports.link import Link
+    from sightline.robot_side.guardian.start import GuardianEnd
 
 
 TASKS: Final = ("test-wheels",)
@@ -60,7 +62,15 @@ def run_task(task: str, config: RobotConfig, confirmed: bool) -> int:
         hint = f" (a robot's id is given with --robot {task})" if not task.startswith("test") else ""
         raise ConfigError(no_such_name("task", task, TASKS) + hint)
     check_confirmed(confirmed, sys.stdin.isatty(), task)
-    return 0 if try_wheels(config, None if confirmed else _prompt, typer.echo) else _CHECK_FAILED
+    is_right = try_wheels(config, None if confirmed else _prompt, typer.echo, _guard)
+    return 0 if is_right else _CHECK_FAILED
+
+
+def _guard(config: RobotConfig) -> "GuardianEnd":
+    """Put this command under a guardian. It ends with exit code 3 if the guardian has to stop it."""
+    from sightline.robot_side.guardian.start import become_guardian
+
+    return become_guardian(config, restarts=False)
 
 
 def drive(
@@ -108,14 +118,14 @@ def _measured_rows(
     config: RobotConfig, duties: list[float], seconds: float, *, confirmed: bool
 ) -> list[tuple[float, float]]:
     rows: list[tuple[float, float]] = []
-    with opened_drive(config) as opened:
-        give = getattr(opened, "set_duty", None)
-        if give is None:
-            raise ConfigError(f"drive '{config.drive.kind}' has no duty to calibrate; use a gpio drive")
+    if not hasattr(DRIVES.load(config.motors)[0], "set_duty"):
+        raise ConfigError(f"drive '{config.drive.kind}' has no duty to calibrate; use a gpio drive")
+    with opened_drive(config, _guard) as (opened, guardian):
+        give = opened.set_duty  # type: ignore[attr-defined]
         for one in duties:
             if not confirmed:
                 _prompt(f"duty {one:g} for {seconds:g} s: put the car on the floor, the way ahead free; Enter drives")
-            turn_for(give, (one, one), seconds)
+            turn_for(give, (one, one), seconds, guardian)
             way_m = _distance_m(f"duty {one:g}: distance in meters (0: it did not move)")
             if way_m > 0:
                 rows.append((one, way_m / seconds))

@@ -128,6 +128,7 @@ def robot(
     """
     from sightline.robot_side.driver.process import run
     from sightline.robot_side.driver.process import zero_motors as set_to_zero
+    from sightline.robot_side.guardian.start import become_guardian
 
     start_log(log, "robot")
     options: dict[str, Any] = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure}
@@ -139,8 +140,11 @@ def robot(
         from sightline.operator_side.cli.calibrate import run_task
 
         return run_task(task, loaded.config, yes)  # type: ignore[arg-type]
+    given: Any = loaded.config
+    if zero_motors:
+        return set_to_zero(given)
     with needs("zenoh"):
-        return (set_to_zero if zero_motors else run)(loaded.config)  # type: ignore[arg-type]
+        return run(given, become_guardian(given, restarts=True))
 
 
 def vision(

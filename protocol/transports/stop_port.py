@@ -171,17 +171,20 @@ _CHILD: Final = (
 class StopProcess:
     """A process that serves the STOP port. It ends when no process holds `near` any longer."""
 
-    def __init__(self, module: str, options: dict[str, Any]) -> None:
+    def __init__(
+        self, module: str, options: dict[str, Any], ends: tuple[socket.socket, socket.socket] | None = None
+    ) -> None:
         """Prepare it; `keep_alive` starts it.
 
         Args:
             module: with a function `main`, below `sightline`.
             options: for that function, as JSON.
+            ends: `near` and `far` of another program, which this one continues; default: a new pair.
         """
-        self.near, self._far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.near, self.far = ends or socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         """`near` is the end of the process that applies a STOP. What is sent while no process reads it waits there."""
         self.near.setblocking(False)
-        self._module, self._options = module, json.dumps(options)
+        self.module, self.options = module, options
         self._process: Any = None
         self._start_at_us = 0
 
@@ -201,15 +204,21 @@ class StopProcess:
                 count_fault("STOP receiver")
                 logging.getLogger(__name__).error("STOP receiver ended (%d); starting it again", self._process.poll())
             root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
-            number = self._far.fileno()
-            command = [sys.executable, "-I", "-S", "-c", _CHILD.format(self._module), root, str(number), self._options]
+            number = self.far.fileno()
+            command = [sys.executable, "-I", "-S", "-c", _CHILD.format(self.module), root, str(number)]
+            command.append(json.dumps(self.options))
             with suppress(OSError):  # no process or descriptor is left; later there may be
                 self._process = subprocess.Popen(command, pass_fds=[number], stdin=subprocess.DEVNULL)
+
+    @property
+    def pid(self) -> int:
+        """Return its process id, 0 before the first start."""
+        return self._process.pid if self._process is not None else 0
 
     def close(self) -> None:
         """End it."""
         self.near.close()
-        self._far.close()
+        self.far.close()
         if self._process is not None:
             self._process.terminate()
             self._process.wait()

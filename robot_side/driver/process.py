@@ -5,7 +5,9 @@ import math
 import secrets
 import select
 import signal
+import socket
 import struct
+import sys
 import threading
 from collections import Counter
 from contextlib import ExitStack, suppress
@@ -16,19 +18,22 @@ from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
 from sightline.protocol.clock import heartbeat_us, monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.config import PLUGIN_ERRORS
-from sightline.protocol.errors import ConfigError, RejectReason, WireError
-from sightline.protocol.log import RepeatLimiter, faults, report_fault, start_log_thread
+from sightline.protocol.errors import RejectReason, SightlineError, WireError
+from sightline.protocol.log import RepeatLimiter, faults, report_fault, start_log, start_log_thread
 from sightline.protocol.messages import LastRejection, State, StreamStatus
-from sightline.protocol.transports.endpoints import stop_addresses
-from sightline.protocol.transports.security import stop_secret_file
-from sightline.protocol.transports.stop_datagram import STOP_PORT
-from sightline.protocol.transports.stop_port import StopProcess, read_packets, send_packet
+from sightline.protocol.transports.stop_port import read_packets, send_packet
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.core import DriverCore
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
-from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS, SystemdNotifier, request_real_time
-from sightline.robot_side.guardian import stop_receiver
+from sightline.robot_side.driver.supervision import (
+    DRIVER_PRIORITY,
+    EXIT_SIGNALS,
+    IGNORED_SIGNALS,
+    request_real_time,
+)
+from sightline.robot_side.guardian.core import AT_REST, MOVING
+from sightline.robot_side.guardian.start import GuardianEnd
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.plugins import BATTERIES, DRIVES, RANGE_SENSORS
@@ -46,19 +51,15 @@ _log: Final = logging.getLogger(__name__)
 
 
 _SHUTDOWN_US = 2_000_000
-_WATCHDOG_PERIOD_US = 100_000
+_MAX_CONFIG_BYTES = 1 << 20
 # The process locks its memory, a stack of the usual 8 MB with it. A plug-in's code needs more than ours.
 _STACK_BYTES, _PLUGIN_STACK_BYTES = 256 * 1024, 1024 * 1024
 _BATTERY_PERIOD_S = 1.0
 _STOP_REPORT_US = 100_000
-_WARNING = (
-    "if this process or the kernel dies, the motors keep their last speed: fit a hardware cut and let systemd watch it "
-    "(docs/explanation/safety.md)"
-)
 
 
-def run(config: RobotConfig) -> int:
-    """Run the robot until one of the ENDING signals; the wheels are at zero when it returns.
+def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
+    """Run the robot until one of the ENDING signals or until the guardian is gone; the wheels are then at zero.
 
     Raises ConfigError, HardwareError or LinkError before anything could move.
     """
@@ -75,14 +76,13 @@ def run(config: RobotConfig) -> int:
             ending.callback(reader.close)
         threading.stack_size(_STACK_BYTES)
         start_log_thread()
-        receiver = stop_receiver_of(config)
-        if receiver is not None:
-            ending.callback(receiver.close)
-        driver = Driver(config, drive, ranges, reader, receiver)
+        driver = Driver(config, drive, ranges, reader, guardian)
         threading.stack_size(_PLUGIN_STACK_BYTES)
         ending.callback(driver.latch_writer.close)
         ending.callback(driver.driver_end.close)
         ending.callback(driver.finish)
+        if guardian is not None:
+            ending.callback(guardian.ending)
         ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are set to zero
         return driver.loop()
 
@@ -94,26 +94,10 @@ def _zero(drive: Drive) -> None:
         report_fault("drive", error)
 
 
-def stop_receiver_of(config: RobotConfig) -> StopProcess | None:
-    """Prepare the STOP receiver beside the links of this robot; None where keys are used without a STOP secret."""
-    try:
-        secret_file = stop_secret_file(config.secure) if config.secure else ""
-    except ConfigError as error:
-        _log.warning("robot %s: %s", config.robot, error)
-        return None
-    addresses, routers = stop_addresses(config.listen), stop_addresses(config.connect)
-    if not addresses and not routers:
-        addresses = [("127.0.0.1", STOP_PORT)]
-    return stop_receiver.start(config.robot, addresses, routers, secret_file)
-
-
 def zero_motors(config: RobotConfig) -> int:
-    """Set the motors to zero without gate or network, to clean up after a dead driver process."""
-    drive = DRIVES.build(config.motors)
-    try:
-        drive.set(0.0, 0.0)
-    finally:
-        drive.close()
+    """Set the motors to zero without gate or network, to clean up after a dead robot service."""
+    plugin, options = DRIVES.load(config.motors)
+    plugin.zero(options.model_dump(mode="json"))
     return 0
 
 
@@ -164,7 +148,7 @@ class Driver:
 
     def __init__(
         self, config: RobotConfig, drive: Drive, ranges: RangeSensor | None,
-        battery_reader: BatteryReader | None = None, receiver: StopProcess | None = None,
+        battery_reader: BatteryReader | None = None, guardian: GuardianEnd | None = None,
     ) -> None:
         latch = StopLatch(config.state_dir, config.robot)
         self.latch_writer = LatchWriter(latch)
@@ -176,8 +160,8 @@ class Driver:
         self._logged_state = self._driver_core.gate.state
         self._is_waiting_logged = False
         self._ending_since_us: int | None = None
-        self._systemd_notifier = SystemdNotifier()
-        self._watchdog_due_us = self._ticked_us = 0
+        self._guardian = guardian
+        self._ticked_us = 0
         self._speeds_are_set = False
         self._scan_layout: tuple[float, ...] = ()
         self._command_acks: list[ipc.CommandAck] = []
@@ -185,7 +169,7 @@ class Driver:
         self._rejected_by_network: Counter[str] = Counter()
         self._faults_of_network: Counter[str] = Counter()
         self.driver_end = DriverEnd(config, self._driver_core.session)
-        self._receiver = receiver
+        self._stops = guardian.stops if guardian else None
         self._stop_applied = 0
         """Number of the newest STOP of the receiver that is latched."""
         self._stop_report, self._stop_report_us = b"", 0
@@ -193,6 +177,7 @@ class Driver:
             signal.signal(number, self._on_signal)
         for number in IGNORED_SIGNALS:
             signal.signal(number, signal.SIG_IGN)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, EXIT_SIGNALS)  # a guardian starts us with them blocked
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
         self._ending_since_us = self._ending_since_us or monotonic_us()
@@ -213,7 +198,6 @@ class Driver:
                 self._tick(now_us, punctual=False)
             elif arrived:
                 self._answer()
-        self._systemd_notifier.notify("STOPPING=1")
         return self.driver_end.exit_code
 
     def finish(self) -> None:
@@ -227,8 +211,7 @@ class Driver:
 
     def _log_missing(self) -> None:
         """Log what this robot lacks before it moves."""
-        missing = list(request_real_time())
-        for line in [*missing, *([] if self._systemd_notifier.is_active else [_WARNING])]:
+        for line in request_real_time(DRIVER_PRIORITY):
             self._log(line)
 
     def _ended(self) -> bool:
@@ -237,14 +220,24 @@ class Driver:
         if self._ending_since_us is None:
             return False
         self._driver_core.gate.disarm("shutting down")
-        is_at_rest = self._driver_core.at_rest and self._speeds_are_set
-        return is_at_rest or monotonic_us() - self._ending_since_us > _SHUTDOWN_US
+        return self._is_at_rest or monotonic_us() - self._ending_since_us > _SHUTDOWN_US
+
+    @property
+    def _is_at_rest(self) -> bool:
+        return self._driver_core.at_rest and self._speeds_are_set
 
     def _wait(self, deadline_us: int) -> None:
         timeout_s = max(0, deadline_us - monotonic_us()) / 1e6
         readable = [self.driver_end.socket] if self.driver_end.socket else []
-        readable += [self._receiver.near] if self._receiver else []
-        select.select(readable, [], [], timeout_s)
+        if self._stops is not None:
+            readable.append(self._stops)
+        if self._guardian is not None:
+            readable.append(self._guardian.heartbeats)
+        ready = select.select(readable, [], [], timeout_s)
+        if self._guardian is not None and self._guardian.heartbeats in ready[0]:  # it sends nothing
+            self._guardian = None
+            self._log("the guardian is gone; shutting down")
+            self._ending_since_us = self._ending_since_us or monotonic_us()
 
     def _tick(self, now_us: int, *, punctual: bool) -> None:
         self._ticked_us = now_us
@@ -253,16 +246,15 @@ class Driver:
         if punctual:
             self._driver_core.faults = faults() + self._faults_of_network
             self._driver_core.latch_failed = self.latch_writer.failed
+            if self._guardian is not None:
+                self._guardian.beat(AT_REST if self._is_at_rest else MOVING)
             for message in self._driver_core.messages(now_us):
                 self.driver_end.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
-            if self._receiver is not None:
-                self._receiver.keep_alive(heartbeat_us())
             self.driver_end.keep_alive(heartbeat_us(), self._driver_core.gate.issued.last_seq("frame") + 1)
             self._driver_core.network_restarts = max(0, self.driver_end.restarts)
             self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)
             self._log_state(self._driver_core.gate.state, self._driver_core.gate.reason)
             self._log_battery(now_us)
-            self._feed_watchdog(now_us)
         self._report_stop(now_us)
 
     def _answer(self) -> None:
@@ -274,11 +266,6 @@ class Driver:
         command_acks, self._command_acks = self._command_acks, []
         for ack in command_acks:
             self.driver_end.send(ipc.pack_command_ack(ack))
-
-    def _feed_watchdog(self, now_us: int) -> None:
-        if now_us >= self._watchdog_due_us:
-            self._systemd_notifier.notify("READY=1\nWATCHDOG=1")
-            self._watchdog_due_us = now_us + _WATCHDOG_PERIOD_US
 
     def _move(self) -> None:
         """Sensors, gate, motors. Whatever a device raises stops the robot, never the loop that stops it.
@@ -365,7 +352,7 @@ class Driver:
     def _drain_receiver(self) -> bool:
         """Handle what the STOP receiver sent; True if a STOP was among it. Next: `SafetyGate.stop`."""
         stopped = False
-        for packet in read_packets(self._receiver.near) if self._receiver else ():
+        for packet in read_packets(self._stops) if self._stops else ():
             if packet.startswith(b"S"):
                 self._driver_core.gate.stop("STOP by a datagram")
                 self.latch_writer.want(True)
@@ -382,14 +369,13 @@ class Driver:
 
     def _report_stop(self, now_us: int) -> None:
         """Send the STOP receiver the state, when it changes and ten times a second."""
-        if self._receiver is None:
+        if self._stops is None:
             return
-        at_rest = self._driver_core.at_rest and self._speeds_are_set
         state, stored = self._driver_core.gate.state, self.latch_writer.is_stored
-        report = pack_report(DriverReport(self._stop_applied, state.value, at_rest, stored))
+        report = pack_report(DriverReport(self._stop_applied, state.value, self._is_at_rest, stored))
         if report != self._stop_report or now_us - self._stop_report_us >= _STOP_REPORT_US:
             self._stop_report, self._stop_report_us = report, now_us
-            send_packet(self._receiver.near, report)
+            send_packet(self._stops, report)
 
     def _on_packet(self, packet: bytes) -> bool:
         kind = ipc.packet_kind(packet)
@@ -442,3 +428,15 @@ class Driver:
             often = f" ({count} times)" if count > 1 else ""
             source = rejection.source or "an unknown source"
             self._log(f"rejected {rejection.reason} from {source}{often}: {rejection.detail}")
+
+
+def main() -> None:
+    """Run a driver process that a guardian started. Its arguments are the descriptors of their sockets."""
+    heartbeats, *stops = (socket.socket(fileno=int(number)) for number in sys.argv[1:])
+    try:
+        start_log(None, "robot")
+        config = RobotConfig.model_validate_json(heartbeats.recv(_MAX_CONFIG_BYTES))
+        sys.exit(run(config, GuardianEnd(heartbeats, *stops)))
+    except SightlineError as error:
+        _log.error("%s", error)
+        sys.exit(error.exit_code)

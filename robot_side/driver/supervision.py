@@ -20,20 +20,31 @@ IGNORED_SIGNALS: Final = (signal.SIGTTIN, signal.SIGTTOU)
 # Each part that is not permitted is logged once at start; the robot runs without it.
 
 
-_PRIORITY: Final = 50  # above ordinary threads and the kernel's own soft work, below its watchdogs
+# Above ordinary threads and the kernel's own soft work, below its watchdogs. The guardian ends a driver in a loop.
+DRIVER_PRIORITY: Final = 50
+GUARDIAN_PRIORITY: Final = 51
 _MCL_CURRENT_AND_FUTURE: Final = 3
+_MCL_ONFAULT: Final = 4  # only what is in use, so that it does not grow
 
 
-def request_real_time() -> Iterator[str]:
+def schedule_real_time(priority: int) -> bool:
+    """Request real-time scheduling for this process, not for what it starts. Returns False if it is not permitted."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    except (OSError, AttributeError):
+        return False
+    return True
+
+
+def request_real_time(priority: int) -> Iterator[str]:
     """Freeze the garbage collector's survivors, request real-time scheduling and locked memory; yields what failed."""
     gc.collect()
     gc.freeze()
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
-    except (OSError, AttributeError):
+    if not schedule_real_time(priority):
         yield "real-time scheduling is not permitted (needs CAP_SYS_NICE or LimitRTPRIO); ticks may be late under load"
     libc = ctypes.CDLL(None, use_errno=True)
-    if not hasattr(libc, "mlockall") or libc.mlockall(_MCL_CURRENT_AND_FUTURE) != 0:
+    flags = _MCL_CURRENT_AND_FUTURE | (_MCL_ONFAULT if priority == GUARDIAN_PRIORITY else 0)
+    if not hasattr(libc, "mlockall") or libc.mlockall(flags) != 0:
         yield "locking memory is not permitted (needs CAP_IPC_LOCK or LimitMEMLOCK); swapping may delay a tick"
 
 

@@ -21,7 +21,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config, first_problem
 from sightline.protocol.errors import ConfigError, HardwareError, install_command
-from sightline.robot_side.hardware.gpio_low import import_lgpio, leave_low
+from sightline.robot_side.hardware.gpio_low import import_lgpio, leave_low, zero
 from sightline.robot_side.ports import WheelAngles
 
 _log: Final = logging.getLogger(__name__)
@@ -301,6 +301,7 @@ class GpioDrive:
     """`opening` and `pause` are seams for tests; the pins are low when it is constructed and when it is closed."""
 
     Config = GpioDriveConfig
+    zero = staticmethod(zero)
 
     def __init__(
         self,

@@ -9,8 +9,8 @@ where the kernel turns a pin without an owner into an input.
 import importlib
 import os
 import sys
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +23,8 @@ def import_lgpio() -> Any:
     """lgpio makes a pipe in the folder it is imported in, and fails where it may not: it gets a folder of its own."""
     if "lgpio" in sys.modules or "LG_WD" in os.environ:
         return importlib.import_module("lgpio")
+    import tempfile  # the guardian has no memory for it without a GPIO drive
+
     here = Path.cwd()  # lgpio leaves it, and what is relative must stay so
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
         os.environ["LG_WD"] = folder
@@ -31,6 +33,18 @@ def import_lgpio() -> Any:
         finally:
             del os.environ["LG_WD"]
             os.chdir(here)
+
+
+def prepare() -> None:
+    """Import lgpio before `zero` needs it: the card may fail when the driver does."""
+    with suppress(Exception):  # without it the drive does not open either, and gives the reason
+        import_lgpio()
+
+
+def zero(config: Mapping[str, Any]) -> None:
+    """Set the pins of a `gpio` drive low, the enable pins first. `config`: its `Config` as plain values."""
+    sides = ("left_forward_pin", "left_backward_pin", "right_forward_pin", "right_backward_pin")
+    leave_low([*config["enable_pins"], *(config[side] for side in sides)])
 
 
 def leave_low(numbers: Sequence[int], chip: int | None = None) -> None:

@@ -1,15 +1,16 @@
 """Write wheel speeds to a file in place of motors, and turn ideal wheels. Shell (a file and a clock)."""
 
+import os
 from pathlib import Path
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config
-from sightline.protocol.errors import HardwareError
+from sightline.robot_side.hardware.log_zero import open_log, zero
 from sightline.robot_side.ports import WheelAngles
 
 
 class LogDriveConfig(Config):
-    """`path`: CSV of t_us,left_rad_s,right_rad_s, one line per command; none is written without it."""
+    """`path`: CSV of t_us,left_rad_s,right_rad_s, one line per command, appended; none is written without it."""
 
     path: Path | None = None
 
@@ -18,12 +19,10 @@ class LogDrive:
     """For trying a robot without wheels. Its encoders read as if every speed were reached at once."""
 
     Config = LogDriveConfig
+    zero = staticmethod(zero)
 
     def __init__(self, config: LogDriveConfig) -> None:
-        try:
-            self._file = config.path.open("w", buffering=1) if config.path else None
-        except OSError as error:
-            raise HardwareError(f"drive log {config.path}: {error.strerror}; choose a writable file") from None
+        self._file = os.fdopen(open_log(str(config.path)), "a", buffering=1) if config.path else None
         self._speeds = (0.0, 0.0)
         self._angles = WheelAngles(0.0, 0.0, monotonic_us())
 

@@ -87,7 +87,7 @@ def test_motor_log_of_another_run_is_one_line(capsys, tmp_path):
 @pytest.mark.slow
 def test_robot_that_hangs_in_a_case_fails_it_in_one_line_and_the_others_run(capsys, tmp_path):
     endpoint = free_endpoint("ws://")
-    with RobotProcess(tmp_path, endpoint=endpoint, safety={}) as robot:
+    with RobotProcess(tmp_path, guarded=False, endpoint=endpoint, safety={}) as robot:
         robot.wait_until_on(f"on {endpoint}")
         begins, run_one = [], conform.run_cases
 

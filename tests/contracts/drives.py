@@ -1,4 +1,4 @@
-"""Contract of every drive plug-in. Run it over your own: `check_drive(lambda: YourDrive(config))`.
+"""Contract of every drive plug-in. Run it over your own: `check_drive(lambda: YourDrive(config), zero)`.
 
 The wheels turn: lift the robot.
 """
@@ -16,8 +16,14 @@ STILL_S = 2.0
 """Motors may follow with their lag; a simulation on a busy machine may be late."""
 
 
-def check_drive(opened: Callable[[], Drive], speed_rad_s: float = SPEED_RAD_S) -> None:
-    """Every promise in turn, on one drive; an AssertionError names the one that is broken."""
+def check_drive(opened: Callable[[], Drive], zero: Callable[[], None], speed_rad_s: float = SPEED_RAD_S) -> None:
+    """Every promise in turn, on one drive; an AssertionError names the one that is broken.
+
+    Args:
+        opened: creates the drive.
+        zero: calls its `zero` with the same configuration as plain values.
+        speed_rad_s: a speed that the wheels reach.
+    """
     drive = opened()
     try:
         _gives_readings_in_order(drive)
@@ -29,6 +35,7 @@ def check_drive(opened: Callable[[], Drive], speed_rad_s: float = SPEED_RAD_S) -
         drive.set(0.0, 0.0)
         drive.close()
         drive.close()  # idempotent
+    _stops_after_its_process(opened, zero, speed_rad_s)
 
 
 def _gives_readings_in_order(drive: Drive) -> None:
@@ -80,6 +87,22 @@ def _stands_still_at_zero(drive: Drive, speed_rad_s: float) -> None:
     deadline_s = time.monotonic() + STILL_S
     while (turned := _turned(drive)) is not None and max(map(abs, turned)) >= 0.05:
         assert time.monotonic() < deadline_s, f"the wheels still turn: {turned} rad in {TURNING_S} s"
+
+
+def _stops_after_its_process(opened: Callable[[], Drive], zero: Callable[[], None], speed_rad_s: float) -> None:
+    """`zero` stops the wheels of a drive that was left, and leaves the device to the next drive."""
+    left = opened()
+    left.set(speed_rad_s, speed_rad_s)
+    left.close()
+    zero()
+    zero()  # idempotent
+    drive = opened()
+    try:
+        deadline_s = time.monotonic() + STILL_S
+        while (turned := _turned(drive)) is not None and max(map(abs, turned)) >= 0.05:
+            assert time.monotonic() < deadline_s, f"zero leaves the wheels turning: {turned} rad in {TURNING_S} s"
+    finally:
+        drive.close()
 
 
 def _turned(drive: Drive) -> tuple[float, float] | None:

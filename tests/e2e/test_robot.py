@@ -66,7 +66,7 @@ def test_a_key_at_the_terminal_does_not_reach_the_network_process(tmp_path, numb
 def test_background_robot_is_not_stopped_by_its_terminal(tmp_path, number):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
         assert driving(robot)
-        for pid in (robot.process.pid, robot.network_pid()):
+        for pid in (robot.process.pid, robot.driver_pid(), robot.network_pid()):
             os.kill(pid, number)
         since = monotonic_us() + 200_000
         assert until(lambda: any(t >= since and left >= 10.0 for t, left, _ in robot.motor_rows()))
@@ -77,15 +77,16 @@ def test_background_robot_is_not_stopped_by_its_terminal(tmp_path, number):
 def test_shutdown_follows_zero_and_leaves_no_process(tmp_path, number):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
         assert driving(robot)
-        network, since = robot.network_pid(), monotonic_us()
-        for pid in (robot.process.pid, network) if number in KEYS else (robot.process.pid,):
+        driver, network, since = robot.driver_pid(), robot.network_pid(), monotonic_us()
+        for pid in (robot.process.pid, driver, network) if number in KEYS else (robot.process.pid,):
             os.kill(pid, number)
         assert robot.process.wait(3) == 0
         assert robot.speed() == 0.0
         seconds, metres = stop_after(robot.motor_rows(), since)
         assert seconds <= BOUND_S and metres <= BOUND_M
-        with pytest.raises(ProcessLookupError):
-            os.kill(network, 0)
+        for pid in (driver, network):
+            with pytest.raises(ProcessLookupError):
+                os.kill(pid, 0)
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(("127.0.0.1", port_of(robot.endpoint)))

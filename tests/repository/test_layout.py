@@ -37,7 +37,7 @@ HEAVY_MODULES = {"av", "cv2", "matplotlib", "mcap", "numpy", "pybullet", "simple
 PURE = (
     "robot_side/kinematics.py",
     "robot_side/safety/*.py",
-    "robot_side/driver/core.py",
+    "robot_side/driver/core.py", "robot_side/guardian/core.py",
     "robot_side/network/core.py",
     "robot_side/network/stream.py",
     "robot_side/network/congestion_window.py",
@@ -65,7 +65,9 @@ SMALL_FILES = {  # with one importer, in their own folder: the reason why each i
     "benchmarks/network/watch.py": "a process of its own: python -m",
     "benchmarks/peers/classic_detector.py": "what a rival would write, kept apart from what all are given",
     "evaluation/demo/relay.py": "a process of its own: python -m",
-    "robot_side/hardware/gpio_low.py": "runs in the guardian of the pins, without what gpio.py imports",
+    "robot_side/hardware/gpio_low.py": "all that the guardian imports of the drive gpio; also a process of its own",
+    "robot_side/guardian/stop_receiver.py": "a process of its own",
+    "robot_side/hardware/log_zero.py": "all that the guardian imports of the drive log",
     "robot_side/driver/persistence.py": "the STOP latch on disk: the one place that a restart depends on",
     "robot_side/safety/lease.py": "a rule set of its own in the safety core, under strict limits",
 }

@@ -136,7 +136,7 @@ def test_dead_process_with_a_descendant_on_the_socket_is_restarted(child):
 @pytest.fixture
 def stopped(tmp_path):
     """A robot at speed with a stopped driver process, and an operator that can send to it."""
-    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
+    with RobotProcess(tmp_path, guarded=False) as robot, Vision(robot.endpoint) as vision:
         assert driving(robot)
         with open_zenoh("r1", connect=[robot.endpoint], role="operator", timeout_s=10) as link:
             assert link.latest(STATUS).take(5.0)

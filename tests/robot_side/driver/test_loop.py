@@ -52,7 +52,7 @@ def run(tmp_path, monkeypatch):
         monkeypatch.setattr(process, "monotonic_us", lambda: loop.now_us)
         monkeypatch.setattr(process, "heartbeat_us", lambda: loop.now_us)
         monkeypatch.setattr(process, "select", SimpleNamespace(select=loop.select))
-        monkeypatch.setattr(process, "request_real_time", list)
+        monkeypatch.setattr(process, "request_real_time", lambda _priority: ())
         driver = Driver(RobotConfig(state_dir=tmp_path), loop, None)
         made.append(driver)
         driver.driver_end = loop

@@ -15,7 +15,8 @@ from sightline.protocol.transports.stop_port import StopProcess
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.persistence import StopLatch
-from sightline.robot_side.driver.process import Driver, stop_receiver_of
+from sightline.robot_side.driver.process import Driver
+from sightline.robot_side.guardian.start import GuardianEnd, stop_receiver_of
 from sightline.robot_side.guardian.stop_core import _REPORT, pack_number
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_port
@@ -53,9 +54,9 @@ def driver(tmp_path, monkeypatch):
     for name in ("signal", "getsignal"):
         monkeypatch.setattr(f"sightline.robot_side.driver.process.signal.{name}", lambda *_: None)
     receiver = StopProcess("unused", {})
-    made = Driver(RobotConfig(state_dir=tmp_path), Drive(), None, None, receiver)
+    made = Driver(RobotConfig(state_dir=tmp_path), Drive(), None, None, GuardianEnd(socket.socket(), receiver.near))
     made.driver_end = Network()
-    made.far = receiver._far
+    made.far = receiver.far
     made.far.setblocking(False)
     yield made
     made.latch_writer.close()
@@ -134,7 +135,7 @@ def test_a_stop_that_arrives_as_the_process_ends_is_latched_and_answered(driver,
 ])  # fmt: skip
 def test_the_port_is_beside_the_links(changes, addresses, routers):
     receiver = stop_receiver_of(RobotConfig(**changes))
-    options = json.loads(receiver._options)
+    options = json.loads(json.dumps(receiver.options))
     receiver.close()
     assert options["addresses"] == addresses and options["routers"] == routers and options["secret_file"] == ""
 
@@ -146,7 +147,7 @@ def test_a_key_folder_without_the_secret_gets_one_line_with_the_command(tmp_path
     (tmp_path / "stop.secret").write_text("x")
     receiver = stop_receiver_of(RobotConfig(secure=str(tmp_path)))
     receiver.close()
-    assert str(tmp_path / "stop.secret") in receiver._options
+    assert str(tmp_path / "stop.secret") in receiver.options["secret_file"]
 
 
 def test_robot_stops_and_latches_by_the_port_alone(tmp_path):

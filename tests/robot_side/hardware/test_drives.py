@@ -13,11 +13,13 @@ from tests.fixtures import demanded
 
 
 def test_the_log_drive(tmp_path):
-    check_drive(lambda: LogDrive(LogDrive.Config(path=tmp_path / "drive.csv")))
+    config = LogDrive.Config(path=tmp_path / "drive.csv")
+    check_drive(lambda: LogDrive(config), lambda: LogDrive.zero(config.model_dump(mode="json")))
 
 
 def test_the_drive_to_copy(tmp_path):
-    check_drive(lambda: MyDrive(MyDrive.Config(port=tmp_path / "port")))
+    config = MyDrive.Config(port=tmp_path / "port")
+    check_drive(lambda: MyDrive(config), lambda: MyDrive.zero(config.model_dump(mode="json")))
 
 
 @pytest.mark.slow
@@ -28,7 +30,8 @@ def test_the_simulated_drive(tmp_path):
     with Processes(tmp_path) as processes:
         processes.start("sim", ["sim", "--scenario", "static", "--socket-dir", str(tmp_path)])
         processes.wait_line("sim", "simulation ready", 20.0)
-        check_drive(lambda: SimDrive(SimDrive.Config(socket_dir=str(tmp_path))))
+        config = SimDrive.Config(socket_dir=str(tmp_path))
+        check_drive(lambda: SimDrive(config), lambda: SimDrive.zero(config.model_dump(mode="json")))
 
 
 class Broken(LogDrive):
@@ -80,4 +83,4 @@ class ClosesOnce(Broken):
 @pytest.mark.parametrize("broken", [Slow, Forgets, Crossed, Coasts, Ahead, ClosesOnce])
 def test_drive_contract_finds_each_broken_promise(broken):
     with pytest.raises(AssertionError):
-        check_drive(broken)
+        check_drive(broken, lambda: LogDrive.zero({"path": None}))

@@ -1,5 +1,7 @@
 """The drive on a Raspberry Pi's pins: duty by table, pins by gpiozero's own mock, every failure low."""
 
+import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +23,7 @@ from sightline.robot_side.hardware.gpio import DutyTable, GpioDrive, table_of, t
 from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
 from sightline.robot_side.plugins import DRIVES
 from tests.contracts.drives import check_drive
-from tests.fixtures.gpio import LEFT, RIGHT, NotingPin, both_ways, config
+from tests.fixtures.gpio import LEFT, RIGHT, FakeLgpio, NotingPin, both_ways, config
 
 ROOT = Path(__file__).parent.parent.parent.parent
 ROWS = ((0.4, 0.08), (0.6, 0.12), (1.0, 0.19))
@@ -269,5 +271,7 @@ def test_without_odometry_there_is_no_reading(board):
     drive.close()
 
 
-def test_gpio_drive_keeps_the_contract(board):
-    check_drive(lambda: GpioDrive(config()), speed_rad_s=4.0)
+def test_gpio_drive_keeps_the_contract(board, monkeypatch):
+    monkeypatch.setitem(sys.modules, "lgpio", FakeLgpio())
+    zero = partial(GpioDrive.zero, config().model_dump(mode="json"))
+    check_drive(lambda: GpioDrive(config()), zero, speed_rad_s=4.0)

@@ -20,7 +20,7 @@ from sightline.robot_side.hardware import gpio as gpio_pins
 from sightline.robot_side.hardware import gpio_low
 from sightline.robot_side.hardware.gpio import GpioDrive
 from sightline.robot_side.plugins import DRIVES
-from tests.fixtures.gpio import NotingPin, config
+from tests.fixtures.gpio import FakeLgpio, NotingPin, config
 
 ROOT = Path(__file__).parent.parent.parent.parent
 
@@ -58,31 +58,6 @@ def test_spi_that_is_switched_on_is_warned_of(board, monkeypatch, caplog, tmp_pa
     assert caplog.text == ""
 
 
-class FakeLgpio(SimpleNamespace):
-    """The part of lgpio that `gpio_low` uses, on a Raspberry Pi 5 with an early kernel: the header is chip 4."""
-
-    SET_PULL_DOWN = 64
-
-    def __init__(self, busy=()):
-        self.calls, self.busy = [], busy
-
-    def gpiochip_open(self, chip):
-        if chip not in (0, 4):
-            raise OSError("no such chip")
-        return chip
-
-    def gpiochip_close(self, handle):
-        self.calls.append(("close", handle))
-
-    def gpio_get_chip_info(self, handle):
-        return [0, 54, f"gpiochip{handle}", "pinctrl-rp1" if handle == 4 else "gpio-brcmstb"]
-
-    def gpio_claim_output(self, handle, number, level, flags):
-        if number in self.busy:
-            raise OSError("GPIO busy")
-        self.calls.append((handle, number, level, flags))
-
-
 def test_pins_are_left_low_by_lgpio_alone(monkeypatch, capsys):
     lgpio = FakeLgpio()
     monkeypatch.setitem(sys.modules, "lgpio", lgpio)
@@ -95,6 +70,28 @@ def test_pins_are_left_low_by_lgpio_alone(monkeypatch, capsys):
     assert capsys.readouterr().err == "error: pins 10, 9, 8: GPIO busy\n"
     for wrong in ([], ["ten"], ["28"], ["-1"], ["¹"]):
         assert gpio_low.main(wrong) == 2
+
+
+def test_zero_sets_the_enable_pins_low_first_and_reports_a_pin_that_has_an_owner(monkeypatch):
+    lgpio, plain = FakeLgpio(), config(enable_pins=(17,)).model_dump(mode="json")
+    monkeypatch.setitem(sys.modules, "lgpio", lgpio)
+    GpioDrive.zero(plain)
+    assert [call[1] for call in lgpio.calls if call[0] == 4] == [17, 10, 9, 8, 7]
+    monkeypatch.setitem(sys.modules, "lgpio", FakeLgpio(busy=(10,)))
+    with pytest.raises(OSError, match="GPIO busy"):
+        GpioDrive.zero(plain)
+
+
+def test_zero_needs_its_library_before_its_moment(monkeypatch):
+    imported = []
+    monkeypatch.setattr(gpio_low, "import_lgpio", lambda: imported.append(1))
+    gpio_low.prepare()
+    assert imported == [1] and zero_module(GpioDrive) is gpio_low
+
+
+def zero_module(plugin):
+    """Return the module that the guardian imports for a drive."""
+    return sys.modules[plugin.zero.__module__]
 
 
 def test_the_end_of_a_real_factory_leaves_the_pins_pulled_down(monkeypatch):

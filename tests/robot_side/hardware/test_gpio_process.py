@@ -102,10 +102,24 @@ def test_every_requested_end_leaves_the_pins_low(tmp_path, board, number):
         assert not any(board_state(board).values())
 
 
-def test_pins_keep_their_state_after_kill_9_until_the_units_command(tmp_path, board):
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_guardian_sets_the_pins_of_a_dead_or_stopped_driver_low_once_it_owns_them(tmp_path, board, number):
+    with RobotProcess(tmp_path, drive=DRIVE) as robot, Vision(robot.endpoint):
+        assert rolling(board)
+        driver, since_us = robot.driver_pid(), time.monotonic_ns() // 1000
+        os.kill(driver, number)
+        robot.wait_until_on("a new driver process starts")
+        low_us = next(t_us for t_us, *event in board_events(board) if t_us > since_us and event == ["17", 0])
+        assert low_us - since_us < 700_000
+        assert "NOT set to zero" not in robot.output()
+
+
+def test_pins_keep_their_state_after_both_processes_died_until_the_units_command(tmp_path, board):
     """Why the unit has an ExecStopPost: nothing that runs in a process outlives it."""
     with RobotProcess(tmp_path, drive=DRIVE) as robot, Vision(robot.endpoint):
         assert rolling(board)
+        os.kill(robot.process.pid, signal.SIGSTOP)  # so that neither has the time to act on the end of the other
+        os.kill(robot.driver_pid(), signal.SIGKILL)
         os.kill(robot.process.pid, signal.SIGKILL)
         robot.process.wait(5)
         time.sleep(0.5)

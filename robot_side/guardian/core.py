@@ -1,0 +1,119 @@
+"""When a driver process counts as hung, and whether it is started again. Pure; standard library only.
+
+A heartbeat is one byte that the control loop sends at each tick. Silence is measured in the driver's own time, without
+the time that the driver waited for a processor, and without the lateness of the guardian itself.
+"""
+
+from collections import deque
+from typing import Final
+
+AT_REST: Final = b"0"
+"""Heartbeat of a loop whose wheels are at zero."""
+MOVING: Final = b"1"
+"""Heartbeat of a loop whose wheels turn."""
+IDLE: Final = b"i"
+"""The wheels are at zero, and the next heartbeat may take as long as an operator thinks."""
+ENDING: Final = b"e"
+"""The last heartbeat: the wheels are at zero, and files and devices are being closed."""
+
+PERIOD_US: Final = 20_000
+"""Between two looks at a driver without a heartbeat."""
+HUNG_US: Final = 200_000
+"""Silence in the driver's own time after which it counts as hung."""
+STARVED_US: Final = 500_000
+"""Silence of a driver without a processor after which moving wheels are stopped: zero follows within 700 ms."""
+STARTS_WITHIN_US: Final = 30_000_000
+"""Until the first heartbeat; a first start reads its packages from a slow card."""
+ENDS_WITHIN_US: Final = 7_000_000
+"""From the request to end: 2 s for the ramp to zero, then latch, network process and battery, each within a second."""
+MAX_RESTARTS: Final = 5
+RESTART_WINDOW_US: Final = 60_000_000
+
+_LONGEST_STEP_US: Final = 2 * PERIOD_US  # of one look: more of it is the lateness of the guardian
+
+
+class HeartbeatMonitor:
+    """The silence of one driver process."""
+
+    def __init__(self, now_us: int) -> None:
+        self._looked_us = now_us
+        self._last = b""
+        self._silence_us = self._own_us = 0
+        self._run_us: int | None = None
+
+    @property
+    def is_ready(self) -> bool:
+        """Return True after the first heartbeat. Before it the driver moved nothing."""
+        return bool(self._last)
+
+    @property
+    def is_late(self) -> bool:
+        """Return True if a heartbeat is missing, so that `look` needs the processor time of the driver."""
+        return self._silence_us >= PERIOD_US and self._last not in (b"", IDLE)
+
+    def on_beat(self, kind: bytes, now_us: int) -> None:
+        """Note a heartbeat. A driver that is ending does not come back to life."""
+        self._last = ENDING if self._last == ENDING else kind
+        self._looked_us, self._silence_us, self._own_us, self._run_us = now_us, 0, 0, None
+
+    def look(self, now_us: int, run_us: int | None = None) -> str:
+        """Return why the driver must be killed, or "" while it need not.
+
+        Args:
+            now_us: monotonic time, us.
+            run_us: processor time of the driver so far if it is ready to run, us; None if it sleeps or is stopped.
+        """
+        step_us, self._looked_us = min(now_us - self._looked_us, _LONGEST_STEP_US), now_us
+        self._silence_us += step_us
+        before_us, self._run_us = self._run_us, run_us
+        if run_us is None or before_us is None:
+            self._own_us += step_us
+        else:
+            self._own_us += min(step_us, run_us - before_us)
+        return self._reason()
+
+    def _reason(self) -> str:
+        if self._last == IDLE:
+            return ""
+        if not self._last or self._last == ENDING:
+            limit_us = ENDS_WITHIN_US if self._last else STARTS_WITHIN_US
+            what = "did not end" if self._last else "did not start"
+            return f"{what} within {limit_us // 1_000_000} s" if self._silence_us >= limit_us else ""
+        if self._own_us >= HUNG_US:
+            return f"no heartbeat for {self._silence_us // 1000} ms"
+        if self._last == MOVING and self._silence_us >= STARVED_US:
+            return f"no processor time for {self._silence_us // 1000} ms; the machine is overloaded"
+        return ""
+
+
+class RestartBudget:
+    """At most 5 restarts within 60 s."""
+
+    def __init__(self) -> None:
+        self._restarts_us: deque[int] = deque()
+
+    def take(self, now_us: int) -> bool:
+        """Take a restart; False if none is left."""
+        while self._restarts_us and now_us - self._restarts_us[0] >= RESTART_WINDOW_US:
+            self._restarts_us.popleft()
+        if len(self._restarts_us) >= MAX_RESTARTS:
+            return False
+        self._restarts_us.append(now_us)
+        return True
+
+
+def exit_code_after(code: int, end_signal: int | None) -> int | None:
+    """Return the exit code of the whole robot after the end of a driver, or None if the driver starts again.
+
+    Args:
+        code: exit code of the driver; negative if a signal ended it.
+        end_signal: the signal that requested the end of the robot, or None.
+    """
+    if code >= 0:
+        return code
+    return None if end_signal is None else 128 + end_signal
+
+
+def needs_zero(code: int, *, was_ready: bool) -> bool:
+    """Return True unless the driver ended by itself with the wheels at zero, or before it could move them."""
+    return code < 0 or (code != 0 and was_ready)

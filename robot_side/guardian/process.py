@@ -1,0 +1,297 @@
+"""The guardian process: watches the heartbeats of a driver process, kills it if it hangs, stops the wheels. Shell.
+
+It has the standard library and `zero` of the drive, nothing else, so that it is small and has little to fail. It opens
+no device while a driver process lives: a GPIO line has one owner, so it kills the driver and waits for its end first.
+"""
+
+import ctypes
+import importlib
+import json
+import logging
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from types import FrameType
+from typing import Any, Final
+
+from sightline.protocol.clock import heartbeat_us
+from sightline.protocol.log import start_log
+from sightline.protocol.transports.stop_port import StopProcess
+from sightline.robot_side.driver.supervision import (
+    EXIT_SIGNALS,
+    GUARDIAN_PRIORITY,
+    IGNORED_SIGNALS,
+    SystemdNotifier,
+    request_real_time,
+)
+from sightline.robot_side.guardian.core import (
+    ENDING,
+    ENDS_WITHIN_US,
+    PERIOD_US,
+    STARTS_WITHIN_US,
+    HeartbeatMonitor,
+    RestartBudget,
+    exit_code_after,
+    needs_zero,
+)
+
+_log: Final = logging.getLogger("sightline.guardian")
+
+_HARDWARE_EXIT: Final = 3
+_SET_CHILD_SUBREAPER: Final = 36
+_WATCHDOG_PERIOD_US: Final = 100_000
+_ZERO_TRIES, _ZERO_RETRY_S = 5, 0.1
+_BEATS_PER_LOOK: Final = 64
+_ORPHANS_END_US: Final = 1_000_000
+_NOT_COVERED: Final = (
+    "not covered: if driver and guardian die together, or the kernel, the motors keep their last speed; fit the "
+    "hardware cutoff of docs/how-to/hardware-cutoff.md{}"
+)
+_NO_WATCHDOG: Final = ", and run it under systemd, whose watchdog covers both processes (`sightline install robot`)"
+_DRIVER: Final = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); "
+    "from sightline.robot_side.driver.process import main; main()"
+)
+
+
+class Guardian:
+    """One robot's guardian. `setup` is what `start.become_guardian` wrote."""
+
+    def __init__(self, setup: dict[str, Any]) -> None:
+        self._setup = setup
+        self._zero_config = setup["zero"]["config"]
+        try:
+            module = importlib.import_module(setup["zero"]["module"])
+        except ImportError:  # of a plug-in that is installed in an unusual way
+            importlib.import_module("site").main()
+            module = importlib.import_module(setup["zero"]["module"])
+        getattr(module, "prepare", lambda: None)()
+        self._zero: Any = module
+        for part in setup["zero"]["name"].split("."):
+            self._zero = getattr(self._zero, part)
+        self._path = json.dumps(setup["path"])
+        self._beats = socket.socket(fileno=setup["beats"])
+        self._receiver: StopProcess | None = None
+        ends = [self._beats]
+        if setup["receiver"] is not None:
+            near, far = (socket.socket(fileno=setup["receiver"][end]) for end in ("near", "far"))
+            self._receiver = StopProcess(setup["receiver"]["module"], setup["receiver"]["options"], (near, far))
+            ends += [near, far]
+        for end in ends:
+            end.set_inheritable(False)
+        self._beats.setblocking(False)
+        self._driver_pid: int = setup["pid"]
+        self._status: int | None = None
+        self._monitor = HeartbeatMonitor(heartbeat_us())
+        self._budget = RestartBudget()
+        self._end_signal: int | None = None
+        self._end_by_us = 0
+        self._fed_us = 0
+        self._systemd = SystemdNotifier()
+        for number in EXIT_SIGNALS:
+            signal.signal(number, self._on_signal)
+        for number in IGNORED_SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, EXIT_SIGNALS)
+
+    def run(self) -> int:
+        """Guard one driver process after the other. Returns the exit code of the robot; the wheels are at zero."""
+        self._say(_NOT_COVERED.format("" if self._systemd.is_active else _NO_WATCHDOG))
+        while True:
+            code = os.waitstatus_to_exitcode(self._watch())
+            if needs_zero(code, was_ready=self._monitor.is_ready):
+                self._set_to_zero()
+            self._kill_orphans()
+            exit_code = exit_code_after(code, self._end_signal)
+            if exit_code is not None:
+                return exit_code
+            if self._setup["driver"] is None:
+                return self._give_up("the motors are at zero")
+            if not self._budget.take(heartbeat_us()):
+                return self._give_up("5 restarts within 60 s; the motors stay at zero; look for the cause above")
+            self._start_driver()
+
+    def _give_up(self, why: str) -> int:
+        _log.error("robot %s: the driver process is not started again: %s", self._setup["robot"], why)
+        return _HARDWARE_EXIT
+
+    # --- the driver process --------------------------------------------------------------------------------------
+
+    def _watch(self) -> int:
+        """Wait until the driver process has ended, by itself or killed. Returns its wait status."""
+        self._status = None
+        while True:
+            with suppress(OSError, ValueError):  # its end has closed: what follows is its exit
+                select.select([self._beats], [], [], PERIOD_US / 1e6)
+            now_us = heartbeat_us()
+            is_open = self._read_beats(now_us)
+            self._reap()
+            if self._status is not None:
+                if self._status and os.WIFSIGNALED(self._status):
+                    self._say(f"the driver process was ended by signal {os.WTERMSIG(self._status)}")
+                return self._status
+            run_us = run_us_of(self._driver_pid) if self._monitor.is_late else None
+            reason = self._monitor.look(now_us, run_us)
+            if not reason and self._end_signal is not None and self._may_not_wait(now_us):
+                reason = "did not end when requested" if self._monitor.is_ready else "ended before its start"
+            if reason:
+                return self._kill_driver(reason)
+            if not is_open:
+                time.sleep(0.001)
+            if self._receiver is not None:
+                self._receiver.keep_alive(now_us)
+
+    def _read_beats(self, now_us: int) -> bool:
+        """Take what the driver process sent. Returns False after the end of its socket."""
+        for _ in range(_BEATS_PER_LOOK):
+            try:
+                kind = self._beats.recv(8)
+            except BlockingIOError:
+                return True
+            except OSError:
+                return False
+            if not kind:
+                return False
+            self._on_beat(kind, now_us)
+        return True
+
+    def _on_beat(self, kind: bytes, now_us: int) -> None:
+        if not self._monitor.is_ready:
+            self._permit_silence(os.environ.get("WATCHDOG_USEC", ""))
+        self._monitor.on_beat(kind, now_us)
+        if kind == ENDING:
+            self._systemd.notify("STOPPING=1")
+        elif now_us - self._fed_us >= _WATCHDOG_PERIOD_US:
+            self._fed_us = now_us
+            self._systemd.notify("READY=1\nWATCHDOG=1")
+
+    def _permit_silence(self, watchdog_us: str | int) -> None:
+        """Set the time of the watchdog of systemd, which is longer while a new driver process starts."""
+        if os.environ.get("WATCHDOG_USEC") and watchdog_us:
+            self._systemd.notify(f"WATCHDOG_USEC={watchdog_us}")
+
+    def _kill_driver(self, reason: str) -> int:
+        self._say(f"the driver process is killed: {reason}")
+        os.kill(self._driver_pid, signal.SIGKILL)
+        _, status = os.waitpid(self._driver_pid, 0)
+        return status
+
+    def _set_to_zero(self) -> None:
+        for left in reversed(range(_ZERO_TRIES)):
+            try:
+                self._zero(self._zero_config)
+                self._say("the motors are set to zero")
+                return
+            except Exception as error:  # foreign code; a dying owner may still hold the device
+                if left:
+                    time.sleep(_ZERO_RETRY_S)
+                    self._kill_orphans()
+                else:
+                    _log.error("robot %s: motors NOT set to zero: %s: %s; switch off their supply",
+                               self._setup["robot"], type(error).__name__, error)
+
+    def _start_driver(self) -> None:
+        self._permit_silence(STARTS_WITHIN_US)
+        self._beats.close()
+        self._beats, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._beats.setblocking(False)
+        self._beats.send(self._setup["driver"].encode())
+        self._driver_pid = self._start([theirs, *([self._receiver.near] if self._receiver else [])])
+        theirs.close()
+        self._monitor = HeartbeatMonitor(heartbeat_us())
+        self._say("a new driver process starts")
+
+    def _start(self, ends: Sequence[socket.socket]) -> int:
+        """Start a driver process whose arguments are the descriptors of `ends`. Returns its process id."""
+        arguments = [sys.executable, "-P", "-c", _DRIVER, *(str(end.fileno()) for end in ends), self._path]
+        for end in ends:
+            end.set_inheritable(True)
+        pid = os.posix_spawn(sys.executable, arguments, os.environ, setsigdef=IGNORED_SIGNALS, setsigmask=EXIT_SIGNALS)
+        for end in ends:
+            end.set_inheritable(False)
+        return pid
+
+    def _kill_orphans(self) -> None:
+        """Kill what a dead driver process left: its network process holds the port and the camera."""
+        receiver = {self._receiver.pid} if self._receiver else set()
+        for pid in set(_children()) - receiver:
+            with suppress(OSError):
+                os.kill(pid, signal.SIGKILL)
+        by_us = heartbeat_us() + _ORPHANS_END_US
+        while heartbeat_us() < by_us and set(_children()) - receiver:
+            self._reap()
+            time.sleep(0.002)
+
+    def _reap(self) -> None:
+        with suppress(ChildProcessError):
+            while True:
+                pid, status = os.waitpid(-1, os.WNOHANG)
+                if not pid:
+                    return
+                if pid == self._driver_pid:
+                    self._status = status
+
+    # --- the end -------------------------------------------------------------------------------------------------
+
+    def _on_signal(self, number: int, _frame: FrameType | None) -> None:
+        """Forward a request to end. The driver process may have received it from the terminal, too."""
+        if self._end_signal is None:
+            self._end_signal, self._end_by_us = number, heartbeat_us() + ENDS_WITHIN_US
+        if self._status is None:
+            with suppress(ProcessLookupError):
+                os.kill(self._driver_pid, number)
+
+    def _may_not_wait(self, now_us: int) -> bool:
+        return not self._monitor.is_ready or now_us >= self._end_by_us
+
+    def _say(self, line: str) -> None:
+        _log.info("robot %s: %s", self._setup["robot"], line)
+
+
+def run_us_of(pid: int) -> int | None:
+    """Return the processor time of the main thread of `pid`, us, if it is ready to run; None if it is not."""
+    try:
+        state = _stat(pid)[0]
+        run_ns = _read(f"/proc/{pid}/schedstat").split()[0]
+    except (OSError, IndexError):  # gone, or a kernel without the statistics
+        return None
+    return int(run_ns) // 1000 if state == "R" else None
+
+
+def _children() -> list[int]:
+    """Return the process ids of our children; not every kernel lists them in one file."""
+    own, found = str(os.getpid()), []
+    for name in os.listdir("/proc"):  # noqa: PTH208  pathlib takes a megabyte
+        with suppress(OSError):
+            if name.isdigit() and _stat(name)[1] == own:
+                found.append(int(name))
+    return found
+
+
+def _stat(pid: int | str) -> list[str]:
+    """Return the fields of a process from its state on."""
+    return _read(f"/proc/{pid}/stat").rpartition(")")[2].split()
+
+
+def _read(path: str) -> str:
+    with open(path, encoding="ascii", errors="replace") as file:  # noqa: PTH123  pathlib takes a megabyte
+        return file.read()
+
+
+def main(setup: dict[str, Any]) -> None:
+    """Run the guardian of `setup` and end with the exit code of its robot."""
+    start_log(None, "robot")
+    ctypes.CDLL(None).prctl(_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # what a driver process leaves becomes ours to kill
+    try:
+        guardian = Guardian(setup)
+    except Exception as error:
+        _log.error("robot %s: the guardian does not start: %s: %s", setup["robot"], type(error).__name__, error)
+        sys.exit(1)
+    for _ in request_real_time(GUARDIAN_PRIORITY):
+        pass  # the driver process logs what is not permitted
+    sys.exit(guardian.run())

@@ -1,0 +1,143 @@
+"""Become the guardian of a fork of this process; the fork's end of their sockets. Shell.
+
+The process that the user or systemd started becomes the guardian, so that it is the parent of each driver process. Its
+fork goes on as the first driver process without a second start of the interpreter.
+"""
+
+import json
+import logging
+import os
+import signal
+import socket
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.transports.endpoints import stop_addresses
+from sightline.protocol.transports.security import stop_secret_file
+from sightline.protocol.transports.stop_datagram import STOP_PORT
+from sightline.protocol.transports.stop_port import StopProcess
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS, GUARDIAN_PRIORITY, schedule_real_time
+from sightline.robot_side.guardian import stop_receiver
+from sightline.robot_side.guardian.core import ENDING
+from sightline.robot_side.plugins import DRIVES
+
+_log: Final = logging.getLogger(__name__)
+
+_GUARDIAN: Final = (
+    "import json, sys; setup = json.load(open(int(sys.argv.pop()))); sys.path[:] = setup['path']; "
+    "top = type(sys)('sightline'); top.__path__ = [setup['root']]; sys.modules['sightline'] = top; "
+    "from sightline.robot_side.guardian.process import main; main(setup)"
+)
+"""It looks for modules where this process does, without Python's site module, which takes 2 MB."""
+
+
+class GuardianEnd:
+    """The guardian as the process with the motors sees it."""
+
+    def __init__(self, heartbeats: socket.socket, stops: socket.socket | None = None) -> None:
+        for end in filter(None, (heartbeats, stops)):
+            end.setblocking(False)
+        self.heartbeats = heartbeats
+        """To wait on: readable when the guardian is gone."""
+        self.stops = stops
+        """To wait on: STOPs of the STOP receiver, also those of before this process; None without a receiver."""
+
+    def beat(self, kind: bytes) -> None:
+        """Send a heartbeat; never waits."""
+        with suppress(OSError):
+            self.heartbeats.send(kind)
+
+    def is_gone(self) -> bool:
+        """Return True if the guardian is dead. It sends nothing, so whatever can be read is its end."""
+        try:
+            return not self.heartbeats.recv(1)
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+
+    def ending(self) -> None:
+        """Send that the wheels are at zero and this process ends."""
+        self.beat(ENDING)
+
+
+def become_guardian(config: RobotConfig, *, restarts: bool) -> GuardianEnd:
+    """Fork. The parent becomes the guardian and never returns; the fork returns its end of the sockets.
+
+    Args:
+        config: the robot; its drive must have `zero(config)`.
+        restarts: whether the guardian starts a driver process after this one. Tools that an operator runs end instead.
+
+    Raises:
+        ConfigError: the drive cannot be loaded or has no `zero`.
+    """
+    module, name, options = zero_of(config)
+    beats, their_beats = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    receiver = stop_receiver_of(config) if restarts else None
+    setup = {
+        "root": str(Path(__file__).parent.parent.parent),
+        "path": [one for one in sys.path if isinstance(one, str)],
+        "robot": config.robot,
+        "zero": {"module": module, "name": name, "config": options},
+        "driver": config.model_dump_json() if restarts else None,
+        "beats": beats.fileno(),
+        "receiver": receiver and {
+            "module": receiver.module, "options": receiver.options,
+            "near": receiver.near.fileno(), "far": receiver.far.fileno(),
+        },
+    }
+    for handler in (*logging.getLogger().handlers, sys.stdout, sys.stderr):
+        handler.flush()
+    signal.pthread_sigmask(signal.SIG_BLOCK, EXIT_SIGNALS)  # until the guardian can forward them
+    setup["pid"] = os.fork()
+    if setup["pid"]:
+        _execute(setup, [end.fileno() for end in (beats, *((receiver.near, receiver.far) if receiver else ()))])
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, EXIT_SIGNALS)
+    beats.close()
+    if receiver is None:
+        return GuardianEnd(their_beats)
+    receiver.far.close()
+    return GuardianEnd(their_beats, receiver.near)
+
+
+def _execute(setup: dict[str, Any], ends: list[int]) -> NoReturn:
+    try:
+        schedule_real_time(GUARDIAN_PRIORITY)  # now, since the fork gets real-time scheduling while the guardian starts
+        file = os.memfd_create("guardian", 0)  # its setup; no part of it is in the list of processes
+        os.write(file, json.dumps(setup).encode())
+        os.lseek(file, 0, os.SEEK_SET)
+        for number in ends:
+            os.set_inheritable(number, True)
+        os.execv(sys.executable, [sys.executable, "-I", "-S", "-c", _GUARDIAN, str(file)])
+    finally:
+        os._exit(1)  # the fork observes that its guardian is gone
+
+
+def stop_receiver_of(config: RobotConfig) -> StopProcess | None:
+    """Prepare the STOP receiver beside the links of this robot; None where keys are used without a STOP secret."""
+    try:
+        secret_file = stop_secret_file(config.secure) if config.secure else ""
+    except ConfigError as error:
+        _log.warning("robot %s: %s", config.robot, error)
+        return None
+    addresses, routers = stop_addresses(config.listen), stop_addresses(config.connect)
+    if not addresses and not routers:
+        addresses = [("127.0.0.1", STOP_PORT)]
+    return stop_receiver.start(config.robot, addresses, routers, secret_file)
+
+
+def zero_of(config: RobotConfig) -> tuple[str, str, dict[str, Any]]:
+    """Return module, name and plain configuration of the drive's `zero`. Raises ConfigError without one."""
+    plugin, options = DRIVES.load(config.motors)
+    zero = getattr(plugin, "zero", None)
+    module, name = getattr(zero, "__module__", None), getattr(zero, "__qualname__", "<")
+    if not callable(zero) or module is None or "<" in name:
+        raise ConfigError(
+            f"drive '{config.drive.kind}' has no static method zero(config), which stops the wheels after its process "
+            "has died; add it as in docs/how-to/add-a-device.md"
+        )
+    return module, name, options.model_dump(mode="json")
