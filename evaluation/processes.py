@@ -214,11 +214,17 @@ def children_of(pid: int) -> list[int]:
 
 def driver_of(guardian: int) -> int:
     """Return the process id of the driver process of a guardian, or 0 without one: its child that receives no STOP."""
-    for pid in reversed(children_of(guardian)):
-        with suppress(OSError):
-            if b"stop_receiver" not in Path(f"/proc/{pid}/cmdline").read_bytes():
+    with suppress(OSError):
+        own = _command(guardian)
+        for pid in reversed(children_of(guardian)):
+            command = _command(pid)  # ours while it is a fork; no line once it is dead
+            if command not in (b"", own) and b"stop_receiver" not in command:
                 return pid
     return 0
+
+
+def _command(pid: int) -> bytes:
+    return Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
 def last_line(log: Path) -> str:

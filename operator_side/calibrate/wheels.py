@@ -90,6 +90,8 @@ def opened_drive(config: RobotConfig, guard: Guard | None = None) -> Iterator[tu
     caught is the task of the guardian.
     """
     guardian = guard(config) if guard is not None else None
+    if guardian is not None:
+        guardian.wait()
 
     def end(_number: int, _frame: FrameType | None) -> None:
         for number in EXIT_SIGNALS:  # a second one, by the guardian, must not interrupt the way to zero

@@ -30,6 +30,7 @@ from sightline.robot_side.driver.supervision import (
     DRIVER_PRIORITY,
     EXIT_SIGNALS,
     IGNORED_SIGNALS,
+    limit_core_dump,
     request_real_time,
 )
 from sightline.robot_side.guardian.core import AT_REST, MOVING
@@ -64,6 +65,7 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
     Raises ConfigError, HardwareError or LinkError before anything could move.
     """
     check_robot_id(config.robot)
+    limit_core_dump()
     with ExitStack() as ending:
         drive = DRIVES.build(config.motors)
         ending.callback(drive.close)
@@ -83,6 +85,7 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         ending.callback(driver.finish)
         if guardian is not None:
             ending.callback(guardian.ending)
+            guardian.wait()
         ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are set to zero
         return driver.loop()
 
@@ -234,7 +237,7 @@ class Driver:
         if self._guardian is not None:
             readable.append(self._guardian.heartbeats)
         ready = select.select(readable, [], [], timeout_s)
-        if self._guardian is not None and self._guardian.heartbeats in ready[0]:  # it sends nothing
+        if self._guardian is not None and self._guardian.heartbeats in ready[0] and self._guardian.is_gone():
             self._guardian = None
             self._log("the guardian is gone; shutting down")
             self._ending_since_us = self._ending_since_us or monotonic_us()

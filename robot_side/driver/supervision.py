@@ -3,6 +3,7 @@
 import ctypes
 import gc
 import os
+import resource
 import signal
 import socket
 from collections.abc import Iterator
@@ -46,6 +47,13 @@ def request_real_time(priority: int) -> Iterator[str]:
     flags = _MCL_CURRENT_AND_FUTURE | (_MCL_ONFAULT if priority == GUARDIAN_PRIORITY else 0)
     if not hasattr(libc, "mlockall") or libc.mlockall(flags) != 0:
         yield "locking memory is not permitted (needs CAP_IPC_LOCK or LimitMEMLOCK); swapping may delay a tick"
+
+
+def limit_core_dump() -> None:
+    """Write no core dump of this process: the motors would keep their speed until the last byte is on the disk."""
+    hard = resource.getrlimit(resource.RLIMIT_CORE)[1]
+    # Not 0: a dump into a program ignores that value. Source: core(5).
+    resource.setrlimit(resource.RLIMIT_CORE, (1 if hard else 0, hard))
 
 
 class SystemdNotifier:

@@ -13,6 +13,8 @@ MOVING: Final = b"1"
 """Heartbeat of a loop whose wheels turn."""
 IDLE: Final = b"i"
 """The wheels are at zero, and the next heartbeat may take as long as an operator thinks."""
+WATCHED: Final = b"w"
+"""What a guardian sends to a driver process once it watches it."""
 ENDING: Final = b"e"
 """The last heartbeat: the wheels are at zero, and files and devices are being closed."""
 
@@ -75,14 +77,14 @@ class HeartbeatMonitor:
     def _reason(self) -> str:
         if self._last == IDLE:
             return ""
-        if not self._last or self._last == ENDING:
-            limit_us = ENDS_WITHIN_US if self._last else STARTS_WITHIN_US
-            what = "did not end" if self._last else "did not start"
-            return f"{what} within {limit_us // 1_000_000} s" if self._silence_us >= limit_us else ""
+        if not self._last:
+            return "did not start within 30 s" if self._silence_us >= STARTS_WITHIN_US else ""
+        if self._last == ENDING:
+            return "did not end within 7 s" if self._silence_us >= ENDS_WITHIN_US else ""
         if self._own_us >= HUNG_US:
             return f"no heartbeat for {self._silence_us // 1000} ms"
         if self._last == MOVING and self._silence_us >= STARVED_US:
-            return f"no processor time for {self._silence_us // 1000} ms; the machine is overloaded"
+            return "no processor time for 500 ms; the machine is overloaded"
         return ""
 
 

@@ -34,6 +34,7 @@ from sightline.robot_side.guardian.core import (
     ENDS_WITHIN_US,
     PERIOD_US,
     STARTS_WITHIN_US,
+    WATCHED,
     HeartbeatMonitor,
     RestartBudget,
     exit_code_after,
@@ -87,6 +88,8 @@ class Guardian:
         self._beats.setblocking(False)
         self._driver_pid: int = setup["pid"]
         self._status: int | None = None
+        self._reason = ""
+        """Why the driver process was killed, "" if it ended by itself."""
         self._monitor = HeartbeatMonitor(heartbeat_us())
         self._budget = RestartBudget()
         self._end_signal: int | None = None
@@ -102,10 +105,12 @@ class Guardian:
     def run(self) -> int:
         """Guard one driver process after the other. Returns the exit code of the robot; the wheels are at zero."""
         self._say(_NOT_COVERED.format("" if self._systemd.is_active else _NO_WATCHDOG))
+        self._keep_receiver()
+        self._send_ready()
         while True:
             code = os.waitstatus_to_exitcode(self._watch())
-            if needs_zero(code, was_ready=self._monitor.is_ready):
-                self._set_to_zero()
+            error = self._set_to_zero() if needs_zero(code, was_ready=self._monitor.is_ready) else None
+            self._log_end(code, error)  # after zero: the thread that writes the log has no real-time priority
             self._kill_orphans()
             exit_code = exit_code_after(code, self._end_signal)
             if exit_code is not None:
@@ -116,6 +121,17 @@ class Guardian:
                 return self._give_up("5 restarts within 60 s; the motors stay at zero; look for the cause above")
             self._start_driver()
 
+    def _log_end(self, code: int, error: Exception | None) -> None:
+        if self._reason:
+            self._say(f"the driver process was killed: {self._reason}")
+        elif code < 0:
+            self._say(f"the driver process was ended by signal {-code}")
+        if error is not None:
+            _log.error("robot %s: motors NOT set to zero: %s: %s; switch off their supply",
+                       self._setup["robot"], type(error).__name__, error)
+        elif needs_zero(code, was_ready=self._monitor.is_ready):
+            self._say("the motors are set to zero")
+
     def _give_up(self, why: str) -> int:
         _log.error("robot %s: the driver process is not started again: %s", self._setup["robot"], why)
         return _HARDWARE_EXIT
@@ -124,7 +140,7 @@ class Guardian:
 
     def _watch(self) -> int:
         """Wait until the driver process has ended, by itself or killed. Returns its wait status."""
-        self._status = None
+        self._status, self._reason = None, ""
         while True:
             with suppress(OSError, ValueError):  # its end has closed: what follows is its exit
                 select.select([self._beats], [], [], PERIOD_US / 1e6)
@@ -132,19 +148,26 @@ class Guardian:
             is_open = self._read_beats(now_us)
             self._reap()
             if self._status is not None:
-                if self._status and os.WIFSIGNALED(self._status):
-                    self._say(f"the driver process was ended by signal {os.WTERMSIG(self._status)}")
                 return self._status
             run_us = run_us_of(self._driver_pid) if self._monitor.is_late else None
-            reason = self._monitor.look(now_us, run_us)
-            if not reason and self._end_signal is not None and self._may_not_wait(now_us):
-                reason = "did not end when requested" if self._monitor.is_ready else "ended before its start"
-            if reason:
-                return self._kill_driver(reason)
+            self._reason = self._monitor.look(now_us, run_us)
+            if not self._reason and self._end_signal is not None and self._may_not_wait(now_us):
+                self._reason = "did not end when requested" if self._monitor.is_ready else "ended before its start"
+            if self._reason:
+                os.kill(self._driver_pid, signal.SIGKILL)
+                return os.waitpid(self._driver_pid, 0)[1]
             if not is_open:
                 time.sleep(0.001)
-            if self._receiver is not None:
-                self._receiver.keep_alive(now_us)
+            self._keep_receiver()
+
+    def _keep_receiver(self) -> None:
+        if self._receiver is not None:
+            self._receiver.keep_alive(heartbeat_us())
+
+    def _send_ready(self) -> None:
+        """Permit the driver process to move: from now on its end is noticed."""
+        with suppress(OSError):
+            self._beats.send(WATCHED)
 
     def _read_beats(self, now_us: int) -> bool:
         """Take what the driver process sent. Returns False after the end of its socket."""
@@ -175,25 +198,18 @@ class Guardian:
         if os.environ.get("WATCHDOG_USEC") and watchdog_us:
             self._systemd.notify(f"WATCHDOG_USEC={watchdog_us}")
 
-    def _kill_driver(self, reason: str) -> int:
-        self._say(f"the driver process is killed: {reason}")
-        os.kill(self._driver_pid, signal.SIGKILL)
-        _, status = os.waitpid(self._driver_pid, 0)
-        return status
-
-    def _set_to_zero(self) -> None:
-        for left in reversed(range(_ZERO_TRIES)):
+    def _set_to_zero(self) -> Exception | None:
+        """Call `zero` of the drive. Returns why it failed, after several tries: a dying owner may hold the device."""
+        failed: Exception | None = None
+        for _ in range(_ZERO_TRIES):
             try:
                 self._zero(self._zero_config)
-                self._say("the motors are set to zero")
-                return
-            except Exception as error:  # foreign code; a dying owner may still hold the device
-                if left:
-                    time.sleep(_ZERO_RETRY_S)
-                    self._kill_orphans()
-                else:
-                    _log.error("robot %s: motors NOT set to zero: %s: %s; switch off their supply",
-                               self._setup["robot"], type(error).__name__, error)
+                return None
+            except Exception as error:  # foreign code
+                failed = error
+                self._kill_orphans()
+                time.sleep(_ZERO_RETRY_S)
+        return failed
 
     def _start_driver(self) -> None:
         self._permit_silence(STARTS_WITHIN_US)
@@ -201,6 +217,7 @@ class Guardian:
         self._beats, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._beats.setblocking(False)
         self._beats.send(self._setup["driver"].encode())
+        self._send_ready()
         self._driver_pid = self._start([theirs, *([self._receiver.near] if self._receiver else [])])
         theirs.close()
         self._monitor = HeartbeatMonitor(heartbeat_us())
@@ -219,13 +236,13 @@ class Guardian:
     def _kill_orphans(self) -> None:
         """Kill what a dead driver process left: its network process holds the port and the camera."""
         receiver = {self._receiver.pid} if self._receiver else set()
-        for pid in set(_children()) - receiver:
-            with suppress(OSError):
-                os.kill(pid, signal.SIGKILL)
         by_us = heartbeat_us() + _ORPHANS_END_US
-        while heartbeat_us() < by_us and set(_children()) - receiver:
-            self._reap()
+        while (orphans := set(_children()) - receiver) and heartbeat_us() < by_us:
+            for pid in orphans:  # again and again: the children of a killed one become ours
+                with suppress(OSError):
+                    os.kill(pid, signal.SIGKILL)
             time.sleep(0.002)
+            self._reap()
 
     def _reap(self) -> None:
         with suppress(ChildProcessError):
@@ -254,13 +271,19 @@ class Guardian:
 
 
 def run_us_of(pid: int) -> int | None:
-    """Return the processor time of the main thread of `pid`, us, if it is ready to run; None if it is not."""
+    """Return the processor time of `pid`, us, if one of its threads is ready to run; None if none is.
+
+    All threads count: the control loop may wait for the interpreter's lock, which another thread holds that in turn
+    waits for a processor.
+    """
+    is_ready, run_ns = False, 0
     try:
-        state = _stat(pid)[0]
-        run_ns = _read(f"/proc/{pid}/schedstat").split()[0]
+        for thread in os.listdir(f"/proc/{pid}/task"):  # noqa: PTH208  pathlib takes a megabyte
+            is_ready |= _stat(f"{pid}/task/{thread}")[0] == "R"
+            run_ns += int(_read(f"/proc/{pid}/task/{thread}/schedstat").split()[0])
     except (OSError, IndexError):  # gone, or a kernel without the statistics
         return None
-    return int(run_ns) // 1000 if state == "R" else None
+    return run_ns // 1000 if is_ready else None
 
 
 def _children() -> list[int]:

@@ -7,6 +7,7 @@ fork goes on as the first driver process without a second start of the interpret
 import json
 import logging
 import os
+import select
 import signal
 import socket
 import sys
@@ -14,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.transports.endpoints import stop_addresses
 from sightline.protocol.transports.security import stop_secret_file
 from sightline.protocol.transports.stop_datagram import STOP_PORT
@@ -22,7 +23,7 @@ from sightline.protocol.transports.stop_port import StopProcess
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, GUARDIAN_PRIORITY, schedule_real_time
 from sightline.robot_side.guardian import stop_receiver
-from sightline.robot_side.guardian.core import ENDING
+from sightline.robot_side.guardian.core import ENDING, STARTS_WITHIN_US
 from sightline.robot_side.plugins import DRIVES
 
 _log: Final = logging.getLogger(__name__)
@@ -46,13 +47,22 @@ class GuardianEnd:
         self.stops = stops
         """To wait on: STOPs of the STOP receiver, also those of before this process; None without a receiver."""
 
+    def wait(self) -> None:
+        """Wait until the guardian watches this process. Nothing may move before.
+
+        Raises:
+            HardwareError: it ended, or is not ready in time.
+        """
+        if not select.select([self.heartbeats], [], [], STARTS_WITHIN_US / 1e6)[0] or self.is_gone():
+            raise HardwareError("the guardian of this process does not start; see its line above")
+
     def beat(self, kind: bytes) -> None:
         """Send a heartbeat; never waits."""
         with suppress(OSError):
             self.heartbeats.send(kind)
 
     def is_gone(self) -> bool:
-        """Return True if the guardian is dead. It sends nothing, so whatever can be read is its end."""
+        """Return True if the guardian is dead."""
         try:
             return not self.heartbeats.recv(1)
         except BlockingIOError:

@@ -14,6 +14,7 @@ from sightline.robot_side.guardian.core import (
     RESTART_WINDOW_US,
     STARTS_WITHIN_US,
     STARVED_US,
+    WATCHED,
     HeartbeatMonitor,
     RestartBudget,
     exit_code_after,
@@ -71,7 +72,8 @@ def test_driver_without_a_processor_is_killed_only_while_its_wheels_turn():
 def test_loop_that_shares_its_processor_is_found_by_its_own_time():
     silent_us, reason = silence_us(beaten(AT_REST), 1_000_000, run_share=0.25)
     assert 700_000 <= silent_us <= 800_000
-    assert reason.startswith("no heartbeat")
+    assert reason == f"no heartbeat for {silent_us // 1000} ms"
+    assert silence_us(beaten(AT_REST), 1_000_000, run_share=0.1) == (1_820_000, "no heartbeat for 1820 ms")
 
 
 def test_silence_while_the_guardian_was_starved_does_not_count():
@@ -87,8 +89,27 @@ def test_start_and_end_have_limits_of_their_own():
     assert silence_us(monitor, 1_000_000) == (ENDS_WITHIN_US, "did not end within 7 s")
 
 
+def test_limits_are_exact():
+    for monitor, limit_us in ((HeartbeatMonitor(0), STARTS_WITHIN_US), (beaten(MOVING, 0), HUNG_US)):
+        assert silence_us(monitor, 0, limit_us=limit_us - PERIOD_US)[0] is None
+        assert monitor.look(limit_us - 1) == ""
+        assert monitor.look(limit_us) != ""
+
+
+def test_driver_that_falls_asleep_while_it_waits_for_a_processor_is_hung():
+    monitor = beaten(MOVING, 0)
+    assert silence_us(monitor, 0, run_share=0.0, limit_us=100_000)[0] is None
+    assert silence_us(monitor, 100_000)[0] == HUNG_US - PERIOD_US
+
+
+def test_heartbeats_are_bytes_that_differ():
+    assert (AT_REST, MOVING, IDLE, ENDING, WATCHED) == (b"0", b"1", b"i", b"e", b"w")
+    assert RESTART_WINDOW_US == 60_000_000
+
+
 def test_tool_that_waits_for_an_operator_may_be_silent():
     assert silence_us(beaten(IDLE), 0, limit_us=10 * STARTS_WITHIN_US)[0] is None
+    assert beaten(IDLE).look(2_000_000) == ""
 
 
 def test_processor_time_is_needed_only_after_a_missing_heartbeat():
@@ -109,7 +130,8 @@ def test_five_restarts_within_a_minute_are_permitted():
 
 
 @pytest.mark.parametrize(("code", "end_signal", "expected"), [
-    (0, None, 0), (0, 15, 0), (4, None, 4), (-9, None, None), (-11, None, None), (-9, 15, 143), (-9, 2, 130),
+    (0, None, 0), (0, 15, 0), (4, None, 4), (-9, None, None), (-11, None, None), (-1, None, None),
+    (-9, 15, 143), (-9, 2, 130),
 ])  # fmt: skip
 def test_exit_codes_are_forwarded_and_a_killed_driver_starts_again(code, end_signal, expected):
     assert exit_code_after(code, end_signal) == expected
@@ -117,6 +139,7 @@ def test_exit_codes_are_forwarded_and_a_killed_driver_starts_again(code, end_sig
 
 @pytest.mark.parametrize(("code", "was_ready", "expected"), [
     (0, True, False), (0, False, False), (1, True, True), (1, False, False), (-9, False, True), (-9, True, True),
+    (-1, False, True),
 ])  # fmt: skip
 def test_motors_are_set_to_zero_unless_the_driver_did_it(code, was_ready, expected):
     assert needs_zero(code, was_ready=was_ready) is expected

@@ -2,10 +2,11 @@
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
-import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,7 @@ from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.guardian.start import zero_of
 from sightline.robot_side.hardware.log_drive import LogDrive
+from tests.fixtures.dying import LATE, DriveFault
 from tests.fixtures.links import START_S, until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving, stop_after
 
@@ -37,71 +39,79 @@ def arm(endpoint: str) -> None:
         assert until(lambda: operator.request(Verb.ARM).ok, START_S)
 
 
-class LoopingDrive(LogDrive):
-    """Its hundredth motion never returns; the next driver process finds the mark and does not do it again."""
-
-    turned = 0
-
-    def set(self, left_rad_s, right_rad_s):
-        super().set(left_rad_s, right_rad_s)
-        self.turned += left_rad_s > 10
-        mark = Path(os.environ["LOOPED"])
-        if self.turned == 20 and not mark.exists():
-            mark.touch()
-            while True:
-                pass
-
-
 class ZerolessDrive(LogDrive):
     """A plug-in that was written before `zero` existed."""
 
     zero = None
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP, signal.SIGSEGV])
-def test_dead_or_stopped_driver_leaves_the_wheels_at_zero_and_a_new_one_starts(tmp_path, number):
-    with RobotProcess(tmp_path, safety={"auto_arm": False}) as robot, Vision(robot.endpoint) as vision:
-        robot.wait_until_on()
-        arm(robot.endpoint)
-        assert driving(robot)
-        driver, since_us = robot.driver_pid(), time.monotonic_ns() // 1000
-        os.kill(driver, number)
-        robot.wait_until_on("a new driver process starts")
-        stop_s, stop_m = stop_after(robot.motor_rows(), since_us)
-        assert stop_s <= BOUND_S and stop_m <= BOUND_M
-        assert until(lambda: robot.output().count("robot r1: on") == 2, START_S), robot.output()
-        assert vision.status().state == "DISARMED"
-        assert robot.driver_pid() != driver
-        assert robot.speed() == 0.0
+@pytest.fixture
+def dying(tmp_path, monkeypatch):
+    """Start a robot whose drive has a fault, and wait for it; return the robot and the fault."""
+    with ExitStack() as ending:
+
+        def start(name, **changes):
+            fault = DriveFault(monkeypatch, tmp_path, name)
+            drive = {"kind": "tests.fixtures.dying:DyingLogDrive", "options": {"path": str(tmp_path / "drive.csv")}}
+            robot = ending.enter_context(RobotProcess(tmp_path, drive=drive, **changes))
+            vision = ending.enter_context(Vision(robot.endpoint))
+            return robot, vision, fault
+
+        yield start
 
 
-def test_endless_loop_in_the_driver_is_ended(tmp_path, monkeypatch):
-    monkeypatch.setenv("LOOPED", str(tmp_path / "looped"))
-    kind = f"{__name__}:LoopingDrive"
-    drive = {"kind": kind, "options": {"path": str(tmp_path / "drive.csv")}}
-    with RobotProcess(tmp_path, drive=drive) as robot, Vision(robot.endpoint):
-        assert until((tmp_path / "looped").exists, START_S)
-        since_us = time.monotonic_ns() // 1000
-        robot.wait_until_on("a new driver process starts")
-        assert stop_after(robot.motor_rows(), since_us)[0] <= BOUND_S
+def check_stop(robot, fault):
+    stop_s, stop_m = stop_after(robot.motor_rows(), fault.t_us)
+    assert stop_s <= BOUND_S and stop_m <= BOUND_M
 
 
-def test_driver_ramps_to_zero_and_ends_without_its_guardian(tmp_path):
-    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
-        assert driving(robot)
-        driver, network, since_us = robot.driver_pid(), robot.network_pid(), time.monotonic_ns() // 1000
-        robot.process.kill()
-        robot.process.wait(5)
-        gone = [Path(f"/proc/{pid}/cmdline") for pid in (driver, network)]
-        assert until(lambda: not any(path.exists() and path.read_bytes() for path in gone), 5)
-        stop_s, stop_m = stop_after(robot.motor_rows(), since_us)
-        assert stop_s <= BOUND_S and stop_m <= BOUND_M
-        assert any(0 < left < 10 for t_us, left, _ in robot.motor_rows() if t_us > since_us), "a ramp, not a jump"
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGSTOP", "SIGSEGV"])
+def test_dead_or_stopped_driver_leaves_the_wheels_at_zero_and_a_new_one_starts(dying, name):
+    robot, vision, fault = dying(name, safety={"auto_arm": False})
+    robot.wait_until_on()
+    driver = robot.driver_pid()
+    arm(robot.endpoint)
+    robot.wait_until_on("a new driver process starts")
+    check_stop(robot, fault)
+    assert until(lambda: robot.output().count("robot r1: on") == 2, START_S), robot.output()
+    assert vision.status().state == "DISARMED"
+    assert robot.driver_pid() != driver
+    assert robot.speed() == 0.0
 
 
-def test_guardian_is_small_and_imports_no_package_of_ours_that_is_not_needed(tmp_path):
+def test_endless_loop_in_the_driver_is_ended(dying):
+    robot, _, fault = dying("loop")
+    robot.wait_until_on("a new driver process starts")
+    check_stop(robot, fault)
+
+
+def test_driver_ramps_to_zero_and_ends_without_its_guardian(dying):
+    robot, _, fault = dying("guardian")
+    robot.wait_until_on()
+    driver = robot.driver_pid()
+    network = robot.network_pid()
+    assert until(fault.has_come, START_S)
+    gone = [Path(f"/proc/{pid}/cmdline") for pid in (driver, network)]
+    assert until(lambda: not any(path.exists() and path.read_bytes() for path in gone), START_S)
+    check_stop(robot, fault)
+    assert any(0 < left < 10 for t_us, left, _ in robot.motor_rows() if t_us > fault.t_us), "a ramp, not a jump"
+
+
+def test_nothing_moves_before_the_guardian_watches(tmp_path, monkeypatch):
+    """Its `zero` may need a library that takes seconds to import."""
+    monkeypatch.setenv(LATE, str(tmp_path / "ready"))
+    with RobotProcess(tmp_path, drive={"kind": "tests.fixtures.dying:LateLogDrive",
+                                       "options": {"path": str(tmp_path / "drive.csv")}}) as robot:
+        with Vision(robot.endpoint):
+            assert driving(robot)
+        ready_us = int((tmp_path / "ready").read_text())
+        assert min(t_us for t_us, left, _ in robot.motor_rows() if left) > ready_us
+
+
+def test_guardian_is_small_and_the_driver_dumps_no_core(tmp_path):
     with RobotProcess(tmp_path) as robot:
         robot.wait_until_on()
+        assert resource.prlimit(robot.driver_pid(), resource.RLIMIT_CORE)[0] <= 1
         assert rss_kb(robot.process.pid) <= MEMORY_KB
         maps = Path(f"/proc/{robot.process.pid}/maps").read_text()
         assert "pydantic" not in maps and "zenoh" not in maps

@@ -1,6 +1,5 @@
 """A real driver process on mock pins that outlive it, checked by the events of the pins."""
 
-import os
 import signal
 import subprocess
 import sys
@@ -12,8 +11,9 @@ from tests.fixtures import demanded
 
 demanded.module("gpiozero", "robot-pi")
 
+from tests.fixtures.dying import DriveFault
 from tests.fixtures.gpio import BOARD, LEFT, OPTIONS, RIGHT, board_events, board_state
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.robot_process import RobotProcess, Vision
 
 LOW_WITHIN_US = 50_000
@@ -32,7 +32,7 @@ def board(tmp_path, monkeypatch):
 
 def rolling(board) -> bool:
     """Wait until both wheels are driven forwards."""
-    return until(lambda: all(board_state(board).get(number, 0.0) > 0 for number in (LEFT[0], RIGHT[0])), 10)
+    return until(lambda: all(board_state(board).get(number, 0.0) > 0 for number in (LEFT[0], RIGHT[0])), START_S)
 
 
 def stopped(board) -> bool:
@@ -102,26 +102,24 @@ def test_every_requested_end_leaves_the_pins_low(tmp_path, board, number):
         assert not any(board_state(board).values())
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_guardian_sets_the_pins_of_a_dead_or_stopped_driver_low_once_it_owns_them(tmp_path, board, number):
-    with RobotProcess(tmp_path, drive=DRIVE) as robot, Vision(robot.endpoint):
-        assert rolling(board)
-        driver, since_us = robot.driver_pid(), time.monotonic_ns() // 1000
-        os.kill(driver, number)
+DYING = {**DRIVE, "kind": "tests.fixtures.gpio:DyingBoardDrive"}
+
+
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGSTOP"])
+def test_guardian_sets_the_pins_of_a_dead_or_stopped_driver_low_once_it_owns_them(tmp_path, board, monkeypatch, name):
+    fault = DriveFault(monkeypatch, tmp_path, name)
+    with RobotProcess(tmp_path, drive=DYING) as robot, Vision(robot.endpoint):
         robot.wait_until_on("a new driver process starts")
-        low_us = next(t_us for t_us, *event in board_events(board) if t_us > since_us and event == ["17", 0])
-        assert low_us - since_us < 700_000
+        low_us = next(t_us for t_us, *event in board_events(board) if t_us > fault.t_us and event == ["17", 0])
+        assert low_us - fault.t_us < 700_000
         assert "NOT set to zero" not in robot.output()
 
 
-def test_pins_keep_their_state_after_both_processes_died_until_the_units_command(tmp_path, board):
+def test_pins_keep_their_state_after_both_processes_died_until_the_units_command(tmp_path, board, monkeypatch):
     """Why the unit has an ExecStopPost: nothing that runs in a process outlives it."""
-    with RobotProcess(tmp_path, drive=DRIVE) as robot, Vision(robot.endpoint):
-        assert rolling(board)
-        os.kill(robot.process.pid, signal.SIGSTOP)  # so that neither has the time to act on the end of the other
-        os.kill(robot.driver_pid(), signal.SIGKILL)
-        os.kill(robot.process.pid, signal.SIGKILL)
-        robot.process.wait(5)
+    DriveFault(monkeypatch, tmp_path, "both")
+    with RobotProcess(tmp_path, drive=DYING) as robot, Vision(robot.endpoint):
+        assert robot.process.wait(START_S) == -signal.SIGKILL
         time.sleep(0.5)
         assert board_state(board)[LEFT[0]] > 0 and board_state(board)[RIGHT[0]] > 0
         zero_motors()
