@@ -28,6 +28,7 @@ TABLES = {
     "robot_side/safety/states.py": _GATE,
     "robot_side/kinematics.py": ("tests/robot_side/test_kinematics.py",),
     "robot_side/driver/core.py": ("tests/robot_side/driver/test_core.py",),
+    "robot_side/guardian/core.py": ("tests/robot_side/guardian/test_core.py",),
     "robot_side/network/core.py": ("tests/robot_side/network/test_core.py",),
     "robot_side/network/stream.py": ("tests/robot_side/network/test_credit.py",),
     "robot_side/network/bitrate_control.py": ("tests/robot_side/network/test_bitrate_control.py",),
