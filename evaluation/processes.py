@@ -223,6 +223,13 @@ def driver_of(guardian: int) -> int:
     return 0
 
 
+def is_running(pid: int) -> bool:
+    """Return True unless the process has ended; one without a parent that waits for it has ended too."""
+    with suppress(OSError):
+        return bool(_command(pid))
+    return False
+
+
 def _command(pid: int) -> bytes:
     return Path(f"/proc/{pid}/cmdline").read_bytes()
 

@@ -1,6 +1,7 @@
 """Every case of the fault bench: processes, network, commands, clients, operators. Shell."""
 
 import itertools
+import os
 import resource
 import signal
 import socket
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
-from sightline.evaluation.faults.devices import DRIVE_ERROR
+from sightline.evaluation.faults.devices import DRIVE_ERROR, LOOP
 from sightline.evaluation.faults.drivers import ATTACKED_S, COMMAND_CASES, SETTLED_S, VISION
 from sightline.evaluation.faults.evidence import INJECTED, REQUESTED, MotorRow, wheel_mps
 from sightline.evaluation.faults.fixture import AT_SPEED_S, ROBOT, RobotFixture, Setup
@@ -22,7 +23,7 @@ from sightline.evaluation.faults.load_clients import ADMITTED, HANDSHAKES, READY
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.evaluation.faults.sampler import Hole
 from sightline.evaluation.faults.stop_cases import STOP_CASES
-from sightline.evaluation.processes import children_of
+from sightline.evaluation.processes import children_of, is_running
 from sightline.operator_side.config.errors import no_such_name
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError
@@ -34,6 +35,7 @@ from sightline.vision_side.config import TrackConfig
 
 STOPPED_S: Final = 3.0
 AGAIN_MPS: Final = 0.2
+BETWEEN_S: Final = 0.05
 AGAIN_S: Final = 20.0
 LEFT_OVER_US: Final = 500_000
 """A driver may still answer frames that it had when the network process died; a new one takes longer than this."""
@@ -125,6 +127,53 @@ def busy_processes() -> Iterator[None]:
             process.wait()
 
 
+def _hurt_driver(rig: RobotFixture, number: signal.Signals) -> Injected:
+    """Send the driver process a signal. Its guardian stops the wheels and starts a new one."""
+    before, at_us = rig.processes.driver("robot"), monotonic_us()
+    os.kill(before, number)
+    rig.until(lambda: rig.processes.driver("robot") not in (0, before), AGAIN_S, "a new driver process")
+    rig.watch(SETTLED_S)
+    again = drives_again(rig)
+    first_us = min((one.t_us for one in rig.sent() if one.t_us > at_us + LEFT_OVER_US), default=None)
+    return Injected(1, at_us, first_us, again)
+
+
+def _kill_guardian(rig: RobotFixture) -> Injected:
+    driver, at_us = rig.processes.driver("robot"), monotonic_us()
+    rig.processes.signal("robot", signal.SIGKILL)
+    rig.watch(SETTLED_S)
+    is_left = is_running(driver)
+    rig.probe_motors()  # so that the log has lines while the wheels roll out
+    return Injected(1, at_us, checks=(at_most("driver processes left", is_left, "", 0),))
+
+
+def _kill_driver_and_guardian(rig: RobotFixture) -> Injected:
+    driver, at_us = rig.processes.driver("robot"), monotonic_us()
+    os.kill(driver, signal.SIGKILL)
+    time.sleep(BETWEEN_S)
+    rig.processes.signal("robot", signal.SIGKILL)
+    rig.watch(SETTLED_S)
+    rig.probe_motors()
+    return Injected(2, at_us)
+
+
+def _kill_guardian_and_driver(rig: RobotFixture) -> Injected:
+    """Nothing that runs in a process covers this; then the command that systemd runs sets the motors to zero."""
+    driver = rig.processes.driver("robot")
+    rig.processes.signal("robot", signal.SIGKILL)
+    time.sleep(BETWEEN_S)
+    os.kill(driver, signal.SIGKILL)
+    rig.watch(STOPPED_S)
+    kept_mps, at_us = wheel_mps(rig.motors()[-1]), monotonic_us()
+    rig.processes.start("zero", ["robot", "--config", str(rig.folder / "robot.toml"), "--zero-motors"])
+    code = rig.processes.exit_code("zero", AGAIN_S)
+    rig.watch(SETTLED_S)
+    return Injected(2, at_us, checks=(
+        at_least("speed kept without them", kept_mps, "m/s", AGAIN_MPS), at_most("exit code", code, "", 0),
+        at_most("last speed set", wheel_mps(rig.motors()[-1]), "m/s", 0.0),
+    ))
+
+
 def _starve(rig: RobotFixture) -> Injected:
     with busy_processes():
         rig.watch(SETTLED_S)
@@ -174,6 +223,22 @@ PROCESS_CASES: Final = (
     ),
     FaultCase(
         "driver.starved", "robot: four busy processes beside it; then vision: SIGKILL", _starve, _SCRIPT, alone=True
+    ),
+    *(
+        FaultCase(f"guardian.{name}", f"driver process: {what}", partial(_hurt_driver, number=number), _SCRIPT,
+                  blind=True, again=True, short=name == "driver_kill", alone=name == "driver_loop")
+        for name, what, number in (
+            ("driver_kill", "SIGKILL", signal.SIGKILL), ("driver_pause", "SIGSTOP", signal.SIGSTOP),
+            ("driver_segfault", "segmentation fault", signal.SIGSEGV), ("driver_loop", "endless loop", LOOP),
+        )
+    ),
+    FaultCase("guardian.kill", "guardian: SIGKILL", _kill_guardian, _SCRIPT, blind=True, also="driver process ends"),
+    FaultCase("guardian.driver_first", "driver process, 50 ms later guardian: SIGKILL", _kill_driver_and_guardian,
+              _SCRIPT, blind=True),
+    FaultCase(
+        "guardian.guardian_first", "guardian, 50 ms later driver process: SIGKILL; 3 s later `--zero-motors`",
+        _kill_guardian_and_driver, _SCRIPT, stops=False,
+        also="not covered: the wheels keep their speed until `--zero-motors`, which systemd runs, sets zero"
     ),
     *(
         FaultCase(

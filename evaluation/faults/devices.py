@@ -1,13 +1,15 @@
-"""A camera and a drive, plug-ins that fail on command. Shell (files).
+"""A camera and a drive, plug-ins that fail on command. Shell (files, signals).
 
 Every image that was spoiled is noted in `camera.ledger` beside it, every failure of the drive in `drive.ledger`.
 """
 
 import ctypes
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import FrameType
 from typing import Final
 
 from sightline.evaluation.faults.evidence import INJECTED, EventLog
@@ -23,6 +25,8 @@ DRIVE_EVENTS: Final = "drive.ledger"
 DRIVE_ERROR: Final = "no encoder (injected by the bench)"
 GIL_HELD_S: Final = 1
 SLOW_S: Final = 0.2
+LOOP: Final = signal.SIGUSR2
+"""To a driver process with a `FaultyDrive`: an endless loop begins."""
 HEAVY_BYTES: Final = 16_700
 """At 30 fps, 4 Mbit/s."""
 SPARE: Final = {"black": (320, 240), "resized": (160, 120), "bomb": (64, 64)}
@@ -68,7 +72,7 @@ class FaultyCamera:
 
 
 class FaultyDrive(SimDrive):
-    """A `Drive` that raises while the file DRIVE_MODE exists."""
+    """The simulated wheels. They raise while the file DRIVE_MODE exists. The signal LOOP begins an endless loop."""
 
     class Config(SimSocketConfig):
         """`folder` holds the mode and the ledger."""
@@ -78,6 +82,7 @@ class FaultyDrive(SimDrive):
     def __init__(self, config: Config) -> None:
         super().__init__(SimSocketConfig(socket_dir=config.socket_dir))
         self._mode, self._ledger = config.folder / DRIVE_MODE, EventLog(config.folder / DRIVE_EVENTS)
+        signal.signal(LOOP, _loop)
 
     def wheels(self) -> WheelAngles | None:
         """Read the encoders, see `Drive`."""
@@ -118,6 +123,9 @@ FAULTS: Final[dict[str, Callable[[Picture, Picture], Picture | None]]] = {
     "gil": _hold_gil, "unplugged": _unplugged, "frozen": _frozen, "slow": _slow, "heavy": _heavy, "nothing": _nothing,
     "hangs": lambda now, _last: now,
 }
+def _loop(_number: int, _frame: FrameType | None) -> None:
+    while True:
+        pass
 
 
 def write_spares(folder: Path) -> None:

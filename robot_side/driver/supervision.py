@@ -28,10 +28,10 @@ _MCL_CURRENT_AND_FUTURE: Final = 3
 _MCL_ONFAULT: Final = 4  # only what is in use, so that it does not grow
 
 
-def schedule_real_time(priority: int) -> bool:
-    """Request real-time scheduling for this process, not for what it starts. Returns False if it is not permitted."""
+def schedule_real_time(priority: int, thread: int = 0) -> bool:
+    """Request real-time scheduling for a thread, not for what it starts. Returns False if it is not permitted."""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+        os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
     except (OSError, AttributeError):
         return False
     return True

@@ -18,8 +18,8 @@ WATCHED: Final = b"w"
 ENDING: Final = b"e"
 """The last heartbeat: the wheels are at zero, and files and devices are being closed."""
 
-PERIOD_US: Final = 20_000
-"""Between two looks at a driver without a heartbeat."""
+PERIOD_US: Final = 25_000
+"""Between two looks at a driver without a heartbeat; the control loop sends one every 20 ms."""
 HUNG_US: Final = 200_000
 """Silence in the driver's own time after which it counts as hung."""
 STARVED_US: Final = 500_000

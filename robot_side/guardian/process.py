@@ -23,11 +23,13 @@ from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.log import start_log
 from sightline.protocol.transports.stop_port import StopProcess
 from sightline.robot_side.driver.supervision import (
+    DRIVER_PRIORITY,
     EXIT_SIGNALS,
     GUARDIAN_PRIORITY,
     IGNORED_SIGNALS,
     SystemdNotifier,
     request_real_time,
+    schedule_real_time,
 )
 from sightline.robot_side.guardian.core import (
     ENDING,
@@ -151,6 +153,8 @@ class Guardian:
                 return self._status
             run_us = run_us_of(self._driver_pid) if self._monitor.is_late else None
             self._reason = self._monitor.look(now_us, run_us)
+            if self._monitor.is_late:
+                hurry(self._driver_pid)
             if not self._reason and self._end_signal is not None and self._may_not_wait(now_us):
                 self._reason = "did not end when requested" if self._monitor.is_ready else "ended before its start"
             if self._reason:
@@ -284,6 +288,17 @@ def run_us_of(pid: int) -> int | None:
     except (OSError, IndexError):  # gone, or a kernel without the statistics
         return None
     return run_ns // 1000 if is_ready else None
+
+
+def hurry(pid: int) -> None:
+    """Give all threads of `pid` the priority of the control loop, where that is permitted.
+
+    A killed process ends with its last thread, and only then another process may open its devices. Its other threads
+    have no real-time priority: beside busy processes they wait for a processor, and with them the wheels.
+    """
+    with suppress(OSError):
+        for thread in os.listdir(f"/proc/{pid}/task"):  # noqa: PTH208  pathlib takes a megabyte
+            schedule_real_time(DRIVER_PRIORITY, int(thread))
 
 
 def _children() -> list[int]:

@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import Verb
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver.supervision import schedule_real_time
+from sightline.robot_side.guardian.process import hurry
 from sightline.robot_side.guardian.start import zero_of
 from sightline.robot_side.hardware.log_drive import LogDrive
 from tests.fixtures.dying import LATE, DriveFault
@@ -160,6 +163,39 @@ def test_zero_of_a_drive_is_named_by_its_own_module(kind, options, expected):
 def test_zero_of_an_unknown_drive_is_a_configuration_error():
     with pytest.raises(ConfigError, match="no drive called 'lgo'"):
         zero_of(RobotConfig(drive=PluginChoice(kind="lgo")))
+
+
+def test_late_driver_gets_its_priority_for_all_threads():
+    """A killed process ends with its last thread, which beside busy processes would wait for a processor."""
+    code = "import threading, time; threading.Thread(target=time.sleep, args=(9,)).start(); print(1, flush=True)"
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        hurry(process.pid)
+        threads = [int(path.name) for path in Path(f"/proc/{process.pid}/task").iterdir()]
+        permitted = schedule_real_time(1, threads[0])
+        assert len(threads) == 2
+        assert [bool(os.sched_getscheduler(thread) & os.SCHED_FIFO) for thread in threads] == [permitted] * 2
+        process.kill()
+
+
+@pytest.mark.parametrize("seconds", [
+    pytest.param(20, marks=[pytest.mark.slow, pytest.mark.alone]),
+    pytest.param(600, marks=[pytest.mark.long, pytest.mark.alone]),
+])  # fmt: skip
+def test_busy_processes_without_real_time_cost_no_healthy_driver(tmp_path, seconds):
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(8)]
+    try:
+        with RobotProcess(tmp_path, real_time=False) as robot, Vision(robot.endpoint):
+            assert driving(robot)
+            driver = robot.driver_pid()
+            assert os.sched_getscheduler(driver) == os.sched_getscheduler(robot.process.pid) == os.SCHED_OTHER
+            time.sleep(seconds)
+            assert robot.driver_pid() == driver, robot.output()
+            assert "driver process" not in robot.output()
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 def test_shipped_zero_needs_no_pydantic():
