@@ -11,7 +11,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 from typing import Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
@@ -455,9 +454,9 @@ def _spoil_camera(rig: RobotFixture, mode: str) -> Injected:
 
 def _lose_camera(rig: RobotFixture, mode: str) -> Injected:
     """The camera gives no image until its process was started again and `status` names it."""
-    before = rig.processes.child("robot")
+    before = rig.processes.network("robot")
     at_us = rig.camera_mode(mode)
-    rig.until(lambda: rig.processes.child("robot") not in (0, before), AGAIN_S, "a new network process")
+    rig.until(lambda: rig.processes.network("robot") not in (0, before), AGAIN_S, "a new network process")
     since_s = (monotonic_us() - at_us) / 1e6
     rig.until(lambda: rig.logged(f"robot {ROBOT}: on") > 1, AGAIN_S, "a new endpoint")
     named = rig.status()["stream"]["camera_fault"]
@@ -486,8 +485,8 @@ def _one_traceback(rig: RobotFixture, text: str) -> tuple[Check, Check]:
 
 def _fill_disk(rig: RobotFixture) -> Injected:
     """No process of the robot can write a byte to a file any more. It drives on, and stops when vision dies."""
-    driver = rig.processes.pid("robot")
-    for pid in (driver, *children_of(driver)):
+    guardian = rig.processes.pid("robot")
+    for pid in (guardian, *_descendants(guardian)):
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, 0))
     since_us = monotonic_us()
     rig.watch(BAD_S)
@@ -509,7 +508,7 @@ def _kill_demo(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
     rig.processes.kill("demo")
     rig.watch(DEMO_ENDS_S)
-    left = sum(map(_is_alive, started))
+    left = sum(map(is_running, started))
     return Injected(len(started), at_us, checks=(at_most("processes after 2 s", left, "", 0),))
 
 
@@ -517,13 +516,6 @@ def _descendants(pid: int) -> Iterator[int]:
     for child in children_of(pid):
         yield child
         yield from _descendants(child)
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        return bool(Path(f"/proc/{pid}/cmdline").read_bytes())  # a zombie has none
-    except OSError:
-        return False
 
 
 def _blacken(rig: RobotFixture) -> Injected:

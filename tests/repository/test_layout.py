@@ -65,7 +65,6 @@ SMALL_FILES = {  # with one importer, in their own folder: the reason why each i
     "benchmarks/network/watch.py": "a process of its own: python -m",
     "benchmarks/peers/classic_detector.py": "what a rival would write, kept apart from what all are given",
     "evaluation/demo/relay.py": "a process of its own: python -m",
-    "evaluation/faults/devices.py": "plug-ins that the processes of the robot load by their names",
     "robot_side/hardware/gpio_low.py": "all that the guardian imports of the drive gpio; also a process of its own",
     "robot_side/guardian/stop_receiver.py": "a process of its own",
     "robot_side/hardware/log_zero.py": "all that the guardian imports of the drive log",

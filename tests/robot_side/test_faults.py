@@ -315,7 +315,7 @@ def test_a_camera_that_hangs_is_in_the_status_and_its_process_is_started_again(t
         robot.wait_until_on()
         before = robot.network_pid()
         with Vision(robot.endpoint) as vision:
-            driver_pid, shown = robot.process.pid, []
+            driver, shown = robot.driver_pid(), []
 
             def named():
                 message = vision.status_slot.take(0.2)
@@ -325,4 +325,4 @@ def test_a_camera_that_hangs_is_in_the_status_and_its_process_is_started_again(t
 
             assert until(named, 20), shown[-1:]
             assert until(lambda: robot.network_pid() != before, 10)
-        assert robot.process.pid == driver_pid and robot.process.poll() is None
+        assert robot.driver_pid() == driver
