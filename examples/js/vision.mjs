@@ -64,7 +64,6 @@ export class Vision {
   constructor(session, source = "vision") {
     this.session = session;
     this.source = source;
-    this.digest = sessionDigest(source, session); // what others see of both
     this.proofs = new ProofChain();
     this.robotSession = "";
     this.camera = null;
@@ -73,6 +72,11 @@ export class Vision {
     this.side = 1; // where the target was last: left
     this.seq = this.requestSeq = this.requestId = 0;
     this.status = null; // {header, payload}: the newest
+  }
+
+  /** What others see of source and session. */
+  get digest() {
+    return sessionDigest(this.source, this.session);
   }
 
   /** A new session of the robot: what was learned from the old one is forgotten. */

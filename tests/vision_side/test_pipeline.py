@@ -145,7 +145,7 @@ ANSWERS = st.none() | st.builds(
     twist=st.none(),
     seen=st.just(Observation("tracking")),
     scan=st.none() | COUNTS,
-    request=st.none() | st.builds(RequestId, session=SESSIONS, id=COUNTS),
+    request=st.none() | st.builds(RequestId, digest=SESSIONS, id=COUNTS),
 )
 
 
@@ -160,5 +160,5 @@ def test_encoded_answer_header_fits_and_has_the_fields_of_frame_and_answer(robot
     if answer and answer.scan is not None:
         expected["scan"] = answer.scan
     if answer and answer.request is not None:
-        expected["mission"] = {"session": answer.request.session, "id": answer.request.id}
+        expected["mission"] = {"digest": answer.request.digest, "id": answer.request.id}
     assert list(json.loads(encoded).items()) == list(expected.items()) and len(encoded) <= MAX_HEADER_BYTES

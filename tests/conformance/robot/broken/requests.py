@@ -23,11 +23,6 @@ def reply_has_its_own_id(robot):
 
 
 @breaks("R-REQ-03")
-def reply_is_to_nobody(robot):
-    bend_out(robot, "reply", lambda _header, payload: payload.update(to="00000000"))
-
-
-@breaks("R-REQ-03")
 def reply_shows_the_session(robot):
     def around(inner, message):
         robot.asker = fields_of(message.header).get("session")
