@@ -106,7 +106,6 @@ class Guardian:
 
     def run(self) -> int:
         """Guard one driver process after the other. Returns the exit code of the robot; the wheels are at zero."""
-        self._say(_NOT_COVERED.format("" if self._systemd.is_active else _NO_WATCHDOG))
         self._keep_receiver()
         self._send_ready()
         while True:
@@ -190,6 +189,8 @@ class Guardian:
     def _on_beat(self, kind: bytes, now_us: int) -> None:
         if not self._monitor.is_ready:
             self._permit_silence(os.environ.get("WATCHDOG_USEC", ""))
+            if not self._fed_us:  # once, and after the lines of a driver process that does not start
+                self._say(_NOT_COVERED.format("" if self._systemd.is_active else _NO_WATCHDOG))
         self._monitor.on_beat(kind, now_us)
         if kind == ENDING:
             self._systemd.notify("STOPPING=1")

@@ -311,7 +311,7 @@ def by_tier(rows):
     """Put the rows that compute for more than 1.5 s into the second tier."""
     costly = {"command.flood", "command.heartbeat", "command.replay", "camera.frozen", "stop.driving", "wire.cut3",
               "end.sigterm", "network.kill", "network.gil", "vision.hangs", "vision.kill", "flood.tls25",
-              "flood.tcp500", "camera.hangs", "drive.raises"}
+              "flood.tcp500", "camera.hangs", "drive.raises", "guardian.driver_kill"}
     assert costly <= {row.id for row in rows}
     return [pytest.param(row, marks=pytest.mark.slow if row.id in costly else (), id=row.id) for row in rows]
 

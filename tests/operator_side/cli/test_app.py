@@ -171,7 +171,6 @@ def test_completion_of_the_shell_offers_commands_and_options():
         (["robot", "--set", "drive.kind=:"], 2, "':'"),
         (["robot", "--set", "drive.kind=.a:X"], 2, "'.a:X'"),
         (["watch", "r1", "nope"], 2, "expected frame, "),
-        (["robot", "--socket-dir", "/nowhere"], 3, "sightline sim"),
         (["vision", "--robot", "r1/"], 2, "'r1/'"),
         (["vision", "--set", "hsv.min_radius_px=-1"], 2, "-1"),
         (["sim", "--scenario", "cirle"], 2, "'circle'"),

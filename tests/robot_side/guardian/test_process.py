@@ -203,3 +203,11 @@ def test_shipped_zero_needs_no_pydantic():
     code = f"import sys, {', '.join(modules)}; print([m for m in ('pydantic', 'typer', 'zenoh') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)
     assert json.loads(done.stdout) == []
+
+
+def test_a_robot_without_hardware_ends_with_one_line_and_its_exit_code(tmp_path):
+    command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "robot", "--socket-dir", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    expected = f"nothing simulates a robot in {tmp_path}; start it with `sightline sim`\n"
+    assert done.returncode == 3 and not done.stdout
+    assert done.stderr.endswith(expected) and done.stderr.count("\n") == 1
