@@ -118,11 +118,14 @@ def opened_drive(config: RobotConfig, guard: Guard | None = None) -> Iterator[tu
 def turn_for(
     give: Callable[[float, float], None], values: tuple[float, float], seconds: float, guardian: GuardianEnd | None
 ) -> None:
-    """Set both values, and zero after that time or at an error. Raises HardwareError when the guardian is gone."""
+    """Set both values, and zero after that time or at an error. Raises HardwareError when the guardian is gone.
+
+    The values are repeated at the pace of the control loop, for controllers and cutoffs that stop without commands.
+    """
     end_s = time.monotonic() + seconds
     try:
-        give(*values)
         while (left_s := end_s - time.monotonic()) > 0:
+            give(*values)
             if guardian is not None:
                 guardian.beat(MOVING)
                 if guardian.is_gone():

@@ -123,6 +123,10 @@ class Pins(Protocol):
         """Set the enable lines high or low, if there are any."""
         ...
 
+    def pulse(self) -> None:
+        """Change the level of the pulse pin, if there is one."""
+        ...
+
     def close(self) -> None:
         """Set all pins low and release them."""
         ...
@@ -135,6 +139,8 @@ class WiredPins(Protocol):
     def pins(self) -> tuple[int, int, int, int]: ...
     @property
     def enable_pins(self) -> tuple[int, ...]: ...
+    @property
+    def pulse_pin(self) -> int | None: ...
     @property
     def pwm_hz(self) -> int: ...
 
@@ -163,13 +169,17 @@ class GpiozeroPins:
 
     def __init__(self, gpiozero: Any, config: WiredPins, made: bool) -> None:
         self._device_class, self._made = gpiozero.Device, made
-        self._numbers = (*config.enable_pins, *config.pins)
+        pulse_pins = () if config.pulse_pin is None else (config.pulse_pin,)
+        self._numbers = (*config.enable_pins, *config.pins, *pulse_pins)
         self._enables: list[Any] = []
+        self._pulses: list[Any] = []
         self._motors: dict[int, Any] = {}
         try:
             # gpiozero's Motor takes no frequency, so each pin is a device of its own.
             for number in config.enable_pins:
                 self._enables.append(gpiozero.DigitalOutputDevice(number))
+            for number in pulse_pins:
+                self._pulses.append(gpiozero.DigitalOutputDevice(number))
             for number in config.pins:
                 self._motors[number] = gpiozero.PWMOutputDevice(number, frequency=config.pwm_hz)
         except Exception:
@@ -185,15 +195,21 @@ class GpiozeroPins:
         for device in self._enables:
             device.value = int(wanted)
 
+    def pulse(self) -> None:
+        """Change the level of the pulse pin."""
+        for device in self._pulses:
+            device.toggle()
+
     def close(self) -> None:
         """Set the enable lines low first, then the pins of the motors, and release them. Idempotent."""
-        for device in (*self._enables, *self._motors.values()):
+        devices = (*self._enables, *self._motors.values(), *self._pulses)
+        for device in devices:
             with suppress(Exception):  # the rest still has to go down
                 device.value = 0
-        for device in (*self._enables, *self._motors.values()):
+        for device in devices:
             with suppress(Exception):
                 device.close()
-        self._enables, self._motors = [], {}
+        self._enables, self._pulses, self._motors = [], [], {}
         if self._made:
             self._made = False
             self._give_back()
@@ -267,6 +283,8 @@ class GpioDriveConfig(TableConfig):
     right_backward_pin: BcmPin = 7
     enable_pins: Annotated[tuple[BcmPin, ...], Field(max_length=2)] = ()
     """ENA and ENB of the bridge, on one pin or two: high from the first motion until a failure or the end."""
+    pulse_pin: BcmPin | None = None
+    """Changes its level with each command of the control loop, for a cutoff: docs/how-to/hardware-cutoff.md."""
     pwm_hz: Annotated[int, Field(ge=400, le=10_000)] = 2_000
     left_reversed: bool = False
     right_reversed: bool = False
@@ -288,7 +306,7 @@ class GpioDriveConfig(TableConfig):
 
     @model_validator(mode="after")
     def _are_distinct(self) -> Self:
-        numbers = [*self.pins, *self.enable_pins]
+        numbers = [*self.pins, *self.enable_pins, *([] if self.pulse_pin is None else [self.pulse_pin])]
         twice = sorted({number for number in numbers if numbers.count(number) > 1})
         if twice:
             raise ValueError(f"pin {twice[0]} is named twice; each wire has its own")
@@ -342,6 +360,7 @@ class GpioDrive:
             self._enable(moves or self._enabled)
             for motor, duty in wanted:
                 motor.drive(pins, duty)
+            pins.pulse()
         except Exception as error:
             self._failed = True
             self._all_low()

@@ -90,6 +90,7 @@ def test_table_file_replaces_the_table_and_a_missing_file_is_reported(board, tmp
 
 @pytest.mark.parametrize(("options", "says"), [
     ({"left_forward_pin": 9}, "pin 9 is named twice"), ({"enable_pins": (7,)}, "pin 7 is named twice"),
+    ({"pulse_pin": 7}, "pin 7 is named twice"),
     ({"right_forward_pin": 28}, "less than or equal to 27"), ({"right_forward_pin": 1}, "greater than or equal to 2"),
     ({"pwm_hz": 20}, "400"), ({"trim": 0.5}, "0.3"), ({"table_file": "x", "table": [[0.5, 0.2]]}, "keep one"),
     ({"left_forwad_pin": 10}, "left_forwad_pin"), ({"odometry": "encoders"}, "'table' or 'none'"),
@@ -227,6 +228,19 @@ def test_the_enable_line_is_high_from_the_first_motion_to_the_end(board):
     assert duties(board) == {}
 
 
+def test_the_pulse_pin_changes_with_each_command_that_the_pins_take(board):
+    drive = GpioDrive(config(pulse_pin=17))
+    for speed_rad_s in (0.0, 0.0, 4.0, 4.0):
+        drive.set(speed_rad_s, 0.0)
+    assert [value for number, value in board.events if number == 17] == [1, 0, 1, 0]
+    with pytest.raises(HardwareError):
+        drive.set(float("nan"), 0.0)
+    drive.set(4.0, 0.0)
+    drive.close()
+    assert [value for number, value in board.events if number == 17] == [1, 0, 1, 0, 1, 0]
+    assert board.pin("GPIO17").function == "input"
+
+
 def test_close_leaves_no_output_pin(board):
     drive = GpioDrive(config())
     drive.set(4.0, 4.0)
@@ -240,7 +254,7 @@ def test_close_leaves_no_output_pin(board):
 def test_pins_are_low_before_their_release():
     calls = []
     pins = SimpleNamespace(
-        write=lambda number, duty: calls.append((number, duty)), enable=calls.append,
+        write=lambda number, duty: calls.append((number, duty)), enable=calls.append, pulse=lambda: None,
         close=lambda: calls.append("close"),
     )  # fmt: skip
     drive = GpioDrive(config(), opening=lambda _config: pins)
