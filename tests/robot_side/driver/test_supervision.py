@@ -8,7 +8,8 @@ from pathlib import Path
 
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.process import zero_motors
-from sightline.robot_side.driver.supervision import SystemdNotifier
+from sightline.robot_side.driver.supervision import DRIVER_PRIORITY, GUARDIAN_PRIORITY, SystemdNotifier
+from sightline.robot_side.guardian.core import ENDS_WITHIN_US
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 
@@ -24,7 +25,8 @@ def test_the_unit_watches_restarts_and_zeroes():
     assert 0 < float(service["WatchdogSec"]) <= 2 and service["Restart"] == "on-failure"
     assert service["ExecStopPost"].endswith("--zero-motors")
     assert service["ExecStart"].split(" --zero")[0] == service["ExecStopPost"].split(" --zero")[0]
-    assert float(service["TimeoutStopSec"]) > 2, "the driver may take 2 s to bring the wheels to zero"
+    assert float(service["TimeoutStopSec"]) > ENDS_WITHIN_US / 1e6, "the guardian waits so long for the driver process"
+    assert int(service["LimitRTPRIO"]) >= GUARDIAN_PRIORITY > DRIVER_PRIORITY
 
 
 def test_the_guardian_feeds_the_watchdog_only_while_heartbeats_arrive(tmp_path, monkeypatch):
