@@ -16,6 +16,7 @@ NAMED = re.compile(r"\[`([^`\]]+)`\]\(([^)\s]+)\)")
 HAZARDS = ROOT / "docs/explanation/hazards.md"
 PROMISING = {
     "README.md": ("How it works",),
+    "README.zh-CN.md": ("工作原理",),
     "SECURITY.md": ("What counts",),
     "docs/explanation/safety.md": (
         "Safety: what stops the robot", "The bounds, with the default configuration", "Two processes",
@@ -25,8 +26,9 @@ PROMISING = {
 }
 NO_PROMISE = (
     # introductions, and what is stated to be not covered
-    "The robot streams JPEG images.", "A dead driver process leaves", "Sightline makes two promises", "[Safety limits]",
-    "These are security problems", "STOP also comes by", "Without keys a peer can open", "The [security model]",
+    "The robot streams JPEG images.", "A dead driver process leaves", "机器人发送 JPEG 图像流。", "如果驱动进程本身",
+    "Sightline makes two promises", "[Safety limits]", "STOP also comes by", "Without keys a peer can open",
+    "These are security problems", "The [security model]",
     # rows of a table whose introduction names the tests
     "| a frame that the robot did not issue", "| a frame of an earlier start", "| a frame over the age limit",
     "| a frame from the future", "| a frame correctly",

@@ -14,7 +14,7 @@ Promises without a number keep the others from being true of a robot that never 
 import math
 
 from sightline.protocol.messages import State, Verb
-from tests.exploration.robot import DRIVERS, FRAMES, HUMAN, LIVE, OLD, SPEEDS, Image, Robot
+from tests.exploration.robot import DRIVERS, FRAMES, HUMAN, LIVE, OLD, SPEEDS, THIEF, Image, Robot
 
 RANK = {"vision": 1, "teleop": 2}
 LEASE, SILENCE, STALE, FULL_SPEED_TICKS, ZERO_SPEED, HOLD = 10, 3, 4, 1.5, 4, 10  # ticks; HOLD as configured
@@ -53,7 +53,7 @@ class Promises:
         self.frozen = False  # the newest frame came long after it
         self.started = 0
         self.ended = FRAMES  # ticks since the newest STOP, disarm, fault or loss of the human
-        self.seen = (False,) * len(DRIVERS)
+        self.seen = (False,) * THIEF
         self.holder, self.left, self.live = NOBODY, 0, 0
         self.command = (NOBODY, NOBODY, NOBODY)  # age of the image, age of the arrival, driver
         self.auto = auto and not stopped
@@ -82,8 +82,19 @@ class Promises:
 
     # --- what happens ----------------------------------------------------------------------------------------------
 
-    def on_twist(self, driver: int, age: int, reason: str, *, fresh: bool = True, real: bool = True) -> None:
-        """A command arrived. `real` citations name a frame as issued; `fresh` numbers are newer than the last."""
+    def on_twist(
+        self, driver: int, age: int, reason: str, *, fresh: bool = True, real: bool = True, proven: bool = True
+    ) -> None:
+        """A command arrived.
+
+        Args:
+            driver: that it names, or the thief with proofs of its own.
+            age: of the cited frame.
+            reason: of its rejection.
+            fresh: its number is newer than the last.
+            real: it names the frame as issued.
+            proven: where drivers prove their identity, its proof is the next one of the driver.
+        """
         valid, image = reason in ("", "DISARMED"), self.images[age]
         if not real or not 0 <= image <= STALE:
             demand(not valid, "1: a command needs a frame that this robot issued lately, by its own record and clock")
@@ -91,6 +102,9 @@ class Promises:
         known, self.seen = self.seen, tuple(was or index == driver for index, was in enumerate(self.seen))
         if not fresh and known[driver]:
             demand(not valid, "2: a command counts once")
+            return
+        if not proven and self._names_holder(driver):
+            demand(not valid, "2: a copied identity proves nothing")
             return
         if self.state in LATCHED:
             demand(not valid, "2: no command has an effect until reset")
@@ -193,6 +207,9 @@ class Promises:
 
     # --- inside ----------------------------------------------------------------------------------------------------
 
+    def _names_holder(self, driver: int) -> bool:
+        return self.holder != NOBODY and DRIVERS[self.holder] == DRIVERS[driver]
+
     def _may_take(self, driver: int) -> bool:
         if driver == NOBODY or self.holder in (NOBODY, driver):
             return driver != NOBODY
@@ -251,11 +268,10 @@ class Promises:
             self.speed_mps = speed_mps
         else:
             demand(speed_mps == before_mps, "2: only a tick moves the wheels")
-        state, holder = gate.state, gate.holder(robot.now_us)
-        if state is not self.state:
-            self._check_state(state)
-        promised = None if self.holder == NOBODY else DRIVERS[self.holder]
-        demand(holder == promised, f"2: the lease belongs to {promised.source if promised else 'no driver'}")
+        if gate.state is not self.state:
+            self._check_state(gate.state)
+        promised = "no driver" if self.holder == NOBODY else DRIVERS[self.holder].source
+        demand(robot.holder() == self.holder, f"2: the lease belongs to {promised}")
 
     def _check_wheels(self, before_mps: float, speed_mps: float) -> None:
         """Check a tick: the wheels approach what is permitted, without going beyond it, and stop in time."""

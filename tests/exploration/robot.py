@@ -8,16 +8,19 @@ import tempfile
 from collections import OrderedDict
 from enum import Enum
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 
 from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import STILL, AnswerHeader, Echo, Holder, Request, RequestHeader, State, Twist, Verb
+from sightline.protocol.proof import NO_PROOF, Proof
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver import core as driver_core
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from sightline.robot_side.safety import gate as safety_gate
+from sightline.robot_side.safety import lease as safety_lease
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.robot_side.safety.validation import AcceptedCommand
 
@@ -32,8 +35,10 @@ VISION, SECOND, HUMAN = (
     _holder(source="vision", session="0000cccc"),
     _holder(source="teleop", session="0000dddd"),
 )
-DRIVERS = (VISION, SECOND, HUMAN)
-_SENDERS = tuple((who.source, who.session) for who in DRIVERS)
+DRIVERS = (VISION, SECOND, HUMAN, VISION)
+"""The last one is a thief: a peer that copied the session of the first."""
+THIEF = 3
+_SENDERS = tuple((who.source, who.session) for who in DRIVERS[:THIEF])
 _PLACE = {sender: place for place, sender in enumerate(_SENDERS)}
 OPERATOR = _holder(source="operator", session="0000ffff")
 SPEEDS = {VISION: 0.5, SECOND: 0.5, HUMAN: -0.5}
@@ -44,6 +49,8 @@ OLD = FRAMES - 1  # an image of this age or above is stale
 STATUSES = (0, 2, 21)
 """Ages of the statuses that an operator cites; the last one is too old for any request."""
 LIVE = 2
+PLAIN, AUTO, KEYS = range(3)
+"""Configurations: an operator arms; the robot arms itself; an operator arms, and drivers prove their identity."""
 SAFETY = {"live_commands_to_arm": LIVE, "disarm_after_hold_s": 1}
 HELD = 11  # ticks in HOLD until it ends
 RECORD_FIELDS = 2 * FRAMES + 4
@@ -64,11 +71,26 @@ def _config(auto_arm: bool) -> RobotConfig:
     return RobotConfig(camera=none, drive=none, safety=SafetyConfig(**SAFETY, auto_arm=auto_arm))
 
 
-CONFIGS = (_config(False), _config(True))
+CONFIGS = (_config(False), _config(True), _config(False))
+
+
+def _chain(secret: bytes) -> tuple[str, ...]:
+    """Return the end of a chain of proofs: an old one, the last accepted one, and the next one (clause 6.6)."""
+    elements = [secret]
+    while len(elements) < 3:
+        elements.append(sha256(elements[-1]).digest()[:16])
+    return tuple(element.hex() for element in reversed(elements))
+
+
+CHAINS = tuple(_chain(bytes(15) + bytes([driver])) for driver in range(len(DRIVERS)))
+"""Each state has the proofs of the same three commands, since a proof counts only by those before it."""
+OLD_PROOF, LAST_PROOF, NEXT_PROOF = range(3)
+_OWNER = {proof: driver for driver, chain in enumerate(CHAINS) for proof in chain}
 
 # All of these are pure, and the same arguments come in many states. Without this most of the time is spent in them.
 driver_core.decode = cache(driver_core.decode)
 driver_core.parse_twist = cache(driver_core.parse_twist)
+safety_lease.continues = cache(safety_lease.continues)
 safety_gate.LastRejection = cache(safety_gate.LastRejection)
 safety_gate.Holder = driver_core.Holder = _holder
 Holder.__eq__ = object.__eq__  # of each value there is one
@@ -97,9 +119,10 @@ class _Ramp(safety_gate.Ramp):
 class _Core(driver_core.DriverCore):
     """The core, without its replies and with a ramp of short memory."""
 
-    def __init__(self, config: RobotConfig, *, stopped: bool) -> None:
-        super().__init__(config, ROBOT, stopped=stopped)
-        self.gate._ramp = _Ramp(config.safety)
+    def __init__(self, mode: int, *, stopped: bool) -> None:
+        super().__init__(CONFIGS[mode], ROBOT, stopped=stopped)
+        self.gate._ramp = _Ramp(CONFIGS[mode].safety)
+        self.gate._needs_proof = mode == KEYS
 
     def _post(self, *_reply: object) -> None:
         pass
@@ -125,26 +148,26 @@ class Robot:
     """One robot whose state can be replaced."""
 
     def __init__(self) -> None:
-        self._cores = [_Core(config, stopped=False) for config in CONFIGS]
+        self._cores = [_Core(mode, stopped=False) for mode in range(len(CONFIGS))]
         self._after_write = latch_on_disk()
-        self._starts = {(auto, disk): self._start(auto, disk) for auto in range(2) for disk in range(2)}
+        self._starts = {(mode, disk): self._start(mode, disk) for mode in range(len(CONFIGS)) for disk in range(2)}
         self.start(0, 0)
 
-    def _start(self, auto: int, disk: int) -> tuple[float, ...]:
+    def _start(self, mode: int, disk: int) -> tuple[float, ...]:
         """Return the state after a start of the driver process, with motors at zero, as the guardian leaves them."""
-        self._auto, self._disk, self._started, self.now_us = auto, disk, 0, NOW_US
-        self.core = _Core(CONFIGS[auto], stopped=bool(disk))
+        self._mode, self._disk, self._started, self.now_us = mode, disk, 0, NOW_US
+        self.core = _Core(mode, stopped=bool(disk))
         self.gate = self.core.gate
         self.core.tick(self.now_us, None, None)
         self.gate.issued.add("status", NOW_SEQ, self.now_us)
         self._images = Image.LAST.value, Image.PREVIOUS.value
         self._record: tuple[int, ...] | None = None
-        self._numbers = _seen(False, False, False)
+        self._numbers, self._proof = _seen(False, False, False), NO_PROOF
         return self.save()
 
-    def start(self, auto: int, disk: int) -> None:
+    def start(self, mode: int, disk: int) -> None:
         """Start the driver process, with what is on the disk."""
-        self.load(self._starts[auto, disk])
+        self.load(self._starts[mode, disk])
 
     # --- states ----------------------------------------------------------------------------------------------------
 
@@ -152,9 +175,7 @@ class Robot:
         """Return everything that decides the future of this robot."""
         gate, now_us = self.gate, self.now_us
         lease, command, sequence, axis, held = gate._lease, gate._command, gate._sequence, gate._ramp._linear, 0
-        holder, echo, arrival, commanded = -1, -1, -1, 0.0
-        if lease.holder is not None:
-            holder = _PLACE[lease.holder.source, lease.holder.session]
+        echo, arrival, commanded = -1, -1, 0.0
         if command is not None:
             echo, arrival = _age(command.echo_us, now_us), min((now_us - command.arrival_us) // TICK_US, 4)
             commanded = command.twist.linear_mps
@@ -163,12 +184,12 @@ class Robot:
         newest = NOW_SEQ + (now_us - NOW_US) // TICK_US
         return (
             *(self._record or self._save_record()),
-            self._auto,
+            self._mode,
             self._disk,
             min(self._started, STATUSES[1]),
             _STATE_INDEX[gate.state],
             *[key in sequence._drivers or key in sequence._others for key in _SENDERS],
-            holder,
+            self._holder(),
             max(0, (lease.expires_us - now_us) // TICK_US),
             min(gate._live_commands, LIVE),
             _denied(newest - gate.issued._denied_seq),
@@ -181,6 +202,18 @@ class Robot:
             axis.speed,
             axis._acceleration,
         )
+
+    def _holder(self) -> int:
+        """Return the driver of the lease, which may have ended, or -1. A thief differs from the first by its proofs."""
+        lease = self.gate._lease
+        if lease.holder is None:
+            return -1
+        place = _PLACE[lease.holder.source, lease.holder.session]
+        return place if lease.proof.proof is None else _OWNER[lease.proof.proof]
+
+    def holder(self) -> int:
+        """Return the driver that holds the lease, or -1."""
+        return -1 if self.gate.holder(self.now_us) is None else self._holder()
 
     def _save_record(self) -> tuple[int, ...]:
         """Return the frames and images."""
@@ -200,19 +233,19 @@ class Robot:
         """Put the robot into a state of `save`."""
         self._record = saved = state[:RECORD_FIELDS]
         (
-            self._auto, self._disk, self._started, state_index, *seen, holder, left, live, denied, arms_itself, held,
+            self._mode, self._disk, self._started, state_index, *seen, holder, left, live, denied, arms_itself, held,
             echo, arrival, commanded, applied, speed, acceleration,
         ) = state[RECORD_FIELDS:]  # fmt: skip
         self.now_us, self._images = NOW_US, (1, 2)
-        self.core = core = self._cores[self._auto]
+        self.core = core = self._cores[self._mode]
         self.gate = gate = core.gate
         record, pictures, lease, axis = gate.issued, gate.pictures, gate._lease, gate._ramp._linear
         frames, pictures._shown_us, pictures._first_us, pictures._newest_us, pictures._changed_us = _load_record(saved)
         record._times = {"frame": frames, "status": _statuses(self._started)}
         record._denied_seq = NOW_SEQ - denied
         self._numbers = _seen(*seen)
-        gate._sequence._drivers = self._numbers.copy()
-        gate._sequence._others = OrderedDict()
+        self._proof = Proof(CHAINS[holder][LAST_PROOF]) if self._mode == KEYS and holder >= 0 else NO_PROOF
+        self._forget()
         lease.holder = None if holder < 0 else DRIVERS[holder]
         lease.expires_us = NOW_US + left * TICK_US
         gate.state = STATES[state_index]
@@ -224,11 +257,17 @@ class Robot:
         gate.applied = _twist(applied)
         axis.speed, axis._acceleration = speed, acceleration
 
+    def _forget(self) -> None:
+        """Forget the number and the proof of a message before, that led to the same state and was not undone."""
+        sequence = self.gate._sequence
+        sequence._drivers, sequence._others = self._numbers.copy(), OrderedDict()
+        self.gate._lease.proof = self._proof
+
     # --- what happens ----------------------------------------------------------------------------------------------
 
     def restart(self) -> None:
         """Kill the driver process, and start it with what is on the disk."""
-        self.start(self._auto, self._disk)
+        self.start(self._mode, self._disk)
 
     def tick(self, image: Image) -> None:
         """Let one tick pass; the robot publishes a frame and a status."""
@@ -245,23 +284,25 @@ class Robot:
         record.add("status", NOW_SEQ + 1, self.now_us)
         self._started += 1
 
-    def twist(self, who: Holder, age: int, seq: int, session: str = ROBOT, shift_us: int = 0) -> str:
+    def twist(
+        self, who: Holder, age: int, seq: int, session: str = ROBOT, shift_us: int = 0, proof: str | None = None
+    ) -> str:
         """Deliver a command; return the reason of its rejection, or an empty string."""
         gate = self.gate
-        # A command that changed nothing else, and was not undone by `load`, has left its number there.
-        gate._sequence._drivers, gate._sequence._others = self._numbers.copy(), OrderedDict()
+        self._forget()
         accepted, gate.last_rejection = gate.accepted, None
-        self.core.on_twist(_twist_message(who, age, seq, session, shift_us), NOW_US)
+        self.core.on_twist(_twist_message(who, age, seq, session, shift_us, proof), NOW_US)
         if gate.accepted > accepted:
             return ""
         assert gate.last_rejection is not None
         return gate.last_rejection.reason
 
-    def request(self, who: Holder, verb: Verb, age: int) -> str:
+    def request(self, who: Holder, verb: Verb, age: int, proof: str | None = None) -> str:
         """Deliver a request; return the reason of its rejection, or an empty string."""
         gate = self.gate
+        self._forget()
         gate.last_rejection = None
-        self.core.on_request(_request_message(who, verb, age), NOW_US)
+        self.core.on_request(_request_message(who, verb, age, proof), NOW_US)
         return gate.last_rejection.reason if gate.last_rejection else ""
 
     def fault(self) -> None:
@@ -323,16 +364,16 @@ def _twist(speed: float) -> Twist:
 
 
 @cache
-def _twist_message(who: Holder, age: int, seq: int, session: str, shift_us: int) -> Message:
+def _twist_message(who: Holder, age: int, seq: int, session: str, shift_us: int, proof: str | None) -> Message:
     echo = Echo(channel="frame", session=session, seq=NOW_SEQ - age, t_us=NOW_US - age * TICK_US + shift_us)
-    header = AnswerHeader(source=who.source, session=who.session, seq=seq, echo=echo)
+    header = AnswerHeader(source=who.source, session=who.session, seq=seq, echo=echo, proof=proof)
     return Message(TWIST, who.source, encode(header), f"{SPEEDS[who]}|0".encode())
 
 
 @cache
-def _request_message(who: Holder, verb: Verb, age: int) -> Message:
+def _request_message(who: Holder, verb: Verb, age: int, proof: str | None) -> Message:
     echo = Echo(channel="status", session=ROBOT, seq=NOW_SEQ - age, t_us=NOW_US - age * TICK_US)
-    header = RequestHeader(source=who.source, session=who.session, seq=1, echo=echo)
+    header = RequestHeader(source=who.source, session=who.session, seq=1, echo=echo, proof=proof)
     return Message(REQUEST, who.source, encode(header), encode(Request(id=1, verb=verb)))
 
 

@@ -12,14 +12,21 @@ from functools import cache, partial
 from sightline.protocol.messages import Holder, Verb
 from tests.exploration.promises import NOBODY, BrokenError, Promises
 from tests.exploration.robot import (
-    CONFIGS,
+    AUTO,
+    CHAINS,
     DRIVERS,
     EARLIER,
     HUMAN,
+    KEYS,
+    LAST_PROOF,
+    NEXT_PROOF,
+    OLD_PROOF,
     OPERATOR,
+    PLAIN,
     ROBOT,
     ROBOT_FIELDS,
     SECOND,
+    THIEF,
     VISION,
     Image,
     Robot,
@@ -27,7 +34,6 @@ from tests.exploration.robot import (
 
 _NAMES = {VISION: "vision", SECOND: "a second vision service", HUMAN: "teleop", OPERATOR: "an operator"}
 _CHUNK = 500  # states that a process expands at once
-_AUTO = tuple(config.safety.auto_arm for config in CONFIGS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +87,28 @@ def _request(who: Holder, verb: Verb, age: int = 0) -> Event:
     return Event(f"{_NAMES[who]}: {verb}{when} arrives", happen, possible)
 
 
+def _proof_twist(driver: int, words: str, proof: str | None, *, proven: bool = True) -> Event:
+    """`driver` sends the command, or, where it is `NOBODY`, a peer that must never drive."""
+    who = VISION if driver == NOBODY else DRIVERS[driver]
+
+    def happen(robot: Robot, promises: Promises) -> None:
+        reason = robot.twist(who, 0, 1, proof=proof)
+        promises.on_twist(driver, 0, reason, proven=proven)
+
+    return Event(f"a command {words} arrives", happen, lambda promises: promises.images[0] >= 0)
+
+
+def _proof_request(driver: int, verb: Verb, words: str, proof: str | None) -> Event:
+    """`driver` sends the request, or, where it is `NOBODY`, a peer with a proof that proves nothing."""
+    who = VISION if driver == NOBODY else DRIVERS[driver]
+
+    def happen(robot: Robot, promises: Promises) -> None:
+        reason = robot.request(who, verb, 0, proof)
+        promises.on_request(driver, verb, 0, reason, False)
+
+    return Event(f"{verb} {words} arrives", happen)
+
+
 def _restart(robot: Robot, promises: Promises) -> None:
     robot.restart()
     promises.on_restart(robot.core.config.safety.auto_arm)
@@ -116,7 +144,24 @@ HUMAN_ARM = _request(HUMAN, Verb.ARM)
 RESTART = Event("the driver process is killed and starts again", _restart)
 WRITE = Event("the disk stores the latch", _write)
 FAULT = Event("the drive fails", _fault)
-V, S, H = (_twist(who, 0) for who in DRIVERS)
+V, S, H = (_twist(who, 0) for who in DRIVERS[:THIEF])
+
+VISION_PROOFS, HUMAN_PROOFS, THIEF_PROOFS = (CHAINS[driver] for driver in (0, 2, THIEF))
+IDENTITY = (
+    _proof_twist(0, "of vision, with its next proof,", VISION_PROOFS[NEXT_PROOF]),
+    _proof_twist(2, "of teleop, with its next proof,", HUMAN_PROOFS[NEXT_PROOF]),
+    _proof_twist(THIEF, "of a thief, with proofs of its own,", THIEF_PROOFS[NEXT_PROOF]),
+    _proof_twist(0, "of a thief, with vision's last proof,", VISION_PROOFS[LAST_PROOF], proven=False),
+    _proof_twist(NOBODY, "of a thief, without a proof,", None),
+    _proof_request(0, Verb.ACQUIRE, "of vision, with its next proof,", VISION_PROOFS[NEXT_PROOF]),
+    _proof_request(0, Verb.RELEASE, "of vision, with its next proof,", VISION_PROOFS[NEXT_PROOF]),
+    _proof_request(2, Verb.RELEASE, "of teleop, with its next proof,", HUMAN_PROOFS[NEXT_PROOF]),
+    _proof_request(THIEF, Verb.ACQUIRE, "of a thief, with proofs of its own,", THIEF_PROOFS[NEXT_PROOF]),
+    _proof_request(THIEF, Verb.RELEASE, "of a thief, with proofs of its own,", THIEF_PROOFS[NEXT_PROOF]),
+    _proof_request(NOBODY, Verb.RELEASE, "of a thief, with vision's last proof,", VISION_PROOFS[LAST_PROOF]),
+    _proof_request(NOBODY, Verb.RELEASE, "of a thief, with an old proof of vision,", VISION_PROOFS[OLD_PROOF]),
+    _proof_request(NOBODY, Verb.RELEASE, "of a thief, without a proof,", None),
+)
 
 LIFE = (
     NEW, V, NEW, V, ARM, V, NEW, V, NEW, V, NEW, V, NEW, V,  # vision drives at top speed
@@ -133,26 +178,27 @@ class Part:
 
     Args:
         events: what may happen in each state.
-        auto_arm: configurations to begin with.
+        modes: configurations to begin with.
         life: events that lead to more states to begin with.
         most: number of states after which it ends.
     """
 
     events: tuple[Event, ...]
-    auto_arm: tuple[bool, ...] = (False, True)
+    modes: tuple[int, ...] = (PLAIN, AUTO)
     life: tuple[Event, ...] = ()
-    most: int = 150_000
+    most: int = 100_000
 
 
 PARTS = {
     "all": Part((
         NEW, *IMAGES, *(_twist(VISION, age) for age in (2, 4, 5)), V, S, H, _twist(HUMAN, 2), *FORGED,
         STOP, DISARM, ARM, RESET, HUMAN_ARM, *LATE, *LEASE, RESTART, WRITE, FAULT,
-    ), life=LIFE, most=700_000),
+    ), life=LIFE, most=600_000),
     "loss": Part((NEW, V, S, H, ARM)),
-    "lease": Part((NEW, V, S, H, STOP, ARM, RESET, *LEASE), auto_arm=(False,)),
+    "lease": Part((NEW, V, S, H, STOP, ARM, RESET, *LEASE), modes=(PLAIN,)),
     "latch": Part((NEW, V, H, STOP, DISARM, ARM, RESET, *LATE, RESTART, WRITE, FAULT)),
-    "images": Part((NEW, *IMAGES[:2], V, *(_twist(VISION, age) for age in (2, 4, 5)), ARM), auto_arm=(False,)),
+    "identity": Part((NEW, *IDENTITY, STOP, ARM, RESET), modes=(KEYS,)),
+    "images": Part((NEW, *IMAGES[:2], V, *(_twist(VISION, age) for age in (2, 4, 5)), ARM), modes=(PLAIN,)),
 }
 """The first has each event, for a few events from each state of a life. The others have fewer, and go deeper."""
 
@@ -188,10 +234,10 @@ class Explorer:
 
     def roots(self, *, pack: bool = True) -> Iterator[bytes]:
         """Yield the states after each kind of start."""
-        for auto in self._part.auto_arm:
+        for mode in self._part.modes:
             for stopped in (False, True):
-                self._robot.start(_AUTO.index(auto), int(stopped))
-                self._promises.begin(auto=auto, stopped=stopped)
+                self._robot.start(mode, int(stopped))
+                self._promises.begin(auto=mode == AUTO, stopped=stopped)
                 state = self._robot.save() + self._promises.save()
                 yield self._packed.pack(*state) if pack else state
 
