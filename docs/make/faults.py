@@ -87,21 +87,22 @@ def report_page(record: Record) -> str:
         "",
         *(f"- {line}" for line in [*record["machine"], *again]),
         "",
-        f"| fault | required | worst of {max(row['runs'] for row in record['rows'])} | pass |",
-        "|---|---|---|---|",
+        f"| row | fault | required | worst of {max(row['runs'] for row in record['rows'])} | pass |",
+        "|---|---|---|---|---|",
         *(_table_row(row, _checks(record, row)) for row in record["rows"]),
         "",
     ])
 
 
 def _table_row(row: Record, checks: Iterable[Record]) -> str:
+    name = f"| `{row['id']}` | {row['what']} | {row['demanded']} |"
     if row["skipped"]:
-        return f"| {row['what']} | {row['demanded']} | {row['skipped']} | not run |"
+        return f"{name} {row['skipped']} | not run |"
     shown = [figure_text(one["name"], one["value"], one["unit"]) for one in checks
              if not one["ok"] or one["name"] not in _SHOWN_IF_WRONG]
     trouble = [row["trouble"]] if row["trouble"] else []
     figures, passed = ", ".join([*trouble, *shown]), "yes" if row["ok"] else "**no**"
-    return f"| {row['what']} | {row['demanded']} | {figures} | {passed} |"
+    return f"{name} {figures} | {passed} |"
 
 
 def safety_page(page: str, record: Record) -> str:

@@ -63,6 +63,7 @@ def test_the_report_has_a_row_for_each_fault_and_counts_rows_that_ran():
     assert "2 of 4 rows passed" in text and "| worst of 2 |" in text
     assert "| injected 1 times, falls 150 ms, zero 560 ms, distance 0.19 m, memory 0.1 MB | yes |" in text
     assert "zero never ms" in text and "| needs root | not run |" in text
+    assert "| `vision.SIGKILL` | vision: SIGKILL |" in text and "| `network.cut` | network: cut |" in text
     assert "exit code" not in report_page(record(row("a: b", USUAL, **{"exit code": 0})))
     assert "inconclusive, exit code 1 | **no** |" in report_page(
         record(row("a: b", USUAL, ok=False, trouble="inconclusive", **{"exit code": 1})))
@@ -79,9 +80,9 @@ def test_rows_that_ran_again_replace_their_own_and_no_others():
     old = record(row("a: 1", "stop", falls=1), row("b: 1", "stop", ok=False, falls=9), row("c: 1", "stop", falls=1))
     report = report_page(merged(old, record(row("b: 1", "stop", falls=2), command="sightline faults --only b")))
     assert "3 of 3 rows passed" in report and "Written by `sightline faults --repeat 2`" in report
-    assert "- run again by `sightline faults --only b`: b: 1\n\n| fault" in report
+    assert "- run again by `sightline faults --only b`: b: 1\n\n| row | fault" in report
     lines = [line for line in report.splitlines() if "stop" in line and line.startswith("| ")]
-    assert [line.split(" | ")[0] for line in lines] == ["| a: 1", "| b: 1", "| c: 1"]
+    assert [line.split(" | ")[1] for line in lines] == ["a: 1", "b: 1", "c: 1"]
     assert "falls 2 ms" in report and "falls 9 ms" not in report
 
 
