@@ -33,7 +33,7 @@ def found(bug: Bug, part: str) -> list[str]:
             from tests.exploration.search import explore
 
             result = explore(part, _STATES)
-            Path(report.name).write_text("\n".join([result.promise, *result.words, str(result.states)]))
+            Path(report.name).write_text("\n".join([result.promise, *result.words, str(len(result.states))]))
             return 0
 
         os.waitpid(fork(run, bug.file, _CPU_SECONDS), 0)

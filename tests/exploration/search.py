@@ -3,7 +3,7 @@
 import array
 import multiprocessing
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, KeysView
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -193,7 +193,7 @@ PARTS = {
     "all": Part((
         NEW, *IMAGES, *(_twist(VISION, age) for age in (2, 4, 5)), V, S, H, _twist(HUMAN, 2), *FORGED,
         STOP, DISARM, ARM, RESET, HUMAN_ARM, *LATE, *LEASE, RESTART, WRITE, FAULT,
-    ), life=LIFE, most=600_000),
+    ), life=LIFE, most=700_000),
     "loss": Part((NEW, V, S, H, ARM)),
     "lease": Part((NEW, V, S, H, STOP, ARM, RESET, *LEASE), modes=(PLAIN,)),
     "latch": Part((NEW, V, H, STOP, DISARM, ARM, RESET, *LATE, RESTART, WRITE, FAULT)),
@@ -208,14 +208,14 @@ class Found:
     """The result.
 
     Args:
-        states: their number.
+        states: all of them, packed.
         all_of_them: True if no event leads to another state.
         depth: number of events, from a first state, whose orders were all explored.
         promise: that breaks; empty if none does.
         words: the events that lead there.
     """
 
-    states: int
+    states: KeysView[bytes]
     all_of_them: bool
     depth: int
     promise: str
@@ -360,4 +360,4 @@ def explore(part: str, most: int, jobs: int = 1) -> Found:
             begin += len(frontier)
             frontier = following
     promise = known.violation[2] if known.violation else ""
-    return Found(len(known.states), not frontier and not promise, depth, promise, known.words())
+    return Found(known.states.keys(), not frontier and not promise, depth, promise, known.words())
