@@ -150,6 +150,14 @@ class Pipeline:
         if self.mission.needs_camera:
             self._mission_switch = MissionSwitch(self.mission, camera)
 
+    def fits(self, jpeg: bytes) -> bool:
+        """Return True if an image has the size of the camera model. Does not decode."""
+        try:
+            self._decoder.check(jpeg)
+        except WireError:
+            return False
+        return True
+
     def step(self, frame: Frame) -> PipelineAnswer:
         """Answer one frame. Never raises for any JPEG bytes.
 

@@ -242,6 +242,8 @@ class Service:
             self._wait_for_camera(message.payload)
             self._publish(header, PipelineAnswer(None, Observation("no image", note="no camera model yet")), 0)
             return
+        if not self._pipeline.fits(message.payload):
+            self._look_at_camera()  # the robot publishes the model of a new size before its first image
         self._mission_channel.prepare(self._pipeline, header)
         deadline_us = monotonic_us() + round(self._config.detector.deadline_s * 1e6)
         answer = self._pipeline.step(Frame(header, message.payload, deadline_us))

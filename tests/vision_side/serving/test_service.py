@@ -118,6 +118,20 @@ def test_another_camera_is_taken_over(bench: Bench) -> None:
     assert any("640x480" in line for line in bench.said)
 
 
+@pytest.mark.parametrize("size_px", [(640, 480), (160, 120)])
+def test_first_image_of_another_size_is_answered_by_a_twist(bench: Bench, size_px: tuple[int, int]) -> None:
+    """Its camera model was published before it, and both wait in the slots of the vision service."""
+    bench.camera()
+    bench.frame(BALL, 1)
+    bench.twists.take()
+    other = camera(*size_px)
+    bench.robot.publish(CAMERA, encode(Stamp(session="0000abcd", seq=2, t_us=bench.now_us)), encode(other))
+    bench.frame(jpeg_of(scene(other, 1.0, 0.2)), 2)
+    message = bench.twists.take()
+    assert message is not None and decode(AnswerHeader, message.header).echo.seq == 2
+    assert not bench.service.skipped
+
+
 def test_lines_are_logged_per_change_and_never_per_frame(bench: Bench) -> None:
     bench.camera()
     for seq in range(1, 50):
