@@ -104,6 +104,11 @@ class CongestionWindow:
         """Return the delay of the link without a queue, or None before the first measurement."""
         return min(self._alone_us, default=None)
 
+    def is_floor(self, delay_us: int, jitter_us: float) -> bool:
+        """Return True for the delay of a link without a queue."""
+        own_us = self.own_delay_us
+        return own_us is not None and delay_us <= own_us + _slack_us(own_us) + jitter_us
+
     def on_answer(self, answered: AckSample, now_us: int) -> LinkCapacity | None:
         """Adapt the window to an answer.
 

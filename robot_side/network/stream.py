@@ -4,6 +4,15 @@ A frame is captured only with credit, so that it is young when it leaves and no 
 rejected twist, or an ack) returns credit. The window starts at one frame in flight, and widens only for the delay of
 the link (`congestion_window`), never for a slow detector. With an 80 ms detector, one frame in flight is 81-83 ms old,
 and two are 141-175 ms old. On a slow link the images become smaller (`bitrate_control`).
+
+Loss is not a queue. Frames without an answer between two answers at floor delay are lost. Such losses, and as many in a
+row as they explain, change nothing: the stream continues at its rate. A queue delays the answers, and an outage lasts
+longer. Then the stream slows down.
+
+Source: BBR (Linux, `net/ipv4/tcp_bbr.c`): the lowest recent delay is the path's own, the data in flight follows from
+it, and a loss is not a signal. WebRTC (draft-ietf-rmcat-gcc-02): a growing delay lowers the rate. Loss has a controller
+of its own there, which a few percent do not trigger. Here no share of loss triggers it, because a slower stream loses
+the same share. Both sources wait for answers. Here a silence decides too, because a robot without commands must stop.
 """
 
 from collections import OrderedDict, deque
@@ -23,6 +32,14 @@ _TIMEOUT_SLACK_US = 12_000  # with a quick peer, below one interval at 30 fps: a
 _PENDING_US = 1_000_000  # a frame that is neither answered nor overtaken for this long was lost
 # One overdue answer can be a loss. A second one, of a frame that was sent after the first timeout, is a queue.
 _OVERDUE_IN_A_ROW = 2
+# Time without a loss after which the link counts as one without losses again.
+_LOSS_MEMORY_US = 30_000_000
+# Weight of the earlier losses at each new one. The last fifty decide.
+_LOSS_WEIGHT = 0.98
+# Loss explains a silence that happens at least once in so many losses. Otherwise it is a queue or an outage.
+_LOSSES_PER_SILENCE = 10_000
+# A longer silence is an outage. The robot holds after the same time without a command.
+_LONGEST_LOSS_US = 300_000
 
 
 class StreamConfig(Config):
@@ -49,6 +66,49 @@ class _Sent:
     followed: bool = False
 
 
+class LossRecord:
+    """Counts the frames that the link lost, and separates them from frames that wait in a queue."""
+
+    def __init__(self) -> None:
+        self._at_floor = False
+        self._until_us = 0
+        # Sums over the runs of lost frames, the newest with weight 1.
+        self._frames, self._runs = 0.5, 0.0
+
+    def add(self, lost: int, at_floor: bool, silence_us: int, now_us: int) -> None:
+        """Note an answer.
+
+        Args:
+            lost: number of older frames without an answer.
+            at_floor: True if the answer took the delay of a link without a queue.
+            silence_us: time since the answer before it.
+            now_us: monotonic clock.
+        """
+        was_at_floor, self._at_floor = self._at_floor, at_floor
+        if lost and was_at_floor and at_floor and silence_us <= _LONGEST_LOSS_US:
+            self._frames = _LOSS_WEIGHT * self._frames + lost
+            self._runs = _LOSS_WEIGHT * self._runs + 1
+            self._until_us = now_us + _LOSS_MEMORY_US
+
+    def is_recent(self, now_us: int) -> bool:
+        """Return True if the link lost frames recently, and has no queue now."""
+        return self._at_floor and now_us < self._until_us
+
+    def explains(self, overdue: int, silence_us: int, now_us: int) -> bool:
+        """Return True if so many frames without an answer are no more than the link loses in a row.
+
+        Args:
+            overdue: frames whose answer is overdue, since the last answer.
+            silence_us: time since the last answer.
+            now_us: monotonic clock.
+        """
+        if not self.is_recent(now_us):
+            return False
+        # The share of lost frames of which the next one was lost too.
+        again = 1 - self._runs / self._frames
+        return silence_us <= _LONGEST_LOSS_US and again**overdue * _LOSSES_PER_SILENCE >= 1
+
+
 class Stream:
     """Controls the flow of one camera. The caller checks `may_capture`, and calls `on_sent` and `on_answer`."""
 
@@ -66,6 +126,7 @@ class Stream:
         self._answered_at_us = 0
         self._overdue = self._overdue_at_us = 0
         self._may_probe = False
+        self._losses = LossRecord()
         self._held_back = False
         self._next_us = 0
         self.sent = self.credit_timeouts = self.overtaken = 0
@@ -114,7 +175,7 @@ class Stream:
             now_us: monotonic clock.
             size_bytes: size of the JPEG, or 0 if unknown.
         """
-        self._in_flight[seq] = now_us + self._timeout_us()
+        self._in_flight[seq] = now_us + self._timeout_us(now_us)
         self._may_probe = False
         pending = [one for one in self._sent_frames.values() if now_us - one.at_us <= _PENDING_US]
         for one in pending:
@@ -175,15 +236,18 @@ class Stream:
         """Pass the credit to another peer."""
         # The times and the capacity of the former peer do not apply to a slower successor on another link.
         self._owner = owner
+        self._losses = LossRecord()
         self._answer_us, self._spread_us, self._overdue = None, 0.0, 0
         self._congestion_window = CongestionWindow(self._interval_us, self._config.max_window)
 
     def _measure(self, sent: _Sent, passed: list[_Sent], compute_us: int, now_us: int) -> None:
-        answer_us = now_us - sent.at_us
+        # A negative time would count as a longer link, and widen the window.
+        compute_us, answer_us = max(0, compute_us), max(0, now_us - sent.at_us)
         delay_us = max(0, answer_us - compute_us)
         if self._answer_us is None or answer_us <= self._usual_us():
             self._overdue = self._overdue_at_us = 0
         self._remember_answer(answer_us)
+        silence_us = now_us - self._answered_at_us
         carrying_since_us = max(self._answered_at_us, passed[0].at_us)
         carried = sum(one.size_bytes for one in passed)
         self._answered_at_us = now_us
@@ -192,6 +256,8 @@ class Stream:
             delay_us, sent.behind, sent.followed, sent.held_back, gap_us, len(passed), carried, compute_us
         )
         full = self._congestion_window.on_answer(answered, now_us)
+        at_floor = self._congestion_window.is_floor(delay_us, self._spread_us)
+        self._losses.add(len(passed) - 1, at_floor, silence_us, now_us)
         if full is None:
             self._bitrate_control.on_delay(delay_us, now_us)
         else:
@@ -207,16 +273,20 @@ class Stream:
 
     # --- timeouts ------------------------------------------------------------------------------------------------
 
-    def _timeout_us(self) -> int:
+    def _timeout_us(self, now_us: int) -> int:
         """Return the timeout of the next frame in us."""
-        # It doubles with each further timeout, because a late answer can wait behind the frames in flight.
         longest_us = self._config.max_credit_timeout_ms * 1000
-        return min(longest_us, round(self._usual_us() * (1 << min(max(0, self._overdue - 1), 8))))
+        usual_us = self._usual_us(is_lossy=not self._overdue and self._losses.is_recent(now_us))
+        # It doubles with each further timeout, because a late answer can wait behind the frames in flight.
+        return min(longest_us, round(usual_us * (1 << min(max(0, self._overdue - 1), 8))))
 
-    def _usual_us(self) -> float:
+    def _usual_us(self, *, is_lossy: bool = False) -> float:
         """Return the answer time in us above which a frame is overdue."""
         if self._answer_us is None:
             return float(_FIRST_TIMEOUT_US)
+        if is_lossy:
+            # A lost frame must not hold its credit for longer than an answer takes.
+            return self._answer_us + max(_TIMEOUT_SLACK_US, 2 * self._spread_us)
         patient_us = max(1.5 * self._answer_us, self._answer_us + 4 * self._spread_us)
         return min(patient_us, 2 * self._answer_us) + _TIMEOUT_SLACK_US
 
@@ -229,7 +299,11 @@ class Stream:
         for seq in late:
             del self._in_flight[seq]
             self.credit_timeouts += 1
-        if self._answer_us is not None and any(self._sent_at_us(seq) >= self._overdue_at_us for seq in late):
+        overdue = len(self._sent_frames) - len(self._in_flight)
+        is_loss = self._losses.explains(overdue, now_us - self._answered_at_us, now_us)
+        if is_loss or self._answer_us is None:
+            return
+        if any(self._sent_at_us(seq) >= self._overdue_at_us for seq in late):
             self._overdue += 1
             self._overdue_at_us = now_us
             self._may_probe = True

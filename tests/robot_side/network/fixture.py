@@ -29,10 +29,15 @@ class Leg:
     """(from when, rate)."""
     down_us: tuple[int, int] = (0, 0)
     queue_bytes: int = 300_000
+    gone: float = 0.0
+    """Share of whole messages that never arrive, as without TCP."""
+    gone_in_a_row: float = 1.0
+    """Mean number of those in a row."""
     seed: int = 1
     free_us: float = 0.0
     arrived_us: float = 0.0
     in_burst: bool = False
+    losing: bool = False
     random: Random = field(init=False)
 
     def __post_init__(self):
@@ -54,7 +59,15 @@ class Leg:
             at_us += PACKET_BYTES * 8e6 / rate if rate else 0.0
             self.arrived_us = max(self.arrived_us, at_us + self.delay_us + self.recovery_us(packets - number))
         self.free_us = at_us
-        return self.arrived_us
+        return None if self.gone and self.is_gone() else self.arrived_us
+
+    def is_gone(self):
+        """Gilbert's model, as in `MemoryNetwork`."""
+        if self.gone_in_a_row == 1:
+            return self.random.random() < self.gone
+        enter = self.gone / (self.gone_in_a_row * (1 - self.gone))
+        self.losing = self.random.random() < (1 - 1 / self.gone_in_a_row if self.losing else enter)
+        return self.losing
 
     def after_outage(self, at_us):
         """Sent into a dead link: again and again, twice as late each time, until one try falls behind the outage."""
@@ -122,8 +135,11 @@ class Course:
         return max(b - a for a, b in pairwise(times)) if len(times) > 1 else 1e9
 
 
-def run(out, back, *, seconds=20.0, compute_us=3_000, camera=None, config=None, slot_us=500):
-    """A camera that ticks, the stream, `out` and `back`, and a peer that looks at the newest frame."""
+def run(out, back, *, seconds=20.0, compute_us=3_000, camera=None, config=None, slot_us=500, copies=1):
+    """A camera that ticks, the stream, `out` and `back`, and a peer that looks at the newest frame.
+
+    The peer sends each answer `copies` times.
+    """
     camera, stream = camera or Camera(), Stream(config or StreamConfig())
     events, answers, windows = [], [], []
     state = {"seq": 0, "slot": None, "busy": 0.0, "captures": 0}
@@ -135,9 +151,9 @@ def run(out, back, *, seconds=20.0, compute_us=3_000, camera=None, config=None, 
         if state["slot"] and now >= state["busy"]:
             item, state["slot"] = state["slot"], None
             state["busy"] = now + compute_us
-            at = back.send(100, round(now + compute_us))
-            if at is not None:
-                push(at + slot_us, "answer", item)
+            for at in [back.send(100, round(now + compute_us)) for _ in range(copies)]:
+                if at is not None:
+                    push(at + slot_us, "answer", item)
             push(state["busy"], "look", None)
 
     for tick in range(round(seconds * 1e6 / 1000)):

@@ -9,7 +9,7 @@ from sightline.protocol.messages import Holder
 from sightline.robot_side.network import stream as module
 from sightline.robot_side.network.bitrate_control import EncodingTarget
 from sightline.robot_side.network.congestion_window import AckSample, LinkCapacity
-from sightline.robot_side.network.stream import Stream, StreamConfig
+from sightline.robot_side.network.stream import LossRecord, Stream, StreamConfig
 
 VISION, VIEWER = Holder(source="vision", session="0000bbbb"), Holder(source="viewer", session="0000cccc")
 FIRST_TIMEOUT_US = 120_000
@@ -61,6 +61,7 @@ class NotedWindow:
     def __init__(self, interval_us, most):
         self.given = (interval_us, most)
         self.frames, self.full = 1, None
+        self.floor_us, self.jitters_us = -1, []
         self.answers, self.timeouts = [], []
         NotedWindow.made.append(self)
 
@@ -70,6 +71,10 @@ class NotedWindow:
 
     def on_timeout(self, now_us):
         self.timeouts.append(now_us)
+
+    def is_floor(self, delay_us, jitter_us):
+        self.jitters_us.append(jitter_us)
+        return delay_us <= self.floor_us
 
 
 class NotedBitrate:
@@ -383,6 +388,188 @@ def test_control_of_the_encoding_gets_each_size_and_each_delay_or_the_capacity()
     assert stream._bitrate_control.calls == [
         ("on_sent", 9_000, 500), ("on_delay", 30_000, 40_500), ("on_sent", 0, 50_000), ("on_full", full, 90_000)
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("compute_us", "now_us"), [(-30_000, 40_000), (0, -5_000), (-30_000, -5_000)])
+def test_negative_times_count_as_zero(compute_us, now_us):
+    """A peer that claims them, or a clock that jumped back, would widen the window."""
+    stream = stream_of()
+    stream.on_holder(VISION, 0)
+    stream.on_sent(0, 0, 0)
+    stream.on_answer(VISION, 0, compute_us, now_us)
+    assert (answers(stream)[0][0].delay_us, answers(stream)[0][0].compute_us) == (max(0, now_us), 0)
+    assert timeout_us(stream, 1_000_000) == 12_000 + max(0, now_us) * 3 // 2
+
+
+# --- loss or queue -----------------------------------------------------------------------------------------------
+
+LOSSY_TIMEOUT_US = 52_000
+"""Of a link with losses whose answers take 40 ms: 12 ms more. Without losses it is 72 ms."""
+
+
+def lossy_link(*runs, frames=3, answer_us=40_000, floor_us=1_000_000, **config):
+    """Return a stream whose link lost as many frames in a row as each of `runs`, and the time of its last answer.
+
+    All answers take `answer_us`, at most `floor_us` of which is the link's own delay.
+    """
+    stream = stream_of(frames, max_fps=100, **config)
+    stream.on_holder(VISION, 0)
+    now_us = seq = 0
+    NotedWindow.made[-1].floor_us, NotedWindow.made[-1].frames = floor_us, frames
+    for lost in (0, *(one for run in runs for one in (run, 0))):
+        for _ in range(lost + 1):
+            seq, now_us = seq + 1, now_us + 20_000
+            stream.on_sent(seq, now_us, now_us)
+        now_us += answer_us
+        stream.on_answer(VISION, seq, 0, now_us)
+    return stream, now_us
+
+
+def timeout_of(stream, now_us):
+    """Return the timeout of a frame that is sent now, whatever else is in flight."""
+    stream.on_sent(5_000, now_us, now_us)
+    return stream._in_flight[5_000] - now_us
+
+
+def silent_frames(stream, now_us):
+    """Let answers stop, and return how many frames are overdue when the stream notices it."""
+    for seq in range(10_000, 10_064):
+        stream.on_sent(seq, now_us, now_us)
+        now_us = max(stream._in_flight.values())
+        stream.may_capture(now_us, listening=True)
+        if stream._overdue:
+            return seq - 9_999
+    return None
+
+
+@pytest.mark.parametrize(("runs", "overdue"), [
+    ((), 1),  # nothing was lost before
+    ((1,), 6), ((2,), 6),  # limited by the silence of 300 ms
+    ((1, 1, 1), 5), ([1] * 20, 3), ([1] * 100, 2), ([1, 2] * 20, 6),
+])  # fmt: skip
+def test_silence_that_the_losses_of_the_link_explain_is_not_a_queue(runs, overdue):
+    stream, now_us = lossy_link(*runs)
+    assert silent_frames(stream, now_us) == overdue
+
+
+def test_lost_frame_returns_its_credit_and_changes_nothing_else():
+    stream, now_us = lossy_link(2, 1)
+    window, bitrate = NotedWindow.made[-1], stream._bitrate_control
+    bitrate.calls.clear()
+    for seq in (901, 902, 903):
+        stream.on_sent(seq, now_us, now_us)
+    assert not credit(stream, now_us + LOSSY_TIMEOUT_US - 1)
+    timeouts = stream.credit_timeouts
+    assert credit(stream, now_us + LOSSY_TIMEOUT_US) and stream.credit_timeouts == timeouts + 3
+    for seq in (904, 905, 906):
+        stream.on_sent(seq, now_us + LOSSY_TIMEOUT_US, now_us + LOSSY_TIMEOUT_US)
+        assert credit(stream, now_us + 2 * LOSSY_TIMEOUT_US - 1) is (seq < 906), "as many as the window allows"
+    assert window.timeouts == [] and not [call for call in bitrate.calls if call[0] == "on_overdue"]
+
+
+def test_silence_of_300_ms_is_an_outage():
+    stream, now_us = lossy_link(*[5] * 9)
+    for late_us, overdue in ((300_000, 0), (300_001, 1)):
+        stream.on_sent(900 + overdue, now_us, now_us)
+        stream._in_flight = {900 + overdue: now_us + late_us}
+        stream.may_capture(now_us + late_us, listening=True)
+        assert stream._overdue == overdue
+
+
+@pytest.mark.parametrize(("floors", "lossy"), [((1, 1), True), ((-1, 1), False), ((1, -1), False), ((-1, -1), False)])
+def test_loss_is_proven_by_answers_at_floor_delay_before_and_after_it(floors, lossy):
+    stream = stream_of(max_fps=100)
+    stream.on_holder(VISION, 0)
+    window = NotedWindow.made[-1]
+    for seq, floor in zip((1, 4), floors, strict=True):
+        window.floor_us = floor * 1_000_000
+        stream.on_sent(seq - 1, seq * 50_000, seq * 50_000)
+        stream.on_sent(seq, seq * 50_000, seq * 50_000)
+        stream.on_answer(VISION, seq, 0, seq * 50_000 + 40_000)
+    window.floor_us = 1_000_000
+    for seq in (10, 11):  # two more at floor delay, with nothing lost
+        stream.on_sent(seq, seq * 50_000, seq * 50_000)
+        stream.on_answer(VISION, seq, 0, seq * 50_000 + 40_000)
+    assert timeout_of(stream, 1_000_000) == (LOSSY_TIMEOUT_US if lossy else 72_000)
+
+
+@pytest.mark.parametrize(("silence_us", "lossy"), [(300_000, True), (300_001, False)])
+def test_frames_of_an_outage_prove_no_loss(silence_us, lossy):
+    stream, now_us = lossy_link()
+    for seq in (900, 901):
+        stream.on_sent(seq, now_us, now_us + silence_us - 40_000)
+    stream.on_answer(VISION, 901, 0, now_us + silence_us)
+    assert timeout_of(stream, now_us + 500_000) == (LOSSY_TIMEOUT_US if lossy else 72_000)
+
+
+def test_queue_ends_the_patience_with_losses():
+    stream, now_us = lossy_link(2, 2)
+    NotedWindow.made[-1].floor_us = 39_999
+    stream.on_sent(900, now_us, now_us)
+    stream.on_answer(VISION, 900, 0, now_us + 40_000)
+    assert silent_frames(stream, now_us + 50_000) == 1
+
+
+@pytest.mark.parametrize(("later_us", "lossy"), [(29_999_999, True), (30_000_000, False)])
+def test_losses_are_forgotten_after_30_s_without_one(later_us, lossy):
+    stream, now_us = lossy_link(2)
+    proven_us = now_us - 60_000  # the last frame was answered without a loss
+    assert timeout_of(stream, proven_us + later_us) == (LOSSY_TIMEOUT_US if lossy else 72_000)
+
+
+def record_of(*runs):
+    """Return the record after as many frames were lost in a row as each of `runs`, at 0."""
+    record = LossRecord()
+    for lost in (0, *runs):
+        record.add(lost, at_floor=True, silence_us=0, now_us=0)
+    return record
+
+
+@pytest.mark.parametrize(("runs", "again"), [
+    ((1,), 0.49 / 1.49), ((2,), 1.49 / 2.49), ((2, 1), (0.98 * 1.49) / (0.98 * 2.49 + 1)),
+])  # fmt: skip
+def test_share_of_lost_frames_of_which_the_next_is_lost_too(runs, again):
+    """The newest count most, and the first one is as if half a frame more had been lost."""
+    record = record_of(*runs)
+    for overdue in range(1, 12):
+        assert record.explains(overdue, 0, 0) is (again**overdue >= 1e-4)
+    assert 1 - record._runs / record._frames == pytest.approx(again, rel=1e-12)
+
+
+@pytest.mark.parametrize(("more", "explained"), [(1e-6, True), (-1e-6, False)])
+def test_loss_explains_what_happens_once_in_10_000_losses(more, explained):
+    record = record_of(1)
+    record._frames, record._runs = 1.0, 0.9 - more
+    assert record.explains(4, 0, 0) is explained
+    assert record.explains(3, 0, 0) and not record.explains(5, 0, 0)
+
+
+def test_new_owner_begins_without_losses():
+    stream, now_us = lossy_link(2)
+    stream.on_holder(VIEWER, now_us)
+    NotedWindow.made[-1].floor_us = 1_000_000
+    stream.on_sent(900, now_us, now_us)
+    stream.on_sent(901, now_us, now_us)
+    stream.on_answer(VIEWER, 901, 0, now_us + 40_000)
+    assert timeout_of(stream, now_us + 100_000) == 72_000, "its first answer has none before it"
+
+
+def test_timeout_of_a_lossy_link_follows_the_spread_and_is_bounded():
+    stream, now_us = lossy_link(2)
+    stream.on_sent(900, now_us, now_us)
+    stream.on_answer(VISION, 900, 0, now_us + 80_000)
+    mean_us, spread_us = stream._answer_us, stream._spread_us
+    assert timeout_of(stream, now_us + 100_000) == round(mean_us + 2 * spread_us) > mean_us + 12_000
+    assert NotedWindow.made[-1].jitters_us[-1] == spread_us
+    stream, now_us = lossy_link(2, max_credit_timeout_ms=45)
+    assert timeout_of(stream, now_us) == 45_000
+
+
+def test_overdue_stream_of_a_lossy_link_waits_longer_and_longer():
+    stream, now_us = lossy_link(2, *[1] * 20)
+    silent_frames(stream, now_us)
+    usual_us = timeout_of(stream, now_us + 1_000_000)
+    assert usual_us > LOSSY_TIMEOUT_US and stream._overdue == 1
 
 
 # --- timeouts ----------------------------------------------------------------------------------------------------
