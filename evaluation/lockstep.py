@@ -32,7 +32,7 @@ from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector, notices_of
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.ranges import decode_scan
-from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnswer, answer_header
+from sightline.vision_side.pipeline import SOURCE, Frame, FrameLoss, Pipeline, PipelineAnswer, answer_header
 
 COMPUTE_US = 4_000
 """What one frame costs the vision side in virtual time: one step of the world, above what it takes in truth."""
@@ -90,7 +90,8 @@ class Lockstep:
         self._pipeline = Pipeline(vision, world.camera_model, self._detector)
         self._scanned = self._vision_link.latest(SCAN) if self._pipeline.mission.wants_scan else None
         self._labels = Labels(vision.boxes, world.camera_model) if vision.detector.kind == "boxes" else None
-        self._computed: deque[tuple[int, Message]] = deque(maxlen=1)
+        self._computed: deque[tuple[int, list[Message]]] = deque(maxlen=1)
+        self._loss = FrameLoss()
         self._answers = 0
         self._compute_us = COMPUTE_US + seams.late_us
         self._camera_tick = 0
@@ -171,26 +172,31 @@ class Lockstep:
         if self._computed and self._computed[0][0] > self._now_us:
             return
         if self._computed:
-            _, message = self._computed.popleft()
-            self._vision_link.publish(message.channel, message.header, message.payload)
+            _, messages = self._computed.popleft()
+            for message in messages:
+                self._vision_link.publish(message.channel, message.header, message.payload)
         taken = self._frames.take()
         if taken is not None:
             self._computed.append((self._now_us + self._compute_us, self._answer(taken)))
 
-    def _answer(self, message: Message) -> Message:
+    def _answer(self, message: Message) -> list[Message]:
         frame = Frame(decode(FrameHeader, message.header), message.payload)
         scan = self._scanned.take() if self._scanned else None
         if scan is not None:
             self._pipeline.put_scan(*decode_scan(scan.header, scan.payload))
         answer = self._pipeline.step(frame) if self._labels is None else self._follow(self._labels, frame.header)
         self.run.said.append((frame.header.t_us, answer.seen.phase, answer.seen.note))
-        header = encode(answer_header(frame.header, _VISION_SESSION, self._answers, self._compute_us, answer))
-        self._answers += 1
+        self._loss.update(frame.header, self._frames.dropped)
         if answer.twist is None:
-            return Message(ACK, SOURCE, header, b"")
+            return [self._message(frame.header, answer, b"")]
         text = format_twist(answer.twist)
         self.run.twists.append(text)
-        return Message(TWIST, SOURCE, header, text)
+        return [self._message(frame.header, answer, text) for _ in range(self._loss.copies)]
+
+    def _message(self, header: FrameHeader, answer: PipelineAnswer, payload: bytes) -> Message:
+        stamp = encode(answer_header(header, _VISION_SESSION, self._answers, self._compute_us, answer))
+        self._answers += 1
+        return Message(ACK if answer.twist is None else TWIST, SOURCE, stamp, payload)
 
     def _follow(self, labels: Labels, examined: FrameHeader) -> PipelineAnswer:
         header, found = labels.of(examined)

@@ -19,6 +19,10 @@ NO_ANSWER = "NO_ANSWER"
 """Value of `skipped` for a frame without an answer of the detector in time."""
 # A longer gap between frames contains no further information about the motion in it.
 _MAX_DT_S = 0.5
+# Weight of the earlier frames in the share of lost ones. About sixty frames decide, two seconds at 30 fps.
+_LOSS_WEIGHT = 63 / 64
+# Share of lost frames above which each twist is sent twice. A long run of losses is then rare in both directions.
+_TWICE_ABOVE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +240,32 @@ class Pipeline:
 
 def _seen(plan: Plan, detections: tuple[Detection, ...]) -> Observation:
     return Observation(plan.phase, detections, plan.target, plan.bearing_rad, plan.distance_m, plan.note, plan.done)
+
+
+class FrameLoss:
+    """Estimates the share of frames that the network lost, by the gaps in their sequence numbers."""
+
+    def __init__(self) -> None:
+        self._share = 0.0
+        self._newest: tuple[str, int, int] | None = None
+
+    def update(self, header: FrameHeader, replaced: int) -> None:
+        """Note a received frame.
+
+        Args:
+            header: header of the frame.
+            replaced: number of frames so far that arrived and were replaced by newer ones.
+        """
+        session, seq, before = self._newest or ("", 0, 0)
+        self._newest = (header.session, header.seq, replaced)
+        if header.session == session:
+            lost = max(0, header.seq - seq - 1 - (replaced - before))
+            self._share = _LOSS_WEIGHT * (1 - (1 - self._share) * _LOSS_WEIGHT**lost)
+
+    @property
+    def copies(self) -> int:
+        """Return how often to send a twist, each time with a new number, so that one loss does not cost the twist."""
+        return 2 if self._share > _TWICE_ABOVE else 1
 
 
 def answer_header(

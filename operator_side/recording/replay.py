@@ -188,7 +188,10 @@ def _answers(path: Path) -> _Answers:
         answers.gaps += max(0, header.seq - last.get(header.session, header.seq - 1) - 1)
         last[header.session] = header.seq
         twist = recorded.message.payload if recorded.message.channel is TWIST else None
-        answers.by_frame.setdefault((header.echo.session, header.echo.seq), []).append((header, twist))
+        of_frame = answers.by_frame.setdefault((header.echo.session, header.echo.seq), [])
+        # On a lossy link a twist is sent twice. The pipeline computed it once.
+        if twist is None or not any((one.session, sent) == (header.session, twist) for one, sent in of_frame):
+            of_frame.append((header, twist))
     return answers
 
 

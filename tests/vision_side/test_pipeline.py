@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,7 +16,7 @@ from sightline.protocol.messages import STILL, AnswerHeader, FrameHeader, Reques
 from sightline.protocol.text import format_twist
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.registry import configured_detector
-from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header
+from sightline.vision_side.pipeline import Frame, FrameLoss, Observation, Pipeline, PipelineAnswer, answer_header
 from tests.fixtures.vision.vision import Rig, camera, eight, jpeg_of, scene
 
 MODEL = camera()
@@ -162,3 +163,49 @@ def test_encoded_answer_header_fits_and_has_the_fields_of_frame_and_answer(robot
     if answer and answer.request is not None:
         expected["mission"] = {"digest": answer.request.digest, "id": answer.request.id}
     assert list(json.loads(encoded).items()) == list(expected.items()) and len(encoded) <= MAX_HEADER_BYTES
+
+
+def loss_of(seqs: list[int], replaced: int = 0) -> FrameLoss:
+    """Return the estimate after frames with these numbers, `replaced` of them before the last in all."""
+    loss = FrameLoss()
+    for seq in seqs[:-1]:
+        loss.update(header(seq), 0)
+    loss.update(header(seqs[-1]), replaced)
+    return loss
+
+
+@pytest.mark.parametrize(("seqs", "copies"), [
+    ([7], 1), ([*range(100)], 1), ([0, 4], 1), ([0, 5], 2), ([0, 1, 1, 0, 1], 1),
+    ([number * 10 for number in range(20)], 2),
+])  # fmt: skip
+def test_each_twist_is_sent_twice_while_more_than_a_twentieth_of_the_frames_is_lost(
+    seqs: list[int], copies: int
+) -> None:
+    assert loss_of(seqs).copies == copies
+
+
+def test_loss_is_forgotten_after_frames_without_one() -> None:
+    loss = loss_of([0, 10])
+    later = 0
+    while loss.copies == 2:
+        later += 1
+        loss.update(header(10 + later), 0)
+    assert later == 61
+
+
+def test_frames_that_newer_ones_replaced_are_not_lost() -> None:
+    assert loss_of([0, 10], replaced=9).copies == 1
+    assert loss_of([0, 10], replaced=4).copies == 2, "five are lost"
+
+
+def test_another_session_of_the_robot_is_not_a_loss() -> None:
+    loss = loss_of([0])
+    loss.update(header(1_000, session="0000abce"), 0)
+    assert loss.copies == 1
+
+
+def test_image_fits_by_its_size_alone() -> None:
+    one = pipeline()
+    assert one.fits(BALL)
+    assert not one.fits(jpeg_of(scene(camera(640, 480), 1.0, 0.2)))
+    assert not one.fits(b"junk")

@@ -22,7 +22,7 @@ from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import attach_detector
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.registry import configured_detector
-from sightline.vision_side.pipeline import Frame, Observation, Pipeline, PipelineAnswer, answer_header
+from sightline.vision_side.pipeline import Frame, FrameLoss, Observation, Pipeline, PipelineAnswer, answer_header
 from sightline.vision_side.serving.legacy_robot import assumed_camera, camera_line, is_legacy, target_box
 from sightline.vision_side.serving.mission_channel import NO_FRAMES, MissionChannel
 from sightline.vision_side.tracking.locate import REMEMBERED, BoxReader
@@ -164,6 +164,8 @@ class Service:
         self._pipeline: Pipeline | None = None
         self._session = secrets.token_hex(4)
         self._proofs = ProofChain(secrets.token_bytes)
+        self._seq = 0
+        self._loss = FrameLoss()
         self._is_legacy = any(is_legacy(one) for one in config.connect)
         self._robot_session = ""
         self._sessions = SessionSelector()
@@ -269,6 +271,7 @@ class Service:
                 self._log_change("time", f"rejecting frames of robot {self._config.robot} whose time disagrees with "
                                          "this clock; does another client send frames?")
             return False
+        self._loss.update(header, self._frames.dropped)
         if self._pipeline is not None and self._sessions.clock.replaced != replaced:
             self._pipeline.restart_clock()
         return True
@@ -299,14 +302,19 @@ class Service:
         self.answered += 1
         self.steered += answer.twist is not None
         self._newest = (compute_us, header.latency_us)
+        for _ in range(1 if answer.twist is None else self._loss.copies):
+            self._send(header, answer, compute_us)
+        if self._is_legacy and self._camera is not None:
+            self._link.publish(DETECTIONS, b"", target_box(answer.seen.target, self._camera))
+
+    def _send(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
+        self._seq += 1
         proof = NO_PROOF if answer.twist is None else self._proofs.next()
-        stamp = encode(answer_header(header, self._session, self.answered, compute_us, answer, proof=proof))
+        stamp = encode(answer_header(header, self._session, self._seq, compute_us, answer, proof=proof))
         if answer.twist is None:
             self._link.publish(ACK, stamp, b"")
         else:
             self._link.publish(TWIST, stamp, format_twist(answer.twist))
-        if self._is_legacy and self._camera is not None:
-            self._link.publish(DETECTIONS, b"", target_box(answer.seen.target, self._camera))
 
     def _decoded(self, model: type[Model], data: bytes, max_bytes: int) -> Model | None:
         try:

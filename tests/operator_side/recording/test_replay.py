@@ -88,3 +88,16 @@ def test_mission_with_scans_is_repeated_exactly(tmp_path):
     assert len(set(scans)) > 25 and scans == sorted(scans)
     result = replay(path)
     assert result.ok and result.total > 60, result
+
+
+def test_twist_that_was_sent_twice_is_computed_once(tmp_path):
+    """After lost frames the vision service sends each twist twice."""
+    path, bench = tmp_path / "run.mcap", Bench(config=GOTO)
+    with Recorder(bench.network.link("r1"), path, {VISION_CONFIG: GOTO.model_dump_json()}):
+        show_camera(bench, MODEL)
+        bench.frames(3)
+        bench.seq += 10
+        bench.frames(4)
+    assert len(answers(path)) == 3 + 2 * 4
+    result = replay(path)
+    assert result.ok and result.total == 7 and not result.missing_frames, result

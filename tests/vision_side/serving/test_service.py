@@ -74,6 +74,41 @@ def test_a_frame_is_answered_by_a_twist_that_names_it(bench: Bench) -> None:
         assert parse_twist(message.payload).angular_rad_s > 0
 
 
+def test_on_a_lossy_link_a_twist_is_sent_twice_with_a_new_number_and_a_new_proof(bench: Bench) -> None:
+    bench.camera()
+    twists: list[Message] = []
+    bench.robot.subscribe(TWIST, twists.append)
+    for seq in (1, 2, 12):
+        bench.frame(BALL, seq)
+    headers = [decode(AnswerHeader, one.header) for one in twists]
+    assert [one.echo.seq for one in headers] == [1, 2, 12, 12]
+    assert [one.seq for one in headers] == [1, 2, 3, 4]
+    assert len({one.proof for one in headers}) == 4
+    assert twists[2].payload == twists[3].payload
+    assert bench.service.answered == bench.service.steered == 3
+
+
+def test_on_a_lossy_link_an_acknowledgement_is_sent_once(bench: Bench) -> None:
+    bench.camera()
+    acks: list[Message] = []
+    bench.robot.subscribe(ACK, acks.append)
+    for seq in (1, 12):
+        bench.frame(b"junk", seq)
+    assert [decode(AnswerHeader, one.header).seq for one in acks] == [1, 2]
+
+
+def test_frames_that_waited_in_vain_are_not_lost_by_the_link(bench: Bench) -> None:
+    """A slow detector takes the newest frame only."""
+    bench.camera()
+    twists: list[Message] = []
+    bench.robot.subscribe(TWIST, twists.append)
+    bench.frame(BALL, 1)
+    for seq in range(2, 12):
+        bench.robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=seq, t_us=seq * 33_333)), BALL)
+    bench.frame(BALL, 12)
+    assert len(twists) == 2
+
+
 def test_an_image_that_does_not_decode_is_acknowledged_and_counted(bench: Bench) -> None:
     bench.camera()
     bench.frame(b"junk", 1)
