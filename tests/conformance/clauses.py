@@ -11,6 +11,7 @@ _CLAUSE = re.compile(r"\*\*(\d+\.\d+)(?: ([^*]+?))?\.?\*\*")
 UNTESTED = {
     "5.5 A picture that does not change": "the kit cannot freeze a robot's camera; tests/robot_side/safety",
     "5.6 Reasons": "the text that a peer shows to an operator is not on the wire; V-STAT-05 sends an unknown reason",
+    "7.6 Loss": "a SHOULD, and the kit's links lose nothing; tests/robot_side/network/test_loss.py",
     "12.1 Detections": "for services that detect without steering; the golden vectors hold its bounds",
     "12.4 Steering by them":
         "for a vision service that steers by the boxes of another source, which few do; tests/vision_side/serving",

@@ -44,6 +44,8 @@ class RememberingDecoder:
             raise WireError(found.reason, found.detail)
         return found
 
+    check = decode
+
 
 class RememberingDetector:
     """Detector that returns the detections from the decoder."""

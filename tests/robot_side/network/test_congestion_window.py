@@ -500,3 +500,17 @@ def test_timeout_before_the_first_answer_costs_no_time():
     window.alone(after_us=0)
     window.alone(after_us=0)
     assert window.frames == 2
+
+
+@pytest.mark.parametrize(("own_us", "jitter_us", "most_us"), [
+    (12_000, 0, 17_000), (12_000, 1_000, 18_000), (60_000, 0, 70_000), (60_000, 2_500, 72_500),
+])  # fmt: skip
+def test_delay_of_a_link_without_a_queue_is_its_own_delay_and_the_jitter(own_us, jitter_us, most_us):
+    window = Window()
+    window.alone(own_us)
+    assert window.window.is_floor(most_us, jitter_us) is True
+    assert window.window.is_floor(most_us + 1, jitter_us) is False
+
+
+def test_no_delay_is_that_of_a_link_without_a_queue_before_the_first_measurement():
+    assert CongestionWindow(INTERVAL_US, 12).is_floor(0, 0) is False

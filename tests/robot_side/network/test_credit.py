@@ -544,6 +544,27 @@ def test_loss_explains_what_happens_once_in_10_000_losses(more, explained):
     assert record.explains(3, 0, 0) and not record.explains(5, 0, 0)
 
 
+def test_losses_that_happen_exactly_so_often_explain_a_silence(monkeypatch):
+    monkeypatch.setattr(module, "_LOSSES_PER_SILENCE", 8)
+    record = record_of(1)
+    record._frames, record._runs = 2.0, 1.0
+    assert record.explains(3, 0, 0) is True and record.explains(4, 0, 0) is False
+
+
+def test_link_that_lost_nothing_explains_nothing():
+    assert LossRecord().explains(1, 0, 0) is False
+    assert record_of().explains(1, 0, 0) is False
+
+
+def test_frames_in_flight_are_not_overdue():
+    stream, now_us = lossy_link(*[1] * 20)
+    for seq in (901, 902, 903):
+        stream.on_sent(seq, now_us, now_us + (seq - 901) * 5_000)
+    for late_us, overdue in ((0, 0), (5_000, 0), (10_000, 1)):
+        assert credit(stream, now_us + LOSSY_TIMEOUT_US + late_us)
+        assert stream._overdue == overdue
+
+
 def test_new_owner_begins_without_losses():
     stream, now_us = lossy_link(2)
     stream.on_holder(VIEWER, now_us)
