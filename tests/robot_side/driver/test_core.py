@@ -2,6 +2,7 @@
 
 import array
 import math
+from collections import Counter
 
 import pytest
 
@@ -308,6 +309,24 @@ def test_status_at_the_start_has_no_counts():
     status = status_of(core_of(), NOW_US)
     assert (status.tick_late_max_us, status.network_restarts, status.refused) == (0, 0, {})
     assert status.last_refusal is None and status.stream == StreamStatus() and status.auto_arm is False
+
+
+@pytest.mark.parametrize(("reason", "why", "shown"), [
+    ("STOP", "", "STOP"), ("STOP", "No space", "STOP; not stored for a restart: No space"),
+    ("x" * 201, "", "x" * 200), ("x" * 201, "No space", "x" * 164 + "; not stored for a restart: No space"),
+    ("STOP", "y" * 300, ("; not stored for a restart: " + "y" * 300)[:200]),
+])
+def test_reason_shows_a_latch_that_is_not_on_disk(reason, why, shown):
+    core = core_of()
+    core.gate.reason, core.latch_failed = reason, why
+    assert status_of(core, NOW_US).reason == shown
+
+
+def test_status_shows_the_faults():
+    core = core_of()
+    assert status_of(core, NOW_US).faults == {}
+    core.faults = Counter(drive=2, camera=1)
+    assert status_of(core, NOW_US + 10**6).faults == {"drive": 2, "camera": 1}
 
 
 def test_long_reason_is_cut_to_what_the_wire_holds():

@@ -248,6 +248,12 @@ def test_status_shows_every_counter():
     assert list(shown.dropped.items()) == [("odometry", 5), ("camera", 3), ("status", 1)], "the most first"
 
 
+@pytest.mark.parametrize("length", [0, 1, 200, 201])
+def test_status_shows_what_fits_of_the_cause_without_images(length):
+    assert core_of().status(0, camera_fault="x" * length).camera_fault == "x" * min(length, 200)
+    assert core_of().status(0).camera_fault == ""
+
+
 def test_status_shows_at_most_sixteen_channels():
     dropped = {f"channel{number}": number for number in range(1, 21)}
     assert sorted(core_of().status(0, dropped=dropped).dropped.values()) == list(range(5, 21))
