@@ -19,12 +19,13 @@ from sightline.protocol.channels import ACK, FRAME, REQUEST, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.config import PLUGIN_ERRORS
-from sightline.protocol.errors import SightlineError, WireError
+from sightline.protocol.errors import HardwareError, SightlineError, WireError
 from sightline.protocol.log import count_fault, error_line, error_text, faults, report_fault, start_log
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
 from sightline.protocol.transports.zenoh.flood_limits import limit_floods
 from sightline.robot_side import pipe as ipc
+from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.pipe import CAMERA_EXIT, KEYS, NetworkEnd, NetworkSetup
 from sightline.robot_side.plugins import CAMERAS
@@ -66,6 +67,7 @@ _CHECK_STEP_US = 200_000
 _RESTARTED = "; its process was started again"
 _LONGEST_NAP_S = 0.1
 _LEAVES_WITHIN_S = 3.0
+_OPENS_WITHIN_S = 20.0
 
 
 class NetworkProcess:
@@ -252,11 +254,28 @@ class NetworkProcess:
         self._credit.set()
 
 
+def _open_camera(choice: PluginChoice) -> Camera:
+    """Open the camera at the first start. One that hangs ends the process, because nothing else reports it yet."""
+    hanging = threading.Timer(_OPENS_WITHIN_S, _end_hanging, [choice.kind])
+    hanging.daemon = True
+    hanging.start()
+    try:
+        return CAMERAS.build(choice)
+    finally:
+        hanging.cancel()
+
+
+def _end_hanging(kind: str) -> None:
+    why = f"camera {kind} does not open within {_OPENS_WITHIN_S:g} s; unplug it and plug it in again"
+    print(error_line(why), file=sys.stderr, flush=True)
+    os._exit(HardwareError.exit_code)
+
+
 def _run(setup: NetworkSetup, driver: NetworkEnd) -> None:
     config = setup.config
     with ExitStack() as ending:
         # After a restart the link comes first, so that a robot without a camera can be reached.
-        camera = None if setup.is_restart else CAMERAS.build(config.camera)
+        camera = None if setup.is_restart else _open_camera(config.camera)
         ending.enter_context(limit_floods(config.doors, lambda line: _log.info("robot %s: %s", config.robot, line)))
         link = ending.enter_context(
             open_link(

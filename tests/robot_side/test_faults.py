@@ -263,6 +263,73 @@ def test_exceptions_of_a_camera_are_reported_as_they_come_and_end_no_loop(proces
     assert counts == [{"camera": 1}, {"camera": 2}] and reported(process) == "division by zero"
 
 
+@pytest.fixture
+def main(tmp_path, monkeypatch):
+    """Runs a network process whose `_run` raises; returns its exit code, and what it sent."""
+
+    def run(error, *, is_restart):
+        def fail(*_):
+            raise error
+
+        def end(code):
+            raise Ended(code)
+
+        setup = NetworkSetup(config=RobotConfig(state_dir=tmp_path), session=ROBOT, first_seq=7, is_restart=is_restart)
+        pipe = PipeEnd()
+        pipe.receive = setup.model_dump_json
+        for name, value in {"_run": fail, "NetworkEnd": lambda *_: pipe, "start_log": lambda *_: None}.items():
+            monkeypatch.setattr(network_process, name, value)
+        monkeypatch.setattr(network_process.sys, "argv", ["network"])
+        monkeypatch.setattr(network_process.signal, "signal", lambda *_: None)
+        monkeypatch.setattr(network_process.signal, "pthread_sigmask", lambda *_: None)
+        monkeypatch.setattr(network_process.logging, "shutdown", lambda: None)
+        monkeypatch.setattr(network_process.os, "_exit", end)
+        with pytest.raises(Ended) as ended:
+            network_process.main()
+        return ended.value.args[0], pipe.sent
+
+    return run
+
+
+def test_an_exception_that_ends_the_network_process_is_logged_and_counted(main, caplog):
+    code, sent = main(ZeroDivisionError("two\nlines"), is_restart=True)
+    assert (code, [ipc.unpack_counts(one) for one in sent]) == (1, [{"network process": 1}])
+    assert caplog.messages == ["network process raised ZeroDivisionError: two lines"]
+
+
+def test_what_ends_a_first_network_process_is_the_last_line_of_the_program_and_later_a_line_of_the_log(
+    main, caplog, capsys
+):
+    assert main(HardwareError("no camera"), is_restart=False) == (3, [])
+    assert (capsys.readouterr().err, caplog.messages) == ("error: no camera\n", [])
+    assert main(HardwareError("no camera"), is_restart=True) == (3, [])
+    assert (capsys.readouterr().err, caplog.messages) == ("", ["robot r1: no camera"])
+
+
+def test_a_camera_that_hangs_at_the_first_start_ends_the_robot_with_its_name(monkeypatch, capsys):
+    ended, going_on = [], threading.Event()
+
+    class Hangs(HangingCamera):
+        def __init__(self, _config):
+            going_on.wait(5.0)
+
+    def end(code):
+        ended.append(code)
+        going_on.set()
+
+    monkeypatch.setattr(network_process, "_OPENS_WITHIN_S", 0.02)
+    monkeypatch.setattr(network_process.os, "_exit", end)
+    monkeypatch.setattr(network_process.CAMERAS.__class__, "build", lambda *_: Hangs(None))
+    network_process._open_camera(PluginChoice(kind="v4l2"))
+    assert ended == [3] and capsys.readouterr().err == (
+        "error: camera v4l2 does not open within 0.02 s; unplug it and plug it in again\n"
+    )
+    monkeypatch.setattr(network_process.CAMERAS.__class__, "build", lambda *_: None)
+    network_process._open_camera(PluginChoice(kind="v4l2"))
+    time.sleep(0.05)
+    assert ended == [3]
+
+
 @pytest.mark.parametrize("odd", ["ball\udce9.jpg\x1b[2J", "two\nlines"])
 def test_a_camera_with_an_odd_message_is_named_in_letters(process, odd):
     def fails(_timeout_s):

@@ -10,6 +10,7 @@ import pytest
 from sightline.operator_side.setup import keys
 from sightline.protocol.channels import CAMERA, DETECTIONS, FRAME, OVERLAY, PREVIEW, TWIST
 from sightline.protocol.codec import decode, encode
+from sightline.protocol.log import faults
 from sightline.protocol.messages import DetectedBox, Detections, DetectionsHeader, Echo, FrameHeader, Stamp
 from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.zenoh.session import open_session
@@ -135,6 +136,7 @@ def test_image_that_cannot_be_drawn_is_logged_once_and_driving_continues(site, m
         assert site.twists.take(2.0) is not None
         time.sleep(0.08)  # so that it is time for another overlay
     assert until(lambda: site.said.count("vision: cannot show an image: RuntimeError: no paint") == 1)
+    assert faults()["viewing"] >= 1
     monkeypatch.undo()
     assert until(lambda: site.frame() and overlays.take(0.1), 5.0)
 

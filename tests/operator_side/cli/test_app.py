@@ -231,6 +231,17 @@ def test_unexpected_error_is_one_line_and_a_traceback_only_on_request(capsys, mo
         cli.run(["config", "check", "robot"])
 
 
+def test_error_that_ends_a_service_leaves_its_traceback_in_the_log(capsys, caplog, monkeypatch):
+    def broken(*_arguments: object, **_options: object) -> None:
+        raise ZeroDivisionError("two\nlines")
+
+    monkeypatch.setattr("sightline.operator_side.cli.services.load_service", broken)
+    assert run(capsys, "robot")[0] == 1
+    (record,) = caplog.records
+    assert (record.levelname, record.message) == ("ERROR", "program raised ZeroDivisionError: two lines")
+    assert record.exc_info[2].tb_next
+
+
 def test_config_commands_print_output_for_scripts(capsys, tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text('robot = "r9"\n')

@@ -16,6 +16,7 @@ from sightline.operator_side.cockpit.http_server import (
     served,
 )
 from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.log import faults
 from tests.fixtures.links import until
 
 
@@ -28,6 +29,7 @@ ROUTES = {
     "GET /echo": lambda ask, body: as_json(dict(ask)),
     "POST /echo": lambda ask, body: HttpAnswer(body),
     "POST /reject": _refuse,
+    "GET /broken": lambda ask, body: 1 / 0,
     "POST /number": lambda ask, body: as_json(int(json.loads(body)["number"])),
 }
 
@@ -136,3 +138,11 @@ def test_port_in_use_is_one_line(port):
     with pytest.raises(LinkError, match=f"port {port} is in use") as why, served(ROUTES, port):
         pass
     assert "\n" not in str(why.value)
+
+
+def test_a_route_that_raises_is_logged_once_with_its_traceback_and_counted(port, caplog):
+    for _ in range(2):
+        with pytest.raises(http.client.RemoteDisconnected), asked(port, "GET", "/broken"):
+            pass
+    assert until(lambda: faults() == {"web page": 2})
+    assert caplog.messages == ["web page raised ZeroDivisionError: division by zero"] and caplog.records[0].exc_info

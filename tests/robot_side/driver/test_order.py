@@ -11,6 +11,7 @@ import pytest
 from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
+from sightline.protocol.log import faults
 from sightline.protocol.messages import AnswerHeader, Echo, Request, RequestHeader, Verb
 from sightline.protocol.transports.link import Message
 from sightline.robot_side import pipe as ipc
@@ -185,3 +186,19 @@ def test_hanging_reading_has_the_age_of_its_start_and_its_thread_closes_the_devi
     assert reader.newest[1] <= begun_us
     reader.close()
     assert until(lambda: battery.closed_by == "battery")
+
+
+def test_each_failed_reading_of_the_battery_is_counted_and_its_close_too(monkeypatch):
+    monkeypatch.setattr("sightline.robot_side.driver.process._BATTERY_PERIOD_S", 0.01)
+
+    class Gone:
+        def read(self):
+            raise OSError("no such battery")
+
+        close = read
+
+    reader = BatteryReader(Gone())
+    assert until(lambda: faults()["battery"] >= 3)
+    reader.close()
+    counted = faults()["battery"]
+    assert until(lambda: not reader._thread.is_alive()) and counted >= 4

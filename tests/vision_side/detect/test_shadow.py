@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sightline.protocol.errors import ConfigError
+from sightline.protocol.log import faults
 from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
@@ -155,7 +156,7 @@ def test_shadow_that_raises_is_reported_and_continues(pair) -> None:
     _, shadow, both = pair
     shadow.detect, good = None, shadow.detect  # calling None raises
     both.detect([frame(1)], NO_DEADLINE)
-    assert until(lambda: any("failed" in line for line in both.notices()))
+    assert until(lambda: any("failed" in line for line in both.notices())) and faults()["detector"] == 1
     shadow.detect = good
     both.detect([frame(2)], NO_DEADLINE)
     assert until(lambda: ("r1", 2) in shadow.seen)
