@@ -279,7 +279,7 @@ def test_the_report_is_one_object_and_one_table():
     assert [row["ok"] for row in report["rows"]] == [True, False]
     text = report_page(record(results))
     rows = [line for line in text.splitlines() if line.startswith("| ")]
-    assert len(rows) == 1 + len(results) and {line.count("|") for line in rows} == {5}
+    assert len(rows) == 1 + len(results) and {line.count("|") for line in rows} == {6}
     assert "| yes |" in rows[1] and "**no**" in rows[2] and "1 of 2 rows passed" in text
 
 

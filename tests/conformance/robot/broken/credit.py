@@ -56,7 +56,7 @@ def refused_twists_return_nothing(robot):
 
 @breaks("R-FLOW-05")
 def credit_is_out_for_long(robot):
-    stream_of(robot)._timeout_us = lambda: 800_000
+    stream_of(robot)._timeout_us = lambda _now_us: 800_000
 
 
 @breaks("R-FLOW-06")
