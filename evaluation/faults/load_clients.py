@@ -133,6 +133,9 @@ SESSIONS: Final = 63
 
 
 def _place(endpoint: str) -> tuple[str, int]:
+    if "://" in endpoint:
+        web = parse_websocket_endpoint(endpoint)
+        return web.host, web.port
     _, host, port = parse_zenoh_endpoint(endpoint)
     return host, port
 

@@ -24,12 +24,14 @@ AFTER_S: Final = (2.0, 20.0, 80.0)
 STOP_ENDS_S: Final = 20.0
 READY_S: Final = 30.0
 KEPT_MPS: Final = 0.4
+_REPORTED: Final = ("connect_25", "connect_500", "half_open")
+"""Floods that exceed the limits of one address. The others stay below, in number and in rate."""
 
 
 def _flood(rig: RobotFixture, kind: str, after_s: float | None = None) -> Injected:
     """Send STOP during a flood, or some time after its end."""
     rig.prepare_operator()
-    rig.start_crowd(kind, rig.endpoint)
+    rig.start_crowd(kind, rig.web_endpoint or rig.endpoint)
     rig.processes.wait_line("crowd", READY, READY_S)
     rig.watch(AT_WORK_S)
     if after_s is not None:
@@ -37,6 +39,10 @@ def _flood(rig: RobotFixture, kind: str, after_s: float | None = None) -> Inject
         rig.watch(after_s)
     count = len(rig.noted("crowd", INJECTED))
     at_us, checks = rig.stop_by_operator()
+    if kind in _REPORTED:
+        log = rig.processes.log("router" if rig.setup.routed else "robot").read_text("utf-8")
+        checks += at_least("reported", "connections from" in log, "", 1), at_most(
+            "lines of the flood", log.count("connections from"), "", 1)
     return Injected(count, at_us, checks=checks)
 
 
@@ -197,6 +203,7 @@ _FLOODS: Final = {
     "tcp500": ("connect_500", f"{MANY_HZ} connections a second", False),
     "tcp_half": ("half_open", f"{HALF_OPEN} half-open connections", False),
     "sessions": ("sessions", f"{SESSIONS} more sessions", False),
+    "web500": ("connect_500", f"{MANY_HZ} WebSocket connections a second", False),
 }
 HALF_OPEN_MB: Final = 16.0
 """Zenoh holds about 10 kB for each TLS connection that it has accepted; the descriptors of the process bound them."""
@@ -210,15 +217,16 @@ def _flood_case(name: str, *, routed: bool = False, after_s: float | None = None
     ending = ("_router" if routed else "") + ("" if after_s is None else f"_after{after_s:g}")
     return FaultCase(
         f"flood.{name}{ending}", f"flood: {what}{where}; STOP by a new operator{when}",
-        partial(_flood, kind=kind, after_s=after_s), Setup(secure=secured, routed=routed), blind=True,
-        memory_mb=HALF_OPEN_MB if kind == "half_open" else MEMORY_MB,
+        partial(_flood, kind=kind, after_s=after_s), Setup(secure=secured, routed=routed, web=name == "web500"),
+        blind=True, memory_mb=HALF_OPEN_MB if kind == "half_open" else MEMORY_MB,
         also=_DEMANDED + (f"; memory <= {HALF_OPEN_MB:g} MB" if kind == "half_open" else ""),
         short=ending == "" and name in ("tls25", "tcp500"), alone=True,
     )
 
 
 STOP_CASES: Final = (
-    *(_flood_case(name, routed=routed) for routed in (False, True) for name in _FLOODS),
+    *(_flood_case(name, routed=routed) for routed in (False, True) for name in _FLOODS
+      if not (routed and name == "web500")),
     *(_flood_case("tls_half", after_s=after_s) for after_s in AFTER_S),
     FaultCase("guest.one_image", "guests: one command on one image for 4 s, ahead and turning; then STOP", _guests,
               Setup("guest", guests=True), blind=True, also=f"zero <= {_GUEST.guest_unchanged_ms / 1000:g} s and "

@@ -21,9 +21,9 @@ from sightline.protocol.codec import encode
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, SightlineError, WireError
 from sightline.protocol.log import count_fault, error_line, error_text, faults, report_fault, start_log
+from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
-from sightline.protocol.transports.zenoh.flood_limits import limit_floods
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.network.core import NetworkCore

@@ -147,7 +147,7 @@ class ServingOptions:
 
 def run(config: VisionConfig, detector: Detector, options: ServingOptions) -> int:
     """Serve until SIGTERM or SIGINT; returns the exit code 0. Raises ConfigError, LinkError as `open_fleet` does."""
-    from sightline.protocol.transports.zenoh.flood_limits import limit_floods
+    from sightline.protocol.transports.flood_limits import limit_floods
     from sightline.protocol.transports.zenoh.link import open_fleet
 
     ending, services = threading.Event(), list[DetectorService]()

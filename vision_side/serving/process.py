@@ -44,7 +44,7 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 
     Raises ConfigError for an invalid endpoint or mission, LinkError if the link cannot be opened.
     """
-    from sightline.protocol.transports.zenoh.flood_limits import limit_floods
+    from sightline.protocol.transports.flood_limits import limit_floods
 
     configured_mission(config)  # report an unknown mission before any endpoint is opened
     ending, detector = threading.Event(), configured_detector(config)

@@ -22,6 +22,7 @@ from sightline.protocol.channels import FRAME, REQUEST, TWIST
 from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES, WebSocketEndpoint, host_problem, origin_problem
+from sightline.protocol.transports.flood_limits import note_accepted
 from sightline.protocol.transports.security import (
     NO_TOKEN,
     NOT_LISTED,
@@ -228,10 +229,12 @@ class Server:
             end.close()
 
     def _welcome(self, near: socket.socket, address: str) -> None:
+        note_accepted(address)
         slot = self._connection_limits.admit(address)
         if slot is not None and self._is_begun(near, slot):
             return
-        self._reject(TOO_MANY_CLIENTS, address, "too many connections")
+        # Without a line in the log: `flood_limits` reports a flood once, with its rate.
+        self._count_rejection(TOO_MANY_CLIENTS)
         # Without a reply, because a flood must not cost a thread and a handshake for each connection.
         near.close()
 

@@ -7,7 +7,7 @@ import pytest
 
 from sightline.protocol.transports import diagnosis
 from sightline.protocol.transports.diagnosis import connection_ends
-from sightline.protocol.transports.zenoh.flood_limits import limit_floods
+from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.zenoh.session import MAX_SESSIONS
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port

@@ -1,8 +1,9 @@
-"""Limit the connections that one address opens to the ports of Zenoh, and report a flood. Shell (sockets, a thread).
+"""Limit the connections that one address opens to the ports of the links; report a flood. Shell (sockets, a thread).
 
-Zenoh accepts connections itself and has no limit per address. So the kernel drops the first packet (SYN) of each new
-connection from an address that floods, by a filter on Zenoh's listening sockets. Sessions that are open, and all other
-addresses, go on; no frame is copied. docs/explanation/decisions/0010-floods.md states what else was tried.
+Zenoh accepts connections itself and has no limit per address. So the kernel holds a connection back until its first
+byte, and drops what comes from an address that floods before it has a connection, by a filter on the listening sockets.
+Sessions that are open, and all other addresses, go on; no frame is copied.
+docs/explanation/decisions/0010-floods.md states what else was tried.
 """
 
 import ctypes
@@ -12,19 +13,21 @@ import socket
 import struct
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.diagnosis import connection_ends, listening_inodes
-from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
+from sightline.protocol.transports.endpoints import parse_websocket_endpoint, parse_zenoh_endpoint
 from sightline.protocol.transports.zenoh.session import MAX_SESSIONS
 
 MAX_OPEN: Final = MAX_SESSIONS
-"""Connections of one address, half-open ones included: more than Zenoh accepts from all addresses."""
+"""Connections of one address, half-open ones included: as many as Zenoh accepts from all addresses, and more than
+WebSocket does."""
 MAX_NEW: Final = MAX_SESSIONS
 """New connections of one address within `WINDOW_US`."""
 WINDOW_US: Final = 3_000_000
@@ -56,14 +59,18 @@ class FloodDetector:
         """Host -> time and count of its new connections, for each sample within the window."""
         self._blocked_until_us: dict[str, int] = {}
 
-    def sample(self, ends: dict[tuple[str, str], str], now_us: int) -> list[Flood]:
+    def sample(
+        self, ends: dict[tuple[str, str], str], now_us: int, accepted: Mapping[str, int] = MappingProxyType({})
+    ) -> list[Flood]:
         """Take a sample. Returns the hosts that are over a limit now.
 
         Args:
             ends: connection (local and remote end) -> its host.
             now_us: time of the sample.
+            accepted: host -> connections since the last sample, of the hosts for which this is counted.
         """
-        for host, count in Counter(ends[end] for end in ends.keys() - self._known).items():
+        new_now = Counter(ends[end] for end in ends.keys() - self._known)
+        for host, count in (new_now | Counter(accepted)).items():  # the larger of both
             self._new.setdefault(host, deque()).append((now_us, count))
         self._known = frozenset(ends)
         for host, samples in list(self._new.items()):
@@ -89,25 +96,44 @@ class FloodDetector:
         return [host for host in self._blocked_until_us if host not in _OWN][-MAX_BLOCKED:]
 
 
+_accepted: Final = Counter[str]()
+
+
+def note_accepted(host: str) -> None:
+    """Count a connection that this process has accepted, because a short one may end between two samples."""
+    if host in _accepted or len(_accepted) < MAX_BLOCKED:
+        _accepted[host] += 1
+
+
 @contextmanager
 def limit_floods(listen: Sequence[str], report: Callable[[str], None]) -> Iterator[None]:
-    """Limit and report floods of connections to `listen` until the end of the `with`. WebSocket has its own limits."""
-    ports = {parse_zenoh_endpoint(endpoint)[2] for endpoint in listen if "://" not in endpoint}
+    """Limit and report floods of connections to `listen` until the end of the `with`."""
+    ports = {_port(endpoint) for endpoint in listen}
     ending = threading.Event()
     if ports:
         arguments = (ports, report, ending)
-        threading.Thread(target=_watch, args=arguments, name="zenoh-floods", daemon=True).start()
+        threading.Thread(target=_watch, args=arguments, name="floods", daemon=True).start()
     try:
         yield
     finally:
         ending.set()
 
 
+def _port(endpoint: str) -> int:
+    return parse_websocket_endpoint(endpoint).port if "://" in endpoint else parse_zenoh_endpoint(endpoint)[2]
+
+
 def _watch(ports: set[int], report: Callable[[str], None], ending: threading.Event) -> None:
     detector, limiter, blocked, silent = FloodDetector(), RepeatLimiter(), list[str](), set[Peer]()
+    deferred = set[str]()
     while not ending.wait(_CHECK_S):
+        if len(deferred) < len(ports):  # a link opens its ports some time after this thread begins
+            deferred = _listeners(ports)
+            _defer(deferred)
         now_us = heartbeat_us()
-        floods = detector.sample(connection_ends(ports), now_us)
+        accepted = dict(_accepted)
+        _accepted.clear()
+        floods = detector.sample(connection_ends(ports), now_us, accepted)
         # Before the report, so that what the log states is true.
         if detector.blocked(now_us) != blocked:
             blocked = detector.blocked(now_us)
@@ -128,35 +154,48 @@ def _line(flood: Flood) -> str:
 
 
 # Half-open connections of a host that floods. Zenoh does one TLS handshake at a time, and waits 10 s for a peer that
-# sends nothing.
+# does not continue.
 
 
 Peer = tuple[str, int]
-_SENT_BYTES: Final = struct.Struct("128xQ")
-"""`tcpi_bytes_received` in `struct tcp_info` of linux/tcp.h."""
+_ACKED_BYTES: Final = struct.Struct("120xQ")
+"""`tcpi_bytes_acked` in `struct tcp_info` of linux/tcp.h: what the peer has received from this end."""
+_DEFER_S: Final = 10
+
+
+def _sockets(wanted: Callable[[str], bool]) -> Iterator[socket.socket]:
+    """Yield the sockets of this process whose entry in `/proc/self/fd` is wanted, each to be used before the next."""
+    for link in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # closed meanwhile, or another system
+            if wanted(str(link.readlink())):
+                with socket.socket(fileno=os.dup(int(link.name))) as one:
+                    yield one
+
+
+def _defer(inodes: set[str]) -> None:
+    """Let the kernel accept a connection with its first byte, which an honest peer sends when it connects."""
+    for listener in _sockets(inodes.__contains__):
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, _DEFER_S)
 
 
 def _end_half_open(ports: set[int], hosts: Sequence[str], waiting: set[Peer]) -> set[Peer]:
-    """End connections from `hosts` that have not sent a byte since the last turn. Returns those that wait since now.
+    """End connections from `hosts` that nothing was sent to since the last turn. Returns those that wait since now.
 
-    A session that is open has sent bytes. An honest peer sends its first bytes when it connects.
+    A session that is open has received bytes. A peer that is silent, or stops amid a handshake, has not.
     """
-    silent: set[Peer] = set()
-    for link in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # closed meanwhile, or no TCP socket
-            if not str(link.readlink()).startswith("socket:"):
+    unanswered: set[Peer] = set()
+    for one in _sockets(lambda name: name.startswith("socket:")):
+        with suppress(OSError):  # no TCP socket
+            if one.family not in (socket.AF_INET, socket.AF_INET6) or one.getsockname()[1] not in ports:
                 continue
-            with socket.socket(fileno=os.dup(int(link.name))) as one:
-                if one.family not in (socket.AF_INET, socket.AF_INET6) or one.getsockname()[1] not in ports:
-                    continue
-                host, port = one.getpeername()[:2]
-                info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _SENT_BYTES.size)
-                if host.removeprefix("::ffff:") not in hosts or _SENT_BYTES.unpack(info)[0]:
-                    continue
-                silent.add((host, port))
-                if (host, port) in waiting:
-                    one.shutdown(socket.SHUT_RDWR)
-    return silent
+            host, port = one.getpeername()[:2]
+            info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _ACKED_BYTES.size)
+            if host.removeprefix("::ffff:") not in hosts or _ACKED_BYTES.unpack(info)[0]:
+                continue
+            unanswered.add((host, port))
+            if (host, port) in waiting:
+                one.shutdown(socket.SHUT_RDWR)
+    return unanswered
 
 
 # The filter on a listening socket: a classic BPF program, which needs no privilege.
@@ -166,21 +205,19 @@ _SO_ATTACH_FILTER: Final = 26
 _INSTRUCTION: Final = struct.Struct("HBBI")
 _LOAD_BYTE, _LOAD_WORD, _AND, _IF_EQUAL, _RETURN = 0x30, 0x20, 0x54, 0x15, 0x06
 _NETWORK_HEADER: Final = 0x1_0000_0000 - 0x10_0000  # SKF_NET_OFF of linux/filter.h
-_SYN, _SYN_ACK, _TCP_FLAGS, _IP_SOURCE = 0x02, 0x12, 13, 12
+_IP_SOURCE: Final = 12
 _PASS, _DROP = 0xFFFF_FFFF, 0
 
 
-def syn_filter(addresses: Sequence[int]) -> list[tuple[int, int, int, int]]:
-    """Return the instructions (code, jump if true, jump if false, operand) that drop a SYN from IPv4 `addresses`.
+def source_filter(addresses: Sequence[int]) -> list[tuple[int, int, int, int]]:
+    """Return the instructions (code, jump if true, jump if false, operand) that drop packets from IPv4 `addresses`.
 
-    An open session sends no SYN, so it passes even where its address is listed, and where its socket inherits this.
+    A listening socket receives the packets of connections that it has not accepted, no others. A session inherits the
+    filter of the moment when it was opened, which did not list its address.
     """
     rows = len(addresses)
     checks = [(_IF_EQUAL, rows - place, 0, address) for place, address in enumerate(addresses)]
     return [
-        (_LOAD_BYTE, 0, 0, _TCP_FLAGS),
-        (_AND, 0, 0, _SYN_ACK),
-        (_IF_EQUAL, 0, rows + 4, _SYN),
         (_LOAD_BYTE, 0, 0, _NETWORK_HEADER),
         (_AND, 0, 0, 0xF0),
         (_IF_EQUAL, 0, rows + 1, 0x40),  # IPv4
@@ -194,12 +231,13 @@ def syn_filter(addresses: Sequence[int]) -> list[tuple[int, int, int, int]]:
 def _block(ports: set[int], hosts: Sequence[str]) -> None:
     """Drop new connections from `hosts` on the listening sockets of this process, and from no other host."""
     addresses = [int(ip) for host in hosts if (ip := ipaddress.ip_address(host.partition("%")[0])).version == 4]
-    program = b"".join(_INSTRUCTION.pack(*row) for row in syn_filter(addresses))
+    program = b"".join(_INSTRUCTION.pack(*row) for row in source_filter(addresses))
     buffer = ctypes.create_string_buffer(program)
     pointer = struct.pack("HP", len(program) // _INSTRUCTION.size, ctypes.addressof(buffer))
-    wanted = {f"socket:[{inode}]" for inode in listening_inodes(ports)}
-    for link in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # closed meanwhile, or another system
-            if str(link.readlink()) in wanted:
-                with socket.socket(fileno=os.dup(int(link.name))) as listener:
-                    listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, pointer)
+    for listener in _sockets(_listeners(ports).__contains__):
+        listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, pointer)
+
+
+def _listeners(ports: set[int]) -> set[str]:
+    """Return the names that listening sockets on `ports` have in `/proc/self/fd`."""
+    return {f"socket:[{inode}]" for inode in listening_inodes(ports)}
