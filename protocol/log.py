@@ -162,6 +162,15 @@ def start_log(form: str | None, service: str) -> None:
     logging.getLogger().addHandler(_HANDLER)  # of the root: third-party libraries and plug-ins log the same way
     logging.captureWarnings(True)
     threading.excepthook = _log_thread_error
+    logging.getLogger("zenoh.handlers").addFilter(_is_no_fault)
+
+
+def _is_no_fault(record: logging.LogRecord) -> bool:
+    """Report the exception of a callback that Zenoh logs each time. Returns False to drop the line of Zenoh."""
+    error = record.exc_info[1] if record.exc_info else None
+    if error is not None:
+        report_fault("callback", error)
+    return error is None
 
 
 def _log_thread_error(error: threading.ExceptHookArgs) -> None:

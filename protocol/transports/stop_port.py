@@ -207,8 +207,11 @@ class StopProcess:
             number = self.far.fileno()
             command = [sys.executable, "-I", "-S", "-c", _CHILD.format(self.module), root, str(number)]
             command.append(json.dumps(self.options))
+            # The child inherits the mask, so a key does not interrupt its imports; later it ignores these signals.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, _KEYS)
             with suppress(OSError):  # no process or descriptor is left; later there may be
                 self._process = subprocess.Popen(command, pass_fds=[number], stdin=subprocess.DEVNULL)
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     @property
     def pid(self) -> int:

@@ -25,11 +25,24 @@ from sightline.protocol.log import (
     QueueHandler,
     RepeatLimiter,
     TextFormatter,
+    faults,
     start_log,
 )
 from tests.fixtures.robot_process import RobotProcess
 
 SECOND_US = 1_000_000
+
+
+def test_an_exception_that_zenoh_logs_of_a_callback_is_counted_and_logged_once(caplog):
+    start_log("text", "robot")
+    for _ in range(3):
+        try:
+            raise ValueError("in a callback")
+        except ValueError:
+            logging.getLogger("zenoh.handlers").exception("callback error")
+    logging.getLogger("zenoh.handlers").warning("something else")
+    assert caplog.messages == ["callback raised ValueError: in a callback", "something else"]
+    assert faults() == {"callback": 3}
 
 
 class SlowToShowError(ValueError):

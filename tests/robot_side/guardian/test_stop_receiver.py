@@ -1,5 +1,6 @@
 """The STOP receiver as a process: small, only the standard library, deaf to anything but a valid STOP."""
 
+import signal
 import socket
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from sightline.protocol.log import faults
+from sightline.protocol.transports import stop_port
 from sightline.protocol.transports.stop_datagram import DATAGRAM_BYTES, StopRequests, pack_stop, unpack_stop
 from sightline.protocol.transports.stop_port import now_us, read_packets, send_packet
 from sightline.robot_side.guardian import stop_forwarder, stop_receiver
@@ -148,6 +150,19 @@ def test_a_killed_receiver_is_counted_and_started_again(started, operator, caplo
     process.keep_alive(now_us() + 2_000_000)
     assert stop(operator, address, driver, StopRequests("r1", b"", 70))
     assert faults() == {"STOP receiver": 1} and caplog.messages == ["STOP receiver ended (-9); starting it again"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP])
+def test_a_key_during_a_start_of_the_receiver_does_not_end_it(started, monkeypatch, number):
+    """A traceback of its imports would be the last that the operator reads."""
+    monkeypatch.setattr(stop_port, "_CHILD", "import time; time.sleep(30)")
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    process = started(stop_receiver.start("r1", [], [], ""))
+    process._process.send_signal(number)
+    with pytest.raises(subprocess.TimeoutExpired):
+        process._process.wait(0.2)
+    assert Path(f"/proc/{process._process.pid}/stat").read_text().split()[2] != "T"
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before, "this process gets its keys again"
 
 
 def test_a_port_in_use_is_reported_and_opened_later(started, operator):
