@@ -198,10 +198,7 @@ class StopProcess:
             import logging
             import subprocess
 
-            from sightline.protocol.log import count_fault
-
             if self._process is not None:
-                count_fault("STOP receiver")
                 logging.getLogger(__name__).error("STOP receiver ended (%d); starting it again", self._process.poll())
             root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
             number = self.far.fileno()

@@ -129,7 +129,7 @@ class Guardian:
             self._say(f"the driver process was ended by signal {-code}")
         if error is not None:
             _log.error("robot %s: motors NOT set to zero: %s: %s; switch off their supply",
-                       self._setup["robot"], type(error).__name__, error)
+                       self._setup["robot"], type(error).__name__, error, exc_info=error)
         elif needs_zero(code, was_ready=self._monitor.is_ready):
             self._say("the motors are set to zero")
 
