@@ -3,6 +3,7 @@
 import pytest
 
 from sightline.protocol.errors import ConfigError
+from sightline.protocol.log import faults
 from sightline.protocol.messages import STILL, FrameHeader, RequestId, Twist
 from sightline.vision_side.config import MissionConfig, VisionConfig
 from sightline.vision_side.detect.port import NoDetector
@@ -232,3 +233,4 @@ def test_note_of_a_failed_mission_has_at_most_200_characters():
 
     switch._mission.step = fail
     assert switch.step(looked()).note == "RuntimeError: " + "x" * 186
+    assert faults() == {"mission": 1}
