@@ -101,6 +101,7 @@ _accepted: Final = Counter[str]()
 
 def note_accepted(host: str) -> None:
     """Count a connection that this process has accepted, because a short one may end between two samples."""
+    # Without `limit_floods` in this process nothing empties it, so the number of hosts is bounded.
     if host in _accepted or len(_accepted) < MAX_BLOCKED:
         _accepted[host] += 1
 
@@ -131,6 +132,7 @@ def _watch(ports: set[int], report: Callable[[str], None], ending: threading.Eve
             deferred = _listeners(ports)
             _defer(deferred)
         now_us = heartbeat_us()
+        # A connection that comes between these two lines is not counted, which a flood does not need.
         accepted = dict(_accepted)
         _accepted.clear()
         floods = detector.sample(connection_ends(ports), now_us, accepted)
@@ -175,6 +177,7 @@ def _sockets(wanted: Callable[[str], bool]) -> Iterator[socket.socket]:
 def _defer(inodes: set[str]) -> None:
     """Let the kernel accept a connection with its first byte, which an honest peer sends when it connects."""
     for listener in _sockets(inodes.__contains__):
+        # The option may be set while the socket listens already. It holds for connections from now on.
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, _DEFER_S)
 
 
@@ -192,6 +195,7 @@ def _end_half_open(ports: set[int], hosts: Sequence[str], waiting: set[Peer]) ->
             info = one.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _ACKED_BYTES.size)
             if host.removeprefix("::ffff:") not in hosts or _ACKED_BYTES.unpack(info)[0]:
                 continue
+            # Twice in a row, because an honest peer may be amid its handshake now.
             unanswered.add((host, port))
             if (host, port) in waiting:
                 one.shutdown(socket.SHUT_RDWR)
@@ -215,6 +219,7 @@ def source_filter(addresses: Sequence[int]) -> list[tuple[int, int, int, int]]:
     A listening socket receives the packets of connections that it has not accepted, no others. A session inherits the
     filter of the moment when it was opened, which did not list its address.
     """
+    # Addresses of IPv6 are not listed: a sender has many of them.
     rows = len(addresses)
     checks = [(_IF_EQUAL, rows - place, 0, address) for place, address in enumerate(addresses)]
     return [
