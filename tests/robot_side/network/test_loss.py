@@ -51,7 +51,7 @@ def test_bursts_of_loss_cost_neither_rate_nor_quality(seed):
     assert course(0.1, in_a_row=2.0, seed=seed).stream.encoding_target == (100, 100)
 
 
-BOUNDS = [(0.1, 0.0, 0), (0.2, 0.2, 600), (0.3, 1.0, 1_000)]
+BOUNDS = [(0.1, 0.0, 0), (0.2, 0.2, 600), (0.3, 1.0, 2_000)]
 
 
 @pytest.mark.slow
