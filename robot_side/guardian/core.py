@@ -1,7 +1,7 @@
 """When a driver process counts as hung, and whether it is started again. Pure; standard library only.
 
-A heartbeat is one byte that the control loop sends at each tick. Silence is measured in the driver's own time, without
-the time that the driver waited for a processor, and without the lateness of the guardian itself.
+A heartbeat is a byte and its time, which the control loop sends at each tick. Silence is measured in the driver's own
+time, without the time that the driver waited for a processor, and without the lateness of the guardian itself.
 """
 
 from collections import deque
@@ -18,8 +18,10 @@ WATCHED: Final = b"w"
 ENDING: Final = b"e"
 """The last heartbeat: the wheels are at zero, and files and devices are being closed."""
 
-PERIOD_US: Final = 25_000
-"""Between two looks at a driver without a heartbeat; the control loop sends one every 20 ms."""
+PERIOD_US: Final = 100_000
+"""Between two looks at a driver: each wakes the guardian, and the end of a driver wakes it without a look."""
+LATE_US: Final = 25_000
+"""Silence of a driver that is late, and then the time between two looks; the loop sends a heartbeat every 20 ms."""
 HUNG_US: Final = 200_000
 """Silence in the driver's own time after which it counts as hung."""
 STARVED_US: Final = 500_000
@@ -31,7 +33,17 @@ ENDS_WITHIN_US: Final = 7_000_000
 MAX_RESTARTS: Final = 5
 RESTART_WINDOW_US: Final = 60_000_000
 
-_LONGEST_STEP_US: Final = 2 * PERIOD_US  # of one look: more of it is the lateness of the guardian
+_LONGEST_STEP_US: Final = PERIOD_US + LATE_US  # of one look: more of it is the lateness of the guardian
+
+
+def pack_beat(kind: bytes, sent_us: int) -> bytes:
+    """Return the packet of a heartbeat."""
+    return kind + sent_us.to_bytes(8, "little")
+
+
+def unpack_beat(packet: bytes) -> tuple[bytes, int]:
+    """Return the kind of a heartbeat and the time at which it was sent, us."""
+    return packet[:1], int.from_bytes(packet[1:], "little")
 
 
 class HeartbeatMonitor:
@@ -51,12 +63,12 @@ class HeartbeatMonitor:
     @property
     def is_late(self) -> bool:
         """Return True if a heartbeat is missing, so that `look` needs the processor time of the driver."""
-        return self._silence_us >= PERIOD_US and self._last not in (b"", IDLE)
+        return self._silence_us >= LATE_US and self._last not in (b"", IDLE)
 
-    def on_beat(self, kind: bytes, now_us: int) -> None:
+    def on_beat(self, kind: bytes, sent_us: int) -> None:
         """Note a heartbeat. A driver that is ending does not come back to life."""
         self._last = ENDING if self._last == ENDING else kind
-        self._looked_us, self._silence_us, self._own_us, self._run_us = now_us, 0, 0, None
+        self._looked_us, self._silence_us, self._own_us, self._run_us = sent_us, 0, 0, None
 
     def look(self, now_us: int, run_us: int | None = None) -> str:
         """Return why the driver must be killed, or "" while it need not.

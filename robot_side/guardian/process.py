@@ -34,6 +34,7 @@ from sightline.robot_side.driver.supervision import (
 from sightline.robot_side.guardian.core import (
     ENDING,
     ENDS_WITHIN_US,
+    LATE_US,
     PERIOD_US,
     STARTS_WITHIN_US,
     WATCHED,
@@ -41,6 +42,7 @@ from sightline.robot_side.guardian.core import (
     RestartBudget,
     exit_code_after,
     needs_zero,
+    unpack_beat,
 )
 
 _log: Final = logging.getLogger("sightline.guardian")
@@ -87,7 +89,7 @@ class Guardian:
             ends += [near, far]
         for end in ends:
             end.set_inheritable(False)
-        self._beats.setblocking(False)
+        self._hang_up = _hang_up_of(self._beats)
         self._driver_pid: int = setup["pid"]
         self._status: int | None = None
         self._reason = ""
@@ -143,8 +145,7 @@ class Guardian:
         """Wait until the driver process has ended, by itself or killed. Returns its wait status."""
         self._status, self._reason = None, ""
         while True:
-            with suppress(OSError, ValueError):  # its end has closed: what follows is its exit
-                select.select([self._beats], [], [], PERIOD_US / 1e6)
+            self._hang_up.poll((LATE_US if self._monitor.is_late else PERIOD_US) // 1000)
             now_us = heartbeat_us()
             is_open = self._read_beats(now_us)
             self._reap()
@@ -176,22 +177,22 @@ class Guardian:
         """Take what the driver process sent. Returns False after the end of its socket."""
         for _ in range(_BEATS_PER_LOOK):
             try:
-                kind = self._beats.recv(8)
+                packet = self._beats.recv(16)
             except BlockingIOError:
                 return True
             except OSError:
                 return False
-            if not kind:
+            if not packet:
                 return False
-            self._on_beat(kind, now_us)
+            self._on_beat(*unpack_beat(packet), now_us)
         return True
 
-    def _on_beat(self, kind: bytes, now_us: int) -> None:
+    def _on_beat(self, kind: bytes, sent_us: int, now_us: int) -> None:
         if not self._monitor.is_ready:
             self._permit_silence(os.environ.get("WATCHDOG_USEC", ""))
             if not self._fed_us:  # once, and after the lines of a driver process that does not start
                 self._say(_NOT_COVERED.format("" if self._systemd.is_active else _NO_WATCHDOG))
-        self._monitor.on_beat(kind, now_us)
+        self._monitor.on_beat(kind, sent_us)
         if kind == ENDING:
             self._systemd.notify("STOPPING=1")
         elif now_us - self._fed_us >= _WATCHDOG_PERIOD_US:
@@ -220,7 +221,7 @@ class Guardian:
         self._permit_silence(STARTS_WITHIN_US)
         self._beats.close()
         self._beats, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self._beats.setblocking(False)
+        self._hang_up = _hang_up_of(self._beats)
         self._beats.send(self._setup["driver"].encode())
         self._send_ready()
         self._driver_pid = self._start([theirs, *([self._receiver.near] if self._receiver else [])])
@@ -273,6 +274,14 @@ class Guardian:
 
     def _say(self, line: str) -> None:
         _log.info("robot %s: %s", self._setup["robot"], line)
+
+
+def _hang_up_of(beats: socket.socket) -> select.poll:
+    """Return what waits for the end of the process at the other end, and not for its heartbeats."""
+    beats.setblocking(False)
+    hang_up = select.poll()
+    hang_up.register(beats, 0)
+    return hang_up
 
 
 def run_us_of(pid: int) -> int | None:

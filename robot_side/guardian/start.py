@@ -15,6 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
+from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.transports.endpoints import stop_addresses
 from sightline.protocol.transports.security import stop_secret_file
@@ -23,7 +24,7 @@ from sightline.protocol.transports.stop_port import StopProcess
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, GUARDIAN_PRIORITY, schedule_real_time
 from sightline.robot_side.guardian import stop_receiver
-from sightline.robot_side.guardian.core import ENDING, STARTS_WITHIN_US
+from sightline.robot_side.guardian.core import ENDING, STARTS_WITHIN_US, pack_beat
 from sightline.robot_side.plugins import DRIVES
 
 _log: Final = logging.getLogger(__name__)
@@ -59,7 +60,7 @@ class GuardianEnd:
     def beat(self, kind: bytes) -> None:
         """Send a heartbeat; never waits."""
         with suppress(OSError):
-            self.heartbeats.send(kind)
+            self.heartbeats.send(pack_beat(kind, heartbeat_us()))
 
     def is_gone(self) -> bool:
         """Return True if the guardian is dead."""

@@ -8,6 +8,7 @@ from sightline.robot_side.guardian.core import (
     ENDS_WITHIN_US,
     HUNG_US,
     IDLE,
+    LATE_US,
     MAX_RESTARTS,
     MOVING,
     PERIOD_US,
@@ -19,10 +20,12 @@ from sightline.robot_side.guardian.core import (
     RestartBudget,
     exit_code_after,
     needs_zero,
+    pack_beat,
+    unpack_beat,
 )
 
 
-def silence_us(monitor, begin_us, *, run_share=None, step_us=PERIOD_US, limit_us=60_000_000):
+def silence_us(monitor, begin_us, *, run_share=None, step_us=LATE_US, limit_us=60_000_000):
     """Look at a silent driver every `step_us`; return the silence until it must be killed, or None, and the reason."""
     now_us = begin_us
     while now_us - begin_us < limit_us:
@@ -50,9 +53,9 @@ def test_stopped_or_looping_driver_is_hung_after_200_ms(kind, run_share):
 @pytest.mark.parametrize("kind", [AT_REST, MOVING])
 def test_driver_with_regular_heartbeats_is_never_killed(kind):
     monitor = HeartbeatMonitor(0)
-    for now_us in range(0, 10_000_000, PERIOD_US):
+    for now_us in range(0, 10_000_000, LATE_US):
         monitor.on_beat(kind, now_us)
-        assert monitor.look(now_us + PERIOD_US - 1) == ""
+        assert monitor.look(now_us + LATE_US - 1) == ""
         assert not monitor.is_late
 
 
@@ -79,7 +82,7 @@ def test_loop_that_shares_its_processor_is_found_by_its_own_time():
 def test_silence_while_the_guardian_was_starved_does_not_count():
     monitor = beaten(MOVING, 0)
     assert monitor.look(5_000_000) == "", "one late look is the lateness of the guardian"
-    assert silence_us(monitor, 5_000_000)[0] == HUNG_US - 2 * PERIOD_US
+    assert silence_us(monitor, 5_000_000)[0] == HUNG_US - PERIOD_US - LATE_US
 
 
 def test_start_and_end_have_limits_of_their_own():
@@ -91,7 +94,7 @@ def test_start_and_end_have_limits_of_their_own():
 
 def test_limits_are_exact():
     for monitor, limit_us in ((HeartbeatMonitor(0), STARTS_WITHIN_US), (beaten(MOVING, 0), HUNG_US)):
-        assert silence_us(monitor, 0, limit_us=limit_us - PERIOD_US)[0] is None
+        assert silence_us(monitor, 0, limit_us=limit_us - LATE_US)[0] is None
         assert monitor.look(limit_us - 1) == ""
         assert monitor.look(limit_us) != ""
 
@@ -99,12 +102,20 @@ def test_limits_are_exact():
 def test_driver_that_falls_asleep_while_it_waits_for_a_processor_is_hung():
     monitor = beaten(MOVING, 0)
     assert silence_us(monitor, 0, run_share=0.0, limit_us=100_000)[0] is None
-    assert silence_us(monitor, 100_000)[0] == HUNG_US - PERIOD_US
+    assert silence_us(monitor, 100_000)[0] == HUNG_US - LATE_US
 
 
 def test_heartbeats_are_bytes_that_differ():
     assert (AT_REST, MOVING, IDLE, ENDING, WATCHED) == (b"0", b"1", b"i", b"e", b"w")
     assert RESTART_WINDOW_US == 60_000_000
+    assert unpack_beat(pack_beat(MOVING, 2**40 + 3)) == (MOVING, 2**40 + 3)
+
+
+def test_silence_counts_from_the_time_at_which_the_heartbeat_was_sent():
+    monitor = beaten(MOVING, 0)
+    monitor.on_beat(MOVING, 20_000)
+    assert monitor.look(PERIOD_US) == "" and monitor.is_late
+    assert monitor.look(20_000 + HUNG_US) == "no heartbeat for 200 ms"
 
 
 def test_tool_that_waits_for_an_operator_may_be_silent():
@@ -117,7 +128,7 @@ def test_processor_time_is_needed_only_after_a_missing_heartbeat():
     monitor.look(50_000)
     assert not monitor.is_late and not monitor.is_ready
     monitor.on_beat(MOVING, 60_000)
-    monitor.look(60_000 + PERIOD_US)
+    monitor.look(60_000 + LATE_US)
     assert monitor.is_late and monitor.is_ready
 
 
