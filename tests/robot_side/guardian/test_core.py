@@ -108,6 +108,7 @@ def test_driver_that_falls_asleep_while_it_waits_for_a_processor_is_hung():
 def test_heartbeats_are_bytes_that_differ():
     assert (AT_REST, MOVING, IDLE, ENDING, WATCHED) == (b"0", b"1", b"i", b"e", b"w")
     assert RESTART_WINDOW_US == 60_000_000
+    assert pack_beat(MOVING, 1) == b"1\x01" + bytes(7)
     assert unpack_beat(pack_beat(MOVING, 2**40 + 3)) == (MOVING, 2**40 + 3)
 
 
