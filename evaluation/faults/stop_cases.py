@@ -24,8 +24,9 @@ AFTER_S: Final = (2.0, 20.0, 80.0)
 STOP_ENDS_S: Final = 20.0
 READY_S: Final = 30.0
 KEPT_MPS: Final = 0.4
-_REPORTED: Final = ("connect_25", "connect_500", "half_open")
-"""Floods that exceed the limits of one address. The others stay below, in number and in rate."""
+_REPORTED: Final = ("connect_25", "half_open")
+"""Floods that exceed the limits of one address. The others stay below, in number and in rate. Connections to plain TCP
+that end within a millisecond leave nothing to count, so `connect_500` is reported on WebSocket only."""
 
 
 def _flood(rig: RobotFixture, kind: str, after_s: float | None = None) -> Injected:
@@ -39,7 +40,7 @@ def _flood(rig: RobotFixture, kind: str, after_s: float | None = None) -> Inject
         rig.watch(after_s)
     count = len(rig.noted("crowd", INJECTED))
     at_us, checks = rig.stop_by_operator()
-    if kind in _REPORTED:
+    if kind in _REPORTED or (kind == "connect_500" and rig.web_endpoint):
         log = rig.processes.log("router" if rig.setup.routed else "robot").read_text("utf-8")
         checks += at_least("reported", "connections from" in log, "", 1), at_most(
             "lines of the flood", log.count("connections from"), "", 1)
