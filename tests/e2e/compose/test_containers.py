@@ -97,6 +97,7 @@ def test_each_role_has_only_its_own_keys(running):
     for service, role in held.items():
         files = running.inside(service, "sh", "-c", "cd /keys; find . -type f").split()
         names = {"ca.pem", *(f"{one}.{kind}" for one in (role, "viewer") for kind in ("key", "pem", "token"))}
+        names |= {"stop.secret"} if role in ("robot", "operator") else set()
         assert {file.rpartition("/")[2] for file in files} == names
 
 
