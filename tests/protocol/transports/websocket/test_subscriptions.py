@@ -62,6 +62,7 @@ def test_large_messages_are_accepted_only_while_subscribed(site):
     assert until(lambda: robot.rejected["OVERSIZE"] == 1)
     viewer = opened("viewer")
     seen = viewer.latest(OVERLAY)
+    assert until(lambda: robot._subscriptions.announced[1:])
     stranger = hail(end, role="vision", wants=["status"])
     assert until(lambda: stranger.send(large) or seen.take(0.2))
     viewer.close()
