@@ -30,4 +30,5 @@ def zero(config: Mapping[str, Any]) -> None:
                 if answer == MOTION_BUSY:
                     raise HardwareError(f"another process owns the simulated motors in {folder}; end it")
         except OSError as error:
-            raise HardwareError(f"the simulation in {folder} takes no motor commands: {error}") from None
+            why = error.strerror or "no answer"
+            raise HardwareError(f"the simulation in {folder} takes no motor commands ({why}); is it running?") from None

@@ -66,15 +66,9 @@ def _pause_vision(rig: RobotFixture) -> Injected:
     return Injected(1, at_us, resumed_us, drives_again(rig))
 
 
-def _fail_detector(rig: RobotFixture) -> Injected:
+def _spoil_detector(rig: RobotFixture, seconds: float = SETTLED_S) -> Injected:
     at_us = rig.trigger()
-    rig.watch(SETTLED_S)
-    return Injected(rig.injected(), at_us)
-
-
-def _slow_detector(rig: RobotFixture) -> Injected:
-    at_us = rig.trigger()
-    rig.watch(2 * STOPPED_S)
+    rig.watch(seconds)
     return Injected(rig.injected(), at_us)
 
 
@@ -87,10 +81,12 @@ def _restart_vision(rig: RobotFixture) -> Injected:
     return Injected(1, at_us, resumed_us, drives_again(rig))
 
 
-def _kill_network(rig: RobotFixture) -> Injected:
-    before = rig.processes.network("robot")
-    at_us = rig.signal_network(signal.SIGKILL)
-    rig.until(lambda: rig.processes.network("robot") not in (0, before), AGAIN_S, "a new network process")
+def _hurt(rig: RobotFixture, part: str, number: signal.Signals) -> Injected:
+    """Send the network or driver process a signal that ends it. Its parent starts a new one."""
+    pid = partial(getattr(rig.processes, part), "robot")
+    before, at_us = pid(), monotonic_us()
+    os.kill(before, number)
+    rig.until(lambda: pid() not in (0, before), AGAIN_S, f"a new {part} process")
     rig.watch(SETTLED_S)
     again = drives_again(rig)
     first_us = min((one.t_us for one in rig.sent() if one.t_us > at_us + LEFT_OVER_US), default=None)
@@ -126,17 +122,6 @@ def busy_processes() -> Iterator[None]:
             process.wait()
 
 
-def _hurt_driver(rig: RobotFixture, number: signal.Signals) -> Injected:
-    """Send the driver process a signal. Its guardian stops the wheels and starts a new one."""
-    before, at_us = rig.processes.driver("robot"), monotonic_us()
-    os.kill(before, number)
-    rig.until(lambda: rig.processes.driver("robot") not in (0, before), AGAIN_S, "a new driver process")
-    rig.watch(SETTLED_S)
-    again = drives_again(rig)
-    first_us = min((one.t_us for one in rig.sent() if one.t_us > at_us + LEFT_OVER_US), default=None)
-    return Injected(1, at_us, first_us, again)
-
-
 def _kill_guardian(rig: RobotFixture) -> Injected:
     driver, at_us = rig.processes.driver("robot"), monotonic_us()
     rig.processes.signal("robot", signal.SIGKILL)
@@ -151,8 +136,9 @@ def _kill_driver_and_guardian(rig: RobotFixture) -> Injected:
     os.kill(driver, signal.SIGKILL)
     time.sleep(BETWEEN_S)
     rig.processes.signal("robot", signal.SIGKILL)
+    rig.until(lambda: wheel_mps(rig.motors()[-1]) == 0.0, SETTLED_S, "zero, set by the guardian")
+    rig.probe_motors()  # at once: the log has a line for each command only, and the wheels still roll
     rig.watch(SETTLED_S)
-    rig.probe_motors()
     return Injected(2, at_us)
 
 
@@ -210,11 +196,13 @@ _ENDED: Final = "zero is the last speed set, exit code 0, port free <= 2 s"
 PROCESS_CASES: Final = (
     FaultCase("vision.kill", "vision: SIGKILL", _kill_vision, VISION, short=True),
     FaultCase("vision.pause", "vision: SIGSTOP 3 s, then SIGCONT", _pause_vision, VISION, again=True),
-    FaultCase("vision.raises", "vision: the detector raises", _fail_detector, Setup("vision", "raises")),
-    FaultCase("vision.hangs", "vision: the detector hangs", _fail_detector, Setup("vision", "hangs"), short=True),
-    FaultCase("vision.slow", "vision: the detector takes 330 ms", _slow_detector, Setup("vision", "slow"), stops=False),
+    FaultCase("vision.raises", "vision: the detector raises", _spoil_detector, Setup("vision", "raises")),
+    FaultCase("vision.hangs", "vision: the detector hangs", _spoil_detector, Setup("vision", "hangs"), short=True),
+    FaultCase("vision.slow", "vision: the detector takes 330 ms", partial(_spoil_detector, seconds=2 * STOPPED_S),
+              Setup("vision", "slow"), stops=False),
     FaultCase("vision.restart", "vision: killed and started again", _restart_vision, VISION, again=True),
-    FaultCase("network.kill", "network process: SIGKILL", _kill_network, _SCRIPT, blind=True, again=True, short=True),
+    FaultCase("network.kill", "network process: SIGKILL", partial(_hurt, part="network", number=signal.SIGKILL),
+              _SCRIPT, blind=True, again=True, short=True),
     FaultCase("network.pause", "network process: SIGSTOP 3 s", _pause_network, _SCRIPT, blind=True, again=True),
     FaultCase(
         "network.gil", "network process: C code holds the interpreter 1 s", _hold_gil, _SCRIPT, blind=True, again=True,
@@ -224,8 +212,8 @@ PROCESS_CASES: Final = (
         "driver.starved", "robot: four busy processes beside it; then vision: SIGKILL", _starve, _SCRIPT, alone=True
     ),
     *(
-        FaultCase(f"guardian.{name}", f"driver process: {what}", partial(_hurt_driver, number=number), _SCRIPT,
-                  blind=True, again=True, short=name == "driver_kill", alone=name == "driver_loop")
+        FaultCase(f"guardian.{name}", f"driver process: {what}", partial(_hurt, part="driver", number=number),
+                  _SCRIPT, blind=True, again=True, short=name == "driver_kill", alone=name == "driver_loop")
         for name, what, number in (
             ("driver_kill", "SIGKILL", signal.SIGKILL), ("driver_pause", "SIGSTOP", signal.SIGSTOP),
             ("driver_segfault", "segmentation fault", signal.SIGSEGV), ("driver_loop", "endless loop", LOOP),

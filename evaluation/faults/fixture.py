@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -174,7 +174,7 @@ PORT: Final = 7447
 _POLL_S: Final = 0.01
 _TAIL_BYTES: Final = 8192
 """More than a second of the motors' log."""
-_PROBES: Final = 25
+_PROBED_S: Final = 0.5
 _OPERATOR_READY_S: Final = 30.0
 _STOP_ENDS_S: Final = 20.0
 _CHASE: Final[dict[str, Any]] = {
@@ -420,12 +420,15 @@ class RobotFixture:
 
         It then sets zero, so that the log continues.
         """
-        last_mps = wheel_mps(self.motors()[-1])
-        drive = SimDrive(SimSocketConfig(socket_dir=self._sockets))
-        for _ in range(_PROBES):
-            drive.set(0.0, 0.0)
+        last_mps, end_s = wheel_mps(self.motors()[-1]), time.monotonic() + _PROBED_S
+        while time.monotonic() < end_s:
+            # A driver process that starts may own the motors for a moment.
+            with suppress(HardwareError), closing(SimDrive(SimSocketConfig(socket_dir=self._sockets))) as drive:
+                while time.monotonic() < end_s:
+                    drive.set(0.0, 0.0)
+                    drive.wheels()
+                    time.sleep(TICK_US / 1e6)
             time.sleep(TICK_US / 1e6)
-        drive.close()
         return last_mps
 
     # --- evidence ------------------------------------------------------------------------------------------------

@@ -139,7 +139,7 @@ class MissionClient:
         request = request_of(self._id, name, waypoints, options or {})
         # Repeats cite the same status, so the age of a request counts from the first one.
         echo = Echo.of(self.operator.wait_report().stamp)
-        mine = RequestId(digest=session_digest(SOURCE, self._session), id=self._id)
+        mine = self._newest_id()
         deadline_s = time.monotonic() + PATIENCE_S
         while (left_s := deadline_s - time.monotonic()) > 0:
             self._seq += 1
@@ -157,7 +157,7 @@ class MissionClient:
         Raises:
             LinkError: no report within `timeout_s`, or another mission replaced the requested one.
         """
-        mine, previous = RequestId(digest=session_digest(SOURCE, self._session), id=self._id), None
+        mine, previous = self._newest_id(), None
         while True:
             report = self.report(timeout_s)
             if report.asked != mine:
@@ -169,6 +169,9 @@ class MissionClient:
                 yield report
             if report.done:
                 return
+
+    def _newest_id(self) -> RequestId:
+        return RequestId(digest=session_digest(SOURCE, self._session), id=self._id)
 
     def _next(self, wanted: Callable[[MissionReport], bool], timeout_s: float) -> MissionReport:
         with self._changed:

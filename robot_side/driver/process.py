@@ -34,7 +34,7 @@ from sightline.robot_side.driver.supervision import (
     request_real_time,
 )
 from sightline.robot_side.guardian.core import AT_REST, MOVING
-from sightline.robot_side.guardian.start import GuardianEnd
+from sightline.robot_side.guardian.start import GuardianEnd, zero_of
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.plugins import BATTERIES, DRIVES, RANGE_SENSORS
@@ -98,9 +98,12 @@ def _zero(drive: Drive) -> None:
 
 
 def zero_motors(config: RobotConfig) -> int:
-    """Set the motors to zero without gate or network, to clean up after a dead robot service."""
-    plugin, options = DRIVES.load(config.motors)
-    plugin.zero(options.model_dump(mode="json"))
+    """Set the motors to zero without gate or network, to clean up after a dead robot service.
+
+    Raises ConfigError for a drive without `zero`, HardwareError if the motors may still turn.
+    """
+    zero, options = zero_of(config)
+    zero(options)
     return 0
 
 

@@ -190,7 +190,8 @@ class Guardian:
     def _on_beat(self, kind: bytes, sent_us: int, now_us: int) -> None:
         if not self._monitor.is_ready:
             self._permit_silence(os.environ.get("WATCHDOG_USEC", ""))
-            if not self._fed_us:  # once, and after the lines of a driver process that does not start
+            # Once, after the lines of a driver process that does not start. An operator watches a tool.
+            if not self._fed_us and self._setup["driver"] is not None:
                 self._say(_NOT_COVERED.format("" if self._systemd.is_active else _NO_WATCHDOG))
         self._monitor.on_beat(kind, sent_us)
         if kind == ENDING:

@@ -11,6 +11,7 @@ import select
 import signal
 import socket
 import sys
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -86,14 +87,14 @@ def become_guardian(config: RobotConfig, *, restarts: bool) -> GuardianEnd:
     Raises:
         ConfigError: the drive cannot be loaded or has no `zero`.
     """
-    module, name, options = zero_of(config)
+    zero, options = zero_of(config)
     beats, their_beats = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     receiver = stop_receiver_of(config) if restarts else None
     setup = {
         "root": str(Path(__file__).parent.parent.parent),
         "path": [one for one in sys.path if isinstance(one, str)],
         "robot": config.robot,
-        "zero": {"module": module, "name": name, "config": options},
+        "zero": {"module": zero.__module__, "name": zero.__qualname__, "config": options},
         "driver": config.model_dump_json() if restarts else None,
         "beats": beats.fileno(),
         "receiver": receiver and {
@@ -141,14 +142,13 @@ def stop_receiver_of(config: RobotConfig) -> StopProcess | None:
     return stop_receiver.start(config.robot, addresses, routers, secret_file)
 
 
-def zero_of(config: RobotConfig) -> tuple[str, str, dict[str, Any]]:
-    """Return module, name and plain configuration of the drive's `zero`. Raises ConfigError without one."""
+def zero_of(config: RobotConfig) -> tuple[Callable[[Mapping[str, Any]], None], dict[str, Any]]:
+    """Return the drive's `zero` and its argument. Raises ConfigError without one that another process can import."""
     plugin, options = DRIVES.load(config.motors)
     zero = getattr(plugin, "zero", None)
-    module, name = getattr(zero, "__module__", None), getattr(zero, "__qualname__", "<")
-    if not callable(zero) or module is None or "<" in name:
+    if not callable(zero) or getattr(zero, "__module__", None) is None or "<" in getattr(zero, "__qualname__", "<"):
         raise ConfigError(
             f"drive '{config.drive.kind}' has no static method zero(config), which stops the wheels after its process "
             "has died; add it as in docs/how-to/add-a-device.md"
         )
-    return module, name, options.model_dump(mode="json")
+    return zero, options.model_dump(mode="json")

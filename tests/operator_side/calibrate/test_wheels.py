@@ -154,6 +154,7 @@ def test_signal_during_a_turn_sets_zero_first(tmp_path, opened, number):
     terminal.process.send_signal(number)
     assert terminal.process.wait(3) == 130
     assert commanded(log)[-1] == (0.0, 0.0)
+    assert "not covered" not in terminal.text()
 
 
 def test_a_drive_is_calibrated_at_a_terminal(tmp_path, opened, monkeypatch):

@@ -6,6 +6,9 @@ import signal
 import socket
 from pathlib import Path
 
+import pytest
+
+from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.process import zero_motors
 from sightline.robot_side.driver.supervision import DRIVER_PRIORITY, GUARDIAN_PRIORITY, SystemdNotifier
@@ -59,6 +62,11 @@ def test_motors_are_zeroed_without_gate_or_network(tmp_path):
     config = RobotConfig(drive=PluginChoice(kind="log", options={"path": log}))
     assert zero_motors(config) == 0
     assert log.read_text().strip().endswith(",0.0000,0.0000")
+
+
+def test_motors_of_a_drive_without_zero_are_a_configuration_error():
+    with pytest.raises(ConfigError, match="has no static method zero"):
+        zero_motors(RobotConfig(drive=PluginChoice(kind="tests.fixtures.dying:ZerolessDrive")))
 
 
 def test_driver_scheduling_is_not_inherited(tmp_path):

@@ -20,7 +20,6 @@ from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.supervision import schedule_real_time
 from sightline.robot_side.guardian.process import hurry
 from sightline.robot_side.guardian.start import zero_of
-from sightline.robot_side.hardware.log_drive import LogDrive
 from tests.fixtures.dying import LATE, DriveFault
 from tests.fixtures.links import START_S, until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving, stop_after
@@ -40,12 +39,6 @@ def arm(endpoint: str) -> None:
     with open_zenoh("r1", connect=[endpoint], role="operator", timeout_s=START_S) as link:
         operator = Operator(link)
         assert until(lambda: operator.request(Verb.ARM).ok, START_S)
-
-
-class ZerolessDrive(LogDrive):
-    """A plug-in that was written before `zero` existed."""
-
-    zero = None
 
 
 @pytest.fixture
@@ -143,7 +136,7 @@ def test_end_before_the_first_heartbeat_is_quick_and_quiet(tmp_path, number):
 
 
 def test_drive_without_zero_is_one_line_at_start(tmp_path):
-    kind = f"{__name__}:ZerolessDrive"
+    kind = "tests.fixtures.dying:ZerolessDrive"
     with RobotProcess(tmp_path, drive={"kind": kind}) as robot:
         assert robot.process.wait(START_S) == 2
         assert robot.output().splitlines() == [
@@ -157,7 +150,8 @@ def test_drive_without_zero_is_one_line_at_start(tmp_path):
     ("sim", {"socket_dir": "/tmp/s"}, ("sightline.sim.zero", "zero", {"socket_dir": "/tmp/s"})),
 ])  # fmt: skip
 def test_zero_of_a_drive_is_named_by_its_own_module(kind, options, expected):
-    assert zero_of(RobotConfig(drive=PluginChoice(kind=kind, options=options))) == expected
+    zero, config = zero_of(RobotConfig(drive=PluginChoice(kind=kind, options=options)))
+    assert (zero.__module__, zero.__qualname__, config) == expected
 
 
 def test_zero_of_an_unknown_drive_is_a_configuration_error():
