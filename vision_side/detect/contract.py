@@ -8,6 +8,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from random import Random
 from statistics import median
 from typing import Final
@@ -104,7 +105,7 @@ def _keeps_order(detector: Detector, _make: Make, seed: int) -> str:
 def _keeps_answering(detector: Detector, _make: Make, seed: int) -> str:
     """Every image gets an answer, of any size, black, noise or full."""
     for size in SIZES:
-        for index, frame in enumerate(drawn_frames(seed, 6, size)):
+        for index, frame in enumerate(drawn_frames(seed, 8, size)):
             if detector.detect([frame], NO_DEADLINE) == [None]:
                 return f"no answer to image {index} of {size[0]}x{size[1]}"
     return ""
@@ -232,10 +233,15 @@ def _is_bad(frame: DetectFrame) -> bool:
 
 def drawn_frames(seed: int, count: int, size: tuple[int, int], robot: str = "r1") -> Iterator[DetectFrame]:
     """Draw frames of one robot, 33 ms apart, each with a separate decoder, so that all stay valid."""
-    random = Random(seed)
-    for index in range(count):
+    for index, jpeg in enumerate(_jpegs(seed, count, size)):
         header = FrameHeader(session="0000abcd", seq=index + 1, t_us=5_000_000 + index * _FRAME_US)
-        yield DetectFrame(robot, header, _jpeg(random, size, index), Decoder(*size, _MAX_PIXELS))
+        yield DetectFrame(robot, header, jpeg, Decoder(*size, _MAX_PIXELS))
+
+
+@lru_cache(maxsize=32)  # several promises are checked with the same images
+def _jpegs(seed: int, count: int, size: tuple[int, int]) -> list[bytes]:
+    random = Random(seed)
+    return [_jpeg(random, size, index) for index in range(count)]
 
 
 def _jpeg(random: Random, size: tuple[int, int], index: int = 0) -> bytes:

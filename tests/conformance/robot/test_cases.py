@@ -28,7 +28,7 @@ def test_our_robot_passes(case):
     assert result.outcome is Outcome.PASSED, result.reason
 
 
-@pytest.mark.parametrize("cases", [VIRTUAL[::4], pytest.param(VIRTUAL, marks=pytest.mark.slow)], ids=["some", "all"])
+@pytest.mark.parametrize("cases", [VIRTUAL[::8], pytest.param(VIRTUAL, marks=pytest.mark.slow)], ids=["some", "all"])
 def test_one_robot_passes_cases_in_a_row(cases):
     bench, _robot = virtual_robot()
     results = run_cases(cases, bench, prepare)
@@ -47,9 +47,8 @@ def test_a_robot_without_guests_passes_what_applies():
 def test_robot_whose_wheels_differ_from_its_status_fails(break_it):
     bench, _robot = virtual_robot(break_it)
     found = broken_motion.LIARS[break_it]
-    groups = {case.group for case in VIRTUAL if case.id in found}
-    results = run_cases([case for case in VIRTUAL if case.group in groups], bench, prepare)
-    assert {one.case.id for one in results if one.outcome is Outcome.FAILED} >= set(found)
+    results = run_cases([case for case in VIRTUAL if case.id in found], bench, prepare)
+    assert {one.case.id for one in results if one.outcome is Outcome.FAILED} == set(found)
     assert not passed(results)
 
 

@@ -92,8 +92,8 @@ def test_images_of_the_look_real_are_of_the_seed_byte_for_byte():
         with started("circle", look_named("real"), seed) as world:
             world.set_wheels(4.0, 7.0)
             found = []
-            for _ in range(3):
-                for _ in range(20):
+            for _ in range(2):
+                for _ in range(10):
                     world.step()
                 found.append(world.render())
             return found

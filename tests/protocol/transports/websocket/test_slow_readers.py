@@ -88,7 +88,7 @@ def test_flood_of_pings_with_unread_answers_costs_little(robot):
     with bare_client(robot.endpoint, receive_bytes=4096, wants=[]) as near:
         near.settimeout(1)
         with suppress(OSError):  # the robot takes no more, or hangs up
-            for _ in range(1000):
+            for _ in range(250):  # 12 MB
                 near.sendall((b"\x89\x80" + bytes(4)) * 8192)
         assert resident_kib() - before_kib < 5_000
         robot.still_serves()
