@@ -219,9 +219,7 @@ Matrix = npt.NDArray[np.float64]
 def floor_tile(seed: int) -> Picture:
     """Grey-brown boards with specks, tileable: structure for a tracker, no colour that a ball could have."""
     draw = np.random.default_rng([seed, 4])
-    middle = slice(TILE_TEXELS, 2 * TILE_TEXELS)
-    specks = np.tile(draw.normal(0.0, 88.0, (TILE_TEXELS, TILE_TEXELS)), (3, 3))
-    grey = cv2.GaussianBlur(specks, (0, 0), 2.0)[middle, middle]
+    grey = _blurred(draw.normal(0.0, 88.0, (TILE_TEXELS, TILE_TEXELS)), 2.0)
     boards = np.repeat(draw.normal(0.0, 7.0, 8), TILE_TEXELS // 8)
     value = 118.0 + grey + boards[:, None]
     tile = np.stack([value * 1.02, value, value * 0.96], axis=-1)
@@ -332,7 +330,7 @@ class SceneCamera:
         return max(0, math.ceil(model.cy_px + model.fy_px * lens_m / ahead_m))
 
 
-def _blurred(tile: Picture, sigma: float) -> Picture:
+def _blurred(tile: npt.NDArray[Any], sigma: float) -> npt.NDArray[Any]:
     """Blur a tile as if it were repeated."""
     if not sigma:
         return tile
