@@ -16,6 +16,8 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import port_of
 from tests.fixtures.robot_process import RobotProcess, Vision, driving, stop_after
 
+pytestmark = pytest.mark.waits
+
 BOUND_S, BOUND_M = 0.7, 0.25
 KEYS = [signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP]  # Ctrl-C, Ctrl-\, Ctrl-Z
 

@@ -19,6 +19,8 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
+pytestmark = pytest.mark.waits
+
 
 @pytest.fixture
 def robot(tmp_path):

@@ -18,6 +18,8 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
 from tests.fixtures.robot_process import RobotProcess
 
+pytestmark = pytest.mark.waits
+
 ROOT = Path(__file__).parent.parent.parent.parent
 PICTURES = str(ROOT / "examples/pictures")
 PAGE = (ROOT / "docs/tutorials/implement-a-peer.md").read_text("utf-8")

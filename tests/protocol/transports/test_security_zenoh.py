@@ -36,6 +36,8 @@ from sightline.protocol.transports.zenoh.session import MAX_MESSAGE_BYTES, open_
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 
+pytestmark = pytest.mark.waits
+
 SAID = (TWIST, ACK, REQUEST, MISSION, REPORT)
 
 

@@ -24,6 +24,8 @@ from tests.fixtures.dying import LATE, DriveFault
 from tests.fixtures.links import START_S, until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving, stop_after
 
+pytestmark = pytest.mark.waits
+
 MEMORY_KB = 15_000
 BOUND_S, BOUND_M = 0.7, 0.25
 

@@ -11,6 +11,8 @@ from sightline.robot_side.ports import WheelAngles
 from tests.contracts.drives import check_drive
 from tests.fixtures import demanded
 
+pytestmark = pytest.mark.waits
+
 
 def test_the_log_drive(tmp_path):
     config = LogDrive.Config(path=tmp_path / "drive.csv")
@@ -79,7 +81,6 @@ class ClosesOnce(Broken):
         self.closed = True
 
 
-@pytest.mark.waits
 @pytest.mark.parametrize("broken", [Slow, Forgets, Crossed, Coasts, Ahead, ClosesOnce])
 def test_drive_contract_finds_each_broken_promise(broken):
     with pytest.raises(AssertionError):

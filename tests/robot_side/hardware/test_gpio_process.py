@@ -16,6 +16,8 @@ from tests.fixtures.gpio import BOARD, LEFT, OPTIONS, RIGHT, board_events, board
 from tests.fixtures.links import START_S, until
 from tests.fixtures.robot_process import RobotProcess, Vision
 
+pytestmark = pytest.mark.waits
+
 LOW_WITHIN_US = 50_000
 """From the moment that the gate's zero reaches the drive; the issue's bound."""
 FINE = [[0.02, 0.001], [1.0, 1.0]]

@@ -15,10 +15,11 @@ from tests.fixtures.links import claim, until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.websocket import bare_client, never_reads, pause_until, resident_kib
 
+pytestmark = pytest.mark.waits
+
 FPS = 30
 
 
-@pytest.mark.waits
 @pytest.mark.own_process
 def test_client_that_never_reads_delays_no_peer_and_can_still_send(robot):
     took_s, heard, before_kib = [], 0, resident_kib()
@@ -41,7 +42,6 @@ def test_client_that_never_reads_delays_no_peer_and_can_still_send(robot):
     robot.still_serves()
 
 
-@pytest.mark.waits
 @pytest.mark.own_process
 @pytest.mark.parametrize("picture_bytes", [3_000, 46_000, 200_000])
 def test_client_that_reads_one_image_a_second_stays_and_gets_new_images(picture_bytes):

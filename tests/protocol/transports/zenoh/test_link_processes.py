@@ -16,6 +16,8 @@ from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.websocket import resident_kib
 
+pytestmark = pytest.mark.waits
+
 PRELUDE = """
 import sys, time
 from sightline.protocol.channels import *

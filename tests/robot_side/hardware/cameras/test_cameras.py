@@ -11,6 +11,8 @@ from tests.contracts.cameras import check_camera
 from tests.fixtures import demanded
 from tests.fixtures.cameras import FakeDevice, install_fake_picamera2, jpeg, video
 
+pytestmark = pytest.mark.waits
+
 KINDS = ("folder", "still", "video", "v4l2", "picamera")
 
 

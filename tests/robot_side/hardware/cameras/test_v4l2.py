@@ -20,6 +20,8 @@ from sightline.robot_side.plugins import CAMERAS
 from tests.contracts.cameras import next_picture
 from tests.fixtures.cameras import FakeDevice, jpeg
 
+pytestmark = pytest.mark.waits
+
 
 @pytest.fixture
 def node(tmp_path):
