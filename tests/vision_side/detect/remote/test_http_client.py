@@ -115,7 +115,7 @@ def test_unsolicited_reply_answers_no_later_frame():
 
 
 MILLION = b'{"width_px":320,"height_px":240,"boxes":[' + b",".join([b"{}"] * 1_000_000) + b"]}"
-BOMB = gzip.compress(bytes(64 << 20))
+BOMB = gzip.compress(bytes(64 << 20), 1)
 HOSTILE = {
     "empty": (http_reply(b""), "MALFORMED"),
     "no json": (http_reply(b"{"), "MALFORMED"),
