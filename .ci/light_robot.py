@@ -30,6 +30,7 @@ ROOT: Final = Path(__file__).parent.parent
 ENDPOINT: Final = "tcp/127.0.0.1:17461"
 HEAVY: Final = ("numpy", "cv2", "pybullet", "simplejpeg", "matplotlib")
 MEMORY_BOUND_MB: Final = 52.0
+GUARDIAN_BOUND_MB: Final = 15.0
 _START_S: Final = 30.0
 
 
@@ -43,6 +44,8 @@ class LightRobot:
     driving_percent: float
     network_mb: float
     driver_mb: float
+    guardian_mb: float
+    """The larger one of guardian and STOP receiver."""
 
 
 def measure_light_robot(seconds: float) -> LightRobot:
@@ -63,7 +66,10 @@ def measure_light_robot(seconds: float) -> LightRobot:
         driver = driver_of(robot.pid)
         network = children_of(driver)[-1]
         size = sum(path.stat().st_size for path in (folder / "venv").rglob("*") if path.is_file())
-        return LightRobot(_heavy(python), size / 1e6, fps, driving, _high_water_mb(network), _high_water_mb(driver))
+        guardian = max(map(_high_water_mb, {robot.pid, *children_of(robot.pid)} - {driver}))
+        return LightRobot(
+            _heavy(python), size / 1e6, fps, driving, _high_water_mb(network), _high_water_mb(driver), guardian
+        )
 
 
 def _bare_environment(folder: Path) -> str:
@@ -145,6 +151,7 @@ def main() -> int:
         ("% of the time not driving", 100 - seen.driving_percent, 2.0),
         ("MB, network process", seen.network_mb, MEMORY_BOUND_MB),
         ("MB, driver process", seen.driver_mb, MEMORY_BOUND_MB),
+        ("MB, guardian or STOP receiver", seen.guardian_mb, GUARDIAN_BOUND_MB),
     )
     for name, value, bound in figures:
         print(f"light robot: {name}: {value:.3g} (at most {bound:g}){'' if value <= bound else ' NOT REACHED'}")

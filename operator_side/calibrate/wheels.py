@@ -78,7 +78,10 @@ def try_wheels(config: RobotConfig, prompt: Prompt | None, show: Print, guard: G
                 advice.append(f"{turn.name}: {_advice(config.motors, turn, _what_instead(prompt))}")
     for line in dict.fromkeys(advice):
         show(line)
-    show("all wheels turn as expected" if prompt is not None and not advice else "correct the errors and test again")
+    if prompt is None:
+        show("each wheel was turned; compare what you saw with these lines")
+    else:
+        show("correct the errors and test again" if advice else "all wheels turn as expected")
     return not advice
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import signal
 import sys
 import time
 
@@ -15,6 +16,7 @@ def main() -> int:
     parser.add_argument("--states", type=int, default=10_000_000, help="end a part after so many states")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="processes")
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # and with it the workers
     known, began_s = set(), time.monotonic()
     for name in options.only or PARTS:
         found = explore(name, min(options.states, PARTS[name].most), options.jobs)

@@ -15,7 +15,7 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import CameraModel, FrameHeader, Stamp
-from sightline.protocol.proof import NO_PROOF, ProofChain
+from sightline.protocol.proof import NO_PROOF, ProofChain, session_digest
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.vision_side.config import VisionConfig
@@ -239,7 +239,7 @@ class Service:
         self._heard_s = time.monotonic()
         if header.session != self._robot_session:
             self._robot_session = header.session
-            self._log_change("link", f"frames from robot {self._config.robot}, session {header.session}")
+            self._log_change("link", f"frames from robot {self._config.robot}, session {_shown(header.session)}")
         if self._pipeline is None:
             self._wait_for_camera(message.payload)
             self._publish(header, PipelineAnswer(None, Observation("no image", note="no camera model yet")), 0)
@@ -264,9 +264,9 @@ class Service:
         except WireError as error:
             self.skipped[error.reason] += 1
             if error.reason is RejectReason.OTHER_SESSION:
-                self._log_change("other", f"rejecting frames of session {header.session}: robot {self._config.robot} "
-                                          f"is steered in session {self._sessions.current}; give each robot its "
-                                          "own with --robot")
+                self._log_change("other", f"rejecting frames of session {_shown(header.session)}: robot "
+                                          f"{self._config.robot} is steered in session "
+                                          f"{_shown(self._sessions.current)}; give each robot its own with --robot")
             else:
                 self._log_change("time", f"rejecting frames of robot {self._config.robot} whose time disagrees with "
                                          "this clock; does another client send frames?")
@@ -348,6 +348,10 @@ class Service:
             self._report(f"vision: {line}")
 
 
+def _shown(session: str) -> str:
+    return session_digest("robot", session)
+
+
 def endpoints_text(config: VisionConfig) -> str:
     return ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)]) or "nowhere"
 
@@ -415,7 +419,7 @@ class BoxesService(Service):
         if header is None:
             return
         self._heard_s = time.monotonic()
-        self._log_change("link", f"frames from robot {self._config.robot}, session {header.session}")
+        self._log_change("link", f"frames from robot {self._config.robot}, session {_shown(header.session)}")
         self._publish(header, PipelineAnswer(None, Observation("no image", note="another service detects")), 0)
         self._viewing.keep(header, message.payload)
         if self._pipeline is None:

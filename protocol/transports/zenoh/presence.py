@@ -178,7 +178,7 @@ class PresenceAnnouncer:
             return
         raise LinkError(
             f"robot id {self._fixed.robot!r} is in use on host {other.host or 'unknown'} "
-            f"({other.up_us / 1e6:.0f} s, session {other.session}); pass --robot ID"
+            f"(running for {other.up_us / 1e6:.0f} s); pass --robot ID"
         )
 
 

@@ -89,6 +89,12 @@ def test_drive_without_these_options_gets_a_wiring_hint(robot):
     assert "right wheel, forward: the other wheel turned: exchange the motors' plugs" in text
 
 
+def test_without_questions_the_operator_has_to_compare(robot):
+    lines = []
+    assert wheel_test.try_wheels(robot[0], None, lines.append)
+    assert lines[-1] == "each wheel was turned; compare what you saw with these lines"
+
+
 def test_drive_that_fails_is_set_to_zero_and_closed(monkeypatch, robot):
     config, log = robot
     monkeypatch.setattr(wheel_test.time, "sleep", lambda _s: 1 / 0)

@@ -12,6 +12,7 @@ import pytest
 from sightline.protocol.channels import ACK, CAMERA, FRAME, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, CameraModel, FrameHeader, Stamp
+from sightline.protocol.proof import session_digest
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Message
 from sightline.protocol.transports.memory import MemoryNetwork
@@ -24,6 +25,7 @@ from tests.fixtures.vision.vision import camera, jpeg_of, scene
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
 EMPTY = jpeg_of(np.full((240, 320, 3), 140, np.uint8))
+SHOWN, OTHER = (session_digest("robot", session) for session in ("0000abcd", "0000beef"))
 
 
 class Bench:
@@ -176,7 +178,7 @@ def test_lines_are_logged_per_change_and_never_per_frame(bench: Bench) -> None:
     for seq in range(130, 230):
         bench.frame(b"junk", seq)
     assert [line.split(": ", 1)[1].split(" at ")[0] for line in bench.said] == [
-        "camera is 320x240, fx 190.7 px, calibrated", "frames from robot r1, session 0000abcd", "target seen",
+        "camera is 320x240, fx 190.7 px, calibrated", f"frames from robot r1, session {SHOWN}", "target seen",
         "target lost", "no target, searching",
         *(f"skipped images: {count}; newest: image: not a JPEG, no SOI marker"
           for count in (1, 10, 100)),
@@ -220,7 +222,7 @@ def test_frames_after_a_silence_are_reported_again(bench: Bench, monkeypatch: py
     bench.frame(BALL, 2)
     bench.frame(BALL, 3)
     assert len([line for line in bench.said if "no frames from robot r1" in line]) == 1
-    assert len([line for line in bench.said if "frames from robot r1, session 0000abcd" in line]) == 2
+    assert len([line for line in bench.said if f"frames from robot r1, session {SHOWN}" in line]) == 2
 
 
 def test_skipped_frames_are_counted_over_all_cameras(bench: Bench) -> None:
@@ -244,7 +246,7 @@ def test_frames_of_an_ended_session_are_skipped_and_logged_once(bench):
         bench.frame(BALL, seq)
     assert bench.service.answered == answered == 4
     assert bench.service.skipped["OTHER_SESSION"] == 4
-    refused = "rejecting frames of session 0000abcd: robot r1 is steered in session 0000beef"
+    refused = f"rejecting frames of session {SHOWN}: robot r1 is steered in session {OTHER}"
     assert sum(refused in line for line in bench.said) == 1
     bench.frame(BALL, 2, session="0000beef")
     assert bench.service.answered == 5
@@ -289,4 +291,4 @@ def test_second_robot_with_one_id_is_rejected_and_logged(bench, monkeypatch):
     assert answers["0000abcd"] > 75 and answers["0000beef"] < 12
     refused = [line for line in bench.said if "rejecting frames" in line]
     assert len(refused) == 2, refused  # first the old one, for a moment, then the second robot
-    assert "rejecting frames of session 0000beef: robot r1 is steered in session 0000abcd" in refused[-1]
+    assert f"rejecting frames of session {OTHER}: robot r1 is steered in session {SHOWN}" in refused[-1]
