@@ -9,7 +9,6 @@ from enum import Enum
 from functools import lru_cache
 from typing import Final
 
-from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import (
     AnswerHeader,
     CameraModel,
@@ -28,6 +27,7 @@ from sightline.protocol.messages import (
     WireModel,
 )
 from sightline.protocol.text import MAX_TWIST_BYTES
+from sightline.protocol.transports.endpoints import ROBOT_ID, check_robot_id
 
 MAX_HEADER_BYTES = 512
 KEY_PREFIX = "sightline"
@@ -133,22 +133,7 @@ CHANNELS: dict[str, Channel] = {
                     OVERLAY, PREVIEW)
 }
 
-_ROBOT_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 _SOURCE = re.compile(r"[a-z][a-z0-9_]{0,15}")
-
-
-def check_robot_id(robot: str) -> str:
-    """Return `robot` if it is a valid id.
-
-    Raises:
-        ConfigError: the id cannot be part of a key.
-    """
-    if not _ROBOT_ID.fullmatch(robot):
-        raise ConfigError(
-            f"invalid robot id {robot!r}: expected 1 to 32 letters, digits, '_', '-' or '.', starting with a letter or "
-            "digit (no '/' or '*'), e.g. --robot r1"
-        )
-    return robot
 
 
 @lru_cache(maxsize=1024)  # used for each message; after an idle camera period the pattern alone costs 50 us
@@ -181,7 +166,7 @@ def parse_key(key: str) -> tuple[str, Channel, str] | None:
     """Split an exact key into (robot, channel, source). Return None for any other text, also with wildcards."""
     parts = key.split("/")
     channel = CHANNELS.get(parts[2]) if len(parts) in (3, 4) and parts[0] == KEY_PREFIX else None
-    if channel is None or channel.has_source != (len(parts) == 4) or not _ROBOT_ID.fullmatch(parts[1]):
+    if channel is None or channel.has_source != (len(parts) == 4) or not ROBOT_ID.fullmatch(parts[1]):
         return None
     source = parts[3] if channel.has_source else ""
     if channel.has_source and not _SOURCE.fullmatch(source):

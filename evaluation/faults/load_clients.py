@@ -24,9 +24,8 @@ from sightline.protocol.channels import FRAME
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint, parse_zenoh_endpoint, stop_addresses
-from sightline.protocol.transports.security import stop_secret_file
 from sightline.protocol.transports.stop_datagram import CHALLENGE_BYTES, Kind, StopDatagram, pack_stop, unpack_stop
-from sightline.protocol.transports.stop_port import read_secret
+from sightline.protocol.transports.stop_port import read_secret, stop_secret_file
 from sightline.protocol.transports.websocket.client import Client
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, Hello
 from sightline.protocol.transports.websocket.peer import OPEN_S

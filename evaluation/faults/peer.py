@@ -48,8 +48,8 @@ from sightline.protocol.text import format_twist
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint
 from sightline.protocol.transports.link import LatestSlot, Link, LinkWrapper, Message
 from sightline.protocol.transports.open import open_link
-from sightline.protocol.transports.security import stop_secret_file
 from sightline.protocol.transports.stop_datagram import StopRequests
+from sightline.protocol.transports.stop_port import stop_secret_file
 from sightline.protocol.transports.websocket.legacy_text import encode_picture
 from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session

@@ -21,9 +21,9 @@ from sightline.operator_side.doctor.finding import Finding, as_object
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.setup import install as units
 from sightline.operator_side.table import print_table
-from sightline.protocol.channels import check_robot_id
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.open import check_endpoint, open_link
+from sightline.protocol.transports.endpoints import check_endpoint, check_robot_id
+from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import RobotConfig
 
 ANSWER_S = 5.0

@@ -53,7 +53,7 @@ COMMANDS: Final = {
     "scenarios": Entry("Run", "services", "List scenarios, or write the configuration of one"),
     "arm": Entry("Drive", "operate", "Arm a robot so that it may move"),
     "disarm": Entry("Drive", "operate", "Stop the wheels and disarm a robot"),
-    "stop": Entry("Drive", "operate", "STOP a robot and latch the stop until reset"),
+    "stop": Entry("Drive", "stop", "STOP a robot and latch the stop until reset"),
     "reset": Entry("Drive", "operate", "Clear a latched STOP or a drive fault"),
     "teleop": Entry("Drive", "operate", "Drive a robot with the keyboard or a gamepad"),
     "mission": Entry("Drive", "operate", "Show or start a robot's mission"),
@@ -153,7 +153,9 @@ def _help_by_default(
 def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code; never raises."""
     try:
-        code = app(list(arguments), standalone_mode=False, prog_name="sightline")
+        code = _stopped(arguments)
+        if code is None:
+            code = app(list(arguments), standalone_mode=False, prog_name="sightline")
         return code if isinstance(code, int) else 0
     except SightlineError as error:
         return _print_error(str(error), error.exit_code)
@@ -164,6 +166,15 @@ def run(arguments: Sequence[str]) -> int:
         return UNEXPECTED
     except Exception as error:
         return _unexpected(error)
+
+
+def _stopped(arguments: Sequence[str]) -> int | None:
+    """Run a plain `sightline stop` without typer, which imports pydantic to read any command line; or return None."""
+    if arguments[:1] != ["stop"]:
+        return None
+    module = import_module("sightline.operator_side.cli.stop")
+    options = module.plain_options(arguments[1:])
+    return None if options is None else module.stop(**options) or 0
 
 
 def _unexpected(error: Exception) -> int:

@@ -1,4 +1,4 @@
-"""Commands for a running robot: robots, status, arm, disarm, stop, reset, mission, goto, teleop. Shell."""
+"""Commands for a running robot: robots, status, arm, disarm, reset, mission, goto, teleop. Shell."""
 
 import json
 import secrets
@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from sightline.operator_side.cli.app import ABANDONED_THREAD
-from sightline.operator_side.cli.options import REJECTED_EXIT, Connect, Json, Robot, Secure, target_of
+from sightline.operator_side.cli.options import REJECTED_EXIT, Connect, Json, Robot, Secure, stop_secret_of, target_of
 from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import reply_line, short_lines, status_lines
 from sightline.operator_side.config.context import RobotAddress
@@ -19,7 +18,6 @@ from sightline.operator_side.table import print_block
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.messages import MissionReport, Reply, State, Status, Verb
 from sightline.protocol.transports.open import open_link
-from sightline.protocol.transports.security import stop_secret_file
 
 if TYPE_CHECKING:
     from sightline.operator_side.client.missions import MissionClient, Waypoints
@@ -35,7 +33,6 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: sightline status r1 --watch")(status)
     app.command(epilog="Example: sightline arm r1 --connect tcp/192.168.1.20:7447")(arm)
     app.command(epilog="Example: sightline disarm r1")(disarm)
-    app.command(epilog="Example: sightline stop r1 --connect tcp/192.168.1.20:7447")(stop)
     app.command(epilog="Example: sightline reset r1 && sightline arm r1")(reset)
     app.command(epilog="Example: sightline mission r1 follow")(mission)
     app.command(
@@ -168,39 +165,6 @@ def reset(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_
     """
     with _operator(target_of(robot, connect, secure, announce=True)) as operator:
         return _print_reply(operator, Verb.RESET, operator.reset(), as_json)
-
-
-def stop(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_json: Json = False) -> None:
-    """STOP a robot and latch the stop until reset
-
-    The wheels stay at zero until `sightline reset`. STOP needs the network, so it is not an emergency stop.
-    """
-
-    from sightline.operator_side.client.stop import stop_robot
-
-    def on_slow() -> None:
-        typer.echo(f"STOP of {target.robot} is not confirmed, repeating; be ready to cut its power by hand", err=True)
-
-    target = target_of(robot, connect, secure, announce=True)
-    done = stop_robot(
-        target.robot, target.connect, target.secure, _stop_secret(target), on_slow, thread_name=ABANDONED_THREAD
-    )
-    if not done.stored:
-        typer.echo(f"STOP of {target.robot} is not on its disk, so that a restart ends it; is the disk full?", err=True)
-    detail = done.status.reason if done.status else "wheels at zero"
-    if as_json:
-        typer.echo(json.dumps({"robot": target.robot, "ok": True, "state": State.STOPPED, "detail": detail}))
-    else:
-        typer.echo(f"{target.robot}: {State.STOPPED} ({detail})")
-
-
-def _stop_secret(target: RobotAddress) -> str:
-    """Return the file of the STOP secret; print one line where the keys lack it."""
-    try:
-        return stop_secret_file(target.secure) if target.secure else ""
-    except ConfigError as error:
-        typer.echo(str(error), err=True)
-        return ""
 
 
 def _print_reply(operator: Operator, verb: Verb, reply: Reply, as_json: bool) -> int:
@@ -378,7 +342,7 @@ def teleop(
         pad = Gamepad(gamepad) if gamepad else None
         if pad is not None:
             ending.callback(pad.close)
-        secret_file = _stop_secret(target)
+        secret_file = stop_secret_of(target)
         link = ending.enter_context(_link(target, ROLE))
         steered = Teleop(session, Speeds(linear, angular), layout)
         Cockpit(link, steered, lambda: StopSender(target.robot, target.connect, secret_file), pad).run()

@@ -8,9 +8,9 @@ from typing import Annotated, Any, Final, TypeVar
 import typer
 
 from sightline.operator_side.config.context import RobotAddress, find_address
-from sightline.protocol.channels import check_robot_id
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.open import check_endpoint
+from sightline.protocol.transports.endpoints import check_endpoint, check_robot_id
+from sightline.protocol.transports.stop_port import stop_secret_file
 
 REJECTED_EXIT: Final = 5
 
@@ -132,3 +132,12 @@ def target_of(robot: str | None, connect: list[str] | None, secure: str, *, anno
     if announce:
         typer.echo(str(target), err=True)
     return target
+
+
+def stop_secret_of(target: RobotAddress) -> str:
+    """Return the file of the STOP secret; print one line where the keys lack it."""
+    try:
+        return stop_secret_file(target.secure) if target.secure else ""
+    except ConfigError as error:
+        typer.echo(str(error), err=True)
+        return ""

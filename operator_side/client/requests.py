@@ -18,12 +18,11 @@ from sightline.protocol.errors import LinkError, RejectReason, WireError
 from sightline.protocol.messages import Echo, Reply, Request, RequestHeader, Stamp, State, Status, Verb
 from sightline.protocol.proof import session_digest
 from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.stop_datagram import STOP_SLOW_S
 
 SOURCE: Final = "operator"
 REPEAT_S: Final = 0.2
 STOP_PERIOD_S: Final = 0.05
-STOP_SLOW_S: Final = 0.3
-"""After this time without a confirmation the operator is warned; the STOP is repeated meanwhile."""
 _KEPT_REPLIES = 64
 _CITES_STATUS = (Verb.ARM, Verb.RESET, Verb.ACQUIRE)
 """Requests that permit motion must cite a status younger than two seconds; requests that end it need not."""

@@ -1,25 +1,27 @@
-"""STOP of one robot by datagrams and by its link at the same time, until one of both proves it. Shell (threads).
+"""STOP of one robot by datagrams, and by its link if they are not answered soon, until one of both proves it.
+Shell (threads).
 
-The datagrams go out first: opening a link can take seconds, or fail, while a flood occupies the ports of the links.
+The datagrams go out first: opening a link can take seconds, or fail, while a flood occupies the ports of the links,
+and the libraries of a link take longer to import than all that a datagram needs.
 """
 
-import secrets
+import os
 import select
 import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from sightline.operator_side.client.requests import SOURCE, STOP_SLOW_S, Operator
 from sightline.protocol.errors import LinkError, SightlineError
-from sightline.protocol.messages import State, Status
 from sightline.protocol.transports.endpoints import stop_addresses
-from sightline.protocol.transports.link import Link
-from sightline.protocol.transports.open import open_link
-from sightline.protocol.transports.stop_datagram import DATAGRAM_BYTES, StopRequests
+from sightline.protocol.transports.stop_datagram import DATAGRAM_BYTES, STOP_SLOW_S, StopRequests
 from sightline.protocol.transports.stop_port import read_secret
+
+if TYPE_CHECKING:
+    from sightline.operator_side.client.requests import Operator
+    from sightline.protocol.messages import Status
 
 DATAGRAM_PERIOD_S: Final = 0.02
 _STORED_S: Final = 1.0
@@ -27,7 +29,10 @@ _STORED_S: Final = 1.0
 _ANSWERED_S: Final = 1.0
 """Time for the answer to a datagram, if the link cannot be opened."""
 _LINK_CLOSES_S: Final = 0.3
-_FIRST_BELOW: Final = 2**62
+_RESOLVED_S: Final = 0.5
+"""Longest wait for the addresses of a robot's name."""
+_FIRST_S: Final = 0.05
+"""Time for the answer that the robot has applied a datagram, before the link is opened."""
 
 
 class StopSender:
@@ -42,9 +47,10 @@ class StopSender:
             secret_file: file of the STOP secret, or "" without keys.
         """
         secret = read_secret(secret_file)
-        self._requests = [(address, StopRequests(robot, secret, secrets.randbelow(_FIRST_BELOW)))
+        self._requests = [(address, StopRequests(robot, secret, int.from_bytes(os.urandom(8)) >> 2))
                           for address in stop_addresses(endpoints)]
         self._ending = threading.Event()
+        self._sent, self._latched = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._run, name="stop datagrams", daemon=True)
         self._thread.start()
 
@@ -67,6 +73,11 @@ class StopSender:
     def is_latched(self) -> bool:
         """Return True once the robot has applied this STOP. Its wheels may still turn."""
         return any(one.is_latched for _, one in self._requests)
+
+    def wait(self, seconds: float) -> bool:
+        """Return True as soon as the robot has applied this STOP, False that time after the first datagrams."""
+        self._sent.wait(_RESOLVED_S)
+        return self._latched.wait(seconds)
 
     @property
     def is_stopped(self) -> bool:
@@ -91,6 +102,7 @@ class StopSender:
             while not self._ending.is_set():
                 for one, place, requests in places:
                     self._send(one, place, requests)
+                self._sent.set()
                 self._receive(sockets, time.monotonic() + DATAGRAM_PERIOD_S)
 
     @staticmethod
@@ -107,6 +119,8 @@ class StopSender:
                     for _, requests in self._requests:
                         if requests.on_datagram(data):
                             self._send(one, place, requests)
+                        if requests.is_latched:
+                            self._latched.set()
 
 
 def _resolve(address: tuple[str, int]) -> list[tuple[socket.AddressFamily, tuple[str, int]]]:
@@ -120,16 +134,16 @@ def _resolve(address: tuple[str, int]) -> list[tuple[socket.AddressFamily, tuple
 class Stopped(NamedTuple):
     """A robot that is stopped: its status, if that came by the link, and whether the STOP is on its disk."""
 
-    status: Status | None
+    status: "Status | None"
     stored: bool
 
 
 class _LinkStop(threading.Thread):
     """Opens the link and sends STOP there."""
 
-    def __init__(self, name: str, open_it: Callable[[], Link], timeout_s: float) -> None:
+    def __init__(self, name: str, robot: str, connect: Sequence[str], secure: str, timeout_s: float) -> None:
         super().__init__(name=name, daemon=True)
-        self._open, self._timeout_s = open_it, timeout_s
+        self._robot, self._connect, self._secure, self._timeout_s = robot, connect, secure, timeout_s
         self._operator: Operator | None = None
         self.ended = threading.Event()
         """Set from outside: then no more STOP is sent here."""
@@ -138,8 +152,11 @@ class _LinkStop(threading.Thread):
 
     def run(self) -> None:
         """Set `status` or `error`."""
+        from sightline.operator_side.client.requests import SOURCE, Operator
+        from sightline.protocol.transports.open import open_link
+
         try:
-            with self._open() as link:
+            with open_link(self._robot, connect=self._connect, role=SOURCE, secure=self._secure) as link:
                 self._operator = Operator(link)
                 self.status = self._operator.stop(lambda: None, self._timeout_s, self.ended.is_set)
         except SightlineError as error:
@@ -149,14 +166,14 @@ class _LinkStop(threading.Thread):
     def is_latched(self) -> bool:
         """Return True if the newest status shows STOPPED."""
         report = self._operator.report if self._operator else None
-        return report is not None and report.status.state is State.STOPPED
+        return report is not None and report.status.state == "STOPPED"
 
 
 def stop_robot(
     robot: str, connect: Sequence[str], secure: str, secret_file: str, on_slow: Callable[[], None], *,
     timeout_s: float = 10.0, thread_name: str = "stop link",
 ) -> Stopped:
-    """Stop a robot by datagrams and by its link. Returns once it is STOPPED with its wheels at zero.
+    """Stop a robot by datagrams, and by its link without an answer. Returns once it is STOPPED, its wheels at zero.
 
     Args:
         robot: robot id.
@@ -171,15 +188,15 @@ def stop_robot(
         SightlineError: that of the link, if no datagram is answered; or at `timeout_s`. The robot may still move.
     """
     with StopSender(robot, connect, secret_file) as sender:
-        link = _LinkStop(
-            thread_name, lambda: open_link(robot, connect=connect, role=SOURCE, secure=secure), timeout_s
-        )
-        link.start()
+        link = _LinkStop(thread_name, robot, connect, secure, timeout_s)
+        if not sender.wait(_FIRST_S):
+            link.start()
         try:
             return _wait(robot, sender, link, on_slow, timeout_s)
         finally:
             link.ended.set()
-            link.join(_LINK_CLOSES_S)
+            if link.is_alive():
+                link.join(_LINK_CLOSES_S)
 
 
 def _wait(

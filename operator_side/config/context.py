@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from sightline.protocol.channels import check_robot_id
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
-from sightline.protocol.transports.open import check_endpoint
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, check_endpoint, check_robot_id
 
 CONNECT_VARIABLE: Final = "SIGHTLINE_CONNECT"
 DEFAULT_ROBOT: Final = "r1"

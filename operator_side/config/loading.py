@@ -17,11 +17,10 @@ from pydantic import ValidationError
 from sightline.operator_side.config.context import CONNECT_VARIABLE
 from sightline.operator_side.config.errors import explain, is_known, known_keys, no_such_name
 from sightline.operator_side.config.toml_text import key_and_text, toml_value
-from sightline.protocol.channels import check_robot_id
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import LOG_FORMAT_VARIABLE
-from sightline.protocol.transports.open import check_endpoint
+from sightline.protocol.transports.endpoints import check_endpoint, check_robot_id
 
 SERVICES: Final = ("robot", "vision", "sim")
 ENV_PREFIX: Final = "SIGHTLINE_"

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.security import ROLES, STOP_SECRET_FILE
+from sightline.protocol.transports.security import ROLES
+from sightline.protocol.transports.stop_port import STOP_SECRET_FILE
 
 if TYPE_CHECKING:
     from cryptography import x509

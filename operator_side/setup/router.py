@@ -15,8 +15,8 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, stop_addresses
 from sightline.protocol.transports.flood_limits import limit_floods
-from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys, stop_secret_file
-from sightline.protocol.transports.stop_port import StopProcess, read_packets
+from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
+from sightline.protocol.transports.stop_port import StopProcess, read_packets, stop_secret_file
 from sightline.protocol.transports.zenoh.session import open_session
 from sightline.robot_side.guardian import stop_forwarder
 from sightline.robot_side.guardian.stop_core import unpack_ignored

@@ -1,4 +1,4 @@
-"""Parse Zenoh endpoints (`tcp/host:port`) and WebSocket endpoints (`ws://host:port`). Pure."""
+"""Check robot ids; parse Zenoh endpoints (`tcp/host:port`) and WebSocket endpoints (`ws://host:port`). Pure."""
 
 import ipaddress
 import re
@@ -16,10 +16,33 @@ DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 # at p95 instead of 219 (`bench network --only rtt200`).
 SEND_BUFFER_BYTES: Final = 262_144
 
+ROBOT_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 _ZENOH_ENDPOINT = re.compile(
     r"(tcp|tls|quic|udp|ws)/(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]]+):([0-9]{1,5})(\?[^#\s]*)?(#\S*)?"
 )
 _BUFFERED = ("tcp", "tls")
+
+
+def check_robot_id(robot: str) -> str:
+    """Return `robot` if it is a valid id.
+
+    Raises:
+        ConfigError: the id cannot be part of a key.
+    """
+    if not ROBOT_ID.fullmatch(robot):
+        raise ConfigError(
+            f"invalid robot id {robot!r}: expected 1 to 32 letters, digits, '_', '-' or '.', starting with a letter or "
+            "digit (no '/' or '*'), e.g. --robot r1"
+        )
+    return robot
+
+
+def check_endpoint(endpoint: str) -> None:
+    """Raise ConfigError, with the correct form, for an endpoint that no transport accepts."""
+    if "://" in endpoint:
+        parse_websocket_endpoint(endpoint)
+    else:
+        parse_zenoh_endpoint(endpoint)
 
 
 def parse_zenoh_endpoint(endpoint: str) -> tuple[str, str, int]:

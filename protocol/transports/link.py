@@ -21,7 +21,6 @@ from sightline.protocol.channels import (
     REQUEST,
     Channel,
     Priority,
-    check_robot_id,
     key_for,
     parse_key,
 )
@@ -29,6 +28,7 @@ from sightline.protocol.codec import request_verb
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import report_fault
 from sightline.protocol.messages import Verb
+from sightline.protocol.transports.endpoints import check_robot_id
 
 Item = TypeVar("Item")
 

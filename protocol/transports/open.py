@@ -13,17 +13,7 @@ from typing import Any
 
 from sightline.protocol.channels import CHANNELS, FRAME, Channel
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports import endpoints
-from sightline.protocol.transports import endpoints as websocket_endpoints
 from sightline.protocol.transports.link import Link, Message
-
-
-def check_endpoint(endpoint: str) -> None:
-    """Raise ConfigError, with the correct form, for an endpoint that no transport accepts."""
-    if "://" in endpoint:
-        websocket_endpoints.parse_websocket_endpoint(endpoint)
-    else:
-        endpoints.parse_zenoh_endpoint(endpoint)
 
 
 def open_link(

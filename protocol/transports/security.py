@@ -190,23 +190,6 @@ def own_token(folder: str, source: str) -> str:
     return _read(file) if folder and file.is_file() else ""
 
 
-STOP_SECRET_FILE: Final = "stop.secret"
-"""The secret of STOP datagrams, which robots, routers and operators share."""
-
-
-def stop_secret_file(folder: str) -> str:
-    """Return the path of the STOP secret in a folder from `sightline keys`.
-
-    Raises:
-        ConfigError: the folder has no such file, as folders of earlier releases.
-    """
-    file = Path(folder).expanduser() / STOP_SECRET_FILE
-    if not file.is_file():
-        raise ConfigError(f"{file} is missing: STOP works on the link only; add it with `sightline keys add {folder} "
-                          "stop`, and copy it to robots, routers and operators")
-    return str(file)
-
-
 def _read(file: Path) -> str:
     try:
         token = file.read_text("ascii").strip()

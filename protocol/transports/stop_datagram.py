@@ -28,6 +28,8 @@ STOP_PORT: Final = 7448
 DATAGRAM_BYTES: Final = 112
 CHALLENGE_BYTES: Final = 16
 NO_CHALLENGE: Final = bytes(CHALLENGE_BYTES)
+STOP_SLOW_S: Final = 0.3
+"""Without proof of a STOP by then, the operator is warned."""
 STATES: Final = ("", "DISARMED", "HOLD", "ACTIVE", "DEGRADED", "STOPPED", "FAULT")
 """States of the gate by their number in a datagram. The first one: the driver process is silent."""
 STOPPED: Final = STATES.index("STOPPED")

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
+from sightline.protocol.errors import ConfigError
+
 Address = tuple[str, int]
 Origin = tuple[int, Address]
 Replies = Iterable[tuple[bytes, Origin]]
@@ -149,11 +151,30 @@ def read_arguments() -> tuple[socket.socket, dict[str, Any]]:
     return socket.socket(fileno=int(sys.argv[1])), json.loads(sys.argv[2])
 
 
+STOP_SECRET_FILE: Final = "stop.secret"
+"""The secret of STOP datagrams, which robots, routers and operators share."""
+
+
+def stop_secret_file(folder: str) -> str:
+    """Return the path of the STOP secret in a folder from `sightline keys`.
+
+    Raises:
+        ConfigError: the folder has no such file, as folders of earlier releases.
+    """
+    from pathlib import Path  # which the receiver itself does without: it takes a megabyte
+
+    file = Path(folder).expanduser() / STOP_SECRET_FILE
+    if not file.is_file():
+        raise ConfigError(f"{file} is missing: STOP works on the link only; add it with `sightline keys add {folder} "
+                          "stop`, and copy it to robots, routers and operators")
+    return str(file)
+
+
 def read_secret(file: str) -> bytes:
     """Return the STOP secret in `file`, b"" for no file."""
     if not file:
         return b""
-    with open(file, "rb") as secret:  # noqa: PTH123  pathlib takes a megabyte
+    with open(file, "rb") as secret:  # noqa: PTH123  without pathlib
         return secret.read().strip()
 
 

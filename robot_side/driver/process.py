@@ -14,13 +14,14 @@ from contextlib import ExitStack, suppress
 from types import FrameType
 from typing import Final
 
-from sightline.protocol.channels import REQUEST, TWIST, check_robot_id
+from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.clock import heartbeat_us, monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import RejectReason, SightlineError, WireError
 from sightline.protocol.log import RepeatLimiter, faults, report_fault, start_log, start_log_thread
 from sightline.protocol.messages import LastRejection, State, StreamStatus
+from sightline.protocol.transports.endpoints import check_robot_id
 from sightline.protocol.transports.stop_port import read_packets, send_packet
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig

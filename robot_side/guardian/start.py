@@ -19,9 +19,8 @@ from typing import Any, Final, NoReturn
 from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.transports.endpoints import stop_addresses
-from sightline.protocol.transports.security import stop_secret_file
 from sightline.protocol.transports.stop_datagram import STOP_PORT
-from sightline.protocol.transports.stop_port import StopProcess
+from sightline.protocol.transports.stop_port import StopProcess, stop_secret_file
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, GUARDIAN_PRIORITY, schedule_real_time
 from sightline.robot_side.guardian import stop_receiver

@@ -14,7 +14,6 @@ from sightline.protocol.channels import (
     MAX_HEADER_BYTES,
     SCAN,
     Direction,
-    check_robot_id,
     key_for,
     parse_key,
     pattern_for,
@@ -32,6 +31,7 @@ from sightline.protocol.messages import (
     Stamp,
 )
 from sightline.protocol.spec.message_cases import CASES
+from sightline.protocol.transports.endpoints import check_robot_id
 
 MODELS = sorted(
     {channel.header for channel in CHANNELS.values()} | {c.payload for c in CHANNELS.values() if c.payload},

@@ -11,12 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, SCAN, check_robot_id, key_for, parse_key
+from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, SCAN, key_for, parse_key
 from sightline.protocol.codec import decode, decode_ranges, encode, encode_ranges
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import WireModel
 from sightline.protocol.text import MAX_TWIST_BYTES, format_twist, parse_twist
+from sightline.protocol.transports.endpoints import check_robot_id
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, MAX_HELLO_BYTES, pack, parse_hello, unpack
 from sightline.protocol.transports.websocket.legacy_text import (
     MAX_BOXES,

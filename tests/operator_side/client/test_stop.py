@@ -1,16 +1,20 @@
 """STOP by datagrams and by the link at the same time: either of both proves it, and neither holds up the other."""
 
 import socket
+import subprocess
+import sys
 import threading
 import time
 from contextlib import contextmanager
 
 import pytest
 
+from sightline.operator_side.client import requests
 from sightline.operator_side.client import stop as client
 from sightline.operator_side.client.stop import StopSender, stop_robot
 from sightline.protocol.errors import LinkError, RejectReason, WireError
 from sightline.protocol.messages import State, Status
+from sightline.protocol.transports import open as open_module
 from sightline.protocol.transports.stop_datagram import unpack_stop
 from sightline.robot_side.guardian.stop_core import DriverReport, ReceiverCore, pack_report, unpack_number
 from tests.fixtures.links import until
@@ -97,8 +101,8 @@ def link(monkeypatch):
             return self.links.status
 
     links = Links()
-    monkeypatch.setattr(client, "open_link", links.open_link)
-    monkeypatch.setattr(client, "Operator", LinkOperator)
+    monkeypatch.setattr(open_module, "open_link", links.open_link)
+    monkeypatch.setattr(requests, "Operator", LinkOperator)
     return links
 
 
@@ -113,6 +117,27 @@ def test_stop_returns_when_the_wheels_are_at_zero(robot, link, port):
     one = robot(turns_s=0.3)
     done = stop(port, on_slow=lambda: pytest.fail("slow"))
     assert done.stored and done.status is None and time.monotonic() - one.stopped_s >= 0.3
+
+
+def test_an_answered_datagram_needs_no_link(robot, link, port):
+    robot(turns_s=0.2)
+    assert stop(port).stored and not link.begun_s
+
+
+def test_the_first_datagram_leaves_before_the_libraries_of_the_link_are_imported(port):
+    """The process of the command ends at its first datagram, and prints what it has imported."""
+    code = (
+        "import os, sys\n"
+        "def end(event, arguments):\n"
+        "    if event == 'socket.sendto':\n"
+        "        print(*{'pydantic', 'zenoh', 'websockets', 'numpy'} & set(sys.modules), flush=True)\n"
+        "        os._exit(9)\n"
+        "sys.addaudithook(end)\n"
+        "from sightline.operator_side.cli import app\n"
+        f"app.run(['stop', 'r1', '--connect', 'tcp/127.0.0.1:{port - 1}'])\n"
+    )
+    run = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=30)
+    assert (run.returncode, run.stdout) == (9, "\n"), run.stderr
 
 
 def test_a_link_that_cannot_be_opened_does_not_matter(robot, link, port):

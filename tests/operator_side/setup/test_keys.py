@@ -4,7 +4,7 @@ import pytest
 
 from sightline.operator_side.setup import keys
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.security import stop_secret_file
+from sightline.protocol.transports.stop_port import stop_secret_file
 
 
 def test_a_new_folder_has_a_secret_that_only_its_owner_reads(tmp_path):
