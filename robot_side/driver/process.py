@@ -190,19 +190,23 @@ class Driver:
         self._ending_since_us = self._ending_since_us or monotonic_us()
 
     def loop(self) -> int:
-        """Tick at absolute 20 ms deadlines and whenever a command arrives, until the end is requested and reached."""
+        """Tick at absolute 20 ms deadlines, and for a command as soon as MIN_TICK_US have passed since the last tick."""
         self._log_missing()
         deadline_us = monotonic_us()
+        is_pending = False
         while not self._ended():
-            self._wait(deadline_us)
+            self._wait(min(deadline_us, self._ticked_us + MIN_TICK_US) if is_pending else deadline_us)
             arrived = self._drain()
+            is_pending |= arrived
             now_us = monotonic_us()
             if now_us >= deadline_us:
                 self._driver_core.tick_late_max_us = max(self._driver_core.tick_late_max_us, now_us - deadline_us)
                 deadline_us = max(deadline_us + TICK_US, now_us)
                 self._tick(now_us, punctual=True)
-            elif arrived and now_us - self._ticked_us >= MIN_TICK_US:
+                is_pending = False
+            elif is_pending and now_us - self._ticked_us >= MIN_TICK_US:
                 self._tick(now_us, punctual=False)
+                is_pending = False
             elif arrived:
                 self._answer()
         return self.driver_end.exit_code

@@ -1,7 +1,9 @@
 """The driver's loop on a virtual clock: 50 ticks a second, however late each one wakes."""
 
 import signal
-from itertools import pairwise
+from bisect import bisect_left
+from itertools import accumulate, pairwise
+from random import Random
 from types import SimpleNamespace
 
 import pytest
@@ -10,6 +12,7 @@ from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver import process
 from sightline.robot_side.driver.process import Driver
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
+from sightline.robot_side.safety.limits import MIN_TICK_US
 
 
 class VirtualLoop:
@@ -56,6 +59,7 @@ def run(tmp_path, monkeypatch):
         driver = Driver(RobotConfig(state_dir=tmp_path), loop, None)
         made.append(driver)
         driver.driver_end = loop
+        monkeypatch.setattr(driver, "_on_packet", lambda _packet: True)
         started_us, tick = loop.now_us, driver._tick
 
         def counted(now_us, *, punctual):
@@ -94,3 +98,29 @@ def test_deadlines_that_a_stall_has_passed_are_not_caught_up(run):
     gaps_us = [after - before for before, after in pairwise(ticks_us)]
     assert gaps_us[:4] == [20_000] * 4 and gaps_us[4] == 520_000
     assert sum(gap_us < 20_000 for gap_us in gaps_us[5:]) <= 1, "at most one tick follows at once"
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_command_waits_for_a_tick_that_it_does_not_need(run, seed):
+    random = Random(seed)
+    loop = VirtualLoop(late_us=0)
+    arrivals_us = iter(accumulate([random.choice((200, 1_500, 9_000, 40_000)) for _ in range(1_700)],
+                                  initial=loop.now_us + 500))
+    arrived_us = []
+    loop.next_us = next(arrivals_us)
+
+    def select(_readable, _writable, _broken, timeout_s):
+        loop.now_us = min(loop.now_us + round(timeout_s * 1e6), max(loop.now_us, loop.next_us))
+
+    def packets():
+        while loop.next_us <= loop.now_us:
+            arrived_us.append(loop.next_us)
+            loop.next_us = next(arrivals_us, 1 << 60)
+            yield b"a command"
+
+    loop.select, loop.packets = select, packets
+    started_us = loop.now_us
+    ticks_us = run(loop, seconds=25.0)
+    waits_us = [next(tick for tick in ticks_us[bisect_left(ticks_us, at - started_us):]) - (at - started_us)
+                for at in arrived_us]
+    assert len(waits_us) == 1_701 and max(waits_us) <= MIN_TICK_US
