@@ -190,7 +190,7 @@ class Driver:
         self._ending_since_us = self._ending_since_us or monotonic_us()
 
     def loop(self) -> int:
-        """Tick at absolute 20 ms deadlines, and for a command as soon as MIN_TICK_US have passed since the last tick."""
+        """Tick at absolute 20 ms deadlines, and for a command once MIN_TICK_US have passed since the last tick."""
         self._log_missing()
         deadline_us = monotonic_us()
         is_pending = False
