@@ -130,6 +130,9 @@ class Operator:
     def arm(self, patience_s: float = 5.0) -> Reply:
         """Request arming. Repeat it while a condition is missing (valid commands, wheels at zero).
 
+        A repeat cites a newer status. It is not sent if that shows another state or reason than the first one, because
+        another operator may have stopped or disarmed the robot meanwhile.
+
         Args:
             patience_s: time for the conditions, s.
 
@@ -140,10 +143,13 @@ class Operator:
             LinkError: no answer from the robot.
         """
         deadline_s = time.monotonic() + patience_s
-        reply = self.request(Verb.ARM)
+        first = seen = self.wait_report()
+        reply = self._request(Verb.ARM, seen, 2.0)
         while not reply.ok and reply.detail.startswith(RejectReason.NOT_ALLOWED) and time.monotonic() < deadline_s:
-            self.wait_report()
-            reply = self.request(Verb.ARM)
+            seen = self.wait_report()
+            if (seen.status.state, seen.status.reason) != (first.status.state, first.status.reason):
+                break
+            reply = self._request(Verb.ARM, seen, 2.0)
         return reply
 
     def reset(self, patience_s: float = 1.5) -> Reply:
