@@ -90,7 +90,7 @@ def test_the_longest_frame_header_is_within_the_overhead_bound():
     assert len(encode(header)) + len(key_for("r1", FRAME)) + len("image/jpeg") <= 320
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(st.sampled_from(MODELS), st.binary(max_size=600))
 @example(FrameHeader, b"")
 @example(FrameHeader, b"null")
@@ -113,7 +113,7 @@ json_values = st.recursive(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(st.data(), st.sampled_from(CASES), json_values)
 def test_any_value_in_any_field_gives_a_message_or_a_wire_error(data, case, value):
     header = json.loads(case.header or b"{}") if case.refuse is None else {}

@@ -39,7 +39,7 @@ MODELS = {
     for model, size in ((channel.header, 512), (channel.payload, channel.max_payload_bytes))
     if model is not None
 }
-EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "100"))  # more for a night's run
+EXAMPLES = int(os.environ.get("FUZZ_EXAMPLES", "50"))  # more for a night's run
 
 
 def check_twist(data):
