@@ -98,17 +98,17 @@ def source(path: Path) -> str:
 
 @cache
 def tree(path: Path) -> ast.Module:
-    gc.disable()  # which would look through all earlier trees again and again
-    try:
-        return ast.parse(source(path))
-    finally:
-        gc.enable()
+    return ast.parse(source(path))
 
 
 @cache
 def nodes(path: Path) -> tuple[ast.AST, ...]:
     """All of a file; a walk over all files takes as long as parsing them."""
-    return tuple(ast.walk(tree(path)))
+    gc.disable()  # which would look through all earlier trees again and again
+    try:
+        return tuple(ast.walk(tree(path)))
+    finally:
+        gc.enable()
 
 
 def imported(statements) -> set[str]:

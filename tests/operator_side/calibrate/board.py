@@ -56,16 +56,17 @@ def turned(about_x_deg: float, about_y_deg: float, about_z_deg: float = 0.0) -> 
     return rotation
 
 
-def tilted_views(model: CameraModel = TRUTH) -> list[bytes]:
-    """Twelve views as the tutorial describes them: tilted both ways, near and far, in the corners."""
-    seen = rays(model)
-    poses = [
-        (about_x, about_y, 7.0 * number, x, y, z)
-        for number, (about_x, about_y, x, y, z) in enumerate([
-            (30, 0, 0.0, 0.0, 0.40), (-30, 0, 0.05, 0.02, 0.42), (0, 30, -0.05, 0.0, 0.40), (0, -30, 0.0, -0.03, 0.45),
-            (25, 25, 0.08, 0.05, 0.50), (-25, 25, -0.10, 0.05, 0.50), (25, -25, 0.10, -0.06, 0.50),
-            (-25, -25, -0.10, -0.06, 0.52), (35, 10, 0.0, 0.08, 0.48), (10, 35, -0.12, 0.0, 0.55),
-            (-35, -10, 0.12, 0.02, 0.55), (5, -35, 0.0, 0.0, 0.36),
-        ])
-    ]
-    return [draw_board(seen, turned(ax, ay, az), np.array([x, y, z])) for ax, ay, az, x, y, z in poses]
+_POSES = (  # turned about x and y, degrees; middle of the board, meters
+    (30, 0, 0.0, 0.0, 0.40), (-30, 0, 0.05, 0.02, 0.42), (0, 30, -0.05, 0.0, 0.40), (0, -30, 0.0, -0.03, 0.45),
+    (25, 25, 0.08, 0.05, 0.50), (-25, 25, -0.10, 0.05, 0.50), (25, -25, 0.10, -0.06, 0.50),
+    (-25, -25, -0.10, -0.06, 0.52), (35, 10, 0.0, 0.08, 0.48), (10, 35, -0.12, 0.0, 0.55),
+    (-35, -10, 0.12, 0.02, 0.55), (5, -35, 0.0, 0.0, 0.36),
+)  # fmt: skip
+VIEWS = len(_POSES)
+
+
+@cache
+def tilted_view(number: int) -> bytes:
+    """One of the twelve views as the tutorial describes them: tilted both ways, near and far, in the corners."""
+    about_x, about_y, *middle_m = _POSES[number]
+    return draw_board(rays(TRUTH), turned(about_x, about_y, 7.0 * number), np.array(middle_m))
