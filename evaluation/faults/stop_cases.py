@@ -10,7 +10,7 @@ from typing import Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, ZERO_MS, measure_stop, wheel_mps
-from sightline.evaluation.faults.fixture import RobotFixture, Setup
+from sightline.evaluation.faults.fixture import ROBOT, RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import FEW_HZ, HALF_OPEN, MANY_HZ, READY, SESSIONS, STOPS
 from sightline.evaluation.faults.peer import LEGACY_LIBRARIES
 from sightline.evaluation.faults.runner import FaultCase, Injected
@@ -87,6 +87,29 @@ def _replay(rig: RobotFixture) -> Injected:
     at_us, checks = rig.stop_by_operator()
     checks += at_least("speed kept", slowest_mps, "m/s", KEPT_MPS), at_least("reasons logged", counted, "", 2)
     return Injected(len(rig.noted("crowd", INJECTED)), at_us, checks=checks)
+
+
+TYPED_ZERO_MS: Final = 550.0
+"""From the start of the command to wheels at zero, of which the ramp from 0.5 m/s takes 320 ms."""
+TYPED_FALLS_MS: Final = 200.0
+TYPED_CPU_S: Final = 0.2
+
+
+def _typed(rig: RobotFixture) -> Injected:
+    """Run `sightline stop`, and count from the start of its process, as from the Enter key."""
+    before, at_us = resource.getrusage(resource.RUSAGE_CHILDREN), monotonic_us()
+    code = subprocess.run(
+        [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "stop", ROBOT, "--connect", rig.endpoint],
+        check=False, capture_output=True, timeout=STOP_ENDS_S,
+    ).returncode
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    rig.watch(ZERO_MS / 1000)
+    falls_ms = measure_stop(rig.motors(), at_us).falls_ms
+    return Injected(1, at_us, checks=(
+        at_most("speed falls after the start of the command", falls_ms, "ms", TYPED_FALLS_MS),
+        at_most("CPU time of the command", cpu_s, "s", TYPED_CPU_S), at_most("exit code of stop", code, "", 0),
+    ))
 
 
 BUSY: Final = 8
@@ -233,6 +256,8 @@ STOP_CASES: Final = (
               Setup("guest", guests=True), blind=True, also=f"zero <= {_GUEST.guest_unchanged_ms / 1000:g} s and "
               f"{_GUEST.guest_unchanged_m:g} m, plus braking; {_DEMANDED}"),
     *LEGACY_CASES,
+    FaultCase("stop.typed", "STOP: the command `sightline stop`, counted from its start", _typed, Setup(), blind=True,
+              zero_ms=TYPED_ZERO_MS, alone=True, also=f"falls <= {TYPED_FALLS_MS:g} ms; CPU time <= {TYPED_CPU_S:g} s"),
     FaultCase("stop.busy", f"STOP by a new operator: {BUSY} busy processes beside it", _busy, Setup(), blind=True,
               also=_DEMANDED, alone=True),
     FaultCase("stop.no_descriptors", "STOP by a new operator: the robot has no file descriptor left", _no_descriptors,
