@@ -447,15 +447,19 @@ def test_reset_gives_up_at_its_patience_and_at_another_rejection(robot, operator
     assert reply.detail.startswith("STALE") and len(robot.sent) == 2, "the STOP in between wins"
 
 
+@pytest.mark.parametrize("act", ["arm", "reset"])
 @pytest.mark.parametrize("lost", ["first", "second"])
-def test_reset_without_an_answer_is_an_error_after_two_seconds(robot, operator, lost):
-    robot.driving.gate.stop()
-    robot.wheels(0.2)
+def test_without_an_answer_there_is_an_error_after_two_seconds(robot, operator, act, lost):
+    if act == "reset":
+        robot.driving.gate.stop()
+        robot.wheels(0.2)
+    robot.drives = False
+    robot.driving.gate._live_commands = 0
     if lost == "first":
         robot.receives = False
     robot.on_sent = lambda count: setattr(robot, "receives", False)
-    with pytest.raises(LinkError, match="to reset after 2 s"):
-        operator.reset()
+    with pytest.raises(LinkError, match=f"to {act} after 2 s"):
+        getattr(operator, act)()
 
 
 # --- STOP --------------------------------------------------------------------------------------------------------
