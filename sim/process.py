@@ -239,12 +239,9 @@ class BusClients:
         """Handle the next packet or the end of a client. Returns False if there is neither."""
         if client not in self._clients[name]:
             return False
-        try:
-            data = client.recv(64)
-        except BlockingIOError:
+        data = _received(client)
+        if data is None:
             return False
-        except OSError:
-            data = b""
         if not data:
             self._drop(client, name)
         elif name == MOTION:
@@ -281,6 +278,19 @@ class BusClients:
             for connection in (*self._listeners.values(), *(c for held in self._clients.values() for c in held)):
                 connection.close()
         self._selector.close()
+
+
+def _received(client: socket.socket) -> bytes | None:
+    """Return the next packet, b"" at the end of the client, or None if there is nothing at present."""
+    while True:
+        try:
+            return client.recv(64)
+        except BlockingIOError:
+            return None
+        except ConnectionResetError:  # it ended with packets unread; what it sent before follows
+            continue
+        except OSError:
+            return b""
 
 
 def _send(client: socket.socket, data: bytes) -> None:

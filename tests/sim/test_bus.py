@@ -1,6 +1,7 @@
 """The simulation as a process behind the robot's ports: real sockets, real kills, the motors' log."""
 
 import json
+import select
 import signal
 import socket
 import subprocess
@@ -151,6 +152,18 @@ def test_motors_latch_and_the_log_outlives_killed_clients_and_a_killed_simulatio
     assert second[1:3] == [1.0, 2.0]
     assert -1000 < second[0] - sent_us < 100_000
     assert second[4] > 8.0 > first[4]
+
+
+def test_last_command_counts_of_a_client_that_dies_without_reading_its_packets(sim):
+    """The kernel reports the unread packets as a reset, before what the client had sent."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
+        client.connect(f"{sim.socket_dir}/{MOTION}")
+        assert select.select([client], [], [], 5)[0], "an encoder reading"
+        sim.process.send_signal(signal.SIGSTOP)
+        client.send(MOTION_SET.pack(3.0, 4.0))
+    sim.process.send_signal(signal.SIGCONT)
+    eventually(sim.rows)
+    assert sim.rows()[0][1:3] == [3.0, 4.0]
 
 
 def test_malformed_motor_packets_change_nothing(sim):
