@@ -131,7 +131,7 @@ class Operator:
         """Request arming. Repeat it while a condition is missing (valid commands, wheels at zero).
 
         A repeat cites a newer status. It is not sent if that shows another state or reason than the first one, because
-        another operator may have stopped or disarmed the robot meanwhile.
+        another operator may have stopped the robot meanwhile.
 
         Args:
             patience_s: time for the conditions, s.

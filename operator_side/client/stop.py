@@ -27,7 +27,7 @@ DATAGRAM_PERIOD_S: Final = 0.02
 _STORED_S: Final = 1.0
 """Longest wait for the disk of a robot that is stopped, with its wheels at zero."""
 _ANSWERED_S: Final = 1.0
-"""Time for the answer to a datagram, if the link cannot be opened."""
+"""Time for the answer to a datagram, if the link cannot be opened; and for the wheels, before the link opens too."""
 _LINK_CLOSES_S: Final = 0.3
 _RESOLVED_S: Final = 0.5
 """Longest wait for the addresses of a robot's name."""
@@ -214,6 +214,8 @@ def _wait(
                 return Stopped(link.status, not sender.is_answered)
         elif link.error is not None and not sender.is_answered and now_s - began_s > _ANSWERED_S:
             raise link.error
+        elif link.ident is None and now_s - began_s > _ANSWERED_S:  # it is applied, but the wheels are not at zero
+            link.start()
         if not warned and now_s - began_s > STOP_SLOW_S and not (sender.is_latched or link.is_latched):
             warned = True
             on_slow()

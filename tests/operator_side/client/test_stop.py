@@ -124,6 +124,11 @@ def test_an_answered_datagram_needs_no_link(robot, link, port):
     assert stop(port).stored and not link.begun_s
 
 
+def test_an_answer_without_wheels_at_zero_opens_the_link_after_all(robot, link, port):
+    one = robot(turns_s=1.4)
+    assert stop(port).stored and link.begun_s - one.stopped_s == pytest.approx(1.0, abs=0.3)
+
+
 def test_the_first_datagram_leaves_before_the_libraries_of_the_link_are_imported(port):
     """The process of the command ends at its first datagram, and prints what it has imported."""
     code = (
