@@ -47,7 +47,8 @@ def page_lines(
     yield "# Sabotage of the score\n"
     yield (f"Each listed scenario runs with one broken part, in lockstep from seeds {listed}, "
            f"+{LATENCY_MS:g} ms latency,\n{LOSS:.0%} loss on each leg. The score must notice it in each run. A cell "
-           "names the bound that broke, over all starts.\n")
+           "names the bound that broke, over all starts.\nA pair in which nothing can change runs from the first seed "
+           "alone.\n")
     yield (f"Written by `python -m docs.make.sabotage --seeds {listed}{only}`.\n"
            "Break one yourself with `sightline score --scenario NAME --sabotage NAME`.\n")
     yield "| sabotage | broken part |\n|---|---|"

@@ -284,11 +284,11 @@ class SabotageReport:
 
 
 def sabotaged(wanted: Sequence[ScoreCase], names: Sequence[str]) -> list[ScoreCase]:
-    """Return each case with each sabotage, those of one group together."""
-    groups = groupby(wanted, key=lambda case: case.group)
+    """Return each case with each sabotage, those of one group together; one case if the sabotage changes nothing."""
+    groups = [list(group) for _, group in groupby(wanted, key=lambda case: case.group)]
     return [
-        replace(case, sabotage=name) for members in [list(group) for _, group in groups] for name in names
-        for case in members
+        replace(case, sabotage=name) for members in groups for name in names
+        for case in (members[:1] if reason_of(name, members[0].scenario) else members)
     ]
 
 

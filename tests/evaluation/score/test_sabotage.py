@@ -19,11 +19,10 @@ from sightline.evaluation.score.runs import (
     SabotageReport,
     ScoreCase,
     cases,
-    run_of,
     run_sabotaged,
     sabotaged,
 )
-from sightline.evaluation.score.sabotage import HEALTHY, SABOTAGES, UNAFFECTED, SeamDetector, reason_of, sabotages_named
+from sightline.evaluation.score.sabotage import HEALTHY, SABOTAGES, UNAFFECTED, SeamDetector, sabotages_named
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.ports import Ranges, WheelAngles
@@ -140,11 +139,11 @@ def test_scenario_without_bounds_cannot_notice_a_sabotage(tmp_path):
     assert report.ok is None and report.to_dict()["checks"] == [] and "not evaluated" in report.lines()[0]
 
 
-def test_each_case_comes_with_each_sabotage_and_groups_lie_together():
+def test_each_case_comes_with_each_sabotage_and_groups_lie_together_but_once_where_nothing_can_change():
     wanted = sabotaged(cases(["static", "eight"], [1, 2], [50], [0.1], None), ["wheels-dead", "range-blind"])
     assert [(one.scenario, one.sabotage, one.seed) for one in wanted] == [
-        (scenario, name, seed) for scenario in ("static", "eight") for name in ("wheels-dead", "range-blind")
-        for seed in (1, 2)]
+        (scenario, name, seed) for scenario in ("static", "eight")
+        for name, seed in (("wheels-dead", 1), ("wheels-dead", 2), ("range-blind", 1))]
 
 
 # --- runs --------------------------------------------------------------------------------------------------------
@@ -183,13 +182,3 @@ def test_score_notices_every_sabotage_and_no_healthy_run_fails(scenario, capsys)
     options = ["score", "--scenario", scenario, "--seeds", NEVER_USED_SEEDS]
     assert cli.run(options) == 0, capsys.readouterr().out
     assert cli.run([*options, "--sabotage", "all"]) == 0, capsys.readouterr().out
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("name", "scenario"), [
-    (name, scenario) for name, (_, scenarios) in UNAFFECTED.items() for scenario in sorted(scenarios)
-])
-def test_run_of_a_pair_without_effect_equals_the_healthy_run(name, scenario):
-    assert reason_of(name, scenario)
-    wanted = case(scenario, name, seed=7107)
-    assert run_of(wanted)[1] == run_of(replace(wanted, sabotage=None))[1]
