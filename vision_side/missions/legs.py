@@ -91,21 +91,22 @@ class Legs(Follow):
         if left_rad <= right_rad:
             return None
         bearing_rad = (right_rad + left_rad) / 2
-        range_m = self._range(about_lens, right_rad, left_rad)
-        if range_m is None:
-            range_m = self._remembered_m(view)
+        legs_m = self._legs_m(about_lens, right_rad, left_rad, view)
+        range_m = float(np.mean(legs_m[:2])) + self._legs.leg_radius_m if legs_m else self._remembered_m(view)
         x_m = self._camera.x_m + range_m * math.cos(bearing_rad)
-        return Sighting(x_m, self._camera.y_m + range_m * math.sin(bearing_rad), one)
+        # One leg hides the other, or the scan missed both: the middle may be a quarter of a stride further or nearer.
+        exactness = 1.0 if len(legs_m) > 1 else 0.5
+        return Sighting(x_m, self._camera.y_m + range_m * math.sin(bearing_rad), one, exactness)
 
-    def _range(self, about_lens: Points, right_rad: float, left_rad: float) -> float | None:
-        """Return the range from the lens to the middle between the legs, m, or None without an echo in the span."""
+    def _legs_m(self, about_lens: Points, right_rad: float, left_rad: float, view: View) -> list[float]:
+        """Return the ranges from the lens to the legs in the span, m, nearest first; empty without an echo."""
         bearings = np.arctan2(about_lens[:, 1], about_lens[:, 0])
         inside = (bearings >= right_rad - _SPAN_MARGIN_RAD) & (bearings <= left_rad + _SPAN_MARGIN_RAD)
         away = np.hypot(about_lens[inside, 0], about_lens[inside, 1])
         if not len(away):
-            return None
-        legs = nearest_legs(about_lens[inside], away, self._legs.stride_m)
-        return float(np.mean(legs[:2])) + self._legs.leg_radius_m
+            return []
+        expected_m = None if self._track.target is None else self._remembered_m(view) - self._legs.leg_radius_m
+        return nearest_legs(about_lens[inside], away, self._legs.stride_m, expected_m)
 
     def _remembered_m(self, view: View) -> float:
         """Return the last known distance of the legs, for a box without an echo, in m."""
@@ -116,13 +117,18 @@ class Legs(Follow):
         return math.hypot(x - self._camera.x_m, y - self._camera.y_m)
 
 
-def nearest_legs(points: Points, away_m: NDArray[np.float64], stride_m: float) -> list[float]:
+def nearest_legs(
+    points: Points, away_m: NDArray[np.float64], stride_m: float, expected_m: float | None = None
+) -> list[float]:
     """Return the range of each leg's nearest echo, nearest first, within a stride of the nearest leg.
 
-    `points` come in the order of the scan; a gap between two of them parts one leg from the next.
+    `points` come in the order of the scan; a gap between two of them parts one leg from the next. Legs within half a
+    stride of `expected_m` come before all others: who walks in between is nearer, but is not the one to follow.
     """
     parts = np.split(np.arange(len(points)), np.flatnonzero(np.hypot(*np.diff(points, axis=0).T) > _GAP_M) + 1)
-    nearest = sorted(float(away_m[part].min()) for part in parts)
+    all_m = sorted(float(away_m[part].min()) for part in parts)
+    expected = [one for one in all_m if expected_m is not None and abs(one - expected_m) <= stride_m / 2]
+    nearest = expected or all_m
     return [one for one in nearest if one <= nearest[0] + stride_m]
 
 

@@ -39,11 +39,13 @@ class Sighting:
         x_m: forward.
         y_m: left.
         detection: its detection.
+        exactness: above 0 to 1. Less than 1 for a range that is partly assumed.
     """
 
     x_m: float
     y_m: float
     detection: Detection
+    exactness: float = 1.0
 
 
 def locate_sphere(detection: Detection, camera: CameraModel, radius_m: float) -> Sighting | None:

@@ -103,8 +103,8 @@ class Track:
     def _noise(self, sighting: Sighting) -> float:
         """Return the variance of one position. The range error grows with the square of the range."""
         # A partly hidden outline (low score) gives a less exact range.
-        range_m2 = sighting.x_m**2 + sighting.y_m**2
-        return float((self._config.range_noise * max(range_m2, 0.1) / max(sighting.detection.score, 0.2) ** 2) ** 2)
+        range_m2, score = sighting.x_m**2 + sighting.y_m**2, sighting.detection.score * sighting.exactness
+        return float((self._config.range_noise * max(range_m2, 0.1) / max(score, 0.2) ** 2) ** 2)
 
 
 def to_odometry(pose: Pose, x_m: float, y_m: float) -> tuple[float, float]:

@@ -131,6 +131,27 @@ def test_legs_are_distinguished_by_the_gap_between_them() -> None:
     assert nearest_legs(points, np.hypot(*points.T), 0.6) == pytest.approx([1.006, 1.090], abs=0.01)
 
 
+@pytest.mark.parametrize(("expected_m", "found_m"), [
+    (None, [1.2, 1.35, 1.7]), (1.95, [1.7, 2.0, 2.1]), (1.3, [1.2, 1.35]), (3.0, [1.2, 1.35, 1.7]),
+])
+def test_legs_at_the_expected_distance_come_before_nearer_ones(expected_m, found_m) -> None:
+    points = np.array([[1.2, 0.0], [1.35, 0.3], [1.7, 0.0], [2.0, 0.3], [2.1, 0.0]])
+    assert nearest_legs(points, points[:, 0], 0.6, expected_m) == found_m
+
+
+def test_one_leg_before_the_other_does_not_pull_the_target_nearer() -> None:
+    legs = Legs(Legs.Config(), LENS)
+    apart, behind = ((2.0, 0.1, LEG_M), (2.0, -0.1, LEG_M)), ((1.85, 0.0, LEG_M), (2.15, 0.0, LEG_M))
+    plans = []
+    for step, posts in enumerate([apart] * 20 + [behind] * 10):
+        header = FrameHeader(session="0000abcd", seq=step + 1, t_us=step * 33_000)
+        scan = Lidar(at_x_m=0.055).scan(Course(posts=posts), (0.0, 0.0, 0.0), step * 33_000)
+        boxes = box_of(posts, (0.0, 0.0, 0.0))
+        plans.append(legs.step(View(header, 0.033, 0.05, LENS, boxes, None, scan)))
+    assert plans[19].distance_m == pytest.approx(2.0 - LENS.x_m, abs=0.03)
+    assert plans[-1].distance_m == pytest.approx(2.0 - LENS.x_m, abs=0.1)
+
+
 def test_a_box_of_something_else_is_left_alone() -> None:
     cat = Detection(100, 50, 140, 160, 0.9, "cat")
     assert Legs(Legs.Config(), LENS).step(view((cat,), None)).target is None

@@ -13,8 +13,8 @@ HERE = (0.0, 0.0, 0.0)
 DT_S = 0.1
 
 
-def at(x_m, y_m=0.0, score=1.0):
-    return Sighting(x_m, y_m, Detection(0, 0, 1, 1, score, "target"))
+def at(x_m, y_m=0.0, score=1.0, **exactness):
+    return Sighting(x_m, y_m, Detection(0, 0, 1, 1, score, "target"), **exactness)
 
 
 def started(*positions, **config):
@@ -39,6 +39,14 @@ def test_noise_of_a_position_grows_with_the_square_of_the_range(x_m, score, sigm
     predicted = sigma_m**2 + 0.3**2 * dt_s**2 + 0.35**2 * dt_s**3 / 3  # position, velocity of 0.3 m/s, acceleration
     share = predicted / (predicted + sigma_m**2)
     assert track.target.y_m == pytest.approx(0.0001 * share, rel=1e-5)
+
+
+@pytest.mark.parametrize(("exactness", "score"), [({}, 0.8), ({"exactness": 0.5}, 0.4), ({"exactness": 0.9}, 0.72)])
+def test_partly_assumed_range_counts_as_a_lower_score(exactness, score):
+    less, lower = (started((1.0,), (1.001, 0.0)) for _ in range(2))
+    less.step(DT_S, HERE, [at(1.01, 0.0, 0.8, **exactness)])
+    lower.step(DT_S, HERE, [at(1.01, 0.0, score)])
+    assert less.target.x_m == pytest.approx(lower.target.x_m, rel=1e-9)
 
 
 def test_noise_depends_on_the_distance_not_on_the_direction():
