@@ -83,6 +83,7 @@ def at(sighting):
 def test_sphere_is_located_exactly_by_any_part_of_its_outline(center, share):
     detection = outlined(pixels(rays(center, share=share)))
     sighting = locate_sphere(detection, CAMERA, RADIUS_M)
+    assert sighting is not None and sighting.exactness == 1
     assert sighting.detection is detection
     assert at(sighting) == pytest.approx(place(center), abs=1e-5)
 
