@@ -1,11 +1,12 @@
 """Settings, samples, figures and bounds of a race. Pure."""
 
-from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import Final
+from typing import Final, NamedTuple
 
 from sightline.evaluation.checks import Check, at_most
 from sightline.protocol.errors import ConfigError
@@ -101,11 +102,16 @@ Accepted = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """`ages_us` are (approximate time of the result, age of the image at the result), in the order of time."""
+    """`ages_us` are (time of the result, age of the image at the result), in the order of time.
+
+    The result of the services is the first `drive.set` after the validation of a command; `validated_us` are the ages
+    at the validation. A peer has no wheels: its result is the command in its robot process.
+    """
 
     captured: int
     answered_percent: float
     ages_us: tuple[tuple[int, int], ...]
+    validated_us: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +141,8 @@ def joined(samples: Sequence[LoopSample]) -> LoopSample:
     carried = [sample.carried_bytes for sample in samples]
     return replace(
         first,
-        course=Course(captured, answered, tuple(age for course in courses for age in course.ages_us)),
+        course=Course(captured, answered, tuple(age for course in courses for age in course.ages_us),
+                      tuple(age for course in courses for age in course.validated_us)),
         seconds=sum(sample.seconds for sample in samples),
         cpu_s={name: sum(sample.cpu_s[name] for sample in samples) for name in first.cpu_s},
         memory_mb={name: max(sample.memory_mb[name] for sample in samples) for name in first.memory_mb},
@@ -159,25 +166,43 @@ def course_of_tally(
     return Course(len(captured), 100 * len(answered) / max(1, len(captured)), ages_us)
 
 
-def course_of_headers(headers: Sequence[Header], accepted: Sequence[Accepted], begin_us: int, end_us: int) -> Course:
-    """Return the course of the services: ages as the driver measured them, from the next frame header; its accepted
-    count.
+class WheelAge(NamedTuple):
+    """Age of the image of an accepted command, at `drive.set` and at the validation."""
 
-    A header whose latency is the one before it brings no news: nothing was accepted in between.
+    set_us: int
+    age_us: int
+    validated_us: int
+
+
+def wheel_ages(headers: Sequence[Header], sets_us: Sequence[int]) -> Iterator[WheelAge]:
+    """Yield the ages of the accepted commands: from frame headers, and from the times of `drive.set`.
+
+    A header contains the age at the last validation before it, of the newest frame that is so old by then. A header
+    whose latency is the one before it brings no news: nothing was accepted in between.
     """
+    times_us = [t_us for _, t_us, _ in headers]
+    for (_, _, before_us), (_, t_us, latency_us) in pairwise(headers):
+        if latency_us is None or latency_us == before_us:
+            continue
+        frame = bisect_right(times_us, t_us - latency_us) - 1
+        applied = bisect_left(sets_us, times_us[frame] + latency_us) if frame >= 0 else len(sets_us)
+        if applied < len(sets_us):
+            yield WheelAge(sets_us[applied], sets_us[applied] - times_us[frame], latency_us)
+
+
+def course_of_headers(
+    headers: Sequence[Header], accepted: Sequence[Accepted], sets_us: Sequence[int], begin_us: int, end_us: int
+) -> Course:
+    """Return the course of the services: ages at the wheels, and the driver's count of accepted commands."""
     inside = [header for header in headers if begin_us <= header[1] < end_us]
-    ages_us: list[tuple[int, int]] = []
-    last_us: int | None = None
-    for _, t_us, latency_us in inside:
-        if latency_us is not None and latency_us != last_us:
-            ages_us.append((t_us, latency_us))
-        last_us = latency_us
-    if not ages_us:
+    ages = [age for age in wheel_ages(headers, sets_us) if begin_us <= age.set_us < end_us]
+    if not ages or not inside:
         return Course(0, 0.0, ())
-    lag_us = round(median(age_us for _, age_us in ages_us))
+    lag_us = round(median(age.validated_us for age in ages))
     statuses = [status for status in accepted if begin_us <= status[0] < end_us]
     captured = inside[-1][0] - inside[0][0] + 1  # by number: those that never arrived count too
-    return Course(captured, _accepted_percent(headers, statuses, lag_us), tuple(ages_us))
+    return Course(captured, _accepted_percent(headers, statuses, lag_us),
+                  tuple((age.set_us, age.age_us) for age in ages), tuple(age.validated_us for age in ages))
 
 
 def _accepted_percent(headers: Sequence[Header], statuses: Sequence[Accepted], lag_us: int) -> float:
@@ -209,7 +234,8 @@ _PARTS: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class LoopFigures:
-    """One contestant. Times are from capture to the result; None without an answer.
+    """One contestant. Times are from capture to the result, `validated_ms` (median) to the validation of the services;
+    None without an answer.
 
     `first_ms` and `last_ms` are medians of the first and the last ten seconds, or fifths of a shorter time; `cpu_ms` is
     per answered image and process, `memory_mb` the high-water mark, `bytes_per_picture` what went over the sockets,
@@ -223,6 +249,7 @@ class LoopFigures:
     p50_ms: float | None
     p95_ms: float | None
     p99_ms: float | None
+    validated_ms: float | None
     first_ms: float | None
     last_ms: float | None
     cpu_ms: Mapping[str, float]
@@ -256,6 +283,7 @@ def figures_of(sample: LoopSample) -> LoopFigures:
         p50_ms=percentile(ages_ms, 50),
         p95_ms=percentile(ages_ms, 95),
         p99_ms=percentile(ages_ms, 99),
+        validated_ms=percentile([age_us / 1000 for age_us in course.validated_us], 50),
         first_ms=parts[0],
         last_ms=parts[1],
         cpu_ms={name: 1000 * cpu_s / judged for name, cpu_s in sample.cpu_s.items()},

@@ -17,6 +17,7 @@ from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.open import open_link
 
 ROBOT: Final = "r1"
+_WHEELS: Final = "wheels.csv"
 TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}"}
 
 
@@ -28,6 +29,8 @@ class Ours:
     ports: tuple[int, ...]
     endpoint: str
     tally: Path
+    wheels: Path
+    """The motor log."""
     accepted: list[Accepted] = field(default_factory=list)
 
     def note(self, message: Message) -> None:
@@ -38,7 +41,8 @@ class Ours:
     def course(self, begin_us: int, end_us: int) -> Course:
         """Return the course of that time. Call it only after the end of the vision service."""
         headers = [(seq, t_us, latency_us) for seq, t_us, latency_us in json.loads(self.tally.read_text())]
-        return course_of_headers(headers, self.accepted, begin_us, end_us)
+        sets_us = [int(line.split(",")[0]) for line in self.wheels.read_text("ascii").split("\n")[:-1]]
+        return course_of_headers(headers, self.accepted, sets_us, begin_us, end_us)
 
 
 def endpoint_of(transport: str, port: int) -> str:
@@ -63,7 +67,7 @@ def running_services(setting: LoopSetting, folder: Path, processes: Processes) -
         vision = processes.start("vision", [json.dumps(settings)], module="sightline.benchmarks.loop.vision")
         robot = {"guardian": guardian, "driver": processes.driver("robot"), "network": processes.network("robot")}
         pids = {**robot, "vision": vision}
-        ours = Ours(pids, (port,), endpoint, tally)
+        ours = Ours(pids, (port,), endpoint, tally, folder / _WHEELS)
         link.subscribe(STATUS, ours.note)
         processes.wait_line("vision", "target seen")
         yield ours
@@ -75,7 +79,8 @@ def _robot_toml(setting: LoopSetting, folder: Path, endpoint: str) -> Path:
     path.write_text(
         f"robot = {json.dumps(ROBOT)}\nlisten = [{json.dumps(endpoint)}]\nstate_dir = {json.dumps(str(folder))}\n"
         f'[camera]\nkind = "folder"\noptions = {{path = {json.dumps(str(setting.pictures))}, fps = {setting.fps}}}\n'
-        f'[drive]\nkind = "log"\n[safety]\nauto_arm = true\n[stream]\nmax_fps = {setting.fps}\n',
+        f'[drive]\nkind = "log"\noptions = {{path = {json.dumps(str(folder / _WHEELS))}}}\n'
+        f'[safety]\nauto_arm = true\n[stream]\nmax_fps = {setting.fps}\n',
         "utf-8",
     )
     return path

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
-from sightline.benchmarks.loop.figures import percentile
+from sightline.benchmarks.loop.figures import percentile, wheel_ages
 from sightline.benchmarks.network.cases import HOLD_AGE_MS, NetworkCase
 from sightline.benchmarks.network.watch import NOTED
 from sightline.evaluation.checks import Check, at_least, at_most, worst_checks
@@ -102,10 +102,12 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class NetworkFigures:
-    """Figures of one period. Ages are from capture to the accepted command. A late command counts as infinitely old."""
+    """Figures of one period. Ages are from capture to `drive.set`, `validated_ms` (median) to the validation. A late
+    command counts as infinitely old."""
 
     p50_ms: float | None
     p95_ms: float | None
+    validated_ms: float | None
     fps: float
     executed_ms: float
     """The oldest frame that was driven on, as ten statuses a second show it."""
@@ -119,17 +121,23 @@ class NetworkFigures:
     timeouts: int
 
 
-def figures_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: Stretch) -> NetworkFigures:
-    """Compute the figures of `stretch`."""
+def figures_of(
+    notes: Mapping[str, Sequence[Sequence[Any]]], rows: Sequence[WheelCommand], stretch: Stretch
+) -> NetworkFigures:
+    """Compute the figures of `stretch`. `rows` are the wheel commands of the whole run."""
     frames = [row for row in notes["frames"] if stretch.judged_us <= row[1] < stretch.end_us]
     statuses = [dict(zip(NOTED, row, strict=True)) for row in notes["statuses"]]
     inside = [one for one in statuses if stretch.judged_us <= one["t_us"] < stretch.end_us]
     seconds = (stretch.end_us - stretch.judged_us) / 1e6
-    late = inside[-1]["stale"] - inside[0]["stale"] if inside else 0
-    ages_ms = [*(age_us / 1000 for age_us in _ages_us(frames)), *[float("inf")] * late]
+    never_ms = [float("inf")] * (inside[-1]["stale"] - inside[0]["stale"] if inside else 0)
+    headers = [(row[0], row[1], row[2]) for row in notes["frames"]]
+    ages = [age for age in wheel_ages(headers, [row.t_us for row in rows])
+            if stretch.judged_us <= age.set_us < stretch.end_us]
+    ages_ms = [*(age.age_us / 1000 for age in ages), *never_ms]
     return NetworkFigures(
         p50_ms=percentile(ages_ms, 50),
         p95_ms=percentile(ages_ms, 95),
+        validated_ms=percentile([*(age.validated_us / 1000 for age in ages), *never_ms], 50),
         fps=(inside[-1]["accepted"] - inside[0]["accepted"]) / seconds if inside else 0.0,
         executed_ms=max((one["frame_age_us"] or 0 for one in inside if one["state"] in DRIVING), default=0) / 1000,
         holds_s=tuple(_holds_s(inside)),
@@ -154,13 +162,6 @@ def _count_at(counts: Sequence[tuple[int, int]], at_us: int) -> float:
         if before_us <= at_us < after_us:
             return before + (after - before) * (at_us - before_us) / (after_us - before_us)
     return float(counts[-1][1] if counts and at_us >= counts[-1][0] else counts[0][1] if counts else 0)
-
-
-def _ages_us(frames: Sequence[Sequence[Any]]) -> Iterator[int]:
-    """A header whose latency is the one before it brings no news: nothing was accepted in between."""
-    for before, frame in pairwise(frames):
-        if frame[2] is not None and frame[2] != before[2]:
-            yield frame[2]
 
 
 def _holds_s(statuses: Sequence[Mapping[str, Any]]) -> Iterator[float]:

@@ -16,7 +16,14 @@ import numpy as np
 
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.network.cases import NetworkCase, spans_s
-from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks, on_old_sight, read_wheel_commands
+from sightline.benchmarks.network.figures import (
+    Stretch,
+    WheelCommand,
+    figures_of,
+    network_checks,
+    on_old_sight,
+    read_wheel_commands,
+)
 from sightline.benchmarks.network.scenes import fleet, moved, router, standby, uplink
 from sightline.benchmarks.network.stage import (
     NetworkRun,
@@ -115,17 +122,18 @@ def _course(row: NetworkCase, stage: Stage) -> NetworkRun:
         injected = wire.shape(LinkShapes()) - before
         processes.end()
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
-    figures = tuple(figures_of(notes, stretch) for stretch in stretches)
+    rows = read_wheel_commands(stage.wheels.read_text("ascii"))
+    figures = tuple(figures_of(notes, rows, stretch) for stretch in stretches)
     harmed = at_least("injected", float(injected), "", 1.0)
     return NetworkRun(
-        row, stage.seed, injected, figures, (harmed, *network_checks(row, figures), *_wheel_checks(stage, notes))
+        row, stage.seed, injected, figures, (harmed, *network_checks(row, figures), *_wheel_checks(rows, notes))
     )
 
 
-def _wheel_checks(stage: Stage, notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[Check]:
+def _wheel_checks(rows: Sequence[WheelCommand], notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[Check]:
     """Yield checks of the wheel commands, independent of the robot's reports. Only Zenoh shows twists."""
     if notes["twists"]:
-        lines = on_old_sight(read_wheel_commands(stage.wheels.read_text("ascii")), notes["twists"])
+        lines = on_old_sight(rows, notes["twists"])
         yield at_most("moved on frames over 400 ms", float(lines), "lines", 0)
 
 

@@ -87,7 +87,8 @@ SECTIONS: Final = (
     Section(
         "loop",
         "The whole loop",
-        "Capture to the result of the driver process over Zenoh. Robot and vision service run in their own processes "
+        "Capture to `drive.set` over Zenoh, by the motor log; for a peer, to the command in its robot process. Robot "
+        "and vision service run in their own processes "
         "on this machine, next to the floor (the same pipeline in one process at the same pace), plain TCP, and "
         "other stacks, on the same images in the same run. On loopback the transports tie: this compares what a user "
         "gets. The peers detect as the legacy programs do, with OpenCV on the whole image. Rows with `+` show the "
@@ -135,7 +136,7 @@ SECTIONS: Final = (
         "network",
         "Slow and lossy networks",
         "Robot and vision service in two network namespaces, as on two machines. Each packet crosses a wire that "
-        "loses and delays it. Ages count from capture to the accepted command. Where packets are lost, five seeds "
+        "loses and delays it. Ages count from capture to `drive.set`. Where packets are lost, five seeds "
         "run, and each bound applies to the worst.",
         _rows("radio", "bursts", "thin", "through", "step", "rise", extra=("--seeds", "1,2,3,4,5")),
     ),
@@ -260,7 +261,7 @@ def _section(section: Section, result: dict[str, Any]) -> str:
     rows = [_row(check, with_median) for check in result["checks"]]
     rule = "|---" * (head.count("|") - 1) + "|"
     command = f"`sightline {' '.join(section.arguments)}`"
-    shown = [f"![Age of the frames at validation](img/{section.picture})\n"] if section.picture else []
+    shown = [f"![Age of the frames at the wheels](img/{section.picture})\n"] if section.picture else []
     race = [*_race(result["contestants"]), ""] if "contestants" in result else []
     intro = [f"{_HEADING}{section.title}\n", f"{section.why}\n", f"{command}\n", f"Measured {_machine()}\n"]
     return "\n".join([*intro, *race, *shown, head, rule, *rows])
@@ -268,9 +269,11 @@ def _section(section: Section, result: dict[str, Any]) -> str:
 
 def _race(contestants: Sequence[dict[str, Any]]) -> list[str]:
     """One row for each contestant of `bench loop`."""
-    heads = ("", "answered %", "p50 ms", "p95 ms", "p99 ms", "bytes a picture", "CPU ms a picture", "memory MB")
+    heads = ("", "answered %", "p50 ms", "p95 ms", "p99 ms", "validated p50 ms", "bytes a picture", "CPU ms a picture",
+             "memory MB")
     rows = [
-        (one["name"], *(_number(one[key]) for key in ("answered_percent", "p50_ms", "p95_ms", "p99_ms")),
+        (one["name"], *(_number(one[key]) for key in (
+            "answered_percent", "p50_ms", "p95_ms", "p99_ms", "validated_ms")),
          "none" if one["bytes_per_picture"] is None else f"{one['bytes_per_picture']:.0f}",
          *(_by_process(one[key]) for key in ("cpu_ms", "memory_mb")))
         for one in contestants

@@ -203,7 +203,7 @@ def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
 def _table(race: "Race") -> list[str]:
     from sightline.benchmarks.loop.figures import OUR_DETECTOR
 
-    names = f"{'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'bytes':>8} {'others':>7}"
+    names = f"{'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'validated':>9} {'bytes':>8} {'others':>7}"
     head = f"{'':18} {names}  CPU ms per image; MB"
     alone = [_ALONE.format(OUR_DETECTOR)] if any(name.endswith(OUR_DETECTOR) for name in race.figures) else []
     return [head, *(_row(name, race) for name in race.figures), *alone]
@@ -214,7 +214,8 @@ def _row(name: str, race: "Race") -> str:
     ages = " ".join(f"{'never' if age is None else f'{age:.1f}':>8}" for age in (one.p50_ms, one.p95_ms, one.p99_ms))
     cpu = " ".join(f"{process} {cpu_ms:.2f}" for process, cpu_ms in one.cpu_ms.items())
     memory = " ".join(f"{megabytes:.0f}" for megabytes in one.memory_mb.values())
-    carried = f"{one.bytes_per_picture or 0:8.0f} {one.taken_percent:5.1f} %"
+    validated = "" if one.validated_ms is None else f"{one.validated_ms:.1f}"
+    carried = f"{validated:>9} {one.bytes_per_picture or 0:8.0f} {one.taken_percent:5.1f} %"
     return f"{name:18} {one.answered_percent:7.1f} % {ages}    {carried}  {cpu}; {memory}"
 
 
@@ -273,7 +274,7 @@ def _print_run(run: "NetworkRun", *, as_json: bool) -> None:
     typer.echo(f"{run.row.name} ({run.row.what}), seed {run.seed}", err=as_json)
     for last in run.figures[-1:]:
         typer.echo(
-            f"  age p50 {number(last.p50_ms)} p95 {number(last.p95_ms)} ms, "
+            f"  age p50 {number(last.p50_ms)} p95 {number(last.p95_ms)} ms, validated {number(last.validated_ms)} ms, "
             f"{last.fps:.1f} fps of {last.bytes_per_frame / 1000:.0f} kB, quality {last.quality_percent:.0f} %, "
             f"size {last.scale_percent:.0f} %, window up to {last.window}, {last.timeouts} unanswered, "
             f"holds {', '.join(f'{one:.1f} s' for one in last.holds_s) or 'none'}", err=as_json,

@@ -27,6 +27,7 @@ from sightline.benchmarks.loop.figures import (
     peers_of,
     percentile,
     size_of,
+    wheel_ages,
 )
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.race import run_race
@@ -88,12 +89,33 @@ def statuses(rows, refused=()):
         yield t_us, sum(at_us + 2 * MS <= t_us and seq not in refused for seq, at_us, _ in rows)
 
 
+SETS_US = range(0, 100 * 33 * MS, 250)
+"""Times of `drive.set`."""
+
+
+@given(st.lists(st.integers(1, 300 * MS), unique=True), st.integers(0, 20 * MS))
+def test_age_at_the_wheels_is_that_of_the_first_command_after_the_validation(latencies_us, wait_us):
+    headers = [(seq, seq * 350 * MS, latency_us) for seq, latency_us in enumerate([None, *latencies_us])]
+    validated_us = [seq * 350 * MS + latency_us for seq, latency_us in enumerate(latencies_us)]
+    sets_us = sorted(at_us + later_us for at_us in validated_us for later_us in (-1, wait_us))
+    assert list(wheel_ages(headers, sets_us)) == [
+        (at_us + wait_us, latency_us + wait_us, latency_us)
+        for at_us, latency_us in zip(validated_us, latencies_us, strict=True)]
+
+
+def test_image_of_a_command_is_the_newest_one_that_is_so_old():
+    headers = [(0, 0, None), (1, 33, None), (2, 66, None), (3, 99, 70), (4, 132, 36), (5, 165, 36)]
+    assert list(wheel_ages(headers, range(0, 200, 10))) == [(70, 70, 70), (110, 44, 36)]
+    assert list(wheel_ages(headers, range(0, 80, 10))) == [(70, 70, 70)], "the wheels never received the second one"
+
+
 @given(st.sets(st.integers(5, 85), max_size=30))
 def test_rejected_commands_are_missing_from_the_headers(refused):
     rows = header_rows(100, refused)
-    course = course_of_headers(rows, list(statuses(rows, refused)), 0, rows[-1][1] + 1)
+    course = course_of_headers(rows, list(statuses(rows, refused)), SETS_US, 0, rows[-1][1] + 1)
     assert course.captured == 100
     assert len(course.ages_us) == 99 - len(refused)
+    assert course.validated_us == tuple(2 * MS + seq for seq in range(99) if seq not in refused)
     assert course.answered_percent == pytest.approx(100 - len(refused), abs=2.5)
 
 
@@ -101,7 +123,7 @@ def test_frames_that_the_vision_service_did_not_receive_are_unanswered():
     rows = header_rows(100)
     kept = [row for row in rows if not 40 <= row[0] < 60]
     accepted = list(statuses(rows, range(40, 60)))
-    course = course_of_headers(kept, accepted, 0, rows[-1][1] + 1)
+    course = course_of_headers(kept, accepted, SETS_US, 0, rows[-1][1] + 1)
     assert course.captured == 100
     assert course.answered_percent == pytest.approx(80, abs=2.5)
 

@@ -7,7 +7,14 @@ import sys
 import pytest
 
 from sightline.benchmarks.network.cases import CASES, NetworkCase, chosen, spans_s
-from sightline.benchmarks.network.figures import Stretch, figures_of, network_checks, sent_between, worst_of_seeds
+from sightline.benchmarks.network.figures import (
+    Stretch,
+    WheelCommand,
+    figures_of,
+    network_checks,
+    sent_between,
+    worst_of_seeds,
+)
 from sightline.benchmarks.network.run import SCENES, write_film
 from sightline.benchmarks.network.stage import NetworkSetting
 from sightline.evaluation.checks import Check, at_most
@@ -32,7 +39,8 @@ def frames(*latencies_ms, begin_s=0.0):
 
 def seen(frame_rows=(), statuses=(), end_s=10.0, judged_s=0.0):
     stretch = Stretch(0, round(judged_s * SECOND_US), round(end_s * SECOND_US))
-    return figures_of({"frames": list(frame_rows), "statuses": list(statuses)}, stretch)
+    wheels = [WheelCommand(t_us, 1.0, 1.0) for t_us in range(0, 10 * SECOND_US, 1000)]
+    return figures_of({"frames": list(frame_rows), "statuses": list(statuses)}, wheels, stretch)
 
 
 # --- rows --------------------------------------------------------------------------------------------------------
@@ -94,7 +102,9 @@ def test_a_seed_makes_the_wire_lose_the_same_packets_again():
 
 def test_ages_come_from_accepted_commands_and_late_ones_count_as_infinite():
     rows = frames(None, 40, 41, 42, 43)
-    assert seen(rows, [status(0), status(10)]).p50_ms == pytest.approx(41, abs=1)
+    found = seen(rows, [status(0), status(10)])
+    assert found.p50_ms == pytest.approx(42.5, abs=0.5), "the wheels follow each millisecond"
+    assert found.validated_ms == pytest.approx(41.5, abs=0.51)
     late = seen(rows, [status(0), status(9.9, stale=100)])
     assert late.p50_ms == float("inf")
     assert seen(rows[:1], [status(0), status(10)]).p50_ms is None
