@@ -13,18 +13,12 @@ from sightline.protocol.errors import ConfigError
 
 OURS: Final = "sightline"
 FLOOR: Final = "floor"
-TCP: Final = "tcp"
-"""The least that two processes can do; a reference, and a rival only when the detector is slow."""
-PEERS: Final = ("older", "lekiwi", "openpi", "callback")
+"""The pipeline at the pace of the images, in one process."""
+OLDER: Final = "older"
+"""The pipeline of the legacy articles, detector included. All others use Sightline's detector and steering."""
+ZENOH: Final = ("callback", "ring", "newest")
+PEERS: Final = ("tcp", *ZENOH, "openpi", "lekiwi", OLDER)
 """What a user would build, one by one."""
-OUR_DETECTOR: Final = "+our detector"
-"""After a peer's name: the peer with Sightline's own pipeline instead of its own, so that its transport alone shows."""
-WITH_OUR_DETECTOR: Final = ("openpi", "callback")
-"""Peers whose transport is fast enough for this comparison."""
-OWN_DETECTOR: Final = ("lekiwi", "openpi", "callback")
-"""Peers with the detector of the legacy articles.
-
-All others, including floor and bare TCP, use Sightline's pipeline."""
 MAX_FPS: Final = 240.0
 """As much as the robot service takes."""
 TAKEN_BOUND_PERCENT: Final = 5.0
@@ -67,9 +61,8 @@ class LoopSetting:
 
     @property
     def contestants(self) -> tuple[str, ...]:
-        """Return the contestants in order, with the transports alone last."""
-        alone = tuple(name + OUR_DETECTOR for name in WITH_OUR_DETECTOR if name in self.peers)
-        return (FLOOR, OURS, *((TCP, *self.peers, *alone) if self.peers else ()))
+        """Return the contestants in order."""
+        return (FLOOR, OURS, *self.peers)
 
 
 def size_of(text: str) -> tuple[int, int]:
@@ -218,12 +211,17 @@ def _accepted_percent(headers: Sequence[Header], statuses: Sequence[Accepted], l
 # The figures of `bench loop` and the bounds they are held against. Pure.
 
 
-P50_OVER_FLOOR_MS: Final = 1.5
-P95_OVER_FLOOR_MS: Final = 5.0
+TIMES_FLOOR: Final = 1.5
+BEHIND_ZENOH_MS: Final = 0.3
+MOST_WAIT_MS: Final = 5.0
+"""Of a command for `drive.set`, from its validation."""
+CPU_MS: Final = 1.5
+"""Per image: of all processes of the robot, and of vision."""
 CPU_OVER_FLOOR_MS: Final = 0.6
 ANSWERED_PERCENT: Final = 99.0
 OVERLOADED_LIKE_MS: Final = 80.0
 """A detector overloaded by the rate is allowed the same ages as one with this delay."""
+TIMES_BEST: Final = 1.02
 LOADED_P50_OVER_DELAY_MS: Final = 10.0
 LOADED_P99_OVER_DELAY_MS: Final = 40.0
 DRIFT_PERCENT: Final = 10.0
@@ -235,7 +233,7 @@ _PARTS: Final = 5
 @dataclass(frozen=True, slots=True)
 class LoopFigures:
     """One contestant. Times are from capture to the result, `validated_ms` (median) to the validation of the services;
-    None without an answer.
+    `most_wait_ms` is the longest time between the two. None without an answer.
 
     `first_ms` and `last_ms` are medians of the first and the last ten seconds, or fifths of a shorter time; `cpu_ms` is
     per answered image and process, `memory_mb` the high-water mark, `bytes_per_picture` what went over the sockets,
@@ -250,6 +248,7 @@ class LoopFigures:
     p95_ms: float | None
     p99_ms: float | None
     validated_ms: float | None
+    most_wait_ms: float | None
     first_ms: float | None
     last_ms: float | None
     cpu_ms: Mapping[str, float]
@@ -258,6 +257,11 @@ class LoopFigures:
     taken_percent: float
     tries: int
     hot_ms: float | None
+
+    @property
+    def is_disturbed(self) -> bool:
+        """Return True if others had too much of the machine's time."""
+        return self.taken_percent > TAKEN_BOUND_PERCENT
 
 
 def percentile(values: Sequence[float], percent: float) -> float | None:
@@ -284,6 +288,8 @@ def figures_of(sample: LoopSample) -> LoopFigures:
         p95_ms=percentile(ages_ms, 95),
         p99_ms=percentile(ages_ms, 99),
         validated_ms=percentile([age_us / 1000 for age_us in course.validated_us], 50),
+        most_wait_ms=max((age_ms - us / 1000 for age_ms, us in zip(ages_ms, course.validated_us, strict=False)),
+                         default=None),
         first_ms=parts[0],
         last_ms=parts[1],
         cpu_ms={name: 1000 * cpu_s / judged for name, cpu_s in sample.cpu_s.items()},
@@ -307,42 +313,49 @@ def _parts(ages_us: Sequence[tuple[int, int]]) -> tuple[float | None, float | No
 
 
 def loop_checks(figures: Mapping[str, LoopFigures], setting: LoopSetting) -> list[Check]:
-    """Hold Sightline against the floor of the same run, or, with a detector slower than the camera, against its delay.
+    """Hold Sightline against the floor and the rivals of the same run, or against the delay of a slow detector.
 
-    And against every competitor; transports with Sightline's detector are shown and not checked. `figures` has at least
-    the floor and Sightline.
+    `figures` has at least the floor and Sightline.
     """
     ours, floor = figures[OURS], figures[FLOOR]
+    rivals = [figures[name] for name in PEERS if name in figures]
     like_ms = setting.detector_delay_ms or OVERLOADED_LIKE_MS
-    checks = _loaded(ours, like_ms) if setting.is_loaded else _unloaded(ours, floor)
-    rivals = [figures[name] for name in (*PEERS, *((TCP,) if setting.is_loaded else ())) if name in figures]
+    checks = list(_loaded(ours, like_ms, rivals) if setting.is_loaded else _unloaded(ours, floor, rivals))
     for rival in rivals:
         checks.append(at_most(f"p95 behind {rival.name}", _over(ours.p95_ms, rival.p95_ms), "ms", 0.0))
-        if setting.is_loaded:
-            checks.append(at_most(f"p50 behind {rival.name}", _over(ours.p50_ms, rival.p50_ms), "ms", 0.0))
-    disturbed = [one for one in figures.values() if one.taken_percent > TAKEN_BOUND_PERCENT]
+        if not setting.is_loaded:
+            checks.append(at_most(f"p99 behind {rival.name}", _over(ours.p99_ms, rival.p99_ms), "ms", 0.0))
+    disturbed = [one for one in figures.values() if one.is_disturbed]
     return [*checks, at_most("samples disturbed by others", len(disturbed), "", 0.0)]
 
 
-def _unloaded(ours: LoopFigures, floor: LoopFigures) -> list[Check]:
-    cpu_ms = ours.cpu_ms["vision"] - floor.cpu_ms["vision"]
-    return [
-        at_most("p50 over floor", _over(ours.p50_ms, floor.p50_ms), "ms", P50_OVER_FLOOR_MS),
-        at_most("p95 over floor", _over(ours.p95_ms, floor.p95_ms), "ms", P95_OVER_FLOOR_MS),
-        at_most("not accepted", 100 - ours.answered_percent, "%", 100 - ANSWERED_PERCENT),
-        at_most("vision CPU over floor", cpu_ms, "ms", CPU_OVER_FLOOR_MS),
-    ]
+def _unloaded(ours: LoopFigures, floor: LoopFigures, rivals: Sequence[LoopFigures]) -> Iterator[Check]:
+    yield at_most("p50, times the floor", _times(ours.p50_ms, floor.p50_ms), "x", TIMES_FLOOR)
+    best_ms = min((one.p50_ms for one in rivals if one.name in ZENOH and one.p50_ms is not None), default=None)
+    if best_ms is not None:
+        yield at_most("p50 behind the fastest over Zenoh", _over(ours.p50_ms, best_ms), "ms", BEHIND_ZENOH_MS)
+    yield at_most("longest wait for the wheels", ours.most_wait_ms, "ms", MOST_WAIT_MS)
+    yield at_most("not accepted", 100 - ours.answered_percent, "%", 100 - ANSWERED_PERCENT)
+    vision_ms = ours.cpu_ms["vision"]
+    yield at_most("robot CPU", sum(ours.cpu_ms.values()) - vision_ms, "ms", CPU_MS)
+    yield at_most("vision CPU", vision_ms, "ms", CPU_MS)
+    yield at_most("vision CPU over floor", vision_ms - floor.cpu_ms["vision"], "ms", CPU_OVER_FLOOR_MS)
 
 
-def _loaded(ours: LoopFigures, delay_ms: float) -> list[Check]:
+def _loaded(ours: LoopFigures, delay_ms: float, rivals: Sequence[LoopFigures]) -> Iterator[Check]:
     drift = _over(ours.last_ms, ours.first_ms)
     drift_percent = None if drift is None or not ours.first_ms else 100 * abs(drift) / ours.first_ms
-    return [
-        at_most("age p50", ours.p50_ms, "ms", delay_ms + LOADED_P50_OVER_DELAY_MS),
-        at_most("age p99", ours.p99_ms, "ms", delay_ms + LOADED_P99_OVER_DELAY_MS),
-        at_most("drift of age", drift_percent, "%", DRIFT_PERCENT),
-        at_most("not accepted", 100 - ours.answered_percent, "%", 100 - ANSWERED_PERCENT),
-    ]
+    best_ms = min((one.p50_ms for one in rivals if one.p50_ms is not None), default=None)
+    if best_ms is not None:
+        yield at_most("p50, times the best rival", _times(ours.p50_ms, best_ms), "x", TIMES_BEST)
+    yield at_most("age p50", ours.p50_ms, "ms", delay_ms + LOADED_P50_OVER_DELAY_MS)
+    yield at_most("age p99", ours.p99_ms, "ms", delay_ms + LOADED_P99_OVER_DELAY_MS)
+    yield at_most("drift of age", drift_percent, "%", DRIFT_PERCENT)
+    yield at_most("not accepted", 100 - ours.answered_percent, "%", 100 - ANSWERED_PERCENT)
+
+
+def _times(value: float | None, other: float | None) -> float | None:
+    return None if value is None or not other else value / other
 
 
 def _over(value: float | None, other: float | None) -> float | None:

@@ -8,16 +8,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from sightline.benchmarks.loop.figures import FLOOR, OUR_DETECTOR, OURS, TCP, LoopSetting
+from sightline.benchmarks.loop.figures import FLOOR, OLDER, OURS, LoopSetting
 from sightline.benchmarks.loop.race import Race
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 LABELS: Final = {
-    FLOOR: "floor (one process)", OURS: "sightline", TCP: "bare TCP", "older": "legacy article",
-    "lekiwi": "ZeroMQ as LeKiwi", "openpi": "WebSocket as openpi", "callback": "zenoh, plain callback",
-    "openpi" + OUR_DETECTOR: "openpi's transport alone", "callback" + OUR_DETECTOR: "callback's transport alone",
+    FLOOR: "floor (one process)", OURS: "sightline", "tcp": "bare TCP", "callback": "Zenoh, callback",
+    "ring": "Zenoh, RingChannel(1)", "newest": "Zenoh, newest as zenoh-demos", "openpi": "WebSocket as openpi",
+    "lekiwi": "ZeroMQ as LeKiwi", OLDER: "legacy article",
 }
 _PAUSE_US: Final = 2_000_000
 
@@ -56,7 +56,7 @@ def _slowness(setting: LoopSetting) -> str:
 def _draw_one(shares: "Axes", times: "Axes", name: str, ages_us: tuple[tuple[int, int], ...]) -> None:
     ages_ms = sorted(age_us / 1000 for _, age_us in ages_us)
     width = 2.5 if name == OURS else 1.2
-    style = ":" if name.endswith(OUR_DETECTOR) else "--" if name in (FLOOR, TCP) else "-"
+    style = "--" if name in (FLOOR, "tcp") else ":" if name == OLDER else "-"
     percents = [100 * (at + 1) / len(ages_ms) for at in range(len(ages_ms))]
     shares.plot(ages_ms, percents, label=LABELS[name], linewidth=width, linestyle=style)
     times.plot(*_over_time(ages_us), linewidth=width, linestyle=style)

@@ -18,11 +18,14 @@ from typing import Any, Final
 from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 _RETRY_S: Final = 0.1
+_ZENOH: Final = ("callback", "ring", "newest")
+"""Peers of one module; each name is its vision."""
 
 
 def main(name: str, role: str, settings: dict[str, Any]) -> None:
     """Play `role` of peer `name`."""
-    play = _part(importlib.import_module(f"sightline.benchmarks.peers.{name}"), role, settings)
+    module, vision = ("zenoh_peers", name) if name in _ZENOH else (name, "vision")
+    play = _part(importlib.import_module(f"sightline.benchmarks.peers.{module}"), role, vision, settings)
     while True:
         try:
             play()
@@ -30,10 +33,10 @@ def main(name: str, role: str, settings: dict[str, Any]) -> None:
             time.sleep(_RETRY_S)
 
 
-def _part(peer: ModuleType, role: str, settings: dict[str, Any]) -> Callable[[], None]:
+def _part(peer: ModuleType, role: str, vision: str, settings: dict[str, Any]) -> Callable[[], None]:
     if role == "vision":
         signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
-        return partial(peer.vision, _vision(settings), settings["port"])
+        return partial(getattr(peer, vision), _vision(settings), settings["port"])
     tally, film = Tally(Path(settings["tally"])), RecordedFrames(Path(settings["pictures"]), settings["fps"])
     signal.signal(signal.SIGTERM, lambda *_: _end(tally))
     if role == "alone":

@@ -1,14 +1,15 @@
-"""ZeroMQ as LeKiwi uses it: PUSH and PULL that keep the newest message; commands are read once a tick. Shell.
+"""ZeroMQ as LeKiwi uses it: PUSH and PULL with short queues; commands are read once a tick. Shell.
 
-Images go as base64 in JSON, with the robot's state, as there. The command that a tick reads answers an earlier tick.
+An image goes as the second part of a message, as raw JPEG after a JSON header, and the receiver drains its queue to the
+newest one: `src/lerobot/robots/lekiwi` of github.com/huggingface/lerobot at 7427f318. The command that a tick reads
+answers an earlier tick.
 """
 
 from __future__ import annotations
 
-import base64
 import json
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import zmq
 
@@ -16,18 +17,21 @@ if TYPE_CHECKING:
     from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 Socket = zmq.Socket[bytes]
+QUEUE: Final = 2
+"""Images in each queue: ZeroMQ cannot keep only the newest one of messages with several parts."""
 
 
-def _newest(context: zmq.Context[Socket], kind: int) -> Socket:
+def _socket(context: zmq.Context[Socket], kind: int, option: int, value: int) -> Socket:
     made = context.socket(kind)
-    made.setsockopt(zmq.CONFLATE, 1)
+    made.setsockopt(option, value)
     return made
 
 
 def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
     """Tick at the images' pace: command in, image out."""
     context = zmq.Context()
-    commands, observations = _newest(context, zmq.PULL), _newest(context, zmq.PUSH)
+    commands = _socket(context, zmq.PULL, zmq.CONFLATE, 1)
+    observations = _socket(context, zmq.PUSH, zmq.SNDHWM, QUEUE)
     commands.bind(f"tcp://127.0.0.1:{port}")
     observations.bind(f"tcp://127.0.0.1:{port + 1}")
     while True:
@@ -35,9 +39,9 @@ def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
         _read_command(commands, tally)
         t_us, jpeg = film.shoot()
         tally.capture(t_us)
-        observation = {"t_us": t_us, "x.vel": 0.0, "theta.vel": 0.0, "front": base64.b64encode(jpeg).decode()}
+        header = {"_cams": ["front"], "t_us": t_us, "x.vel": 0.0, "theta.vel": 0.0}
         try:
-            observations.send_string(json.dumps(observation), flags=zmq.NOBLOCK)
+            observations.send_multipart([json.dumps(header).encode(), jpeg], flags=zmq.NOBLOCK)
         except zmq.Again:
             continue  # no reader
 
@@ -54,11 +58,21 @@ def _read_command(commands: Socket, tally: Tally) -> None:
 def vision(eyes: Vision, port: int) -> None:
     """Answer the newest image of the robot at `port`."""
     context = zmq.Context()
-    commands, observations = _newest(context, zmq.PUSH), _newest(context, zmq.PULL)
+    commands = _socket(context, zmq.PUSH, zmq.CONFLATE, 1)
+    observations = _socket(context, zmq.PULL, zmq.RCVHWM, QUEUE)
     commands.connect(f"tcp://127.0.0.1:{port}")
     observations.connect(f"tcp://127.0.0.1:{port + 1}")
     while True:
-        observation = json.loads(observations.recv_string())
-        linear, angular = eyes.answer(observation["t_us"], base64.b64decode(observation["front"])).split("|")
-        command = {"t_us": observation["t_us"], "x.vel": float(linear), "theta.vel": float(angular)}
-        commands.send_string(json.dumps(command))
+        header, jpeg = _newest(observations)
+        t_us = json.loads(header)["t_us"]
+        linear, angular = eyes.answer(t_us, jpeg).split("|")
+        commands.send_string(json.dumps({"t_us": t_us, "x.vel": float(linear), "theta.vel": float(angular)}))
+
+
+def _newest(observations: Socket) -> list[bytes]:
+    newest = observations.recv_multipart()
+    while True:
+        try:
+            newest = observations.recv_multipart(zmq.NOBLOCK)
+        except zmq.Again:
+            return newest

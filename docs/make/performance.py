@@ -87,12 +87,12 @@ SECTIONS: Final = (
     Section(
         "loop",
         "The whole loop",
-        "Capture to `drive.set` over Zenoh, by the motor log; for a peer, to the command in its robot process. Robot "
-        "and vision service run in their own processes "
-        "on this machine, next to the floor (the same pipeline in one process at the same pace), plain TCP, and "
-        "other stacks, on the same images in the same run. On loopback the transports tie: this compares what a user "
-        "gets. The peers detect as the legacy programs do, with OpenCV on the whole image. Rows with `+` show the "
-        "transport of a peer alone, with Sightline's pipeline and without credit, age or gate. They have no bound.",
+        "Capture to `drive.set` over Zenoh, by the motor log; for a rival, to the command in its robot process. Robot "
+        "and vision service run in their own processes on this machine. Next to them run the floor (the same "
+        "pipeline in one process at the same pace), plain TCP, three usual ways to receive Zenoh's images, the "
+        "WebSocket request of openpi, the ZeroMQ of LeKiwi, and the legacy pipeline (`older`), on the same images in "
+        "the same run. All but the legacy pipeline have Sightline's detector and steering, but no rival has credit, "
+        "an age limit or a safety gate. `benchmarks/peers/` names the sources.",
         ("bench", "loop", "--seconds", "15"),
         "loop-zenoh.png",
     ),

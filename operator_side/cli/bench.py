@@ -117,10 +117,6 @@ def _print_checks(checks: "Sequence[Check]", as_json: bool) -> int:
 # --- `bench loop` and `bench watchers` ---------------------------------------------------------------------------
 
 
-_ALONE = (
-    "Peers detect as the legacy programs do. With `{}` they use Sightline's pipeline, which shows the cost of their "
-    "transport alone, without credit, age or a gate; it is not scored."
-)
 Transport = Annotated[str, typer.Option(help="zenoh or websocket, between robot and vision service.")]
 
 
@@ -134,13 +130,13 @@ def loop(
         float, typer.Option(help="Images per detection, e.g. 2 for overload; sets rate or detector.")
     ] = 0.0,
     seconds: Annotated[float, typer.Option(help="Length for each contestant, 2 to 600.")] = 10.0,
-    peers: Annotated[str, typer.Option(help="all, none, or names: older, lekiwi, openpi, callback.")] = "all",
+    peers: Annotated[str, typer.Option(help="all, none, or names, e.g. tcp,ring.")] = "all",
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Write loop.json and loop.png here.")] = None,
     as_json: Json = False,
 ) -> int:
-    """Compare the time from capture to driver with other designs
+    """Compare the time from capture to wheels with other designs
 
-    The others are the in-process minimum, bare TCP and the designs of other projects.
+    The others are the in-process minimum, bare TCP and other designs. `!` marks a sample that was disturbed.
     """
     with needs("bench"):
         from sightline.benchmarks.loop.figures import LoopSetting, peers_of, size_of
@@ -201,12 +197,9 @@ def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
 
 
 def _table(race: "Race") -> list[str]:
-    from sightline.benchmarks.loop.figures import OUR_DETECTOR
-
     names = f"{'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'validated':>9} {'bytes':>8} {'others':>7}"
     head = f"{'':18} {names}  CPU ms per image; MB"
-    alone = [_ALONE.format(OUR_DETECTOR)] if any(name.endswith(OUR_DETECTOR) for name in race.figures) else []
-    return [head, *(_row(name, race) for name in race.figures), *alone]
+    return [head, *(_row(name, race) for name in race.figures)]
 
 
 def _row(name: str, race: "Race") -> str:
@@ -215,7 +208,8 @@ def _row(name: str, race: "Race") -> str:
     cpu = " ".join(f"{process} {cpu_ms:.2f}" for process, cpu_ms in one.cpu_ms.items())
     memory = " ".join(f"{megabytes:.0f}" for megabytes in one.memory_mb.values())
     validated = "" if one.validated_ms is None else f"{one.validated_ms:.1f}"
-    carried = f"{validated:>9} {one.bytes_per_picture or 0:8.0f} {one.taken_percent:5.1f} %"
+    others = f"{one.taken_percent:5.1f} %{'!' if one.is_disturbed else ' '}"
+    carried = f"{validated:>9} {one.bytes_per_picture or 0:8.0f} {others}"
     return f"{name:18} {one.answered_percent:7.1f} % {ages}    {carried}  {cpu}; {memory}"
 
 
