@@ -67,6 +67,7 @@ def clear_of(points: Points, body: Footprint, twist: tuple[float, float], keep_m
 _GAIN_M = 0.1
 _DETOUR_M, _MAX_DETOURS = 0.3, 8
 _APPLIED = 1e-3
+_MOVED_M, _MOVED_RAD = 0.02, 0.1
 
 
 class ProgressCheckerConfig(Config):
@@ -91,6 +92,7 @@ class ProgressChecker:
         self._best_m = math.inf
         self._discoveries = -1
         self._detours = 0
+        self._stands_at: Pose | None = None
 
     def step(self, view: View, left_m: float | None, discoveries: int) -> str:
         """Why to give up, or nothing. `left_m` is None where no way is left.
@@ -107,7 +109,10 @@ class ProgressChecker:
             self._best_m, self._stuck_s = left_m, 0.0
         else:
             self._wait(view, left_m)
-        return f"no progress in {self._config.stuck_s:.0f} s" if self._stuck_s >= self._config.stuck_s else ""
+        if self._stuck_s < self._config.stuck_s:
+            return ""
+        no_motion = "its wheels are commanded, but it does not move: check motors and encoders"
+        return no_motion if self._stands_at else f"no progress in {self._config.stuck_s:.0f} s"
 
     def _wait(self, view: View, left_m: float) -> None:
         """Wait for progress.
@@ -118,6 +123,11 @@ class ProgressChecker:
             self._best_m = left_m
             self._detours += 1
         if max(map(abs, view.header.applied)) > _APPLIED:
+            pose = view.header.pose
+            self._stands_at = pose if not self._stuck_s else self._stands_at
+            if self._stands_at and (math.dist(pose[:2], self._stands_at[:2]) > _MOVED_M
+                                    or abs(pose[2] - self._stands_at[2]) > _MOVED_RAD):
+                self._stands_at = None
             self._stuck_s += view.dt_s
 
 

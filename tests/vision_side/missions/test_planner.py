@@ -181,8 +181,8 @@ def test_only_motion_toward_a_point_is_cut() -> None:
 # --- patience ----------------------------------------------------------------------------------------------------
 
 
-def view(dt_s: float, applied=(0.2, 0.0)) -> View:
-    return View(header(0, applied=applied), dt_s, 0.05, camera(), ())
+def view(dt_s: float, applied=(0.2, 0.0), pose=(0.0, 0.0, 0.0)) -> View:
+    return View(header(0, applied=applied, pose=pose), dt_s, 0.05, camera(), ())
 
 
 def test_closed_for_long_enough_is_closed_and_a_way_found_meanwhile_is_not() -> None:
@@ -193,9 +193,18 @@ def test_closed_for_long_enough_is_closed_and_a_way_found_meanwhile_is_not() -> 
     assert patience.step(view(0.5), None, 0) == "every way that was seen is closed"
 
 
+@pytest.mark.parametrize(("pose", "stands"), [
+    ((0.01, -0.01, 0.09), True), ((0.03, 0.0, 0.0), False), ((0.0, 0.0, -0.11), False),
+])
+def test_robot_that_never_moved_is_told_from_one_without_a_way(pose, stands) -> None:
+    patience = ProgressChecker(ProgressCheckerConfig(stuck_s=2.0))
+    told = [patience.step(view(0.5, pose=(0.0, 0.0, 0.0) if at != 2 else pose), 3.0, 0) for at in range(5)]
+    assert told[:4] == [""] * 4 and ("does not move" in told[4]) is stands
+
+
 def test_no_progress_is_driving_without_coming_nearer_or_seeing_anything_new() -> None:
     patience = ProgressChecker(ProgressCheckerConfig(stuck_s=2.0))
-    assert [patience.step(view(0.5), 3.0, 0) for _ in range(4)] == [""] * 4
+    assert [patience.step(view(0.5, pose=(at / 9, 0.0, 0.0)), 3.0, 0) for at in range(4)] == [""] * 4
     assert patience.step(view(0.5), 3.0, 0) == "no progress in 2 s"
     patience.start_again()
     for left_m in (3.0, 2.8, 2.6, 2.4, 2.2, 2.0):
