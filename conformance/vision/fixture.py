@@ -120,6 +120,7 @@ class RobotPlayed:
         self._first_t_us, self._last_t_us, self._next_seq = first_t_us, first_t_us - 1, first_seq
         self._stamps, self._stopped = itertools.count(1), False
         self._read: dict[int, VisionAnswer] = {}
+        self._plain: list[Sent] = []
         self._announce_camera()
         self._announce_status()
 
@@ -150,9 +151,12 @@ class RobotPlayed:
         known = FrameHeader(session=self.session, seq=self._next_seq, t_us=t_us).model_copy(update=fields)
         if not fields.keys() & {"seq", "t_us", "session"}:
             self._next_seq, self._last_t_us = known.seq + 1, known.t_us
-        at_us = self.bench.now_us  # before it leaves: sending takes time, and a quick peer answers meanwhile
+        # The time before it leaves: sending takes time, and a quick peer answers meanwhile.
+        sent = Sent(known.session, known.seq, known.t_us, self.bench.now_us)
+        if header is None:
+            self._plain.append(sent)
         self.bench.publish(FRAME, encode(known) if header is None else header, picture(name) if jpeg is None else jpeg)
-        return Sent(known.session, known.seq, known.t_us, at_us)
+        return sent
 
     def next_fields(self) -> dict[str, Any]:
         """The fields of the frame that comes next, as a dictionary; the frame itself does not come."""
@@ -198,6 +202,15 @@ class RobotPlayed:
     def twists(self, since: int | None = None) -> list[VisionAnswer]:
         """Only what drives."""
         return [one for one in self.answers(since) if one.is_twist]
+
+    def answers_to_others(self, since: int) -> list[VisionAnswer]:
+        """Twists and acks since a mark that answer something else than a frame with a good header.
+
+        An answer may come late, and twice while frames are lost (7.1).
+        """
+        plain = [[one.session, one.seq, one.t_us] for one in self._plain]
+        names = ("session", "seq", "t_us")
+        return [one for one in self.answers(since) if [one.echo.get(name) for name in names] not in plain]
 
     def answers_to(self, sent: Sent) -> list[VisionAnswer]:
         """Whatever cites `sent`."""

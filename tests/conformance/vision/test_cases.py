@@ -1,5 +1,7 @@
 """Tests of the cases for vision services: ours passes; tests/conformance/mutants runs the broken ones."""
 
+from collections.abc import Sequence
+
 import pytest
 
 from sightline.conformance.case import Level
@@ -35,6 +37,30 @@ def test_the_reference_conforms(case):
 def test_a_broken_vision_of_which_nothing_is_broken_conforms(cases):
     outcomes = {case.id: result_of(case, BrokenVision).outcome for case in cases}
     assert [name for name, outcome in outcomes.items() if outcome is not Outcome.PASSED] == []
+
+
+class SendsTwice(VirtualVision):
+    """Sends each twist twice, as clause 7.1 recommends while frames are lost. The second one comes a moment later."""
+
+    copies: Sequence[tuple[object, ...]] = ()
+
+    def tick(self, now_us):
+        copies, self.copies = self.copies, []
+        for copy in copies:
+            super()._publish(*copy)
+        super().tick(now_us)
+
+    def _publish(self, *answer):
+        super()._publish(*answer)
+        self.copies = [*self.copies, answer]
+
+
+HOSTILE = [case for case in VIRTUAL if case.group == "hostile input"]
+
+
+def test_second_copy_of_an_answer_is_no_answer_to_an_invalid_frame():
+    results = [result_of(case, SendsTwice) for case in HOSTILE[::2]]
+    assert [(one.case.id, one.reason) for one in results if one.outcome is not Outcome.PASSED] == []
 
 
 def test_there_are_enough_cases_of_both_levels():
