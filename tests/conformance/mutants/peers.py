@@ -92,10 +92,10 @@ def _with_ids(mutant):
 
 
 def hand_written():
-    """Yield the broken peers that are programs of their own: each fails exactly its case."""
+    """Yield the broken peers that are programs of their own: each fails exactly its cases."""
     exact = {"fault": HAND_WRITTEN, "operator": HAND_WRITTEN, "exact": True}
     for name, break_it in BROKEN_ROBOTS.items():
-        yield Mutant(break_it.__name__.replace("_", " "), "robot", caught_by=(name,), **exact)
+        yield Mutant(break_it.__name__.replace("_", " "), "robot", caught_by=(name, *break_it.also), **exact)
     for name, (wrong, _kind) in BROKEN_VISIONS.items():
         yield Mutant(wrong, "vision", caught_by=(name,), **exact)
     for name, defect in DEFECTS.items():

@@ -62,7 +62,7 @@ def two_commands_will_do(robot):
     )  # fmt: skip
 
 
-@breaks("R-ARM-03")
+@breaks("R-ARM-03", "R-ARM-15")
 def never_arms(robot):
     robot.driving.gate._missing_to_arm = lambda now_us: "not today"
 

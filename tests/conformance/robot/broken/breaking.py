@@ -8,12 +8,12 @@ BROKEN = {}
 """Case id -> `break_it(robot)`, whose name shows what is wrong. Exactly that case must fail."""
 
 
-def breaks(case_id):
-    """Decorator: this mutation is what `case_id` finds."""
+def breaks(case_id, *also):
+    """Decorator: this mutation is what `case_id` finds; the cases `also` build on what it breaks."""
 
     def add(break_it):
         assert case_id not in BROKEN, case_id
-        BROKEN[case_id] = break_it
+        BROKEN[case_id], break_it.also = break_it, also
         return break_it
 
     return add

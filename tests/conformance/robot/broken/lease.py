@@ -26,12 +26,12 @@ def who_sends(message):
         return None
 
 
-@breaks("R-LEASE-01")
+@breaks("R-LEASE-01", "R-PROOF-07")
 def tells_no_holder(robot):
     bend_out(robot, "status", lambda _header, payload: payload.pop("holder", None))
 
 
-@breaks("R-LEASE-02")
+@breaks("R-LEASE-02", "R-SEQ-12")
 def lets_two_drive(robot):
     def may_take(self, who, now_us):
         holder = self.live_holder(now_us)
@@ -71,7 +71,7 @@ def refused_commands_renew(robot):
     wrap(robot, "on_twist", around)
 
 
-@breaks("R-LEASE-07")
+@breaks("R-LEASE-07", "R-PROOF-01", "R-PROOF-02", "R-PROOF-03", "R-PROOF-04", "R-PROOF-07")
 def acks_renew(robot):
     def around(inner, message):
         inner(message)
@@ -203,7 +203,7 @@ def proofs_of(robot, check):
     lease_of(robot, check_proof=check_proof)
 
 
-@breaks("R-PROOF-01")
+@breaks("R-PROOF-01", "R-PROOF-03", "R-PROOF-04", "R-PROOF-07")
 def any_proof_will_do(robot):
     proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is not None)
 
@@ -218,7 +218,7 @@ def the_last_proof_will_do(robot):
     proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is not None and proof.proof == lease.proof.proof)
 
 
-@breaks("R-PROOF-04")
+@breaks("R-PROOF-04", "R-PROOF-07")
 def forged_seq_is_used_up(robot):
     gate = robot.driving.gate
 

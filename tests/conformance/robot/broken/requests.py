@@ -25,7 +25,7 @@ def reply_has_its_own_id(robot):
 @breaks("R-REQ-03")
 def reply_shows_the_session(robot):
     def around(inner, message):
-        robot.asker = fields_of(message.header).get("session")
+        robot.asker = (fields_of(message.header) or {}).get("session")
         inner(message)
 
     wrap(robot, "on_request", around)
