@@ -58,7 +58,7 @@ class SendsTwice(VirtualVision):
 HOSTILE = [case for case in VIRTUAL if case.group == "hostile input"]
 
 
-def test_second_copy_of_an_answer_is_no_answer_to_an_invalid_frame():
+def test_second_copy_of_an_answer_answers_no_invalid_frame():
     results = [result_of(case, SendsTwice) for case in HOSTILE[::2]]
     assert [(one.case.id, one.reason) for one in results if one.outcome is not Outcome.PASSED] == []
 

@@ -196,7 +196,7 @@ def test_closed_for_long_enough_is_closed_and_a_way_found_meanwhile_is_not() -> 
 @pytest.mark.parametrize(("pose", "stands"), [
     ((0.01, -0.01, 0.09), True), ((0.03, 0.0, 0.0), False), ((0.0, 0.0, -0.11), False),
 ])
-def test_robot_that_never_moved_is_told_from_one_without_a_way(pose, stands) -> None:
+def test_robot_that_never_moved_is_distinguished_from_one_without_a_way(pose, stands) -> None:
     patience = ProgressChecker(ProgressCheckerConfig(stuck_s=2.0))
     told = [patience.step(view(0.5, pose=(0.0, 0.0, 0.0) if at != 2 else pose), 3.0, 0) for at in range(5)]
     assert told[:4] == [""] * 4 and ("does not move" in told[4]) is stands
