@@ -206,14 +206,19 @@ def probe(wire, timeout_s=5.0):
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
 
 
+def quickest_s(wire):
+    """Return the least of a few times: on a busy machine a probe may wait for a processor."""
+    probes = [probe(wire) for _ in range(3)]
+    assert {outcome for outcome, _ in probes} == {"closed"}
+    return min(seconds for _, seconds in probes)
+
+
 @needs_wire
 def test_real_packets_pass_are_late_and_are_cut_in_one_direction(tmp_path):
     with BenchWire(tmp_path / "wire.log") as wire:
-        outcome, seconds = probe(wire)
-        assert outcome == "closed" and seconds < 0.05
+        assert quickest_s(wire) < 0.05
         wire.shape(LinkShapes(ab=LinkShape(delay_ms=150), ba=LinkShape(delay_ms=100)))
-        outcome, seconds = probe(wire)
-        assert outcome == "closed" and 0.25 <= seconds < 0.4
+        assert 0.25 <= quickest_s(wire) < 0.4
         before = wire.shape(LinkShapes(ab=LinkShape(cut=True)))
         assert probe(wire, 0.3)[0] == "silence"
         assert wire.shape(LinkShapes()) > before
