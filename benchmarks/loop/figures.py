@@ -159,6 +159,25 @@ def course_of_tally(
     return Course(len(captured), 100 * len(answered) / max(1, len(captured)), ages_us)
 
 
+class WheelCommand(NamedTuple):
+    """One line of the log drive's file."""
+
+    t_us: int
+    left_rad_s: float
+    right_rad_s: float
+
+    @property
+    def moves(self) -> bool:
+        """Return True if a wheel must turn."""
+        return bool(self.left_rad_s or self.right_rad_s)
+
+
+def read_wheel_commands(text: str) -> list[WheelCommand]:
+    """Whole lines; one that is still being written is left out."""
+    parts = [line.split(",") for line in text.split("\n")[:-1]]
+    return [WheelCommand(int(t), float(left), float(right)) for t, left, right in parts]
+
+
 class WheelAge(NamedTuple):
     """Age of the image of an accepted command, at `drive.set` and at the validation."""
 
@@ -211,6 +230,8 @@ def _accepted_percent(headers: Sequence[Header], statuses: Sequence[Accepted], l
 # The figures of `bench loop` and the bounds they are held against. Pure.
 
 
+P50_OVER_FLOOR_MS: Final = 1.5
+P95_OVER_FLOOR_MS: Final = 5.0
 TIMES_FLOOR: Final = 1.5
 BEHIND_ZENOH_MS: Final = 0.3
 MOST_WAIT_MS: Final = 5.0
@@ -331,6 +352,8 @@ def loop_checks(figures: Mapping[str, LoopFigures], setting: LoopSetting) -> lis
 
 def _unloaded(ours: LoopFigures, floor: LoopFigures, rivals: Sequence[LoopFigures]) -> Iterator[Check]:
     yield at_most("p50, times the floor", _times(ours.p50_ms, floor.p50_ms), "x", TIMES_FLOOR)
+    yield at_most("p50 over floor", _over(ours.p50_ms, floor.p50_ms), "ms", P50_OVER_FLOOR_MS)
+    yield at_most("p95 over floor", _over(ours.p95_ms, floor.p95_ms), "ms", P95_OVER_FLOOR_MS)
     best_ms = min((one.p50_ms for one in rivals if one.name in ZENOH and one.p50_ms is not None), default=None)
     if best_ms is not None:
         yield at_most("p50 behind the fastest over Zenoh", _over(ours.p50_ms, best_ms), "ms", BEHIND_ZENOH_MS)

@@ -7,7 +7,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from sightline.benchmarks.loop.figures import Accepted, Course, LoopSetting, course_of_headers
+from sightline.benchmarks.loop.figures import (
+    Accepted,
+    Course,
+    LoopSetting,
+    course_of_headers,
+    read_wheel_commands,
+)
 from sightline.evaluation.processes import Processes, free_port
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import decode
@@ -41,7 +47,7 @@ class Ours:
     def course(self, begin_us: int, end_us: int) -> Course:
         """Return the course of that time. Call it only after the end of the vision service."""
         headers = [(seq, t_us, latency_us) for seq, t_us, latency_us in json.loads(self.tally.read_text())]
-        sets_us = [int(line.split(",")[0]) for line in self.wheels.read_text("ascii").split("\n")[:-1]]
+        sets_us = [row.t_us for row in read_wheel_commands(self.wheels.read_text("ascii"))]
         return course_of_headers(headers, self.accepted, sets_us, begin_us, end_us)
 
 

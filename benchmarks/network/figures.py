@@ -3,9 +3,9 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-from sightline.benchmarks.loop.figures import percentile, wheel_ages
+from sightline.benchmarks.loop.figures import WheelCommand, percentile, wheel_ages
 from sightline.benchmarks.network.cases import HOLD_AGE_MS, NetworkCase
 from sightline.benchmarks.network.watch import NOTED
 from sightline.evaluation.checks import Check, at_least, at_most, worst_checks
@@ -19,25 +19,6 @@ _RAMPED_OUT_US: Final = (stop_bound(SafetyConfig()).ramped_us + 2 * _LATE_US) //
 both be late."""
 _FASTER_RAD_S: Final = 0.15
 """Smallest gain of speed. The conversion of a twist to wheel speeds rounds."""
-
-
-class WheelCommand(NamedTuple):
-    """One line of the log drive's file."""
-
-    t_us: int
-    left_rad_s: float
-    right_rad_s: float
-
-    @property
-    def moves(self) -> bool:
-        """Return True if a wheel must turn."""
-        return bool(self.left_rad_s or self.right_rad_s)
-
-
-def read_wheel_commands(text: str) -> list[WheelCommand]:
-    """Whole lines; one that is still being written is left out."""
-    parts = [line.split(",") for line in text.split("\n")[:-1]]
-    return [WheelCommand(int(t), float(left), float(right)) for t, left, right in parts]
 
 
 def on_old_sight(rows: Sequence[WheelCommand], answers: Sequence[Sequence[int]]) -> int:

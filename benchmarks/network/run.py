@@ -14,15 +14,14 @@ from typing import Final
 import cv2
 import numpy as np
 
+from sightline.benchmarks.loop.figures import WheelCommand, read_wheel_commands
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.network.cases import NetworkCase, spans_s
 from sightline.benchmarks.network.figures import (
     Stretch,
-    WheelCommand,
     figures_of,
     network_checks,
     on_old_sight,
-    read_wheel_commands,
 )
 from sightline.benchmarks.network.scenes import fleet, moved, router, standby, uplink
 from sightline.benchmarks.network.stage import (

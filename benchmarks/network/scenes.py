@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
-from sightline.benchmarks.loop.figures import percentile
+from sightline.benchmarks.loop.figures import WheelCommand, percentile, read_wheel_commands
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.network.cases import NetworkCase
-from sightline.benchmarks.network.figures import WheelCommand, moves_again_s, read_wheel_commands, sent_between
+from sightline.benchmarks.network.figures import moves_again_s, sent_between
 from sightline.benchmarks.network.robots import Settings
 from sightline.benchmarks.network.stage import EVERYWHERE, NetworkRun, ShapedWire, Stage, start_robot, start_vision
 from sightline.benchmarks.network.stop_client import RESET, STOPPED

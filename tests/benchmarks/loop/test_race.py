@@ -135,6 +135,7 @@ def test_without_an_answer_there_are_no_figures_and_no_check_holds():
     assert (silent.p50_ms, silent.p95_ms, silent.first_ms, silent.most_wait_ms) == (None, None, None, None)
     found = judged(**{OURS: sample(OURS, [], answered_percent=0), FLOOR: sample(FLOOR, [1.0] * 100)})
     assert not found["p50, times the floor"]
+    assert not found["p50 over floor"] and not found["p95 over floor"]
     assert not found["longest wait for the wheels"]
     assert not found["not accepted"]
 
@@ -143,7 +144,8 @@ def test_the_bounds_are_held_against_the_floor_of_the_same_run():
     floor = sample(FLOOR, [1.0] * 100, cpu_s=0.1)
     assert all(judged(**{FLOOR: floor, OURS: sample(OURS, [1.5] * 95 + [5.9] * 5, cpu_s=0.15)}).values())
     for changes, bound in (
-        ({"ages_ms": [1.51] * 100}, "p50, times the floor"),
+        ({"ages_ms": [1.51] * 100}, "p50, times the floor"), ({"ages_ms": [2.6] * 100}, "p50 over floor"),
+        ({"ages_ms": [1.5] * 94 + [6.1] * 6}, "p95 over floor"),
         ({"cpu_s": 0.17}, "vision CPU over floor"), ({"cpu_s": 0.151}, "vision CPU"),
         ({"robot_s": 0.0751}, "robot CPU"), ({"answered_percent": 98.9}, "not accepted"),
         ({"ages_ms": [1.5] * 99 + [7.0], "waits_ms": [0.0] * 99 + [5.1]}, "longest wait for the wheels"),

@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
+from sightline.benchmarks.loop.figures import WheelCommand
 from sightline.benchmarks.network.cases import CASES, NetworkCase, chosen, spans_s
 from sightline.benchmarks.network.figures import (
     Stretch,
-    WheelCommand,
     figures_of,
     network_checks,
     sent_between,

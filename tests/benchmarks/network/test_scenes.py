@@ -6,7 +6,8 @@ import sys
 
 import pytest
 
-from sightline.benchmarks.network.figures import moves_again_s, on_old_sight, read_wheel_commands
+from sightline.benchmarks.loop.figures import read_wheel_commands
+from sightline.benchmarks.network.figures import moves_again_s, on_old_sight
 from sightline.benchmarks.network.scenes import ROBOTS, fleet_checks, reached_ms, reported_check, stop_checks_of
 from sightline.evaluation.faults.evidence import MotorRow
 from sightline.sim.tun_emulator import why_impossible

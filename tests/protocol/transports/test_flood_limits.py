@@ -142,7 +142,7 @@ def test_what_a_flooding_address_begins_is_dropped_and_all_others_go_on(family, 
         assert f"connections from 127.0.0.2, {(MAX_OPEN + 2) * 1e6 / WINDOW_US:.0f} new ones" in reported[0]
         with pytest.raises(TimeoutError), suppress(ConnectionError), closing(connect(address, "127.0.0.2")):
             pass
-        while "ws" in endpoint and not is_empty(server):  # the kernel holds back none that it had before the block
+        while "ws" in endpoint and not is_empty(server):  # without waiting for a byte: those before the block
             pass
         with suppress(ConnectionError):
             flood[0].sendall(b"x")
