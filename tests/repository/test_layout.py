@@ -78,6 +78,10 @@ def module_name(path: Path) -> str:
     return ".".join(("sightline", *(parts[:-1] if parts[-1] == "__init__" else parts)))
 
 
+LEAVES = (ast.Name, ast.Constant, ast.expr_context, ast.operator, ast.cmpop, ast.unaryop, ast.boolop)
+DEFINITIONS = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+DOCUMENTED = (ast.Module, *DEFINITIONS)
+WANTED = (*DOCUMENTED, ast.Import, ast.ImportFrom, ast.Name, ast.Attribute, ast.Call)
 FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 MODULES = {module_name(path): path for path in FILES}
 
@@ -102,13 +106,25 @@ def tree(path: Path) -> ast.Module:
 
 
 @cache
-def nodes(path: Path) -> tuple[ast.AST, ...]:
-    """All of a file; a walk over all files takes as long as parsing them."""
+def by_kind(path: Path) -> dict[type, list]:
+    """Return what the tests look at. `ast.walk` takes three times as long, most of it for names and constants."""
     gc.disable()  # which would look through all earlier trees again and again
-    try:
-        return tuple(ast.walk(tree(path)))
-    finally:
-        gc.enable()
+    found, waiting = {kind: [] for kind in WANTED}, [tree(path)]
+    while waiting:
+        node = waiting.pop()
+        if type(node) in found:
+            found[type(node)].append(node)
+        for part in () if isinstance(node, LEAVES) else node.__dict__.values():
+            if isinstance(part, list):
+                waiting += [one for one in part if isinstance(one, ast.AST)]
+            elif isinstance(part, ast.AST):
+                waiting.append(part)
+    gc.enable()
+    return found
+
+
+def nodes(path: Path, *kinds: type):
+    return chain.from_iterable(by_kind(path)[kind] for kind in kinds)
 
 
 def imported(statements) -> set[str]:
@@ -124,7 +140,7 @@ def imported(statements) -> set[str]:
 
 @cache
 def imports(path: Path) -> set[str]:
-    return imported(nodes(path))
+    return imported(nodes(path, ast.Import, ast.ImportFrom))
 
 
 @cache
@@ -180,15 +196,9 @@ def test_no_import_cycle():
 @cache
 def own_names(path: Path) -> set[str]:
     """Every name that a file defines, as a function, class, variable or attribute of `self`."""
-    found = set()
-    for node in nodes(path):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            found.add(node.name)
-        elif isinstance(node, ast.Name):
-            found.add(node.id)
-        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in ("self", "cls"):
-            found.add(node.attr)
-    return found
+    defined = {node.name for node in nodes(path, *DEFINITIONS)} | {node.id for node in nodes(path, ast.Name)}
+    return defined | {node.attr for node in nodes(path, ast.Attribute)
+                      if isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")}
 
 
 def test_no_private_name_crosses_a_file():
@@ -198,8 +208,8 @@ def test_no_private_name_crosses_a_file():
         wrong += [f"{shown(path)} imports {name}" for name in imports(path)
                   if name.startswith("sightline.") and re.match(r"_[a-z]", name.rpartition(".")[2])]
         known = own_names(path) | library
-        wrong += [f"{shown(path)}:{node.lineno} {ast.unparse(node)}" for node in nodes(path)
-                  if isinstance(node, ast.Attribute) and re.match(r"_[a-z]", node.attr) and node.attr not in known]
+        wrong += [f"{shown(path)}:{node.lineno} {ast.unparse(node)}" for node in nodes(path, ast.Attribute)
+                  if re.match(r"_[a-z]", node.attr) and node.attr not in known]
     none_of(wrong)
 
 
@@ -223,18 +233,15 @@ def test_the_robot_needs_no_heavy_package():
     wrong = []
     for path in (path for path in FILES if path.is_relative_to(ROOT / "robot_side") or shown(path) == "sim/bus.py"):
         in_hardware = path.is_relative_to(ROOT / "robot_side/hardware")
-        statements = on_import(tree(path).body) if in_hardware else nodes(path)
+        statements = on_import(tree(path).body) if in_hardware else nodes(path, ast.Import, ast.ImportFrom)
         heavy = [name for name in imported(statements) if name.split(".")[0] in HEAVY_MODULES]
         wrong += [f"{shown(path)} imports {name}" for name in heavy]
     none_of(wrong)
 
 
 def lines_of_docstrings(path: Path) -> int:
-    total = 0
-    for node in nodes(path):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
-            total += node.body[0].end_lineno - node.body[0].lineno + 1
-    return total
+    return sum(node.body[0].end_lineno - node.body[0].lineno + 1
+               for node in nodes(path, *DOCUMENTED) if ast.get_docstring(node))
 
 
 def test_files_and_functions_stay_small():
@@ -242,9 +249,8 @@ def test_files_and_functions_stay_small():
     wrong = [shown(path) for path in FILES
              if source(path).count("\n") - lines_of_docstrings(path) > MAX_FILE_LINES]
     for path in FILES:
-        wrong += [f"{shown(path)}: {node.name}" for node in nodes(path)
-                  if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
-                  and node.end_lineno - node.lineno + 1 > MAX_FUNCTION_LINES]
+        wrong += [f"{shown(path)}: {node.name}" for node in nodes(path, ast.FunctionDef, ast.AsyncFunctionDef)
+                  if node.end_lineno - node.lineno + 1 > MAX_FUNCTION_LINES]
     none_of(wrong)
 
 
@@ -292,8 +298,8 @@ def test_no_two_public_classes_share_a_name():
 
 
 def test_every_thread_has_a_name():
-    wrong = [f"{shown(path)}:{node.lineno}" for path in FILES for node in nodes(path)
-             if isinstance(node, ast.Call) and getattr(node.func, "attr", getattr(node.func, "id", "")) == "Thread"
+    wrong = [f"{shown(path)}:{node.lineno}" for path in FILES for node in nodes(path, ast.Call)
+             if getattr(node.func, "attr", getattr(node.func, "id", "")) == "Thread"
              and "name" not in {keyword.arg for keyword in node.keywords}]
     none_of(wrong)
 
@@ -314,8 +320,8 @@ def texts():
     for path in PAGES:
         yield shown(path), re.sub(r"^```.*?^```", "", source(path), flags=re.S | re.M)
     for path in FILES:
-        for node in nodes(path):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and (text := ast.get_docstring(node)):
+        for node in nodes(path, *DOCUMENTED):
+            if text := ast.get_docstring(node):
                 yield shown(path), text
         yield shown(path), "\n".join(re.findall(r"(?<!['\"])# .*", source(path)))
 
