@@ -424,6 +424,7 @@ FIGURES: Mapping[str, Figure] = {
     "wall_contact_s": Figure("s", "count", is_exact=True),
     "target_contacts": Figure("steps", "count", is_exact=True),
     "commanded_m": Figure("m", "count"),
+    "least_travelled_m": Figure("m", "count"),
     "least_distance_m": Figure("m", "extreme", "legs"),
     "most_distance_m": Figure("m", "extreme", "legs"),
     "least_ever_m": Figure("m", "extreme", "legs"),

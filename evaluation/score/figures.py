@@ -69,7 +69,8 @@ class Score:
 
     def figure(self, name: str) -> float | None:
         """One figure by its name, whichever kind it is."""
-        value: float | None = self.figures[name] if name in self.figures else getattr(self, name, None)
+        own = name.removeprefix(AT_LEAST)
+        value: float | None = self.figures[name] if name in self.figures else getattr(self, own, None)
         return value
 
 

@@ -154,7 +154,14 @@ def test_legs_are_kept_at_a_distance_from_acquisition_on():
 
 def test_an_occluder_may_be_touched_for_less_than_a_tenth_of_a_second():
     for steps, bad in ((25, set()), (26, {"wall_contact_s"})):
-        assert failed("occluder", samples(200, walls=lambda at, steps=steps: steps if at > 50 else 0)) == bad
+        run = samples(200, x_m=lambda at: at / 100, walls=lambda at, steps=steps: steps if at > 50 else 0)
+        assert failed("occluder", run) == bad
+
+
+def test_a_robot_that_stays_where_it_is_does_not_follow_behind_an_occluder():
+    for way_m, bad in ((0.51, set()), (0.49, {"least_travelled_m"}), (0.0, {"least_travelled_m"})):
+        run = samples(201, x_m=lambda at, way_m=way_m: way_m * at / 200)
+        assert failed("occluder", run) == bad and scored(run).figure("least_travelled_m") == pytest.approx(way_m)
 
 
 def test_driving_into_the_target_is_a_failure():
