@@ -121,6 +121,8 @@ def _name(process: Path) -> str:
 
 _TLS_TIMEOUT_S = 1.0
 _PLAIN = "it is a plain link, not TLS; pass --secure there too, or on neither end"
+_SILENT = ("it does not answer TLS; it is a plain link (pass --secure there too, or on neither end), or others flood "
+           "it (see its log)")
 _CAUSES = (
     ("certificate has expired", "its certificate has expired; make new keys there"),
     ("Hostname mismatch", "its certificate names other hosts; sightline keys add DIR ROLE --host HOST"),
@@ -175,7 +177,7 @@ def _try_handshake(host: str, port: int, context: ssl.SSLContext) -> str:
             try:
                 secure = context.wrap_socket(plain, server_hostname=host)
             except TimeoutError:
-                return _PLAIN
+                return _SILENT
             with secure:
                 secure.recv(1)
     except ssl.SSLError as error:

@@ -1,5 +1,6 @@
 """Secured Zenoh links: permissions to send and receive, by certificate, and readable causes of a mismatch."""
 
+import socket
 import threading
 import time
 from contextlib import closing
@@ -22,6 +23,7 @@ from sightline.protocol.channels import (
     Direction,
 )
 from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.diagnosis import diagnose_tls
 from sightline.protocol.transports.security import (
     ROLES,
     certificate_role,
@@ -184,7 +186,13 @@ def test_a_certificate_of_another_host_is_named(folder, endpoint, broken, monkey
 
 def test_plain_to_secured_and_secured_to_plain_are_rejected_with_the_cause(folder, endpoint):
     assert "accepts only TLS" in _refusal(endpoint, folder, None)
-    assert "plain link, not TLS" in _refusal(endpoint, folder, folder, plain_robot=True)
+    assert "it is a plain link (pass --secure" in _refusal(endpoint, folder, folder, plain_robot=True)
+
+
+def test_a_port_that_does_not_answer_tls_is_reported_with_both_causes(folder):
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # as a plain port does, and one that others flood
+        why = diagnose_tls(f"tls/127.0.0.1:{silent.getsockname()[1]}", load_role_keys(str(folder), "vision"))
+    assert "does not answer TLS" in why and "plain link" in why and "flood" in why
 
 
 def test_failed_tls_does_not_fall_back_to_a_plain_link(folder):
