@@ -36,7 +36,7 @@ from sightline.protocol.transports.zenoh.discovery import list_robots
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.session import MAX_MESSAGE_BYTES, open_session
 from tests.fixtures.links import until
-from tests.fixtures.ports import free_endpoint
+from tests.fixtures.ports import free_endpoint, free_port
 
 pytestmark = pytest.mark.waits
 
@@ -190,8 +190,9 @@ def test_plain_to_secured_and_secured_to_plain_are_rejected_with_the_cause(folde
 
 
 def test_a_port_that_does_not_answer_tls_is_reported_with_both_causes(folder):
-    with socket.create_server(("127.0.0.1", 0)) as silent:  # as a plain port does, and one that others flood
-        why = diagnose_tls(f"tls/127.0.0.1:{silent.getsockname()[1]}", load_role_keys(str(folder), "vision"))
+    port = free_port()
+    with socket.create_server(("127.0.0.1", port)):  # silent as a plain port is, and one that others flood
+        why = diagnose_tls(f"tls/127.0.0.1:{port}", load_role_keys(str(folder), "vision"))
     assert "does not answer TLS" in why and "plain link" in why and "flood" in why
 
 
