@@ -4,6 +4,7 @@ A stock `zenohd` also works, without the access rules of `--secure` and without 
 """
 
 import logging
+import resource
 import signal
 import threading
 from collections.abc import Sequence
@@ -17,7 +18,7 @@ from sightline.protocol.transports.endpoints import check_zenoh_endpoints, stop_
 from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
 from sightline.protocol.transports.stop_port import StopProcess, read_packets, stop_secret_file
-from sightline.protocol.transports.zenoh.session import open_session
+from sightline.protocol.transports.zenoh.session import MAX_ROUTER_SESSIONS, open_session
 from sightline.robot_side.guardian import stop_forwarder
 from sightline.robot_side.guardian.stop_core import unpack_ignored
 
@@ -25,6 +26,7 @@ _log: Final = logging.getLogger(__name__)
 
 _REACH_S = 5.0
 _WATCHED_S = 1.0
+_DESCRIPTORS: Final = 4 * MAX_ROUTER_SESSIONS
 _limiter: Final = RepeatLimiter()
 
 
@@ -32,11 +34,12 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
     """Serve until SIGTERM or SIGINT. Raises ConfigError and LinkError as `open_session` does."""
     check_zenoh_endpoints(listen, connect)
     secured = load_role_keys(secure, ROBOT_ROLE)
+    _raise_descriptor_limit()
     ending = threading.Event()
     with (
         ExitStack() as closing_all,
         limit_floods(listen, lambda line: _log.info("router: %s", line)),
-        closing(open_session(listen, connect, _REACH_S, secured)),
+        closing(open_session(listen, connect, _REACH_S, secured, MAX_ROUTER_SESSIONS)),
     ):
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: ending.set())
@@ -51,6 +54,14 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
                 _watch(forwarder)
     _log.info("router: ended")
     return 0
+
+
+def _raise_descriptor_limit() -> None:
+    """Permit this process as many descriptors as its sessions need, as far as the system does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(_DESCRIPTORS, hard)
+    if resource.RLIM_INFINITY != soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def _stop_forwarder(listen: Sequence[str], secure: str) -> StopProcess | None:

@@ -52,8 +52,10 @@ LEASE_MS: Final = 2000
 KEEP_ALIVES_PER_LEASE: Final = 50
 MAX_MESSAGE_BYTES: Final = 1_048_576
 HANDSHAKE_MS: Final = 3000
-# Sessions at a listening end: a fleet of twenty robots, their vision services, and viewers.
+# Sessions at a listening end: a robot, or a vision service with twenty robots and their viewers.
 MAX_SESSIONS: Final = 64
+# Sessions at a router.
+MAX_ROUTER_SESSIONS: Final = 1000
 _OVER_UDP: Final = ("udp", "quic")
 _PROBE_TIMEOUT_S: Final = 0.3
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
@@ -75,7 +77,8 @@ CLOSED_SESSION: Final[Any] = _ClosedSession()
 
 
 def open_session(
-    listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: RoleKeys | None = None
+    listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: RoleKeys | None = None,
+    max_sessions: int = MAX_SESSIONS,
 ) -> zenoh.Session:
     """Open a session.
 
@@ -84,6 +87,7 @@ def open_session(
         connect: valid endpoints to connect to.
         timeout_s: longest wait for an answer, if there are only endpoints to connect to.
         secured: keys for mutual TLS, or None. The listening end then applies the access rules.
+        max_sessions: security limit for the sessions of other ends with this one.
 
     Raises:
         ConfigError: Zenoh is missing, or an endpoint does not fit `secured`.
@@ -103,7 +107,7 @@ def open_session(
     # Without a handler Python prints the warnings of Zenoh to the terminal.
     logging.getLogger("zenoh").addHandler(logging.NullHandler())
     try:
-        return _open(session_config(listen, connect, timeout_s, secured))
+        return _open(session_config(listen, connect, timeout_s, secured, max_sessions))
     except zenoh.ZError as error:
         raise _error_of(str(error), listen, connect, timeout_s, secured) from None
 
@@ -122,10 +126,11 @@ def _open(config: dict[str, Any]) -> zenoh.Session:
 
 
 def session_config(
-    listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: RoleKeys | None = None
+    listen: Sequence[str], connect: Sequence[str], timeout_s: float, secured: RoleKeys | None = None,
+    max_sessions: int = MAX_SESSIONS,
 ) -> dict[str, Any]:
     """Return the Zenoh configuration. A listening end is a router, other ends are clients."""
-    config = _session_config(listen, connect, timeout_s)
+    config = _session_config(listen, connect, timeout_s, max_sessions)
     if secured is not None:
         config["transport"]["link"]["tls"] = secured.tls_section()
         # A client needs no rules, because its only peer is a listening end, which applies them.
@@ -135,7 +140,9 @@ def session_config(
     return config
 
 
-def _session_config(listen: Sequence[str], connect: Sequence[str], timeout_s: float) -> dict[str, Any]:
+def _session_config(
+    listen: Sequence[str], connect: Sequence[str], timeout_s: float, max_sessions: int
+) -> dict[str, Any]:
     return {
         "mode": "router" if listen else "client",
         "listen": {"endpoints": [with_send_buffer(endpoint) for endpoint in listen], "exit_on_failure": True},
@@ -148,13 +155,13 @@ def _session_config(listen: Sequence[str], connect: Sequence[str], timeout_s: fl
         "scouting": {"multicast": multicast_section(listen), "gossip": {"enabled": False}, "delay": 0},
         "open": {"return_conditions": {"connect_scouted": False}},
         "timestamping": {"enabled": False},
-        "transport": _transport_config(),
+        "transport": _transport_config(max_sessions),
     }
 
 
-def _transport_config() -> dict[str, Any]:
+def _transport_config(max_sessions: int) -> dict[str, Any]:
     return {
-        "unicast": {"max_sessions": MAX_SESSIONS, "open_timeout": HANDSHAKE_MS, "accept_timeout": HANDSHAKE_MS},
+        "unicast": {"max_sessions": max_sessions, "open_timeout": HANDSHAKE_MS, "accept_timeout": HANDSHAKE_MS},
         "link": {
             "tx": {
                 "lease": LEASE_MS,
@@ -182,7 +189,9 @@ def _error_of(
         more = ""
         if "quic/" in where:
             more = ", or one end rejects the other's keys: start the robot with RUST_LOG=zenoh_link_commons=warn"
-        more += ", and the service that listens there is not Zenoh" if any(map(_is_open, connect)) else ""
+        if any(map(_is_open, connect)):
+            more += (f". Something listens there, but it is not Zenoh, or has its limit of {MAX_SESSIONS} sessions "
+                     f"({MAX_ROUTER_SESSIONS} at a router)")
         return LinkError(
             f"no answer from {where} after {timeout_s:g} s; start the robot or router, or check the address{more}"
         )

@@ -1,15 +1,17 @@
 """`sightline router` as a process: robot and vision meet at it; a busy port and a missing key are one line."""
 
+import resource
 import signal
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import pytest
 
-from sightline.operator_side.setup import keys
+from sightline.operator_side.setup import keys, router
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.transports.zenoh.session import MAX_ROUTER_SESSIONS, MAX_SESSIONS, open_session
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 
@@ -57,3 +59,27 @@ def test_router_without_its_keys_reports_the_missing_file(tmp_path):
     with _router("--listen", "tls/127.0.0.1:7450", "--secure", str(tmp_path)) as router:
         assert router.wait(10) == 2
         assert router.stderr.read().startswith("error: ca.pem is missing in")
+
+
+@pytest.mark.slow
+def test_a_router_serves_more_sessions_than_a_robot_does():
+    endpoint = free_endpoint()
+    with _router("--listen", endpoint) as process, ExitStack() as ending:
+        assert " on " in process.stdout.readline()
+        soft, hard = resource.prlimit(process.pid, resource.RLIMIT_NOFILE)
+        assert soft == resource.RLIM_INFINITY or soft >= min(4 * MAX_ROUTER_SESSIONS, hard)
+        for _ in range(MAX_SESSIONS + 4):
+            ending.callback(open_session((), [endpoint], 5.0).close)
+
+
+@pytest.mark.parametrize(("limits", "expected"), [
+    ((1024, 1_048_576), (4000, 1_048_576)), ((1024, 2048), (2048, 2048)), ((8192, 8192), None),
+    ((1024, resource.RLIM_INFINITY), (4000, resource.RLIM_INFINITY)),
+    ((resource.RLIM_INFINITY, resource.RLIM_INFINITY), None),
+])
+def test_descriptor_limit_is_raised_and_never_lowered(limits, expected, monkeypatch):
+    set_to = []
+    monkeypatch.setattr(resource, "getrlimit", lambda _which: limits)
+    monkeypatch.setattr(resource, "setrlimit", lambda _which, to: set_to.append(to))
+    router._raise_descriptor_limit()
+    assert set_to == ([expected] if expected else [])

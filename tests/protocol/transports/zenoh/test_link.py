@@ -5,7 +5,7 @@ import socket
 import sys
 import threading
 import time
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
 
@@ -58,9 +58,18 @@ def test_missing_answer_raises_in_time():
         open_zenoh("r1", connect=[endpoint], timeout_s=0.4)
     assert 0.3 < time.monotonic() - begin_s < 2
     with socket.create_server(("127.0.0.1", parse_zenoh_endpoint(endpoint)[2])):
-        more = f"{said}, and the service that listens there is not Zenoh"
+        more = f"{said}. Something listens there, but it is not Zenoh, or has its limit of 64 sessions (1000 at a"
         with pytest.raises(LinkError, match=re.escape(more)):
             open_zenoh("r1", connect=[endpoint], timeout_s=0.4)
+
+
+def test_a_listener_with_its_limit_of_sessions_rejects_the_next_and_the_error_names_the_limit():
+    endpoint = free_endpoint()
+    with closing(open_session([endpoint], (), 5.0, max_sessions=2)), ExitStack() as ending:
+        for _ in range(2):
+            ending.callback(open_session((), [endpoint], 5.0).close)
+        with pytest.raises(LinkError, match="has its limit of 64 sessions"):
+            open_session((), [endpoint], 0.4)
 
 
 def test_an_address_of_another_machine_cannot_be_listened_on():
