@@ -171,7 +171,7 @@ def vision(
     camera_sets: CameraSets = None,
     metrics: Annotated[
         str | None,
-        typer.Option("--metrics", metavar="[HOST:]PORT", help="Serve /metrics and /health at this port, e.g. 9465."),
+        typer.Option("--metrics", metavar="[HOST:]PORT", help="Serve /metrics, /live, /ready at this port, e.g. 9465."),
     ] = None,
     log: LogForm = None,
     shape: Annotated[str | None, typer.Option("--shape", hidden=True)] = None,
@@ -415,7 +415,7 @@ def metrics(
 ) -> int:
     """Serve a robot's status to Prometheus
 
-    It serves /metrics and /health until Ctrl-C.
+    It serves /metrics, /live and /ready until Ctrl-C.
     """
     with needs("metrics"):
         import_module("prometheus_client")

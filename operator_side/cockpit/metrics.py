@@ -1,4 +1,4 @@
-"""A robot's status as Prometheus metrics, served at /metrics and /health. Shell (HTTP, a link).
+"""A robot's status as Prometheus metrics, and the probes of a supervisor. Shell (HTTP, a link).
 
 `prometheus_client` writes the format, since the Prometheus project maintains it.
 """
@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Protocol
 
 from sightline.operator_side.client.requests import read_report
-from sightline.operator_side.cockpit.http_server import HttpAnswer, PageRequest, Route, served
+from sightline.operator_side.cockpit.http_server import HttpAnswer, Route, served
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import State, Status, StreamStatus
@@ -33,8 +33,12 @@ class Exposed(Protocol):
         """Yield the present metrics."""
         ...
 
-    def is_healthy(self) -> bool:
-        """Return the result of the health check."""
+    def is_live(self) -> bool:
+        """Return False if the process hangs and must be started again."""
+        ...
+
+    def is_ready(self) -> bool:
+        """Return True if it does its work."""
         ...
 
 
@@ -60,22 +64,26 @@ def counter(name: str, about: str, values: dict[tuple[str, ...], float], *labels
 
 @contextmanager
 def serving(exposed: Exposed, host: str, port: int) -> Iterator[str]:
-    """Serve `/metrics` and `/health` while the block runs; yields the address. Raises LinkError for a port in use."""
+    """Serve `/metrics`, `/live` and `/ready` while the block runs; yields the address.
+
+    `/health` is the former name of `/ready`. Raises LinkError for a port in use.
+    """
     from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 
     registry = CollectorRegistry()
     registry.register(exposed)
 
-    def health(_request: PageRequest, _body: bytes) -> HttpAnswer:
-        return (
-            HttpAnswer(b"ok\n", "text/plain")
-            if exposed.is_healthy()
-            else HttpAnswer(b"no data\n", "text/plain", 503)
+    def probe(is_true: Callable[[], bool], otherwise: bytes) -> Route:
+        return lambda _request, _body: (
+            HttpAnswer(b"ok\n", "text/plain") if is_true() else HttpAnswer(otherwise, "text/plain", 503)
         )
 
+    ready = probe(exposed.is_ready, b"not ready\n")
     routes: dict[str, Route] = {
         "GET /metrics": lambda _request, _body: HttpAnswer(generate_latest(registry), CONTENT_TYPE_LATEST),
-        "GET /health": health,
+        "GET /live": probe(exposed.is_live, b"hangs\n"),
+        "GET /ready": ready,
+        "GET /health": ready,
     }
     with served(routes, port, host, names=()) as address:
         yield address
@@ -130,8 +138,12 @@ class Watched:
         newest = self._newest
         return newest[0] if newest is not None and time.monotonic() - newest[1] <= FRESH_S else None
 
-    def is_healthy(self) -> bool:
-        """Return whether the robot publishes its status."""
+    def is_live(self) -> bool:
+        """Return True: this process only waits."""
+        return True
+
+    def is_ready(self) -> bool:
+        """Return True while the robot publishes its status."""
         return self.fresh() is not None
 
     def collect(self) -> Iterator[Family]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from sightline.operator_side.cockpit.metrics import counter, gauge, serving
 from sightline.protocol.errors import ConfigError
-from sightline.vision_side.serving.service import CountsNow, Observe, ServiceCounts
+from sightline.vision_side.serving.service import Observe, ServiceCounts, ServingState
 
 if TYPE_CHECKING:
     from sightline.operator_side.cockpit.metrics import Family
@@ -19,22 +19,26 @@ _LOOPBACK: Final = "127.0.0.1"
 
 
 class VisionMetrics:
-    """Collects the counters of a vision service. It is healthy while it receives frames."""
+    """Collects the counters of a vision service, and answers its probes."""
 
     def __init__(self) -> None:
-        self._now: CountsNow = list
+        self._state: ServingState | None = None
 
-    def look_at(self, now: CountsNow) -> None:
-        """Use `now` as the source of the counters."""
-        self._now = now
+    def look_at(self, state: ServingState) -> None:
+        """Use `state` as the source."""
+        self._state = state
 
-    def is_healthy(self) -> bool:
-        """Return whether frames of a robot arrive."""
-        return any(one.heard for one in self._now())
+    def is_live(self) -> bool:
+        """Return True while the loop turns, and before it begins."""
+        return self._state is None or self._state.is_live
+
+    def is_ready(self) -> bool:
+        """Return True while frames would be answered, whether or not a robot is present."""
+        return self._state is not None and self._state.is_ready
 
     def collect(self) -> Iterator[Family]:
         """Yield the present metrics of each robot."""
-        rows = self._now()
+        rows = self._state.counts() if self._state else []
 
         def each(value: Callable[[ServiceCounts], float]) -> dict[tuple[str, ...], float]:
             return {(one.robot,): value(one) for one in rows}
@@ -44,6 +48,8 @@ class VisionMetrics:
         yield counter("vision_twists", "frames answered by a twist", each(lambda one: one.steered), "robot")
         yield counter("vision_frames_overtaken", "frames that a newer one replaced before their detection",
                       each(lambda one: one.overtaken), "robot")
+        yield counter("vision_restarts", "services of this robot that failed and were started again",
+                      each(lambda one: one.restarts), "robot")
         skipped: dict[tuple[str, ...], float] = {
             (one.robot, reason): count for one in rows for reason, count in one.skipped.items()
         }

@@ -278,15 +278,15 @@ class FleetLink(Closing):
 
     @abstractmethod
     def robots(self) -> list[str]:
-        """Return the ids of all robots so far, in the order of their first message."""
+        """Return the ids of the present robots, in the order of their first message. A silent robot is forgotten."""
 
     @abstractmethod
     def on_new_robot(self, callback: Callable[[], None]) -> None:
-        """Call `callback` on a transport thread at the first message of each robot."""
+        """Call `callback` on a transport thread at the first message of each robot, again after it was forgotten."""
 
     @abstractmethod
     def link(self, robot: str) -> Link:
-        """Return a link to one robot. It closes with this one.
+        """Return a new link to one robot. It closes with this one, if not before.
 
         Args:
             robot: robot id, also of a robot without a message so far.

@@ -6,7 +6,8 @@ import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from operator import add
 from typing import Final, Generic, TypeVar
 
 from pydantic import ValidationError
@@ -66,6 +67,9 @@ class FrameCounters:
     rejected: int = 0
     """Not a frame, not an image, or an invalid result."""
 
+    def __add__(self, other: "FrameCounters") -> "FrameCounters":
+        return FrameCounters(*map(add, astuple(self), astuple(other)))
+
     @property
     def dropped(self) -> int:
         """Return the number of frames without an answer."""
@@ -91,6 +95,11 @@ class FairQueue(Generic[Item]):
         counters.offered += 1
         counters.overtaken += self._waiting.get(robot) is not None
         self._waiting[robot] = QueuedFrame(robot, item, now_us)
+
+    def forget(self, robot: str) -> FrameCounters:
+        """Forget a robot that has left. Returns the outcomes of its frames."""
+        self._waiting.pop(robot, None)
+        return self.counters.pop(robot, FrameCounters())
 
     def take(self, now_us: int, each_us: int = 0) -> list[QueuedFrame[Item]]:
         """Take waiting frames as one batch that fits in half a deadline if a frame takes `each_us`; may be empty."""
@@ -184,6 +193,8 @@ class DetectorService:
         self._load_checked_s = time.monotonic()
         self._load_before = (0, 0)
         self._overloaded = False
+        self._gone = FrameCounters()
+        """Of the robots that have left."""
         self._reasons: set[str] = set()
         fleet_link.on_new_robot(lambda: self._bell.put(True))
 
@@ -199,7 +210,10 @@ class DetectorService:
         """Report the detector's notices, add new robots, then detect in one batch; False if nothing waited."""
         for line in notices_of(self._detector):
             self._report(f"detector: {line}")
-        for robot in self._fleet_link.robots():
+        present = self._fleet_link.robots()
+        for robot in self._links.keys() - present:
+            self._forget(robot)
+        for robot in present:
             if robot not in self._links:
                 self._add_robot(robot)
         with self._guard:
@@ -224,8 +238,15 @@ class DetectorService:
         return f"{what}: {state}{len(self._links)} robots, {served} frames answered, {dropped} dropped{age}"
 
     def _totals(self) -> tuple[int, int]:
-        counters = self.counters().values()
+        counters = [*self.counters().values(), self._gone]
         return sum(one.served for one in counters), sum(one.dropped for one in counters)
+
+    def _forget(self, robot: str) -> None:
+        self._links.pop(robot).close()
+        with self._guard:
+            gone = self._queue.forget(robot)
+        self._gone += gone
+        self._report(f"detector: {robot} left")
 
     def _add_robot(self, robot: str) -> None:
         link = self._links[robot] = self._fleet_link.link(robot)
@@ -289,7 +310,8 @@ class DetectorService:
             return
         self._seq += 1
         stamp = _stamp(frame.header, self._session, self._seq, took_us)
-        self._links[turn.robot].publish(DETECTIONS, stamp, payload, ROLE)
+        if link := self._links.get(turn.robot):  # it may have left
+            link.publish(DETECTIONS, stamp, payload, ROLE)
         counters.served += 1
         self._ages_us.append(age_us)
         self._maker = (result.model_hash[:8], result.device)
@@ -301,7 +323,7 @@ class DetectorService:
         """Report an overload, and its end."""
         if now_s - self._load_checked_s < _LOAD_PERIOD_S:
             return
-        counters, before = self.counters().values(), self._load_before
+        counters, before = [*self.counters().values(), self._gone], self._load_before
         now = sum(one.served for one in counters), sum(one.too_many for one in counters)
         self._load_checked_s, self._load_before = now_s, now
         served, dropped = now[0] - before[0], now[1] - before[1]

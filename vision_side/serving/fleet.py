@@ -7,19 +7,31 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import replace
 
 from sightline.protocol.channels import Channel
+from sightline.protocol.errors import SightlineError
 from sightline.protocol.log import report_fault
 from sightline.protocol.transports.link import FleetLink, Link, LinkWrapper, Message
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.registry import configured_detector, waits_for_service
-from sightline.vision_side.serving.service import LogLine, Service, ServiceCounts, open_service
+from sightline.vision_side.serving.service import (
+    LogLine,
+    Observe,
+    Service,
+    ServiceCounts,
+    ServingState,
+    open_service,
+)
 
 _LONGEST_WAIT_S = 0.2
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 30.0
+"""From the error of a robot's service to the start of its next one: twice as long each time."""
 
 
 class _NotifyingLink(LinkWrapper):
@@ -38,8 +50,9 @@ class _NotifyingLink(LinkWrapper):
 
 
 class Fleet:
-    """A service for each robot that is received. One turn gives every robot with something new its turn.
+    """A service for each robot that is present. One turn gives every robot with something new its turn.
 
+    An error in one robot's service ends that service alone; it is logged, counted, and a new one starts after a pause.
     With a detector that waits for another service, each robot has its own detector and thread: an answer that one of
     them waits for keeps no other waiting.
     """
@@ -52,73 +65,110 @@ class Fleet:
         self._waits_for_service = waits_for_service(config)
         self._detector = detector or configured_detector(config)
         self._bell, self._ending = threading.Event(), threading.Event()
-        self._threads: list[threading.Thread] = []
-        self._failed: Exception | None = None
+        self._threads: dict[str, threading.Thread] = {}
+        self._links: dict[str, Link] = {}
+        self._failed: deque[tuple[str, Exception]] = deque()
+        """Errors of the robots' threads."""
+        self._starts_s: dict[str, float] = {}
+        """Earliest start of the next service of a robot that failed."""
+        self._restarts: Counter[str] = Counter()
         self.services: dict[str, Service] = {}
         fleet_link.on_new_robot(self._bell.set)
 
-    def serve(self, ending: threading.Event) -> None:
-        """Serve until `ending` is set."""
+    def serve(self, ending: threading.Event, observe: Observe | None = None) -> None:
+        """Serve until `ending` is set. `observe` receives the state."""
+        state = ServingState(self.counts, ending, time.monotonic())
+        if observe is not None:
+            observe(state)
         try:
-            while not ending.is_set():
+            while state.turns():
                 self._bell.wait(_LONGEST_WAIT_S)
                 self._bell.clear()
                 self.turn()
         finally:
             self._end()
-        if self._failed is not None:  # in closing
-            raise self._failed
         for robot, service in self.services.items():
             skipped = dict(service.skipped) or "none"
             self._report(f"vision: {robot}: ended after {service.answered} frames; skipped: {skipped}")
 
     def counts(self) -> list[ServiceCounts]:
         """Count the frames of each robot so far; from any thread."""
-        return [service.counts() for service in list(self.services.values())]
+        services = list(self.services.items())
+        return [replace(service.counts(), restarts=self._restarts[robot]) for robot, service in services]
 
     def turn(self) -> None:
         """Add new robots, and answer at most one frame of each robot without a thread of its own.
 
-        So no robot waits longer than one round, however many frames another one sends.
+        So no robot waits longer than one round, however many frames another one sends. Raises SightlineError for an
+        invalid configuration, which is that of every robot.
         """
-        for robot in self._fleet_link.robots():
-            if robot not in self.services:
-                self._add_robot(robot)
-            if not self._waits_for_service:
-                self.services[robot].turn(0.0)
-        if self._failed is not None:
-            raise self._failed
+        present = self._fleet_link.robots()
+        for robot in self._links.keys() - present:
+            self._report(f"vision: {robot}: left")
+            self._drop(robot)
+            self._starts_s.pop(robot, None)
+        for robot in present:
+            try:
+                self._turn_of(robot)
+            except SightlineError:
+                raise
+            except Exception as error:
+                self._failed.append((robot, error))
+        while self._failed:
+            self._on_error(*self._failed.popleft())
+
+    def _turn_of(self, robot: str) -> None:
+        if robot not in self._links and time.monotonic() >= self._starts_s.get(robot, 0.0):
+            self._add_robot(robot)
+        if robot in self.services and not self._waits_for_service:
+            self.services[robot].turn(0.0)
+
+    def _on_error(self, robot: str, error: Exception) -> None:
+        report_fault("vision", error, robot)
+        self._drop(robot)
+        pause_s = min(_FIRST_PAUSE_S * 2.0 ** self._restarts[robot], _LONGEST_PAUSE_S)
+        self._restarts[robot] += 1
+        self._starts_s[robot] = time.monotonic() + pause_s
+        self._report(f"vision: {robot}: its service failed; a new one starts in {pause_s:.0f} s")
+
+    def _drop(self, robot: str) -> None:
+        """End the service of a robot. Its thread ends at its next turn."""
+        self.services.pop(robot, None)
+        self._threads.pop(robot, None)
+        if link := self._links.pop(robot, None):
+            link.close()
 
     def _add_robot(self, robot: str) -> None:
         config = self._config.model_copy(update={"robot": robot})
-        link = self._fleet_link.link(robot)
+        link = self._links[robot] = self._fleet_link.link(robot)
         if not self._waits_for_service:
             notifying = _NotifyingLink(link, self._bell)
             self.services[robot] = open_service(config, notifying, self._report_of(robot), self._detector)
             return
         own = configured_detector(config) if self.services else None
         service = self.services[robot] = open_service(config, link, self._report_of(robot), own or self._detector)
-        thread = threading.Thread(target=self._serve_one, args=(service, own), name=f"vision {robot}", daemon=True)
-        self._threads.append(thread)
+        arguments = (robot, service, own)
+        thread = threading.Thread(target=self._serve_one, args=arguments, name=f"vision {robot}", daemon=True)
+        self._threads[robot] = thread
         thread.start()
 
-    def _serve_one(self, service: Service, own: Detector | None) -> None:
-        """Run a robot's thread, and close its `own` detector at the end. An error ends the whole fleet."""
+    def _serve_one(self, robot: str, service: Service, own: Detector | None) -> None:
+        """Run a robot's thread until its service is dropped, and close its `own` detector at the end."""
         try:
             with ExitStack() as ending:
                 ending.callback(close_detector, own)
-                while not self._ending.is_set():
+                while not self._ending.is_set() and self.services.get(robot) is service:
                     service.turn(_LONGEST_WAIT_S)
         except Exception as error:
-            report_fault("vision", error)
-            self._failed = error
-            self._bell.set()
+            if self.services.get(robot) is service:
+                self._failed.append((robot, error))
+                self._bell.set()
 
     def _end(self) -> None:
         """End the robots' threads together; one whose detector hangs is left behind."""
         self._ending.set()
         until_s = time.monotonic() + _LONGEST_WAIT_S + self._config.detector.deadline_s
-        for thread in self._threads:
+        for thread in self._threads.values():
             thread.join(max(0.0, until_s - time.monotonic()))
 
     def _report_of(self, robot: str) -> LogLine:

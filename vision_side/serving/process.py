@@ -3,6 +3,7 @@
 import logging
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -17,7 +18,7 @@ from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.registry import configured_mission
 from sightline.vision_side.pipeline import SOURCE
 from sightline.vision_side.serving.legacy_robot import LegacyRobotLink, is_legacy
-from sightline.vision_side.serving.service import LogLine, Observe, endpoints_text, open_service
+from sightline.vision_side.serving.service import LogLine, Observe, ServingState, endpoints_text, open_service
 
 _log: Final = logging.getLogger(__name__)
 
@@ -40,7 +41,7 @@ def ends_on_signal(ending: threading.Event) -> Iterator[None]:
 
 
 def run(config: VisionConfig, observe: Observe | None = None) -> int:
-    """Serve until SIGTERM or SIGINT. Returns the exit code 0. `observe` receives a reader of the counters.
+    """Serve until SIGTERM or SIGINT. Returns the exit code 0. `observe` receives its state.
 
     Raises ConfigError for an invalid endpoint or mission, LinkError if the link cannot be opened.
     """
@@ -85,9 +86,7 @@ def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe |
     with opened as fleet_link, ends_on_signal(ending):
         _log.info("vision: looking for robots %s at %s", config.robot, endpoints_text(config))
         fleet = Fleet(config, fleet_link, _log.info, detector)
-        if observe is not None:
-            observe(fleet.counts)
-        fleet.serve(ending)
+        fleet.serve(ending, observe)
     return 0
 
 
@@ -97,8 +96,9 @@ def serve(
 ) -> None:
     """Answer frames that come over `link` until `ending` is set."""
     service = open_service(config, link, report, detector)
+    state = ServingState(lambda: [service.counts()], ending, time.monotonic())
     if observe is not None:
-        observe(lambda: [service.counts()])
-    while not ending.is_set():
+        observe(state)
+    while state.turns():
         service.turn(_WAIT_S)
     report(f"vision: ended after {service.answered} frames; skipped: {dict(service.skipped) or 'none'}")

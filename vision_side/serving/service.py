@@ -46,11 +46,42 @@ class ServiceCounts:
     compute_us: int
     latency_us: int | None
     """Capture to accepted command, as the robot measured it."""
+    restarts: int = 0
+    """Times that this robot's service failed and another one was started."""
 
 
-CountsNow = Callable[[], list[ServiceCounts]]
-Observe = Callable[[CountsNow], None]
-"""Receives, once, the reader of all robots' counters."""
+LIVE_S: Final = 10.0
+"""A loop that has not turned for this long hangs. A turn waits 0.2 s for a frame, and computes one detection."""
+
+
+@dataclass(slots=True)
+class ServingState:
+    """The state of a vision service for a supervisor. Safe from any thread."""
+
+    counts: Callable[[], list[ServiceCounts]]
+    """Counts of each robot."""
+    ending: threading.Event
+    turned_s: float
+    """Begin of the newest turn of its loop, on `time.monotonic`."""
+
+    @property
+    def is_live(self) -> bool:
+        """Return True while the loop turns."""
+        return time.monotonic() - self.turned_s <= LIVE_S
+
+    @property
+    def is_ready(self) -> bool:
+        """Return True while a frame would be answered: link and detector are open, and it does not end."""
+        return self.is_live and not self.ending.is_set()
+
+    def turns(self) -> bool:
+        """Note a turn. Returns False when the service must end."""
+        self.turned_s = time.monotonic()
+        return not self.ending.is_set()
+
+
+Observe = Callable[[ServingState], None]
+"""Receives the state, once, when the loop begins."""
 
 
 # The session of a robot to steer, when frames of several sessions arrive. Pure.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import secrets
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
@@ -287,8 +288,10 @@ class _ConnectedPeers:
 #     link = fleet_link.link("r1")
 
 
-# Security limit: robots of one fleet.
+# Security limit: robots of one fleet that are present at a time.
 MAX_ROBOTS: Final = 256
+# A robot publishes ten statuses a second. One that is silent for longer has left. Its next status adds it again.
+LEFT_AFTER_S: Final = 10.0
 
 
 def open_fleet(
@@ -336,9 +339,10 @@ class ZenohFleet(FleetLink):
     def __init__(self, session: zenoh.Session, pattern: str, role: str, max_frame_bytes: int) -> None:
         """Take over an open `session`."""
         self._session, self._pattern, self._role, self._max_frame_bytes = session, pattern, role, max_frame_bytes
+        self._links: dict[str, ZenohLink] = {}
         self._ending = ExitStack()
         self._ending.callback(session.close)
-        self._seen: dict[str, None] = {}
+        self._heard_s: dict[str, float] = {}
         self._on_new_robot: Callable[[], None] = lambda: None
         self._listen()
 
@@ -347,20 +351,28 @@ class ZenohFleet(FleetLink):
         self._ending.callback(here.answer_in(self._session))
 
     def robots(self) -> list[str]:
-        """Return the ids of all robots so far, in the order of their first status."""
-        return list(self._seen)
+        """Return the ids of the robots with a status within `LEFT_AFTER_S`, in the order of their first one."""
+        now_s = time.monotonic()
+        for robot in [one for one, heard_s in self._heard_s.copy().items() if now_s - heard_s > LEFT_AFTER_S]:
+            del self._heard_s[robot]
+        return list(self._heard_s)
 
     def on_new_robot(self, callback: Callable[[], None]) -> None:
-        """Call `callback` on a thread of Zenoh at the first status of each robot."""
+        """Call `callback` on a thread of Zenoh at the first status of each robot, again after it had left."""
         self._on_new_robot = callback
 
     def link(self, robot: str) -> Link:
-        """Return a link to `robot` over the shared session."""
+        """Return a link to `robot` over the shared session. An earlier link to it is closed."""
         rules = LinkRules(robot, self._role, self._max_frame_bytes)
-        return self._ending.enter_context(ZenohLink(self._session, rules, shared=True))
+        if robot in self._links:
+            self._links[robot].close()
+        self._links[robot] = ZenohLink(self._session, rules, shared=True)
+        return self._links[robot]
 
     def close(self) -> None:
         """Close all links and the session."""
+        for link in self._links.values():
+            link.close()
         self._ending.close()
         self._session = CLOSED_SESSION
 
@@ -373,8 +385,11 @@ class ZenohFleet(FleetLink):
 
     def _note(self, sample: zenoh.Sample) -> None:
         parsed = parse_key(str(sample.key_expr))
-        if parsed is None or parsed[0] in self._seen or len(self._seen) >= MAX_ROBOTS:
+        if parsed is None or not fnmatchcase(parsed[0], self._pattern):
             return
-        if fnmatchcase(parsed[0], self._pattern):
-            self._seen[parsed[0]] = None
+        is_new = parsed[0] not in self._heard_s
+        if is_new and len(self._heard_s) >= MAX_ROBOTS:
+            return
+        self._heard_s[parsed[0]] = time.monotonic()
+        if is_new:
             self._on_new_robot()

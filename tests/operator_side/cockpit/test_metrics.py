@@ -21,9 +21,9 @@ def _samples(port):
     return {(s.name, *sorted(s.labels.values())): s.value for family in parsed(text) for s in family.samples}
 
 
-def _health(port):
+def _ready(port):
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5) as answer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/ready", timeout=5) as answer:
             return answer.status
     except urllib.error.HTTPError as error:
         return error.code
@@ -47,7 +47,7 @@ def test_metrics_show_a_robot_and_its_end(tmp_path):
         try:
             assert exporter.stdout.readline() == f"metrics of r1: http://127.0.0.1:{port}/metrics\n"
             assert driving(robot)
-            assert until(lambda: _health(port) == 200)
+            assert until(lambda: _ready(port) == 200)
             assert until(lambda: 0 < _samples(port).get(("sightline_frame_age_seconds", "r1"), 0) < 0.15)
             vision.twist = b"nan|0"
             assert until(lambda: _samples(port).get(("sightline_commands_refused_total", "NOT_FINITE", "r1"), 0) > 3)
@@ -63,7 +63,7 @@ def test_metrics_show_a_robot_and_its_end(tmp_path):
             assert sum(value for key, value in samples.items() if key[0] == "sightline_state") == 1
             robot.process.terminate()
             assert until(lambda: _samples(port) == {("sightline_up", "r1"): 0}, 6)
-            assert _health(port) == 503
+            assert _ready(port) == 503
         finally:
             exporter.terminate()
             assert exporter.wait(20) == 0
@@ -90,28 +90,30 @@ def test_busy_port_is_reported_with_its_owner(tmp_path):
 
 
 @pytest.mark.slow
-def test_vision_service_is_measured_and_healthy_while_frames_arrive(tmp_path):
+def test_vision_service_is_measured_and_ready_with_and_without_a_robot(tmp_path):
     port = free_port()
     with RobotProcess(tmp_path) as robot:
         robot.wait_until_on()
         command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "vision", "--connect", robot.endpoint]
         vision = subprocess.Popen([*command, "--metrics", str(port)], stdout=subprocess.PIPE, text=True)
         try:
-            assert until(lambda: _health_if_up(port) == 200, 40)
+            assert until(lambda: _ready_if_up(port) == 200, 40)
+            assert until(lambda: _samples(port).get(("sightline_vision_hears", "r1")) == 1)
             samples = _samples(port)
-            assert samples["sightline_vision_hears", "r1"] == 1
             assert samples["sightline_vision_frames_answered_total", "r1"] > 0
+            assert samples["sightline_vision_restarts_total", "r1"] == 0
             assert until(lambda: _samples(port)["sightline_vision_compute_seconds", "r1"] > 0)
             robot.process.terminate()
-            assert until(lambda: _health_if_up(port) == 503, 15)
+            assert until(lambda: _samples(port)["sightline_vision_hears", "r1"] == 0, 15)
+            assert _ready(port) == 200
         finally:
             vision.terminate()
             assert vision.wait(20) == 0
 
 
-def _health_if_up(port):
+def _ready_if_up(port):
     try:
-        return _health(port)
+        return _ready(port)
     except OSError:
         return 0
 

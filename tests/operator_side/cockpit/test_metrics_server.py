@@ -1,8 +1,10 @@
-"""The small server of `/metrics` and `/health`: silent or closed connections delay no other."""
+"""The small server of `/metrics` and the probes: silent or closed connections delay no other."""
 
 import select
 import socket
+import threading
 import time
+import urllib.error
 import urllib.request
 from contextlib import contextmanager
 from urllib.parse import urlsplit
@@ -12,28 +14,59 @@ import pytest
 from sightline.operator_side.cockpit import http_server
 from sightline.operator_side.cockpit.http_server import MAX_CONNECTIONS
 from sightline.operator_side.cockpit.metrics import serving
+from sightline.operator_side.cockpit.vision_metrics import VisionMetrics
+from sightline.vision_side.serving.service import LIVE_S, ServingState
 from tests.fixtures.links import until
 
 
 class Nothing:
-    """A healthy source without metrics."""
+    """A source without metrics."""
+
+    def __init__(self, live=True, ready=True):
+        self.is_live, self.is_ready = (lambda: live), (lambda: ready)
 
     def collect(self):
         return iter(())
 
-    def is_healthy(self):
-        return True
-
 
 @contextmanager
-def served_port():
-    with serving(Nothing(), "127.0.0.1", 0) as address:
+def served_port(**state):
+    with serving(Nothing(**state), "127.0.0.1", 0) as address:
         yield urlsplit(address).port
 
 
-def _health(port):
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=3) as answer:
+def _health(port, path="ready"):
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/{path}", timeout=3) as answer:
         return answer.read()
+
+
+def _status(port, path):
+    try:
+        _health(port, path)
+    except urllib.error.HTTPError as error:
+        return error.code
+    return 200
+
+
+@pytest.mark.parametrize(("live", "ready"), [(True, True), (True, False), (False, False)])
+def test_probes_of_a_supervisor(live, ready):
+    codes = {True: 200, False: 503}
+    with served_port(live=live, ready=ready) as port:
+        found = [_status(port, path) for path in ("live", "ready", "health")]
+    assert found == [codes[live], codes[ready], codes[ready]], "/health is the former name of /ready"
+
+
+def test_vision_service_is_live_while_its_loop_turns_and_ready_until_it_ends():
+    metrics, ending = VisionMetrics(), threading.Event()
+    assert (metrics.is_live(), metrics.is_ready()) == (True, False), "before the link is open"
+    state = ServingState(list, ending, time.monotonic())
+    metrics.look_at(state)
+    assert (metrics.is_live(), metrics.is_ready()) == (True, True), "without a robot"
+    state.turned_s -= LIVE_S + 0.1
+    assert (metrics.is_live(), metrics.is_ready()) == (False, False), "its loop hangs"
+    assert state.turns() and metrics.is_ready()
+    ending.set()
+    assert not state.turns() and (metrics.is_live(), metrics.is_ready()) == (True, False), "it ends"
 
 
 @pytest.mark.parametrize("said", [b"", b"GET /hea"])

@@ -43,13 +43,13 @@ class Bench:
     """A robot, and the service that looks at its frames."""
 
     def __init__(self, detector, **serving):
-        self.network, self.words, self.seq = MemoryNetwork(seed=31), [], 0
+        self.network, self.words, self.seq, self.present = MemoryNetwork(seed=31), [], 0, ["r1"]
         self.robot = self.network.link("r1")
         self.heard = self.robot.latest(DETECTIONS)
         self.service = DetectorService(self, detector, ServingOptions("named", **serving), self.words.append)
 
     def robots(self):
-        return ["r1"]
+        return self.present
 
     def on_new_robot(self, callback):
         self.ring = callback
@@ -86,6 +86,20 @@ def test_rejected_request_adds_no_load_and_each_reason_is_logged_once():
     assert len(told) == 2 and "out of memory" in told[0] and "cannot be sent" in told[1]
     bench.service._check_load(1e9)
     assert bench.tally().rejected == 60 and "overloaded" not in bench.service.about() and len(bench.words) == 3
+
+
+def test_a_robot_that_left_is_forgotten_and_its_frames_stay_in_the_totals():
+    bench = Bench(Named(GOOD))
+    assert bench.look() is not None
+    bench.service._check_load(1e9)
+    bench.present = []
+    assert bench.look() is None
+    assert bench.service.counters() == {} and bench.words[-1] == "detector: r1 left"
+    bench.service._check_load(2e9)
+    assert "0 robots, 1 frames answered, 0 dropped" in bench.service.about() and "overload" not in bench.service.about()
+    bench.present = ["r1"]
+    assert bench.look() is not None and bench.tally().served == 1
+    assert "1 robots, 2 frames answered" in bench.service.about()
 
 
 def test_number_of_logged_reasons_is_bounded():

@@ -11,6 +11,7 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import AnswerHeader, FrameHeader, Stamp, State, Status
 from sightline.protocol.transports.link import LatestSlot
+from sightline.protocol.transports.zenoh import link as zenoh_link
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.fleet import Fleet
@@ -136,3 +137,23 @@ def test_a_robot_may_come_later():
 def test_several_robots_need_zenoh():
     with pytest.raises(ConfigError, match="need Zenoh"):
         open_fleet("r*", connect=["ws://127.0.0.1:9090"])
+
+
+def test_a_silent_robot_is_forgotten_and_found_again(fleet, monkeypatch):
+    monkeypatch.setattr(zenoh_link, "LEFT_AFTER_S", 0.5)
+    running, endpoint, said = fleet
+    with ExitStack() as ending:
+        robots = {name: Robot(name, endpoint) for name in ("r1", "r2")}
+        for robot in robots.values():
+            ending.enter_context(robot.link)
+
+        def all_say(*names):
+            for name in names:
+                robots[name].say()
+            time.sleep(0.02)
+            return set(running.services)
+
+        assert until(lambda: all_say("r1", "r2") == {"r1", "r2"}, 10)
+        assert until(lambda: all_say("r1") == {"r1"}, 5) and "vision: r2: left" in said
+        assert until(lambda: all_say("r1", "r2") == {"r1", "r2"}, 10)
+        assert until(lambda: [robots["r2"].frame(), all_say("r1", "r2")] and robots["r2"].answered, 5)

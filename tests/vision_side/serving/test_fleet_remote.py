@@ -9,6 +9,7 @@ import pytest
 from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.config import Config
+from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import FrameHeader, Stamp, State, Status
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
@@ -16,6 +17,7 @@ from sightline.vision_side.config import DetectorConfig, HsvConfig, VisionConfig
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.plugin_calls import close_detector
 from sightline.vision_side.detect.registry import configured_detector
+from sightline.vision_side.serving import fleet as fleet_module
 from sightline.vision_side.serving.detector_service import DetectorService, ServingOptions
 from sightline.vision_side.serving.fleet import Fleet
 from sightline.vision_side.serving.service import Service
@@ -146,14 +148,63 @@ class Quiet:
         return MemoryNetwork().link(robot, role="vision")
 
 
-def test_error_in_one_robot_thread_ends_the_vision_service(monkeypatch):
+def broken_turns(monkeypatch, robot):
+    """Let each turn of one robot's service raise while the returned event is set."""
+    turn, is_broken = Service.turn, threading.Event()
+
     def fail(service, wait_s):
-        raise RuntimeError("out of threads")
+        if is_broken.is_set() and service.counts().robot == robot:
+            raise RuntimeError("out of luck")
+        turn(service, wait_s)
 
     monkeypatch.setattr(Service, "turn", fail)
-    fleet = Fleet(VisionConfig(robot="r*", detector=DetectorConfig(kind="zenoh")), Quiet(1), lambda line: None)
-    with pytest.raises(RuntimeError, match="out of threads"):
-        fleet.serve(threading.Event())
+    is_broken.set()
+    return is_broken
+
+
+@pytest.mark.parametrize("kind", ["zenoh", "hsv"])
+def test_an_error_in_one_robots_service_ends_it_alone_and_a_new_one_starts(monkeypatch, kind, caplog):
+    monkeypatch.setattr(fleet_module, "_FIRST_PAUSE_S", 0.02)
+    is_broken, said, over = broken_turns(monkeypatch, "r1"), [], threading.Event()
+    fleet = Fleet(VisionConfig(robot="r*", detector=DetectorConfig(kind=kind)), Quiet(2), said.append)
+    thread = threading.Thread(target=fleet.serve, args=(over,), daemon=True)
+    thread.start()
+
+    def restarts():
+        return {one.robot: one.restarts for one in fleet.counts()}
+
+    assert until(lambda: fleet._restarts["r1"] >= 2)
+    other = fleet.services["r0"]
+    is_broken.clear()
+    assert until(lambda: restarts().get("r1", 0) >= 2) and restarts()["r0"] == 0
+    over.set()
+    thread.join(5)
+    assert not thread.is_alive() and fleet.services["r0"] is other
+    assert "vision: r1: its service failed; a new one starts in 0 s" in said
+    assert caplog.text.count("RuntimeError: out of luck") == 2, "the line and its traceback, once"
+
+
+def test_an_invalid_configuration_ends_the_vision_service(monkeypatch):
+    def refuse(*_given):
+        raise ConfigError("no such label")
+
+    monkeypatch.setattr(fleet_module, "open_service", refuse)
+    fleet = Fleet(VisionConfig(robot="r*"), Quiet(1), lambda line: None)
+    with pytest.raises(ConfigError, match="no such label"):
+        fleet.turn()
+
+
+def test_a_robot_that_left_is_dropped_and_served_again_when_it_comes_back():
+    site, said = Quiet(2), []
+    fleet = Fleet(VisionConfig(robot="r*"), site, said.append)
+    fleet.turn()
+    first = fleet.services["r1"]
+    site.robots().remove("r1")
+    fleet.turn()
+    assert list(fleet.services) == ["r0"] and said[-1] == "vision: r1: left"
+    site.robots().append("r1")
+    fleet.turn()
+    assert fleet.services["r1"] is not first
 
 
 class Hanging:
