@@ -70,6 +70,27 @@ def connection_ends(ports: Collection[int]) -> dict[tuple[str, str], str]:
     return {(row[1], row[2]): _host(row[2]) for row in _rows(ports) if row[3] != _LISTEN}
 
 
+_OPENED: Final = {"snmp": "PassiveOpens", "netstat": "TCPDeferAcceptDrop"}
+"""Counters of the connections that were opened to this machine, and of those that it holds back until their first
+byte."""
+
+
+def opened_connections() -> int | None:
+    """Count what was opened to this machine so far, or return None if the system does not show it.
+
+    Only a change of the count is of use: one that is held back counts twice. To read it takes a thirtieth of the time
+    that the table of sockets takes.
+    """
+    total = 0
+    with suppress(OSError, ValueError, KeyError):
+        for name, counter in _OPENED.items():
+            rows = [line.split() for line in (TABLES / name).read_text("ascii").splitlines()]
+            (names, values) = (row for row in rows if row[0] in ("Tcp:", "TcpExt:"))
+            total += int(dict(zip(names, values, strict=True))[counter])
+        return total
+    return None
+
+
 def listening_inodes(ports: Collection[int]) -> set[str]:
     """Return the inodes of the sockets that listen on `ports`."""
     return {row[9] for row in _rows(ports) if row[3] == _LISTEN}

@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 
 from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.log import RepeatLimiter
-from sightline.protocol.transports.diagnosis import connection_ends, listening_inodes
+from sightline.protocol.transports.diagnosis import connection_ends, listening_inodes, opened_connections
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint, parse_zenoh_endpoint
 from sightline.protocol.transports.zenoh.session import MAX_SESSIONS
 
@@ -36,6 +36,8 @@ BLOCKED_US: Final = 10_000_000
 MAX_BLOCKED: Final = 64
 """Security limit: addresses that are blocked at a time."""
 _CHECK_S: Final = 0.2
+_QUIET_US: Final = 2_000_000
+"""Longest time between two looks at the table. A flood that opens no connection is found so late."""
 _OWN: Final = ("127.0.0.1", "::1")
 """This machine: its floods are reported and not blocked, because its services share one address."""
 
@@ -128,12 +130,18 @@ def _port(endpoint: str) -> int:
 
 def _watch(ports: set[int], zenoh_ports: set[int], report: Callable[[str], None], ending: threading.Event) -> None:
     detector, limiter, blocked, silent = FloodDetector(), RepeatLimiter(), list[str](), set[Peer]()
-    deferred = set[str]()
+    deferred, floods, opened, read_us = set[str](), list[Flood](), None, 0
     while not ending.wait(_CHECK_S):
         if len(deferred) < len(zenoh_ports):  # a link opens its ports some time after this thread begins
             deferred = _listeners(zenoh_ports)
             _defer(deferred)
         now_us = heartbeat_us()
+        # Without a new connection there is hardly a new flood, and the table takes 3 ms to read.
+        opened_before, opened = opened, opened_connections()
+        is_quiet = opened is not None and opened == opened_before and not floods and not blocked
+        if is_quiet and now_us - read_us < _QUIET_US:
+            continue
+        read_us = now_us
         # A connection that comes between these two lines is not counted, which a flood does not need.
         accepted = dict(_accepted)
         _accepted.clear()

@@ -5,8 +5,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from sightline.protocol.transports import diagnosis
-from sightline.protocol.transports.diagnosis import connection_ends
+from sightline.protocol.transports import diagnosis, flood_limits
+from sightline.protocol.transports.diagnosis import connection_ends, opened_connections
 from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.zenoh.session import MAX_SESSIONS
 from tests.fixtures.links import until
@@ -32,6 +32,41 @@ def test_row_that_the_table_repeats_counts_once(monkeypatch, tmp_path):
     (tmp_path / "tcp").write_text(row + row.splitlines()[-1] + "\n")
     monkeypatch.setattr(diagnosis, "TABLES", tmp_path)
     assert list(connection_ends([0x1D17]).values()) == ["127.0.0.2"]
+
+
+@pytest.mark.parametrize("holds_back", [0, 10])
+def test_each_opened_connection_is_counted_also_one_that_is_held_back(holds_back):
+    with socket.create_server(("127.0.0.1", free_port())) as server, ExitStack() as ending:
+        server.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, holds_back)
+        for _ in range(3):
+            before = opened_connections()
+            ending.enter_context(socket.create_connection(server.getsockname()))
+            assert until(lambda before=before: opened_connections() > before)
+
+
+@pytest.mark.parametrize("text", [
+    "", "Tcp: A B\n", "Tcp: A B\nTcp: 1\n", "Tcp: A\nTcp: 1\n", "Tcp: PassiveOpens\nTcp: x\n",
+])
+def test_count_of_another_system_is_unknown(monkeypatch, tmp_path, text):
+    monkeypatch.setattr(diagnosis, "TABLES", tmp_path)
+    assert opened_connections() is None
+    (tmp_path / "snmp").write_text(text)
+    (tmp_path / "netstat").write_text(text)
+    assert opened_connections() is None
+
+
+def test_the_table_is_read_only_after_a_new_connection(monkeypatch):
+    opened, reads = [0], []
+    monkeypatch.setattr(flood_limits, "opened_connections", lambda: opened[0])
+    monkeypatch.setattr(flood_limits, "connection_ends", lambda _ports: reads.append(1) or {})
+    monkeypatch.setattr(flood_limits, "_CHECK_S", 0.01)
+    monkeypatch.setattr(flood_limits, "_QUIET_US", 500_000)
+    with limit_floods([f"ws://127.0.0.1:{free_port()}"], lambda _line: None):
+        for count in (1, 2, 3):
+            assert until(lambda count=count: len(reads) == count)
+            assert not until(lambda count=count: len(reads) > count, 0.1)
+            opened[0] += 1
+        assert until(lambda: len(reads) == 5, 2.0), "and from time to time"
 
 
 def test_a_flood_of_connections_is_reported_once_with_its_address():
