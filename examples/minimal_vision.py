@@ -61,6 +61,7 @@ class Vision:
 
     def __init__(self, answer: Answer) -> None:
         self.answer, self.robot_session, self.last, self.heard_us = answer, "", (-1, -1), 0
+        self.over: set[str] = set()  # 2.5: earlier sessions of the robot
 
     def frame(self, header: Header, jpeg: bytes) -> None:
         started = time.monotonic_ns()
@@ -69,9 +70,10 @@ class Vision:
             return
         silent_us = started // 1000 - self.heard_us
         newer = now[0] > self.last[0] and 0 < now[1] - self.last[1] <= silent_us + 500_000  # 2.6: nor of the future
-        newer |= session != self.robot_session or silent_us > 500_000
+        newer |= session not in {self.robot_session, *self.over} or silent_us > 500_000
         twist = look(jpeg) if newer else None
         if newer:
+            self.over = (self.over | {self.robot_session}) - {session}
             self.robot_session, self.last, self.heard_us = session, now, started // 1000
         echo = {"channel": "frame", **{name: header[name] for name in ("session", "seq", "t_us")}}  # 2.7
         stamp = {"v": 1, "source": SOURCE, "session": SESSION, "seq": next(COUNT), "echo": echo,

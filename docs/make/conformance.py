@@ -7,6 +7,8 @@ Results lie in runs/conformance, one JSON for each peer; the page is made of wha
 """
 
 import json
+import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -32,7 +34,9 @@ TOKEN = "conformance-0123456789abcdef"
 
 PREFACE = """`python -m docs.make.conformance` runs the kit over these peers and writes this page. A case that a peer's
 choices leave nothing to test in (no guests, no scan, no port of the legacy protocol, no token, another transport)
-counts as not applicable. Clauses are those of [protocol/README.md](https://github.com/sightline-robot/sightline/blob/main/protocol/README.md)."""
+counts as not applicable. The minimal peers are the examples of
+[Implement a peer](../../tutorials/implement-a-peer.md): they leave out clauses on purpose and therefore do not conform.
+Clauses are those of [protocol/README.md](https://github.com/sightline-robot/sightline/blob/main/protocol/README.md)."""
 
 UNSEEN = """## Not visible over the wire
 
@@ -139,6 +143,30 @@ def their_vision(name: str) -> None:
             conform(name, "vision", endpoint, "--token", str(token))
 
 
+def minimal_robot(name: str, transport: str) -> None:
+    """The example without Sightline. It states what it leaves out, so it does not conform."""
+    endpoint, port = minimal_end(transport)
+    with subprocess.Popen([sys.executable, EXAMPLES.parent / "minimal_robot.py", transport, str(port),
+                           EXAMPLES.parent / "pictures"], stdout=subprocess.DEVNULL) as robot:
+        conform(name, "robot", endpoint)
+        robot.kill()
+
+
+def minimal_vision(name: str, transport: str) -> None:
+    """The example without Sightline. On Zenoh it ends without a robot, so it is started until the kit listens."""
+    endpoint, _ = minimal_end(transport)
+    command = f"until {sys.executable} {EXAMPLES.parent / 'minimal_vision.py'} {endpoint}; do sleep 0.2; done"
+    with subprocess.Popen(["/bin/sh", "-c", command], start_new_session=True, stdout=subprocess.DEVNULL,
+                          stderr=subprocess.DEVNULL) as vision:
+        conform(name, "vision", endpoint)
+        os.killpg(vision.pid, signal.SIGKILL)
+
+
+def minimal_end(transport: str) -> tuple[str, int]:
+    port = free_port()
+    return f"{'ws://' if transport == 'ws' else 'tcp/'}127.0.0.1:{port}", port
+
+
 RUNS: dict[str, Callable[[str], None]] = {
     "robot, WebSocket": lambda name: our_robot(name, "ws://"),
     "robot, Zenoh": lambda name: our_robot(name, "tcp/"),
@@ -148,6 +176,10 @@ RUNS: dict[str, Callable[[str], None]] = {
     "vision, WebSocket": lambda name: our_vision(name, "ws://"),
     "vision, Zenoh": lambda name: our_vision(name, "tcp/"),
     "JavaScript vision, WebSocket": their_vision,
+    "minimal robot, WebSocket": lambda name: minimal_robot(name, "ws"),
+    "minimal robot, Zenoh": lambda name: minimal_robot(name, "zenoh"),
+    "minimal vision, WebSocket": lambda name: minimal_vision(name, "ws"),
+    "minimal vision, Zenoh": lambda name: minimal_vision(name, "zenoh"),
     "codec, Python": lambda name: conform(name, "codec", "--", sys.executable, str(ADAPTER)),
     "codec, JavaScript": lambda name: conform(name, "codec", "--", node(), str(EXAMPLES / "codec_adapter.mjs")),
 }
