@@ -118,8 +118,8 @@ MISSION = Channel("mission", _IN, RequestHeader, MissionRequest, _JSON, Priority
                   4096, "the requested mission; the robot passes it on", passed_on=True,
                   said_by=("operator", "teleop"))
 REPORT = Channel("report", _IN, DetectionsHeader, MissionReport, _JSON, Priority.INTERACTIVE_HIGH,
-                 "2 Hz and on a change", 2048, "the state of the mission; the robot passes it on", passed_on=True,
-                 said_by=("vision",))
+                 "2 Hz, 10 Hz with a target, and on a change", 2048, "the state of the mission; the robot passes it on",
+                 passed_on=True, said_by=("vision",))
 OVERLAY = Channel("overlay", _IN, DetectionsHeader, None, JPEG, Priority.DATA_LOW, "15 Hz at most, while watched",
                   250_000, "the image with the detections drawn on it; the robot passes it on",
                   passed_on=True, while_watched=True, said_by=("vision",))

@@ -309,10 +309,13 @@ class DetectedCircle(WireModel):
     radius_px: float = Field(gt=0, le=1e6, description="radius")
 
 
+Label = Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]{1,64}$")]
+
+
 class DetectedBox(WireModel):
     """One object in pixels of the encoded image. `x2_px` >= `x1_px` and `y2_px` >= `y1_px` are exclusive."""
 
-    label: str = Field(pattern=r"^[^\x00-\x1f\x7f]{1,64}$", description="what it is, as the detector names it")
+    label: Label = Field(description="what it is, as the detector names it")
     score: float = Field(ge=0, le=1, description="how sure the detector is")
     x1_px: Number = Field(description="left edge")
     y1_px: Number = Field(description="top edge")
@@ -395,6 +398,21 @@ class MissionRequest(WireModel):
     )
 
 
+class ReportedTarget(WireModel):
+    """The object that the mission follows, in an image of this size."""
+
+    label: Label = Field(description="what it is, as the detector names it")
+    score: float = Field(ge=0, le=1, description="how sure the detector is")
+    track: Counter | None = Field(default=None, description="the detector's number for an object that it follows")
+    bearing_rad: Number | None = Field(default=None, description="from the optical axis of the camera, left positive")
+    distance_m: float | None = Field(default=None, ge=0, le=1e6, description="distance of the target")
+    cx_px: Number = Field(description="center, from the left")
+    cy_px: Number = Field(description="center, from the top")
+    radius_px: float | None = Field(default=None, gt=0, le=1e6, description="radius, if the detector finds a circle")
+    width_px: PixelCount = Field(description="width of the encoded image")
+    height_px: PixelCount = Field(description="height of the encoded image")
+
+
 class MissionReport(WireModel):
     """The state of the current mission."""
 
@@ -412,4 +430,7 @@ class MissionReport(WireModel):
     )
     faults: dict[str, Counter] = Field(
         default={}, description="exceptions of the vision service since the start, by part; its log has the tracebacks"
+    )
+    target: ReportedTarget | None = Field(
+        default=None, description="what it follows, in the image of `echo`; null while it follows nothing"
     )

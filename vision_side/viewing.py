@@ -1,4 +1,4 @@
-"""Publishes `overlay` and `preview` while a client subscribes to them. Shell (a thread)."""
+"""Publishes `overlay`, `preview` and `detections` while a client subscribes to them. Shell (a thread)."""
 
 import os
 import secrets
@@ -14,14 +14,15 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from sightline.protocol.channels import OVERLAY, PREVIEW, Channel
+from sightline.protocol.channels import DETECTIONS, OVERLAY, PREVIEW, Channel
 from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import encode
-from sightline.protocol.log import report_fault
+from sightline.protocol.log import error_text, report_fault
 from sightline.protocol.messages import CameraModel, DetectionsHeader, Echo, FrameHeader
 from sightline.protocol.transports.link import LatestSlot, Link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.port import detections_payload
 from sightline.vision_side.overlay import OverlayData, draw_overlay, draw_preview
 from sightline.vision_side.pipeline import SOURCE, PipelineAnswer
 
@@ -85,7 +86,7 @@ class ViewPublisher:
         self._starting = threading.Lock()
         self._thread: threading.Thread | None = None
         self._session = secrets.token_hex(4)
-        self._seqs = {OVERLAY: 0, PREVIEW: 0}
+        self._seqs = {OVERLAY: 0, PREVIEW: 0, DETECTIONS: 0}
         self._decoder: Decoder | None = None
         self._clock = RobotClock()
 
@@ -115,6 +116,17 @@ class ViewPublisher:
                       self._clock.age_us(header.session, header.t_us, now_us))
         self._jobs.put(_Job(shown, jpeg, channels, started_ns))
         self._wake()
+
+    def publish_detections(self, header: FrameHeader, answer: PipelineAnswer, started_ns: int) -> None:
+        """Publish what was found in an answered frame, if a client subscribes to it."""
+        if answer.result is None or not self._link.has_listener(DETECTIONS):
+            return
+        try:
+            payload = detections_payload(answer.result)
+        except ValueError as error:  # of a plug-in
+            self._log_change("detections", f"the result cannot be sent: {error_text(error)}")
+            return
+        self._link.publish(DETECTIONS, self._header(DETECTIONS, header, started_ns), payload, SOURCE)
 
     def _kept_of(self, header: FrameHeader) -> bytes | None:
         return next((jpeg for kept, jpeg in self._kept if kept == header), None)
@@ -152,7 +164,7 @@ class ViewPublisher:
         for channel, drawn, quality in self._views(picture, job):
             jpeg = _encoded(drawn, quality, channel.max_payload_bytes)
             if jpeg is not None:
-                self._link.publish(channel, self._header(channel, job), jpeg, SOURCE)
+                self._link.publish(channel, self._header(channel, job.shown.header, job.started_ns), jpeg, SOURCE)
 
     def _views(self, picture: NDArray[np.uint8], job: _Job) -> Iterator[tuple[Channel, NDArray[np.uint8], int]]:
         config = self._config.viewing
@@ -175,10 +187,9 @@ class ViewPublisher:
         )
         return pixels
 
-    def _header(self, channel: Channel, job: _Job) -> bytes:
-        frame = job.shown.header
+    def _header(self, channel: Channel, frame: FrameHeader, started_ns: int) -> bytes:
         self._seqs[channel] += 1
-        compute_us = (time.perf_counter_ns() - job.started_ns) // 1000
+        compute_us = (time.perf_counter_ns() - started_ns) // 1000
         return encode(DetectionsHeader(source=SOURCE, session=self._session, seq=self._seqs[channel],
                                        echo=Echo.of(frame), compute_us=max(0, compute_us)))
 

@@ -198,6 +198,11 @@ export const MissionRequest = {
   waypoints: [list(list(meters, 2, 2), 0, 64), []],
   options: [map(option, 16, /^[a-z][a-z0-9_.]{0,63}$/), {}],
 };
+export const ReportedTarget = {
+  label: [matching(/^[^\x00-\x1f\x7f]{1,64}$/u)], score: [number(0, 1)], track: [orNull(counter), null],
+  bearing_rad: [orNull(real), null], distance_m: [orNull(number(0, 1e6)), null], cx_px: [real], cy_px: [real],
+  radius_px: [orNull(number(0, 1e6, true)), null], width_px: [integer(16, 8192)], height_px: [integer(16, 8192)],
+};
 export const MissionReport = {
   mission: [text(64)],
   phase: [text(32)],
@@ -210,6 +215,7 @@ export const MissionReport = {
   model: [text(64), ""],
   inference_us: [orNull(counter), null],
   faults: [map(counter), {}],
+  target: [orNull(object(ReportedTarget)), null],
 };
 export const Hello = {
   v: [version, VERSION],

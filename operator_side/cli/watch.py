@@ -1,5 +1,7 @@
 """Commands that show or save a robot's images and messages: watch, capture. Shell."""
 
+import csv
+import io
 import json
 import sys
 import time
@@ -12,16 +14,24 @@ import typer
 
 from sightline.operator_side.cli.operate import follow_status
 from sightline.operator_side.cli.options import Connect, Json, Port, Robot, Secure, target_of
-from sightline.operator_side.client.messages import ChannelInbox, message_line, message_object
+from sightline.operator_side.client.messages import (
+    TARGET_COLUMNS,
+    ChannelInbox,
+    message_line,
+    message_object,
+    target_line,
+    target_object,
+)
 from sightline.operator_side.client.missions import MissionClient
 from sightline.operator_side.client.pictures import Pictures, viewer_role
 from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.preflight import needs
-from sightline.protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, Channel, Direction
+from sightline.protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, REPORT, Channel, Direction
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
 
+_TARGET = "target"
 _SHOWN = (OVERLAY.name, PREVIEW.name, FRAME.name)
 _WAIT_S = 0.2
 _SILENCE_S = 3.0
@@ -38,7 +48,9 @@ def register(app: typer.Typer) -> None:
 
 def watch(
     robot: Robot = None,
-    channel: Annotated[str | None, typer.Argument(metavar="CHANNEL", help="Print its messages.")] = None,
+    channel: Annotated[
+        str | None, typer.Argument(metavar="CHANNEL", help="Print its messages; target: what is followed.")
+    ] = None,
     *,
     text: Annotated[bool, typer.Option("--text", help="Show the robot's state in this terminal.")] = False,
     show: Annotated[
@@ -50,15 +62,19 @@ def watch(
     connect: Connect = None,
     secure: Secure = "",
     as_json: Json = False,
+    as_csv: Annotated[bool, typer.Option("--csv", help="Print the target as a table for other programs.")] = False,
 ) -> int:
     """Show a robot's images or messages live
 
-    It serves a page for a browser on this machine until Ctrl-C. With CHANNEL, it prints the messages, one per line.
+    It serves a page for a browser on this machine until Ctrl-C. With CHANNEL, it prints the messages, one per line. The
+    channel `target` prints bearing, distance and place in the image of what the vision service follows.
     """
     if channel is None and (as_json or count):
         raise ConfigError("--json and --count need a channel; name it, e.g. sightline watch r1 status --json")
-    if channel is not None and channel not in CHANNELS:
-        raise ConfigError(no_such_name("channel", channel, CHANNELS))
+    if as_csv and (channel != _TARGET or as_json):
+        raise ConfigError("--csv is for the target and without --json: sightline watch r1 target --csv")
+    if channel is not None and channel not in (*CHANNELS, _TARGET):
+        raise ConfigError(no_such_name("channel", channel, [*CHANNELS, _TARGET]))
     if show not in _SHOWN:
         raise ConfigError(no_such_name("channel of images", show, _SHOWN))
     target = target_of(robot, connect, secure)
@@ -66,8 +82,8 @@ def watch(
     role, ends_s = viewer_role(secure), time.monotonic() + seconds if seconds else _EVER
     with open_link(robot, connect=target.connect, role=role, secure=secure) as link, suppress(KeyboardInterrupt):
         if channel is not None:
-            shown = (lambda message: json.dumps(message_object(message))) if as_json else message_line
-            inbox = ChannelInbox(link, role, CHANNELS[channel], secure)
+            shown = _target_form(robot, as_json, as_csv) if channel == _TARGET else _message_form(as_json)
+            inbox = ChannelInbox(link, role, REPORT if channel == _TARGET else CHANNELS[channel], secure)
             return _print_channel(inbox, shown, count or sys.maxsize, ends_s)
         if text:
             return follow_status(MissionClient(link), verbose=True, ends_s=ends_s)
@@ -76,6 +92,26 @@ def watch(
             while time.monotonic() < ends_s:
                 time.sleep(min(_WAIT_S, max(0.0, ends_s - time.monotonic())))
     return 0
+
+
+def _message_form(as_json: bool) -> Callable[[Message], str]:
+    return (lambda message: json.dumps(message_object(message))) if as_json else message_line
+
+
+def _target_form(robot: str, as_json: bool, as_csv: bool) -> Callable[[Message], str]:
+    """Return what formats a report as the target's line. The first line of CSV names the columns."""
+    if as_csv:
+        typer.echo(",".join(TARGET_COLUMNS))
+
+    def form(message: Message) -> str:
+        target = target_object(message) | {"robot": robot}
+        if as_csv:
+            line = io.StringIO()
+            csv.writer(line, lineterminator="").writerow("" if one is None else one for one in target.values())
+            return line.getvalue()
+        return json.dumps(target) if as_json else target_line(target)
+
+    return form
 
 
 def _page(link: Link, role: str, first: Channel, port: int, secure: str) -> AbstractContextManager[str]:

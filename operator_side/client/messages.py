@@ -11,7 +11,7 @@ from sightline.protocol.channels import FRAME, JPEG, SCAN, TWIST, Channel
 from sightline.protocol.codec import decode, decode_ranges
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.messages import WireModel
+from sightline.protocol.messages import DetectionsHeader, MissionReport, WireModel
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 
@@ -161,3 +161,40 @@ def _word(value: Any) -> str:
     if isinstance(value, str):
         return value if value.isprintable() and value and " " not in value else json.dumps(value)
     return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+# --- the target of a report --------------------------------------------------------------------------------------
+
+
+TARGET_COLUMNS: Final = (
+    "robot", "t_us", "phase", "label", "score", "track", "bearing_rad", "distance_m", "cx_px", "cy_px", "radius_px",
+    "width_px", "height_px", "detector",
+)
+
+
+def target_object(message: Message) -> dict[str, Any]:
+    """Return the target of a report in `TARGET_COLUMNS`, None for what is absent; `phase` describes an invalid message.
+
+    `t_us` is the capture time of its image, on the robot's clock.
+    """
+    try:
+        header, report = decode(DetectionsHeader, message.header), decode(MissionReport, message.payload)
+    except WireError as error:
+        return dict.fromkeys(TARGET_COLUMNS) | {"phase": f"invalid report: {error}"}
+    target = _plain(report.target) if report.target else {}
+    return dict.fromkeys(TARGET_COLUMNS) | {
+        "t_us": header.echo.t_us if header.echo else None, "phase": report.phase, "detector": report.detector, **target,
+    }
+
+
+def target_line(target: Mapping[str, Any]) -> str:
+    """Format a target as one line."""
+    if target["label"] is None:
+        return f"no target ({target['phase']})"
+    bearing = "" if target["bearing_rad"] is None else f"{math.degrees(target['bearing_rad']):+6.1f} deg  "
+    distance = "" if target["distance_m"] is None else f"{target['distance_m']:5.2f} m  "
+    radius = "" if target["radius_px"] is None else f", radius {target['radius_px']:.1f}"
+    place = f"{target['cx_px']:.0f},{target['cy_px']:.0f} px"
+    size = f"{target['width_px']}x{target['height_px']}"
+    return (f"{bearing}{distance}{target['label']} {target['score']:.2f} at {place}{radius} of {size} "
+            f"({target['phase']})")

@@ -38,6 +38,9 @@ MISSION: dict[str, Any] = {"id": 5, "name": "goto", "waypoints": [[1.5, 1.5], [0
 REPORT: dict[str, Any] = {"mission": "goto", "phase": "driving", "note": "to waypoint 1 of 2",
                           "asked": {"digest": PEER, "id": 5}, "detector": "hsv", "device": "cpu"}
 
+TARGET: dict[str, Any] = {"label": "ball", "score": 0.93, "track": 4, "bearing_rad": 0.05, "distance_m": 0.8,
+                          "cx_px": 150, "cy_px": 118.5, "radius_px": 22.4, "width_px": 320, "height_px": 240}
+
 
 def packed(value: dict[str, Any]) -> bytes:
     """JSON without blanks."""
@@ -368,6 +371,16 @@ def reports() -> list[MessageCase]:
         case(name, "measured", "with the model and its time",
              payload=REPORT | {"device": "cuda", "model": "9f86d081884c7d65", "inference_us": 1060}),
         case(name, "of_a_path", "a mission of one's own", payload=REPORT | {"mission": "my_missions:Circle"}),
+        case(name, "target", "what it follows", payload=REPORT | {"target": TARGET}),
+        case(name, "target_far_right", "without a circle or a distance",
+             payload=REPORT | {"target": without(TARGET, "radius_px", "distance_m", "track") | {"bearing_rad": -0.5}}),
+        case(name, "target_null", "null is as good as absent", payload=REPORT | {"target": None}),
+        case(name, "target_no_size", "the image has a size", MALFORMED,
+             payload=REPORT | {"target": without(TARGET, "width_px")}),
+        case(name, "target_radius_0", "a circle has a radius", MALFORMED,
+             payload=REPORT | {"target": TARGET | {"radius_px": 0}}),
+        case(name, "target_behind", "not below 0", MALFORMED, payload=REPORT | {"target": TARGET | {"distance_m": -1}}),
+        case(name, "target_unsure", "at most 1", MALFORMED, payload=REPORT | {"target": TARGET | {"score": 1.5}}),
         case(name, "no_phase", "a phase is needed", MALFORMED, payload=without(REPORT, "phase")),
         case(name, "note_201", "at most 200 characters", MALFORMED, payload=REPORT | {"note": "x" * 201}),
         case(name, "asked_no_id", "an id is needed", MALFORMED, payload=REPORT | {"asked": {"digest": PEER}}),

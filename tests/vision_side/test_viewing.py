@@ -86,6 +86,22 @@ def test_viewer_receives_the_answered_frame_with_its_detections(site):
     assert not site.link.has_listener(PREVIEW)
 
 
+@pytest.mark.parametrize("site", ["tcp"], indirect=True)  # a robot on WebSocket always wants them, to pass them on
+def test_subscriber_receives_the_detections_of_each_frame_and_without_one_none_are_encoded(site, monkeypatch):
+    encoded = []
+    real = viewing.detections_payload
+    monkeypatch.setattr(viewing, "detections_payload", lambda result: encoded.append(1) or real(result))
+    site.frame()
+    assert encoded == []
+    found = site.viewer.latest(DETECTIONS)
+    assert until(lambda: site.link.has_listener(DETECTIONS))
+    header = site.frame()
+    message = found.take(5.0)
+    assert message.source == "vision" and decode(DetectionsHeader, message.header).echo == Echo.of(header)
+    (box,) = decode(Detections, message.payload).boxes
+    assert box.x1_px < box.circle.cx_px < box.x2_px and encoded == [1]
+
+
 def test_viewing_ends_without_viewers(site, monkeypatch):
     monkeypatch.setattr(viewing, "IDLE_S", 0.1)
     overlays, previews = site.viewer.latest(OVERLAY), site.viewer.latest(PREVIEW)

@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from sightline.protocol.messages import FrameHeader
+from sightline.protocol.channels import DETECTIONS
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import DetectedBox, DetectedCircle, Detections, FrameHeader
 from sightline.vision_side.decode import DecodedImage, Decoder
 
 LONGEST_LABEL: Final = 64
@@ -306,3 +308,23 @@ def overlap(one: Corners, other: Corners) -> float:
 
 def _area(box: Corners) -> float:
     return (box[2] - box[0]) * (box[3] - box[1])
+
+
+def detections_payload(result: DetectionResult) -> bytes:
+    """Encode the boxes for the channel `detections`, best first. The last ones are dropped if it would be too long.
+
+    Raises ValueError for a result of a plug-in that the wire cannot carry.
+    """
+    boxes = tuple(_box(one) for one in result.detections)
+    message = Detections(width_px=result.width_px, height_px=result.height_px, boxes=boxes, detector=result.detector,
+                         device=result.device, model=result.model_hash)
+    while len(payload := encode(message)) > DETECTIONS.max_payload_bytes:
+        message = message.model_copy(update={"boxes": message.boxes[:-1]})
+    return payload
+
+
+def _box(one: Detection) -> DetectedBox:
+    circle = one.circle
+    ring = DetectedCircle(cx_px=circle.cx_px, cy_px=circle.cy_px, radius_px=circle.radius_px) if circle else None
+    return DetectedBox(label=one.label, score=one.score, x1_px=one.x1_px, y1_px=one.y1_px, x2_px=one.x2_px,
+                       y2_px=one.y2_px, circle=ring, track=one.track_id)

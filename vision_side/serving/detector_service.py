@@ -21,9 +21,6 @@ from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import (
     LEAST_SIDE_PX,
     MOST_SIDE_PX,
-    DetectedBox,
-    DetectedCircle,
-    Detections,
     DetectionsHeader,
     Echo,
     FrameHeader,
@@ -32,7 +29,7 @@ from sightline.protocol.transports.link import FleetLink, LatestSlot, Link, Mess
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.per_robot import DecoderPool
 from sightline.vision_side.detect.plugin_calls import checked_results, maker_of, notices_of
-from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector
+from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector, detections_payload
 from sightline.vision_side.serving.process import ends_on_signal
 
 _log: Final = logging.getLogger(__name__)
@@ -304,7 +301,7 @@ class DetectorService:
             counters.late += 1
             return
         try:
-            payload = _payload(result)
+            payload = detections_payload(result)
         except ValueError as error:
             self._reject(turn, f"the result cannot be sent: {_first_line(error)}")
             return
@@ -334,29 +331,9 @@ class DetectorService:
                       f"answered, {dropped} dropped in {_LOAD_PERIOD_S:.0f} s")
 
 
-def _payload(result: DetectionResult) -> bytes:
-    """Encode the boxes, best first. The last ones are dropped if the message would be too long.
-
-    Raises ValueError for a result of a plug-in that the wire cannot carry.
-    """
-    boxes = tuple(_box(one) for one in result.detections)
-    message = Detections(width_px=result.width_px, height_px=result.height_px, boxes=boxes, detector=result.detector,
-                         device=result.device, model=result.model_hash)
-    while len(payload := encode(message)) > DETECTIONS.max_payload_bytes:
-        message = message.model_copy(update={"boxes": message.boxes[:-1]})
-    return payload
-
-
 def _first_line(error: ValueError) -> str:
     """Return the first problem, with its field."""
     return first_problem(error) if isinstance(error, ValidationError) else str(error)
-
-
-def _box(one: Detection) -> DetectedBox:
-    circle = one.circle
-    ring = DetectedCircle(cx_px=circle.cx_px, cy_px=circle.cy_px, radius_px=circle.radius_px) if circle else None
-    return DetectedBox(label=one.label, score=one.score, x1_px=one.x1_px, y1_px=one.y1_px, x2_px=one.x2_px,
-                       y2_px=one.y2_px, circle=ring, track=one.track_id)
 
 
 def _stamp(frame: FrameHeader, session: str, seq: int, compute_us: int) -> bytes:

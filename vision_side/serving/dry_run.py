@@ -101,7 +101,7 @@ class ScansOnly(MissionChannel):
         """Give `pipeline` the newest scan."""
         self._give_scan(pipeline, frame)
 
-    def report(self, now_s: float, answer: PipelineAnswer, frame: FrameHeader | None) -> None:  # noqa: ARG002
+    def report(self, *_given: object) -> None:
         """Log only the detector's notices."""
         self.log_notices()
 

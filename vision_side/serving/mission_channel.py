@@ -8,17 +8,21 @@ import secrets
 from collections.abc import Callable
 from typing import Any, Final
 
+from pydantic import ValidationError
+
 from sightline.protocol.channels import MISSION, REPORT, SCAN
 from sightline.protocol.clock import AHEAD_US
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError, RejectReason, WireError
 from sightline.protocol.log import faults
 from sightline.protocol.messages import (
+    CameraModel,
     DetectionsHeader,
     Echo,
     FrameHeader,
     MissionReport,
     MissionRequest,
+    ReportedTarget,
     RequestHeader,
     RequestId,
 )
@@ -86,13 +90,30 @@ def _check(header: RequestHeader, source: str, frame: FrameHeader) -> None:
         raise WireError(RejectReason.STALE, f"requested {age_us / 1e6:.1f} s ago; repeat the request")
 
 
-# The mission reports and their rate: twice a second, and immediately after a change. Pure.
+# The mission reports and their rate: twice a second, ten times with a target, and immediately after a change. Pure.
 
 
 PERIOD_S: Final = 0.5
 LEAST_GAP_S: Final = 0.1
 """Shortest time between two reports, even if the target appears and disappears with every frame."""
 _PHASE_LENGTH, _TEXT_LENGTH, _NAME_LENGTH, _DEVICE_LENGTH = 32, 200, 64, 32
+
+
+def reported_target(seen: Observation, camera: CameraModel | None) -> ReportedTarget | None:
+    """Return the target of a step for a report, or None without one, or for one that the wire cannot carry."""
+    one = seen.target
+    if one is None or camera is None:
+        return None
+    circle = one.circle
+    center_px = (circle.cx_px, circle.cy_px) if circle else ((one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2)
+    try:
+        return ReportedTarget(
+            label=one.label, score=one.score, track=one.track_id, bearing_rad=seen.bearing_rad,
+            distance_m=seen.distance_m, cx_px=center_px[0], cy_px=center_px[1],
+            radius_px=circle.radius_px if circle else None, width_px=camera.width_px, height_px=camera.height_px,
+        )
+    except ValidationError:  # of a plug-in
+        return None
 
 
 class Reporter:
@@ -106,14 +127,15 @@ class Reporter:
 
     def due(
         self, now_s: float, mission: str, seen: Observation, newest: RequestId | None, rejection: str, *,
-        result: DetectionResult | None = None, beside: str = "",
+        result: DetectionResult | None = None, beside: str = "", camera: CameraModel | None = None,
     ) -> MissionReport | None:
         """Return a report if one is due.
 
-        `result` is the newest of the detector, `beside` describes the shadow detector.
+        `result` is the newest of the detector, `beside` describes the shadow detector. `camera` is the model of the
+        image of `seen`.
         """
         state = (mission, seen.phase, seen.done, newest, rejection)
-        gap_s = LEAST_GAP_S if state != self._reported else PERIOD_S
+        gap_s = LEAST_GAP_S if state != self._reported or seen.target is not None else PERIOD_S
         if self._reported is not None and now_s - self._reported_s < gap_s:
             return None
         self._reported, self._reported_s = state, now_s
@@ -121,6 +143,7 @@ class Reporter:
             mission=mission[:_NAME_LENGTH], phase=_line(seen.phase, _PHASE_LENGTH),
             note=_line(seen.note, _TEXT_LENGTH), done=seen.done,
             asked=newest, refused=rejection[:_TEXT_LENGTH], faults=dict(faults()),
+            target=reported_target(seen, camera),
             **self._detector_fields(result, beside),
         )
 
@@ -175,8 +198,10 @@ class MissionChannel:
             self._apply(message, pipeline, frame)
         self._give_scan(pipeline, frame)
 
-    def report(self, now_s: float, answer: PipelineAnswer, frame: FrameHeader | None) -> None:
-        """Publish the report of an answer, if it is time; `frame` is None if no frame comes."""
+    def report(
+        self, now_s: float, answer: PipelineAnswer, frame: FrameHeader | None, camera: CameraModel | None = None
+    ) -> None:
+        """Publish the report of an answer, if it is time. `frame` is None if no frame comes, `camera` is its model."""
         self._result = answer.result or self._result
         newest, rejection = self._requests.newest, self._requests.rejection
         if answer.mission and newest not in (None, answer.request):
@@ -184,7 +209,7 @@ class MissionChannel:
         self.log_notices()
         shadow = self._detector.shadow_text(self._link.robot) if isinstance(self._detector, ShadowDetector) else ""
         report = self._reporter.due(now_s, answer.mission or self._mission, answer.seen, newest, rejection,
-                                    result=self._result, beside=shadow)
+                                    result=self._result, beside=shadow, camera=camera)
         if report is None:
             return
         self._reports += 1

@@ -284,7 +284,9 @@ class Service:
             self.skipped[answer.skipped] += 1
         self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._report_phase(answer)
-        self._mission_channel.report(time.monotonic(), answer, header)
+        self._mission_channel.report(time.monotonic(), answer, header, self._camera)
+        if not self._is_legacy:
+            self._viewing.publish_detections(header, answer, started_ns)
         self._viewing.show(header, answer, self._camera, started_ns=started_ns, jpeg=message.payload)
 
     def _is_of_robot(self, header: FrameHeader) -> bool:
@@ -479,7 +481,7 @@ class BoxesService(Service):
             return
         self._publish(frame, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._report_phase(answer)
-        self._mission_channel.report(time.monotonic(), answer, frame)
+        self._mission_channel.report(time.monotonic(), answer, frame, self._camera)
         self._viewing.show(frame, answer, self._camera, started_ns=started_ns)
 
     def _remember_replaced(self) -> None:

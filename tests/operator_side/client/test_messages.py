@@ -8,9 +8,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.operator_side.client.messages import MAX_WAITING, ChannelInbox, message_line, message_object
+from sightline.operator_side.client.messages import (
+    MAX_WAITING,
+    TARGET_COLUMNS,
+    ChannelInbox,
+    message_line,
+    message_object,
+    target_line,
+    target_object,
+)
 from sightline.protocol.channels import CHANNELS, JPEG, SCAN, STATUS, TWIST
-from sightline.protocol.spec.message_cases import CASES, USUAL, packed
+from sightline.protocol.spec.message_cases import ANSWER, CASES, REPORT, TARGET, USUAL, packed
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.memory import MemoryNetwork
 
@@ -109,3 +117,32 @@ def test_text_messages_wait_in_order_up_to_a_bound():
     inbox, messages = heard("status", MAX_WAITING + 3)
     assert [inbox.take(0.0) for _ in range(MAX_WAITING)] == messages[:MAX_WAITING]
     assert inbox.take(0.0) is None and inbox.dropped == 3
+
+
+# --- the target of a report --------------------------------------------------------------------------------------
+
+
+def target_of(**changes):
+    return target_object(usual("report", payload=packed(REPORT | {"target": TARGET | changes})))
+
+
+def test_target_has_every_column_and_the_time_of_its_image():
+    target = target_of()
+    assert tuple(target) == TARGET_COLUMNS and target["robot"] is None
+    assert {name: target[name] for name in TARGET} == TARGET
+    assert (target["t_us"], target["phase"], target["detector"]) == (ANSWER["echo"]["t_us"], "driving", "hsv")
+
+
+@pytest.mark.parametrize(("changes", "line"), [
+    ({}, "  +2.9 deg   0.80 m  ball 0.93 at 150,118 px, radius 22.4 of 320x240 (driving)"),
+    ({"bearing_rad": None, "distance_m": None, "radius_px": None}, "ball 0.93 at 150,118 px of 320x240 (driving)"),
+])
+def test_target_is_one_line(changes, line):
+    assert target_line(target_of(**changes)) == line
+
+
+def test_missing_target_and_invalid_report_are_lines_too():
+    assert target_line(target_object(usual("report"))) == "no target (driving)"
+    invalid = target_object(usual("report", payload=b"{}"))
+    assert tuple(invalid) == TARGET_COLUMNS
+    assert target_line(invalid).startswith("no target (invalid report: MALFORMED: MissionReport.mission: ")

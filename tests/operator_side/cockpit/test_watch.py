@@ -1,5 +1,6 @@
 """`watch`, `capture`, `pick-color` at a robot in the simulation and its vision, and in a real browser."""
 
+import csv
 import json
 import os
 import re
@@ -71,10 +72,30 @@ def test_any_channel_is_printed(site: Site, end: str, capsys: pytest.CaptureFixt
     assert re.match(r"status #\d+: state=DISARMED reason=", capsys.readouterr().out)
 
 
+@pytest.mark.parametrize("end", ["zenoh", "web"])
+def test_the_target_is_printed_as_a_line_an_object_and_a_table(
+    site: Site, end: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ["watch", "r1", "target", "--connect", site.at(end), "--count", "2", "--seconds", "10"]
+    assert run([*where, "--json"]) == 0
+    first, second = (json.loads(line) for line in capsys.readouterr().out.splitlines())
+    assert first["robot"] == "r1" and first["label"] == "target" and 0.2 < first["distance_m"] < 3.0
+    assert 0 < second["t_us"] - first["t_us"] < 1_000_000, "of new images"
+    assert run([*where, "--csv"]) == 0
+    rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))
+    assert len(rows) == 2 and list(rows[0]) == list(first) and float(rows[0]["bearing_rad"]) == pytest.approx(
+        first["bearing_rad"], abs=0.05)
+    assert run(where) == 0
+    assert re.fullmatch(r"( *[+-]\d+\.\d deg +\d\.\d\d m  target \d\.\d\d at .* px, radius .* \(\w+\)\n){2}",
+                        capsys.readouterr().out)
+
+
 def test_invalid_watch_is_one_line(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, code, words in (
         (["r1", "fram"], 2, "unknown channel 'fram'; did you mean 'frame'?"),
-        (["r1", "--json"], 2, "name it"),
+        (["r1", "--json"], 2, "name it"), (["r1", "tagret"], 2, "unknown channel 'tagret'; did you mean 'target'?"),
+        (["r1", "status", "--csv"], 2, "--csv is for the target"), (["r1", "--csv"], 2, "--csv is for the target"),
+        (["r1", "target", "--csv", "--json"], 2, "--csv is for the target"),
         (["r1", "twist", "--connect", site.web, "--seconds", "1"], 4, "deliver it to the robot only"),
         (["r1", "scan", "--connect", "tcp/127.0.0.1:1", "--seconds", "1"], 4, "tcp/127.0.0.1:1"),
     ):

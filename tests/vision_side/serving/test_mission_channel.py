@@ -1,7 +1,9 @@
 """The missions that a vision service accepts, its reports, and the scans for a mission."""
 
 import array
+import math
 import struct
+from dataclasses import replace
 
 import pytest
 
@@ -24,15 +26,17 @@ from sightline.protocol.messages import (
 from sightline.protocol.proof import session_digest
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.detect.port import Circle, Detection
 from sightline.vision_side.pipeline import Observation
 from sightline.vision_side.serving.dry_run import AckingService
-from sightline.vision_side.serving.mission_channel import LEAST_GAP_S, PERIOD_S, Reporter
+from sightline.vision_side.serving.mission_channel import LEAST_GAP_S, PERIOD_S, Reporter, reported_target
 from sightline.vision_side.serving.service import Service
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
 FRAME_US = 33_333
+TARGET = Detection(100.0, 40.0, 140.0, 80.0, 0.9, "ball", Circle(120.0, 70.0, 20.0), track_id=7)
 SESSION, ASKER = "0000abcd", "0000feed"
 
 
@@ -162,6 +166,42 @@ def test_reports_come_twice_a_second_and_immediately_on_a_change():
     assert [one for one in told if one < 2] == [0.0, PERIOD_S, 2 * PERIOD_S, 3 * PERIOD_S]
     late = [one for one in told if one >= 2]
     assert 8 <= len(late) <= 1 / LEAST_GAP_S + 1
+
+
+def test_reports_with_a_target_come_ten_times_a_second():
+    due = Reporter(DetectorConfig()).due
+    seen = Observation("tracking", target=TARGET)
+    reports = [report for step in range(31) if (report := due(step / 30, "follow", seen, None, "", camera=MODEL))]
+    assert 9 <= len(reports) <= 11 and all(report.target.label == "ball" for report in reports)
+
+
+@pytest.mark.parametrize(("changes", "center_px", "radius_px"), [
+    ({}, (120.0, 70.0), 20.0), ({"circle": None}, (120.0, 60.0), None),
+])
+def test_report_names_the_target_its_place_and_the_size_of_the_image(changes, center_px, radius_px):
+    seen = Observation("tracking", target=replace(TARGET, **changes), bearing_rad=-0.1, distance_m=0.8)
+    target = reported_target(seen, MODEL)
+    assert (target.cx_px, target.cy_px) == center_px and target.radius_px == radius_px
+    assert (target.label, target.score, target.track) == ("ball", 0.9, 7)
+    assert (target.bearing_rad, target.distance_m) == (-0.1, 0.8)
+    assert (target.width_px, target.height_px) == (MODEL.width_px, MODEL.height_px)
+
+
+@pytest.mark.parametrize(("target", "model"), [
+    (None, MODEL), (TARGET, None), (replace(TARGET, label=""), MODEL), (replace(TARGET, score=math.nan), MODEL),
+])
+def test_target_that_is_missing_or_cannot_be_sent_is_absent(target, model):
+    assert reported_target(Observation("tracking", target=target), model) is None
+
+
+def test_vision_service_reports_the_target_in_the_image_of_its_frame():
+    bench = Bench()
+    bench.frames(3)
+    newest = bench.reports[-1]
+    header, report = decode(DetectionsHeader, newest.header), decode(MissionReport, newest.payload)
+    assert report.target.bearing_rad == pytest.approx(math.atan2(0.2, 1.0), abs=0.02)
+    assert report.target.distance_m == pytest.approx(math.hypot(0.2, 1.0), abs=0.1)
+    assert header.echo.seq == 1 and report.target.width_px == MODEL.width_px
 
 
 def test_report_contains_the_mission_text_on_one_bounded_line():
