@@ -61,7 +61,7 @@ class Vision:
 
     def __init__(self, answer: Answer) -> None:
         self.answer, self.robot_session, self.last, self.heard_us = answer, "", (-1, -1), 0
-        self.over: set[str] = set()  # 2.5: earlier sessions of the robot
+        self.over: list[str] = []  # 2.5: earlier sessions of the robot, the newest first
 
     def frame(self, header: Header, jpeg: bytes) -> None:
         started = time.monotonic_ns()
@@ -73,7 +73,7 @@ class Vision:
         newer |= session not in {self.robot_session, *self.over} or silent_us > 500_000
         twist = look(jpeg) if newer else None
         if newer:
-            self.over = (self.over | {self.robot_session}) - {session}
+            self.over = [one for one in dict.fromkeys([self.robot_session, *self.over]) if one != session][:8]
             self.robot_session, self.last, self.heard_us = session, now, started // 1000
         echo = {"channel": "frame", **{name: header[name] for name in ("session", "seq", "t_us")}}  # 2.7
         stamp = {"v": 1, "source": SOURCE, "session": SESSION, "seq": next(COUNT), "echo": echo,
