@@ -66,8 +66,8 @@ def watch(
 ) -> int:
     """Show a robot's images or messages live
 
-    It serves a page for a browser on this machine until Ctrl-C. With CHANNEL, it prints the messages, one per line. The
-    channel `target` prints bearing, distance and place in the image of what the vision service follows.
+    It serves a page for a browser on this machine until Ctrl-C. With CHANNEL, it prints the messages, one per line;
+    with target, bearing and distance of what the vision service follows.
     """
     if channel is None and (as_json or count):
         raise ConfigError("--json and --count need a channel; name it, e.g. sightline watch r1 status --json")
