@@ -10,6 +10,7 @@ from sightline.conformance.runner import Outcome
 from tests.conformance.mutants import peers
 from tests.conformance.mutants.operators import OPERATORS, OperatorError, change_function
 from tests.conformance.mutants.table import FAULTS, read_table
+from tests.fixtures.javascript import EXAMPLES
 
 MUTANTS, PROBLEMS = peers.table()
 PYTHON = ("robot", "vision")
@@ -106,6 +107,12 @@ def test_javascript_peer_passes_in_virtual_time(stage, peer):
 
 def test_every_row_of_the_table_is_good():
     assert PROBLEMS == ()
+
+
+def test_text_that_a_javascript_mutant_changes_is_in_the_source_once():
+    changes = [one.parameters for one in MUTANTS if one.peer in JAVASCRIPT and one.operator == "source"]
+    counts = {one["old"]: (EXAMPLES / one["place"]).read_text("utf-8").count(one["old"]) for one in changes}
+    assert len(counts) > 20 and {old: count for old, count in counts.items() if count != 1} == {}
 
 
 def test_every_case_has_a_mutant():
