@@ -2,6 +2,7 @@
 
 import ast
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -73,13 +74,16 @@ def test_forked_child_gets_other_ports():
     mine, (reader, writer) = free_port(), os.pipe()
     child = os.fork()
     if not child:
-        os.write(writer, str(free_port()).encode())
-        os._exit(0)
-    os.waitpid(child, 0)
-    with os.fdopen(reader) as text:
-        os.close(writer)
-        theirs = int(text.read())
-    assert theirs not in {mine, *(free_port() for _ in range(BLOCK))}
+        os.write(writer, f"{free_port()}\n".encode())
+        signal.pause()  # its block is free for others once it has ended
+    os.close(writer)
+    try:
+        with os.fdopen(reader) as text:
+            theirs = int(text.readline())
+        assert theirs not in {mine, *(free_port() for _ in range(BLOCK))}
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
 
 
 @pytest.mark.parametrize(("text", "usable"), [
