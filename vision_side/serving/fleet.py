@@ -13,7 +13,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 from sightline.protocol.channels import Channel
-from sightline.protocol.errors import SightlineError
+from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import report_fault
 from sightline.protocol.transports.link import FleetLink, Link, LinkWrapper, Message
 from sightline.vision_side.config import VisionConfig
@@ -30,7 +30,7 @@ from sightline.vision_side.serving.service import (
 )
 
 _LONGEST_WAIT_S = 0.2
-_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 30.0
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S, _DOUBLINGS = 1.0, 30.0, 16
 """From the error of a robot's service to the start of its next one: twice as long each time."""
 
 
@@ -99,7 +99,7 @@ class Fleet:
     def turn(self) -> None:
         """Add new robots, and answer at most one frame of each robot without a thread of its own.
 
-        So no robot waits longer than one round, however many frames another one sends. Raises SightlineError for an
+        So no robot waits longer than one round, however many frames another one sends. Raises ConfigError for an
         invalid configuration, which is that of every robot.
         """
         present = self._fleet_link.robots()
@@ -110,7 +110,7 @@ class Fleet:
         for robot in present:
             try:
                 self._turn_of(robot)
-            except SightlineError:
+            except ConfigError:
                 raise
             except Exception as error:
                 self._failed.append((robot, error))
@@ -126,7 +126,7 @@ class Fleet:
     def _on_error(self, robot: str, error: Exception) -> None:
         report_fault("vision", error, robot)
         self._drop(robot)
-        pause_s = min(_FIRST_PAUSE_S * 2.0 ** self._restarts[robot], _LONGEST_PAUSE_S)
+        pause_s = min(_FIRST_PAUSE_S * 2.0 ** min(self._restarts[robot], _DOUBLINGS), _LONGEST_PAUSE_S)
         self._restarts[robot] += 1
         self._starts_s[robot] = time.monotonic() + pause_s
         self._report(f"vision: {robot}: its service failed; a new one starts in {pause_s:.0f} s")

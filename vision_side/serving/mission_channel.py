@@ -96,6 +96,8 @@ def _check(header: RequestHeader, source: str, frame: FrameHeader) -> None:
 PERIOD_S: Final = 0.5
 LEAST_GAP_S: Final = 0.1
 """Shortest time between two reports, even if the target appears and disappears with every frame."""
+_LEFT_OUT: Final = ("note", "target", "refused", "faults")
+"""Fields that a report loses, one after the other, until the wire carries it: a letter may take four bytes."""
 _PHASE_LENGTH, _TEXT_LENGTH, _NAME_LENGTH, _DEVICE_LENGTH = 32, 200, 64, 32
 
 
@@ -139,13 +141,18 @@ class Reporter:
         if self._reported is not None and now_s - self._reported_s < gap_s:
             return None
         self._reported, self._reported_s = state, now_s
-        return MissionReport(
+        report = MissionReport(
             mission=mission[:_NAME_LENGTH], phase=_line(seen.phase, _PHASE_LENGTH),
             note=_line(seen.note, _TEXT_LENGTH), done=seen.done,
             asked=newest, refused=rejection[:_TEXT_LENGTH], faults=dict(faults()),
             target=reported_target(seen, camera),
             **self._detector_fields(result, beside),
         )
+        for name in _LEFT_OUT:
+            if len(encode(report)) <= REPORT.max_payload_bytes:
+                break
+            report = report.model_copy(update={name: MissionReport.model_fields[name].default})
+        return report
 
     def _detector_fields(self, result: DetectionResult | None, beside: str) -> dict[str, Any]:
         """Return the detector, its device and its time."""

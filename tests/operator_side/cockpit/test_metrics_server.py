@@ -35,14 +35,14 @@ def served_port(**state):
         yield urlsplit(address).port
 
 
-def _health(port, path="ready"):
+def _probe(port, path="ready"):
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/{path}", timeout=3) as answer:
         return answer.read()
 
 
 def _status(port, path):
     try:
-        _health(port, path)
+        _probe(port, path)
     except urllib.error.HTTPError as error:
         return error.code
     return 200
@@ -75,7 +75,7 @@ def test_silent_connection_delays_neither_others_nor_the_end(said):
         idle = [socket.create_connection(("127.0.0.1", port)) for _ in range(3)]
         for one in idle:
             one.sendall(said)
-        assert _health(port) == b"ok\n"
+        assert _probe(port) == b"ok\n"
         began_s = time.monotonic()
     assert time.monotonic() - began_s < 3
     for one in idle:
@@ -101,7 +101,7 @@ def _closed_by_server(held):
 
 def _is_served(port):
     try:
-        return _health(port) == b"ok\n"
+        return _probe(port) == b"ok\n"
     except OSError:
         return False
 
@@ -114,5 +114,5 @@ def test_silent_connection_is_closed_without_a_message(monkeypatch, capfd):
         with socket.create_connection(("127.0.0.1", port)) as gone:
             gone.sendall(b"GET /metrics HTTP/1.1\r\n")
             gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")
-        assert until(lambda: _health(port) == b"ok\n")
+        assert until(lambda: _probe(port) == b"ok\n")
     assert capfd.readouterr().err == ""

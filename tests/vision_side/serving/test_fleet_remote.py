@@ -9,7 +9,7 @@ import pytest
 from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.config import Config
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, WireError
 from sightline.protocol.messages import FrameHeader, Stamp, State, Status
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
@@ -182,6 +182,21 @@ def test_an_error_in_one_robots_service_ends_it_alone_and_a_new_one_starts(monke
     assert not thread.is_alive() and fleet.services["r0"] is other
     assert "vision: r1: its service failed; a new one starts in 0 s" in said
     assert caplog.text.count("RuntimeError: out of luck") == 2, "the line and its traceback, once"
+
+
+@pytest.mark.parametrize("error", [RuntimeError("a"), WireError("MALFORMED", "b"), OSError("c")])
+def test_a_service_that_fails_for_days_is_started_again_each_half_minute(monkeypatch, error):
+    def fail(_service, _wait_s):
+        raise error
+
+    monkeypatch.setattr(Service, "turn", fail)
+    said = []
+    fleet = Fleet(VisionConfig(robot="r*"), Quiet(1), said.append)
+    fleet._restarts["r0"] = 5_000
+    fleet.turn()
+    assert said == ["vision: r0: its service failed; a new one starts in 30 s"] and fleet.services == {}
+    fleet.turn()
+    assert fleet.services == {}, "not before"
 
 
 def test_an_invalid_configuration_ends_the_vision_service(monkeypatch):

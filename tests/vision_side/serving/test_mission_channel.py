@@ -28,6 +28,7 @@ from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.detect.port import Circle, Detection
 from sightline.vision_side.pipeline import Observation
+from sightline.vision_side.serving import mission_channel
 from sightline.vision_side.serving.dry_run import AckingService
 from sightline.vision_side.serving.mission_channel import LEAST_GAP_S, PERIOD_S, Reporter, reported_target
 from sightline.vision_side.serving.service import Service
@@ -37,6 +38,7 @@ MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
 FRAME_US = 33_333
 TARGET = Detection(100.0, 40.0, 140.0, 80.0, 0.9, "ball", Circle(120.0, 70.0, 20.0), track_id=7)
+LONG = "\N{LARGE YELLOW CIRCLE}" * 200
 SESSION, ASKER = "0000abcd", "0000feed"
 
 
@@ -192,6 +194,19 @@ def test_report_names_the_target_its_place_and_the_size_of_the_image(changes, ce
 ])
 def test_target_that_is_missing_or_cannot_be_sent_is_absent(target, model):
     assert reported_target(Observation("tracking", target=target), model) is None
+
+
+@pytest.mark.parametrize(("rejection", "fault", "lost"), [
+    ("", "", set()), (LONG, "", {"note"}), (LONG, "x" * 300, {"note", "target"}),
+    (LONG, "x" * 1200, {"note", "target", "refused"}), (LONG, "x" * 3000, {"note", "target", "refused", "faults"}),
+])
+def test_report_that_is_too_long_for_the_wire_loses_first_its_note(monkeypatch, rejection, fault, lost):
+    monkeypatch.setattr(mission_channel, "faults", lambda: {fault: 1} if fault else {})
+    seen = Observation(LONG, target=replace(TARGET, label=LONG[:64]), note=LONG)
+    report = Reporter(DetectorConfig(kind=LONG)).due(0.0, LONG, seen, None, rejection, camera=MODEL)
+    assert len(encode(report)) <= REPORT.max_payload_bytes and report.phase == LONG[:32]
+    given = {"note": LONG, "target": True, "refused": rejection, "faults": fault}
+    assert {name for name, value in given.items() if value and not getattr(report, name)} == lost
 
 
 def test_vision_service_reports_the_target_in_the_image_of_its_frame():
