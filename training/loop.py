@@ -13,8 +13,9 @@ from dataclasses import asdict, dataclass, replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import nn
@@ -34,7 +35,7 @@ from sightline.training.network import (
     Weights,
     network,
 )
-from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, TrainingSample, drawn_scenes, sample
+from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, SceneSource, drawn_scenes, sample
 from sightline.training.schedule import Training
 from sightline.training.shipping import Card, Progress, card_text, chosen_thresholds, final_report, written
 
@@ -161,11 +162,11 @@ _LOG_EVERY: Final = 50
 
 
 def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
-          log: Callable[[str], None]) -> Weights:
-    """Train, or go on from the checkpoint in `folder`; the averaged weights, normalization folded in. More than one
-    process only on the CPU."""
+          log: Callable[[str], None], *, feeders: int = 1) -> Weights:
+    """Train, or go on from the checkpoint in `folder`; the averaged weights, normalization folded in. `training.jobs`
+    processes share the work on the CPU; `feeders` processes prepare the batches of a GPU."""
     if training.jobs == 1:
-        return _trained(scenes, training, device, folder, log)
+        return _trained(scenes, training, device, folder, log, feeders=feeders)
     _checkpoint(folder / CHECKPOINT, _made_by(scenes, training), device)  # one error for that of another training
     with _helpers(scenes, training, folder):
         return _trained(scenes, training, device, folder, log)
@@ -225,7 +226,7 @@ def _join_group(rank: int, training: Training, folder: Path) -> None:
 
 
 def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
-             log: Callable[[str], None] | None) -> Weights:
+             log: Callable[[str], None] | None, *, feeders: int = 1) -> Weights:
     """Train in one process; only the one with `log` writes checkpoints."""
     torch.set_num_threads(1)  # two are slower on shared cores: the layers are small
     torch.manual_seed(training.seed)
@@ -234,12 +235,13 @@ def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
     begin = state.load(checkpoint)
     if begin and log is not None:
         log(f"continues at step {begin} of {training.steps}")
-    for step, batch in enumerate(_batches(scenes, training, begin), start=begin):
+    batches = _batches(scenes, training, begin) if device == "cpu" else _fed(scenes, training, begin, feeders)
+    for step, batch in enumerate(batches, start=begin):
         loss = state.learn(step, batch)
         if log is None:
             continue
         if (step + 1) % _LOG_EVERY == 0:
-            log(f"step {step + 1} of {training.steps}: loss {loss:.3f}")
+            log(f"step {step + 1} of {training.steps}: loss {float(loss):.3f}")
         if (step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == training.steps:
             state.save(checkpoint, step + 1)
     return folded(state.average)
@@ -261,29 +263,43 @@ def _checkpoint(path: Path, made_by: str, device: Any) -> dict[str, Any] | None:
     return kept
 
 
+class Batch(NamedTuple):
+    """Samples side by side: the arrays of `TrainingSample`, each with one more axis before its own."""
+
+    image: Any
+    heat: Any
+    geometry: Any
+    sure: Any
+    counts: Any
+    known: Any
+
+
 class _State:
     """Network, optimizer and average."""
 
     def __init__(self, scenes: DrawnScenes, training: Training, device: Any) -> None:
         self._training, self._made_by = training, _made_by(scenes, training)
         self._device = device
-        self.network = TorchNetwork().to(device=device, memory_format=torch.channels_last).train()
-        self._optimizer = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay)
+        # Channels last is faster on a CPU, and slower on a GPU, whose depthwise kernels want the other order.
+        order = torch.channels_last if device.type == "cpu" else torch.contiguous_format
+        self.network = TorchNetwork().to(device=device, memory_format=order).train()
+        self._optimizer = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay,
+                                            fused=self._device.type == "cuda")
         self._schedule = torch.optim.lr_scheduler.LambdaLR(self._optimizer, training.rate_at)
         self.average = self._copied()
 
     def _copied(self) -> dict[str, Any]:
         return {name: value.detach().clone() for name, value in self.network.state_dict().items()}
 
-    def begin(self, weights: Weights, batch: list[TrainingSample]) -> None:
+    def begin(self, weights: Weights, batch: Batch) -> None:
         """Take those weights over, for the last round."""
-        begin_from(self.network, weights, self._on_device([one.image for one in batch]))
+        begin_from(self.network, weights, self._on_device(batch.image))
         self.average = self._copied()
         self._schedule.last_epoch = self._training.last_from
 
-    def learn(self, step: int, batch: list[TrainingSample]) -> float:
-        """Run one step. Returns its loss."""
-        loss = _loss(self.network(self._on_device([one.image for one in batch])), batch, self._on_device)
+    def learn(self, step: int, batch: Batch) -> Any:
+        """Run one step. Returns its loss, on the device."""
+        loss = _loss(self.network(self._on_device(batch.image)), batch, self._on_device)
         self._optimizer.zero_grad()
         loss.backward()
         self._average_gradients()
@@ -291,10 +307,9 @@ class _State:
         self._optimizer.step()
         self._schedule.step()
         share = min(_AVERAGED, (step + 1) / (step + 10))
-        for name, value in self.network.state_dict().items():
-            old = self.average[name]
-            self.average[name] = old.lerp(value.detach(), 1 - share) if value.is_floating_point() else value.clone()
-        return float(loss.detach())
+        now = {name: value for name, value in self.network.state_dict().items() if value.is_floating_point()}
+        torch._foreach_lerp_([self.average[name] for name in now], list(now.values()), 1 - share)
+        return loss.detach()
 
     def _average_gradients(self) -> None:
         """Gradients become the mean of all processes', so that all networks stay the same."""
@@ -306,8 +321,8 @@ class _State:
         for one, mean in zip(gradients, together.split([one.numel() for one in gradients]), strict=True):
             one.copy_(mean.view_as(one) / torch.distributed.get_world_size())
 
-    def _on_device(self, arrays: list[Any]) -> Any:
-        return torch.from_numpy(np.stack(arrays)).to(self._device)
+    def _on_device(self, array: Any) -> Any:
+        return torch.as_tensor(array).to(self._device, non_blocking=True)
 
     def save(self, path: Path, step: int) -> None:
         """Written beside and moved, so that a cut leaves the one before."""
@@ -329,14 +344,15 @@ class _State:
         return int(kept["step"])
 
 
-def _loss(given: Any, batch: list[TrainingSample], on_device: Callable[[list[Any]], Any]) -> Any:
+def _loss(given: Any, batch: Batch, on_device: Callable[[Any], Any]) -> Any:
     """Focal loss on the heat maps, distances on the geometry of the middle cells."""
     geometry = given[:, len(LABELS) : OUTPUTS]
-    wanted, counts = on_device([one.heat for one in batch]), on_device([one.counts for one in batch])[:, None]
-    labels = _focal(given[:, : len(LABELS)], wanted[:, :-TAUGHT], counts)
-    taught = _focal(given[:, OUTPUTS:], wanted[:, -TAUGHT:], counts)
-    sure = on_device([one.sure for one in batch])[:, None]
-    off = (geometry - on_device([one.geometry for one in batch])).abs() * sure
+    wanted = on_device(batch.heat)
+    counts = on_device(batch.counts)[:, None] * on_device(batch.known)[:, :, None, None]
+    labels = _focal(given[:, : len(LABELS)], wanted[:, :-TAUGHT], counts[:, :-TAUGHT])
+    taught = _focal(given[:, OUTPUTS:], wanted[:, -TAUGHT:], counts[:, -TAUGHT:])
+    sure = on_device(batch.sure)[:, None]
+    off = (geometry - on_device(batch.geometry)).abs() * sure
     return labels + _TAUGHT_WEIGHT * taught + _GEOMETRY_WEIGHT * off.sum() / sure.sum().clamp(min=1.0)
 
 
@@ -349,23 +365,44 @@ def _focal(heat: Any, wanted: Any, counts: Any) -> Any:
     return -((found + empty) * counts).sum() / is_middle.sum().clamp(min=1.0)
 
 
-def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[list[TrainingSample]]:
+def _fed(scenes: DrawnScenes, training: Training, first: int, feeders: int) -> Iterator[Batch]:
+    """Prepared by so many processes: a GPU learns from a batch in less time than one process prepares it in."""
+    steps = range(first, training.steps)
+    return iter(torch.utils.data.DataLoader(
+        _Steps(scenes, training), batch_size=None, sampler=steps, num_workers=feeders, prefetch_factor=_PREPARED,
+        pin_memory=torch.cuda.is_available(),
+    ))
+
+
+class _Steps(torch.utils.data.Dataset):  # type: ignore[misc]
+    """The batch of each step."""
+
+    def __init__(self, scenes: DrawnScenes, training: Training) -> None:
+        self._scenes, self._training = scenes, training
+
+    def __getitem__(self, step: int) -> Batch:
+        cv2.setNumThreads(1)
+        return Batch(*(torch.from_numpy(one) for one in _batch(self._scenes, self._training, step, 0)))
+
+
+def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[Batch]:
     """Prepared by a second thread, so that two cores have something to do; a few wait, no more."""
     rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
     with ThreadPoolExecutor(1, "batches") as pool:
-        waiting: deque[Future[list[TrainingSample]]] = deque()
+        waiting: deque[Future[Batch]] = deque()
         for step in range(first, training.steps):
             for coming in range(step + len(waiting), min(step + _PREPARED, training.steps)):
                 waiting.append(pool.submit(_batch, scenes, training, coming, rank))
             yield waiting.popleft().result()
 
 
-def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> list[TrainingSample]:
+def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> Batch:
     """Return the share of this process."""
     size_px, count = (WHOLE_PX, training.batch // 2) if training.whole_at(step) else (CUT_PX, training.batch)
-    share, shown = max(1, count // training.jobs), training.shown_at(step, len(scenes.truths))
-    return [sample(scenes, shown, (training.seed, step, place), size_px)
-            for place in range(rank * share, (rank + 1) * share)]
+    share, shown = max(1, count // training.jobs), training.shown_at(step, scenes.own)
+    samples = [sample(scenes, shown, (training.seed, step, place), size_px)
+               for place in range(rank * share, (rank + 1) * share)]
+    return Batch(*(np.stack([getattr(one, name) for one in samples]) for name in Batch._fields))
 
 
 # `sightline train`: scenes, training, thresholds, ONNX file, score, model card. Shell (files).
@@ -379,7 +416,7 @@ class TrainOptions:
     """Options of `sightline train`."""
 
     out: Path
-    scenes: int
+    scenes: SceneSource
     training: Training
     device: str
     jobs: int
@@ -393,11 +430,11 @@ class TrainOptions:
 
 def run_training(options: TrainOptions, log: Callable[[str], None], progress: Progress) -> Path:
     """Everything, in order; the model's path. What a run that was cut left in the folder is gone on with."""
-    with progress(options.scenes, "scenes") as advance:
+    with progress(options.scenes.total, "scenes") as advance:
         scenes = drawn_scenes(options.out, options.scenes, options.jobs, advance)
     if options.start is not None:
         start_from(options.start, scenes, options.training, options.out)
-    weights = train(scenes, options.training, options.device, options.out, log)
+    weights = train(scenes, options.training, options.device, options.out, log, feeders=options.jobs)
     log("thresholds are being chosen on scenes of other seeds")
     thresholds = chosen_thresholds(options.out / "unchosen.onnx", weights, options.validated, options.jobs, progress)
     model = options.out / MODEL
@@ -406,7 +443,7 @@ def run_training(options: TrainOptions, log: Callable[[str], None], progress: Pr
     report = final_report(model, options.judged, progress)
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
     parameters = sum(int(one.size) for one in weights.values())
-    card = Card(options.training, options.scenes, options.device, thresholds, parameters, model.stat().st_size, digest,
-                options.validated, report)
+    card = Card(options.training, options.scenes.count, options.device, thresholds, parameters, model.stat().st_size,
+                digest, options.validated, report)
     (options.out / CARD).write_text(card_text(card), "utf-8")
     return model

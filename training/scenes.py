@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import simplejpeg
 
+from sightline.evaluation.photographs import read_photographs
 from sightline.evaluation.processes import worker_pool
 from sightline.protocol.errors import ConfigError
 from sightline.sim.scenes.model import (
@@ -27,9 +29,12 @@ from sightline.sim.scenes.model import (
     Box,
     Column,
     LabelledBox,
+    PhotoScene,
     Random,
+    Scene,
     trained_column,
 )
+from sightline.sim.scenes.photos import photo_scene
 from sightline.sim.scenes.plan import with_defects
 from sightline.sim.scenes.render import SceneRenderer
 from sightline.training.network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
@@ -50,6 +55,13 @@ class DrawnScenes:
     unclear: tuple[tuple[Box, ...], ...]
     others: tuple[tuple[Box, ...], ...]
     """Boxes of distractors: things without a label."""
+    simulated: int | None = None
+    """The scenes from this one on are over photographs, in which only balls are labeled; None if none is."""
+
+    @property
+    def own(self) -> int:
+        """Number of scenes that the simulator has drawn."""
+        return len(self.truths) if self.simulated is None else self.simulated
 
     def digest(self) -> str:
         """Hash the scenes: their number, their truths, the first image."""
@@ -59,38 +71,72 @@ class DrawnScenes:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle images on disk by name: the receiver opens them again."""
         pictures = self.pictures.filename if isinstance(self.pictures, np.memmap) else self.pictures
-        return _reopened, (pictures, self.truths, self.unclear, self.others)
+        return _reopened, (pictures, self.truths, self.unclear, self.others, self.simulated)
 
 
 def _reopened(pictures: Any, *rest: Any) -> DrawnScenes:
     return DrawnScenes(pictures if isinstance(pictures, np.ndarray) else np.load(pictures, mmap_mode="r"), *rest)
 
 
-def drawn_scenes(folder: Path, count: int, jobs: int, advance: Callable[[int], None]) -> DrawnScenes:
-    """Scenes of the seeds 0 to `count`, drawn now or taken from `folder`, where they were drawn before."""
-    if not 0 < count <= VALIDATED_FROM:
-        raise ConfigError(f"--scenes {count}: 1 to {VALIDATED_FROM}; seeds from there on validate and score")
+@dataclass(frozen=True, slots=True)
+class SceneSource:
+    """Where scenes come from: `count` of the simulator, with each `every`-th seed from 0 up, then `over_photos` over
+    the photographs of a folder."""
+
+    count: int
+    over_photos: int = 0
+    photos: Path | None = None
+    every: int = 1
+
+    @property
+    def total(self) -> int:
+        """Scenes of both kinds."""
+        return self.count + self.over_photos
+
+    def drawn(self, renderer: SceneRenderer, number: int) -> Scene | PhotoScene:
+        """Draw one scene."""
+        if number < self.count:
+            seed = number * self.every
+            return renderer.scene(seed, trained_column(seed))
+        assert self.photos is not None
+        return photo_scene(_photographs(self.photos), number - self.count)
+
+
+@cache
+def _photographs(folder: Path) -> tuple[npt.NDArray[np.uint8], ...]:
+    """Read once per process."""
+    return tuple(one.rgb for one in read_photographs(folder))
+
+
+def drawn_scenes(folder: Path, source: SceneSource, jobs: int, advance: Callable[[int], None]) -> DrawnScenes:
+    """Scenes of `source`, drawn now or taken from `folder`, where they were drawn before."""
+    if not 0 < source.count * source.every <= VALIDATED_FROM:
+        raise ConfigError(f"--scenes {source.count}: 1 to {VALIDATED_FROM // source.every}; seeds from "
+                          f"{VALIDATED_FROM} up validate and score")
     pictures, notes = folder / "scenes.npy", folder / "scenes.json"
-    if _would_be_the_same(pictures, notes, count):
-        advance(count)
+    if _would_be_the_same(pictures, notes, source):
+        advance(source.total)
     else:
         folder.mkdir(parents=True, exist_ok=True)
         notes.unlink(missing_ok=True)  # it no longer describes the drawn scenes
-        _draw_all(pictures, notes, count, jobs, advance)
+        _draw_all(pictures, notes, source, jobs, advance)
     rows = json.loads(notes.read_text("utf-8"))
     truths = tuple(tuple(_truth(one) for one in row["truths"]) for row in rows)
     unclear, others = (tuple(tuple((*one,) for one in row[kind]) for row in rows) for kind in ("unclear", "others"))
-    return DrawnScenes(np.load(pictures, mmap_mode="r"), truths, unclear, others)
+    return DrawnScenes(np.load(pictures, mmap_mode="r"), truths, unclear, others,
+                       source.count if source.over_photos else None)
 
 
-def _would_be_the_same(pictures: Path, notes: Path, count: int) -> bool:
+def _would_be_the_same(pictures: Path, notes: Path, source: SceneSource) -> bool:
     """Check that they were drawn whole, as many, and as they would be now: the first of each kind are compared."""
-    if not notes.exists() or not pictures.exists() or len(json.loads(notes.read_text("utf-8"))) != count:
+    if not notes.exists() or not pictures.exists() or len(json.loads(notes.read_text("utf-8"))) != source.total:
         return False
     drawn = np.load(pictures, mmap_mode="r")
     with SceneRenderer() as renderer:
-        return all(np.array_equal(drawn[seed], renderer.scene(seed, trained_column(seed)).rgb)
-                   for first in (0, LATER_FROM, HARDER_FROM) for seed in range(first, min(count, first + _TRIED)))
+        return all(np.array_equal(drawn[number], source.drawn(renderer, number).rgb)
+                   for first in (0, LATER_FROM // source.every, HARDER_FROM // source.every, source.count,
+                                 source.total - _TRIED)
+                   for number in range(max(0, first), min(source.total, first + _TRIED)))
 
 
 def _truth(one: list[Any]) -> LabelledBox:
@@ -98,13 +144,13 @@ def _truth(one: list[Any]) -> LabelledBox:
     return LabelledBox(label, (box[0], box[1], box[2], box[3]), seen)
 
 
-def _draw_all(pictures: Path, notes: Path, count: int, jobs: int, advance: Callable[[int], None]) -> None:
-    shape = (count, HEIGHT_PX, WIDTH_PX, 3)
+def _draw_all(pictures: Path, notes: Path, source: SceneSource, jobs: int, advance: Callable[[int], None]) -> None:
+    shape = (source.total, HEIGHT_PX, WIDTH_PX, 3)
     np.lib.format.open_memmap(pictures, "w+", np.uint8, shape).flush()
-    rows: list[dict[str, Any]] = [{} for _ in range(count)]
+    rows: list[dict[str, Any]] = [{} for _ in range(source.total)]
     with worker_pool(jobs) as pool:  # they write straight into the file
-        waiting = [pool.submit(_draw, pictures, range(first, min(first + _SLICE, count)))
-                   for first in range(0, count, _SLICE)]
+        waiting = [pool.submit(_draw, pictures, source, range(first, min(first + _SLICE, source.total)))
+                   for first in range(0, source.total, _SLICE)]
         for done in as_completed(waiting):
             first, drawn = done.result()
             rows[first : first + len(drawn)] = drawn
@@ -113,18 +159,18 @@ def _draw_all(pictures: Path, notes: Path, count: int, jobs: int, advance: Calla
     notes.with_suffix(".part").replace(notes)
 
 
-def _draw(pictures: Path, seeds: Sequence[int]) -> tuple[int, list[dict[str, Any]]]:
-    """One slice of seeds into the file; what is in them."""
+def _draw(pictures: Path, source: SceneSource, numbers: Sequence[int]) -> tuple[int, list[dict[str, Any]]]:
+    """One slice of scenes into the file; what is in them."""
     store = np.lib.format.open_memmap(pictures, "r+")
     rows = []
     with SceneRenderer() as renderer:
-        for seed in seeds:
-            scene = renderer.scene(seed, trained_column(seed))
-            store[seed] = scene.rgb
+        for number in numbers:
+            scene = source.drawn(renderer, number)
+            store[number] = scene.rgb
             truths = [[one.label, one.box, one.seen] for one in scene.truths]
             rows.append({"truths": truths, "unclear": scene.unclear, "others": scene.others})
     store.flush()
-    return seeds[0], rows
+    return numbers[0], rows
 
 
 # Scenes into what the network learns from: a spoiled cut-out, and the heat maps that it should give. Pure.
@@ -136,11 +182,15 @@ WHOLE_PX: Final = (WIDTH_PX, HEIGHT_PX)
 _LEAST_LEFT: Final = 0.4  # of an object's box after the cut; with less left it is neither right nor wrong
 _NEW: Final = 0.5  # of the samples of a harder round: drawn from the scenes that it adds alone
 _AROUND_OTHERS: Final = 0.3  # of those samples: cut around distractors, where others are around objects
+_OVER_PHOTOS: Final = 0.5  # of the samples, if there are such scenes
 _SPREAD: Final = 0.09  # standard deviation of the bump on the heat map, by the object's side
 _LEAST_SPREAD: Final = 0.6  # cells
 _SURE: Final = 0.4  # of the bump: cells from there up learn where the object's edges are
 
 Array = npt.NDArray[np.float32]
+_ALL_KNOWN: Final = np.ones(len(LABELS) + TAUGHT, np.float32)
+_IN_PHOTOS: Final = np.array([label == "ball" for label in LABELS] + [True] * TAUGHT, np.float32)
+"""A photograph may show lights and legs that nobody has labeled."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +206,8 @@ class TrainingSample:
     """(H/4, W/4): how much a cell's geometry counts."""
     counts: Array
     """(H/4, W/4): 0 where the right output is not known."""
+    known: Array
+    """(labels and `TAUGHT`,): 0 for a label that is not known to be nowhere else in the image."""
 
 
 def sample(
@@ -163,7 +215,11 @@ def sample(
 ) -> TrainingSample:
     """Draw a scene, a cut, a side and defects, always the same for the same seed, step and place in a batch."""
     draw = np.random.default_rng(numbers)
-    number, around, column = (_harder if shown.harder else _plain)(draw, scenes, shown)
+    is_photo = scenes.own < len(scenes.truths) and draw.random() < _OVER_PHOTOS
+    if is_photo:
+        number, around, column = _photo(draw, scenes)
+    else:
+        number, around, column = (_harder if shown.harder else _plain)(draw, scenes, shown)
     left, top = _cut(draw, around, size_px)
     rgb = scenes.pictures[number][top : top + size_px[1], left : left + size_px[0]]
     mirrored = bool(draw.random() < 0.5)
@@ -172,7 +228,16 @@ def sample(
     moved = [(one, _moved(one.box, left, top, size_px, mirrored)) for one in scenes.truths[number]]
     unclear, others = ([_moved(one, left, top, size_px, mirrored) for one in boxes]
                        for boxes in (scenes.unclear[number], scenes.others[number]))
-    return _wanted(np.ascontiguousarray(bgr.transpose(2, 0, 1)), moved, unclear, others)
+    known = (_IN_PHOTOS if is_photo else _ALL_KNOWN).copy()
+    return _wanted(np.ascontiguousarray(bgr.transpose(2, 0, 1)), moved, unclear, others, known)
+
+
+def _photo(draw: Random, scenes: DrawnScenes) -> tuple[int, list[Box], Column]:
+    """A scene over a photograph, what of it a cut is made around, its defects."""
+    number = int(draw.integers(scenes.own, len(scenes.truths)))
+    labelled = [one.box for one in scenes.truths[number]]
+    around = list(scenes.others[number]) if draw.random() < _AROUND_OTHERS else labelled
+    return number, around, DEFECTS[int(draw.integers(len(DEFECTS)))]
 
 
 def _plain(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, list[Box], Column]:
@@ -207,11 +272,11 @@ def _moved(box: Box, left: int, top: int, size_px: tuple[int, int], mirrored: bo
 
 
 def _wanted(image: npt.NDArray[np.uint8], objects: list[tuple[LabelledBox, Box]], unclear: list[Box],
-            others: list[Box]) -> TrainingSample:
+            others: list[Box], known: Array) -> TrainingSample:
     rows, columns = image.shape[1] // STRIDE, image.shape[2] // STRIDE
     one = TrainingSample(image, np.zeros((len(LABELS) + TAUGHT, rows, columns), np.float32),
                  np.zeros((GEOMETRY, rows, columns), np.float32), np.zeros((rows, columns), np.float32),
-                 np.ones((rows, columns), np.float32))
+                 np.ones((rows, columns), np.float32), known)
     for box in unclear:
         _blank(one, box)
     for truth, box in sorted(objects, key=lambda pair: -_area(pair[1])):

@@ -345,6 +345,7 @@ def _summary(results: "Results", folder: Path) -> str:
 STEPS = [15_000, 14_000, 13_000, 14_000, 20_000, 20_000]
 SCENES = 100_000
 BATCH = 32
+OVER_PHOTOS = 60_000
 VALIDATED = 5000
 """The values of the shipped model, so that the same command makes a model like it; a test compares them. (Its rounds
 were trained one by one, the last from the file before, as its card states.)"""
@@ -365,6 +366,9 @@ def train(
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Device that trains.")] = "cpu",
     jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Processes [default: one per core].")] = None,
     start: Annotated[Path | None, typer.Option(metavar="MODEL", help=_START)] = None,
+    photos: Annotated[Path | None, typer.Option(metavar="DIR", help="Ball-free photographs as backgrounds.")] = None,
+    every: Annotated[int, typer.Option(min=1, max=1000, help="Use each n-th seed of the scenes only.")] = 1,
+    over_photos: Annotated[int, typer.Option(min=8, max=800_000, help="Scenes over the photographs.")] = OVER_PHOTOS,
     validated: Annotated[int, typer.Option(min=5, max=100_000, help="Scenes per column for thresholds.")] = VALIDATED,
     scored: Annotated[
         int, typer.Option("--scored", "--judged", min=5, help="Scenes per column for the table of the card.")
@@ -378,6 +382,7 @@ def train(
         import torch
 
         from sightline.training.loop import TrainOptions, run_training
+        from sightline.training.scenes import SceneSource
     if device == "cuda" and not torch.cuda.is_available():
         raise HardwareError("--device cuda: PyTorch finds no GPU; check `nvidia-smi` and that PyTorch is a CUDA "
                             "build, or use --device cpu")
@@ -385,7 +390,8 @@ def train(
     weights, digest = _begun(start) if start else (None, "")
     sharing = _sharing(batch, processes) if device == "cpu" else 1
     training = Training(tuple(steps), batch, seed=seed, jobs=sharing, start=digest)
-    options = TrainOptions(out, scenes, training, device, processes, validated, scored, weights)
+    source = SceneSource(scenes, over_photos if photos else 0, photos, every)
+    options = TrainOptions(out, source, training, device, processes, validated, scored, weights)
     try:
         out.mkdir(parents=True, exist_ok=True)
         model = run_training(options, _print_line, progress_bar)

@@ -198,6 +198,16 @@ class Scene:
     """Labeled objects that are hardly in view. A detection of them is neither right nor wrong."""
 
 
+@dataclass(frozen=True, slots=True)
+class PhotoScene:
+    """A scene over a photograph: RGB (240, 320, 3), and boxes as in `Scene`. The photograph itself is not labeled."""
+
+    rgb: npt.NDArray[np.uint8]
+    truths: tuple[LabelledBox, ...]
+    others: tuple[Box, ...]
+    unclear: tuple[Box, ...]
+
+
 def trained_column(seed: int) -> Column:
     """Return the column of a training scene."""
     return HARDER if seed >= HARDER_FROM else TRAINED

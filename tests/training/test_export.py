@@ -12,12 +12,15 @@ demanded.module("pybullet", "sim")
 
 import cv2
 
+from sightline.evaluation.photographs import FEWEST, read_photographs
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import ConfigError
-from sightline.sim.scenes.model import HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox
+from sightline.sim.scenes.model import HARDER, HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox
+from sightline.sim.scenes.photos import photo_scene
+from sightline.sim.scenes.render import SceneRenderer
 from sightline.training.network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
-from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, drawn_scenes, sample
-from sightline.training.schedule import SceneRange
+from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, SceneSource, _photographs, drawn_scenes, sample
+from sightline.training.schedule import SceneRange, Training
 from tests.training.fixture import weights
 
 BALL = LabelledBox("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
@@ -158,9 +161,9 @@ def test_each_label_has_a_separate_map():
 
 def test_scenes_are_drawn_once(tmp_path):
     told = []
-    first = drawn_scenes(tmp_path, 8, 1, told.append)
+    first = drawn_scenes(tmp_path, SceneSource(8), 1, told.append)
     stamp = (tmp_path / "scenes.npy").stat().st_mtime_ns
-    again = drawn_scenes(tmp_path, 8, 1, told.append)
+    again = drawn_scenes(tmp_path, SceneSource(8), 1, told.append)
     assert (tmp_path / "scenes.npy").stat().st_mtime_ns == stamp and told == [8, 8]
     sent = pickle.loads(pickle.dumps(again))  # as to the processes that train
     assert len(pickle.dumps(again)) < 20_000 and np.array_equal(sent.pictures, again.pictures)
@@ -171,22 +174,58 @@ def test_scenes_are_drawn_once(tmp_path):
 
 @pytest.mark.slow
 def test_scenes_are_drawn_again_when_they_would_be_others_now_or_were_cut(tmp_path, monkeypatch):
-    first = drawn_scenes(tmp_path, 3, 1, lambda _: None)
+    first = drawn_scenes(tmp_path, SceneSource(3), 1, lambda _: None)
     (tmp_path / "scenes.json").unlink()  # as a run leaves it that is cut while it draws
-    again = drawn_scenes(tmp_path, 3, 1, lambda _: None)
+    again = drawn_scenes(tmp_path, SceneSource(3), 1, lambda _: None)
     assert np.array_equal(first.pictures, again.pictures) and first.digest() == again.digest()
     notes = tmp_path / "scenes.json"
     stamp = notes.stat().st_mtime_ns
     pictures = np.lib.format.open_memmap(tmp_path / "scenes.npy", "r+")
     pictures[1] += 1  # as if they were drawn by an older program
     pictures.flush()
-    assert drawn_scenes(tmp_path, 3, 1, lambda _: None).truths == first.truths and notes.stat().st_mtime_ns > stamp
-    assert drawn_scenes(tmp_path, 2, 1, lambda _: None).digest() != first.digest()
+    assert drawn_scenes(tmp_path, SceneSource(3), 1, lambda _: None).truths == first.truths
+    assert notes.stat().st_mtime_ns > stamp
+    assert drawn_scenes(tmp_path, SceneSource(2), 1, lambda _: None).digest() != first.digest()
 
 
 def test_no_scene_of_another_purpose_is_trained_on(tmp_path):
-    with pytest.raises(ConfigError, match="--scenes 800001"):
-        drawn_scenes(tmp_path, 800_001, 1, lambda _: None)
+    for source in (SceneSource(800_001), SceneSource(200_001, every=4)):
+        with pytest.raises(ConfigError, match=f"--scenes {source.count}: 1 to {800_000 // source.every}"):
+            drawn_scenes(tmp_path, source, 1, lambda _: None)
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for seed in range(FEWEST):
+        coarse = np.random.default_rng(seed).integers(0, 255, (5, 7, 3), np.uint8)
+        cv2.imwrite(str(folder / f"{seed:02}.jpg"), cv2.resize(coarse, (WIDTH_PX + seed, HEIGHT_PX)))
+    return folder
+
+
+def test_scenes_over_photographs_are_half_of_what_is_shown(tmp_path, photographs):
+    drawn = drawn_scenes(tmp_path, SceneSource(4, 6, photographs, every=25_000), 1, lambda _: None)
+    assert drawn.own == 4 and len(drawn.truths) == 10
+    with SceneRenderer() as renderer:
+        assert np.array_equal(drawn.pictures[3], renderer.scene(75_000, HARDER).rgb)
+    pictures = [one.rgb for one in read_photographs(photographs)]
+    assert np.array_equal(drawn.pictures[5], photo_scene(pictures, 1).rgb)
+    shown_at = Training((1, 1, 10)).shown_at(5, drawn.own)
+    samples = [sample(drawn, shown_at, (1, 5, place), CUT_PX) for place in range(200)]
+    over_photos = [one for one in samples if not one.known.all()]
+    assert 70 < len(over_photos) < 130
+    assert all(one.known.tolist() == [1, 0, 0, 0, 0, 1] for one in over_photos)  # balls and other things only
+
+
+def test_scenes_are_drawn_again_for_other_photographs(tmp_path, photographs):
+    source = SceneSource(2, 8, photographs)
+    first = drawn_scenes(tmp_path, source, 1, lambda _: None).pictures.copy()
+    for one in photographs.iterdir():
+        cv2.imwrite(str(one), 255 - cv2.imread(str(one)))
+    _photographs.cache_clear()
+    again = drawn_scenes(tmp_path, source, 1, lambda _: None)
+    assert np.array_equal(first[:2], again.pictures[:2]) and not np.array_equal(first[2:], again.pictures[2:])
 
 
 def test_training_without_pytorch_prints_the_install_command(monkeypatch, capsys, tmp_path):

@@ -72,6 +72,32 @@ def test_interrupted_training_ends_with_the_same_result(tmp_path, monkeypatch):
             train(others, again, "cpu", cut, said.append)
 
 
+def test_processes_that_feed_a_gpu_prepare_the_same_batches():
+    training = Training((1, 1, 4), batch=4, seed=2)
+    plain = list(train_run._batches(scenes(), training, 1))
+    fed = list(train_run._fed(scenes(), training, 1, 2))
+    assert len(plain) == len(fed) == 5
+    assert all(np.array_equal(one, other.numpy()) for first, second in zip(plain, fed, strict=True)
+               for one, other in zip(first, second, strict=True))
+    assert not multiprocessing.active_children()
+
+
+def test_a_label_that_is_not_known_is_not_learned():
+    """A photograph may show legs that nobody labeled: whatever the network says there changes no loss."""
+    draw = torch.Generator().manual_seed(1)
+    batch = next(train_run._batches(scenes(), Training((1,), batch=2, seed=2), 0))
+    given = torch.randn((*batch.heat.shape[:1], OUTPUTS + 1, *batch.heat.shape[2:]), generator=draw)
+    known = np.array([[1, 0, 0, 0, 0, 1]] * len(batch.known), np.float32)
+    other = given.clone()
+    other[:, 1 : len(LABELS)] += 3.0
+
+    def loss(answer, some):
+        return float(train_run._loss(answer, some, torch.as_tensor))
+
+    assert loss(given, batch._replace(known=known)) == loss(other, batch._replace(known=known))
+    assert loss(given, batch) != loss(other, batch)
+
+
 @pytest.mark.slow
 def test_two_processes_train_one_network(tmp_path, capfd):
     """The second's share counts: the same first half alone ends elsewhere; and a cut is gone on from."""
