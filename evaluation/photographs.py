@@ -32,7 +32,7 @@ class Photograph:
 
 
 def read_photographs(folder: Path) -> tuple[Photograph, ...]:
-    """Return the photographs of a folder by name. Raises ConfigError for a file that is none, or for too few."""
+    """Return the photographs of a folder by name. Raises ConfigError for an invalid file, or for too few."""
     try:
         files = sorted(one for one in folder.iterdir() if one.suffix.lower() in _ENDINGS)
     except OSError as error:
@@ -68,7 +68,7 @@ def _size(path: Path, data: bytes) -> tuple[int, int]:
     try:
         height, width, _, _ = simplejpeg.decode_jpeg_header(data)
     except ValueError:
-        raise ConfigError(f"{path} is no JPEG or PNG image; remove it, or rename it") from None
+        raise ConfigError(f"{path} is not a JPEG or PNG image; remove it, or rename it") from None
     return int(width), int(height)
 
 

@@ -263,6 +263,9 @@ def _checkpoint(path: Path, made_by: str, device: Any) -> dict[str, Any] | None:
     return kept
 
 
+BATCHED: Final = ("image", "heat", "geometry", "sure", "counts", "known")
+
+
 class Batch(NamedTuple):
     """Samples side by side: the arrays of `TrainingSample`, each with one more axis before its own."""
 
@@ -308,7 +311,8 @@ class _State:
         self._schedule.step()
         share = min(_AVERAGED, (step + 1) / (step + 10))
         now = {name: value for name, value in self.network.state_dict().items() if value.is_floating_point()}
-        torch._foreach_lerp_([self.average[name] for name in now], list(now.values()), 1 - share)
+        for name, value in now.items():
+            self.average[name].lerp_(value, 1 - share)
         return loss.detach()
 
     def _average_gradients(self) -> None:
@@ -402,7 +406,7 @@ def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> Bat
     share, shown = max(1, count // training.jobs), training.shown_at(step, scenes.own)
     samples = [sample(scenes, shown, (training.seed, step, place), size_px)
                for place in range(rank * share, (rank + 1) * share)]
-    return Batch(*(np.stack([getattr(one, name) for one in samples]) for name in Batch._fields))
+    return Batch(*(np.stack([getattr(one, name) for one in samples]) for name in BATCHED))
 
 
 # `sightline train`: scenes, training, thresholds, ONNX file, score, model card. Shell (files).

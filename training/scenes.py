@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -39,9 +39,17 @@ from sightline.sim.scenes.plan import with_defects
 from sightline.sim.scenes.render import SceneRenderer
 from sightline.training.network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
 from sightline.training.schedule import SceneRange
+from sightline.vision_side.decode import DecodedImage
+from sightline.vision_side.detect.onnx.engine import open_engine
+from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
+from sightline.vision_side.detect.port import corners, overlap
 
 _SLICE: Final = 100
 """Scenes that one process draws between two reports of progress."""
+_MINED_FROM: Final = 0.3
+"""Score from which a false ball is one to learn from."""
+_OF_A_BALL: Final = 0.1
+"""Intersection by union with a labeled ball from which a detection may be of that ball."""
 _TRIED: Final = 4
 """Scenes of each kind that are drawn again, to check that the stored ones are still valid."""
 
@@ -80,13 +88,15 @@ def _reopened(pictures: Any, *rest: Any) -> DrawnScenes:
 
 @dataclass(frozen=True, slots=True)
 class SceneSource:
-    """Where scenes come from: `count` of the simulator, with each `every`-th seed from 0 up, then `over_photos` over
+    """The origin of scenes: `count` of the simulator, with each `every`-th seed from 0 up, then `over_photos` over
     the photographs of a folder."""
 
     count: int
     over_photos: int = 0
     photos: Path | None = None
     every: int = 1
+    mined_with: Path | None = None
+    """Model whose false balls in scenes over photographs are added to the other things there."""
 
     @property
     def total(self) -> int:
@@ -99,13 +109,41 @@ class SceneSource:
             seed = number * self.every
             return renderer.scene(seed, trained_column(seed))
         assert self.photos is not None
-        return photo_scene(_photographs(self.photos), number - self.count)
+        scene = photo_scene(_photographs(self.photos), number - self.count)
+        return scene if self.mined_with is None else with_false_balls(scene, open_miner(self.mined_with))
 
 
 @cache
 def _photographs(folder: Path) -> tuple[npt.NDArray[np.uint8], ...]:
     """Read once per process."""
     return tuple(one.rgb for one in read_photographs(folder))
+
+
+Miner = Callable[[npt.NDArray[np.uint8]], list[Box]]
+"""Takes an image, BGR; returns the boxes of what it takes for balls."""
+
+
+@cache
+def open_miner(model: Path) -> Miner:
+    """Open a model once per process."""
+    engine = open_engine(model, "cpu", 1)
+    form = model_format(engine.header, (), "auto")
+
+    def balls(bgr: npt.NDArray[np.uint8]) -> list[Box]:
+        picture = DecodedImage(bgr, 1)
+        pixels, fitting = fit_picture(picture, form)
+        found = read_outputs(engine.run(pixels), form, fitting, picture, _MINED_FROM)
+        return [corners(one) for one in found if one.label == "ball"]
+
+    return balls
+
+
+def with_false_balls(scene: PhotoScene, miner: Miner) -> PhotoScene:
+    """Return the scene with what `miner` takes for a ball where none is among its other things."""
+    labelled = [*(one.box for one in scene.truths), *scene.unclear]
+    found = [box for box in miner(np.ascontiguousarray(scene.rgb[..., ::-1]))
+             if not any(overlap(box, one) > _OF_A_BALL for one in labelled)]
+    return replace(scene, others=(*scene.others, *found))
 
 
 def drawn_scenes(folder: Path, source: SceneSource, jobs: int, advance: Callable[[int], None]) -> DrawnScenes:
@@ -190,7 +228,7 @@ _SURE: Final = 0.4  # of the bump: cells from there up learn where the object's 
 Array = npt.NDArray[np.float32]
 _ALL_KNOWN: Final = np.ones(len(LABELS) + TAUGHT, np.float32)
 _IN_PHOTOS: Final = np.array([label == "ball" for label in LABELS] + [True] * TAUGHT, np.float32)
-"""A photograph may show lights and legs that nobody has labeled."""
+"""A photograph may show lights and legs without a label."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,13 +120,13 @@ def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks:
         for seed in seeds:
             scene = renderer.scene(seed, column)
             jpeg = as_seen(scene)
-            said = [_answer(one.detector, seed, jpeg, decoder, looks) for one in asked]
+            said = [answer_of(one.detector, seed, jpeg, decoder, looks) for one in asked]
             yield ScoredScene(scene, jpeg, tuple(one if isinstance(one, DetectionResult) else None for one in said),
                        tuple(one if isinstance(one, str) else "" for one in said))
 
 
-def _answer(detector: Detector, seed: int, jpeg: bytes, decoder: Decoder, looks: int) -> DetectionResult | str:
-    """Return the answer of the last call, or the cause of a missing one."""
+def answer_of(detector: Detector, seed: int, jpeg: bytes, decoder: Decoder, looks: int) -> DetectionResult | str:
+    """Return the answer of the last call, in a session of its own, or the cause of a missing one."""
     result: DetectionResult | str = ""
     for look in range(looks):
         header = FrameHeader(session=f"{seed:08x}", seq=look, t_us=(1 + look) * _FRAME_US)

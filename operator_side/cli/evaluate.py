@@ -177,6 +177,8 @@ def score(
 
 
 COMPARED = ("hsv", "onnx")
+PHOTO_FRAMES, PHOTO_SEED = 60, 1
+_PHOTOS = "Score balls in these photographs instead, and false alarms in the photographs themselves."
 FRAMES = 100
 FROM = 900_000
 """The same as in sim/scenes/model.py, whose imports are too heavy for the command line. A test compares them."""
@@ -192,6 +194,7 @@ def detectors(
     ] = None,
     seeds: Annotated[int, typer.Option(min=0, max=10**9, metavar="FROM", help="Seed of the first scene.")] = FROM,
     column: Annotated[str, typer.Option(help="`all`, or names separated by commas, e.g. blur,all at once.")] = "all",
+    photos: Annotated[Path | None, typer.Option(metavar="DIR", help=_PHOTOS)] = None,
     looks: Annotated[int, typer.Option(min=1, max=100, help="Detections of each scene; `adaptive` needs several.")] = 1,
     demand: Annotated[
         bool, typer.Option("--demand", help="Check the bounds of a learned detector; exit code 5 if it fails.")
@@ -213,6 +216,11 @@ def detectors(
             close_subjects,
             score_scenes,
         )
+    if photos is not None:
+        if demand or column != "all":
+            raise ConfigError("--photos scores photographs, without --column and --demand")
+        subjects = _subjects(names or COMPARED, config, sets or (), device)
+        return _score_photos(photos, subjects, frames or PHOTO_FRAMES, looks, as_json)
     if demand and seeds < FROM:
         raise ConfigError(f"--demand needs seeds from {FROM} up, which no training uses; {seeds} is lower")
     columns, shown = _columns(column), frames or (DEMANDED_FRAMES if demand else FRAMES)
@@ -223,6 +231,21 @@ def detectors(
     finally:
         close_subjects(subjects)
     return _print_report(report, all_detector_checks(report) if demand else None, as_json)
+
+
+def _score_photos(photos: Path, subjects: "list[Subject]", each: int, looks: int, as_json: bool) -> int:
+    from sightline.evaluation.photographs import read_photographs
+    from sightline.evaluation.score.ball_textures import KINDS
+    from sightline.evaluation.score.detector_report import close_subjects
+    from sightline.evaluation.score.photo_report import photo_lines, score_photos
+
+    try:
+        photographs = read_photographs(photos)
+        with progress_bar(len(KINDS) * each + len(photographs)) as advance:
+            report = score_photos(subjects, photographs, each, PHOTO_SEED, looks=looks, advance=advance)
+    finally:
+        close_subjects(subjects)
+    return print_result(report.to_dict(), photo_lines(report), as_json)
 
 
 def _subjects(
@@ -345,6 +368,7 @@ def _summary(results: "Results", folder: Path) -> str:
 STEPS = [15_000, 14_000, 13_000, 14_000, 20_000, 20_000]
 SCENES = 100_000
 BATCH = 32
+RATE = 0.003
 OVER_PHOTOS = 60_000
 VALIDATED = 5000
 """The values of the shipped model, so that the same command makes a model like it; a test compares them. (Its rounds
@@ -362,6 +386,7 @@ def train(
     scenes: Annotated[int, typer.Option(min=8, max=800_000, help="Scenes to generate, with seeds from 0 up.")] = SCENES,
     steps: Annotated[list[int], typer.Option(min=1, max=10_000_000, metavar="<int range>", help=_STEPS)] = STEPS,
     batch: Annotated[int, typer.Option(min=2, max=1024, help="Cut-outs of scenes in each step.")] = BATCH,
+    rate: Annotated[float, typer.Option(min=1e-6, max=1.0, help="Highest learning rate of the first round.")] = RATE,
     seed: Annotated[int, typer.Option(min=0, max=2**31, help="Seed of weights, cut-outs and defects.")] = 1,
     device: Annotated[Literal["cpu", "cuda"], typer.Option(help="Device that trains.")] = "cpu",
     jobs: Annotated[int | None, typer.Option(min=1, max=256, help="Processes [default: one per core].")] = None,
@@ -389,8 +414,8 @@ def train(
     processes = jobs or os.cpu_count() or 1
     weights, digest = _begun(start) if start else (None, "")
     sharing = _sharing(batch, processes) if device == "cpu" else 1
-    training = Training(tuple(steps), batch, seed=seed, jobs=sharing, start=digest)
-    source = SceneSource(scenes, over_photos if photos else 0, photos, every)
+    training = Training(tuple(steps), batch, rate, seed=seed, jobs=sharing, start=digest)
+    source = SceneSource(scenes, over_photos if photos else 0, photos, every, start if photos else None)
     options = TrainOptions(out, source, training, device, processes, validated, scored, weights)
     try:
         out.mkdir(parents=True, exist_ok=True)

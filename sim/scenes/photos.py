@@ -9,11 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from sightline.sim.scenes.model import HEIGHT_PX, MOST_HIDDEN, WIDTH_PX, Box, LabelledBox, PhotoScene, Random
-from sightline.sim.scenes.sprites import Array, Light, Sprite, any_light, ball, thing
+from sightline.sim.scenes.sprites import Array, Sprite, SpriteLight, any_light, ball, thing
 
 Picture = npt.NDArray[np.uint8]
 
-BALL_PX: Final = (8.0, 110.0)
+BALL_PX: Final = (9.0, 110.0)
 _WITHOUT_BALL: Final = 0.3
 _MOST_THINGS: Final = 4
 _LEAST_SHARE: Final = 0.35
@@ -77,8 +77,8 @@ def _laid(canvas: Array, draw: Random, is_ball: bool) -> Laid:
     return cover, box, min(1.0, float(cover.sum()) / max(whole, 1.0))
 
 
-def _light_at(canvas: Array, x: float, y: float, width_px: float, draw: Random) -> Light:
-    """Light of about the brightness and a little of the color of the place."""
+def _light_at(canvas: Array, x: float, y: float, width_px: float, draw: Random) -> SpriteLight:
+    """SpriteLight of about the brightness and a little of the color of the place."""
     half = max(8, int(width_px))
     rows = slice(max(0, int(y) - half), max(1, min(HEIGHT_PX, int(y) + half)))
     columns = slice(max(0, int(x) - half), max(1, min(WIDTH_PX, int(x) + half)))

@@ -1,4 +1,4 @@
-"""Draws balls of many designs, and things that are no balls, as sprites to lay over a photograph. Pure."""
+"""Draws balls of many designs, and other things, as sprites to lay over a photograph. Pure."""
 
 import math
 from collections.abc import Callable
@@ -22,7 +22,7 @@ _ICOSAHEDRON: Final = np.array([[a, b * (1 + math.sqrt(5)) / 2, 0] for a in (-1,
 
 @dataclass(frozen=True, slots=True)
 class Sprite:
-    """What covers a part of an image."""
+    """An image that covers a part of another."""
 
     rgb: Array
     """(H, W, 3), 0..1."""
@@ -31,8 +31,8 @@ class Sprite:
 
 
 @dataclass(frozen=True, slots=True)
-class Light:
-    """How a place is lit."""
+class SpriteLight:
+    """The light at a place."""
 
     towards: Array
     """Unit vector to the light: right, down, out of the image."""
@@ -42,16 +42,16 @@ class Light:
     """Color and strength, about 1."""
 
 
-def any_light(draw: Random, rgb: Array) -> Light:
+def any_light(draw: Random, rgb: Array) -> SpriteLight:
     """Draw a light from above, of that color."""
     towards = np.array([draw.normal(0, 0.6), -draw.uniform(0.3, 1.0), draw.uniform(0.05, 0.9)], np.float32)
-    return Light(towards / np.linalg.norm(towards), draw.uniform(0.3, 0.85), rgb)
+    return SpriteLight(towards / np.linalg.norm(towards), draw.uniform(0.3, 0.85), rgb)
 
 
 # --- balls ---------------------------------------------------------------------------------------------------------
 
 
-def ball(draw: Random, width_px: float, light: Light) -> Sprite:
+def ball(draw: Random, width_px: float, light: SpriteLight) -> Sprite:
     """Draw a ball of that width in any color and design."""
     side = math.ceil(width_px) + 2
     x, y = _grid(side, width_px)
@@ -84,7 +84,7 @@ def _turn(draw: Random) -> Array:
     return np.asarray(matrix * np.sign(np.diag(upper)), np.float32)
 
 
-def _lit(draw: Random, paint: Array, normal: Array, light: Light) -> Array:
+def _lit(draw: Random, paint: Array, normal: Array, light: SpriteLight) -> Array:
     """Shade `paint`: light from one side and from all, brighter from above, and on half of the balls a highlight."""
     direct = np.maximum(normal @ light.towards, 0)
     around = light.ambient * (1 - draw.uniform(0.1, 0.45) * (normal[..., 1] + 0.3))
@@ -228,11 +228,11 @@ _DESIGNS: Final[tuple[Callable[[Random, Array], Array], ...]] = (
 _WEIGHTS: Final = (0.48, 0.10, 0.09, 0.09, 0.10, 0.06, 0.04, 0.04)
 
 
-# --- things that are no balls --------------------------------------------------------------------------------------
+# --- other things --------------------------------------------------------------------------------------------------
 
 
-def thing(draw: Random, width_px: float, light: Light) -> Sprite:
-    """Draw something that is no ball: a box, a cylinder, a cone, an oval plate, a ring, a polygon."""
+def thing(draw: Random, width_px: float, light: SpriteLight) -> Sprite:
+    """Draw another thing than a ball: a box, a cylinder, a cone, an oval plate, a ring, a polygon."""
     side = math.ceil(width_px) + 2
     x, y = _grid(side, width_px)
     inside, shade = _SHAPES[int(draw.integers(len(_SHAPES)))](draw, x, y)

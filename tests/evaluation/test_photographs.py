@@ -63,14 +63,14 @@ def png_of(width, height):
 
 
 @pytest.mark.parametrize(("content", "reason"), [
-    (b"hello, I am text", "is no JPEG or PNG"),
-    (b"", "is no JPEG or PNG"),
+    (b"hello, I am text", "is not a JPEG or PNG"),
+    (b"", "is not a JPEG or PNG"),
     (cv2.imencode(".png", np.zeros((1, 1, 3), np.uint8))[1].tobytes(), "is 1x1 pixels"),
     (png_of(30_000, 30_000), "is 30000x30000 pixels"),
     (png_of(640, 480), "cannot be decoded"),
-    (cv2.imencode(".jpg", photograph(1))[1].tobytes()[:20], "is no JPEG or PNG"),
+    (cv2.imencode(".jpg", photograph(1))[1].tobytes()[:20], "is not a JPEG or PNG"),
 ])
-def test_a_file_that_is_no_photograph_is_one_line(folder, content, reason):
+def test_an_invalid_file_is_one_line(folder, content, reason):
     (folder / "bad.jpg").write_bytes(content)
     with pytest.raises(ConfigError, match=reason) as told:
         read_photographs(folder)

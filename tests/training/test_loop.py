@@ -83,7 +83,7 @@ def test_processes_that_feed_a_gpu_prepare_the_same_batches():
 
 
 def test_a_label_that_is_not_known_is_not_learned():
-    """A photograph may show legs that nobody labeled: whatever the network says there changes no loss."""
+    """A photograph may show legs without a label: whatever the network answers there changes no loss."""
     draw = torch.Generator().manual_seed(1)
     batch = next(train_run._batches(scenes(), Training((1,), batch=2, seed=2), 0))
     given = torch.randn((*batch.heat.shape[:1], OUTPUTS + 1, *batch.heat.shape[2:]), generator=draw)

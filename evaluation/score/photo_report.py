@@ -1,0 +1,169 @@
+"""Detectors on photographs: a ball of each kind in turn, then each photograph without one. Shell (runs detectors).
+
+The balls are ray-cast by `photo_balls.py`, of which training has nothing.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final, Literal
+
+import simplejpeg
+
+from sightline.evaluation.photographs import Photograph
+from sightline.evaluation.score.ball_textures import KINDS
+from sightline.evaluation.score.detector_report import Subject, answer_of, detections
+from sightline.evaluation.score.detectors import is_hit
+from sightline.evaluation.score.photo_balls import photo_with_ball, photo_without_ball
+from sightline.sim.scenes.model import HEIGHT_PX, WIDTH_PX, LabelledBox
+from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.port import Detection, DetectionResult
+
+QUALITY: Final = 85
+SMALL_PX: Final = 12.0
+"""Balls of a smaller radius have a column of their own."""
+_OF_EMPTY: Final = 500_000
+_SEEDS: Final = 1_000_003
+"""Between the first pictures of two seeds."""
+
+Outcome = Literal["hit", "wrong", "missed"]
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoPicture:
+    """One JPEG, and the ball in it."""
+
+    number: int
+    kind: str
+    jpeg: bytes
+    ball: LabelledBox | None
+    radius_px: float
+
+
+@dataclass(slots=True)
+class BallTally:
+    """Number of balls, and of those found, taken for something elsewhere, and missed."""
+
+    balls: int = 0
+    hit: int = 0
+    wrong: int = 0
+    missed: int = 0
+
+    def add(self, outcome: Outcome) -> None:
+        """Count one picture."""
+        self.balls += 1
+        setattr(self, outcome, getattr(self, outcome) + 1)
+
+
+@dataclass(slots=True)
+class PhotoFigures:
+    """The outcomes of one detector."""
+
+    kinds: dict[str, BallTally]
+    small: BallTally
+    large: BallTally
+    """From `SMALL_PX` up."""
+    empty: int = 0
+    false_alarms: int = 0
+    """Photographs without a ball, and those of them with a detection."""
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The share of false alarms with a probability of 95 %, low and high, 0..1."""
+        return wilson(self.false_alarms, self.empty)
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoReport:
+    """Figures by detector."""
+
+    photographs: int
+    each: int
+    """Pictures of each kind."""
+    seed: int
+    figures: dict[str, PhotoFigures]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For --json."""
+        return {**asdict(self), "false_alarm_interval": {name: one.interval for name, one in self.figures.items()}}
+
+
+def wilson(count: int, total: int) -> tuple[float, float]:
+    """95 % interval of a share (Wilson, Probable Inference, 1927)."""
+    if not total:
+        return 0.0, 1.0
+    z, share = 1.96, count / total
+    middle = share + z * z / (2 * total)
+    half = z * math.sqrt(share * (1 - share) / total + z * z / (4 * total * total))
+    return max(0.0, (middle - half) / (1 + z * z / total)), min(1.0, (middle + half) / (1 + z * z / total))
+
+
+def photo_pictures(photographs: Sequence[Photograph], each: int, seed: int) -> Iterator[PhotoPicture]:
+    """Render `each` pictures of every kind, over the photographs in turn, then each photograph without a ball."""
+    first = seed * _SEEDS
+    for number in range(len(KINDS) * each):
+        rgb, kind = photographs[number % len(photographs)].rgb, KINDS[number // each]
+        drawn = photo_with_ball(rgb, kind, first + number)
+        yield PhotoPicture(number, kind, _jpeg(drawn.rgb), LabelledBox("ball", drawn.box, drawn.seen), drawn.radius_px)
+    for place, one in enumerate(photographs):
+        number = _OF_EMPTY + place
+        yield PhotoPicture(number, "", _jpeg(photo_without_ball(one.rgb, first + number)), None, 0.0)
+
+
+def _jpeg(rgb: Any) -> bytes:
+    return bytes(simplejpeg.encode_jpeg(rgb, QUALITY, "RGB", "420"))
+
+
+def score_photos(asked: Sequence[Subject], photographs: Sequence[Photograph], each: int, seed: int, *, looks: int = 1,
+                 advance: Callable[[], None] = lambda: None) -> PhotoReport:
+    """Show every picture to every detector, `looks` times in a row."""
+    decoder = Decoder(WIDTH_PX, HEIGHT_PX, WIDTH_PX * HEIGHT_PX)
+    found = {one.name: PhotoFigures({kind: BallTally() for kind in KINDS}, BallTally(), BallTally()) for one in asked}
+    for picture in photo_pictures(photographs, each, seed):
+        for one in asked:
+            answer = answer_of(one.detector, picture.number, picture.jpeg, decoder, looks)
+            _count(found[one.name], picture, _best_ball(answer, one.balls))
+        advance()
+    return PhotoReport(len(photographs), each, seed, found)
+
+
+def _best_ball(answer: DetectionResult | str, balls: Sequence[str]) -> Detection | None:
+    """Return the first detection of a ball: detectors give the best first. No answer shows none."""
+    found = detections(answer if isinstance(answer, DetectionResult) else None)
+    return next((one for one in found if one.label in balls), None)
+
+
+def _count(figures: PhotoFigures, picture: PhotoPicture, best: Detection | None) -> None:
+    if picture.ball is None:
+        figures.empty += 1
+        figures.false_alarms += best is not None
+        return
+    outcome: Outcome = "missed" if best is None else "hit" if is_hit(best, picture.ball) else "wrong"
+    figures.kinds[picture.kind].add(outcome)
+    (figures.small if picture.radius_px < SMALL_PX else figures.large).add(outcome)
+
+
+# --- the table, as text ----------------------------------------------------------------------------------------------
+
+
+def photo_lines(report: PhotoReport) -> list[str]:
+    """For a terminal and, indented, for a page."""
+    rows: list[tuple[str, ...]] = [("balls", "detector", "pictures", "hits", "wrong", "missed")]
+    for kind in (*KINDS, "small", "large"):
+        for name, figures in report.figures.items():
+            tally = figures.kinds.get(kind) or getattr(figures, kind)
+            rows.append((_NAMES.get(kind, kind), name, str(tally.balls), *(
+                f"{100 * count / max(1, tally.balls):.1f} %" for count in (tally.hit, tally.wrong, tally.missed))))
+    widths = [max(len(row[place]) for row in rows) for place in range(len(rows[0]))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return [*lines, *(_empty_line(name, figures) for name, figures in report.figures.items()),
+            f"{report.photographs} photographs, {report.each} pictures of each kind, seed {report.seed}"]
+
+
+_NAMES: Final = {"small": f"below {SMALL_PX:.0f} px radius", "large": f"from {SMALL_PX:.0f} px radius"}
+
+
+def _empty_line(name: str, one: PhotoFigures) -> str:
+    low, high = one.interval
+    return (f"{name}: a ball in {one.false_alarms} of {one.empty} photographs without one, "
+            f"{100 * one.false_alarms / max(1, one.empty):.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} %)")

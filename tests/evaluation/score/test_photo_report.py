@@ -1,0 +1,122 @@
+"""Detectors on photographs: how a picture counts, and the figures of good, blind and wrong detectors."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from sightline.evaluation.photographs import FEWEST, Photograph
+from sightline.evaluation.score.ball_textures import KINDS
+from sightline.evaluation.score.detector_report import Subject
+from sightline.evaluation.score.photo_balls import photo_with_ball, photo_without_ball
+from sightline.evaluation.score.photo_report import photo_lines, photo_pictures, score_photos, wilson
+from sightline.operator_side.cli import app as cli
+from sightline.vision_side.detect.port import Detection, DetectionResult
+
+EACH = 1
+
+
+def photographs(count=4):
+    draw = np.random.default_rng(3)
+    return [Photograph(f"{number}.jpg", cv2.resize(draw.integers(60, 200, (4, 5, 3), np.uint8), (360, 300)))
+            for number in range(count)]
+
+
+@pytest.fixture(scope="module")
+def boxes():
+    """Number of a picture -> the ball's box, None without a ball."""
+    return {one.number: one.ball and one.ball.box for one in photo_pictures(photographs(), EACH, 1)}
+
+
+class KnowingDetector:
+    """Answers with the ball of each picture, changed by `change`; None is a picture without a ball."""
+
+    def __init__(self, boxes, change):
+        self._boxes, self._change = boxes, change
+
+    def detect(self, frames, deadline_us):
+        (frame,) = frames
+        found = self._change(self._boxes[int(frame.header.session, 16)])
+        marks = () if found is None else (Detection(*found, 0.9, "ball"),)
+        header = frame.header
+        return [DetectionResult(frame.robot, header.session, header.seq, header.t_us, 320, 240, marks, "x")]
+
+
+def figures(boxes, change):
+    detector = KnowingDetector(boxes, change)
+    report = score_photos([Subject("x", detector)], photographs(), EACH, 1)
+    return report, report.figures["x"]
+
+
+def test_a_detector_that_marks_each_ball_hits_all(boxes):
+    report, one = figures(boxes, lambda box: box)
+    assert all(tally.hit == tally.balls == EACH for tally in one.kinds.values()) and set(one.kinds) == set(KINDS)
+    assert one.small.balls + one.large.balls == EACH * len(KINDS) and one.small.balls > 0 < one.large.balls
+    assert (one.false_alarms, one.empty) == (0, 4) and one.interval[0] == 0 and one.interval[1] > 0.3
+    assert "100.0 %" in "\n".join(photo_lines(report)) and report.to_dict()["photographs"] == 4
+
+
+def test_a_blind_detector_misses_all(boxes):
+    _, one = figures(boxes, lambda box: None)
+    assert all(tally.missed == EACH for tally in one.kinds.values()) and one.false_alarms == 0
+
+
+def test_a_detector_that_marks_something_else_is_wrong_and_a_false_alarm(boxes):
+    _, one = figures(boxes, lambda box: (0.0, 0.0, 9.0, 9.0))
+    assert all(tally.wrong == EACH and tally.hit == 0 for tally in one.kinds.values())
+    assert one.false_alarms == one.empty == 4
+
+
+def test_the_interval_is_wilsons():
+    assert wilson(0, 0) == (0.0, 1.0)
+    low, high = wilson(3, 100)
+    assert low == pytest.approx(0.0103, abs=2e-4) and high == pytest.approx(0.0845, abs=2e-4)
+    for count, total in ((0, 10), (5, 10), (10, 10)):
+        low, high = wilson(count, total)
+        assert 0 <= low <= count / total <= high <= 1
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for number in range(FEWEST):
+        picture = photographs(1)[0].rgb + np.uint8(number)
+        cv2.imwrite(str(tmp_path / f"{number:02}.png"), picture)
+    return tmp_path
+
+
+def test_the_command_prints_a_table_and_json(folder, capsys):
+    assert cli.run(["score", "detectors", "hsv", "--photos", str(folder), "--frames", "1"]) == 0
+    told = capsys.readouterr().out
+    assert "yellow" in told and f"of {FEWEST} photographs without one" in told
+    assert cli.run(["score", "detectors", "hsv", "--photos", str(folder), "--frames", "1", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["figures"]["hsv"]["empty"] == FEWEST
+
+
+@pytest.mark.parametrize("arguments", [["--demand"], ["--column", "blur"]])
+def test_options_of_the_scenes_are_rejected_with_photographs(folder, arguments, capsys):
+    assert cli.run(["score", "detectors", "hsv", "--photos", str(folder), *arguments]) == 2
+    assert "--photos" in capsys.readouterr().err
+
+
+# --- the balls themselves ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_box_is_around_what_the_ball_has_changed(kind):
+    photo = photographs(1)[0].rgb
+    for seed in range(2):
+        drawn = photo_with_ball(photo, kind, seed)
+        assert np.array_equal(drawn.rgb, photo_with_ball(photo, kind, seed).rgb)
+        assert 5 <= drawn.radius_px <= 45 and 0.55 <= drawn.seen <= 1
+        x1, y1, x2, y2 = (round(edge) for edge in drawn.box)
+        changed = np.abs(drawn.rgb.astype(int) - photo_without_ball(photo, seed)).max(axis=2) > 6
+        assert changed[y1:y2, x1:x2].mean() > 0.35
+        assert max(x2 - x1, y2 - y1) <= 2 * drawn.radius_px * 1.25 + 2
+
+
+def test_balls_are_of_all_sizes_and_some_are_partly_covered():
+    photo = photographs(1)[0].rgb
+    drawn = [photo_with_ball(photo, "red", seed) for seed in range(22)]
+    assert min(one.radius_px for one in drawn) < 7 and max(one.radius_px for one in drawn) > 35
+    assert 1 <= sum(one.seen < 1 for one in drawn) <= 12
