@@ -13,6 +13,8 @@ import simplejpeg
 from sightline.protocol.errors import ConfigError
 from sightline.sim.scenes.model import HEIGHT_PX, WIDTH_PX
 
+SHIPPED: Final = Path(__file__).parent / "score" / "photographs"
+"""Photographs that come with Sightline, for scores only; `SOURCES.md` there names their origin."""
 FEWEST: Final = 20
 """Photographs in a folder, at least."""
 _MOST_PIXELS: Final = 50_000_000

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import simplejpeg
 
-from sightline.evaluation.photographs import read_photographs
+from sightline.evaluation.photographs import SHIPPED, read_photographs, shared
 from sightline.evaluation.processes import worker_pool
 from sightline.protocol.errors import ConfigError
 from sightline.sim.scenes.model import (
@@ -151,6 +151,8 @@ def drawn_scenes(folder: Path, source: SceneSource, jobs: int, advance: Callable
     if not 0 < source.count * source.every <= VALIDATED_FROM:
         raise ConfigError(f"--scenes {source.count}: 1 to {VALIDATED_FROM // source.every}; seeds from "
                           f"{VALIDATED_FROM} up validate and score")
+    if source.photos is not None:
+        _check_photographs(source.photos)
     pictures, notes = folder / "scenes.npy", folder / "scenes.json"
     if _would_be_the_same(pictures, notes, source):
         advance(source.total)
@@ -163,6 +165,15 @@ def drawn_scenes(folder: Path, source: SceneSource, jobs: int, advance: Callable
     unclear, others = (tuple(tuple((*one,) for one in row[kind]) for row in rows) for kind in ("unclear", "others"))
     return DrawnScenes(np.load(pictures, mmap_mode="r"), truths, unclear, others,
                        source.count if source.over_photos else None)
+
+
+def _check_photographs(folder: Path) -> None:
+    """Raise ConfigError for a photograph that scores detectors, also under another name."""
+    same = shared(read_photographs(folder), read_photographs(SHIPPED))
+    if same:
+        (name, other), more = same[0], len(same) - 1
+        raise ConfigError(f"{folder / name} shows the same as {other}, which is for scores only; remove it"
+                          + (f" and {more} more" if more else ""))
 
 
 def _would_be_the_same(pictures: Path, notes: Path, source: SceneSource) -> bool:

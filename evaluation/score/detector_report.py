@@ -125,12 +125,15 @@ def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks:
                        tuple(one if isinstance(one, str) else "" for one in said))
 
 
-def answer_of(detector: Detector, seed: int, jpeg: bytes, decoder: Decoder, looks: int) -> DetectionResult | str:
+def answer_of(detector: Detector, seed: int, jpeg: bytes, decoder: Decoder, looks: int,
+              *, expected_px: tuple[float, float] | None = None) -> DetectionResult | str:
     """Return the answer of the last call, in a session of its own, or the cause of a missing one."""
     result: DetectionResult | str = ""
     for look in range(looks):
         header = FrameHeader(session=f"{seed:08x}", seq=look, t_us=(1 + look) * _FRAME_US)
-        (result,) = checked_answers(detector, [DetectFrame(_ROBOT, header, jpeg, decoder)], NO_DEADLINE)
+        frame = DetectFrame(_ROBOT, header, jpeg, decoder)
+        frame.expected_px = expected_px
+        (result,) = checked_answers(detector, [frame], NO_DEADLINE)
     return result
 
 

@@ -46,7 +46,7 @@ class PhotoBall:
 
 @dataclass(frozen=True, slots=True)
 class _Pose:
-    """The place of the ball: image position and radius in px; center and radius in units of its depth; up and sideways."""
+    """The place of the ball: image position and radius in px; center and radius in units of its depth; up."""
 
     u: float
     v: float

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
+import numpy as np
 import simplejpeg
 
 from sightline.evaluation.photographs import Photograph
@@ -22,6 +23,7 @@ from sightline.vision_side.detect.port import Detection, DetectionResult
 QUALITY: Final = 85
 SMALL_PX: Final = 12.0
 """Balls of a smaller radius have a column of their own."""
+_OFF_PX: Final = 20.0
 _OF_EMPTY: Final = 500_000
 _SEEDS: Final = 1_000_003
 """Between the first pictures of two seeds."""
@@ -81,6 +83,8 @@ class PhotoReport:
     each: int
     """Pictures of each kind."""
     seed: int
+    tracked: bool
+    """True if each detector knew where a track would expect the ball."""
     figures: dict[str, PhotoFigures]
 
     def to_dict(self) -> dict[str, Any]:
@@ -115,16 +119,26 @@ def _jpeg(rgb: Any) -> bytes:
 
 
 def score_photos(asked: Sequence[Subject], photographs: Sequence[Photograph], each: int, seed: int, *, looks: int = 1,
-                 advance: Callable[[], None] = lambda: None) -> PhotoReport:
-    """Show every picture to every detector, `looks` times in a row."""
+                 tracked: bool = False, advance: Callable[[], None] = lambda: None) -> PhotoReport:
+    """Show every picture to every detector, `looks` times in a row; with `tracked`, as if a track expected the ball."""
     decoder = Decoder(WIDTH_PX, HEIGHT_PX, WIDTH_PX * HEIGHT_PX)
     found = {one.name: PhotoFigures({kind: BallTally() for kind in KINDS}, BallTally(), BallTally()) for one in asked}
     for picture in photo_pictures(photographs, each, seed):
         for one in asked:
-            answer = answer_of(one.detector, picture.number, picture.jpeg, decoder, looks)
+            answer = answer_of(one.detector, picture.number, picture.jpeg, decoder, looks,
+                               expected_px=_expected(picture) if tracked else None)
             _count(found[one.name], picture, _best_ball(answer, one.balls))
         advance()
-    return PhotoReport(len(photographs), each, seed, found)
+    return PhotoReport(len(photographs), each, seed, tracked, found)
+
+
+def _expected(picture: PhotoPicture) -> tuple[float, float]:
+    """Return the ball's place, off by up to `_OFF_PX` each way; a random place in a picture without a ball."""
+    draw = np.random.default_rng([picture.number, 19])
+    if picture.ball is None:
+        return draw.uniform(0, WIDTH_PX), draw.uniform(0, HEIGHT_PX)
+    x1, y1, x2, y2 = picture.ball.box
+    return (x1 + x2) / 2 + draw.uniform(-_OFF_PX, _OFF_PX), (y1 + y2) / 2 + draw.uniform(-_OFF_PX, _OFF_PX)
 
 
 def _best_ball(answer: DetectionResult | str, balls: Sequence[str]) -> Detection | None:
@@ -157,7 +171,8 @@ def photo_lines(report: PhotoReport) -> list[str]:
     widths = [max(len(row[place]) for row in rows) for place in range(len(rows[0]))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     return [*lines, *(_empty_line(name, figures) for name, figures in report.figures.items()),
-            f"{report.photographs} photographs, {report.each} pictures of each kind, seed {report.seed}"]
+            f"{report.photographs} photographs, {report.each} pictures of each kind, seed {report.seed}"
+            + (", each ball expected where it is" if report.tracked else "")]
 
 
 _NAMES: Final = {"small": f"below {SMALL_PX:.0f} px radius", "large": f"from {SMALL_PX:.0f} px radius"}

@@ -178,7 +178,8 @@ def score(
 
 COMPARED = ("hsv", "onnx")
 PHOTO_FRAMES, PHOTO_SEED = 60, 1
-_PHOTOS = "Score balls in these photographs instead, and false alarms in the photographs themselves."
+SHIPPED = "shipped"
+_PHOTOS = f"Score balls put into these photographs, and false alarms; `{SHIPPED}` are those that come along."
 FRAMES = 100
 FROM = 900_000
 """The same as in sim/scenes/model.py, whose imports are too heavy for the command line. A test compares them."""
@@ -195,6 +196,7 @@ def detectors(
     seeds: Annotated[int, typer.Option(min=0, max=10**9, metavar="FROM", help="Seed of the first scene.")] = FROM,
     column: Annotated[str, typer.Option(help="`all`, or names separated by commas, e.g. blur,all at once.")] = "all",
     photos: Annotated[Path | None, typer.Option(metavar="DIR", help=_PHOTOS)] = None,
+    tracked: Annotated[bool, typer.Option("--tracked", help="Expect each ball where it is, as a track does.")] = False,
     looks: Annotated[int, typer.Option(min=1, max=100, help="Detections of each scene; `adaptive` needs several.")] = 1,
     demand: Annotated[
         bool, typer.Option("--demand", help="Check the bounds of a learned detector; exit code 5 if it fails.")
@@ -220,7 +222,9 @@ def detectors(
         if demand or column != "all":
             raise ConfigError("--photos scores photographs, without --column and --demand")
         subjects = _subjects(names or COMPARED, config, sets or (), device)
-        return _score_photos(photos, subjects, frames or PHOTO_FRAMES, looks, as_json)
+        return _score_photos(photos, subjects, frames or PHOTO_FRAMES, looks, tracked=tracked, as_json=as_json)
+    if tracked:
+        raise ConfigError("--tracked belongs to --photos")
     if demand and seeds < FROM:
         raise ConfigError(f"--demand needs seeds from {FROM} up, which no training uses; {seeds} is lower")
     columns, shown = _columns(column), frames or (DEMANDED_FRAMES if demand else FRAMES)
@@ -233,16 +237,18 @@ def detectors(
     return _print_report(report, all_detector_checks(report) if demand else None, as_json)
 
 
-def _score_photos(photos: Path, subjects: "list[Subject]", each: int, looks: int, as_json: bool) -> int:
-    from sightline.evaluation.photographs import read_photographs
+def _score_photos(photos: Path, subjects: "list[Subject]", each: int, looks: int, *, tracked: bool,
+                  as_json: bool) -> int:
+    from sightline.evaluation import photographs as folder
     from sightline.evaluation.score.ball_textures import KINDS
     from sightline.evaluation.score.detector_report import close_subjects
     from sightline.evaluation.score.photo_report import photo_lines, score_photos
 
     try:
-        photographs = read_photographs(photos)
+        photographs = folder.read_photographs(folder.SHIPPED if str(photos) == SHIPPED else photos)
         with progress_bar(len(KINDS) * each + len(photographs)) as advance:
-            report = score_photos(subjects, photographs, each, PHOTO_SEED, looks=looks, advance=advance)
+            report = score_photos(subjects, photographs, each, PHOTO_SEED, looks=looks, tracked=tracked,
+                                  advance=advance)
     finally:
         close_subjects(subjects)
     return print_result(report.to_dict(), photo_lines(report), as_json)

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sightline.evaluation.photographs import FEWEST, read_photographs, shared, show_hash
+from sightline.evaluation.photographs import FEWEST, SHIPPED, read_photographs, shared, show_hash
 from sightline.protocol.errors import ConfigError
 
 
@@ -75,6 +75,14 @@ def test_an_invalid_file_is_one_line(folder, content, reason):
     with pytest.raises(ConfigError, match=reason) as told:
         read_photographs(folder)
     assert "bad.jpg" in str(told.value) and "\n" not in str(told.value)
+
+
+def test_shipped_photographs_are_distinct_and_have_a_source():
+    read = read_photographs(SHIPPED)
+    sources = (SHIPPED / "SOURCES.md").read_text("utf-8")
+    assert len(read) >= 30 and all(f"| {one.name} |" in sources for one in read)
+    assert sources.count(".jpg |") == len(read)
+    assert [pair for pair in shared(read, read) if pair[0] != pair[1]] == []
 
 
 def test_too_few_photographs_and_no_folder_are_one_line(folder, tmp_path):

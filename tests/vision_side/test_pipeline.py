@@ -15,6 +15,7 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import STILL, AnswerHeader, FrameHeader, RequestId
 from sightline.protocol.text import format_twist
 from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import Frame, FrameLoss, Observation, Pipeline, PipelineAnswer, answer_header
 from tests.fixtures.vision.vision import Rig, camera, eight, jpeg_of, scene
@@ -48,6 +49,43 @@ def test_seen_coasted_searched_and_found() -> None:
     turning = answers[69].twist
     assert turning is not None and 0 < turning.angular_rad_s <= 1.2  # the ball was last seen on the left
     assert answers[9].seen.distance_m is not None and answers[9].seen.target in answers[9].seen.detections
+
+
+class NotedDetector:
+    """Notes the expected place of each frame; it finds what `found` has for it."""
+
+    def __init__(self, found: list[tuple[Detection, ...]]) -> None:
+        self.expected: list[tuple[float, float] | None] = []
+        self._found = found
+
+    def detect(self, frames: list[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        (frame,) = frames
+        self.expected.append(frame.expected_px)
+        return [result_of(frame, self._found[len(self.expected) - 1], Maker("noted", "", ""))]
+
+
+def test_a_target_is_expected_for_half_a_second_where_it_was_last_seen() -> None:
+    ball, other = (Detection(x, 100.0, x + 40.0, 140.0, 0.9, "ball") for x in (100.0, 104.0))
+    found = [(ball,), (other,), *[()] * 17]
+    noted = NotedDetector(found)
+    one = Pipeline(VisionConfig(), MODEL, noted)
+    for seq in range(1, len(found) + 1):
+        one.step(Frame(header(seq), EMPTY))
+    last = (124.0, 120.0)
+    assert noted.expected[:3] == [None, (120.0, 120.0), last]
+    assert noted.expected[3:17] == [last] * 14 and noted.expected[17:] == [None] * 2  # 15 frames are 0.5 s
+
+
+def test_a_new_session_and_another_camera_expect_no_target() -> None:
+    ball = Detection(100.0, 100.0, 140.0, 140.0, 0.9, "ball")
+    noted = NotedDetector([(ball,)] * 5)
+    one = Pipeline(VisionConfig(), MODEL, noted)
+    one.step(Frame(header(1), EMPTY))
+    one.step(Frame(header(2, "1111aaaa"), EMPTY))
+    one.set_camera(MODEL)
+    one.step(Frame(header(3, "1111aaaa"), EMPTY))
+    one.step(Frame(header(4, "1111aaaa"), EMPTY))
+    assert noted.expected == [None, None, None, (120.0, 120.0)]
 
 
 def test_missing_image_is_acknowledged_and_starts_no_search() -> None:

@@ -28,11 +28,12 @@ def _inside(frame: DetectFrame, found: Sequence[Detection]) -> list[Detection]:
 
 
 def timed_together(
-    frames: Sequence[DetectFrame], maker: Maker, look: Callable[[Sequence[DecodedImage]], list[Sequence[Detection]]]
+    frames: Sequence[DetectFrame], maker: Maker,
+    look: Callable[[Sequence[tuple[DetectFrame, DecodedImage]]], list[Sequence[Detection]]],
 ) -> list[DetectionResult | None]:
-    """Measure a batch, and give each image its share of the time."""
+    """Measure a batch, and give each image its share of the time. Frames whose image is invalid are left out."""
     pictures = [_picture_of(frame) for frame in frames]
-    there = [one for one in pictures if one is not None]
+    there = [(frame, picture) for frame, picture in zip(frames, pictures, strict=True) if picture is not None]
     started_ns = time.perf_counter_ns()
     found = iter(look(there) if there else [])
     each_us = (time.perf_counter_ns() - started_ns) // 1000 // max(1, len(there))
@@ -44,4 +45,4 @@ def timed(
     frame: DetectFrame, maker: Maker, look: Callable[[DecodedImage], Sequence[Detection]]
 ) -> DetectionResult | None:
     """Return the detections of `look` in `frame` with its time, or None if the bytes are not an image."""
-    return timed_together([frame], maker, lambda pictures: [look(one) for one in pictures])[0]
+    return timed_together([frame], maker, lambda there: [look(picture) for _, picture in there])[0]

@@ -68,6 +68,24 @@ def test_a_detector_that_marks_something_else_is_wrong_and_a_false_alarm(boxes):
     assert one.false_alarms == one.empty == 4
 
 
+def test_a_tracked_ball_is_expected_near_its_place(boxes):
+    places = {}
+
+    class NotedDetector(KnowingDetector):
+        def detect(self, frames, deadline_us):
+            places[int(frames[0].header.session, 16)] = frames[0].expected_px
+            return super().detect(frames, deadline_us)
+
+    noted = NotedDetector(boxes, lambda box: box)
+    assert score_photos([Subject("x", noted)], photographs(), EACH, 1, tracked=True).tracked
+    off = [(x - (box[0] + box[2]) / 2, y - (box[1] + box[3]) / 2)
+           for number, (x, y) in places.items() if (box := boxes[number])]
+    assert len(off) == EACH * len(KINDS) and 5 < max(map(max, off)) <= 20 and -20 <= min(map(min, off)) < -5
+    assert len(set(places.values())) == len(places)
+    score_photos([Subject("x", noted)], photographs(), EACH, 1)
+    assert set(places.values()) == {None}
+
+
 def test_the_interval_is_wilsons():
     assert wilson(0, 0) == (0.0, 1.0)
     low, high = wilson(3, 100)

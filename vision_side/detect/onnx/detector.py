@@ -17,6 +17,7 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.log import report_fault
+from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.config import Device
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.refine import refined
@@ -29,6 +30,7 @@ from sightline.vision_side.detect.onnx.tensors import (
     own_labels,
     read_outputs,
     split_batch,
+    tile_about,
 )
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
 from sightline.vision_side.detect.timing import timed_together
@@ -64,6 +66,8 @@ class OnnxDetector:
         """The order of an input's channels; `auto`: bytes are BGR, floats RGB."""
         refine: Annotated[tuple[str, ...], Field(max_length=64)] = ("ball",)
         """Things with these labels are round: their edge is looked for in the image."""
+        second_look: bool = True
+        """True to enlarge the part of the image where the followed target is expected, if nothing is found there."""
 
     def __init__(self, config: Config) -> None:
         """Raises ConfigError for a file that is not such a model, HardwareError for a device that is not there."""
@@ -71,7 +75,7 @@ class OnnxDetector:
         path, self._form, self._min_score = model.path, model.form, model.min_score
         self.labels = model.form.labels
         """All that it can call a thing; empty where the model has only numbers."""
-        self._refine = frozenset(config.refine)
+        self._refine, self._second_look = frozenset(config.refine), config.second_look
         self._engine = model.engine
         self._notices = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
         self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)
@@ -120,10 +124,25 @@ class OnnxDetector:
                               f"{fewer}: {str(error)[:120]}")
         return results
 
-    def _detections(self, pictures: Sequence[DecodedImage]) -> list[Sequence[Detection]]:
-        together = _found(self._engine, pictures, self._form, self._min_score)
+    def _detections(self, shown: Sequence[tuple[DetectFrame, DecodedImage]]) -> list[Sequence[Detection]]:
+        together = _found(self._engine, [picture for _, picture in shown], self._form, self._min_score)
+        if self._second_look:
+            together = [self._with_second_look(*one, found) for one, found in zip(shown, together, strict=True)]
         return [tuple(refined(picture, one) if one.label in self._refine else one for one in found)
-                for picture, found in zip(pictures, together, strict=True)]
+                for (_, picture), found in zip(shown, together, strict=True)]
+
+    def _with_second_look(
+        self, frame: DetectFrame, picture: DecodedImage, found: tuple[Detection, ...]
+    ) -> tuple[Detection, ...]:
+        """Look again, enlarged, where the target is expected, if the first look has found no target there."""
+        if frame.expected_px is None:
+            return found
+        tile = tile_about(picture, frame.expected_px)
+        if any(frame.goes_by(one.label) and tile.shows_middle(one) for one in found):
+            return found
+        (more,) = _found(self._engine, [tile.picture], self._form, self._min_score)
+        targets = [tile.in_image(one) for one in more if frame.goes_by(one.label) and tile.shows_all(one)]
+        return tuple(sorted((*found, *targets), key=lambda one: -one.score)[:MAX_DETECTED_BOXES])
 
     def _warm_up(self, model: "OnnxModel", config: Config) -> None:
         """Run the model on the test image and compare the answer with the metadata, or with the CPU."""

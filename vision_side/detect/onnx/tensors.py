@@ -8,7 +8,7 @@ Inputs: uint8 rows of pixels (1, H, W, 3), BGR unless configured, or float (1, 3
 import ast
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import cv2
@@ -221,3 +221,51 @@ def _uncovered(boxes: NDArray[Any], scores: NDArray[Any], labels: NDArray[Any]) 
         best = cv2.dnn.NMSBoxes(corners[own].tolist(), scores[own].tolist(), 0.0, _MAX_OVERLAP)
         kept[own[np.array(best, np.intp).reshape(-1)]] = True
     return np.flatnonzero(kept)
+
+
+# --- a part of an image, enlarged by the fit to the input ---------------------------------------------------------
+
+
+TILE_SHARE: Final = 0.6
+"""Of the image's sides: the sides of a tile."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageTile:
+    """A part of an image as an image of its own, and its place: its upper left corner, px of the encoded image."""
+
+    picture: DecodedImage
+    left_px: int
+    top_px: int
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height, px of the encoded image."""
+        rows, columns = self.picture.bgr.shape[:2]
+        return int(columns) * self.picture.scale, int(rows) * self.picture.scale
+
+    def shows_middle(self, one: Detection) -> bool:
+        """Return True if the middle of `one`, in px of the whole image, is inside."""
+        width, height = self.size_px
+        x, y = (one.x1_px + one.x2_px) / 2 - self.left_px, (one.y1_px + one.y2_px) / 2 - self.top_px
+        return 0 <= x < width and 0 <= y < height
+
+    def shows_all(self, one: Detection) -> bool:
+        """Return True if `one`, in px of this tile, is clear of its border: it may go on beyond."""
+        width, height = self.size_px
+        return one.x1_px > 1 and one.y1_px > 1 and one.x2_px < width - 1 and one.y2_px < height - 1
+
+    def in_image(self, one: Detection) -> Detection:
+        """Return a detection in this tile in px of the whole image."""
+        return replace(one, x1_px=one.x1_px + self.left_px, y1_px=one.y1_px + self.top_px,
+                       x2_px=one.x2_px + self.left_px, y2_px=one.y2_px + self.top_px)
+
+
+def tile_about(picture: DecodedImage, place_px: tuple[float, float]) -> ImageTile:
+    """Cut the tile about a place, in px of the encoded image; at the border it moves inside."""
+    rows, columns = picture.bgr.shape[:2]
+    height, width = max(1, round(rows * TILE_SHARE)), max(1, round(columns * TILE_SHARE))
+    left = min(max(0, round(place_px[0] / picture.scale - width / 2)), columns - width)
+    top = min(max(0, round(place_px[1] / picture.scale - height / 2)), rows - height)
+    part = np.ascontiguousarray(picture.bgr[top : top + height, left : left + width])
+    return ImageTile(DecodedImage(part, picture.scale), left * picture.scale, top * picture.scale)

@@ -295,7 +295,7 @@ def _true_centre(picture: np.ndarray) -> tuple[float, float]:
 def test_a_golden_output_that_differs_ends_it(tmp_path: Path) -> None:
     good = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], size=(240, 320))
     eye = detector(good, min_score=0.1, refine=())
-    (found,) = eye._detections([DecodedImage(golden_picture(), 1)])
+    (found,) = eye._detections([(frame(golden_picture()), DecodedImage(golden_picture(), 1))])
     again = brightness_model(tmp_path / "g.onnx", BOXES, [0, 1], golden=golden_text(found))
     assert detector(again, min_score=0.1).maker.device == "cpu"
     other = golden_text([Detection(1, 1, 9, 9, 0.99, "ball")])

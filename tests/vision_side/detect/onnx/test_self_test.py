@@ -73,7 +73,7 @@ def test_real_runtime_can_stay_on_its_device(tmp_path: Path) -> None:
 
 def test_a_golden_output_is_of_the_models_own_labels_and_least_score(tmp_path: Path) -> None:
     plain = detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], min_score="0.1"), refine=())
-    (found,) = plain._detections([DecodedImage(golden_picture(), 1)])
+    (found,) = plain._detections([(frame(GREY), DecodedImage(golden_picture(), 1))])
     assert 0.3 < found[0].score < 0.6
     golden = golden_text(found)
     named = detector(brightness_model(tmp_path / "g.onnx", BOXES, [0, 1], golden=golden), names=("a", "b"))

@@ -1,0 +1,105 @@
+"""The second look: an enlarged part of the image where the target is expected, and what counts of it."""
+
+import numpy as np
+import pytest
+
+from sightline.protocol.messages import FrameHeader
+from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.decode import DecodedImage, Decoder
+from sightline.vision_side.detect.onnx.tensors import ImageTile, tile_about
+from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection
+from sightline.vision_side.detect.registry import build_detector
+from tests.fixtures.vision.vision import BALL_RADIUS_M, camera, jpeg_of, scene
+
+pytestmark = pytest.mark.usefixtures("no_gpu")
+
+FAR_M = 2.0
+"""A ball that is too small for the first look, at 320x240 and 0.1 m to the left."""
+ASIDE_M = 0.1
+EXPECTED_PX = (150.0, 125.0)
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return build_detector("onnx", {}, VisionConfig(detector=DetectorConfig(kind="onnx", device="cpu")))
+
+
+def found(detector, model, jpeg, expected_px=None, goes_by=None):
+    """The detections in one image."""
+    size = (model.width_px, model.height_px)
+    frame = DetectFrame("r1", FrameHeader(session="0000abcd", seq=1, t_us=1), jpeg, Decoder(*size, size[0] * size[1]))
+    frame.expected_px = expected_px
+    if goes_by is not None:
+        frame.goes_by = goes_by
+    (result,) = detector.detect([frame], NO_DEADLINE)
+    return result.detections
+
+
+@pytest.mark.parametrize(("width_px", "height_px"), [(320, 240), (640, 480)])
+@pytest.mark.parametrize("aside_m", [-0.4, 0.1])
+def test_more_far_balls_are_found_where_they_are_expected(shipped, width_px, height_px, aside_m):
+    model = camera(width_px, height_px)
+    once = twice = 0
+    for far_m in np.linspace(1.6, 2.8, 7):
+        jpeg = jpeg_of(scene(model, far_m, aside_m))
+        once += len(found(shipped, model, jpeg))
+        middle = width_px / 2 - model.fx_px * aside_m / far_m
+        for one in found(shipped, model, jpeg, (middle, height_px * 0.52)):
+            twice += 1
+            assert abs((one.x1_px + one.x2_px) / 2 - middle) < 0.03 * width_px
+            width = one.x2_px - one.x1_px
+            assert 0.75 < width / (2 * BALL_RADIUS_M / far_m * model.fx_px) < 1.4
+    assert once + 2 <= twice <= 7
+
+
+def test_a_second_look_is_without_effect_elsewhere_for_other_labels_and_where_it_is_off(shipped):
+    model = camera(320, 240)
+    jpeg = jpeg_of(scene(model, FAR_M, ASIDE_M))
+    assert len(found(shipped, model, jpeg, EXPECTED_PX)) == 1
+    assert found(shipped, model, jpeg) == ()
+    assert found(shipped, model, jpeg_of(scene(model, FAR_M, 0.5)), (310.0, 120.0)) == ()
+    assert found(shipped, model, jpeg, EXPECTED_PX, goes_by=lambda label: label == "legs") == ()
+    once = build_detector("onnx", {"second_look": False}, VisionConfig())
+    assert found(once, model, jpeg, EXPECTED_PX) == ()
+
+
+def test_a_target_that_the_first_look_finds_costs_no_second_look(shipped, monkeypatch):
+    model = camera(320, 240)
+    jpeg = jpeg_of(scene(model, 1.0, ASIDE_M))
+    runs = []
+    run = shipped._engine.run
+    monkeypatch.setattr(shipped._engine, "run", lambda pixels: runs.append(1) or run(pixels))
+    first = found(shipped, model, jpeg)
+    assert found(shipped, model, jpeg, EXPECTED_PX) == first and len(first) == 1 and len(runs) == 2
+    found(shipped, model, jpeg_of(scene(model, FAR_M, ASIDE_M)), EXPECTED_PX)
+    assert len(runs) == 4
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+@pytest.mark.parametrize("place", [(0.0, 0.0), (319.0, 239.0), (160.0, 120.0), (-500.0, 90.0), (1e9, -1e9)])
+def test_a_tile_is_inside_the_image(scale, place):
+    rows, columns = 240 // scale, 320 // scale
+    bgr = np.random.default_rng(1).integers(0, 255, (rows, columns, 3), np.uint8)
+    tile = tile_about(DecodedImage(bgr, scale), place)
+    left, top = tile.left_px // scale, tile.top_px // scale
+    height, width = tile.picture.bgr.shape[:2]
+    assert (width * scale, height * scale) == tile.size_px == (192, 144)
+    assert np.array_equal(tile.picture.bgr, bgr[top : top + height, left : left + width])
+    if 0 <= place[0] < 320 and 0 <= place[1] < 240:
+        assert tile.shows_middle(Detection(place[0] - 2, place[1] - 2, place[0] + 2, place[1] + 2, 1.0, "ball"))
+
+
+def test_an_image_of_one_pixel_has_a_tile():
+    assert tile_about(DecodedImage(np.zeros((1, 1, 3), np.uint8), 1), (5.0, 5.0)).size_px == (1, 1)
+
+
+def test_a_detection_in_a_tile_has_its_place_in_the_image_and_is_left_out_at_the_border():
+    tile = ImageTile(DecodedImage(np.zeros((72, 96, 3), np.uint8), 2), 40, 60)
+    inside = Detection(10.0, 20.0, 30.0, 50.0, 0.7, "ball")
+    assert tile.in_image(inside) == Detection(50.0, 80.0, 70.0, 110.0, 0.7, "ball")
+    assert tile.shows_all(inside)
+    for box in ((0.5, 20.0, 30.0, 50.0), (10.0, 0.0, 30.0, 50.0), (10.0, 20.0, 191.5, 50.0), (10.0, 20.0, 30.0, 144.0)):
+        assert not tile.shows_all(Detection(*box, 0.7, "ball"))
+    assert tile.shows_middle(Detection(40.0, 60.0, 40.0, 60.0, 1.0, "ball"))
+    for middle in ((39.0, 70.0), (232.0, 70.0), (50.0, 59.0), (50.0, 204.0)):
+        assert not tile.shows_middle(Detection(*middle, *middle, 1.0, "ball"))
