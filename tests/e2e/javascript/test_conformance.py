@@ -3,16 +3,19 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from sightline import conformance
 from tests.fixtures.javascript import EXAMPLES, JsRobot, JsVision, node
 from tests.fixtures.ports import free_port
 
 CONFORM = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "conform"]
 NOT_APPLICABLE = (
-    "the kit has no way to send on this transport",
+    "over WebSocket nothing is sent under a key",
+    "no token was named",
     "this robot publishes no scans",
     "no port of the legacy protocol was named",
     "the program does not know questions of kind stop",
@@ -33,6 +36,12 @@ def failed(told: dict[str, Any]) -> list[str]:
         for one in told["checks"]
         if one["value"] != "passed" and not one["reason"].startswith(NOT_APPLICABLE)
     ]
+
+
+@pytest.mark.parametrize("reason", NOT_APPLICABLE)
+def test_a_known_reason_is_one_that_the_kit_gives(reason: str) -> None:
+    folder = Path(conformance.__file__).parent
+    assert any(reason.removesuffix(" stop") in one.read_text("utf-8") for one in folder.rglob("*.py"))
 
 
 def test_javascript_codec_conforms():
