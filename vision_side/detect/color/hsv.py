@@ -41,8 +41,7 @@ class ColorMask:
 
     def region(self, bgr: NDArray[np.uint8]) -> Region | None:
         """Return the region with the color, without speckle, or None."""
-        coarse = codes_565(bgr[COARSE // 2 :: COARSE])[:, COARSE // 2 :: COARSE].copy()
-        x, y, width, height = cv2.boundingRect(cv2.LUT(coarse, self._table))
+        x, y, width, height = cv2.boundingRect(self._coarse(bgr))
         if not width:
             return None
         x1, y1 = max(0, x * COARSE - MARGIN_PX), max(0, y * COARSE - MARGIN_PX)
@@ -50,6 +49,14 @@ class ColorMask:
         # Speckle would cost findContours a hundredfold; a 3x3 opening removes it and keeps disks.
         mask = cv2.morphologyEx(cv2.LUT(codes_565(part), self._table), cv2.MORPH_OPEN, _KERNEL)
         return Region(part, mask, (x1, y1))
+
+    def share(self, bgr: NDArray[np.uint8]) -> float:
+        """Return the share of the pixels with the color, 0..1, of those that are looked at."""
+        marked = self._coarse(bgr)
+        return cv2.countNonZero(marked) / max(1, marked.size)
+
+    def _coarse(self, bgr: NDArray[np.uint8]) -> NDArray[Any]:
+        return cv2.LUT(codes_565(bgr[COARSE // 2 :: COARSE])[:, COARSE // 2 :: COARSE].copy(), self._table)
 
 
 def codes_565(bgr: NDArray[np.uint8]) -> NDArray[np.uint16]:
@@ -235,11 +242,11 @@ class HsvDetector:
     def __init__(self, config: HsvConfig, label: str = "target") -> None:
         self._config = config
         self._label = label
-        self._mask = ColorMask(config.ranges)
+        self.mask = ColorMask(config.ranges)
 
     def detect(self, picture: DecodedImage) -> tuple[Detection, ...]:
         """Return the objects with the color and the configured shape, largest first."""
-        region = self._mask.region(picture.bgr)
+        region = self.mask.region(picture.bgr)
         return () if region is None else self.measure(picture, region)
 
     def measure(self, picture: DecodedImage, region: Region) -> tuple[Detection, ...]:
