@@ -225,6 +225,7 @@ def test_a_photograph_that_scores_detectors_is_not_trained_on(tmp_path, photogra
         drawn_scenes(tmp_path, SceneSource(2, 8, photographs), 1, lambda _: None)
 
 
+@pytest.mark.slow
 def test_scenes_are_drawn_again_for_other_photographs(tmp_path, photographs):
     source = SceneSource(1, 2, photographs)
     first = drawn_scenes(tmp_path, source, 1, lambda _: None).pictures.copy()
