@@ -447,7 +447,7 @@ def run_training(options: TrainOptions, log: Callable[[str], None], progress: Pr
     report = final_report(model, options.judged, progress)
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
     parameters = sum(int(one.size) for one in weights.values())
-    card = Card(options.training, options.scenes.count, options.device, thresholds, parameters, model.stat().st_size,
+    card = Card(options.training, options.scenes, options.device, thresholds, parameters, model.stat().st_size,
                 digest, options.validated, report)
     (options.out / CARD).write_text(card_text(card), "utf-8")
     return model

@@ -103,6 +103,11 @@ class SceneSource:
         """Scenes of both kinds."""
         return self.count + self.over_photos
 
+    @property
+    def photographs(self) -> int:
+        """Number of photographs."""
+        return len(_photographs(self.photos)) if self.photos else 0
+
     def drawn(self, renderer: SceneRenderer, number: int) -> Scene | PhotoScene:
         """Draw one scene."""
         if number < self.count:

@@ -38,6 +38,7 @@ from sightline.sim.scenes.model import (
 from sightline.sim.scenes.textures import JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED
 from sightline.training.export import MOST_BOXES, OPSET, onnx_bytes
 from sightline.training.network import Weights
+from sightline.training.scenes import SceneSource
 from sightline.training.schedule import LEAST_SHARE, WHOLE_FROM, Training
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import DecodedImage
@@ -91,7 +92,7 @@ class Card:
     """All that stands on it."""
 
     training: Training
-    scenes: int
+    source: SceneSource
     device: str
     thresholds: Sequence[float]
     parameters: int
@@ -110,8 +111,9 @@ def card_text(card: Card) -> str:
         f"SHA-256 `{card.sha256}`", "", *_input(), "", "## How it was made", "", *_made(card), "",
         "## How good it is", "", *_scored(card), "",
         "## What it is not", "",
-        "It has only ever seen drawn scenes: balls, boxes, traffic lights of three lamps, legs as two cylinders. Try "
-        "it on your own robot's pictures (`sightline vision --shadow onnx`) before you let it drive.", "",
+        f"It has only ever seen drawn scenes{' and drawn balls over photographs' if card.source.photos else ''}: "
+        "balls, boxes, traffic lights of three lamps, legs as two cylinders. Try it on your own robot's pictures (`sightline "
+        "vision --shadow onnx`) before you let it drive.", "",
     ])
 
 
@@ -127,15 +129,15 @@ def _input() -> list[str]:
 
 
 def _made(card: Card) -> list[str]:
-    training = card.training
+    training, source = card.training, card.source
     thresholds = ", ".join(f"{label} {one:.2f}" for label, one in zip(LABELS, card.thresholds, strict=True))
     steps = " ".join(f"--steps {one}" for one in training.rounds)
     start = " --start MODEL" if training.start else ""
     return [
-        f"`sightline train --scenes {card.scenes} {steps} --batch {training.batch} "
-        f"--seed {training.seed} --device {card.device} --jobs {training.jobs} --validated {card.validated}"
-        f"{start}`", "",
-        f"- Scenes: seeds 0 to {card.scenes - 1}, floors and walls of the families {_families(TRAINED)}; from seed "
+        f"`sightline train --scenes {source.count}{_given(source)} {steps} --rate {training.rate:g} "
+        f"--batch {training.batch} --seed {training.seed} --device {card.device} --jobs {training.jobs} "
+        f"--validated {card.validated}{start}`", "",
+        f"- Scenes: {_seeds(source)}, floors and walls of the families {_families(TRAINED)}; from seed "
         f"{LATER_FROM} up {_families(TRAINED_LATER)}; from {HARDER_FROM} up {_families(TRAINED_HARDER)}, with more "
         "legs and more boxes of the ball's colour. Defects are drawn again each time a scene is shown; from the third "
         "round on a third of the pictures are clear, and a third are dim, blurred and coarse at once.",
@@ -143,10 +145,30 @@ def _made(card: Card) -> list[str]:
         f"{100 * (1 - WHOLE_FROM):.0f} % of a round half as many whole pictures), AdamW, learning rate "
         f"{training.rate:g} at first, half of that in each round that follows down to {training.rate * LEAST_SHARE:g}, "
         "weights averaged.",
+        *_over_photographs(source),
         *([f"- The last round began from MODEL, of SHA-256 `{training.start}`."] if training.start else []),
         f"- Thresholds: {thresholds}, chosen on {card.validated} scenes a column of the seeds from {VALIDATED_FROM}, "
         f"with floors and walls of other families: {_families(VALIDATED)}.",
     ]
+
+
+def _given(source: SceneSource) -> str:
+    """Return the options of the source that differ from the defaults."""
+    every = f" --every {source.every}" if source.every > 1 else ""
+    return every + (f" --photos PHOTOS --over-photos {source.over_photos}" if source.photos else "")
+
+
+def _seeds(source: SceneSource) -> str:
+    last = (source.count - 1) * source.every
+    return f"seeds 0 to {last}" + (f", each {source.every}th" if source.every > 1 else "")
+
+
+def _over_photographs(source: SceneSource) -> list[str]:
+    if source.photos is None:
+        return []
+    mined = "; what MODEL takes for a ball there is shown as another thing" if source.mined_with else ""
+    return [f"- Half of the cut-outs: {source.over_photos} scenes over the {source.photographs} photographs of PHOTOS, "
+            f"balls of many designs and other things drawn on them{mined}. Lights and legs are not learned there."]
 
 
 def _families(names: Sequence[str]) -> str:

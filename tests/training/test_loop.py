@@ -234,5 +234,5 @@ def test_the_whole_command_ends_with_a_model_and_its_card(tmp_path, capsys):
     told = capsys.readouterr().out.splitlines()
     assert str(tmp_path / "sightline.onnx") in told[-1] and len(told) <= 4
     card = (tmp_path / "sightline.md").read_text("utf-8")
-    assert "--scenes 8 --steps 2 --steps 1 --batch 4 --seed 1 --device cpu --jobs 1" in card
+    assert "--scenes 8 --steps 2 --steps 1 --rate 0.003 --batch 4 --seed 1 --device cpu --jobs 1" in card
     assert hashlib.sha256((tmp_path / "sightline.onnx").read_bytes()).hexdigest() in card

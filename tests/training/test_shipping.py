@@ -4,6 +4,8 @@ import hashlib
 from contextlib import contextmanager
 from functools import partial
 
+import cv2
+import numpy as np
 import pytest
 
 from tests.fixtures import demanded
@@ -11,8 +13,11 @@ from tests.fixtures import demanded
 demanded.module("pybullet", "sim")
 demanded.module("onnx", "dev")
 
+from sightline.evaluation.photographs import FEWEST
+from sightline.evaluation.score.detector_report import DetectorReport
 from sightline.sim.scenes.model import COLUMNS, LABELS
 from sightline.training.export import shifted
+from sightline.training.scenes import SceneSource
 from sightline.training.schedule import Training
 from sightline.training.shipping import Card, card_text, chosen_thresholds, final_report, written
 from sightline.vision_side.config import VisionConfig
@@ -43,7 +48,23 @@ def test_weights_become_a_file_with_thresholds_and_a_card_that_is_true_of_it(tmp
     assert set(report.columns) == set(COLUMNS) and report.columns["blur"]["onnx"].frames == 5
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
     training = Training((7, 3), batch=6, seed=5, jobs=2)
-    card = card_text(Card(training, 9, "cpu", thresholds, 12345, model.stat().st_size, digest, 5, report))
-    assert "sightline train --scenes 9 --steps 7 --steps 3 --batch 6 --seed 5 --device cpu --jobs 2" in card
+    card = card_text(Card(training, SceneSource(9), "cpu", thresholds, 12345, model.stat().st_size, digest, 5, report))
+    assert "train --scenes 9 --steps 7 --steps 3 --rate 0.003 --batch 6 --seed 5 --device cpu --jobs 2" in card
     assert "demands are kept; these are not:" in card and "least hits, nominal" in card
     assert digest in card and all(f"| {name} |" in card for name in COLUMNS) and "12345" in card
+
+
+def test_the_card_names_the_photographs_and_every_option(tmp_path):
+    for number in range(FEWEST):
+        picture = np.random.default_rng(number).integers(0, 255, (240, 320, 3), np.uint8)
+        cv2.imwrite(str(tmp_path / f"{number:02}.png"), picture)
+    source = SceneSource(9, 40, tmp_path, every=5, mined_with=tmp_path / "m.onnx")
+    report = DetectorReport(0, 0, {}, {"onnx": {}}, {}, {}, {})
+    training = Training((1, 3), rate=0.006, start="ab" * 32)
+    card = card_text(Card(training, source, "cuda", (0.5,) * 5, 1, 1, "", 5, report))
+    assert ("sightline train --scenes 9 --every 5 --photos PHOTOS --over-photos 40 --steps 1 --steps 3 --rate 0.006 "
+            "--batch 32 --seed 1 --device cuda --jobs 1 --validated 5 --start MODEL`") in card
+    assert "seeds 0 to 40, each 5th" in card and f"40 scenes over the {FEWEST} photographs" in card
+    assert "what MODEL takes for a ball" in card and "and drawn balls over photographs" in card
+    plain = card_text(Card(Training((1,)), SceneSource(9), "cpu", (0.5,) * 5, 1, 1, "", 5, report))
+    assert "photographs" not in plain and "--every" not in plain and "seeds 0 to 8," in plain
