@@ -112,8 +112,8 @@ def card_text(card: Card) -> str:
         "## How good it is", "", *_scored(card), "",
         "## What it is not", "",
         f"It has only ever seen drawn scenes{' and drawn balls over photographs' if card.source.photos else ''}: "
-        "balls, boxes, traffic lights of three lamps, legs as two cylinders. Try it on your own robot's pictures (`sightline "
-        "vision --shadow onnx`) before you let it drive.", "",
+        "balls, boxes, traffic lights of three lamps, legs as two cylinders. Try it on your own robot's pictures "
+        "(`sightline vision --shadow onnx`) before you let it drive.", "",
     ])
 
 
