@@ -315,6 +315,7 @@ def _toward(bench: Bench, name: str) -> Planar:
     robot.stop()
     twists = robot.twists()
     bench.need(twists, "it sends no twists")
+    bench.need(all(map(math.isfinite, twists[-1].speeds)), "its twists are not finite (V-GRAM-02)")
     return twists[-1].speeds
 
 
