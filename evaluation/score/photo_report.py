@@ -68,6 +68,10 @@ class PhotoFigures:
     empty: int = 0
     false_alarms: int = 0
     """Photographs without a ball, and those of them with a detection."""
+    unanswered: int = 0
+    """Pictures without an answer, which count as missed."""
+    why: str = ""
+    """The cause of the first one."""
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -127,7 +131,10 @@ def score_photos(asked: Sequence[Subject], photographs: Sequence[Photograph], ea
         for one in asked:
             answer = answer_of(one.detector, picture.number, picture.jpeg, decoder, looks,
                                expected_px=_expected(picture) if tracked else None)
-            _count(found[one.name], picture, _best_ball(answer, one.balls))
+            _count(found[one.name], picture, best_ball(answer, one.balls))
+            if isinstance(answer, str):
+                found[one.name].unanswered += 1
+                found[one.name].why = found[one.name].why or answer
         advance()
     return PhotoReport(len(photographs), each, seed, tracked, found)
 
@@ -141,7 +148,7 @@ def _expected(picture: PhotoPicture) -> tuple[float, float]:
     return (x1 + x2) / 2 + draw.uniform(-_OFF_PX, _OFF_PX), (y1 + y2) / 2 + draw.uniform(-_OFF_PX, _OFF_PX)
 
 
-def _best_ball(answer: DetectionResult | str, balls: Sequence[str]) -> Detection | None:
+def best_ball(answer: DetectionResult | str, balls: Sequence[str]) -> Detection | None:
     """Return the first detection of a ball: detectors give the best first. No answer shows none."""
     found = detections(answer if isinstance(answer, DetectionResult) else None)
     return next((one for one in found if one.label in balls), None)
@@ -171,6 +178,8 @@ def photo_lines(report: PhotoReport) -> list[str]:
     widths = [max(len(row[place]) for row in rows) for place in range(len(rows[0]))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     return [*lines, *(_empty_line(name, figures) for name, figures in report.figures.items()),
+            *(f"{name}: no answer to {one.unanswered} pictures, which count as missed: {one.why}"
+              for name, one in report.figures.items() if one.unanswered),
             f"{report.photographs} photographs, {report.each} pictures of each kind, seed {report.seed}"
             + (", each ball expected where it is" if report.tracked else "")]
 

@@ -77,6 +77,15 @@ def test_a_detector_that_marks_something_else_is_wrong_and_a_false_alarm(boxes):
     assert one.false_alarms == one.empty == 4
 
 
+def test_missing_answers_are_missed_and_reported(boxes):
+    def fails(box):
+        raise RuntimeError("out of memory")
+
+    report, one = figures(boxes, fails)
+    assert one.unanswered == EACH * len(KINDS) + 4 and all(tally.missed == EACH for tally in one.kinds.values())
+    assert any("no answer to 13 pictures" in line and "out of memory" in line for line in photo_lines(report))
+
+
 def test_a_tracked_ball_is_expected_near_its_place(boxes):
     places = {}
 

@@ -1,0 +1,99 @@
+"""Write docs/reference/results/photographs.md: detectors on the shipped photographs, with images. Shell.
+
+    python -m docs.make.photographs
+"""
+
+import platform
+import sys
+from collections.abc import Iterator, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+from sightline.evaluation.photographs import SHIPPED, Photograph, read_photographs
+from sightline.evaluation.score.ball_textures import KINDS
+from sightline.evaluation.score.detector_report import Subject, answer_of, close_subjects, subjects
+from sightline.evaluation.score.photo_report import (
+    PhotoPicture,
+    PhotoReport,
+    best_ball,
+    photo_lines,
+    photo_pictures,
+    score_photos,
+)
+from sightline.operator_side.terminal import progress_bar
+from sightline.vision_side.detect.onnx.detector import shipped_digest
+
+PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "photographs.md"
+NAMES: Final = ("onnx", "hsv")
+EACH, SEED = 60, 1
+"""As in the command that the page prints."""
+SHOWN_SEED: Final = 2
+_GREEN, _RED = (60, 220, 60), (40, 40, 255)
+
+
+def write_image(path: Path, subject: Subject, photographs: Sequence[Photograph]) -> None:
+    """Write two images of each kind, side by side: the ball's box in green, the detector's answer in red."""
+    import cv2
+    import numpy as np
+
+    images = [image_of(one, subject) for one in photo_pictures(photographs, 2, SHOWN_SEED) if one.ball is not None]
+    rows = [np.hstack(images[first : first + 6]) for first in range(0, len(images), 6)]
+    cv2.imwrite(str(path), np.vstack(rows), [cv2.IMWRITE_JPEG_QUALITY, 80])
+
+
+def image_of(picture: PhotoPicture, subject: Subject) -> Any:
+    """Return one image, BGR, with both boxes."""
+    import cv2
+    import simplejpeg
+
+    from sightline.vision_side.decode import Decoder
+
+    bgr = simplejpeg.decode_jpeg(picture.jpeg, "BGR")
+    answer = answer_of(subject.detector, picture.number, picture.jpeg, Decoder(320, 240, 320 * 240), 1)
+    found = best_ball(answer, subject.balls)
+    boxes = [(picture.ball.box, _GREEN)] if picture.ball else []
+    boxes += [((found.x1_px, found.y1_px, found.x2_px, found.y2_px), _RED)] if found else []
+    for grown, ((x1, y1, x2, y2), color) in enumerate(reversed(boxes)):
+        off = 2 * grown
+        cv2.rectangle(bgr, (round(x1) - off, round(y1) - off), (round(x2) + off, round(y2) + off), color, 1)
+    return bgr
+
+
+def page_lines(plain: PhotoReport, tracked: PhotoReport) -> Iterator[str]:
+    """Yield the page, block by block."""
+    yield "# Photographs\n"
+    yield (
+        f"Ray-cast balls of {len(KINDS)} kinds in the {plain.photographs} photographs that come with Sightline\n"
+        "(`evaluation/score/photographs/SOURCES.md` names their origin), and each photograph without a ball.\nA hit "
+        "overlaps the ball by half. [The learned detector](../../explanation/learned-detector.md#in-photographs) "
+        "explains it.\n"
+    )
+    yield (f"Written by `python -m docs.make.photographs` on {platform.machine()} with the model {shipped_digest()}, "
+           f"ONNX Runtime {version('onnxruntime')}\nand OpenCV {version('opencv-python-headless')}.\n")
+    yield f"![two images of each kind; green: the ball, red: the answer of {NAMES[0]}](photographs/images.jpg)\n"
+    for title, report, option in (("One look", plain, ""), ("Where a track expects the ball", tracked, " --tracked")):
+        yield f"## {title}\n"
+        yield f"```text\n$ sightline score detectors {' '.join(NAMES)} --photos shipped --frames {EACH}{option}"
+        yield from photo_lines(report)
+        yield "```\n"
+
+
+def main() -> int:
+    """Score the detectors on the shipped photographs, and write the page."""
+    photographs, asked = read_photographs(SHIPPED), subjects(NAMES)
+    try:
+        with progress_bar(2 * (len(KINDS) * EACH + len(photographs))) as advance:
+            plain, tracked = (score_photos(asked, photographs, EACH, SEED, tracked=told, advance=advance)
+                              for told in (False, True))
+        folder = PAGE.parent / PAGE.stem
+        folder.mkdir(exist_ok=True)
+        write_image(folder / "images.jpg", asked[0], photographs)
+    finally:
+        close_subjects(asked)
+    PAGE.write_text("\n".join(page_lines(plain, tracked)).rstrip() + "\n", "utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
