@@ -31,6 +31,12 @@ AGAIN_S: Final = 3.4
 """Following again."""
 WALL_S: Final = 1.4
 """At the wall."""
+LOST_AT_X_M: Final = 1.1
+"""The radio is lost where the robot has passed this, on its way to the east wall ..."""
+FAST_MPS: Final = 0.3
+"""... while it drives, and is told to drive, at least this fast ..."""
+_TOWARD_RAD: Final = 0.5
+"""... at most this far aside."""
 _ALONGSIDE_S: Final = 0.6
 """Before the vision service is killed."""
 _NAIVE_BEFORE_S: Final = 2.4
@@ -41,6 +47,7 @@ class Arrival(NamedTuple):
 
     t_us: int
     frame_us: int
+    linear_mps: float
 
 
 class Image(NamedTuple):
@@ -125,6 +132,14 @@ class Story:
         hits = sum(now.wall_contacts for now in self.safe.truths[-1:])
         checks.append(at_most("wall contacts of Sightline", hits, "steps", 0.0))
         return [*checks, at_least("distance of the naive robot", self.naive_m, "m", DISTANCE_M)]
+
+
+def heads_for_wall(now: Truth, arrivals: Sequence[Arrival]) -> bool:
+    """Return True where a robot that keeps its newest command meets the east wall within the outage: it drives fast
+    toward it, and is also told to. On a busy machine the two differ."""
+    is_told = bool(arrivals) and arrivals[-1].linear_mps >= FAST_MPS
+    is_near = now.x_m >= LOST_AT_X_M and abs(now.yaw_rad) < _TOWARD_RAD
+    return is_near and is_told and now.linear_mps >= FAST_MPS
 
 
 def compose(safe: Take, naive: Take) -> Story:

@@ -32,6 +32,7 @@ from sightline.evaluation.demo.story import (
     Story,
     Take,
     compose,
+    heads_for_wall,
     wall_us,
 )
 from sightline.evaluation.faults.evidence import read_motors
@@ -45,6 +46,7 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import ConfigError, HardwareError, SightlineError, WireError
 from sightline.protocol.messages import AnswerHeader, FrameHeader, Status
+from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
 from sightline.sim.bus import TruthReader
@@ -74,13 +76,9 @@ SCENE: Final[dict[str, Any]] = {
     ],
 }
 SCENARIO: Final = "scenario.toml"
-LOST_AT_X_M: Final = 1.1
-"""The radio is lost where the robot passes this, on its way to the east wall."""
 OUTAGE_S: Final = 3.6
 """How long the radio is gone: a robot that drives on meets the wall within it."""
 _FOLLOWS_MPS: Final = 0.2
-_FAST_MPS: Final = 0.3
-"""The radio is lost while the robot drives at least this fast."""
 _MOVES_S: Final = 60.0
 _AGAIN_WITHIN_S: Final = 40.0
 _DYING_S: Final = 1.0
@@ -101,11 +99,11 @@ class Witness:
 
     def _twist(self, message: Message) -> None:
         try:
-            echo = decode(AnswerHeader, message.header).echo
+            echo, twist = decode(AnswerHeader, message.header).echo, parse_twist(message.payload)
         except WireError:
             return
         if echo is not None:
-            self._take.arrivals.append(Arrival(monotonic_us(), echo.t_us))
+            self._take.arrivals.append(Arrival(monotonic_us(), echo.t_us, twist.linear_mps))
 
     def _status(self, message: Message) -> None:
         status = decode(Status, message.payload, STATUS.max_payload_bytes)
@@ -225,7 +223,7 @@ def _lose_radio(stage: TakeProcesses) -> None:
     """Drive toward the wall, then stop the relay and watch the consequence."""
     stage.until(lambda now: now.linear_mps > _FOLLOWS_MPS, _MOVES_S, "motion")
     stage.mark("moving")
-    stage.until(lambda now: now.x_m >= LOST_AT_X_M and now.linear_mps >= _FAST_MPS, _MOVES_S, "way to the wall")
+    stage.until(lambda now: heads_for_wall(now, stage.take.arrivals), _MOVES_S, "way to the wall")
     stage.mark("wifi lost")  # before the signal: the figures include what it takes
     stage.processes.signal("relay", signal.SIGSTOP)
     stage.watch(OUTAGE_S)

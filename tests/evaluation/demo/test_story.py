@@ -117,8 +117,18 @@ def test_wall_contact_before_the_loss_does_not_count():
     assert st.wall_us(truths, 30) is None
 
 
+def test_radio_is_lost_where_a_robot_that_keeps_its_command_meets_the_wall():
+    on_the_way = {"x_m": 1.2, "yaw_rad": 0.05, "linear_mps": 0.35}
+    fast, slow = st.Arrival(100, 60, 0.34), st.Arrival(200, 160, 0.1)
+    assert st.heads_for_wall(truth(0, **on_the_way), [slow, fast])
+    assert not st.heads_for_wall(truth(0, **on_the_way), [fast, slow]), "it is about to brake"
+    assert not st.heads_for_wall(truth(0, **on_the_way), [])
+    for change in ({"x_m": 1.0}, {"yaw_rad": 1.57}, {"yaw_rad": -3.1}, {"linear_mps": 0.2}):
+        assert not st.heads_for_wall(truth(0, **on_the_way | change), [fast])
+
+
 def test_frame_age_counts_from_the_newest_frame():
-    arrivals = [st.Arrival(100, 60), st.Arrival(200, 40), st.Arrival(300, 250)]
+    arrivals = [st.Arrival(100, 60, 0.3), st.Arrival(200, 40, 0.3), st.Arrival(300, 250, 0.3)]
     ages = [st.age_us(arrivals, t_us) for t_us in (99, 100, 250, 300, 1300)]
     assert ages == [None, 40, 190, 50, 1050], "an old frame that comes late does not make the command older"
 
@@ -347,7 +357,7 @@ def test_relay_passes_bytes_and_the_end():
 
 
 def test_the_scene_has_a_wall_ahead_of_the_radio_loss(scene):
-    from sightline.evaluation.demo.story_run import LOST_AT_X_M, OUTAGE_S
+    from sightline.evaluation.demo.story_run import OUTAGE_S
 
-    nearest_m = min(wall.start_m[0] for wall in scene[0].walls if wall.start_m[0] > LOST_AT_X_M) - LOST_AT_X_M
+    nearest_m = min(wall.start_m[0] for wall in scene[0].walls if wall.start_m[0] > st.LOST_AT_X_M) - st.LOST_AT_X_M
     assert nearest_m < OUTAGE_S * SCENE["target"]["speed_mps"], "the outage lasts until a robot that drives on is there"
