@@ -34,7 +34,7 @@ WALL_S: Final = 1.4
 LOST_AT_X_M: Final = 1.1
 """The radio is lost where the robot has passed this, on its way to the east wall ..."""
 FAST_MPS: Final = 0.3
-"""... while it drives, and is told to drive, at least this fast ..."""
+"""... while its speed and its newest command are at least this fast ..."""
 _TOWARD_RAD: Final = 0.5
 """... at most this far aside."""
 _ALONGSIDE_S: Final = 0.6
@@ -136,10 +136,10 @@ class Story:
 
 def heads_for_wall(now: Truth, arrivals: Sequence[Arrival]) -> bool:
     """Return True where a robot that keeps its newest command meets the east wall within the outage: it drives fast
-    toward it, and is also told to. On a busy machine the two differ."""
-    is_told = bool(arrivals) and arrivals[-1].linear_mps >= FAST_MPS
+    toward it, and its newest command is as fast. On a busy machine the two differ."""
+    is_sent_on = bool(arrivals) and arrivals[-1].linear_mps >= FAST_MPS
     is_near = now.x_m >= LOST_AT_X_M and abs(now.yaw_rad) < _TOWARD_RAD
-    return is_near and is_told and now.linear_mps >= FAST_MPS
+    return is_near and is_sent_on and now.linear_mps >= FAST_MPS
 
 
 def compose(safe: Take, naive: Take) -> Story:
