@@ -75,7 +75,9 @@ class OnnxDetector:
         path, self._form, self._min_score = model.path, model.form, model.min_score
         self.labels = model.form.labels
         """All that it can call a thing; empty where the model has only numbers."""
-        self._refine, self._second_look = frozenset(config.refine), config.second_look
+        self._refine = frozenset(config.refine)
+        # A model of any size gets the image unscaled, and a part of it would be no larger.
+        self._second_look = config.second_look and model.form.size is not None
         self._engine = model.engine
         self._notices = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
         self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)

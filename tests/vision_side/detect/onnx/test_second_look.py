@@ -9,6 +9,7 @@ from sightline.vision_side.decode import DecodedImage, Decoder
 from sightline.vision_side.detect.onnx.tensors import ImageTile, tile_about
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection
 from sightline.vision_side.detect.registry import build_detector
+from tests.fixtures.vision.onnx import brightness_model
 from tests.fixtures.vision.vision import BALL_RADIUS_M, camera, jpeg_of, scene
 
 pytestmark = pytest.mark.usefixtures("no_gpu")
@@ -103,3 +104,13 @@ def test_a_detection_in_a_tile_has_its_place_in_the_image_and_is_left_out_at_the
     assert tile.shows_middle(Detection(40.0, 60.0, 40.0, 60.0, 1.0, "ball"))
     for middle in ((39.0, 70.0), (232.0, 70.0), (50.0, 59.0), (50.0, 204.0)):
         assert not tile.shows_middle(Detection(*middle, *middle, 1.0, "ball"))
+
+
+@pytest.mark.parametrize(("size", "runs"), [((240, 320), 2), ((None, None), 1)])
+def test_a_model_of_any_size_looks_once(tmp_path, monkeypatch, size, runs):
+    path = brightness_model(tmp_path / "m.onnx", [[10.0, 20.0, 60.0, 90.0]], [0], size=size)
+    detector = build_detector(f"onnx:{path}", {}, VisionConfig(detector=DetectorConfig(device="cpu")))
+    seen, run = [], detector._engine.run
+    monkeypatch.setattr(detector._engine, "run", lambda pixels: seen.append(1) or run(pixels))
+    found(detector, camera(320, 240), jpeg_of(scene(camera(320, 240), 1.0, 0.0)), (160.0, 120.0), lambda _: False)
+    assert len(seen) == runs
