@@ -33,7 +33,7 @@ WALL_S: Final = 1.4
 """At the wall."""
 LOST_AT_X_M: Final = 1.1
 """The radio is lost where the robot has passed this, on its way to the east wall ..."""
-FAST_MPS: Final = 0.3
+_FAST_MPS: Final = 0.3
 """... while its speed and its newest command are at least this fast ..."""
 _TOWARD_RAD: Final = 0.5
 """... at most this far aside."""
@@ -137,9 +137,8 @@ class Story:
 def heads_for_wall(now: Truth, arrivals: Sequence[Arrival]) -> bool:
     """Return True where a robot that keeps its newest command meets the east wall within the outage: it drives fast
     toward it, and its newest command is as fast. On a busy machine the two differ."""
-    is_sent_on = bool(arrivals) and arrivals[-1].linear_mps >= FAST_MPS
-    is_near = now.x_m >= LOST_AT_X_M and abs(now.yaw_rad) < _TOWARD_RAD
-    return is_near and is_sent_on and now.linear_mps >= FAST_MPS
+    is_on_the_way = now.x_m >= LOST_AT_X_M and abs(now.yaw_rad) < _TOWARD_RAD and now.linear_mps >= _FAST_MPS
+    return is_on_the_way and bool(arrivals) and arrivals[-1].linear_mps >= _FAST_MPS
 
 
 def compose(safe: Take, naive: Take) -> Story:

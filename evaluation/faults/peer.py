@@ -24,7 +24,7 @@ from typing import Any, Final, Literal, NamedTuple
 
 from sightline.evaluation.faults.evidence import GOOD, INJECTED, REQUESTED, EventLog
 from sightline.operator_side.client.requests import SOURCE as OPERATOR_SOURCE
-from sightline.operator_side.client.requests import Operator, StatusReport
+from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.client.stop import stop_robot
 from sightline.operator_side.config.loading import load_service
 from sightline.protocol.channels import ACK, CHANNELS, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST, Channel, key_for
@@ -596,17 +596,14 @@ def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventL
         ledger.note(REQUESTED)
         ledger.note(INJECTED)
         if options.fault == "reset":  # before the wheels are at zero
-            operator.stop(lambda: None, is_proven=lambda: _is_latched(operator.report))
+            operator.stop(lambda: None, is_proven=lambda: (
+                operator.report is not None and operator.report.status.state is State.STOPPED))
             reply = operator.request(Verb.RESET)
             print(f"reset {reply.ok}: {reply.detail}", flush=True)
             return 0
         status = operator.stop(lambda: None)
         print(f"state {status and status.state}", flush=True)
     return 0
-
-
-def _is_latched(report: StatusReport | None) -> bool:
-    return report is not None and report.status.state is State.STOPPED
 
 
 # A new operator: what `sightline stop` runs, in this process so that its first packet is noted. Shell.
