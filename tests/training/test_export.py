@@ -15,12 +15,23 @@ import cv2
 from sightline.evaluation.photographs import FEWEST, SHIPPED, read_photographs
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import ConfigError
-from sightline.sim.scenes.model import HARDER, HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox
+from sightline.sim.scenes.model import HARDER, HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox, PhotoScene
 from sightline.sim.scenes.photos import photo_scene
 from sightline.sim.scenes.render import SceneRenderer
 from sightline.training.network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
-from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, SceneSource, _photographs, drawn_scenes, sample
+from sightline.training.scenes import (
+    CUT_PX,
+    WHOLE_PX,
+    DrawnScenes,
+    SceneSource,
+    _photographs,
+    drawn_scenes,
+    open_miner,
+    sample,
+    with_false_balls,
+)
 from sightline.training.schedule import SceneRange, Training
+from tests.fixtures.vision.onnx import brightness_model
 from tests.training.fixture import weights
 
 BALL = LabelledBox("ball", (100.0, 60.0, 141.0, 99.0), 1.0)
@@ -216,6 +227,29 @@ def test_scenes_over_photographs_are_half_of_what_is_shown(tmp_path, photographs
     over_photos = [one for one in samples if not one.known.all()]
     assert 25 < len(over_photos) < 55
     assert all(one.known.tolist() == [1, 0, 0, 0, 0, 1] for one in over_photos)  # balls and other things only
+
+
+def test_false_balls_of_a_model_become_other_things():
+    ball, other, hidden = (10.0, 10.0, 50.0, 50.0), (200.0, 100.0, 240.0, 140.0), (100.0, 150.0, 140.0, 190.0)
+    rgb = np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8)
+    rgb[..., 0] = 200
+    scene = PhotoScene(rgb, (LabelledBox("ball", ball, 1.0),), (other,), (hidden,))
+    false = (280.0, 20.0, 300.0, 40.0)
+    shown = []
+
+    def miner(bgr):
+        shown.append(bgr[0, 0].tolist())
+        return [(12.0, 9.0, 52.0, 49.0), false, (105.0, 155.0, 150.0, 190.0)]
+
+    more = with_false_balls(scene, miner)
+    assert more.others == (other, false), "detections of labeled and of hidden balls are left out"
+    assert more.truths == scene.truths and shown == [[0, 0, 200]]
+
+
+def test_a_model_finds_its_own_balls_for_mining(tmp_path):
+    picture = np.full((HEIGHT_PX, WIDTH_PX, 3), 128, np.uint8)
+    path = brightness_model(tmp_path / "m.onnx", [[10.0, 20.0, 60.0, 90.0], [100.0, 20.0, 160.0, 90.0]], [0, 1])
+    assert open_miner(path)(picture) == [(10.0, 20.0, 60.0, 90.0)]  # the second has another label
 
 
 def test_a_photograph_that_scores_detectors_is_not_trained_on(tmp_path, photographs):
