@@ -12,7 +12,7 @@ ELEMENT_BYTES: Final = 16
 """Security level: 128 bits."""
 MAX_LOST: Final = 64
 """Security limit: hashes for one command. So many commands may be lost in a row, more than in the life of a lease."""
-_LENGTH: Final = 1024
+CHAIN_LENGTH: Final = 1024
 _ANNOUNCED: Final = 2 * MAX_LOST
 """The next chain is announced in so many commands, so that the robot receives one of them."""
 
@@ -37,6 +37,8 @@ class ProofChain:
     def __init__(self, draw: Callable[[int], bytes]) -> None:
         self._draw = draw
         self._elements = self._new()
+        self.commitment: Final = _hashed(self._elements[-1]).hex()
+        """What the first proof continues. It proves nothing and reveals nothing."""
         self._following: list[bytes] = []
         self._announced: str | None = None
 
@@ -53,18 +55,18 @@ class ProofChain:
 
     def _new(self) -> list[bytes]:
         elements = [self._draw(ELEMENT_BYTES)]
-        for _ in range(_LENGTH - 1):
+        for _ in range(CHAIN_LENGTH - 1):
             elements.append(_hashed(elements[-1]))
         return elements
 
 
-def continues(proof: str | None, last: Proof) -> bool:
-    """Return True if `proof` was revealed by the sender of `last`, at most MAX_LOST commands later."""
+def continues(proof: str | None, last: Proof, most: int = MAX_LOST) -> bool:
+    """Return True if `proof` was revealed by the sender of `last`, at most `most` commands later."""
     if proof is None or last.proof is None:
         return False
     known = {bytes.fromhex(one) for one in last if one is not None}
     element = bytes.fromhex(proof)
-    for _ in range(MAX_LOST):
+    for _ in range(most):
         element = _hashed(element)
         if element in known:
             return True

@@ -5,6 +5,7 @@
                         REJECTED     what the transport rejected so far: how often, by reason
                         FAULTS       exceptions since the last such packet: how often, by part
                         READY        the endpoint is open
+                        TOKEN        the token of a driver appeared or ended: its commitment
               aside     ISSUED       a frame is about to be published: seq, capture time, fingerprint
     driver -> network   COMMAND_ACK  a twist was validated: whose, which frame, computing time, and the holder
                         PUBLISH      bytes to publish: channel, header, payload
@@ -58,6 +59,7 @@ class PacketKind(IntEnum):
     PUBLISH = 7
     REJECTED = 8
     FAULTS = 9
+    TOKEN = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +145,16 @@ def unpack_counts(packet: bytes) -> dict[str, int]:
     """Decode a packet of `pack_counts`."""
     counts = json.loads(packet[1:])
     return {str(reason): int(count) for reason, count in counts.items()}
+
+
+def pack_token(token: str, is_present: bool) -> bytes:
+    """Encode that the token of a driver appeared or ended."""
+    return bytes([PacketKind.TOKEN, is_present]) + token.encode()
+
+
+def unpack_token(packet: bytes) -> tuple[str, bool]:
+    """(token, is_present)."""
+    return packet[2:].decode(), bool(packet[1])
 
 
 def pack_message(kind: PacketKind, message: Message) -> bytes:

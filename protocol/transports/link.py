@@ -29,6 +29,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import report_fault
 from sightline.protocol.messages import Verb
 from sightline.protocol.transports.endpoints import check_robot_id
+from sightline.protocol.transports.tokens import Token
 
 Item = TypeVar("Item")
 
@@ -252,6 +253,12 @@ class Link(Closing):
     def has_listener(self, channel: Channel) -> bool:
         """Return True if a peer subscribes to `channel`. Use it to save work, never for safety."""
 
+    def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
+        """Call `callback` with the commitment of each driver's token of this robot, and whether it is present.
+
+        Only Zenoh has tokens (`protocol/transports/tokens.py`); on other links the lease alone ends.
+        """
+
     @property
     def dropped(self) -> Counter[str]:
         """Return the publications that newer ones replaced before they left, by channel, if the link counts them."""
@@ -296,6 +303,15 @@ class FleetLink(Closing):
         """
 
 
+    @abstractmethod
+    def declare_token(self, token: Token) -> Callable[[], None]:
+        """Declare a token. It ends with the returned function, which the caller keeps, with the session or process."""
+
+    @abstractmethod
+    def watch_tokens(self, callback: Callable[[Token, bool], None]) -> None:
+        """Call `callback` on a transport thread with each valid token of others, and whether it is present."""
+
+
 class LinkWrapper(Link):
     """Forwards every call to another link. A subclass overrides only the methods that differ."""
 
@@ -318,6 +334,10 @@ class LinkWrapper(Link):
     def has_listener(self, channel: Channel) -> bool:
         """Forward to the link."""
         return self._link.has_listener(channel)
+
+    def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
+        """Forward to the link."""
+        self._link.watch_drivers(callback)
 
     @property
     def dropped(self) -> Counter[str]:

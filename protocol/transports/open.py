@@ -100,6 +100,11 @@ class LinkGroup(Link):
         """Return True if a peer subscribes on at least one link."""
         return any(link.has_listener(channel) for link in self.links)
 
+    def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
+        """Watch the tokens of all links that have them."""
+        for link in self.links:
+            link.watch_drivers(callback)
+
     @property
     def dropped(self) -> Counter[str]:
         """Return the sum of all links, by channel."""

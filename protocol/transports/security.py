@@ -25,6 +25,8 @@ from sightline.protocol.channels import (
 )
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_zenoh_endpoint, with_allowed
+from sightline.protocol.transports.tokens import ALL_TOKENS, DRIVER_KIND, ROBOT_KIND, VISION_KIND
+from sightline.protocol.transports.tokens import PREFIX as TOKEN_PREFIX
 
 ROBOT_ROLE: Final = "robot"
 ROLES: Final = (ROBOT_ROLE, *SOURCES_OF_ROLE)
@@ -146,6 +148,7 @@ def _rules(role: str) -> list[dict[str, Any]]:
         ("receives", "egress", ["put"], heard),
         ("is received", "egress", ["declare_subscriber"], listeners),
         *_presence_rows(role),
+        *_token_rows(role),
     ]
     return [
         {"id": f"{role} {what}", "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys}
@@ -162,6 +165,17 @@ def _presence_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
         ("is queried", "egress", ["query"], all_of_it),
         ("queries", "ingress", ["query"], all_of_it),
         ("receives replies", "egress", ["declare_queryable", "reply"], all_of_it),
+    ]
+
+
+def _token_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
+    """Return the rules of liveliness tokens. A robot declares its own kind, vision the others, and all may see them."""
+    own = {ROBOT_ROLE: [ROBOT_KIND], "vision": [VISION_KIND, DRIVER_KIND]}.get(role, [])
+    return [
+        ("is alive", "ingress", ["liveliness_token"], [f"{TOKEN_PREFIX}/{kind}/**" for kind in own]),
+        ("watches", "ingress", ["liveliness_query", "declare_liveliness_subscriber"], [ALL_TOKENS]),
+        ("sees", "egress", ["liveliness_token"], [ALL_TOKENS]),
+        ("is watched", "egress", ["liveliness_query", "declare_liveliness_subscriber"], [ALL_TOKENS]),
     ]
 
 

@@ -108,6 +108,13 @@ class DriverCore:
         sender = Holder(source=header.source, session=header.session)
         return CommandAck(sender, header.echo.seq, header.compute_us, self.gate.holder(now_us))
 
+    def on_token(self, token: str, is_present: bool, now_us: int) -> None:
+        """Note that the token of a driver appeared or ended."""
+        if is_present:
+            self.gate.add_token(token, now_us)
+        else:
+            self.gate.end_token(token, now_us)
+
     def on_battery(self, volts: float, t_us: int) -> None:
         """Store the newest voltage, V, and the time of its reading."""
         if self.battery is not None:

@@ -401,6 +401,8 @@ class Driver:
             self._on_rejected(ipc.unpack_counts(packet))
         elif kind is ipc.PacketKind.FAULTS:
             self._faults_of_network += Counter(ipc.unpack_counts(packet))
+        elif kind is ipc.PacketKind.TOKEN:
+            self._driver_core.on_token(*ipc.unpack_token(packet), monotonic_us())
         elif kind is ipc.PacketKind.READY:
             self._rejected_by_network.clear()
             self.driver_end.on_ready()

@@ -138,6 +138,10 @@ class NetworkCore:
         self._camera_seq += 1
         return Message(CAMERA, "", encode(stamp), encode(model))
 
+    def announce_again(self) -> None:
+        """Make the next model due now: a driver arrives, which needs it before its first frame."""
+        self._camera_due_us = 0
+
     def status(
         self, now_us: int, dropped_commands: int = 0, dropped: Mapping[str, int] | None = None,
         missed_captures: int = 0, camera_fault: str = "",

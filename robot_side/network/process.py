@@ -66,6 +66,8 @@ _CAMERA_RETRY_S = 0.5
 _CHECK_STEP_US = 200_000
 _RESTARTED = "; its process was started again"
 _LONGEST_NAP_S = 0.1
+_SHORT_NAP_S = 0.01
+_AWAKE_US = 1_000_000  # after the token of a driver appeared or ended: its subscription to frames comes or changes now
 _LEAVES_WITHIN_S = 3.0
 _OPENS_WITHIN_S = 20.0
 
@@ -87,6 +89,7 @@ class NetworkProcess:
         self._no_image_since_us = 0
         """Begin of the wait for an image that is due; 0 without one. Another thread watches it."""
         self._watched_since_us = self._waited_us = self._checked_us = 0
+        self._awake_until_us = 0
         self._faults_reported: Counter[str] = Counter()
         self._rejected_acks: Counter[str] = Counter()
         self._rejected_reported: Counter[str] = Counter()
@@ -98,6 +101,7 @@ class NetworkProcess:
         self._link.subscribe(TWIST, self._network_end.forward)
         self._link.subscribe(REQUEST, self._network_end.forward)
         self._link.subscribe(ACK, self._on_ack)
+        self._link.watch_drivers(self._on_driver_token)
         self._relay = Relay(self._link)
         threading.Thread(target=self._read_driver, name="driver-pipe", daemon=True).start()
         while self.running:
@@ -134,7 +138,8 @@ class NetworkProcess:
             nap_s = self._network_core.wait_us(monotonic_us()) / 1e6
         if not due:
             self._no_image_since_us = 0
-            self._credit.wait(min(nap_s, _LONGEST_NAP_S) if listening and nap_s > 0 else _LONGEST_NAP_S)
+            longest_s = _LONGEST_NAP_S if monotonic_us() > self._awake_until_us else _SHORT_NAP_S
+            self._credit.wait(min(nap_s, longest_s) if listening and nap_s > 0 else longest_s)
             self._credit.clear()
         return due
 
@@ -243,6 +248,14 @@ class NetworkProcess:
             ipc.pack_counts(ipc.PacketKind.REJECTED, rejected)
         ):
             self._rejected_reported = rejected
+
+    def _on_driver_token(self, token: str, is_present: bool) -> None:
+        self._network_end.send(ipc.pack_token(token, is_present))
+        self._awake_until_us = monotonic_us() + _AWAKE_US
+        if is_present:
+            with self._lock:
+                self._network_core.announce_again()
+        self._credit.set()
 
     def _on_ack(self, message: Message) -> None:
         try:

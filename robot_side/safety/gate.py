@@ -88,7 +88,8 @@ class SafetyGate:
         self.applied = STILL
         self._sequence = SequenceRecord()
         self._repeats = RepeatRecord()
-        self._lease = Lease(config.lease_ms * 1000)
+        # Then no command of the holder is in force, and its next one would be of a frame that is too old.
+        self._lease = Lease(config.lease_ms * 1000, max(config.silence_ms, config.zero_speed_age_ms) * 1000)
         self._ramp = Ramp(config)
         self._guard = guard
         self._battery = battery
@@ -139,8 +140,8 @@ class SafetyGate:
             raise WireError(RejectReason(self.state), self.reason)
         self._notice_lost_human(now_us)
         holder = self._lease.live_holder(now_us)
-        if not self._lease.may_take(who, now_us):
-            raise WireError(RejectReason.NOT_HOLDER, f"{_shown(holder)} drives")
+        if not self._lease.may_take(who, now_us, _proof_of(header)):
+            raise WireError(RejectReason.NOT_HOLDER, self._why_not(who, holder))
         # The lease is renewed in DISARMED too. Otherwise arming would never find a live driver.
         self._live_commands = self._live_commands + 1 if holder == who else 1
         self._lease.take(who, now_us, _proof_of(header))
@@ -356,10 +357,8 @@ class SafetyGate:
 
     def acquire(self, who: Holder, now_us: int, proof: Proof = NO_PROOF) -> str:
         """Take the lease ahead of the first command, and commit to a chain of proofs. Only commands renew it."""
-        if who.source not in RANKS or not self._lease.may_take(who, now_us):
-            holder = self._lease.live_holder(now_us)
-            detail = f"{holder.source} drives" if holder else f"{who.source} may not drive"
-            raise WireError(RejectReason.NOT_HOLDER, detail)
+        if who.source not in RANKS or not self._lease.may_take(who, now_us, proof):
+            raise WireError(RejectReason.NOT_HOLDER, self._why_not(who, self._lease.live_holder(now_us)))
         if self._lease.live_holder(now_us) == who:
             self._lease.advance(who, proof, now_us)
             return "already held"
@@ -378,6 +377,22 @@ class SafetyGate:
             # The robot never returns from a human to vision without an operator.
             self._end(Event.HUMAN_LOST, "the operator released control; arm again")
         return "released"
+
+    def add_token(self, token: str, now_us: int) -> None:
+        """Store the token of a driver (`protocol/transports/tokens.py`)."""
+        self._lease.add_token(token, now_us)
+
+    def end_token(self, token: str, now_us: int) -> bool:
+        """End the lease of the driver with this token, and return True if it held it.
+
+        Its last command stays in force until it is too old, so that the robot does not stop for a successor.
+        """
+        return self._lease.end_token(token, now_us)
+
+    def _why_not(self, who: Holder, holder: Holder | None) -> str:
+        if self._lease.is_fenced(who):
+            return f"the token of this session ended; {who.source} needs a new session"
+        return f"{_shown(holder)} drives" if holder else f"{who.source} may not drive"
 
     def holder(self, now_us: int) -> Holder | None:
         """Return the driver that holds the lease now, or None."""

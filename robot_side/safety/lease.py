@@ -1,15 +1,19 @@
 """Grant the lease to one (role, session) at a time, by rank, while its commands are accepted. Pure."""
 
-from dataclasses import dataclass
+from collections import OrderedDict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import Holder
-from sightline.protocol.proof import NO_PROOF, Proof, continues
+from sightline.protocol.proof import CHAIN_LENGTH, MAX_LOST, NO_PROOF, Proof, continues
 
 # Roles that may drive. STOP ranks above all of them and is not a role.
 RANKS = {"guest": 0, "vision": 1, "teleop": 2}
 # After the loss of one of these drivers, the robot stops and must be armed again.
 HUMANS = frozenset({"teleop"})
+# Security limits: tokens of drivers, and sessions that drive no more. A driver's own tokens leave last.
+_MAX_TOKENS, _MAX_FENCED = 8, 64
 
 
 @dataclass(slots=True)
@@ -18,23 +22,40 @@ class Lease:
 
     Args:
         life_us: time for which one command holds the lease.
+        succession_us: silence after which another driver of the same rank may succeed. Both need a token.
     """
 
     life_us: int
+    succession_us: int
     holder: Holder | None = None
     expires_us: int = 0
     proof: Proof = NO_PROOF
     """The last accepted proof of the holder, which its next command must continue."""
+    token: str = ""
+    """The token of the holder, "" without one. Its end is the end of the lease."""
+    _tokens: OrderedDict[str, None] = field(default_factory=OrderedDict)
+    _fenced: OrderedDict[Holder, None] = field(default_factory=OrderedDict)
+    """Sessions whose token ended while they held the lease, or that were succeeded. A late command never drives."""
 
     def live_holder(self, now_us: int) -> Holder | None:
         """Return the driver that holds the lease now."""
         return self.holder if now_us < self.expires_us else None
 
-    def may_take(self, who: Holder, now_us: int) -> bool:
-        """Return True if `who` holds the lease or outranks the holder, or if the lease is free."""
+    def is_fenced(self, who: Holder) -> bool:
+        """Return True for a session that must not drive again."""
+        return who in self._fenced
+
+    def may_take(self, who: Holder, now_us: int, proof: Proof = NO_PROOF) -> bool:
+        """Return True if `who` holds the lease, outranks the holder or succeeds it, or if the lease is free."""
         holder = self.live_holder(now_us)
-        # Equal ranks never succeed each other: two vision services would alternate at every command.
-        return holder is None or holder == who or RANKS[who.source] > RANKS[holder.source]
+        if self.is_fenced(who):
+            return False
+        # Equal ranks do not succeed a holder that drives: two vision services would alternate at every command.
+        if holder is None or holder == who or RANKS[who.source] > RANKS[holder.source]:
+            return True
+        silent_us = now_us - (self.expires_us - self.life_us)
+        return bool(self.token) and silent_us > self.succession_us and who.source == holder.source \
+            and any(self._tokens_of(proof, MAX_LOST))
 
     def check_proof(self, who: Holder, proof: Proof, now_us: int) -> None:
         """Check that a message which names the holder is of the holder.
@@ -49,6 +70,11 @@ class Lease:
 
     def take(self, who: Holder, now_us: int, proof: Proof = NO_PROOF) -> None:
         """Take or renew the lease for `life_us`. The first proof commits the holder to its chain."""
+        holder = self.live_holder(now_us)
+        if holder != who:
+            if holder is not None and holder.source == who.source:
+                self._fence(holder)
+            self.token = "" if who.source in HUMANS else next(self._tokens_of(proof, CHAIN_LENGTH), "")
         self.holder, self.expires_us, self.proof = who, now_us + self.life_us, proof
 
     def advance(self, who: Holder, proof: Proof, now_us: int) -> None:
@@ -58,7 +84,35 @@ class Lease:
 
     def drop(self) -> None:
         """End the lease now."""
-        self.holder, self.expires_us, self.proof = None, 0, NO_PROOF
+        self.holder, self.expires_us, self.proof, self.token = None, 0, NO_PROOF, ""
+
+    def add_token(self, token: str, now_us: int) -> None:
+        """Store the token of a driver, which may be the holder."""
+        self._tokens[token] = None
+        if len(self._tokens) > _MAX_TOKENS:
+            del self._tokens[next(one for one in self._tokens if one != self.token)]
+        holder = self.live_holder(now_us)
+        if holder is not None and holder.source not in HUMANS and not self.token:
+            self.token = next(self._tokens_of(self.proof, CHAIN_LENGTH), "")
+
+    def end_token(self, token: str, now_us: int) -> bool:
+        """Return True if the lease ended with this token. Its session never drives again."""
+        self._tokens.pop(token, None)
+        holder = self.live_holder(now_us)
+        if not token or token != self.token or holder is None:
+            return False
+        self._fence(holder)
+        self.drop()
+        return True
+
+    def _tokens_of(self, proof: Proof, most: int) -> Iterator[str]:
+        """Yield the tokens whose driver revealed `proof`, at most `most` commands after its first one."""
+        return (token for token in self._tokens if continues(proof.proof, Proof(token), most))
+
+    def _fence(self, who: Holder) -> None:
+        self._fenced[who] = None
+        if len(self._fenced) > _MAX_FENCED:
+            self._fenced.popitem(last=False)
 
     def lost_human(self, now_us: int) -> bool:
         """Return True if a human held the lease and it expired."""

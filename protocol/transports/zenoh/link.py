@@ -22,6 +22,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
 from sightline.protocol.transports.link import NOT_A_PUT, BaseLink, FleetLink, Link, LinkRules, Message
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
+from sightline.protocol.transports.tokens import ALL_TOKENS, DriverToken, RobotToken, Token, drivers_of, parse_token
 from sightline.protocol.transports.zenoh.presence import PeerInfo, PresenceAnnouncer, query_presence
 from sightline.protocol.transports.zenoh.session import CLOSED_SESSION, open_session
 
@@ -162,6 +163,18 @@ class ZenohLink(BaseLink):
             self._ending.callback(here.answer_in(self._session))
         if here.role == ROBOT_ROLE:
             here.claim(self._session)
+            with self._declaring:
+                self._ending.callback(declare_token(self._session, RobotToken(self.robot)))
+
+    def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
+        """Call `callback` on a thread of Zenoh with the commitment of each driver's token, and if it is present."""
+        def note(token: Token, is_present: bool) -> None:
+            if isinstance(token, DriverToken) and token.robot == self.robot:
+                callback(token.commitment, is_present)
+
+        with self._declaring:
+            if not self._closed:
+                self._ending.callback(watch_tokens(self._session, drivers_of(self.robot), note))
 
     def peers(self) -> list[PeerInfo]:
         """Return all other peers with their round trips, within half a second. For display only."""
@@ -224,6 +237,41 @@ class ZenohLink(BaseLink):
         with suppress(zenoh.ZError, RuntimeError):
             self._ending.close()
         self._session = CLOSED_SESSION
+
+
+def declare_token(session: zenoh.Session, token: Token) -> Callable[[], None]:
+    """Declare a token. It ends with the returned function, which the caller keeps until then, or with the session."""
+    import zenoh
+
+    # Zenoh ends a token whose object is no longer referenced. The closure keeps it.
+    declared = session.liveliness().declare_token(token.key)
+
+    def withdraw() -> None:
+        with suppress(zenoh.ZError):  # gone with its session
+            declared.undeclare()  # type: ignore[no-untyped-call]
+
+    return withdraw
+
+
+def watch_tokens(
+    session: zenoh.Session, pattern: str, callback: Callable[[Token, bool], None]
+) -> Callable[[], None]:
+    """Call `callback` on a thread of Zenoh with each valid token, also those of before, and if it is present."""
+    import zenoh
+
+    def note(sample: zenoh.Sample) -> None:
+        token = parse_token(str(sample.key_expr))
+        if token is not None:
+            callback(token, sample.kind == zenoh.SampleKind.PUT)
+
+    handler = zenoh.handlers.Callback(note, indirect=False)
+    watching = session.liveliness().declare_subscriber(pattern, handler, history=True)
+
+    def end() -> None:
+        with suppress(zenoh.ZError):  # gone with its session
+            watching.undeclare()  # type: ignore[no-untyped-call]
+
+    return end
 
 
 def _options(channel: Channel) -> dict[str, Any]:
@@ -304,6 +352,7 @@ def open_fleet(
     max_frame_bytes: int = FRAME.max_payload_bytes,
     secure: str = "",
     about: Callable[[], str] | None = None,
+    by_status: bool = True,
 ) -> ZenohFleet:
     """Open one session for all robots whose id fits `pattern`. Use it in a `with`.
 
@@ -316,6 +365,7 @@ def open_fleet(
         max_frame_bytes: security limit for the payload of a frame.
         secure: folder from `sightline keys`, or "".
         about: returns one line about this end for presence replies.
+        by_status: find robots by their status. Without it, the caller finds them by their tokens.
 
     Raises:
         ConfigError: an endpoint or the pattern is invalid, or an endpoint is not of Zenoh.
@@ -328,6 +378,8 @@ def open_fleet(
     here = PresenceAnnouncer(role, pattern, secrets.token_hex(4), about) if role else None
     session = open_session(listen, connect, timeout_s, load_role_keys(secure, role))
     fleet_link = ZenohFleet(session, pattern, role, max_frame_bytes)
+    if by_status:
+        fleet_link.listen()
     if here is not None:
         fleet_link.announce(here)
     return fleet_link
@@ -344,7 +396,6 @@ class ZenohFleet(FleetLink):
         self._ending.callback(session.close)
         self._heard_s: dict[str, float] = {}
         self._on_new_robot: Callable[[], None] = lambda: None
-        self._listen()
 
     def announce(self, here: PresenceAnnouncer) -> None:
         """Answer presence queries."""
@@ -376,7 +427,16 @@ class ZenohFleet(FleetLink):
         self._ending.close()
         self._session = CLOSED_SESSION
 
-    def _listen(self) -> None:
+    def declare_token(self, token: Token) -> Callable[[], None]:
+        """Declare a token. It ends with the returned function, which the caller keeps, with the session or process."""
+        return declare_token(self._session, token)
+
+    def watch_tokens(self, callback: Callable[[Token, bool], None]) -> None:
+        """Call `callback` on a thread of Zenoh with each valid token, and whether it is present."""
+        self._ending.callback(watch_tokens(self._session, ALL_TOKENS, callback))
+
+    def listen(self) -> None:
+        """Find robots by their status."""
         import zenoh
 
         handler = zenoh.handlers.Callback(self._note, indirect=False)

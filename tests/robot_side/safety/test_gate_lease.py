@@ -4,6 +4,7 @@ import pytest
 
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import STILL, AnswerHeader, Echo, Holder, Request, RequestHeader, Verb
+from sightline.protocol.proof import session_digest
 from sightline.robot_side.safety.gate import Decision, SafetyGate
 from sightline.robot_side.safety.limits import SafetyConfig
 from tests.fixtures.safety import (
@@ -39,7 +40,8 @@ def test_acquire_takes_the_lease_ahead_of_the_first_command():
     assert rig.offer().reason is RejectReason.NOT_HOLDER
     for source, session in [("teleop", OTHER), ("vision", VISION), ("operator", OTHER)]:
         error = refused(rig, Verb.ACQUIRE, source=source, session=session)
-        assert (error.reason, error.detail) == (RejectReason.NOT_HOLDER, "teleop drives")
+        shown = f"teleop {session_digest('teleop', HUMAN)} drives"
+        assert (error.reason, error.detail) == (RejectReason.NOT_HOLDER, shown)
     error = refused(Rig(), Verb.ACQUIRE, source="operator")
     assert (error.reason, error.detail) == (RejectReason.NOT_HOLDER, "operator may not drive")
 

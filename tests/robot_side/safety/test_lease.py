@@ -19,7 +19,7 @@ GUEST = Holder(source="guest", session="00000000")
 
 
 def held_by(who, now_us=1_000, life_us=500):
-    lease = Lease(life_us)
+    lease = Lease(life_us, 400)
     lease.take(who, now_us)
     return lease
 
@@ -40,8 +40,8 @@ def test_a_lease_lives_its_time(who, now_us, held):
 
 
 def test_new_lease_has_no_holder():
-    lease = Lease(500)
-    assert lease == Lease(500, None, 0)
+    lease = Lease(500, 400)
+    assert lease == Lease(500, 400, None, 0)
     for now_us in (-1, 0, 1):
         assert lease.live_holder(now_us) is None and not lease.lost_human(now_us) and lease.may_take(GUEST, now_us)
 
@@ -50,7 +50,7 @@ def test_new_lease_has_no_holder():
 def test_a_dropped_lease_was_not_lost(who):
     lease = held_by(who)
     lease.drop()
-    assert lease == Lease(500, None, 0)
+    assert lease == Lease(500, 400, None, 0)
     assert lease.live_holder(1_001) is None and not lease.lost_human(9_000)
 
 
@@ -78,7 +78,7 @@ def test_holder_and_higher_rank_may_take_the_lease(holder, who, may):
 
 def proven(seed=1):
     """A lease that the vision service holds until 1000 us, its chain, and the proof that it committed with."""
-    proofs, lease = ProofChain(Random(seed).randbytes), Lease(life_us=1_000)
+    proofs, lease = ProofChain(Random(seed).randbytes), Lease(1_000, 400)
     first = proofs.next()
     lease.take(VISION, 0, first)
     return lease, proofs, first

@@ -1,0 +1,85 @@
+"""Define the liveliness tokens: who is present, and who drives a robot. Pure.
+
+    sightline-token/robot/ROBOT                      a robot
+    sightline-token/vision/NAME/WEIGHT/INSTANCE      a vision service that shares robots
+    sightline-token/driver/ROBOT/NAME/COMMITMENT     a session of it that drives a robot, or is about to
+
+A token ends with its process, some milliseconds later, or with its link. `COMMITMENT` is the start of the driver's hash
+chain (`protocol/proof.py`): only the driver can send a twist that continues it, so a robot knows whose token it is.
+"""
+
+import re
+from typing import Final, NamedTuple
+
+PREFIX: Final = "sightline-token"
+ROBOT_KIND, VISION_KIND, DRIVER_KIND = "robot", "vision", "driver"
+ALL_TOKENS: Final = f"{PREFIX}/**"
+LEAST_WEIGHT, MOST_WEIGHT = 0.01, 1000.0
+
+NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}"
+"""Pattern of the name of a vision service, as of a robot id."""
+# Exact: a peer may declare a token with a wildcard, which would end the tokens of others with its own.
+_KEYS: Final = re.compile(
+    rf"{PREFIX}/(?:robot/(?P<robot>{NAME})"
+    rf"|vision/(?P<name>{NAME})/(?P<weight>\d{{1,4}}(?:\.\d{{1,3}})?)/(?P<instance>[0-9a-f]{{8}})"
+    rf"|driver/(?P<driven>{NAME})/(?P<driver>{NAME})/(?P<commitment>[0-9a-f]{{32}}))"
+)
+
+
+class RobotToken(NamedTuple):
+    """A robot is present."""
+
+    robot: str
+
+    @property
+    def key(self) -> str:
+        """Return its key."""
+        return f"{PREFIX}/{ROBOT_KIND}/{self.robot}"
+
+
+class VisionToken(NamedTuple):
+    """A vision service is present and shares robots. `weight` is its share of them, relative to the other services."""
+
+    name: str
+    weight: float
+    instance: str
+    """8 hex digits drawn at the start: two services with one name differ in it."""
+
+    @property
+    def key(self) -> str:
+        """Return its key."""
+        return f"{PREFIX}/{VISION_KIND}/{self.name}/{self.weight:g}/{self.instance}"
+
+
+class DriverToken(NamedTuple):
+    """A session of the vision service `name` drives `robot`, or is about to."""
+
+    robot: str
+    name: str
+    commitment: str
+
+    @property
+    def key(self) -> str:
+        """Return its key."""
+        return f"{PREFIX}/{DRIVER_KIND}/{self.robot}/{self.name}/{self.commitment}"
+
+
+Token = RobotToken | VisionToken | DriverToken
+
+
+def drivers_of(robot: str) -> str:
+    """Return the key expression of the tokens of the drivers of `robot`."""
+    return f"{PREFIX}/{DRIVER_KIND}/{robot}/*/*"
+
+
+def parse_token(key: str) -> Token | None:
+    """Parse the exact key of a token. Return None for any other text, also for a weight out of bounds."""
+    parts = _KEYS.fullmatch(key)
+    if parts is None:
+        return None
+    if parts["robot"]:
+        return RobotToken(parts["robot"])
+    if parts["driven"]:
+        return DriverToken(parts["driven"], parts["driver"], parts["commitment"])
+    weight = float(parts["weight"])
+    return VisionToken(parts["name"], weight, parts["instance"]) if LEAST_WEIGHT <= weight <= MOST_WEIGHT else None

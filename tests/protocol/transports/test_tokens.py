@@ -1,0 +1,46 @@
+"""Keys of liveliness tokens: each token has one key, and only exact keys are tokens."""
+
+import pytest
+
+from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken, drivers_of, parse_token
+
+COMMITMENT = "0123456789abcdef" * 2
+TOKENS = [
+    (RobotToken("r1"), "sightline-token/robot/r1"),
+    (VisionToken("lab-pc.2", 1.0, "0a1b2c3d"), "sightline-token/vision/lab-pc.2/1/0a1b2c3d"),
+    (VisionToken("v", 0.25, "0a1b2c3d"), "sightline-token/vision/v/0.25/0a1b2c3d"),
+    (VisionToken("v", 1000.0, "0a1b2c3d"), "sightline-token/vision/v/1000/0a1b2c3d"),
+    (DriverToken("r1", "v", COMMITMENT), f"sightline-token/driver/r1/v/{COMMITMENT}"),
+]
+
+
+@pytest.mark.parametrize(("token", "key"), TOKENS)
+def test_each_token_has_one_key(token, key):
+    assert token.key == key
+    assert parse_token(key) == token
+
+
+@pytest.mark.parametrize("weight", [0.01, 0.125, 1.0, 3.5, 999.999, 1000.0])
+def test_a_weight_survives_its_key(weight):
+    token = VisionToken("v", weight, "0a1b2c3d")
+    assert parse_token(token.key) == token
+
+
+@pytest.mark.parametrize("key", [
+    "", "sightline-token", "sightline-token/robot", "sightline-token/robot/", "sightline-token/robot/*",
+    "sightline-token/robot/r1/x", "sightline-token/robot/-r1", "sightline-token/robot/" + "r" * 33,
+    "sightline-token/robot/r1\n", "sightline/robot/r1", "sightline-token/vision/v", "sightline-token/vision/v/1",
+    "sightline-token/vision/v/0/0a1b2c3d", "sightline-token/vision/v/-1/0a1b2c3d",
+    "sightline-token/vision/v/nan/0a1b2c3d", "sightline-token/vision/v/1e9/0a1b2c3d",
+    "sightline-token/vision/v/1001/0a1b2c3d", "sightline-token/vision/v/0.001/0a1b2c3d",
+    "sightline-token/vision/*/1/0a1b2c3d", "sightline-token/vision/a/b/1/0a1b2c3d",
+    "sightline-token/vision/v/1/0A1B2C3D", "sightline-token/vision/v/1/0a1b2c3",
+    f"sightline-token/driver/r1/v/{COMMITMENT[1:]}", f"sightline-token/driver/r1/*/{COMMITMENT}",
+    f"sightline-token/driver/*/v/{COMMITMENT}", f"sightline-token/driver/r1/{COMMITMENT}",
+])  # fmt: skip
+def test_any_other_key_is_not_a_token(key):
+    assert parse_token(key) is None
+
+
+def test_pattern_of_the_drivers_of_a_robot():
+    assert drivers_of("r1") == "sightline-token/driver/r1/*/*"
