@@ -43,6 +43,8 @@ PURE = (
     "robot_side/network/congestion_window.py",
     "robot_side/network/bitrate_control.py",
     "vision_side/pipeline.py",
+    "vision_side/serving/assignment.py",
+    "vision_side/serving/sharing.py",
     "vision_side/tracking/*.py",
     "vision_side/missions/*.py",
     "vision_side/detect/port.py",
@@ -69,7 +71,7 @@ SMALL_FILES = {  # with one importer, in their own folder: the reason why each i
     "robot_side/guardian/stop_receiver.py": "a process of its own",
     "robot_side/hardware/log_zero.py": "all that the guardian imports of the drive log",
     "robot_side/driver/persistence.py": "the STOP latch on disk: the one place that a restart depends on",
-    "robot_side/safety/lease.py": "a rule set of its own in the safety core, under strict limits",
+    "vision_side/serving/assignment.py": "one rule with golden vectors: services of any version must agree on it",
 }
 
 

@@ -1,0 +1,85 @@
+"""Assign robots to vision services: weighted rendezvous hashing with bounded load. Pure.
+
+Every service computes the same assignment from the same tokens, so none of them has to decide for the others. A robot
+moves only if its service leaves, if a service that comes is its better choice, or to keep the load within its bound.
+
+Sources: Thaler and Ravishankar, "Using name-based mappings to increase hit rates" (1998); the weights as in
+Schindelhauer and Schomaker, "Weighted distributed hash tables" (2005); the bound as in Mirrokni, Thorup and
+Zadimoghaddam, "Consistent hashing with bounded loads" (2018).
+"""
+
+from collections.abc import Collection, Mapping
+from hashlib import blake2b
+from math import ceil
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+MAX_LOAD: Final = 1.25
+"""Most robots of a service, in shares of what its weight stands for."""
+_CHOICES: Final = 8
+"""Choices of a robot that are sorted at first. Few robots need more."""
+
+
+def ranked(robot: str, weights: Mapping[str, float]) -> list[str]:
+    """Return all services, the best choice of `robot` first, without regard to their load."""
+    names = sorted(weights)
+    scores = _scores([robot], names, weights)[0]
+    return [names[index] for index in np.argsort(-scores, kind="stable")]
+
+
+def assign(robots: Collection[str], weights: Mapping[str, float]) -> dict[str, tuple[str, str]]:
+    """Return the owner and the standby of each robot.
+
+    Args:
+        robots: ids of the robots.
+        weights: name of each service -> its weight, above 0.
+
+    Returns:
+        robot -> (owner, standby). The standby is "" with one service. Empty without services.
+    """
+    names, all_robots = sorted(weights), sorted(robots)
+    if not names or not all_robots:
+        return {}
+    scores = _scores(all_robots, names, weights)
+    total = sum(weights[name] for name in names)
+    room = [ceil(MAX_LOAD * len(all_robots) * weights[name] / total) for name in names]
+    first = _order(scores, min(_CHOICES, len(names)))
+    found: dict[str, tuple[str, str]] = {}
+    for robot, row, some in zip(all_robots, scores, first, strict=True):
+        choices = some
+        owner = next((one for one in choices if room[one] > 0), None)
+        if owner is None:
+            choices = np.argsort(-row, kind="stable")
+            owner = next(one for one in choices if room[one] > 0)
+        room[owner] -= 1
+        found[robot] = names[owner], next((names[one] for one in choices if one != owner), "")
+    return found
+
+
+def _order(scores: NDArray[np.float64], count: int) -> NDArray[np.intp]:
+    """Return the `count` highest columns of each row, the highest first."""
+    best = np.sort(np.argpartition(-scores, count - 1, axis=1)[:, :count], axis=1)
+    order = np.argsort(-np.take_along_axis(scores, best, axis=1), axis=1, kind="stable")
+    return np.take_along_axis(best, order, axis=1)
+
+
+def _scores(robots: list[str], names: list[str], weights: Mapping[str, float]) -> NDArray[np.float64]:
+    """Return the score of each robot (row) for each service (column): -weight / ln(uniform number of the pair)."""
+    mixed = _mixed(_hashes(robots)[:, None] ^ _hashes(names)[None, :])
+    # 53 bits, in the open interval from 0 to 1.
+    uniform = ((mixed >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+    return np.array([weights[name] for name in names]) / -np.log(uniform)
+
+
+def _hashes(names: list[str]) -> NDArray[np.uint64]:
+    digests = b"".join(blake2b(name.encode(), digest_size=8).digest() for name in names)
+    return np.frombuffer(digests, dtype="<u8").astype(np.uint64)
+
+
+def _mixed(values: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Mix the bits of each number, modulo 2^64. Source: the finalizer of SplitMix64 (Steele, Lea and Flood, 2014)."""
+    values = (values ^ (values >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    values = (values ^ (values >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return values ^ (values >> np.uint64(31))
