@@ -1,14 +1,15 @@
 """Every number of the vision side, with its unit, bounds and reason. Pure."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from sightline.protocol.channels import FRAME
 from sightline.protocol.config import Config
 from sightline.protocol.messages import CameraModel, Source
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
+from sightline.protocol.transports.tokens import LEAST_WEIGHT, MOST_WEIGHT, NAME
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 HueDeg = Annotated[float, Field(ge=0, le=360)]
@@ -215,6 +216,23 @@ class ViewingConfig(Config):
     """JPEG quality of the preview."""
 
 
+class ShareConfig(Config):
+    """Several vision services that share the robots of a site."""
+
+    enabled: bool = False
+    """True to share: the service drives the robots that it owns, and stands by for others. It needs Zenoh."""
+    name: Annotated[str, Field(pattern=rf"^({NAME})?$")] = ""
+    """Name among the services, each with its own; empty for a new one at each start."""
+    weight: Annotated[float, Field(ge=LEAST_WEIGHT, le=MOST_WEIGHT)] = 1.0
+    """Share of the robots, relative to the weights of the other services."""
+
+    @model_validator(mode="after")
+    def _has_effect(self) -> Self:
+        if not self.enabled and (self.name or self.weight != 1.0):
+            raise ValueError("a name or a weight needs --share (share.enabled = true)")
+        return self
+
+
 def _camera_of_file(value: Any) -> Any:
     """Read lists from a file as tuples, which the strict model of the wire requires."""
     return CameraModel.model_validate(value, strict=False) if isinstance(value, dict) else value
@@ -247,5 +265,6 @@ class VisionConfig(Config):
     latency: LatencyConfig = LatencyConfig()
     search: SearchConfig = SearchConfig()
     viewing: ViewingConfig = ViewingConfig()
+    share: ShareConfig = ShareConfig()
     camera: Annotated[CameraModel | None, BeforeValidator(_camera_of_file)] = None
     """Model for robots that do not publish one (legacy protocol). A published model takes precedence."""

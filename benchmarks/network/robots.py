@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from random import Random
@@ -82,9 +83,14 @@ class PlayedRobot:
                 return
             sent = self._network_core.on_camera(Picture(self._jpegs[self._ticks % len(self._jpegs)], at_us), at_us)
             camera = self._network_core.announce_camera(self._model, at_us)
+            if sent is not None:
+                self._on_sent(sent[0].seq, at_us)
         for message in (camera, sent and sent[1]):
             if message is not None:
                 self._link.publish(message.channel, message.header, message.payload)
+
+    def _on_sent(self, seq: int, t_us: int) -> None:
+        """Note a frame before it leaves."""
 
     def _say(self, at_us: int) -> None:
         self._statuses += 1
@@ -116,11 +122,12 @@ def main(settings: Settings) -> None:
             for name in (f"r{number}" for number in range(1, settings.robots + 1))
         ]
         print(f"playing {len(robots)} robots", flush=True)
-        _play(robots, ending)
+        play(robots, ending)
     settings.notes.write_text(json.dumps({robot.name: robot.answers for robot in robots}), "utf-8")
 
 
-def _play(robots: list[PlayedRobot], ending: threading.Event) -> None:
+def play(robots: Sequence[PlayedRobot], ending: threading.Event) -> None:
+    """Let every robot do its due work until `ending` is set."""
     while not ending.is_set():
         due_us = min(robot.play(monotonic_us()) for robot in robots)
         time.sleep(max(0, due_us - monotonic_us()) / 1e6)

@@ -65,6 +65,15 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: sightline metrics r1 --connect tcp/192.168.1.20:7447 --port 9464")(metrics)
 
 
+Share = Annotated[
+    bool, typer.Option("--share", help="Share all robots, or those of --robot, with other services that share.")
+]
+ServiceName = Annotated[str | None, typer.Option("--name", help="With --share: a name of its own among the services.")]
+Weight = Annotated[
+    float | None, typer.Option("--weight", help="With --share: its share of the robots [default: 1].")
+]
+
+
 def sim(
     *,
     scenario: Annotated[
@@ -166,6 +175,9 @@ def vision(
     mission: Annotated[
         str | None, typer.Option("--mission", metavar="NAME", help="Mission [default: follow].")
     ] = None,
+    share: Share = False,
+    name: ServiceName = None,
+    weight: Weight = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the detections and do not steer.")] = False,
     camera: CameraKind = None,
     camera_sets: CameraSets = None,
@@ -181,16 +193,14 @@ def vision(
     It runs until Ctrl-C. --dry-run also accepts --camera, a camera of this machine.
     """
     start_log(log, "vision")
-    if camera is not None and not dry_run:
-        raise ConfigError("--camera has no robot to steer; add --dry-run")
-    if camera_sets and camera is None:
-        raise ConfigError("--camera-set needs --camera; name a camera, e.g. --camera v4l2")
+    _check_vision_options(camera, camera_sets, dry_run=dry_run, share=share)
     if robot is not None and "://" in robot:  # the address of a robot that has no id
         connect, robot = [*(connect or ()), robot], None
     options = {"robot": robot, "listen": _ends(listen), "connect": _ends(connect), "secure": secure,
                "detector.kind": detector, "detector.device": device, "detector.shadow": shadow,
-               "mission.kind": mission}
-    loaded = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
+               "mission.kind": mission, "share.name": name, "share.weight": weight}
+    loaded = load_service("vision", profile="shared" if share else None, file=config, sets=sets or (),
+                          options=options, environ=os.environ)
     with needs("vision"):
         if dry_run:
             return _dry_run(loaded.config, camera, camera_sets or [])
@@ -203,6 +213,15 @@ def vision(
         if metrics is not None:
             return _measured(run, loaded.config, metrics)
         return run(loaded.config)  # type: ignore[arg-type]
+
+
+def _check_vision_options(camera: str | None, camera_sets: list[str] | None, *, dry_run: bool, share: bool) -> None:
+    if camera is not None and not dry_run:
+        raise ConfigError("--camera has no robot to steer; add --dry-run")
+    if camera_sets and camera is None:
+        raise ConfigError("--camera-set needs --camera; name a camera, e.g. --camera v4l2")
+    if share and dry_run:
+        raise ConfigError("--share has no robot to steer with --dry-run; leave one of them out")
 
 
 def _measured(run: Any, config: Any, where: str) -> int:

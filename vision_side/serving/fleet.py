@@ -5,22 +5,30 @@
 
 from __future__ import annotations
 
+import secrets
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from fnmatch import fnmatchcase
 
-from sightline.protocol.channels import Channel
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.channels import STATUS, Channel
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import ConfigError, WireError
 from sightline.protocol.log import report_fault
-from sightline.protocol.transports.link import FleetLink, Link, LinkWrapper, Message
+from sightline.protocol.messages import LeaseHolder, Stamp, Status
+from sightline.protocol.transports.link import FleetLink, LatestSlot, Link, LinkWrapper, Message
+from sightline.protocol.transports.tokens import DriverToken, RobotToken, Token, VisionToken
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.registry import configured_detector, waits_for_service
+from sightline.vision_side.pipeline import SOURCE
 from sightline.vision_side.serving.service import (
+    DriverSession,
     LogLine,
     Observe,
     Service,
@@ -28,6 +36,7 @@ from sightline.vision_side.serving.service import (
     ServingState,
     open_service,
 )
+from sightline.vision_side.serving.sharing import Sharing, SharingPart
 
 _LONGEST_WAIT_S = 0.2
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S, _DOUBLINGS = 1.0, 30.0, 16
@@ -82,14 +91,17 @@ class Fleet:
             observe(state)
         try:
             while state.turns():
-                self._bell.wait(_LONGEST_WAIT_S)
-                self._bell.clear()
+                self._wait()
                 self.turn()
         finally:
             self._end()
         for robot, service in self.services.items():
             skipped = dict(service.skipped) or "none"
             self._report(f"vision: {robot}: ended after {service.answered} frames; skipped: {skipped}")
+
+    def _wait(self) -> None:
+        self._bell.wait(_LONGEST_WAIT_S)
+        self._bell.clear()
 
     def counts(self) -> list[ServiceCounts]:
         """Count the frames of each robot so far; from any thread."""
@@ -102,9 +114,9 @@ class Fleet:
         So no robot waits longer than one round, however many frames another one sends. Raises ConfigError for an
         invalid configuration, which is that of every robot.
         """
-        present = self._fleet_link.robots()
+        present = self._present()
         for robot in self._links.keys() - present:
-            self._report(f"vision: {robot}: left")
+            self._report_left(robot)
             self._drop(robot)
             self._starts_s.pop(robot, None)
         for robot in present:
@@ -116,6 +128,16 @@ class Fleet:
                 self._failed.append((robot, error))
         while self._failed:
             self._on_error(*self._failed.popleft())
+
+    def _report_left(self, robot: str) -> None:
+        self._report(f"vision: {robot}: left")
+
+    def _present(self) -> list[str]:
+        """Return the robots to serve."""
+        return self._fleet_link.robots()
+
+    def _open(self, config: VisionConfig, link: Link, detector: Detector) -> Service:
+        return open_service(config, link, self._report_of(config.robot), detector)
 
     def _turn_of(self, robot: str) -> None:
         if robot not in self._links and time.monotonic() >= self._starts_s.get(robot, 0.0):
@@ -143,10 +165,10 @@ class Fleet:
         link = self._links[robot] = self._fleet_link.link(robot)
         if not self._waits_for_service:
             notifying = _NotifyingLink(link, self._bell)
-            self.services[robot] = open_service(config, notifying, self._report_of(robot), self._detector)
+            self.services[robot] = self._open(config, notifying, self._detector)
             return
         own = configured_detector(config) if self.services else None
-        service = self.services[robot] = open_service(config, link, self._report_of(robot), own or self._detector)
+        service = self.services[robot] = self._open(config, link, own or self._detector)
         arguments = (robot, service, own)
         thread = threading.Thread(target=self._serve_one, args=arguments, name=f"vision {robot}", daemon=True)
         self._threads[robot] = thread
@@ -173,3 +195,134 @@ class Fleet:
 
     def _report_of(self, robot: str) -> LogLine:
         return lambda line: self._report(line.replace("vision: ", f"vision: {robot}: ", 1))
+
+
+# Several vision services that share robots. Shell; `sharing.py` decides.
+
+
+_LONGEST_SHARED_WAIT_S = 0.02
+_HANDS_OVER_WITHIN_S = 0.6
+
+
+class SharedFleet(Fleet):
+    """A fleet that drives the robots of its own and stands by for others, beside other services like it."""
+
+    def __init__(
+        self, config: VisionConfig, fleet_link: FleetLink, report: LogLine, detector: Detector | None = None
+    ) -> None:
+        """Create the fleet, see `Fleet`. It is present from now on."""
+        super().__init__(config, fleet_link, report, detector)
+        self._tokens: deque[tuple[Token, bool]] = deque()
+        self._statuses: dict[str, LatestSlot[Message]] = {}
+        self._withdraw: dict[str, Callable[[], None]] = {}
+        """Ends the token with which a robot is driven."""
+        instance = secrets.token_hex(4)
+        own = VisionToken(config.share.name or f"vision-{instance}", config.share.weight, instance)
+        named = () if set("*?") & set(config.robot) else (config.robot,)
+        self.sharing = Sharing(own, named)
+        self._twin_reported = False
+        fleet_link.watch_tokens(self._note)
+        self._leave_services = fleet_link.declare_token(own)
+        report(f"vision: shares robots as {own.name}, weight {own.weight:g}")
+
+    def turn(self) -> None:
+        """Decide the part in each robot, then serve those that it drives."""
+        now_us = monotonic_us()
+        while self._tokens:
+            self.sharing.on_token(*self._tokens.popleft(), now_us)
+        for robot, service in self.services.items():
+            self._read_status(robot, service, now_us)
+        changed = self.sharing.step(now_us)
+        super().turn()
+        for robot, service in self.services.items():
+            self._carry_out(robot, service)
+        for robot, part in changed.items():
+            self._log_part(robot, part)
+
+    def _end(self) -> None:
+        """Hand the robots over, and end. A robot that no service claims keeps its last command until it is too old."""
+        self._leave_services()
+        self.sharing.leave()
+        until_s = time.monotonic() + _HANDS_OVER_WITHIN_S
+        while self._withdraw and len(self.sharing.services()) and time.monotonic() < until_s:
+            self._wait()
+            self.turn()
+        for robot in tuple(self._withdraw):
+            self._withdraw_token(robot)
+        super()._end()
+
+    def _note(self, token: Token, is_present: bool) -> None:
+        robot = token.robot if isinstance(token, RobotToken | DriverToken) else ""
+        if not robot or fnmatchcase(robot, self._config.robot):
+            self._tokens.append((token, is_present))
+            self._bell.set()
+
+    def _wait(self) -> None:
+        self._bell.wait(_LONGEST_SHARED_WAIT_S)
+        self._bell.clear()
+
+    def _present(self) -> list[str]:
+        return [name for name, robot in self.sharing.robots.items() if robot.part is not SharingPart.NONE]
+
+    def _report_left(self, robot: str) -> None:
+        self._report(f"vision: {robot}: {'has other services' if robot in self.sharing.robots else 'left'}")
+
+    def _open(self, config: VisionConfig, link: Link, detector: Detector) -> Service:
+        self._statuses[config.robot] = link.latest(STATUS)
+        return open_service(config, link, self._report_of(config.robot), detector, is_standby=True)
+
+    def _drop(self, robot: str) -> None:
+        super()._drop(robot)
+        self._statuses.pop(robot, None)
+        self._withdraw_token(robot)
+
+    def _read_status(self, robot: str, service: Service, now_us: int) -> None:
+        message = self._statuses[robot].take()
+        if message is None or robot not in self.sharing.robots:
+            return
+        try:
+            stamp, status = decode(Stamp, message.header), decode(Status, message.payload, STATUS.max_payload_bytes)
+        except WireError:
+            return
+        mine = LeaseHolder.of(SOURCE, service.sender.session) == status.holder
+        self.sharing.on_status(robot, status, is_mine=mine, sent=service.sender.twists, now_us=now_us)
+        self.sharing.robots[robot].is_busy = service.has_request
+        if service.is_standby:
+            service.note_status(stamp)
+        elif self.sharing.needs_session(robot, is_mine=mine, now_us=now_us):
+            self._renew(robot, service)
+
+    def _carry_out(self, robot: str, service: Service) -> None:
+        shared = self.sharing.robots.get(robot)
+        part = shared.part if shared else SharingPart.NONE
+        if part in (SharingPart.CLAIM, SharingPart.DRIVE) and robot not in self._withdraw:
+            self._renew(robot, service)
+        if part is SharingPart.DRIVE and service.is_standby:
+            service.begin()
+        elif part is not SharingPart.DRIVE and not service.is_standby:
+            service.rest()
+        if part in (SharingPart.NONE, SharingPart.STANDBY):
+            self._withdraw_token(robot)
+
+    def _renew(self, robot: str, service: Service) -> None:
+        """Drive with a new session from now on. Its token is there before its first command."""
+        sender = DriverSession()
+        token = DriverToken(robot, self.sharing.own.name, sender.proofs.commitment)
+        withdraw = self._fleet_link.declare_token(token)
+        service.sender = sender
+        self._withdraw_token(robot)
+        self._withdraw[robot] = withdraw
+
+    def _withdraw_token(self, robot: str) -> None:
+        if withdraw := self._withdraw.pop(robot, None):
+            withdraw()
+
+    def _log_part(self, robot: str, part: SharingPart) -> None:
+        if part is SharingPart.DRIVE:
+            self._report(f"vision: {robot}: drives it")
+        elif part is SharingPart.STANDBY:
+            self._report(f"vision: {robot}: stands by")
+        if self.sharing.has_twin and not self._twin_reported:
+            self._twin_reported = True
+            self._report(f"vision: another service is named {self.sharing.own.name}; it drives the robots. Give each "
+                         "service its own --name")

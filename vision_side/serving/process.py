@@ -49,7 +49,7 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 
     configured_mission(config)  # report an unknown mission before any endpoint is opened
     ending, detector = threading.Event(), configured_detector(config)
-    run_it = _run_fleet if set("*?") & set(config.robot) else _run_one
+    run_it = _run_fleet if set("*?") & set(config.robot) or config.share.enabled else _run_one
     try:
         with limit_floods(config.listen, lambda line: _log.info("vision: %s", line)):
             return run_it(config, ending, observe, detector)
@@ -79,13 +79,14 @@ def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | N
 
 def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None, detector: Detector) -> int:
     from sightline.protocol.transports.zenoh.link import open_fleet
-    from sightline.vision_side.serving.fleet import Fleet
+    from sightline.vision_side.serving.fleet import Fleet, SharedFleet
 
+    shared = config.share.enabled
     opened = open_fleet(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
-                       max_frame_bytes=config.max_frame_bytes, secure=config.secure)
+                       max_frame_bytes=config.max_frame_bytes, secure=config.secure, by_status=not shared)
     with opened as fleet_link, ends_on_signal(ending):
         _log.info("vision: looking for robots %s at %s", config.robot, endpoints_text(config))
-        fleet = Fleet(config, fleet_link, _log.info, detector)
+        fleet = (SharedFleet if shared else Fleet)(config, fleet_link, _log.info, detector)
         fleet.serve(ending, observe)
     return 0
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
-from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MAX_HEADER_BYTES, TWIST
+from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MAX_HEADER_BYTES, TWIST, Channel
 from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
@@ -175,27 +175,44 @@ LogLine = Callable[[str], None]
 Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
 
 
-def open_service(config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None) -> "Service":
+def open_service(
+    config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None, *, is_standby: bool = False
+) -> "Service":
     """Create the service for one robot that fits its detector (default: that of `config`)."""
-    if config.detector.kind == "boxes":
-        return BoxesService(config, link, report, detector)
-    return Service(config, link, report, detector)
+    kind = BoxesService if config.detector.kind == "boxes" else Service
+    return kind(config, link, report, detector, is_standby=is_standby)
+
+
+class DriverSession:
+    """A session of a driver: what its commands have in common."""
+
+    def __init__(self) -> None:
+        self.session = secrets.token_hex(4)
+        self.proofs = ProofChain(secrets.token_bytes)
+        self.seq = self.twists = 0
 
 
 class Service:
     """Serves one robot: its camera, its sessions, and the pipeline for them."""
 
-    def __init__(self, config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None) -> None:
+    _looks_at: tuple[Channel, ...] = (FRAME,)
+
+    def __init__(
+        self, config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None, *,
+        is_standby: bool = False,
+    ) -> None:
+        """Create the service. A standby receives no frames until `begin`."""
         self._config, self._link, self._report = config, link, report
         self._detector = detector or configured_detector(config)
         attach_detector(self._detector, link)
         self._cameras: LatestSlot[Message] = link.latest(CAMERA)
-        self._frames = self._arrivals(link)
+        self._frames = self._arrivals()
+        self.is_standby = is_standby
+        if not is_standby:
+            self._subscribe()
         self._camera: CameraModel | None = None
         self._pipeline: Pipeline | None = None
-        self._session = secrets.token_hex(4)
-        self._proofs = ProofChain(secrets.token_bytes)
-        self._seq = 0
+        self.sender = DriverSession()
         self._loss = FrameLoss()
         self._is_legacy = any(is_legacy(one) for one in config.connect)
         self._robot_session = ""
@@ -211,9 +228,35 @@ class Service:
         self._mission_channel = MissionChannel(config, link, self._detector, self._log_change, self._reject)
         self._viewing = ViewPublisher(config, link, self._log_change)
 
-    def _arrivals(self, link: Link) -> LatestSlot[Message]:
-        """Return the slot of the frames to answer."""
-        return link.latest(FRAME)
+    def _arrivals(self) -> LatestSlot[Message]:
+        """Return the slot of the messages to answer."""
+        return LatestSlot()
+
+    def _subscribe(self) -> None:
+        for channel in self._looks_at:
+            self._link.subscribe(channel, self._frames.put)
+
+    def begin(self) -> None:
+        """Receive frames from now on. The frames before were not lost."""
+        self.is_standby, self._loss, self._heard_s = False, FrameLoss(), time.monotonic()
+        self._subscribe()
+
+    def rest(self) -> None:
+        """Receive no more frames, but the model of the camera and requested missions."""
+        self.is_standby = True
+        for channel in self._looks_at:
+            self._link.unsubscribe(channel)
+
+    def note_status(self, stamp: Stamp) -> None:
+        """Take in a requested mission without a frame: it cites a status that is about as old as this one."""
+        if self._pipeline is not None:
+            frame = FrameHeader(session=stamp.session, seq=stamp.seq, t_us=stamp.t_us)
+            self._mission_channel.prepare(self._pipeline, frame)
+
+    @property
+    def has_request(self) -> bool:
+        """Return True if a mission was requested here."""
+        return self._mission_channel.has_request
 
     def turn(self, wait_s: float) -> None:
         """Wait up to `wait_s` for a frame and answer it."""
@@ -226,7 +269,7 @@ class Service:
         self._look_at_camera()
         if message is not None:
             self._frame(message, started_ns)
-        else:
+        elif not self.is_standby:
             self._note_silence(time.monotonic())
 
     def _note_silence(self, now_s: float) -> None:
@@ -341,9 +384,11 @@ class Service:
             self._link.publish(DETECTIONS, b"", target_box(answer.seen.target, self._camera))
 
     def _send(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
-        self._seq += 1
-        proof = NO_PROOF if answer.twist is None else self._proofs.next()
-        stamp = encode(answer_header(header, self._session, self._seq, compute_us, answer, proof=proof))
+        sender = self.sender  # another thread may replace it
+        sender.seq += 1
+        sender.twists += answer.twist is not None
+        proof = NO_PROOF if answer.twist is None else sender.proofs.next()
+        stamp = encode(answer_header(header, sender.session, sender.seq, compute_us, answer, proof=proof))
         if answer.twist is None:
             self._link.publish(ACK, stamp, b"")
         else:
@@ -431,15 +476,18 @@ class BoxesInbox(LatestSlot[Message]):
 class BoxesService(Service):
     """A `Service` whose detector is elsewhere."""
 
-    def __init__(self, config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None) -> None:
+    _looks_at = (FRAME, DETECTIONS)
+
+    def __init__(
+        self, config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None, *,
+        is_standby: bool = False,
+    ) -> None:
         self._inbox = BoxesInbox(config.boxes.source)
         self._reader = BoxReader(config.boxes)
         self._boxes_heard_s = time.monotonic()
-        super().__init__(config, link, report, detector)
+        super().__init__(config, link, report, detector, is_standby=is_standby)
 
-    def _arrivals(self, link: Link) -> LatestSlot[Message]:
-        for channel in (FRAME, DETECTIONS):
-            link.subscribe(channel, self._inbox.put)
+    def _arrivals(self) -> LatestSlot[Message]:
         return self._inbox
 
     def _frame(self, message: Message, started_ns: int) -> None:

@@ -1,0 +1,117 @@
+"""Many robots in one process, each with its real gate, for the rows with several vision services. Shell.
+
+    python -m sightline.benchmarks.network.gated_robots SETTINGS_AS_JSON
+
+A robot here has its own session, credit, status, driver core and gate, and no motors: the gate decides. Written at
+SIGTERM as JSON, for each robot: `accepted`, the accepted commands as (arrival_us, digest of the sender, capture_us of
+its frame), `holds`, the times (begin_us, end_us) without motion after the first command, and `sent`, frames sent.
+"""
+
+import json
+import signal
+import sys
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+from random import Random
+from typing import Any, Final
+
+from sightline.benchmarks.network.robots import PlayedRobot, Settings, play
+from sightline.protocol.channels import ACK
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import decode
+from sightline.protocol.messages import AnswerHeader, State
+from sightline.protocol.transports.link import Link, Message
+from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.driver.core import DriverCore
+from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
+
+_CONNECT_S: Final = 15.0
+
+
+class GatedRobot(PlayedRobot):
+    """A played robot whose commands go through the driver core."""
+
+    def __init__(self, name: str, link: Link, settings: Settings, due_us: int) -> None:
+        super().__init__(name, link, settings, due_us)
+        self.core = DriverCore(RobotConfig(robot=name, safety=SafetyConfig(auto_arm=True)), self._session)
+        self.accepted: list[tuple[int, str, int]] = []
+        self.holds: list[list[int]] = []
+        self._tick_due_us = due_us
+        link.watch_drivers(self._on_token)
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Return what is written of this robot."""
+        return {"accepted": self.accepted, "holds": self.holds, "sent": self._network_core.status(0).sent}
+
+    def play(self, at_us: int) -> int:
+        """Do the due work, also the gate's."""
+        if at_us >= self._tick_due_us:
+            self._tick_due_us = max(self._tick_due_us + TICK_US, at_us)
+            with self._lock:
+                self.core.tick(at_us, None, None)
+                state = self.core.gate.state
+            self._note_state(state, at_us)
+        return min(super().play(at_us), self._tick_due_us)
+
+    def _note_state(self, state: State, at_us: int) -> None:
+        if not self.accepted:
+            return
+        stands = state not in (State.ACTIVE, State.DEGRADED)
+        if stands and (not self.holds or self.holds[-1][1]):
+            self.holds.append([at_us, 0])
+        elif not stands and self.holds and not self.holds[-1][1]:
+            self.holds[-1][1] = at_us
+
+    def _on_sent(self, seq: int, t_us: int) -> None:
+        self.core.on_issued(seq, t_us, 0)
+
+    def _say(self, at_us: int) -> None:
+        with self._lock:
+            self.core.stream = self._network_core.status(at_us)
+            messages = list(self.core.messages(at_us))
+        for message in messages:
+            self._link.publish(message.channel, message.header, message.payload)
+
+    def _on_token(self, token: str, is_present: bool) -> None:
+        with self._lock:
+            self.core.on_token(token, is_present, monotonic_us())
+            if is_present:
+                self._network_core.announce_again()
+
+    def _on_answer(self, message: Message) -> None:
+        at_us = monotonic_us()
+        with self._lock:
+            if message.channel is ACK:
+                self._network_core.on_ack(message, at_us)
+                return
+            before = self.core.gate.accepted
+            ack = self.core.on_twist(message, at_us)
+            if ack is not None:
+                self._network_core.on_command_ack(ack, at_us)
+            if self.core.gate.accepted > before:
+                header = decode(AnswerHeader, message.header)
+                self.accepted.append((at_us, header.digest, header.echo.t_us))
+
+
+def main(settings: Settings) -> None:
+    """Play until SIGTERM."""
+    ending, chance = threading.Event(), Random(settings.seed)
+    signal.signal(signal.SIGTERM, lambda *_: ending.set())
+    with ExitStack() as links:
+        begin_us = monotonic_us() + 1_000_000
+        robots = [
+            GatedRobot(name, links.enter_context(
+                open_zenoh(name, connect=settings.endpoint.split(","), role="robot", timeout_s=_CONNECT_S)
+            ), settings, begin_us + round(chance.random() * 1e6 / settings.fps))
+            for name in (f"r{number}" for number in range(1, settings.robots + 1))
+        ]
+        print(f"playing {len(robots)} robots", flush=True)
+        play(robots, ending)
+    Path(settings.notes).write_text(json.dumps({robot.name: robot.record for robot in robots}), "utf-8")
+
+
+if __name__ == "__main__":
+    main(Settings.model_validate_json(sys.argv[1]))

@@ -1,0 +1,140 @@
+"""Vision services that share robots over real Zenoh sessions; the robots have their real gate."""
+
+import threading
+from contextlib import ExitStack
+
+import pytest
+
+from sightline.benchmarks.loop.pictures import write_pictures
+from sightline.benchmarks.network.gated_robots import GatedRobot
+from sightline.benchmarks.network.robots import Settings, play
+from sightline.protocol.channels import FRAME
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
+from sightline.protocol.transports.zenoh.session import open_session
+from sightline.vision_side.config import ShareConfig, VisionConfig
+from sightline.vision_side.serving.assignment import assign
+from sightline.vision_side.serving.fleet import SharedFleet
+from tests.fixtures.links import until
+from tests.fixtures.ports import free_endpoint
+
+pytestmark = pytest.mark.waits
+
+
+class Vision:
+    """A service that shares, in a thread of this process."""
+
+    def __init__(self, name, endpoint):
+        self.name, self.lines = name, []
+        self.link = open_fleet("r*", connect=[endpoint], role="vision", by_status=False)
+        config = VisionConfig(robot="r*", connect=(endpoint,), share=ShareConfig(enabled=True, name=name))
+        self.fleet, self._ending = SharedFleet(config, self.link, self.lines.append), threading.Event()
+        self._thread = threading.Thread(target=self.fleet.serve, args=(self._ending,), daemon=True)
+        self._thread.start()
+
+    @property
+    def driving(self):
+        return {robot for robot, service in self.fleet.services.items() if not service.is_standby}
+
+    def end(self):
+        self._ending.set()
+        self._thread.join(5)
+        assert not self._thread.is_alive()
+        self.link.close()
+
+    def die(self):
+        """Lose all tokens at once, as a killed process does."""
+        self.link.close()
+        self._ending.set()
+
+
+@pytest.fixture
+def site(tmp_path):
+    """Four robots and two services at a router."""
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    write_pictures(pictures, 160, 120)
+    endpoint, ending = free_endpoint(), threading.Event()
+    settings = Settings(endpoint=endpoint, robots=4, fps=15, pictures=pictures, notes=tmp_path / "notes", seed=1)
+    with ExitStack() as closing:
+        closing.callback(open_session([endpoint], (), 5.0).close)
+        visions = [Vision(name, endpoint) for name in ("a", "b")]
+        links = [closing.enter_context(open_zenoh(f"r{number}", connect=[endpoint], role="robot"))
+                 for number in range(1, 5)]
+        robots = [GatedRobot(link.robot, link, settings, monotonic_us()) for link in links]
+        playing = threading.Thread(target=play, args=(robots, ending), daemon=True)
+        playing.start()
+        assert until(lambda: all(len(robot.accepted) > 10 for robot in robots), 10)
+        assert until(lambda: visions[0].driving | visions[1].driving == {robot.name for robot in robots})
+        yield robots, visions, endpoint
+        for vision in visions:
+            if vision._thread.is_alive():
+                vision.end()
+        ending.set()
+        playing.join(5)
+
+
+def drives_on(robots, since_us):
+    """Return True when each robot has accepted five commands since then."""
+    return until(lambda: all(sum(at_us > since_us for at_us, _, _ in robot.accepted) >= 5 for robot in robots), 5)
+
+
+def stood(robots, since_us):
+    """Return the times without motion that began since then."""
+    return [hold for robot in robots for hold in robot.holds if hold[0] > since_us]
+
+
+def test_services_share_the_robots_and_each_frame_goes_to_one(site):
+    robots, (first, second), _ = site
+    assert not first.driving & second.driving
+    since_us = monotonic_us()
+    sent = sum(robot.record["sent"] for robot in robots)
+    assert drives_on(robots, since_us)
+    sent = sum(robot.record["sent"] for robot in robots) - sent
+    answered = sum(service.answered for one in (first, second) for service in one.fleet.services.values())
+    accepted = sum(at_us > since_us for robot in robots for at_us, _, _ in robot.accepted)
+    assert sent - 2 * len(robots) <= accepted <= sent + len(robots), (accepted, sent)
+    assert answered <= sum(robot.record["sent"] for robot in robots), "no frame goes to two services"
+
+
+@pytest.mark.parametrize("how", ["die", "end"])
+def test_no_robot_stands_when_a_service_dies_or_ends(site, how):
+    robots, (first, second), _ = site
+    since_us = monotonic_us()
+    getattr(first, how)()
+    assert until(lambda: second.driving == {robot.name for robot in robots})
+    assert drives_on(robots, monotonic_us())
+    assert stood(robots, since_us) == []
+
+
+def test_a_service_that_comes_takes_robots_and_none_stands(site):
+    robots, visions, endpoint = site
+    since_us = monotonic_us()
+    visions.append(Vision("c", endpoint))
+    mine = {robot for robot, (owner, _) in assign([one.name for one in robots], dict.fromkeys("abc", 1.0)).items()
+            if owner == "c"}
+    assert mine and until(lambda: visions[2].driving == mine)
+    assert drives_on(robots, monotonic_us())
+    assert sum(len(vision.driving) for vision in visions) == len(robots)
+    assert stood(robots, since_us) == []
+
+
+def test_a_robot_that_rejects_the_session_gets_a_new_one(site):
+    robots, _, _ = site
+    robot, since_us = robots[0], monotonic_us()
+    fenced = robot.accepted[-1][1]
+    with robot._lock:
+        robot.core.gate.end_token(robot.core.gate._lease.token, since_us)
+    assert drives_on([robot], since_us)
+    assert fenced not in {digest for at_us, digest, _ in robot.accepted if at_us > since_us + 100_000}
+    assert len({digest for _, digest, _ in robot.accepted}) >= 2
+
+
+def test_the_standby_has_the_camera_and_no_frames(site):
+    robots, visions, _ = site
+    for vision in visions:
+        standby = {name: one for name, one in vision.fleet.services.items() if one.is_standby}
+        assert standby, "each of two services stands by for the robots of the other"
+        assert until(lambda one=standby: all(service._camera is not None for service in one.values()))
+        assert all(service.answered == 0 for service in standby.values() if service.sender.twists == 0)
+    assert all(robot._link.has_listener(FRAME) for robot in robots)

@@ -1,0 +1,365 @@
+"""Several services share robots: who drives after each event, in virtual time with late tokens."""
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from random import Random
+
+import pytest
+
+from sightline.protocol.messages import LeaseHolder, State, Status, StreamStatus
+from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
+from sightline.vision_side.serving.assignment import assign
+from sightline.vision_side.serving.sharing import MAX_SERVICES, Sharing, SharingPart
+
+MS = 1_000
+STEP_US, STATUS_US, FRAME_US, SILENT_US = 10 * MS, 100 * MS, 60 * MS, 400 * MS
+
+
+@dataclass
+class Robot:
+    """A robot with the rules of its gate: one holder, a fence behind each token, succession of a silent one."""
+
+    holder: str = ""
+    heard_us: int = 0
+    accepted: int = 0
+    fenced: set = field(default_factory=set)
+    gaps: list = field(default_factory=list)
+    state: State = State.ACTIVE
+
+    def offer(self, session, now_us):
+        if session in self.fenced or self.state is State.STOPPED:
+            return
+        if self.holder and self.holder != session:
+            if now_us - self.heard_us <= SILENT_US:
+                return
+            self.fenced.add(self.holder)
+        if self.accepted:
+            self.gaps.append((self.heard_us, now_us - self.heard_us))
+        self.holder, self.heard_us, self.accepted = session, now_us, self.accepted + 1
+
+    def status(self):
+        shown = LeaseHolder(source="vision", digest=self.holder) if self.holder else None
+        return Status(state=self.state, reason="", holder=shown, accepted=self.accepted)
+
+
+class Service:
+    """The shell of a service: carries out what `Sharing` decides."""
+
+    def __init__(self, site, name, weight=1.0, instance=None):
+        self.site = site
+        self.sharing = Sharing(VisionToken(name, weight, instance or f"{site.drawn():08x}"))
+        self.tokens, self.sent, self.driving = {}, {}, set()
+        self.hangs = False
+        site.declare(self, self.sharing.own)
+
+    def turn(self, now_us):
+        for robot, part in self.sharing.step(now_us).items():
+            if part in (SharingPart.CLAIM, SharingPart.DRIVE) and robot not in self.tokens:
+                self.renew(robot)
+            self.driving = {name for name, one in self.sharing.robots.items() if one.part is SharingPart.DRIVE}
+            if part in (SharingPart.NONE, SharingPart.STANDBY) and robot in self.tokens:
+                self.site.withdraw(self, self.tokens.pop(robot))
+
+    def renew(self, robot):
+        token = DriverToken(robot, self.sharing.own.name, f"{self.site.drawn():08x}" + "0" * 24)
+        self.site.declare(self, token)
+        if robot in self.tokens:
+            self.site.withdraw(self, self.tokens[robot])
+        self.tokens[robot], self.sent[robot] = token, 0
+
+    def see(self, name, robot, now_us):
+        one = self.sharing.robots.get(name)
+        if one is None or one.part is SharingPart.NONE:
+            return
+        mine = name in self.tokens and robot.holder == self.tokens[name].commitment[:8]
+        self.sharing.on_status(name, robot.status(), is_mine=mine, sent=self.sent.get(name, 0), now_us=now_us)
+        if self.sharing.needs_session(name, is_mine=mine, now_us=now_us):
+            self.renew(name)
+
+
+class Site:
+    """Robots, services and the tokens between them. Each token arrives at each service after its own delay."""
+
+    def __init__(self, robots, services, seed=0, weights=None):
+        self.chance, self.now_us, self.doubled = Random(seed), 10_000_000, 0
+        self.robots, self.services, self.present, self.late = {}, {}, {}, []
+        for name in robots:
+            self.robots[name] = Robot()
+            self.present[RobotToken(name)] = None
+        for name in services:
+            self.join(name, (weights or {}).get(name, 1.0))
+        self.run(4_000)
+
+    def drawn(self):
+        return self.chance.randrange(2**32)
+
+    def join(self, name, weight=1.0, instance=None):
+        service = Service(self, name, weight, instance)
+        self.services[service.sharing.own.instance] = service
+        for token in list(self.present):
+            self.deliver(service, token, True)
+        return service
+
+    def named(self, name):
+        return next(one for one in self.services.values() if one.sharing.own.name == name)
+
+    def declare(self, owner, token):
+        self.present[token] = owner
+        for service in self.services.values():
+            if service is not owner:
+                self.deliver(service, token, True)
+
+    def withdraw(self, owner, token):
+        self.present.pop(token, None)
+        for service in self.services.values():
+            if service is not owner:
+                self.deliver(service, token, False)
+        if isinstance(token, DriverToken):
+            robot = self.robots[token.robot]
+            if robot.holder == token.commitment[:8]:
+                robot.fenced.add(robot.holder)
+                robot.holder = ""
+
+    def deliver(self, service, token, is_present):
+        # In order for each service, as over one connection.
+        last_us = max((due for due, one, _, _ in self.late if one is service), default=0)
+        self.late.append((max(last_us, self.now_us + self.chance.randrange(1, 12) * MS), service, token, is_present))
+
+    def kill(self, name):
+        service = self.named(name)
+        del self.services[service.sharing.own.instance]
+        for token in [one for one, owner in self.present.items() if owner is service]:
+            self.withdraw(service, token)
+
+    def run(self, ms):
+        end_us = self.now_us + ms * MS
+        while self.now_us < end_us:
+            self.now_us += STEP_US
+            awake = [one for one in self.services.values() if not one.hangs]
+            due = [one for one in self.late if one[0] <= self.now_us and not one[1].hangs]
+            self.late = [one for one in self.late if one not in due]
+            for _, service, token, is_present in due:
+                service.sharing.on_token(token, is_present, self.now_us)
+            for service in awake:
+                if self.now_us % STATUS_US == 0:
+                    for name, robot in self.robots.items():
+                        service.see(name, robot, self.now_us)
+                service.turn(self.now_us)
+            if self.now_us % FRAME_US == 0:
+                self.frames(awake)
+        return self
+
+    def frames(self, awake):
+        for name, robot in self.robots.items():
+            driving = [one for one in awake if name in one.driving]
+            self.doubled += len(driving) > 1
+            for one in self.chance.sample(driving, len(driving)):
+                one.sent[name] += 1
+                robot.offer(one.tokens[name].commitment[:8], self.now_us)
+
+    def drivers(self):
+        return {name: sorted(one.sharing.own.name for one in self.services.values() if name in one.driving)
+                for name in self.robots}
+
+    def assert_owners_drive(self):
+        weights = {one.sharing.own.name: one.sharing.own.weight for one in self.services.values()}
+        owners = {robot: [owner] for robot, (owner, _) in assign(self.robots, weights).items()}
+        assert self.drivers() == owners
+
+    def worst_gap_ms(self, since_us):
+        for robot in self.robots.values():
+            robot.offer("end", self.now_us)  # counts the time up to now
+        return max(gap for robot in self.robots.values() for at_us, gap in robot.gaps if at_us + gap > since_us) / MS
+
+
+def robots(count):
+    return [f"r{number}" for number in range(count)]
+
+
+SERVICES = ("a", "b", "c")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_each_robot_is_driven_by_its_owner_alone(seed):
+    site = Site(robots(12), SERVICES, seed, weights={"a": 2.0})
+    site.assert_owners_drive()
+    assert {part for one in site.services.values() for part in (r.part for r in one.sharing.robots.values())} == {
+        SharingPart.DRIVE, SharingPart.STANDBY, SharingPart.NONE,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_killed_service_is_followed_at_once(seed):
+    site = Site(robots(12), SERVICES, seed)
+    began_us = site.now_us
+    site.kill("b")
+    site.run(2_500)
+    assert site.worst_gap_ms(began_us) <= 150
+    site.assert_owners_drive()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_join_and_an_orderly_end_leave_no_gap_and_no_two_drivers(seed):
+    site = Site(robots(12), SERVICES, seed)
+    began_us, doubled = site.now_us, site.doubled
+    site.join("d")
+    site.run(2_000).assert_owners_drive()
+    leaving = site.named("a")
+    site.withdraw(leaving, leaving.sharing.own)
+    leaving.sharing.leave()
+    site.run(600)
+    assert not leaving.driving and not leaving.tokens
+    site.kill("a")
+    site.run(1_500).assert_owners_drive()
+    assert site.worst_gap_ms(began_us) <= 150 and site.doubled == doubled
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_service_that_hangs_is_succeeded_and_drives_its_robots_again_later(seed):
+    site = Site(robots(12), SERVICES, seed)
+    began_us, hanging = site.now_us, site.named("c")
+    assert hanging.driving
+    hanging.hangs = True
+    site.run(1_500)
+    others = [name for one in site.services.values() if one is not hanging for name in one.driving]
+    assert sorted(others) == sorted(site.robots), "the standby drives"
+    assert site.worst_gap_ms(began_us) <= 800
+    hanging.hangs = False
+    site.run(4_000).assert_owners_drive()
+
+
+def test_a_service_that_never_answers_keeps_no_robot():
+    site = Site(robots(9), ("a", "b"))
+    silent = VisionToken("x", 1000.0, "00000000")
+    site.declare(None, silent)
+    began_us = site.now_us
+    site.run(4_500)
+    assert all(len(drivers) == 1 for drivers in site.drivers().values())
+    assert site.worst_gap_ms(began_us) <= 3_000
+    site.declare(None, DriverToken("r1", "x", "e" * 32))
+    site.run(4_000)
+    assert site.drivers()["r1"] in (["a"], ["b"]), "also with the token of a driver that sends nothing"
+    assert site.robots["r1"].accepted > 0 and site.now_us - site.robots["r1"].heard_us < 200 * MS
+
+
+def test_robots_that_join_without_a_working_owner_are_driven_within_three_seconds():
+    site = Site([], ("a",))
+    for name in ("x", "y"):
+        site.declare(None, VisionToken(name, 1000.0, "00000000"))
+    site.run(100)
+    for name in robots(6):
+        site.robots[name] = Robot()
+        site.declare(None, RobotToken(name))
+    site.run(3_000)
+    assert all(robot.accepted for robot in site.robots.values())
+
+
+def test_of_two_services_with_one_name_one_drives():
+    site = Site(robots(6), ())
+    first, second = (site.join("same", instance=one) for one in ("11111111", "22222222"))
+    site.run(3_000)
+    assert len(first.driving) == 6 and not second.driving
+    assert second.sharing.has_twin and not first.sharing.has_twin
+
+
+def test_a_requested_mission_keeps_its_robot_until_the_service_leaves():
+    site = Site(robots(8), ("a",))
+    site.named("a").sharing.robots["r1"].is_busy = True
+    site.join("b", weight=1000.0)
+    site.run(3_000)
+    assert site.drivers() == {name: ["a" if name == "r1" else "b"] for name in site.robots}
+    site.named("a").sharing.leave()
+    site.run(600)
+    assert site.drivers()["r1"] == ["b"]
+
+
+@pytest.mark.parametrize("state", [State.STOPPED, State.FAULT, State.DISARMED])
+def test_a_robot_that_must_not_move_changes_no_service(state):
+    site = Site(robots(6), SERVICES)
+    before = site.drivers()
+    for robot in site.robots.values():
+        robot.state = State.STOPPED if state is State.FAULT else state
+    claims = {token for token in site.present if isinstance(token, DriverToken)}
+    site.run(3_000)
+    assert site.drivers() == before
+    assert {token for token in site.present if isinstance(token, DriverToken)} == claims
+
+
+def one(status, *, mine=False, sent=(5, 10)):
+    """A service that drives r1 for two seconds with this status; returns whether it needs a new session."""
+    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
+    sharing.on_token(RobotToken("r1"), True, 0)
+    sharing.step(0)
+    assert sharing.robots["r1"].part is SharingPart.DRIVE
+    for number in range(20):
+        now_us = number * 100 * MS
+        sharing.on_status("r1", status, is_mine=mine, sent=sent[0] if number < 2 else sent[1] + number, now_us=now_us)
+        if sharing.needs_session("r1", is_mine=mine, now_us=now_us):
+            return True
+    return False
+
+
+def test_a_driver_whose_session_the_robot_no_longer_accepts_takes_a_new_one():
+    other = LeaseHolder(source="vision", digest="11111111")
+    assert one(Status(state=State.HOLD, reason=""))
+    assert one(Status(state=State.ACTIVE, reason="", holder=other))
+    assert one(Status(state=State.STOPPED, reason=""), sent=(5, 890)), "1024 commands later, no token is its own"
+    assert not one(Status(state=State.ACTIVE, reason=""), mine=True)
+    assert not one(Status(state=State.STOPPED, reason="")) and not one(Status(state=State.FAULT, reason=""))
+    human = LeaseHolder(source="teleop", digest="11111111")
+    assert not one(Status(state=State.ACTIVE, reason="", holder=human))
+    assert not one(Status(state=State.HOLD, reason="", stream=StreamStatus(camera_fault="unplugged")))
+
+
+def test_at_most_one_new_session_a_second():
+    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
+    sharing.on_token(RobotToken("r1"), True, 0)
+    sharing.step(0)
+    status, renewed = Status(state=State.HOLD, reason=""), []
+    for number in range(100):
+        now_us = number * 100 * MS
+        sharing.on_status("r1", status, is_mine=False, sent=number, now_us=now_us)
+        if sharing.needs_session("r1", is_mine=False, now_us=now_us):
+            renewed.append(now_us)
+    assert 5 <= len(renewed) <= 10
+    assert min(later - before for before, later in pairwise(renewed)) >= 1_000 * MS
+
+
+def test_floods_of_tokens_are_bounded():
+    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
+    for number in range(2_000):
+        sharing.on_token(VisionToken(f"v{number}", 1.0, f"{number:08x}"), True, 0)
+        sharing.on_token(DriverToken("r1", "v1", f"{number:032x}"), True, 0)
+    sharing.on_token(RobotToken("r1"), True, 0)
+    assert len(sharing.services()) == MAX_SERVICES + 1
+    assert len(sharing.robots["r1"].drivers) <= 16
+
+
+def test_a_named_robot_needs_no_token_of_its_own():
+    sharing = Sharing(VisionToken("a", 1.0, "0000000a"), named=("old",))
+    assert sharing.step(0) == {"old": SharingPart.DRIVE}
+    sharing.on_token(RobotToken("old"), True, 1)
+    sharing.on_token(RobotToken("old"), False, 2)
+    assert "old" in sharing.robots
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_after_any_events_the_owners_drive(seed):
+    site, chance = Site(robots(8), SERVICES, seed), Random(seed)
+    for number in range(8):
+        awake = [one for one in site.services.values() if not one.hangs]
+        event = chance.choice(("kill", "join", "hang", "wake", "wait"))
+        if event == "kill" and len(awake) > 1:
+            site.kill(chance.choice(awake).sharing.own.name)
+        elif event == "join":
+            site.join(f"n{number}", chance.choice((0.5, 1.0, 3.0)))
+        elif event == "hang" and len(awake) > 1:
+            chance.choice(awake).hangs = True
+        elif event == "wake":
+            for service in site.services.values():
+                service.hangs = False
+        site.run(chance.choice((50, 300, 900)))
+    for service in site.services.values():
+        service.hangs = False
+    site.run(6_000).assert_owners_drive()
+    assert all(site.now_us - robot.heard_us < 200 * MS for robot in site.robots.values())

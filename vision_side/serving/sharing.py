@@ -1,0 +1,245 @@
+"""Decide which robots this vision service drives, beside other services. Pure.
+
+    tokens of robots and services -> assignment -> owner and standby of each robot
+    part      subscribes to           its token of a driver   left when
+    STANDBY   camera model, status    no                      the robot gets another owner or standby
+    CLAIM     the same                yes                     no other driver is left, or it is silent
+    DRIVE     frames too              yes                     a better choice claims the robot
+
+The owner claims; the former driver sees the token and leaves; then the owner drives. So two services never look at the
+frames of one robot, except while one of them hangs. The robot decides by its lease who drives. Nothing here does.
+"""
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Final
+
+from sightline.protocol.messages import State, Status
+from sightline.protocol.transports.tokens import DriverToken, RobotToken, Token, VisionToken
+from sightline.vision_side.serving.assignment import assign, ranked
+
+SILENT_US: Final = 400_000
+"""Time without an accepted command after which the standby drives. The robot permits it after the same time."""
+NO_DRIVER_US: Final = 1_500_000
+"""Time without a token of a driver after which the standby claims a robot, and each further choice a second later."""
+BETWEEN_CHANGES_US: Final = 1_000_000
+"""Shortest time between two claims of one robot by one service."""
+NOT_MINE_US: Final = 300_000
+"""Time without the lease, although commands leave, after which a driver needs a new session."""
+FRESH_COMMANDS: Final = 900
+"""Commands of one session without the lease. After 1024 a robot no longer knows whose token it is."""
+MAX_ROBOTS, MAX_SERVICES, MAX_DRIVERS = 10_000, 256, 16
+"""Security limits: robots, services, and drivers of one robot. Further tokens do not count."""
+
+
+class SharingPart(Enum):
+    """The part of this service in driving a robot."""
+
+    NONE = "none"
+    STANDBY = "standby"
+    CLAIM = "claim"
+    DRIVE = "drive"
+
+
+@dataclass(slots=True)
+class SharedRobot:
+    """State of one robot: its drivers, and the part of this service."""
+
+    drivers: set[DriverToken]
+    part: SharingPart = SharingPart.NONE
+    is_busy: bool = False
+    """True for a mission that an operator requested here: another service does not know it, so the robot stays."""
+    ignored: set[DriverToken] = field(default_factory=set)
+    """Drivers that were silent. A new session of them counts again."""
+    driverless_us: int = 0
+    """Since when there is no driver, or this robot is known."""
+    changed_us: int = -BETWEEN_CHANGES_US
+    accepted: int = -1
+    status_us: int = 0
+    """Time of the newest status."""
+    active_us: int = 0
+    """Last time at which the driver drove, or had no reason to."""
+    sent: int = 0
+    mine_us: int = 0
+    """Last time at which this service held the lease, or had no reason to."""
+
+    @property
+    def others(self) -> set[DriverToken]:
+        """Return the drivers that count."""
+        return self.drivers - self.ignored
+
+    @property
+    def is_silent(self) -> bool:
+        """Return True if its statuses show no driver at work."""
+        return self.status_us - self.active_us >= SILENT_US
+
+
+class Sharing:
+    """The robots of one vision service among others.
+
+    Args:
+        own: the token of this service.
+        named: robots that it serves without a token of theirs, e.g. older ones.
+    """
+
+    def __init__(self, own: VisionToken, named: tuple[str, ...] = ()) -> None:
+        self.own = own
+        self._is_leaving = False
+        self._drivers: dict[str, set[DriverToken]] = {robot: set() for robot in named}
+        self.robots = {robot: SharedRobot(self._drivers[robot]) for robot in named}
+        self._named = frozenset(named)
+        self._services: set[VisionToken] = set()
+        self._choices: dict[str, tuple[str, str]] | None = None
+
+    @property
+    def has_twin(self) -> bool:
+        """Return True if another service has this name and counts instead of this one."""
+        return any(one.name == self.own.name and one.instance < self.own.instance for one in self._services)
+
+    def leave(self) -> None:
+        """End the part of this service: each robot goes to the first other service that claims it."""
+        self._is_leaving, self._choices = True, None
+
+    def services(self) -> dict[str, float]:
+        """Return the weight of each service, this one included. Of two with one name the lower instance counts."""
+        present = sorted((*self._services, self.own), key=lambda one: one.instance, reverse=True)
+        return {one.name: one.weight for one in present if not (self._is_leaving and one == self.own)}
+
+    def on_token(self, token: Token, is_present: bool, now_us: int) -> None:
+        """Note a token that appeared or ended."""
+        if isinstance(token, DriverToken):
+            self._on_driver(token, is_present, now_us)
+        elif isinstance(token, RobotToken):
+            self._on_robot(token.robot, is_present, now_us)
+        elif token != self.own:
+            if not is_present:
+                self._services.discard(token)
+            elif len(self._services) < MAX_SERVICES:
+                self._services.add(token)
+            self._choices = None
+
+    def _on_robot(self, robot: str, is_present: bool, now_us: int) -> None:
+        if is_present and robot not in self.robots and len(self.robots) < MAX_ROBOTS:
+            self.robots[robot] = SharedRobot(self._drivers.setdefault(robot, set()), driverless_us=now_us)
+            self._choices = None
+        elif not is_present and robot in self.robots and robot not in self._named:
+            del self.robots[robot]
+            self._choices = None
+
+    def _on_driver(self, token: DriverToken, is_present: bool, now_us: int) -> None:
+        if token.name == self.own.name:
+            return
+        # The tokens of a robot and of its driver arrive in any order.
+        drivers, robot = self._drivers.setdefault(token.robot, set()), self.robots.get(token.robot)
+        if is_present and len(drivers) < MAX_DRIVERS and len(self._drivers) <= MAX_ROBOTS:
+            drivers.add(token)
+        elif not is_present:
+            drivers.discard(token)
+        if robot is not None and not is_present:
+            robot.ignored.discard(token)
+            robot.driverless_us = robot.driverless_us if drivers else now_us
+        if robot is None and not drivers:
+            del self._drivers[token.robot]
+
+    def on_status(self, robot: str, status: Status, *, is_mine: bool, sent: int, now_us: int) -> None:
+        """Note a status of a robot that this service has a part in.
+
+        Args:
+            robot: robot id.
+            status: its newest status.
+            is_mine: True if its holder is the session of this service.
+            sent: commands of this session so far.
+            now_us: monotonic clock.
+        """
+        one = self.robots.get(robot)
+        if one is None:
+            return
+        human = status.holder is not None and status.holder.source != "vision"
+        needs_no_driver = human or status.state in (State.STOPPED, State.FAULT) or bool(status.stream.camera_fault)
+        waits = status.state is State.DISARMED and status.holder is not None
+        if needs_no_driver or waits or status.accepted != one.accepted:
+            one.active_us = now_us
+        if is_mine or needs_no_driver or sent == one.sent:
+            one.mine_us = now_us
+        one.accepted, one.sent, one.status_us = status.accepted, sent, now_us
+
+    def needs_session(self, robot: str, *, is_mine: bool, now_us: int) -> bool:
+        """Return True if this service drives but the robot no longer accepts its session, at most once a second."""
+        one = self.robots[robot]
+        stale = self._is_not_mine(one, now_us) or (not is_mine and one.sent >= FRESH_COMMANDS)
+        if one.part is not SharingPart.DRIVE or not stale or now_us - one.changed_us < BETWEEN_CHANGES_US:
+            return False
+        one.changed_us = one.mine_us = now_us
+        one.sent = 0
+        return True
+
+    def step(self, now_us: int) -> dict[str, SharingPart]:
+        """Decide the part in each robot from now on. Returns the robots whose part changed."""
+        if self._choices is None:
+            self._choices = assign(self.robots, self.services())
+        changed = {}
+        for name, robot in self.robots.items():
+            before = robot.part
+            # Without another driver, a claim becomes the drive in one step.
+            while (part := self._next_part(name, robot, now_us)) is not robot.part:
+                self._change(robot, part, now_us)
+            if part is not before:
+                changed[name] = part
+        return changed
+
+    def _change(self, robot: SharedRobot, part: SharingPart, now_us: int) -> None:
+        if part is SharingPart.CLAIM:
+            robot.changed_us = now_us
+        if part is SharingPart.DRIVE:
+            robot.ignored |= robot.drivers
+            robot.mine_us, robot.sent = now_us, 0
+        # Without a part, no status came: what it showed before is over. A standby knows that the driver is silent.
+        if part is not SharingPart.CLAIM or robot.part is SharingPart.NONE:
+            robot.active_us = now_us
+        robot.part = part
+
+    def _next_part(self, name: str, robot: SharedRobot, now_us: int) -> SharingPart:
+        owner, standby = (self._choices or {}).get(name, ("", ""))
+        beside = SharingPart.STANDBY if self.own.name in (owner, standby) and not self._is_out else SharingPart.NONE
+        if robot.part is SharingPart.CLAIM and (not robot.others or robot.is_silent):
+            return SharingPart.DRIVE
+        if robot.part in (SharingPart.CLAIM, SharingPart.DRIVE):
+            return beside if self._must_leave(name, robot, now_us) else robot.part
+        return SharingPart.CLAIM if self._may_claim(name, robot, owner, standby, now_us) else beside
+
+    @property
+    def _is_out(self) -> bool:
+        return self._is_leaving or self.has_twin
+
+    def _must_leave(self, name: str, robot: SharedRobot, now_us: int) -> bool:
+        """Return True if another driver has the better claim."""
+        # A silent driver counts again if it has the lease.
+        others = robot.drivers if self._is_not_mine(robot, now_us) else robot.others
+        if not others or self._is_out:
+            return bool(others)
+        before = self._order(name)[: self._place(name)]
+        return not robot.is_busy and any(other.name in before for other in others)
+
+    @staticmethod
+    def _is_not_mine(robot: SharedRobot, now_us: int) -> bool:
+        return robot.part is SharingPart.DRIVE and now_us - robot.mine_us >= NOT_MINE_US
+
+    def _order(self, robot: str) -> list[str]:
+        """Return all services in the order in which they may claim a robot."""
+        first = [one for one in (self._choices or {}).get(robot, ()) if one]
+        return first + [one for one in ranked(robot, self.services()) if one not in first]
+
+    def _place(self, robot: str) -> int:
+        return self._order(robot).index(self.own.name)
+
+    def _may_claim(self, name: str, robot: SharedRobot, owner: str, standby: str, now_us: int) -> bool:
+        if self._is_out or now_us - robot.changed_us < BETWEEN_CHANGES_US:
+            return False
+        if owner == self.own.name:
+            return True
+        waited_us = 0 if robot.drivers else now_us - robot.driverless_us
+        if standby == self.own.name:
+            return waited_us >= NO_DRIVER_US or (robot.part is SharingPart.STANDBY and robot.is_silent)
+        # The third choice after 2.5 s, the next one a second later. The place is computed only then.
+        turns = (waited_us - NO_DRIVER_US) // BETWEEN_CHANGES_US
+        return turns >= 1 and turns >= self._place(name) - 1
