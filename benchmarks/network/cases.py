@@ -174,6 +174,19 @@ CASES: Final = (
         scene="fleet",
         transports=_SITE,
     ),
+    *(
+        NetworkCase(name, f"20 robots, 15 fps, {what}", (NetworkPhase(_NEAR),), scene="shared", transports=_SITE)
+        for name, what in (
+            ("shared-killed", "3 vision services that share: each killed with -9 in turn"),
+            ("shared-rolling", "3 vision services that share: each ended in order and started again in turn"),
+            ("shared-scaled", "3 vision services that share, then 5, then 3"),
+            ("shared-frozen", "3 vision services that share: each stopped for 3 s in turn"),
+            ("shared-cut", "2 vision services that share: the link of one cut for 5 s"),
+            ("shared-alone", "one vision service that shares: its link cut for 5 s"),
+            ("shared-router", "3 vision services and 2 routers: each router killed with -9 in turn"),
+            ("shared-router-frozen", "3 vision services and 2 routers: each router stopped for 5 s in turn"),
+        )
+    ),
 )
 
 

@@ -4,7 +4,8 @@
 
 A robot here has its own session, credit, status, driver core and gate, and no motors: the gate decides. Written at
 SIGTERM as JSON, for each robot: `accepted`, the accepted commands as (arrival_us, digest of the sender, capture_us of
-its frame), `holds`, the times (begin_us, end_us) without motion after the first command, and `sent`, frames sent.
+its frame), `holds`, the times (begin_us, end_us) without motion after the first command, and the numbers of frames
+`sent` and of `answers`, accepted or not.
 """
 
 import json
@@ -37,6 +38,7 @@ class GatedRobot(PlayedRobot):
         super().__init__(name, link, settings, due_us)
         self.core = DriverCore(RobotConfig(robot=name, safety=SafetyConfig(auto_arm=True)), self._session)
         self.accepted: list[tuple[int, str, int]] = []
+        self._answers = 0
         self.holds: list[list[int]] = []
         self._tick_due_us = due_us
         link.watch_drivers(self._on_token)
@@ -44,7 +46,8 @@ class GatedRobot(PlayedRobot):
     @property
     def record(self) -> dict[str, Any]:
         """Return what is written of this robot."""
-        return {"accepted": self.accepted, "holds": self.holds, "sent": self._network_core.status(0).sent}
+        return {"accepted": self.accepted, "holds": self.holds, "answers": self._answers,
+                "sent": self._network_core.status(0).sent}
 
     def play(self, at_us: int) -> int:
         """Do the due work, also the gate's."""
@@ -84,6 +87,7 @@ class GatedRobot(PlayedRobot):
     def _on_answer(self, message: Message) -> None:
         at_us = monotonic_us()
         with self._lock:
+            self._answers += 1
             if message.channel is ACK:
                 self._network_core.on_ack(message, at_us)
                 return

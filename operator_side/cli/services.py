@@ -68,7 +68,7 @@ def register(app: typer.Typer) -> None:
 Share = Annotated[
     bool, typer.Option("--share", help="Share all robots, or those of --robot, with other services that share.")
 ]
-ServiceName = Annotated[str | None, typer.Option("--name", help="With --share: a name of its own among the services.")]
+ShareName = Annotated[str | None, typer.Option("--name", help="With --share: a name of its own among the services.")]
 Weight = Annotated[
     float | None, typer.Option("--weight", help="With --share: its share of the robots [default: 1].")
 ]
@@ -176,7 +176,7 @@ def vision(
         str | None, typer.Option("--mission", metavar="NAME", help="Mission [default: follow].")
     ] = None,
     share: Share = False,
-    name: ServiceName = None,
+    name: ShareName = None,
     weight: Weight = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the detections and do not steer.")] = False,
     camera: CameraKind = None,

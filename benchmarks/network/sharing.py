@@ -1,0 +1,268 @@
+"""Rows of `bench network` with several vision services that share twenty robots: their harms and checks. Shell.
+
+The robots have their real gates (`gated_robots.py`). The score is theirs: accepted commands, and times without motion.
+"""
+
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, Final
+
+from sightline.benchmarks.loop.pictures import write_pictures
+from sightline.benchmarks.network.cases import CUT_S, NetworkCase, both
+from sightline.benchmarks.network.robots import Settings
+from sightline.benchmarks.network.stage import NetworkRun, ShapedWire, Stage
+from sightline.evaluation.checks import Check, at_least, at_most
+from sightline.evaluation.processes import Processes
+from sightline.protocol.clock import monotonic_us
+from sightline.sim.network_emulator import LinkShapes
+from sightline.sim.tun_emulator import ADDRESS_A
+
+ROBOTS: Final = 20
+WIDTH_PX, HEIGHT_PX, FPS = 320, 240, 15.0
+MOST_LOOKS: Final = 1.05
+"""Most answers for each frame. Two services that look at the same frames make two."""
+ENDS_S: Final = 1.0
+_SETTLE_S: Final = 4.0
+_PORTS: Final = (7447, 7448)
+_FROZEN_S: Final = 3.0
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class SharingBounds:
+    """Bounds of a row. `gap_ms` is the longest time between two accepted commands of a robot, or None."""
+
+    services: int
+    stands_s: float
+    gap_ms: float | None = None
+    routers: int = 1
+    beyond: bool = False
+    """True for services beyond the shaped wire; the routers are then on the robots' side."""
+
+
+BOUNDS: Final[Mapping[str, SharingBounds]] = {
+    "shared-killed": SharingBounds(3, 0.0, gap_ms=250),
+    "shared-rolling": SharingBounds(3, 0.0, gap_ms=150),
+    "shared-scaled": SharingBounds(3, 0.0, gap_ms=150),
+    "shared-frozen": SharingBounds(3, 0.5),
+    "shared-cut": SharingBounds(2, 0.5, beyond=True),
+    "shared-alone": SharingBounds(1, CUT_S + 0.5, beyond=True),
+    "shared-router": SharingBounds(3, 0.5, routers=2),
+    "shared-router-frozen": SharingBounds(3, 3.0, routers=2),
+}
+
+
+# --- checks, pure ------------------------------------------------------------------------------------------------
+
+
+def worst_gap_ms(records: Mapping[str, Record], begin_us: int, end_us: int) -> float:
+    """Return the longest time between two accepted commands of one robot that overlaps `begin_us` to `end_us`."""
+    worst_us = 0
+    for record in records.values():
+        times = [begin_us, *(at_us for at_us, _, _ in record["accepted"]), end_us]
+        worst_us = max(worst_us, *(later - before for before, later in pairwise(sorted(times))
+                                   if later > begin_us and before < end_us))
+    return worst_us / 1000
+
+
+def longest_stand_s(records: Mapping[str, Record], begin_us: int, end_us: int) -> float:
+    """Return the longest time without motion of one robot, of those that began from `begin_us` to `end_us`."""
+    holds = (hold for record in records.values() for hold in record["holds"] if begin_us <= hold[0] < end_us)
+    return max(((hold[1] or end_us) - hold[0] for hold in holds), default=0) / 1e6
+
+
+def drivers_that_return(records: Mapping[str, Record]) -> int:
+    """Count the sessions that drove a robot again after another one had driven it: two drivers at once."""
+    count = 0
+    for record in records.values():
+        former: set[str] = set()
+        driving = ""
+        for _, session, _ in record["accepted"]:
+            if session != driving:
+                count += session in former
+                former.add(driving)
+                driving = session
+    return count
+
+
+def changes_of_driver(records: Mapping[str, Record]) -> int:
+    """Count the changes of the driver, of all robots."""
+    return sum(before != after for record in records.values()
+               for (_, before, _), (_, after, _) in pairwise(record["accepted"]))
+
+
+def looks_per_frame(records: Mapping[str, Record]) -> float:
+    """Return the answers of all services over the frames of all robots."""
+    answers, sent = (sum(int(record[name]) for record in records.values()) for name in ("answers", "sent"))
+    return answers / max(1, sent)
+
+
+def sharing_checks(
+    bounds: SharingBounds, records: Mapping[str, Record], spans_us: Sequence[tuple[int, int]]
+) -> Iterator[Check]:
+    """Yield the checks of a row. `spans_us` are the times from each harm to the next one."""
+    stands = max(longest_stand_s(records, *span) for span in spans_us)
+    yield at_least("robots that drive", float(sum(len(one["accepted"]) > 0 for one in records.values())), "", ROBOTS)
+    yield at_most(f"a robot stands, worst of {len(spans_us)} times", stands, "s", bounds.stands_s)
+    if bounds.gap_ms is not None:
+        gap = max(worst_gap_ms(records, *span) for span in spans_us)
+        yield at_most("between two commands, worst robot", gap, "ms", bounds.gap_ms)
+    changed = changes_of_driver(records)
+    yield at_most(f"two drivers at once, in {changed} changes", float(drivers_that_return(records)), "", 0)
+    if bounds.services > 1:
+        yield at_most("answers of all services over frames", looks_per_frame(records), "", MOST_LOOKS)
+
+
+# --- scenes ------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Site:
+    """Robots, routers and services on the stage."""
+
+    stage: Stage
+    processes: Processes
+    wire: ShapedWire
+    bounds: SharingBounds
+    endpoints: tuple[str, ...]
+    running: dict[str, str] = field(default_factory=dict)
+    """The name of each router and service -> that of its process."""
+    ended_s: list[float] = field(default_factory=list)
+    _starts: int = 0
+
+    def start_router(self, number: int) -> None:
+        """Start a router that connects to the other one."""
+        others = [endpoint for index, endpoint in enumerate(self.endpoints) if index != number]
+        listen = f"tcp/0.0.0.0:{_PORTS[number]}"
+        self._start(f"router{number}", "router: on", "router", "--listen", listen, *_connect(others))
+
+    def start_service(self, name: str) -> None:
+        """Start a service that shares. It has its name at the next start too."""
+        namespace = self.wire.far_side if self.bounds.beyond and name == "v0" else self.wire.robot_side
+        self._start(name, "shares robots", "vision", "--share", "--name", name, *_connect(self.endpoints),
+                    namespace=namespace)
+
+    def kill(self, name: str) -> None:
+        """End a process with -9."""
+        self.processes.kill(self.running.pop(name))
+
+    def end(self, name: str) -> None:
+        """End a process in order, and note the time that it takes."""
+        began_s = time.monotonic()
+        self.processes.end_one(self.running.pop(name))
+        self.ended_s.append(time.monotonic() - began_s)
+
+    def freeze(self, name: str, seconds: float) -> None:
+        """Stop a process for a while."""
+        self.processes.signal(self.running[name], signal.SIGSTOP)
+        time.sleep(seconds)
+        self.processes.signal(self.running[name], signal.SIGCONT)
+
+    def _start(self, name: str, line: str, *arguments: str, namespace: str = "") -> None:
+        # Each start has a log of its own, whose first line is waited for.
+        self._starts += 1
+        process = self.running[name] = f"{name}-{self._starts}"
+        self.processes.start(process, list(arguments), namespace=namespace or self.wire.robot_side)
+        self.processes.wait_line(process, line)
+
+
+def _connect(endpoints: Sequence[str]) -> list[str]:
+    return [word for endpoint in endpoints for word in ("--connect", endpoint)]
+
+
+def _restarted(end: Callable[[Site, str], None]) -> Callable[[Site, int], None]:
+    def harm(site: Site, number: int) -> None:
+        name = f"v{number % site.bounds.services}"
+        end(site, name)
+        time.sleep(1.5)
+        site.start_service(name)
+        time.sleep(2.0)
+
+    return harm
+
+
+def _scaled(site: Site, _number: int) -> None:
+    """Three services, five, three."""
+    for name in ("v3", "v4"):
+        site.start_service(name)
+        time.sleep(1.5)
+    for name in ("v3", "v4"):
+        site.end(name)
+        time.sleep(1.5)
+
+
+def _frozen(site: Site, number: int) -> None:
+    site.freeze(f"v{number % site.bounds.services}", _FROZEN_S)
+    time.sleep(4.0)
+
+
+def _cut(site: Site, _number: int) -> None:
+    site.wire.shape(site.stage.seeded(both(cut=True)))
+    time.sleep(CUT_S)
+    site.wire.shape(site.stage.seeded(both(delay_ms=1)))
+    time.sleep(4.0)
+
+
+def _router_killed(site: Site, number: int) -> None:
+    site.kill(f"router{number % 2}")
+    time.sleep(3.0)
+    site.start_router(number % 2)
+    time.sleep(3.0)
+
+
+def _router_frozen(site: Site, number: int) -> None:
+    site.freeze(f"router{number % 2}", 5.0)
+    time.sleep(4.0)
+
+
+HARMS: Final[Mapping[str, Callable[[Site, int], None]]] = {
+    "shared-killed": _restarted(Site.kill), "shared-rolling": _restarted(Site.end), "shared-scaled": _scaled,
+    "shared-frozen": _frozen, "shared-cut": _cut, "shared-alone": _cut, "shared-router": _router_killed,
+    "shared-router-frozen": _router_frozen,
+}
+
+
+def shared(row: NetworkCase, stage: Stage) -> NetworkRun:
+    """Do the harm of the row until the end of the time."""
+    bounds, harm = BOUNDS[row.name], HARMS[row.name]
+    begins_us: list[int] = []
+    with _site(row, stage, bounds) as (site, settings):
+        end_s = time.monotonic() + stage.setting.seconds
+        while not begins_us or time.monotonic() < end_s:
+            begins_us.append(monotonic_us())
+            harm(site, len(begins_us) - 1)
+        spans_us = list(pairwise([*begins_us, monotonic_us()]))
+        site.processes.end()
+    records = json.loads(settings.notes.read_text("utf-8"))
+    checks = [at_least("injected", float(len(spans_us)), "times", 1.0), *sharing_checks(bounds, records, spans_us)]
+    if site.ended_s:
+        checks.append(at_most("a service ends, slowest", max(site.ended_s), "s", ENDS_S))
+    return NetworkRun(row, stage.seed, len(spans_us), (), tuple(checks))
+
+
+@contextmanager
+def _site(row: NetworkCase, stage: Stage, bounds: SharingBounds) -> Iterator[tuple[Site, Settings]]:
+    pictures = stage.folder / "small"
+    pictures.mkdir()
+    write_pictures(pictures, WIDTH_PX, HEIGHT_PX)
+    endpoints = tuple(f"tcp/{ADDRESS_A}:{port}" for port in _PORTS[: bounds.routers])
+    settings = Settings(endpoint=",".join(endpoints), robots=ROBOTS, fps=FPS, pictures=pictures,
+                        notes=stage.folder / "notes.json", seed=stage.seed)
+    with stage.wire() as wire, stage.processes("processes") as processes:
+        wire.shape(stage.seeded(row.phases[0].shapes))
+        site = Site(stage, processes, wire, bounds, endpoints)
+        for number in range(bounds.routers):
+            site.start_router(number)
+        for number in range(bounds.services):
+            site.start_service(f"v{number}")
+        processes.start("robots", [settings.model_dump_json()], namespace=wire.robot_side,
+                        module="sightline.benchmarks.network.gated_robots")
+        processes.wait_line("robots", f"playing {ROBOTS} robots")
+        time.sleep(_SETTLE_S)
+        yield site, settings
+        wire.shape(LinkShapes())

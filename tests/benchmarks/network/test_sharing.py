@@ -1,0 +1,87 @@
+"""The checks of the rows with several vision services: each finds the failure that it is for."""
+
+import pytest
+
+from sightline.benchmarks.network.cases import CASES
+from sightline.benchmarks.network.sharing import (
+    BOUNDS,
+    HARMS,
+    ROBOTS,
+    changes_of_driver,
+    drivers_that_return,
+    longest_stand_s,
+    looks_per_frame,
+    sharing_checks,
+    worst_gap_ms,
+)
+
+MS = 1_000
+STEP_US = 66 * MS
+
+
+def record(drivers, step_us=STEP_US, holds=(), answers_per_frame=1.0):
+    """A robot that accepts a command of each of `drivers` in turn."""
+    accepted = [(number * step_us, driver, number * step_us) for number, driver in enumerate(drivers)]
+    sent = len(accepted)
+    return {"accepted": accepted, "holds": list(holds), "sent": sent, "answers": round(sent * answers_per_frame)}
+
+
+def failed(bounds, records, end_us=6_000 * MS):
+    """Names of the checks that fail."""
+    full = {f"r{number}": records.get(f"r{number}", record("a" * 91)) for number in range(ROBOTS)}
+    return [check.name for check in sharing_checks(bounds, full, [(0, end_us)]) if not check.ok]
+
+
+KILLED = BOUNDS["shared-killed"]
+
+
+def test_a_healthy_site_passes_every_row():
+    for bounds in BOUNDS.values():
+        assert failed(bounds, {"r3": record("a" * 50 + "b" * 41)}) == []
+
+
+@pytest.mark.parametrize("at", [1, 20, 60])
+def test_a_planted_second_driver_is_found(at):
+    both = record("a" * at + "b" + "a" * (90 - at))
+    assert drivers_that_return({"r1": both}) == 1
+    assert failed(KILLED, {"r7": both}) == ["two drivers at once, in 2 changes"]
+    alternating = record("ab" * 45 + "a")
+    assert drivers_that_return({"r1": alternating}) == 89
+    assert changes_of_driver({"r1": alternating, "r2": record("aabbcc")}) == 92
+
+
+def test_a_gap_is_found_in_the_middle_at_the_end_and_for_a_robot_without_commands():
+    gap = record("a" * 91)
+    del gap["accepted"][40:45]
+    assert worst_gap_ms({"r1": gap}, 0, 6_000 * MS) == pytest.approx(6 * 66)
+    assert failed(KILLED, {"r2": gap}) == ["between two commands, worst robot"]
+    assert worst_gap_ms({"r1": record("a" * 10)}, 0, 6_000 * MS) == pytest.approx(6_000 - 9 * 66)
+    assert worst_gap_ms({"r1": record("")}, 1_000 * MS, 3_000 * MS) == 2_000
+    assert "robots that drive" in failed(KILLED, {"r2": record("")})
+
+
+def test_a_gap_counts_for_the_span_that_it_reaches_into():
+    gap = record("a" * 91)
+    del gap["accepted"][40:45]
+    assert worst_gap_ms({"r1": gap}, 0, 30 * STEP_US) == pytest.approx(66)
+    assert worst_gap_ms({"r1": gap}, 0, 42 * STEP_US) >= 3 * 66 - 1
+
+
+def test_standing_is_found_also_until_the_end():
+    stood = record("a" * 91, holds=[(1_000 * MS, 1_600 * MS), (2_000 * MS, 2_100 * MS)])
+    assert longest_stand_s({"r1": stood}, 0, 6_000 * MS) == pytest.approx(0.6)
+    assert longest_stand_s({"r1": stood}, 1_500 * MS, 6_000 * MS) == pytest.approx(0.1)
+    assert longest_stand_s({"r1": record("a", holds=[(1_000 * MS, 0)])}, 0, 6_000 * MS) == pytest.approx(5.0)
+    assert failed(BOUNDS["shared-frozen"], {"r1": stood}) == ["a robot stands, worst of 1 times"]
+
+
+def test_frames_that_two_services_look_at_are_found():
+    twice = {f"r{number}": record("a" * 91, answers_per_frame=2.0) for number in range(ROBOTS)}
+    assert looks_per_frame(twice) == 2.0
+    assert failed(KILLED, twice) == ["answers of all services over frames"]
+    assert failed(BOUNDS["shared-alone"], twice) == [], "one service cannot"
+
+
+def test_every_row_has_its_harm_and_its_bounds():
+    rows = {row.name for row in CASES if row.scene == "shared"}
+    assert rows == set(BOUNDS) == set(HARMS)
