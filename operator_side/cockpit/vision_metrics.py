@@ -33,7 +33,7 @@ class VisionMetrics:
         return self._state is None or self._state.is_live
 
     def is_ready(self) -> bool:
-        """Return True while frames would be answered, whether or not a robot is present."""
+        """Return True while new robots may come, whether or not a robot is present."""
         return self._state is not None and self._state.is_ready
 
     def collect(self) -> Iterator[Family]:

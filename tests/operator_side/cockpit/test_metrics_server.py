@@ -14,9 +14,12 @@ import pytest
 from sightline.operator_side.cockpit import http_server
 from sightline.operator_side.cockpit.http_server import MAX_CONNECTIONS
 from sightline.operator_side.cockpit.metrics import serving
-from sightline.operator_side.cockpit.vision_metrics import VisionMetrics
+from sightline.operator_side.cockpit.vision_metrics import VisionMetrics, served
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.serving import fleet
 from sightline.vision_side.serving.service import LIVE_S, ServingState
 from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 
 
 class Nothing:
@@ -67,6 +70,59 @@ def test_vision_service_is_live_while_its_loop_turns_and_ready_until_it_ends():
     assert state.turns() and metrics.is_ready()
     ending.set()
     assert not state.turns() and (metrics.is_live(), metrics.is_ready()) == (True, False), "it ends"
+
+
+class EmptySite:
+    """A link to a site without a robot. Its loop hangs in `robots` while `hang` is set."""
+
+    def __init__(self):
+        self.hang, self.on_new_robot = threading.Event(), lambda callback: None
+
+    def robots(self):
+        while self.hang.is_set():
+            time.sleep(0.005)
+        return []
+
+
+@pytest.fixture
+def idle_fleet(monkeypatch):
+    """Return the port of a fleet without a robot, its site, its end, and a function that starts its loop."""
+    monkeypatch.setattr("sightline.vision_side.serving.service.LIVE_S", 0.3)
+    monkeypatch.setattr(fleet, "_LONGEST_WAIT_S", 0.02)
+    port, site, ending, states = free_port(), EmptySite(), threading.Event(), []
+
+    def begin():
+        running = fleet.Fleet(VisionConfig(robot="r*"), site, lambda line: None)
+        arguments = (ending, lambda one: (states.append(one), observe(one)))
+        threading.Thread(target=running.serve, args=arguments, daemon=True).start()
+        assert until(lambda: states, 3)
+        return states[0]
+
+    with served(f"127.0.0.1:{port}") as observe:
+        yield port, site, ending, begin
+        site.hang.clear()
+        ending.set()
+
+
+def test_fleet_without_a_robot_is_ready_until_it_drains_and_live_while_its_loop_turns(idle_fleet):
+    port, site, ending, begin = idle_fleet
+
+    def probes():
+        return [_status(port, path) for path in ("live", "ready", "health")]
+
+    assert probes() == [200, 503, 503], "the session is not open yet"
+    state = begin()
+    assert probes() == [200, 200, 200], "without a robot"
+    state.draining = True
+    assert probes() == [200, 503, 503], "it hands its robots over"
+    state.draining = False
+    assert probes() == [200, 200, 200]
+    site.hang.set()
+    assert until(lambda: probes() == [503, 503, 503], 3), "its loop hangs"
+    site.hang.clear()
+    assert until(lambda: probes() == [200, 200, 200], 3)
+    ending.set()
+    assert probes() == [200, 503, 503]
 
 
 @pytest.mark.parametrize("said", [b"", b"GET /hea"])
