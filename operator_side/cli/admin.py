@@ -173,6 +173,11 @@ def install(
         typer.Option("--config", metavar="FILE", help="Its configuration [default: /etc/sightline/SERVICE.toml]."),
     ] = None,
     user: Annotated[str, typer.Option(help="Account of the service [default: yours, under sudo too].")] = "",
+    instances: Annotated[
+        int | None,
+        typer.Option("--instances", metavar="N", min=1, max=units.MAX_INSTANCES,
+                     help="Number of vision services that share the robots."),
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Write the unit, start it, and enable it at boot.")] = False,
 ) -> None:
     """Install a service under systemd
@@ -182,7 +187,7 @@ def install(
     program = Path(sys.executable).with_name("sightline")
     file = (config or Path(f"/etc/sightline/{service}.toml")).expanduser().absolute()  # systemd changes the folder
     runs_it = user or os.environ.get("SUDO_USER") or getpass.getuser()
-    planned = units.plan(service, program, file, runs_it, units.UNIT_DIR)
+    planned = units.plan(service, program, file, runs_it, units.UNIT_DIR, instances=instances)
     if not yes:
         _show(planned, _beside(service, program, file) if file.exists() else None)
         if service == "robot" and not file.exists():
@@ -192,10 +197,12 @@ def install(
     stale = units.drop_in_path(planned.path.parent)
     if service == "robot" and beside is None and units.take_away(stale):
         typer.echo(f"removed {stale}: the drive of this robot is not gpio")
-    units.write(planned, beside)
+    for unit in units.write(planned, beside):
+        typer.echo(f"ended {unit}: it is not one of the units of this command")
     if beside is not None:
         typer.echo(f"wrote {beside.path}: the pins are set low first whenever the robot ends")
-    typer.echo(f"wrote and started {planned.path}; check it with: systemctl status {planned.path.stem}")
+    started = planned.path.stem if instances is None else f"'{planned.path.stem}*'"
+    typer.echo(f"wrote and started {planned.path}; check it with: systemctl status {started}")
 
 
 def _beside(service: str, program: Path, file: Path) -> units.InstallPlan | None:
@@ -206,7 +213,8 @@ def _beside(service: str, program: Path, file: Path) -> units.InstallPlan | None
 
 def _show(planned: units.InstallPlan, beside: units.InstallPlan | None) -> None:
     typer.echo(planned.text, nl=False)
-    typer.echo(f"nothing written; --yes writes this to {planned.path} and starts it", err=True)
+    started = "it" if "@" not in planned.path.stem else f"{planned.units[0]} to {planned.units[-1]}"
+    typer.echo(f"nothing written; --yes writes this to {planned.path} and starts {started}", err=True)
     if beside is not None:
         typer.echo(f"\n{beside.text}", nl=False)
         typer.echo(f"and this to {beside.path}, which sets the pins low first", err=True)

@@ -1,9 +1,10 @@
-"""Writes systemd units for a robot or a vision service. Shell (files).
+"""Writes systemd units for a robot, a vision service or several of them. Shell (files).
 
 The units are readable files (`robot_side/systemd`, `vision_side/systemd`); only paths, user and pins change.
 """
 
 import os
+import re
 import subprocess
 from dataclasses import dataclass
 from importlib.resources import files
@@ -18,34 +19,48 @@ UNIT_DIR = Path("/etc/systemd/system")
 _PROGRAM = "/opt/sightline/bin/sightline"
 _PYTHON = "/opt/sightline/bin/python"
 _DROP_IN = "gpio-low.conf"
+MAX_INSTANCES = 64
+"""Vision services of one machine. More than one per core gains nothing."""
+_STARTED_AT_BOOT = "multi-user.target.wants"
 _DROP_INS_PINS = "gpio_low 10 9 8 7 17"
 """The pins in the file of `robot_side/systemd`: those of the example car."""
 
 
 @dataclass(frozen=True)
 class InstallPlan:
-    """One systemd file: its path and text."""
+    """One systemd file: its path and text, and the units to start, which are several for a template."""
 
     service: str
     path: Path
     text: str
+    units: tuple[str, ...] = ()
 
 
-def plan(service: str, program: Path, config: Path, user: str, unit_dir: Path = UNIT_DIR) -> InstallPlan:
+def plan(
+    service: str, program: Path, config: Path, user: str, unit_dir: Path = UNIT_DIR, *, instances: int | None = None
+) -> InstallPlan:
     """Make the unit of `service` for this machine's paths.
+
+    Args:
+        instances: number of vision services that share the robots; None for one that shares with no other.
 
     Raises:
         ConfigError: the service has no unit, or systemd cannot read the path or user.
     """
     if service not in SERVICES:
         raise ConfigError(f"unknown service '{service}'; expected {' or '.join(SERVICES)}")
+    if instances is not None and service != "vision":
+        raise ConfigError(f"--instances is for vision, and {service} runs once on a machine; remove it")
+    if instances is not None and not 1 <= instances <= MAX_INSTANCES:
+        raise ConfigError(f"invalid --instances {instances}: expected 1 to {MAX_INSTANCES}")
     for what, text in (("program", str(program)), ("config", str(config)), ("user", user)):
         if not text or any(letter.isspace() or letter in "%\"'\\" for letter in text):
             raise ConfigError(f"invalid {what} '{text}' for a unit; remove spaces, quotes and %")
-    name = f"sightline-{service}.service"
+    name = f"sightline-{service}{'' if instances is None else '@'}.service"
+    units = (name,) if instances is None else tuple(name.replace("@", f"@{k}") for k in range(1, instances + 1))
     unit = files(f"sightline.{service}_side").joinpath("systemd", name).read_text()
     unit = unit.replace("User=sightline", f"User={user}")
-    return InstallPlan(service, unit_dir / name, _fitted(unit, service, program, config))
+    return InstallPlan(service, unit_dir / name, _fitted(unit, service, program, config), units)
 
 
 def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UNIT_DIR) -> InstallPlan | None:
@@ -82,18 +97,33 @@ def _fitted(unit: str, service: str, program: Path, config: Path) -> str:
     return "\n".join(line for line in fitted.splitlines() if line[:1] != "#") + "\n"
 
 
-def write(planned: InstallPlan, beside: InstallPlan | None = None) -> None:
-    """Write the unit and its second file, and start it now and at boot.
+def write(planned: InstallPlan, beside: InstallPlan | None = None) -> list[str]:
+    """Write the unit and its second file, and start it now and at boot. Returns the units that it ended.
 
-    A running service restarts: otherwise it may drive other pins than those that its end sets low.
+    A running service restarts: otherwise it may drive other pins than those that its end sets low. Several restart one
+    after another, so that the others have the robots meanwhile. Units of an earlier number of instances end.
 
     Raises:
         ConfigError: a file cannot be written, or systemd does not run; nothing is started.
     """
     for one in [planned, *([beside] if beside else [])]:
         _put(one)
-    for command in (["daemon-reload"], ["enable", planned.path.name], ["restart", planned.path.name]):
-        _systemctl(command)
+    _systemctl(["daemon-reload"])
+    ended = _other_units(planned)
+    if ended:
+        _systemctl(["disable", "--now", *ended])
+    _systemctl(["enable", *planned.units])
+    for unit in planned.units:
+        _systemctl(["restart", unit])
+    return ended
+
+
+def _other_units(planned: InstallPlan) -> list[str]:
+    """Return the units of this service that start at boot and are not part of the plan."""
+    of_service = re.compile(rf"sightline-{planned.service}(@[0-9]+)?\.service")
+    at_boot = planned.path.parent / _STARTED_AT_BOOT
+    names = [path.name for path in at_boot.glob(f"sightline-{planned.service}*")]
+    return sorted(name for name in names if of_service.fullmatch(name) and name not in planned.units)
 
 
 def _put(planned: InstallPlan) -> None:

@@ -4,11 +4,13 @@ import configparser
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.setup import install
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice, RobotConfig
+from tests.fixtures.upcoming import without_upcoming
 
 PROGRAM, CONFIG = Path("/home/pi/.venv/bin/sightline"), Path("/home/pi/robot.toml")
 CAR = """
@@ -91,6 +93,104 @@ def test_folder_that_cannot_be_written_is_reported(tmp_path):
     planned = install.plan("vision", PROGRAM, CONFIG, "pi", tmp_path / "absent")
     with pytest.raises(ConfigError, match=r"cannot write .*: No such file or directory; run it with sudo"):
         install.write(planned)
+
+
+# --- several vision services ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def vision(monkeypatch, tmp_path):
+    """Return the command, the folder of units, and the calls of systemctl; `enable` and `disable` make their links."""
+    file, units, calls = tmp_path / "vision.toml", tmp_path / "units", []
+    at_boot = units / "multi-user.target.wants"
+    file.write_text('robot = "r*"\n')
+    at_boot.mkdir(parents=True)
+
+    def systemctl(arguments):
+        calls.append(arguments)
+        verb, *names = [word for word in arguments if word != "--now"]
+        for name in names if verb in ("enable", "disable") else ():
+            (at_boot / name).touch() if verb == "enable" else (at_boot / name).unlink()
+
+    monkeypatch.setattr(install, "UNIT_DIR", units)
+    monkeypatch.setattr(install, "_systemctl", systemctl)
+    return ["install", "vision", "--config", str(file), "--user", "pi"], units, calls
+
+
+def _instances(*numbers):
+    return [f"sightline-vision@{number}.service" for number in numbers]
+
+
+def test_instances_share_one_template_and_each_has_a_name(vision, capsys):
+    command, units, calls = vision
+    assert cli.run([*command, "--instances", "3"]) == 0
+    shown = capsys.readouterr()
+    assert (calls, list(units.glob("*.service"))) == ([], [])
+    assert "starts sightline-vision@1.service to sightline-vision@3.service" in shown.err
+    assert cli.run([*command, "--instances", "3", "--yes"]) == 0
+    [template] = units.glob("*.service")
+    assert (template.name, template.read_text()) == ("sightline-vision@.service", shown.out)
+    unit = _parsed(shown.out)
+    assert unit["Service"]["ExecStart"].endswith(f"{command[3]} --share --name %l-%i")
+    assert (unit["Service"]["User"], unit["Service"]["Restart"]) == ("pi", "always")
+    assert unit["Install"]["WantedBy"] == "multi-user.target"
+    one_by_one = [["restart", name] for name in _instances(1, 2, 3)]
+    assert calls == [["daemon-reload"], ["enable", *_instances(1, 2, 3)], *one_by_one]
+    assert "systemctl status 'sightline-vision@*'" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("service", "instances"), [("robot", None), ("vision", None), ("vision", 2)])
+def test_command_line_accepts_the_commands_of_the_unit(service, instances, tmp_path):
+    unit = install.plan(service, PROGRAM, CONFIG, "pi", tmp_path, instances=instances).text
+    commands = [line.partition("=")[2].split() for line in unit.splitlines() if line.startswith("Exec")]
+    assert [command[:2] for command in commands] == [[str(PROGRAM), service]] * len(commands) and commands
+    for _, name, *options in commands:
+        words = without_upcoming([name, *options])
+        get_command(cli.app).commands[name].make_context(name, words[1:]).close()
+
+
+@pytest.mark.parametrize(("first", "then", "ended", "left"), [
+    (["--instances", "3"], ["--instances", "1"], _instances(2, 3), _instances(1)),
+    (["--instances", "2"], ["--instances", "4"], [], _instances(1, 2, 3, 4)),
+    ([], ["--instances", "2"], ["sightline-vision.service"], _instances(1, 2)),
+    (["--instances", "2"], [], _instances(1, 2), ["sightline-vision.service"]),
+])  # fmt: skip
+def test_other_number_of_instances_ends_what_is_not_part_of_it(first, then, ended, left, vision, capsys):
+    command, units, calls = vision
+    at_boot = units / "multi-user.target.wants"
+    (at_boot / "sightline-vision-of-another-project.service").touch()
+    (at_boot / "sightline-robot.service").touch()
+    assert cli.run([*command, *first, "--yes"]) == 0
+    capsys.readouterr()
+    calls.clear()
+    assert cli.run([*command, *then, "--yes"]) == 0
+    assert [call[2:] for call in calls if call[:2] == ["disable", "--now"]] == ([ended] if ended else [])
+    assert [f"ended {name}: it is not one of the units of this command" for name in ended] == [
+        line for line in capsys.readouterr().out.splitlines() if line.startswith("ended")
+    ]
+    others = ["sightline-robot.service", "sightline-vision-of-another-project.service"]
+    assert sorted(path.name for path in at_boot.iterdir()) == sorted([*left, *others])
+
+
+@pytest.mark.parametrize(("service", "number", "why"), [
+    ("vision", "0", "greater than or equal to 1"), ("vision", "-2", "greater than or equal to 1"),
+    ("vision", "1000", "less than or equal to 64"), ("vision", "three", "valid integer"),
+    ("vision", "2.5", "valid integer"), ("robot", "2", "--instances is for vision, and robot runs once on a machine"),
+])  # fmt: skip
+def test_number_of_instances_that_is_impossible_is_one_line(service, number, why, vision, capsys):
+    command, units, calls = vision
+    command[1] = service
+    assert cli.run([*command, "--instances", number, "--yes"]) == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("error: ") and said.err.count("\n") == 1 and "--instances" in said.err
+    assert why in said.err
+    assert (said.out, calls, list(units.glob("*.service"))) == ("", [], [])
+
+
+def test_plan_rejects_a_number_of_instances_out_of_range(tmp_path):
+    for number in (0, -1, install.MAX_INSTANCES + 1):
+        with pytest.raises(ConfigError, match=f"invalid --instances {number}: expected 1 to 64"):
+            install.plan("vision", PROGRAM, CONFIG, "pi", tmp_path, instances=number)
 
 
 # --- a robot on a Raspberry Pi's pins -------------------------------------------------------------------------------
