@@ -52,7 +52,7 @@ RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /emp
 
 # --- vision ------------------------------------------------------------------------------------------------------------
 FROM pictures AS vision-packages
-RUN /opt/sightline/bin/pip install "$(echo /empty/*.whl)[vision,websocket]"
+RUN /opt/sightline/bin/pip install "$(echo /empty/*.whl)[vision,websocket,metrics]"
 COPY --from=wheel /dist /dist
 RUN /opt/sightline/bin/pip install --no-deps --force-reinstall /dist/*.whl
 

@@ -188,7 +188,7 @@ def test_each_service_with_a_health_check_is_queried():
 def test_the_robot_image_is_light_and_the_others_are_complete():
     assert not {name for extra in extras_of("robot") for name in requirements(extra)} & HEAVY
     assert {"zenoh", "websocket"} == set(extras_of("robot"))
-    assert (extras_of("vision"), extras_of("sim")) == (["vision", "websocket"], ["sim"])
+    assert (extras_of("vision"), extras_of("sim")) == (["vision", "websocket", "metrics"], ["sim"])
     assert extras_of("keys") == ["secure"]
 
 
