@@ -15,6 +15,7 @@ import yaml
 
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
+from tests.fixtures.upcoming import without_upcoming
 
 ROOT = Path(__file__).parent.parent.parent.parent
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
@@ -43,10 +44,19 @@ class Profile:
     status: str = "status"
     router: str = "router"
     max_bearing_rad: float = 0.1
+    second_router: str = ""
+    scale: str = ""
+    """SERVICE=N, as `up --scale` takes it."""
 
     @property
     def services(self) -> list[str]:
         return [name for name, service in SERVICES.items() if self.name in service["profiles"]]
+
+    @property
+    def runs(self) -> bool:
+        """Return False while the command line lacks an option of a service."""
+        commands = [SERVICES[name].get("command", [""]) for name in self.services]
+        return all(without_upcoming(command) == command for command in commands)
 
 
 PROFILES = [
@@ -57,6 +67,9 @@ PROFILES = [
     Profile("secure", {"r1": ("secure-robot", "sim")}, "secure-vision", "secure-status", "secure-router"),
     Profile("fleet", {"r1": ("robot", "sim"), "r2": ("robot-r2", "sim-r2"), "r3": ("robot-r3", "sim-r3")},
             "fleet-vision"),
+    Profile("shared", {"r1": ("shared-robot", "sim"), "r2": ("shared-robot-r2", "sim-r2"),
+                       "r3": ("shared-robot-r3", "sim-r3")}, "vision-shared", "shared-status", "shared-router-a",
+            second_router="shared-router-b", scale="vision-shared=3"),
 ]
 
 
@@ -80,8 +93,8 @@ def changed_for(folder: Path, ports: dict[str, str]) -> dict:
     for name, service in changed["services"].items():
         service["build"]["network"] = "host"
         if "ports" in service:
-            inside = service["ports"][0].rpartition(":")[2]
-            service["ports"] = [f"127.0.0.1:{ports[inside]}:{inside}"]
+            _, published, inside = service["ports"][0].split(":")
+            service["ports"] = [f"127.0.0.1:{ports[published]}:{inside}"]
         if service["image"] == "sightline-sim":
             (log := folder / name).mkdir()
             log.chmod(0o777)
@@ -96,7 +109,7 @@ class Containers:
 
     def __init__(self, profile: Profile, folder: Path) -> None:
         self.profile = profile
-        self.ports = {inside: str(free_port()) for inside in ("7447", "9091")}
+        self.ports = {published: str(free_port()) for published in ("7447", "7457", "9091")}
         self._folder = folder
         self._project = f"sightline-test-{profile.name}"
         self._containers: dict[str, str] = {}
@@ -115,7 +128,8 @@ class Containers:
 
     def up(self) -> None:
         """Start them. Where the profile is secured, also fetch the operator's keys for commands from outside."""
-        self.compose("up", "-d", "--no-build")
+        scaled = ["--scale", self.profile.scale] if self.profile.scale else []
+        self.compose("up", "-d", "--no-build", *scaled)
         if self.profile.name == "secure":
             ask("docker", "cp", f"{self.container('secure-status')}:/keys/operator", str(self._folder / "keys"))
             secure = ["--secure", str(self._folder / "keys")]

@@ -16,8 +16,9 @@ from sightline.operator_side.cli.app import app
 from sightline.operator_side.config.loading import load_service
 from sightline.robot_side.driver.process import _SHUTDOWN_US
 from sightline.robot_side.pipe import _END_S
-from tests.e2e.compose.fixture import COMPOSE, DEFAULT, HEAVY, PROFILES, ROOT, SERVICES, ask
+from tests.e2e.compose.fixture import COMPOSE, DEFAULT, HEAVY, PROFILES, ROOT, SERVICES, ask, changed_for
 from tests.fixtures.ports import free_endpoint
+from tests.fixtures.upcoming import without_upcoming
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 ROBOTS = {service for profile in PROFILES for service, _ in profile.robots.values()}
@@ -76,7 +77,7 @@ def commands():
 
 @pytest.mark.parametrize("command", list(commands()))
 def test_command_line_accepts_every_command(command):
-    name, *arguments = command
+    name, *arguments = without_upcoming(command)
     if name == "keys":
         return
     with get_command(app).commands[name].make_context(name, list(arguments)) as context:
@@ -96,7 +97,9 @@ OF_A_KIND = {test[3]: name for name, test in reversed(CHECKS.items())}
 def test_health_checks_use_the_link_of_the_service(name):
     command, program, minus_c, _, *arguments = CHECKS[name]
     assert (command, program, minus_c) == ("CMD", "python", "-c")
-    if not name.startswith("sim"):
+    if name == "vision-shared":
+        assert f"--metrics={arguments[0].removeprefix('http://').removesuffix('/ready')}" in SERVICES[name]["command"]
+    elif not name.startswith("sim"):
         endpoint, keys, *robots = arguments
         assert bool(keys) == endpoint.startswith("tls/") == name.startswith("secure")
         known = {robot for profile in PROFILES for robot in profile.robots if name in profile.services}
@@ -109,6 +112,8 @@ def test_health_checks_fail_without_a_service_and_name_existing_targets(name, tm
     nowhere = free_endpoint()
     if name == "sim":
         code, why = code.replace("/run/sightline", str(tmp_path)), "nothing simulates a robot"
+    elif name == "vision-shared":
+        arguments[0], why = nowhere.replace("tcp/", "http://") + "/ready", "Connection refused"
     else:
         arguments[0], why = nowhere, f"no answer from {nowhere}"
     said = ask(sys.executable, "-c", code, *arguments)
@@ -146,13 +151,33 @@ def test_every_profile_has_a_test_and_one_is_the_default():
 def test_profile_is_complete_and_opens_no_port_twice(profile):
     services = {name: SERVICES[name] for name in profile.services}
     for robot, (service, sim) in profile.robots.items():
-        assert services[service]["depends_on"].keys() == {sim, profile.router}
+        assert services[service]["depends_on"].keys() == {sim, profile.router, profile.second_router} - {""}
         assert ("--robot=" + robot in services[service]["command"]) == (robot != "r1")
     assert {profile.driver, profile.status, profile.router} <= set(services)
     ports = [port for service in services.values() for port in service.get("ports", ())]
     assert len(ports) == len(set(ports))
     for service in services.values():
         assert set(service.get("depends_on", ())) <= set(services), "depends on what this profile does not start"
+
+
+def test_shared_profile_is_two_routers_that_every_service_names():
+    profile = next(one for one in PROFILES if one.scale)
+    both = [f"--connect=tcp/{router}:7447" for router in (profile.router, profile.second_router)]
+    for name in set(profile.services) - {sim for _, sim in profile.robots.values()}:
+        assert [word for word in SERVICES[name]["command"] if word.startswith("--connect")] == both, name
+    scaled, number = profile.scale.split("=")
+    assert scaled == profile.driver and int(number) == 3
+    assert "--share" in SERVICES[scaled]["command"], "otherwise one of them drives and the others wait"
+    assert not {"ports", "container_name", "hostname"} & SERVICES[scaled].keys(), "there are several of it"
+
+
+def test_containers_of_a_test_publish_free_ports_only(tmp_path):
+    ports = {"7447": "1", "7457": "2", "9091": "3"}
+    services = changed_for(tmp_path, ports)["services"]
+    for profile in PROFILES:
+        opened = [port.split(":") for name in profile.services for port in services[name].get("ports", ())]
+        numbers = [number for _, number, _ in opened]
+        assert numbers and set(numbers) <= set(ports.values()) and len(numbers) == len(set(numbers))
 
 
 def test_only_its_profile_serves_the_legacy_protocol():
