@@ -11,7 +11,7 @@ from tests.docs.test_pages import FENCE, PAGES, SHELL, TOP, shown
 from tests.fixtures.upcoming import UPCOMING, without_upcoming
 
 INLINE = re.compile(r"`([^`\n]+)`")
-COMMAND = re.compile(r"(?<![\w./-])(?:[\w./]+/)?sightline +([a-z-][^|;&)#`\n>]*)")
+COMMAND = re.compile(r"(?<![\w./=-])(?:[\w./]+/)?sightline +([a-z-][^|;&)#`\n>]*)")
 
 
 def commands_in(text: str):
