@@ -80,7 +80,7 @@ HELP: Final = {
 
 @dataclass(frozen=True)
 class Plan:
-    """What a number of robots needs."""
+    """The needs of a number of robots."""
 
     robots: int
     frames_s: float
@@ -102,7 +102,7 @@ class Plan:
 
 
 def _column(text: str, title: str, row: str, column: str) -> str:
-    """Return a cell of the comparison table of a section. Raises ValueError if there is none."""
+    """Return a cell of the comparison table of a section. Raises ValueError if it is missing."""
     section = text.partition(f"\n## {title}\n")[2].partition("\n## ")[0]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if line[:1] == "|"]
     for heads in (one for one in rows if column in one):

@@ -313,6 +313,21 @@ def test_without_keys_nothing_is_reachable_from_outside():
         assert mount["readOnly"] is True and volume["secret"]["defaultMode"] == 0o440
 
 
+def test_page_creates_the_secrets_with_the_files_that_each_container_reads():
+    page = (ROOT / "docs/how-to/scale.md").read_text("utf-8").replace("\\\n", " ")
+    created = {name: set(re.findall(r"--from-file=keys/(\S+)", files)) for name, files
+               in re.findall(r"create secret generic (\S+)(.*)", page)}
+
+    def role(name):
+        return {"ca.pem", f"{name}.pem", f"{name}.key"}
+
+    assert created == {"sightline-keys-vision": role("vision"),
+                       "sightline-keys-router": role("robot") | role("viewer") | {"stop.secret"}}
+    mounted = {name: [one["secret"]["secretName"] for one in pod["volumes"] if "secret" in one]
+               for name, pod in workloads(SETS["secure"]).items()}
+    assert mounted == {"router": ["sightline-keys-router"], "vision": ["sightline-keys-vision"]}
+
+
 def test_images_are_those_of_the_dockerfile_in_this_version():
     used = {pod["containers"][0]["image"] for pod in workloads(SETS["base"]).values()}
     targets = re.findall(r"^FROM service AS (\w+)", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
