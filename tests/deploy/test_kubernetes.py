@@ -25,7 +25,6 @@ from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
 from sightline.protocol.transports.zenoh.session import open_session
 from tests.fixtures.ports import free_endpoint, free_port
-from tests.fixtures.upcoming import without_upcoming
 
 ROOT = Path(__file__).parent.parent.parent
 FOLDER = ROOT / "deploy" / "kubernetes"
@@ -164,7 +163,7 @@ def test_every_file_is_part_of_its_set():
 @EACH_SET
 def test_command_line_accepts_the_arguments_of_every_container(manifests):
     for pod in workloads(manifests).values():
-        name, *arguments = without_upcoming(words(pod))
+        name, *arguments = words(pod)
         with get_command(app).commands[name].make_context(name, arguments) as context:
             assert [context.params["connect"], context.params["secure"] or ""] == [
                 values(pod, "--connect"), *(values(pod, "--secure") or [""])

@@ -8,7 +8,6 @@ from typer.main import get_command
 
 from sightline.operator_side.cli.app import app
 from tests.docs.test_pages import FENCE, PAGES, SHELL, TOP, shown
-from tests.fixtures.upcoming import UPCOMING, without_upcoming
 
 INLINE = re.compile(r"`([^`\n]+)`")
 COMMAND = re.compile(r"(?<![\w./=-])(?:[\w./]+/)?sightline +([a-z-][^|;&)#`\n>]*)")
@@ -38,7 +37,7 @@ def options_of(command) -> dict[str, bool]:
 def problem_with(words: list[str]) -> str:
     """Return why the command line has no such command or option; empty if it has."""
     command, path, is_value = root(), ["sightline"], False
-    for word in without_upcoming(words):
+    for word in words:
         subcommands = getattr(command, "commands", {})
         if is_value:
             is_value = False
@@ -75,9 +74,3 @@ def test_command_that_does_not_exist_is_found(words, why):
     assert problem_with(words.split()) == why
     page = f"Text.\n\n```sh\nsudo .venv/bin/sightline {words} \\\n  --help | head\ncd sightline && ls\n```\n"
     assert list(commands_in(page)) == [[*words.split(), "--help"]]
-
-
-def test_options_that_are_upcoming_do_not_exist_yet():
-    for name, options in UPCOMING.items():
-        known = {one for parameter in root().commands[name].params for one in parameter.opts}
-        assert not known & options.keys(), f"sightline {name} has them: remove them from tests/fixtures/upcoming.py"

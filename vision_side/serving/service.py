@@ -63,8 +63,6 @@ class ServingState:
     ending: threading.Event
     turned_s: float
     """Begin of the newest turn of its loop, on `time.monotonic`."""
-    draining: bool = False
-    """True while it hands its robots over before its end."""
 
     @property
     def is_live(self) -> bool:
@@ -73,8 +71,8 @@ class ServingState:
 
     @property
     def is_ready(self) -> bool:
-        """Return True while new robots may come: link and detector are open, and it neither drains nor ends."""
-        return self.is_live and not self.draining and not self.ending.is_set()
+        """Return True while new robots may come: link and detector are open, and it does not end."""
+        return self.is_live and not self.ending.is_set()
 
     def turns(self) -> bool:
         """Note a turn. Returns False when the service must end."""

@@ -59,6 +59,9 @@ class SharedRobot:
     """Time of the newest status."""
     active_us: int = 0
     """Last time at which the driver drove, or had no reason to."""
+    part_us: int = 0
+    first_frames: int = -1
+    """Frames that the robot had sent when the part began. Without a further one, a driver has nothing to answer."""
     sent: int = 0
     mine_us: int = 0
     """Last time at which this service held the lease, or had no reason to."""
@@ -157,6 +160,8 @@ class Sharing:
         human = status.holder is not None and status.holder.source != "vision"
         needs_no_driver = human or status.state in (State.STOPPED, State.FAULT) or bool(status.stream.camera_fault)
         waits = status.state is State.DISARMED and status.holder is not None
+        one.first_frames = status.stream.sent if one.accepted < 0 else one.first_frames
+        waits |= status.stream.sent == one.first_frames and now_us - one.part_us < NO_DRIVER_US
         if needs_no_driver or waits or status.accepted != one.accepted:
             one.active_us = now_us
         if is_mine or needs_no_driver or sent == one.sent:
@@ -195,7 +200,7 @@ class Sharing:
             robot.mine_us, robot.sent = now_us, 0
         # Without a part, no status came: what it showed before is over. A standby knows that the driver is silent.
         if part is not SharingPart.CLAIM or robot.part is SharingPart.NONE:
-            robot.active_us = now_us
+            robot.active_us = robot.part_us = now_us
         robot.part = part
 
     def _next_part(self, name: str, robot: SharedRobot, now_us: int) -> SharingPart:

@@ -10,6 +10,7 @@ import json
 import logging
 import re
 import socket
+import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
@@ -52,6 +53,8 @@ LEASE_MS: Final = 2000
 KEEP_ALIVES_PER_LEASE: Final = 50
 MAX_MESSAGE_BYTES: Final = 1_048_576
 HANDSHAKE_MS: Final = 3000
+# Of a client with another endpoint to go to: three round trips of 260 ms. With TLS they are five.
+HANDSHAKE_OF_SEVERAL_MS: Final = 800
 # Sessions at a listening end: a robot, or a vision service with twenty robots and their viewers.
 MAX_SESSIONS: Final = 64
 # Sessions at a router.
@@ -106,10 +109,19 @@ def open_session(
     zenoh.init_log_from_env_or("off")
     # Without a handler Python prints the warnings of Zenoh to the terminal.
     logging.getLogger("zenoh").addHandler(logging.NullHandler())
-    try:
-        return _open(session_config(listen, connect, timeout_s, secured, max_sessions))
-    except zenoh.ZError as error:
-        raise _error_of(str(error), listen, connect, timeout_s, secured) from None
+    until_s = time.monotonic() + timeout_s
+    while True:
+        try:
+            return _open(session_config(listen, connect, timeout_s, secured, max_sessions))
+        except zenoh.ZError as error:
+            if not _tries_each_once(listen, connect) or time.monotonic() >= until_s:
+                raise _error_of(str(error), listen, connect, timeout_s, secured) from None
+        time.sleep(RETRY["period_init_ms"] / 1000)
+
+
+def _tries_each_once(listen: Sequence[str], connect: Sequence[str]) -> bool:
+    # With a time to wait, Zenoh spends all of it on the first endpoint, although another one answers.
+    return not listen and len(connect) > 1
 
 
 def _open(config: dict[str, Any]) -> zenoh.Session:
@@ -148,20 +160,26 @@ def _session_config(
         "listen": {"endpoints": [with_send_buffer(endpoint) for endpoint in listen], "exit_on_failure": True},
         "connect": {
             "endpoints": [with_send_buffer(endpoint) for endpoint in connect],
-            "timeout_ms": -1 if listen else int(timeout_s * 1000),
+            "timeout_ms": -1 if listen else 0 if _tries_each_once(listen, connect) else int(timeout_s * 1000),
             "exit_on_failure": not listen,
             "retry": RETRY,
         },
         "scouting": {"multicast": multicast_section(listen), "gossip": {"enabled": False}, "delay": 0},
         "open": {"return_conditions": {"connect_scouted": False}},
         "timestamping": {"enabled": False},
-        "transport": _transport_config(max_sessions),
+        "transport": _transport_config(max_sessions, _handshake_ms(listen, connect)),
     }
 
 
-def _transport_config(max_sessions: int) -> dict[str, Any]:
+def _handshake_ms(listen: Sequence[str], connect: Sequence[str]) -> int:
+    """Return the longest handshake. A router that hangs must not keep a client from the next one."""
+    has_keys = any(endpoint.startswith(("tls/", "quic/")) for endpoint in connect)
+    return HANDSHAKE_OF_SEVERAL_MS if _tries_each_once(listen, connect) and not has_keys else HANDSHAKE_MS
+
+
+def _transport_config(max_sessions: int, open_ms: int) -> dict[str, Any]:
     return {
-        "unicast": {"max_sessions": max_sessions, "open_timeout": HANDSHAKE_MS, "accept_timeout": HANDSHAKE_MS},
+        "unicast": {"max_sessions": max_sessions, "open_timeout": open_ms, "accept_timeout": HANDSHAKE_MS},
         "link": {
             "tx": {
                 "lease": LEASE_MS,

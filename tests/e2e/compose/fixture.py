@@ -15,7 +15,6 @@ import yaml
 
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
-from tests.fixtures.upcoming import without_upcoming
 
 ROOT = Path(__file__).parent.parent.parent.parent
 COMPOSE = yaml.safe_load((ROOT / "compose.yaml").read_text())
@@ -51,12 +50,6 @@ class Profile:
     @property
     def services(self) -> list[str]:
         return [name for name, service in SERVICES.items() if self.name in service["profiles"]]
-
-    @property
-    def runs(self) -> bool:
-        """Return False while the command line lacks an option of a service."""
-        commands = [SERVICES[name].get("command", [""]) for name in self.services]
-        return all(without_upcoming(command) == command for command in commands)
 
 
 PROFILES = [

@@ -104,19 +104,15 @@ def idle_fleet(monkeypatch):
         ending.set()
 
 
-def test_fleet_without_a_robot_is_ready_until_it_drains_and_live_while_its_loop_turns(idle_fleet):
+def test_fleet_without_a_robot_is_ready_until_it_ends_and_live_while_its_loop_turns(idle_fleet):
     port, site, ending, begin = idle_fleet
 
     def probes():
         return [_status(port, path) for path in ("live", "ready", "health")]
 
     assert probes() == [200, 503, 503], "the session is not open yet"
-    state = begin()
+    begin()
     assert probes() == [200, 200, 200], "without a robot"
-    state.draining = True
-    assert probes() == [200, 503, 503], "it hands its robots over"
-    state.draining = False
-    assert probes() == [200, 200, 200]
     site.hang.set()
     assert until(lambda: probes() == [503, 503, 503], 3), "its loop hangs"
     site.hang.clear()

@@ -10,7 +10,6 @@ from sightline.operator_side.cli import app as cli
 from sightline.operator_side.setup import install
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice, RobotConfig
-from tests.fixtures.upcoming import without_upcoming
 
 PROGRAM, CONFIG = Path("/home/pi/.venv/bin/sightline"), Path("/home/pi/robot.toml")
 CAR = """
@@ -145,7 +144,7 @@ def test_command_line_accepts_the_commands_of_the_unit(service, instances, tmp_p
     commands = [line.partition("=")[2].split() for line in unit.splitlines() if line.startswith("Exec")]
     assert [command[:2] for command in commands] == [[str(PROGRAM), service]] * len(commands) and commands
     for _, name, *options in commands:
-        words = without_upcoming([name, *options])
+        words = [name, *options]
         get_command(cli.app).commands[name].make_context(name, words[1:]).close()
 
 
