@@ -6,11 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import Final, Protocol, Self
 
 from sightline.conformance.case import Access, Bench, NotApplicableError
+from sightline.conformance.raw_peers import RawZenoh
 from sightline.protocol.channels import CHANNELS, Channel, Direction
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.memory import MemoryLink, MemoryNetwork
 from sightline.protocol.transports.security import certificate_role
+from sightline.protocol.transports.tokens import DriverToken, RobotToken
 
 _WAITING: Final = 1024  # messages that a case has not yet looked at; it looks every few milliseconds
 _NAP_S: Final = 0.005
@@ -26,6 +28,7 @@ class LiveBench(Bench):
         channels: Sequence[Channel],
         put_it: Callable[[str, bytes, bytes], None] | None = None,
         *,
+        third_party: RawZenoh | None = None,
         roles: Sequence[str] = ("vision",),
         endpoint: str = "",
         legacy: str = "",
@@ -33,11 +36,14 @@ class LiveBench(Bench):
     ) -> None:
         """`open_it(role)` opens a link, again after each `leave`; `put_it` sends what a link rejects.
 
+        `third_party` declares tokens.
+
         Each of `roles` has a link of its own, where keys decide what a source may send; the first receives, and sends
         what no other may send. Raises what `open_it` raises.
         """
         super().__init__(robot, endpoint, legacy, access)
         self._open_it, self._channels, self._put_it, self._roles = open_it, channels, put_it, roles
+        self._third_party = third_party
         self._links: dict[str, Link] = {}
         self._news = threading.Condition()
         self._waiting: deque[Message] = deque(maxlen=_WAITING)
@@ -61,6 +67,11 @@ class LiveBench(Bench):
         if self._put_it is None:
             raise NotApplicableError("over WebSocket nothing is sent under a key")
         self._put_it(key, header, payload)
+
+    def declare_token(self, token: str) -> Callable[[], None]:
+        if self._third_party is None or not self._third_party.has_token(RobotToken(self.robot)):
+            raise NotApplicableError("the robot declares no liveliness token")
+        return self._third_party.declare_token(DriverToken(self.robot, "kit", token))
 
     def leave(self) -> None:
         for role in tuple(self._links):
@@ -154,6 +165,11 @@ class VirtualBench(Bench):
 
     def put(self, key: str, header: bytes, payload: bytes) -> None:
         self._network.put(key, header, payload, self._link)
+
+    def declare_token(self, token: str) -> Callable[[], None]:
+        if self._link is None or not any(link.watches_drivers for link in self._network.peers_of(self._link)):
+            raise NotApplicableError("the robot declares no liveliness token")
+        return self._network.declare_token(self.robot, token)
 
     def leave(self) -> None:
         if self._link is not None:

@@ -257,6 +257,13 @@ class Bench(ABC):
         """Publish anything under any key, as a third party could. Raises NotApplicableError where that cannot be."""
 
     @abstractmethod
+    def declare_token(self, token: str) -> Callable[[], None]:
+        """Declare the token of a driver; it ends with the returned function.
+
+        Raises NotApplicableError where links have no tokens, and for a robot that declares none of its own.
+        """
+
+    @abstractmethod
     def leave(self) -> None:
         """Close the kit's connection; nothing is received and nothing can be sent until `join`."""
 

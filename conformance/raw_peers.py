@@ -12,11 +12,13 @@ import time
 from base64 import b64encode
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
-from typing import Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.security import load_role_keys
+from sightline.protocol.transports.tokens import Token
 from sightline.protocol.transports.websocket.framing import SUBPROTOCOL
+from sightline.protocol.transports.zenoh.link import declare_token
 from sightline.protocol.transports.zenoh.session import open_session
 
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
@@ -235,17 +237,27 @@ class RawZenoh:
     def __init__(self, endpoint: str, folder: str = "", source: str = "vision") -> None:
         """`folder` holds the keys to come in with, those of `source`."""
         self._endpoint, self._folder, self._source = endpoint, folder, source
-        self._put: Callable[..., None] | None = None
+        self._session: Any = None
         self._ending = ExitStack()
 
     def put(self, key: str, header: bytes, payload: bytes) -> None:
         """Send it. Raises LinkError without an answer."""
-        if self._put is None:
+        self._opened().put(key, payload, attachment=header or None)
+
+    def declare_token(self, token: Token) -> Callable[[], None]:
+        """Declare a token. It ends with the returned function. Raises LinkError without an answer."""
+        return declare_token(self._opened(), token)
+
+    def has_token(self, token: Token) -> bool:
+        """Return True if a peer declares this token. Raises LinkError without an answer."""
+        return any(reply.ok is not None for reply in self._opened().liveliness().get(token.key))
+
+    def _opened(self) -> Any:
+        if self._session is None:
             secured = load_role_keys(self._folder, self._source)
-            session = open_session((), [self._endpoint], _OPEN_S, secured)
-            self._ending.callback(session.close)
-            self._put = session.put
-        self._put(key, payload, attachment=header or None)
+            self._session = open_session((), [self._endpoint], _OPEN_S, secured)
+            self._ending.callback(self._session.close)
+        return self._session
 
     def __enter__(self) -> Self:
         return self

@@ -227,6 +227,10 @@ class Sender:
         fields = {"seq": self.ack_seq, "proof": None, **changes}
         self.bench.publish(ACK, as_json(self.header(frame, **fields)), b"", self.source)
 
+    def declare(self) -> Callable[[], None]:
+        """Declare the token of this session; it ends with the returned function. Not applicable without tokens."""
+        return self.bench.declare_token(self.proofs.commitment)
+
     def drive(self, text: bytes | None = CRAWL) -> None:
         """From now on answer every frame with this twist; None: go back to acknowledging."""
         self.driving = text

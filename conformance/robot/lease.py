@@ -1,5 +1,6 @@
 """Cases on the lease: who drives, by rank, for how long, and what happens when the driver is gone. Pure."""
 
+from collections.abc import Callable
 from typing import Final
 
 from sightline.conformance.case import Bench, Suite
@@ -10,6 +11,8 @@ from sightline.protocol.proof import ProofChain
 
 SUITE: Final = Suite("R")
 _LEASE_US: Final = 1_000_000
+_TOKEN_US: Final = 100_000
+"""Until a token or its end is known everywhere; a dead process takes 4 ms."""
 
 
 def _held_alone(bench: Bench) -> tuple[Sender, Sender]:
@@ -28,6 +31,17 @@ def _held_for_a_while(bench: Bench) -> Sender:
     second = Sender(first.robot)
     bench.need(second.twist_result() == GOOD, "the lease does not end by silence (R-LEASE-04)")
     return second
+
+
+def _with_token(bench: Bench) -> tuple[Sender, Callable[[], None]]:
+    """The source that holds the lease with a token, and a function that ends the token."""
+    robot = ready(bench).robot
+    bench.rest(_LEASE_US * 3 // 2)
+    first = Sender(robot)
+    withdraw = first.declare()
+    bench.rest(_TOKEN_US)
+    first.need_good()
+    return first, withdraw
 
 
 def _holder_is(sender: Sender, within_us: int = 400_000) -> bool:
@@ -262,3 +276,63 @@ def status_shows_no_session(bench: Bench, first: Sender) -> None:
     received = bench.newest(STATUS)
     found = received is not None and first.session.encode() in received.message.payload
     bench.expect(not found, "the status contains the session")
+
+
+# --- tokens ----------------------------------------------------------------------------------------------------------
+
+
+@SUITE.must("R-LEASE-21", "6.8 Tokens", _with_token)
+def token_ends_the_lease(bench: Bench, held: tuple[Sender, Callable[[], None]]) -> None:
+    """The lease ends with the token of the holder."""
+    first, withdraw = held
+    second = Sender(first.robot)
+    bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    withdraw()
+    bench.rest(_TOKEN_US)
+    second.expect(GOOD, what="after the end of the token a second driver")
+
+
+@SUITE.must("R-LEASE-22", "6.8 Tokens", _with_token)
+def session_without_its_token_drives_no_more(bench: Bench, held: tuple[Sender, Callable[[], None]]) -> None:
+    """A session whose token ended never drives again, also when no other drives."""
+    first, withdraw = held
+    withdraw()
+    bench.rest(_TOKEN_US)
+    second = Sender(first.robot)
+    bench.need(second.twist_result() == GOOD, "the lease does not end with the token (R-LEASE-21)")
+    second.fall_silent()
+    bench.rest(_LEASE_US * 3 // 2)
+    first.expect("NOT_HOLDER", what="1.5 s after the others, a twist of the session whose token ended")
+
+
+@SUITE.must("R-LEASE-23", "6.8 Tokens", _with_token)
+def other_tokens_end_nothing(bench: Bench, held: tuple[Sender, Callable[[], None]]) -> None:
+    """The end of the token of another session does not end the lease."""
+    first, _ = held
+    second = Sender(first.robot)
+    withdraw = second.declare()
+    bench.rest(_TOKEN_US)
+    first.need_good()
+    withdraw()
+    bench.rest(_TOKEN_US)
+    Sender(first.robot).expect("NOT_HOLDER", what="after the end of a token that is not of the holder, a third driver")
+
+
+@SUITE.must("R-LEASE-24", "6.8 Tokens", _with_token)
+def silent_holder_is_succeeded(bench: Bench, held: tuple[Sender, Callable[[], None]]) -> None:
+    """A holder with a token that is silent for 0.6 s yields to another driver with a token."""
+    first, _ = held
+    second = Sender(first.robot)
+    second.declare()
+    first.fall_silent()
+    bench.rest(_LEASE_US * 6 // 10)
+    second.expect(GOOD, what="after 0.6 s of silence of the holder, a driver with a token")
+
+
+@SUITE.must("R-LEASE-25", "6.8 Tokens", _with_token)
+def only_a_token_succeeds(bench: Bench, held: tuple[Sender, Callable[[], None]]) -> None:
+    """A holder with a token that is silent for 0.6 s does not yield to a driver without one."""
+    first, _ = held
+    first.fall_silent()
+    bench.rest(_LEASE_US * 6 // 10)
+    Sender(first.robot).expect("NOT_HOLDER", what="after 0.6 s of silence of the holder, a driver without a token")

@@ -401,13 +401,15 @@ def robot(
         def put_it(key: str, header: bytes, payload: bytes) -> None:
             put_over_websocket(bench, key, header, payload)
 
-        put = put_it if "://" in endpoint else ending.enter_context(RawZenoh(endpoint, access.folder)).put
+        third_party = None if "://" in endpoint else ending.enter_context(RawZenoh(endpoint, access.folder))
+        put = put_it if third_party is None else third_party.put
         roles = _ROLES if access.is_guarded else _ROLES[:1]
         if motor_log is not None:
             _motor_rows(motor_log)
         bench = LiveBench(
-            robot, open_it, FROM_ROBOT, put, roles=roles, endpoint=endpoint, legacy=legacy, access=access
-        )  # fmt: skip
+            robot, open_it, FROM_ROBOT, put, third_party=third_party, roles=roles, endpoint=endpoint, legacy=legacy,
+            access=access,
+        )
         ending.enter_context(bench)
         if not side.is_there(bench):
             raise LinkError(f"no status from robot '{robot}' at {endpoint}; check --robot")

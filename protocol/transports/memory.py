@@ -149,6 +149,16 @@ class MemoryNetwork:
         """Return the other open links of the same robot."""
         return [other for other in self._links if other is not link and other.robot == link.robot]
 
+    def declare_token(self, robot: str, token: str) -> Callable[[], None]:
+        """Declare the token of a driver of `robot`. It ends with the returned function."""
+        def show(is_present: bool) -> None:
+            for link in self._links:
+                if link.robot == robot:
+                    link.see_token(token, is_present)
+
+        show(True)
+        return lambda: show(False)
+
     def leave(self, link: "MemoryLink") -> None:
         """Remove `link` and all messages in flight to it."""
         # Messages to a closed link must not arrive at a later link of the same robot. Its streams go too, so that the
@@ -219,6 +229,7 @@ class MemoryLink(BaseLink):
         self._network = network
         self._callbacks: list[tuple[Channel, str, Callable[[Message], None]]] = []
         """Channel, the pattern of its keys, callback."""
+        self._on_token: Callable[[str, bool], None] | None = None
 
     @property
     def connected(self) -> bool:
@@ -243,6 +254,20 @@ class MemoryLink(BaseLink):
         """Return True if another link subscribes to `channel` of this end."""
         key = self._rules.key(channel)
         return not self._closed and any(peer.subscribes_to(key) for peer in self._network.peers_of(self))
+
+    def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
+        """Call `callback` with each token that is declared from now on, and with its end."""
+        self._on_token = callback
+
+    @property
+    def watches_drivers(self) -> bool:
+        """Return True if this end watches the tokens of drivers."""
+        return self._on_token is not None
+
+    def see_token(self, token: str, is_present: bool) -> None:
+        """Deliver a token at once."""
+        if self._on_token is not None:
+            self._on_token(token, is_present)
 
     def subscribes_to(self, key: str) -> bool:
         """Return True if a subscription matches `key`. As on Zenoh, a key with a wildcard matches all."""

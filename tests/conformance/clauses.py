@@ -27,6 +27,7 @@ UNTESTED = {
     "16.2 On Zenoh": "the session's configuration; tests/protocol/transports/zenoh",
     "16.3 On Zenoh": "it permits nothing and rejects nothing",
     "16.4 On Zenoh": "for information only; tests/protocol/transports/zenoh/test_presence.py",
+    "16.5 Liveliness tokens": "keys without a case of their own: those of 6.8 declare tokens under them",
     "18.1 Request":
         "for a vision service that knows missions, which is optional; tests/vision_side/missions/test_registry.py",
     "18.2 Freshness": "as 18.1",

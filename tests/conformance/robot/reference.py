@@ -41,6 +41,7 @@ class ReferenceRobot:
         """Subscribe."""
         for channel in (TWIST, REQUEST, ACK):
             self.link.subscribe(channel, self.receive)
+        self.link.watch_drivers(lambda token, is_present: self.driving.on_token(token, is_present, self.now()))
 
     # --- seams ---------------------------------------------------------------------------------------------------
 

@@ -100,7 +100,7 @@ class BrokenVision(VirtualVision):
         answer = self.decides(header, answer)
         if answer is not None:
             self.answered += 1
-            fields = answer_header(header, self._session, self.answered, COMPUTE_US).model_dump(mode="json")
+            fields = answer_header(header, self.sender.session, self.answered, COMPUTE_US).model_dump(mode="json")
             self.writes(fields, None if answer.twist is None else format_twist(answer.twist))
 
     def writes(self, fields, text):

@@ -3,6 +3,7 @@
 from sightline.protocol.channels import CHANNELS
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import Twist
+from sightline.protocol.proof import NO_PROOF
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.ports import Picture
 from sightline.robot_side.safety.lease import Lease
@@ -143,11 +144,11 @@ def guests_drive_fast(robot):
 
 @breaks("R-DIAL-03")
 def guests_do_not_yield(robot):
-    def may_take(self, who, now_us):
+    def may_take(self, who, now_us, proof=NO_PROOF):
         holder = self.live_holder(now_us)
         if holder is not None and holder.source == "guest" and who.source == "vision":
             return False
-        return Lease.may_take(self, who, now_us)
+        return Lease.may_take(self, who, now_us, proof)
 
     lease_of(robot, may_take=may_take)
 

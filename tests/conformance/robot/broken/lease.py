@@ -14,7 +14,7 @@ STILL = Twist(linear_mps=0.0, angular_rad_s=0.0)
 def lease_of(robot, **methods):
     """The gate's lease as a class of its own, with other methods."""
     gate = robot.driving.gate
-    gate._lease = type("BrokenLease", (Lease,), methods)(gate._lease.life_us)
+    gate._lease = type("BrokenLease", (Lease,), methods)(gate._lease.life_us, gate._lease.succession_us)
 
 
 def who_sends(message):
@@ -33,9 +33,9 @@ def tells_no_holder(robot):
 
 @breaks("R-LEASE-02", "R-SEQ-12")
 def lets_two_drive(robot):
-    def may_take(self, who, now_us):
+    def may_take(self, who, now_us, proof=NO_PROOF):
         holder = self.live_holder(now_us)
-        return Lease.may_take(self, who, now_us) or who.source == holder.source == "vision"
+        return Lease.may_take(self, who, now_us, proof) or who.source == holder.source == "vision"
 
     lease_of(robot, may_take=may_take)
 
@@ -95,8 +95,10 @@ def acks_take(robot):
 
 @breaks("R-LEASE-09")
 def humans_wait_in_line(robot):
-    def may_take(self, who, now_us):
+    def may_take(self, who, now_us, proof=NO_PROOF):
         holder = self.live_holder(now_us)
+        if self.is_fenced(who) or (holder and holder.source == who.source):
+            return Lease.may_take(self, who, now_us, proof)
         outranks = holder is not None and holder.source == "guest" and who.source != "guest"
         return holder is None or holder == who or outranks
 
@@ -107,10 +109,10 @@ def humans_wait_in_line(robot):
 def vision_takes_from_humans(robot):
     gate = robot.driving.gate
 
-    def may_take(self, who, now_us):
+    def may_take(self, who, now_us, proof=NO_PROOF):
         holder = self.live_holder(now_us)
         stolen = holder is not None and holder.source == "teleop" and gate.state is State.DISARMED
-        return Lease.may_take(self, who, now_us) or (stolen and who.source == "vision")
+        return Lease.may_take(self, who, now_us, proof) or (stolen and who.source == "vision")
 
     lease_of(robot, may_take=may_take)
 
@@ -180,6 +182,35 @@ def acquire_of_an_equal(robot):
         return "acquired" if holder and holder.source == who.source else inner(who, now_us, *proof)
 
     wrap(gate, "acquire", around)
+
+
+@breaks("R-LEASE-21")
+def tokens_end_no_lease(robot):
+    robot.driving.gate.end_token = lambda token, now_us: False
+
+
+@breaks("R-LEASE-22")
+def ended_sessions_drive_again(robot):
+    lease_of(robot, _fence=lambda self, who: None)
+
+
+@breaks("R-LEASE-23")
+def any_token_ends_the_lease(robot):
+    lease_of(robot, end_token=lambda self, token, now_us: Lease.end_token(self, self.token or token, now_us))
+
+
+@breaks("R-LEASE-24")
+def silent_holders_keep_the_lease(robot):
+    robot.driving.gate._lease.succession_us = 10_000_000
+
+
+@breaks("R-LEASE-25")
+def silent_holders_yield_to_all(robot):
+    def may_take(self, who, now_us, proof=NO_PROOF):
+        silent_us = now_us - (self.expires_us - self.life_us)
+        return Lease.may_take(self, who, now_us, proof) or (bool(self.token) and silent_us > 400_000)
+
+    lease_of(robot, may_take=may_take)
 
 
 @breaks("R-LEASE-18")
