@@ -1,8 +1,10 @@
 """Images to input tensors, output tensors to detections. Pure.
 
 Inputs: uint8 rows of pixels (1, H, W, 3), BGR unless configured, or float (1, 3, H, W), RGB as 0..1. Outputs:
-`boxes` (K, 4), `scores` (K), `labels` (K), as Sightline's own; one (N, 6) of x1, y1, x2, y2, score, class; or one
-(4 + classes, N) of cx, cy, w, h and a score for each class, as YOLO gives it, with overlaps still to be removed.
+`boxes` (K, 4), `scores` (K), `labels` (K), as Sightline's own, and maybe `masks` (K, h, w); one (N, 6) of x1, y1, x2,
+y2, score, class; one (4 + classes, N) of cx, cy, w, h and a score for each class, as YOLO gives it since version 8, or
+one (N, 5 + classes) with a score of the box before those of the classes, as YOLOv5 gives it, both with overlaps still
+to be removed. Each box of YOLO may have numbers for a mask at its end, and a second output their prototypes.
 """
 
 import ast
@@ -18,7 +20,7 @@ from numpy.typing import NDArray
 from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor
-from sightline.vision_side.detect.port import Detection, clean_label, clipped
+from sightline.vision_side.detect.port import Circle, Detection, clean_label, clipped
 
 Arrays = Mapping[str, NDArray[Any]]
 _MAX_ROWS: Final = 100_000
@@ -26,7 +28,25 @@ _MAX_OVERLAP: Final = 0.5
 _GRAY: Final = 114  # beside an image that is narrower or lower than the input; what YOLO was trained with
 _STEP_PX: Final = 32  # an input of any size is rounded up to this
 _TRIPLE: Final = {"boxes", "scores", "labels"}
+_SUPPRESSED: Final = 1000
+"""Rows from which six numbers are YOLOv5's single class, and not the few boxes of a model that removes overlaps."""
+_COMPARED: Final = 1000
+"""The surest so many boxes are compared for overlaps; at most 64 of them count."""
+_LEAST_ROUND: Final = 0.8
+"""Share of the enclosing circle that a mask fills if it is round. A square fills 0.64."""
 _MAX_LABELS: Final = 1000
+_COCO: Final = (
+    "person,bicycle,car,motorcycle,airplane,bus,train,truck,boat,traffic light,fire hydrant,stop sign,parking meter,"
+    "bench,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe,backpack,umbrella,handbag,tie,suitcase,frisbee,"
+    "skis,snowboard,sports ball,kite,baseball bat,baseball glove,skateboard,surfboard,tennis racket,bottle,wine glass,"
+    "cup,fork,knife,spoon,bowl,banana,apple,sandwich,orange,broccoli,carrot,hot dog,pizza,donut,cake,chair,couch,"
+    "potted plant,bed,dining table,toilet,tv,laptop,mouse,remote,keyboard,cell phone,microwave,oven,toaster,sink,"
+    "refrigerator,book,clock,vase,scissors,teddy bear,hair drier,toothbrush"
+)
+COCO: Final = tuple(_COCO.split(","))
+"""The labels of the 80 classes of COCO, in their usual order. Source: Lin et al., Microsoft COCO, 2014."""
+_NO_CLASS: Final = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
+"""Numbers without a class among the 91 of COCO's own files, which torchvision and DETR use."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +67,13 @@ class ModelFormat:
     size: tuple[int, int] | None
     """(rows, columns); None where any will do."""
     kind: str
-    """triple, rows or yolo."""
+    """triple, rows, yolo or yolov5."""
     labels: tuple[str, ...]
     dtype: str = "uint8"
     batched: bool = False
     """True if it takes several images at once: inputs and outputs leave the number open."""
+    masks: int = 0
+    """Numbers at the end of each row that, with the prototypes, give a mask."""
 
 
 def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelFormat:
@@ -68,37 +90,67 @@ def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelF
         raise ValueError(f"it takes {one.shape[0]} images in one batch; export it for 1, or for any number")
     rows, columns = one.shape[1:3] if rows_first and not floats else one.shape[2:4]
     size = (rows, columns) if rows and columns else None
-    labels = tuple(map(clean_label, names)) or own_labels(header.metadata)
-    kind = _kind(header.outputs, labels)
+    labels = _named(names) or own_labels(header.metadata)
+    kind, classes, masks = _kind(header.outputs, labels)
+    if not labels and classes == len(COCO):
+        labels = COCO
     batched = size is not None and one.shape[0] is None and all(_is_for_several(one, kind) for one in header.outputs)
-    return ModelFormat(floats, floats if color == "auto" else color == "rgb", size, kind, labels, one.type, batched)
+    rgb = floats if color == "auto" else color == "rgb"
+    return ModelFormat(floats, rgb, size, kind, labels, one.type, batched, masks)
+
+
+def _named(names: Sequence[str]) -> tuple[str, ...]:
+    """Return the labels of a configuration. `coco` and `coco91` stand for those of COCO, by either numbering."""
+    if tuple(names) == ("coco91",):
+        words = iter(COCO)
+        return tuple("none" if number in _NO_CLASS else next(words) for number in range(len(COCO) + len(_NO_CLASS)))
+    return COCO if tuple(names) == ("coco",) else tuple(map(clean_label, names))
 
 
 def _is_for_several(output: Tensor, kind: str) -> bool:
     """Return True if its first dimension is open and counts images."""
-    sides = 2 if kind == "triple" and output.name != "boxes" else 3
+    sides = 2 if kind == "triple" and output.name != "boxes" else 3 + _is_prototypes(output)
     return len(output.shape) == sides and output.shape[0] is None
+
+
+def _is_prototypes(output: Tensor) -> bool:
+    """Return True for (1, M, h, w), of which each box's M numbers make a mask."""
+    return len(output.shape) == 4 and output.shape[1] is not None
 
 
 def _shape_text(one: Tensor) -> str:
     return "(" + ", ".join("?" if part is None else str(part) for part in one.shape) + ")"
 
 
-def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> str:
+def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> tuple[str, int, int]:
+    """Return the kind, its number of classes (0 if unknown), and the numbers of a mask in each row."""
     if {one.name for one in outputs} >= _TRIPLE:
-        return "triple"
-    if len(outputs) == 1:
-        shape = outputs[0].shape
-        if shape and shape[-1] == 6:
-            return "rows"
-        if len(shape) == 3 and shape[1] is not None and shape[1] > 4:
-            if labels and shape[1] != 4 + len(labels):
-                raise ValueError(f"it has {shape[1] - 4} classes and {len(labels)} names; "
-                                 "detector.options.names has one for each, in order")
-            return "yolo"
+        return "triple", 0, 0
+    masks = next((one.shape[1] or 0 for one in outputs if _is_prototypes(one)), 0)
+    rows = [one for one in outputs if not _is_prototypes(one)]
+    shape = rows[0].shape if len(rows) == 1 and len(outputs) <= 2 else ()
+    if shape and shape[-1] == 6 + masks and (len(shape) < 2 or (shape[-2] or 0) <= _SUPPRESSED):
+        return "rows", 0, masks
+    if len(shape) == 3:
+        by_row = _is_by_row(shape, len(labels), masks)
+        classes = (shape[2] or 0) - 5 - masks if by_row else (shape[1] or 0) - 4 - masks
+        if classes > 0 and labels and classes != len(labels):
+            raise ValueError(f"it has {classes} classes and {len(labels)} names; "
+                             "detector.options.names has one for each, in order")
+        if classes > 0:
+            return "yolov5" if by_row else "yolo", classes, masks
     given = ", ".join(f"{one.name} {_shape_text(one)}" for one in outputs)
     raise ValueError(f"it gives {given}; it should be boxes, scores and labels, or one (N, 6), or one "
-                     "(1, 4 + classes, N)")
+                     "(1, 4 + classes, N), or one (1, N, 5 + classes)")
+
+
+def _is_by_row(shape: Sequence[int | None], labels: int, masks: int) -> bool:
+    """Return True for a box in each row. By the number of labels, else there are more boxes than classes."""
+    if labels and shape[1] == 4 + labels + masks:
+        return False
+    if labels and shape[2] == 5 + labels + masks:
+        return True
+    return shape[1] is None or (shape[2] is not None and shape[2] < shape[1])
 
 
 def own_labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
@@ -145,24 +197,28 @@ def read_outputs(
     Raises ValueError for outputs of another shape than in the header, and for numbers that are not finite in what
     counts: that is not the same as "saw nothing".
     """
-    boxes, scores, labels = _READERS[form.kind](outputs)
+    boxes, scores, labels = _READERS[form.kind](outputs, form.masks)
     count = len(boxes)
     if boxes.shape != (count, 4) or scores.shape != (count,) or labels.shape != (count,):
         raise ValueError(f"boxes {boxes.shape}, scores {scores.shape}, labels {labels.shape}")
-    counts = ~(scores < min_score)  # nan counts, too
+    counts = np.flatnonzero(~(scores < min_score))  # nan counts, too
     boxes, scores, labels = boxes[counts], scores[counts], labels[counts]
     if not (np.isfinite(boxes).all() and np.isfinite(scores).all() and np.isfinite(labels).all()):
         raise ValueError("a box, score or label is nan or infinite")
     if (scores > 1).any():
         raise ValueError(f"invalid score {scores.max():g}: not between 0 and 1")
     first = np.argsort(-scores, kind="stable")
-    if form.kind == "yolo":
+    if form.kind.startswith("yolo"):
+        first = first[:_COMPARED]
         first = first[_uncovered(boxes[first], scores[first], labels[first])]
     first = first[:MAX_DETECTED_BOXES]  # the surest so many count
-    placed = (boxes[first] - [letterbox.left, letterbox.top] * 2) / letterbox.scale * picture.scale
+    circles = _circles(outputs, form, counts[first], boxes[first])
+    corner, scale = np.array([letterbox.left, letterbox.top]), picture.scale / letterbox.scale
+    placed = (boxes[first] - [*corner, *corner]) * scale
     height, width = (one * picture.scale for one in picture.bgr.shape[:2])
-    found = (Detection(x1, y1, x2, y2, score, _word(form.labels, label)) for (x1, y1, x2, y2), score, label in
-             zip(placed.tolist(), scores[first].tolist(), labels[first].tolist(), strict=True))
+    found = (Detection(x1, y1, x2, y2, score, _word(form.labels, label), ring and _moved(ring, corner, scale))
+             for (x1, y1, x2, y2), score, label, ring in
+             zip(placed.tolist(), scores[first].tolist(), labels[first].tolist(), circles, strict=True))
     return tuple(one for one in (clipped(one, width, height) for one in found) if one is not None)
 
 
@@ -178,29 +234,51 @@ def _word(labels: Sequence[str], label: float) -> str:
     return labels[index] if 0 <= index < len(labels) else clean_label(str(index))
 
 
-def _triple(outputs: Arrays) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+_Columns = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
+"""Boxes (K, 4), scores (K), labels (K)."""
+
+
+def _triple(outputs: Arrays, _masks: int) -> _Columns:
     boxes, scores, labels = (np.asarray(outputs[name], np.float64) for name in ("boxes", "scores", "labels"))
     boxes = boxes.reshape(-1, 4) if boxes.size % 4 == 0 else boxes
     return _bounded(boxes), scores.reshape(-1), labels.reshape(-1)
 
 
-def _rows(outputs: Arrays) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    (rows,) = outputs.values()
-    if rows.ndim < 2 or rows.shape[-1] != 6:
+def _rows(outputs: Arrays, masks: int) -> _Columns:
+    rows = _of_boxes(outputs)
+    if rows.ndim < 2 or rows.shape[-1] != 6 + masks:
         raise ValueError(f"an output of {rows.shape}")
-    rows = _bounded(rows.reshape(-1, 6).astype(np.float64))
+    rows = _bounded(rows.reshape(-1, 6 + masks).astype(np.float64))
     return rows[:, :4], rows[:, 4], rows[:, 5]
 
 
-def _yolo(outputs: Arrays) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    (columns,) = outputs.values()
-    if columns.ndim != 3 or columns.shape[0] != 1 or columns.shape[1] <= 4:
+def _yolo(outputs: Arrays, masks: int) -> _Columns:
+    columns = _of_boxes(outputs)
+    if columns.ndim != 3 or columns.shape[0] != 1 or columns.shape[1] <= 4 + masks:
         raise ValueError(f"an output of {columns.shape}")
-    rows = _bounded(columns[0].T).astype(np.float64)
-    half, classes = rows[:, 2:4] / 2, rows[:, 4:]
-    labels = classes.argmax(axis=1)
-    boxes = np.column_stack([rows[:, :2] - half, rows[:, :2] + half])
-    return boxes, classes[np.arange(len(rows)), labels], labels.astype(np.float64)
+    return _surest(columns[0], 4, masks)
+
+
+def _yolov5(outputs: Arrays, masks: int) -> _Columns:
+    rows = _of_boxes(outputs)
+    if rows.ndim != 3 or rows.shape[0] != 1 or rows.shape[2] <= 5 + masks:
+        raise ValueError(f"an output of {rows.shape}")
+    boxes, scores, labels = _surest(rows[0].T, 5, masks)
+    return boxes, scores * rows[0, :, 4], labels
+
+
+def _surest(columns: NDArray[Any], first: int, masks: int) -> _Columns:
+    """Return box and surest class of each column: cx, cy, w, h, and from `first` on a score for each class."""
+    _bounded(columns.T)
+    half, classes = columns[2:4].astype(np.float64) / 2, columns[first : columns.shape[0] - masks]
+    labels = classes.argmax(axis=0)
+    boxes = np.concatenate([columns[:2] - half, columns[:2] + half]).T
+    return boxes, classes[labels, np.arange(len(boxes))].astype(np.float64), labels.astype(np.float64)
+
+
+def _of_boxes(outputs: Arrays) -> NDArray[Any]:
+    """Return the output that has the boxes: prototypes of masks have four dimensions."""
+    return next((one for one in outputs.values() if one.ndim != 4), np.zeros(0))
 
 
 def _bounded(rows: NDArray[Any]) -> NDArray[Any]:
@@ -209,7 +287,63 @@ def _bounded(rows: NDArray[Any]) -> NDArray[Any]:
     return rows
 
 
-_READERS: Final = {"triple": _triple, "rows": _rows, "yolo": _yolo}
+_READERS: Final = {"triple": _triple, "rows": _rows, "yolo": _yolo, "yolov5": _yolov5}
+
+
+# --- masks: only the circle of a round one is used -----------------------------------------------------------------
+
+
+def _circles(
+    outputs: Arrays, form: ModelFormat, rows: NDArray[np.intp], boxes: NDArray[Any]
+) -> list[Circle | None]:
+    """Return the circle of each of these rows' masks, px of the input; None for those that are not round."""
+    if form.kind == "triple":
+        masks = np.asarray(outputs.get("masks", np.zeros(0)))
+        if not masks.size:
+            return [None] * len(rows)
+        flat = masks.reshape(-1, *masks.shape[-2:])
+        return [circle_of(flat[row] > 0.5) for row in rows]
+    if not form.masks or form.size is None:
+        return [None] * len(rows)
+    prototypes = next(one[0] for one in outputs.values() if one.ndim == 4)
+    table = _of_boxes(outputs)[0]
+    numbers = (table.T if form.kind == "yolo" else table)[rows, -form.masks :]
+    scale = form.size[0] / prototypes.shape[1]
+    return [_of_prototypes(np.tensordot(one, prototypes, 1) > 0, box / scale, scale)
+            for one, box in zip(numbers, boxes, strict=True)]
+
+
+def _of_prototypes(mask: NDArray[np.bool_], box: NDArray[Any], scale: float) -> Circle | None:
+    """Return the circle of a mask, which counts within its box only."""
+    x1, y1, x2, y2 = (max(0, round(float(one))) for one in box)
+    inside = np.zeros_like(mask)
+    inside[y1:y2, x1:x2] = mask[y1:y2, x1:x2]
+    ring = circle_of(inside)
+    return ring and _moved(ring, np.zeros(2), scale)
+
+
+def circle_of(mask: NDArray[np.bool_]) -> Circle | None:
+    """Return the circle with the center and the area of a mask, or None if the mask is not round.
+
+    Args:
+        mask: (rows, columns), True on the object.
+    """
+    points = np.argwhere(mask)[:, ::-1].astype(np.float32)
+    if not len(points):
+        return None
+    radius = cv2.minEnclosingCircle(points)[1] + 0.5  # to the edge of a pixel
+    if len(points) < _LEAST_ROUND * np.pi * radius * radius:
+        return None
+    x, y = points.mean(axis=0) + 0.5
+    return Circle(float(x), float(y), float(np.sqrt(len(points) / np.pi)))
+
+
+def _moved(ring: Circle, corner: NDArray[Any], scale: float) -> Circle:
+    return Circle(float((ring.cx_px - corner[0]) * scale), float((ring.cy_px - corner[1]) * scale),
+                  ring.radius_px * scale)
+
+
+# --- overlaps ------------------------------------------------------------------------------------------------------
 
 
 def _uncovered(boxes: NDArray[Any], scores: NDArray[Any], labels: NDArray[Any]) -> NDArray[np.intp]:

@@ -1,0 +1,144 @@
+"""Heads of exported models: YOLO of version 5 and of version 8, without overlaps, with masks, and the labels of COCO."""
+
+import numpy as np
+import pytest
+
+from sightline.vision_side.decode import DecodedImage
+from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor
+from sightline.vision_side.detect.onnx.tensors import (
+    COCO,
+    ModelFormat,
+    circle_of,
+    fit_picture,
+    model_format,
+    read_outputs,
+)
+from sightline.vision_side.detect.port import Detection
+
+PICTURE = DecodedImage(np.full((240, 320, 3), 128, np.uint8), 1)
+INPUT = Tensor("images", "float32", (1, 3, 640, 640))
+CUP = "{0: 'cup', 1: 'plate'}"
+CUP_NAMES = ("cup", "plate")
+
+
+def form_of(*shapes: tuple[int | None, ...], names: tuple[str, ...] = (), metadata: str = "") -> ModelFormat:
+    outputs = tuple(Tensor(f"output{index}", "float32", shape) for index, shape in enumerate(shapes))
+    return model_format(OnnxHeader((INPUT,), outputs, {"names": metadata} if metadata else {}), names, "auto")
+
+
+@pytest.mark.parametrize(
+    ("shapes", "names", "kind", "masks"),
+    [
+        ([(1, 84, 8400)], "", "yolo", 0),
+        ([(1, 25200, 85)], "", "yolov5", 0),
+        ([(1, 300, 6)], "", "rows", 0),
+        ([(1, 25200, 6)], "{0: 'ball'}", "yolov5", 0),
+        ([(1, 5, 8400)], "{0: 'ball'}", "yolo", 0),
+        ([(None, 6, None)], CUP, "yolo", 0),
+        ([(None, None, 7)], CUP, "yolov5", 0),
+        ([(1, 6, 4)], CUP, "yolo", 0),
+        ([(1, 116, 8400), (1, 32, 160, 160)], "", "yolo", 32),
+        ([(1, 25200, 117), (1, 32, 160, 160)], "", "yolov5", 32),
+        ([(1, 300, 38), (1, 32, 160, 160)], "", "rows", 32),
+    ],
+)
+def test_shapes_and_names_identify_the_head(shapes: list, names: str, kind: str, masks: int) -> None:
+    form = form_of(*shapes, metadata=names)
+    assert (form.kind, form.masks) == (kind, masks)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "words"),
+    [
+        ([(1, 84, 8400), (1, 300, 6)], r"gives output0 \(1, 84, 8400\), output1"),
+        ([(1, 1000)], r"gives output0 \(1, 1000\)"),
+        ([(1, 4, 8400)], "4 \\+ classes"),
+        ([(1, 3, 80, 80, 85)], "80, 80, 85"),
+        ([(1, 30, 8400), (1, 32, 160, 160)], "it should be boxes"),
+    ],
+)
+def test_model_with_other_outputs_is_rejected(shapes: list, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        form_of(*shapes)
+
+
+def test_number_of_names_must_match_the_classes() -> None:
+    for shape in ((1, 84, 8400), (1, 25200, 85)):
+        with pytest.raises(ValueError, match="80 classes and 2 names"):
+            form_of(shape, names=("cup", "plate"))
+
+
+def test_model_of_80_classes_without_names_has_the_labels_of_coco() -> None:
+    assert form_of((1, 84, 8400)).labels == COCO and len(COCO) == 80
+    assert form_of((1, 85, 8400)).labels == ()
+    assert form_of((1, 300, 6), names=("coco",)).labels == COCO
+    by_coco = form_of((1, 300, 6), names=("coco91",)).labels
+    assert len(by_coco) == 91
+    assert [by_coco[number] for number in (1, 13, 37, 62, 90)] == [
+        "person", "stop sign", "sports ball", "chair", "toothbrush"]
+
+
+def read(outputs: dict, form: ModelFormat, picture: DecodedImage = PICTURE) -> tuple[Detection, ...]:
+    return read_outputs(outputs, form, fit_picture(picture, form)[1], picture, 0.25)
+
+
+def test_yolov5_score_is_that_of_the_box_times_that_of_the_class() -> None:
+    rows = np.zeros((1, 3, 7), np.float32)
+    rows[0, 0] = (320, 320, 100, 100, 0.9, 0.1, 0.8)
+    rows[0, 1] = (322, 320, 100, 100, 0.8, 0.1, 0.8)  # the same plate again
+    rows[0, 2] = (100, 200, 50, 50, 0.2, 1.0, 0.0)  # a sure class of what is hardly a thing
+    (one,) = read({"output0": rows}, form_of((1, 25200, 7), names=CUP_NAMES))
+    assert (one.label, one.score) == ("plate", pytest.approx(0.72))
+    # 640x640 holds 320x240 at twice its size, with 80 gray rows above.
+    assert (one.x1_px, one.y1_px, one.x2_px, one.y2_px) == pytest.approx((135, 95, 185, 145))
+
+
+def disk(rows: int, columns: int, x: float, y: float, radius: float) -> np.ndarray:
+    down, across = np.mgrid[:rows, :columns] + 0.5
+    return (across - x) ** 2 + (down - y) ** 2 <= radius**2
+
+
+@pytest.mark.parametrize("by_row", [False, True])
+def test_round_mask_of_yolo_becomes_a_circle(by_row: bool) -> None:
+    prototypes = np.where(np.stack([disk(160, 160, 80, 80, 10), disk(160, 160, 40, 60, 30)]), 1.0, -1.0)
+    boxes = np.array([[320, 240], [320, 240], [80, 60], [80, 60]], np.float32)
+    masks = np.array([[3, 0], [0, 3]], np.float32)  # the second is half of a disk that goes on beyond its box
+    scores = np.array([[0.9, 0.1], [0.1, 0.8]], np.float32)
+    boxes[0, 1] = 200
+    columns = np.concatenate([boxes, *([np.ones((1, 2), np.float32)] if by_row else []), scores, masks])[None]
+    form = form_of((1, 9000, 9) if by_row else (1, 8, 8400), (1, 2, 160, 160), names=CUP_NAMES)
+    outputs = {"output0": columns.transpose(0, 2, 1) if by_row else columns, "output1": prototypes[None]}
+    first, second = read(outputs, form)
+    assert first.circle is not None and second.circle is None
+    circle = first.circle
+    assert (circle.cx_px, circle.cy_px, circle.radius_px) == pytest.approx((160, 120, 20), abs=0.3)
+
+
+def test_masks_beside_boxes_become_circles() -> None:
+    form = ModelFormat(True, True, (240, 320), "triple", ("ball", "box"), "float32")
+    square = np.zeros((240, 320))
+    square[100:140, 200:240] = 1
+    masks = np.stack([square, disk(240, 320, 60.5, 80, 15)])[:, None]
+    outputs = {"boxes": np.array([[200, 100, 240, 140], [45, 65, 76, 95]]), "scores": np.array([0.5, 0.9]),
+               "labels": np.array([1, 0]), "masks": masks}
+    ball, box = read(outputs, form)
+    assert (ball.label, box.label, box.circle) == ("ball", "box", None)
+    assert (ball.circle.cx_px, ball.circle.cy_px, ball.circle.radius_px) == pytest.approx((60.5, 80, 15), abs=0.2)
+
+
+def test_only_a_round_mask_has_a_circle() -> None:
+    assert circle_of(np.zeros((9, 9), bool)) is None
+    assert circle_of(np.ones((9, 9), bool)) is None
+    assert circle_of(disk(40, 80, 20, 20, 12) | disk(40, 80, 50, 20, 12)) is None
+    small = circle_of(disk(40, 40, 20, 20, 4))
+    assert small is not None and small.radius_px == pytest.approx(4, abs=0.2)
+
+
+def test_images_of_other_sizes_in_one_run_keep_their_own_pixels() -> None:
+    form = form_of((1, 6, 8400), names=CUP_NAMES)
+    for height, width in ((240, 320), (480, 640), (61, 97), (240, 320)):
+        picture = DecodedImage(np.zeros((height, width, 3), np.uint8), 1)
+        columns = np.array([[320], [320], [64], [64], [0.9], [0.0]], np.float32)[None]
+        (one,) = read({"output0": columns}, form, picture)
+        assert ((one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2) == pytest.approx(
+            (width / 2, height / 2), abs=0.6)
