@@ -6,7 +6,7 @@ Names are those of the entry points `sightline.detectors`, or, from a configurat
 """
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from sightline.protocol.config import PluginRegistry, config_model, warn_renamed
@@ -154,11 +154,11 @@ def check_vision(config: VisionConfig) -> None:
 
 def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) -> None:
     """Raise ConfigError for what can be known to be wrong before the detector is built: its name, options, model."""
-    _, settings = _checked(kind, options, config)
-    if split_kind(kind)[0] == "onnx":
-        from sightline.vision_side.detect.onnx.detector import read_onnx_model
-
-        read_onnx_model(settings)
+    plugin, settings = _checked(kind, options, config)
+    read_model: Callable[[Any], object] | None = getattr(plugin, "read_model", None)
+    if read_model is not None:
+        with plugin_guard(f"{kind}, when its model is read,"):
+            read_model(settings)
 
 
 def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tuple[Any, Any]:

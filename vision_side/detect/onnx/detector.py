@@ -1,14 +1,15 @@
 """The detector `onnx:PATH`. Shell.
 
-Without a path it is the model that comes with Sightline. Before the first frame it has run warm, and its answer to a
-known image was compared.
+Without a path it is the model that comes with Sightline, and `onnx:nanodet` its model of the 80 classes of COCO. Before
+the first frame it has run warm, and its answer to a known image was compared. Models of other frameworks are subclasses
+that open another engine.
 """
 
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -21,7 +22,7 @@ from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.config import Device
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.refine import refined
-from sightline.vision_side.detect.onnx.engine import Engine, OnnxHeader, open_engine
+from sightline.vision_side.detect.onnx.engine import ModelEngine, OnnxHeader, open_engine
 from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
 from sightline.vision_side.detect.onnx.tensors import (
     ModelFormat,
@@ -35,7 +36,9 @@ from sightline.vision_side.detect.onnx.tensors import (
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
 from sightline.vision_side.detect.timing import timed_together
 
-SHIPPED: Final = Path(__file__).parent.parent.parent / "models" / "sightline.onnx"
+_MODELS: Final = Path(__file__).parent.parent.parent / "models"
+SHIPPED: Final = _MODELS / "sightline.onnx"
+NANODET: Final = _MODELS / "nanodet.onnx"
 HASH_DIGITS: Final = 16
 MAX_BYTES: Final = 2**31
 """A protocol buffer can be no larger."""
@@ -49,29 +52,31 @@ _MAX_BATCH: Final = 32
 class OnnxDetector:
     """One model."""
 
+    kind: ClassVar[str] = "onnx"
+
     class Config(Settings):
         """The model, its device, and which of its answers count."""
 
         renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color"}
         address: str = ""
-        """The file; empty for the model that comes with Sightline."""
+        """The file; empty for the model that comes with Sightline, `nanodet` for its model of people and COCO."""
         device: Device = "auto"
         threads: Annotated[int, Field(ge=1, le=64)] = 1
         """Threads on the CPU. A small image only loses by being split."""
         min_score: Annotated[float | None, Field(ge=0, le=1)] = None
         """None: `min_score` of the model's metadata, or else 0.25."""
         names: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
-        """The labels, in order; empty for those of the model's metadata."""
+        """The labels, in order, or `coco` or `coco91`; empty for those of the model's metadata."""
         color: Literal["auto", "bgr", "rgb"] = "auto"
         """The order of an input's channels; `auto`: bytes are BGR, floats RGB."""
-        refine: Annotated[tuple[str, ...], Field(max_length=64)] = ("ball",)
+        refine: Annotated[tuple[str, ...], Field(max_length=64)] = ("ball", "sports ball")
         """Things with these labels are round: their edge is looked for in the image."""
         second_look: bool = True
         """True to enlarge the part of the image where the followed target is expected, if nothing is found there."""
 
     def __init__(self, config: Config) -> None:
         """Raises ConfigError for a file that is not such a model, HardwareError for a device that is not there."""
-        model = read_onnx_model(config)
+        model = self.read_model(config)
         path, self._form, self._min_score = model.path, model.form, model.min_score
         self.labels = model.form.labels
         """All that it can call a thing; empty where the model has only numbers."""
@@ -80,10 +85,15 @@ class OnnxDetector:
         self._second_look = config.second_look and model.form.size is not None
         self._engine = model.engine
         self._notices = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
-        self.maker = Maker(f"onnx:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)
+        self.maker = Maker(f"{self.kind}:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)
         self._failed = False
         self._max_batch = _MAX_BATCH if self._form.batched else 1
         self._warm_up(model, config)
+
+    @classmethod
+    def read_model(cls, config: Any) -> "LoadedModel":
+        """Load the model that `config` names, a `Config` of this class. Raises ConfigError and HardwareError."""
+        return read_onnx_model(config)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """Return a result for each frame that still has time, in one batch if the model takes several."""
@@ -146,7 +156,7 @@ class OnnxDetector:
         targets = [tile.in_image(one) for one in more if frame.goes_by(one.label) and tile.shows_all(one)]
         return tuple(sorted((*found, *targets), key=lambda one: -one.score)[:MAX_DETECTED_BOXES])
 
-    def _warm_up(self, model: "OnnxModel", config: Config) -> None:
+    def _warm_up(self, model: "LoadedModel", config: Config) -> None:
         """Run the model on the test image and compare the answer with the metadata, or with the CPU."""
         picture, path, expected = DecodedImage(golden_picture(), 1), model.path, model.expected
         form, least = model.own_form, model.own_min_score
@@ -154,7 +164,7 @@ class OnnxDetector:
             for _ in range(_WARM_UP):
                 (found,) = _found(self._engine, [picture], form, least)
             if expected is None and self._engine.device != "cpu":
-                on_cpu = open_engine(path, "cpu", config.threads)
+                on_cpu = self.read_model(config.model_copy(update={"device": "cpu"})).engine
                 expected = list(_found(on_cpu, [picture], form, least)[0])
         except Exception as error:  # whatever an engine raises
             raise ConfigError(f"model {path} does not run: {' '.join(str(error).split())}"[:200]) from None
@@ -166,11 +176,11 @@ class OnnxDetector:
 
 
 @dataclass(frozen=True, slots=True)
-class OnnxModel:
+class LoadedModel:
     """A model's file, loaded, and its metadata."""
 
     path: Path
-    engine: Engine
+    engine: ModelEngine
     form: ModelFormat
     min_score: float
     expected: list[Detection] | None
@@ -180,23 +190,23 @@ class OnnxModel:
     digest: str
 
 
-def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
+def read_onnx_model(config: OnnxDetector.Config) -> LoadedModel:
     """Load the model that `config` names.
 
     Raises:
         ConfigError: for a file that is not a model, or of a form unknown here.
         HardwareError: for a device that is not there.
     """
-    path = Path(config.address).expanduser() if config.address else SHIPPED
-    digest = hashlib.sha256(_bytes_of(path)).hexdigest()[:HASH_DIGITS]
+    path = NANODET if config.address == "nanodet" else Path(config.address).expanduser() if config.address else SHIPPED
+    digest = digest_of(path)
     engine = open_engine(path, config.device, config.threads)
     try:
         header = engine.header
         form, least = model_format(header, config.names, config.color), _least(config.min_score, header)
         if KEY not in header.metadata:
-            return OnnxModel(path, engine, form, least, None, form, _least(None, header), digest)
+            return LoadedModel(path, engine, form, least, None, form, _least(None, header), digest)
         own = replace(form, labels=own_labels(header.metadata))
-        return OnnxModel(
+        return LoadedModel(
             path, engine, form, least, read_golden(header.metadata[KEY]), own, _least(None, header), digest
         )
     except ValueError as error:
@@ -204,7 +214,7 @@ def read_onnx_model(config: OnnxDetector.Config) -> OnnxModel:
 
 
 def _found(
-    engine: Engine, pictures: Sequence[DecodedImage], form: ModelFormat, min_score: float
+    engine: ModelEngine, pictures: Sequence[DecodedImage], form: ModelFormat, min_score: float
 ) -> list[tuple[Detection, ...]]:
     """Return the detections of each image; more than one only where form and engine take them."""
     fitted = [fit_picture(picture, form) for picture in pictures]
@@ -218,21 +228,29 @@ def _found(
 
 def shipped_digest() -> str:
     """Return the hash of the model that comes with Sightline, as results carry it; empty without one."""
-    return hashlib.sha256(SHIPPED.read_bytes()).hexdigest()[:HASH_DIGITS] if SHIPPED.is_file() else ""
+    return digest_of(SHIPPED) if SHIPPED.is_file() else ""
+
+
+def digest_of(*paths: Path) -> str:
+    """Return the first digits of the files' SHA-256, as results carry it. Raises ConfigError, one line."""
+    whole = hashlib.sha256()
+    for path in paths:
+        whole.update(_bytes_of(path))
+    return whole.hexdigest()[:HASH_DIGITS]
 
 
 def _bytes_of(path: Path) -> bytes:
     try:
         size = path.stat().st_size
         if not 0 < size < MAX_BYTES:
-            raise ConfigError(f"model {path} has {size} bytes; an ONNX file has between 1 and {MAX_BYTES}")
+            raise ConfigError(f"model {path} has {size} bytes; a model file has between 1 and {MAX_BYTES}")
         return path.read_bytes()
     except OSError as error:
-        if path == SHIPPED:
+        if path in (SHIPPED, NANODET):
             raise ConfigError("this copy of Sightline has no model; name one, e.g. --detector onnx:ball.onnx, or "
                               "train it (docs/explanation/learned-detector.md)") from None
         why = error.strerror or "it cannot be read"
-        raise ConfigError(f"model {path}: {why}; name an ONNX file, e.g. --detector onnx:ball.onnx") from None
+        raise ConfigError(f"model {path}: {why}; name a model file, e.g. --detector onnx:ball.onnx") from None
 
 
 def _least(given: float | None, header: OnnxHeader) -> float:

@@ -8,7 +8,7 @@ import importlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from numpy.typing import NDArray
 
@@ -45,6 +45,18 @@ class OnnxHeader:
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
     metadata: dict[str, str] = field(default_factory=dict)
+
+
+class ModelEngine(Protocol):
+    """Runs a model of any framework. `device` is what it runs on, `note` what an operator should know about that."""
+
+    name: str
+    device: str
+    note: str
+
+    def run(self, pixels: NDArray[Any]) -> Arrays:
+        """Run the model on one input. Returns all outputs by name. Raises any error of the framework."""
+        ...
 
 
 def _tensors(slots: Iterable[Any]) -> tuple[Tensor, ...]:
