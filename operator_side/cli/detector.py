@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -39,6 +39,13 @@ DeadlineMs = Annotated[
 ]
 MaxBatch = Annotated[int, typer.Option("--max-batch", min=1, max=256, help="Most frames in one batch.")]
 _REMOTE = ("zenoh", "boxes")
+_RECOMMENDED = (
+    ("balls, legs and traffic lights", "onnx"),
+    ("people and the other 79 labels of COCO", "onnx:nanodet"),
+    ("an exported YOLO or another ONNX file", "onnx:FILE"),
+    ("a PyTorch model", "torch:FILE, or torch:package.module:Class"),
+    ("one color in even light, on a small computer", "hsv"),
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -114,6 +121,8 @@ def list_detectors(as_json: Json = False) -> int:
         comes = f", with model {model}" if model else "; without a model: give onnx:PATH"
         print_table((name, f"{why or 'ok'}{comes if name == 'onnx' and not why else ''}") for name, why in rows)
         typer.echo("also: package.module:Name for your own class, and boxes for those of another publisher")
+        typer.echo("\nrecommended:")
+        print_table((f"  {what}", name) for what, name in _RECOMMENDED)
     return 0
 
 
@@ -127,10 +136,10 @@ def _shipped_model() -> str:
 
 def _problem(registry: "PluginRegistry", name: str) -> str:
     try:
-        registry.load(name)
+        missing: Callable[[], str] = getattr(registry.load(name), "missing", str)
+        return missing()
     except ConfigError as error:
         return str(error)
-    return ""
 
 
 def check(

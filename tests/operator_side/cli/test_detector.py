@@ -1,6 +1,7 @@
 """`sightline detector list | check`, `vision --detector`: what is printed and the exit codes."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -44,7 +45,21 @@ def test_detector_list_shows_which_detectors_work(capsys) -> None:
     assert code == 0 and {"hsv", "adaptive", "onnx", "zenoh"} <= set(listed)
     assert listed["hsv"] == {"name": "hsv", "usable": True, "why": ""}
     code, out, _ = run(capsys, "detector", "list")
-    assert code == 0 and "adaptive   ok" in out
+    assert code == 0 and re.search("adaptive +ok", out)
+
+
+def test_detector_list_recommends_in_five_lines_and_names_missing_packages(capsys, monkeypatch) -> None:
+    for package in ("torch", "ultralytics", "transformers"):
+        monkeypatch.setitem(sys.modules, package, None)
+    code, out, _ = run(capsys, "detector", "list")
+    listed, _, recommended = out.partition("recommended:\n")
+    assert code == 0 and len(recommended.splitlines()) == 5
+    assert "onnx:nanodet" in recommended and "onnx:FILE" in recommended
+    assert "pip install ultralytics (AGPL-3.0; no part of Sightline)" in listed
+    _, out, _ = run(capsys, "detector", "list", "--json")
+    usable = {one["name"]: one["usable"] for one in json.loads(out)["detectors"]}
+    assert (usable["torch"], usable["ultralytics"], usable["transformers"], usable["onnx"]) == (
+        False, False, False, True)
 
 
 def test_detector_that_keeps_the_contract_passes(capsys) -> None:
@@ -125,9 +140,9 @@ def test_installation_without_a_model_is_reported(capsys, monkeypatch, tmp_path:
     monkeypatch.setattr(onnx_detector, "SHIPPED", tmp_path / "sightline.onnx")
     code, _, err = run(capsys, "detector", "check", "onnx")
     assert code == 2 and "has no model" in err and err.count("\n") == 1
-    assert "onnx       ok; without a model" in run(capsys, "detector", "list")[1]
+    assert re.search("onnx +ok; without a model", run(capsys, "detector", "list")[1])
     brightness_model(tmp_path / "sightline.onnx", [[1, 1, 9, 9]], [0])
-    assert f"onnx       ok, with model {onnx_detector.shipped_digest()}" in run(capsys, "detector", "list")[1]
+    assert re.search(f"onnx +ok, with model {onnx_detector.shipped_digest()}", run(capsys, "detector", "list")[1])
     assert json.loads(run(capsys, "detector", "list", "--json")[1])["model_hash"] == onnx_detector.shipped_digest()
 
 

@@ -1,5 +1,5 @@
-"""Detectors that are ONNX models.
+"""Detectors that are trained models: ONNX files, and adapters of PyTorch, Ultralytics and Transformers.
 
-May import: `protocol`, `vision_side`; ONNX Runtime.
-Interface: The entry point `onnx`, also as `onnx:PATH`.
+May import: `protocol`, `vision_side`; ONNX Runtime, and inside functions the frameworks.
+Interface: The entry points `onnx`, `torch`, `ultralytics` and `transformers`, each with `:PATH`.
 """

@@ -43,7 +43,7 @@ HASH_DIGITS: Final = 16
 MAX_BYTES: Final = 2**31
 """A protocol buffer can be no larger."""
 _WARM_UP: Final = 3
-_DEFAULT_MIN_SCORE: Final = 0.25  # for a model without `min_score`
+DEFAULT_MIN_SCORE: Final = 0.25  # for a model without `min_score`
 _NAME_LENGTH: Final = 48
 _MAX_BATCH: Final = 32
 """Images in one run: bounds a GPU's memory."""
@@ -256,7 +256,7 @@ def _bytes_of(path: Path) -> bytes:
 def _least(given: float | None, header: OnnxHeader) -> float:
     if given is not None:
         return given
-    least = float(header.metadata.get("min_score", _DEFAULT_MIN_SCORE))
+    least = float(header.metadata.get("min_score", DEFAULT_MIN_SCORE))
     if not 0 <= least <= 1:
         raise ValueError(f"invalid min_score {least:g} in its metadata: not between 0 and 1")
     return least

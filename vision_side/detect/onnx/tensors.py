@@ -90,7 +90,7 @@ def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelF
         raise ValueError(f"it takes {one.shape[0]} images in one batch; export it for 1, or for any number")
     rows, columns = one.shape[1:3] if rows_first and not floats else one.shape[2:4]
     size = (rows, columns) if rows and columns else None
-    labels = _named(names) or own_labels(header.metadata)
+    labels = named_labels(names) or own_labels(header.metadata)
     kind, classes, masks = _kind(header.outputs, labels)
     if not labels and classes == len(COCO):
         labels = COCO
@@ -99,7 +99,7 @@ def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelF
     return ModelFormat(floats, rgb, size, kind, labels, one.type, batched, masks)
 
 
-def _named(names: Sequence[str]) -> tuple[str, ...]:
+def named_labels(names: Sequence[str]) -> tuple[str, ...]:
     """Return the labels of a configuration. `coco` and `coco91` stand for those of COCO, by either numbering."""
     if tuple(names) == ("coco91",):
         words = iter(COCO)

@@ -1,4 +1,4 @@
-"""Heads of exported models: YOLO of version 5 and of version 8, without overlaps, with masks, and the labels of COCO."""
+"""Heads of exported models: YOLO of version 5 and 8, without overlaps, with masks, and the labels of COCO."""
 
 import numpy as np
 import pytest
