@@ -16,7 +16,7 @@ from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, Track
 from sightline.vision_side.detect.plugin_calls import OLD_NOTICES, plugin_guard
 from sightline.vision_side.detect.port import Detector, NoDetector
 from sightline.vision_side.detect.remote.client import EXAMPLES
-from sightline.vision_side.missions.registry import check_missions
+from sightline.vision_side.missions.registry import check_missions, configured_mission
 from sightline.vision_side.plugins import shared_options
 
 BOXES: Final = "boxes"
@@ -39,6 +39,7 @@ def configured_detector(config: VisionConfig) -> Detector:
     check_device(config)
     _check_fallback(config)
     detector = build_detector(one.kind, one.options, config)
+    _check_mission(detector, config)
     if one.fallback:
         from sightline.vision_side.detect.remote.fallback import Fallback
 
@@ -65,20 +66,29 @@ def _check_no_detector(config: VisionConfig) -> None:
 def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
     one = config.detector
     if one.labels:
-        _check_labels(one.kind, one.labels, getattr(detector, "labels", ()))
+        _check_labels("detector.labels", one.kind, one.labels, getattr(detector, "labels", ()))
         detector = LabelFilter(detector, one.labels)
     if one.only_color:
         detector = ColorFilter(detector, config.hsv.ranges)
     return TrackIds(detector) if one.tracked else detector
 
 
-def _check_labels(kind: str, wanted: Sequence[str], known: Sequence[str]) -> None:
+def _check_mission(detector: Detector, config: VisionConfig) -> None:
+    """Raise ConfigError for a mission that follows a label which is not among those that the detector lists."""
+    known = getattr(detector, "labels", ())
+    if not known:
+        return
+    mission = configured_mission(config)
+    _check_labels(f"mission {mission.name!r}", config.detector.kind, (mission.label,) if mission.label else (), known)
+
+
+def _check_labels(place: str, kind: str, wanted: Sequence[str], known: Sequence[str]) -> None:
     """Raise ConfigError for a label that is not among those that the detector lists."""
     for label in wanted if known else ():
         if label not in known:
             nearest = difflib.get_close_matches(label, known, n=1)
             hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it gives {', '.join(known[:_MOST_NAMED])}"
-            raise ConfigError(f"detector.labels: {kind} has no label {label!r}{hint}")
+            raise ConfigError(f"{place}: {kind} has no label {label!r}{hint}")
 
 
 def waits_for_service(config: VisionConfig) -> bool:

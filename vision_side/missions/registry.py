@@ -38,12 +38,20 @@ class MissionSpec:
         """Return True if it must start again with another camera model."""
         return bool(getattr(self.plugin, "needs_camera", True))
 
-    def goes_by(self, label: str) -> bool:
-        """Return True if it may use detections with this label, by the `label` or `target` of its configuration."""
+    @property
+    def label(self) -> str:
+        """The label that it follows, by the `label` or `target` of its configuration; empty for any."""
         own, target = getattr(self.config, "label", None), getattr(self.config, "target", None)
         if isinstance(own, str):
-            return own in ("", label)
-        return is_followable(label, target.label) if isinstance(target, TargetConfig) else True
+            return own
+        return target.label if isinstance(target, TargetConfig) else ""
+
+    def goes_by(self, label: str) -> bool:
+        """Return True if it may use detections with this label."""
+        if isinstance(getattr(self.config, "label", None), str):
+            return self.label in ("", label)
+        has_target = isinstance(getattr(self.config, "target", None), TargetConfig)
+        return is_followable(label, self.label) if has_target else True
 
     def build(self, camera: CameraModel) -> Mission:
         """Create a new mission without a state."""

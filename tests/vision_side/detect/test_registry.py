@@ -142,6 +142,26 @@ def test_every_mistake_is_one_line(detector: dict, words: str) -> None:
     assert "\n" not in str(refused.value) and len(str(refused.value)) < 300
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"target": {"label": "bal"}}, "mission 'follow': onnx has no label 'bal'; did you mean 'ball'?"),
+        ({"mission": {"kind": "follow", "options": {"target": {"label": "bal"}}}}, "mission 'follow': onnx has no"),
+        ({"mission": {"kind": "legs", "options": {"label": "person"}}}, "mission 'legs': onnx has no label 'person'"),
+        ({"detector": {"kind": "onnx", "labels": ["bal"]}}, "detector.labels: onnx has no label 'bal'"),
+    ],
+)
+def test_label_that_the_model_never_gives_is_rejected(settings: dict, words: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        configured_detector(VisionConfig.model_validate({"detector": {"kind": "onnx"}, **settings}))
+
+
+@pytest.mark.parametrize("settings", [{"mission": {"kind": "legs"}}, {"target": {"label": "ball"}}, {}])
+def test_label_of_the_model_is_accepted(settings: dict) -> None:
+    assert isinstance(configured_detector(VisionConfig.model_validate({"detector": {"kind": "onnx"}, **settings})),
+                      OnnxDetector)
+
+
 class Entry:
     """An entry point as an installed package has it."""
 
