@@ -199,12 +199,16 @@ Sets = Annotated[
 ]
 
 
+Label = Annotated[str, typer.Option("--label", metavar="LABEL", help="Label to follow, e.g. person [default: any].")]
+
+
 def mission(
     robot: Robot = None,
     name: Annotated[
         str | None, typer.Argument(metavar="NAME", help="Mission to start; without it, show the mission.")
     ] = None,
     *,
+    label: Label = "",
     sets: Sets = None,
     connect: Connect = None,
     secure: Secure = "",
@@ -218,6 +222,8 @@ def mission(
     from sightline.operator_side.config.toml_text import options_of
 
     options = options_of(sets or ())
+    if label:
+        options["label" if name == "legs" else "target.label"] = label
     if options and name is None:
         raise ConfigError("--set needs a mission to start; name it, e.g. sightline mission r1 follow --set KEY=VALUE")
     if name is not None:

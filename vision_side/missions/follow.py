@@ -5,6 +5,7 @@ another service is located by its height or width.
 """
 
 import math
+from typing import Final
 
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
@@ -22,6 +23,11 @@ from sightline.vision_side.tracking.locate import Sighting, locate_box, locate_s
 from sightline.vision_side.tracking.prediction import MotionPredictor, PredictedMotion
 from sightline.vision_side.tracking.steering import Aim, Search, Steer
 from sightline.vision_side.tracking.track import Target, Track, from_odometry
+
+PERSON: Final = "person"
+"""Label of a whole human, as in COCO."""
+PERSON_M: Final = {"height_m": 1.7, "width_m": 0.45}
+"""Size of a standing adult, unless the configuration has a size. Without it a person is located as a ball at 0.3 m."""
 
 
 class Follow:
@@ -43,6 +49,7 @@ class Follow:
     def __init__(self, config: Config, camera: CameraModel) -> None:
         self._config = config
         self._camera = camera
+        self._sizes = _sizes(config)
         self._track = Track(config.track)
         self._steer = Steer(config.steer, config.target.stand_off_m)
         self._search = Search(config.search)
@@ -67,7 +74,7 @@ class Follow:
 
     def _places(self, view: View) -> list[Sighting | None]:
         """Locate each detection: as a sphere, or as a box from another service or with a configured size."""
-        otherwise_m, sizes = self._expected_m(view.header.pose), self._config.boxes
+        otherwise_m, sizes = self._expected_m(view.header.pose), self._sizes
         return [
             locate_box(one, self._camera, sizes, otherwise_m) if self._is_box(one, view)
             else locate_sphere(one, self._camera, self._config.target.radius_m)
@@ -76,7 +83,7 @@ class Follow:
 
     def _is_box(self, one: Detection, view: View) -> bool:
         """Return True for a box: any detection without pixels, or one without an outline if a size is configured."""
-        sizes = self._config.boxes
+        sizes = self._sizes
         sized = sizes.height_m is not None or sizes.width_m is not None
         return view.picture is None or (sized and one.outline_px is None)
 
@@ -91,7 +98,7 @@ class Follow:
 
     def _expected_m(self, pose: Pose) -> float:
         """Return the assumed distance of a box without a known size, in m: its last one, or the stand-off."""
-        target, boxes = self._track.target, self._config.boxes
+        target, boxes = self._track.target, self._sizes
         if target is None or (boxes.height_m is None and boxes.width_m is None):
             return self._config.target.stand_off_m
         x, y = from_odometry(pose, target.x_m, target.y_m)
@@ -125,6 +132,13 @@ class Follow:
         self._steer.reset()
         twist = self._search.step(view.dt_s, view.header.pose, view.header.applied)
         return Plan(STILL, "lost") if twist is None else Plan(twist, "searching")
+
+
+def _sizes(config: Follow.Config) -> BoxesConfig:
+    """Return the size of a box's object: as configured, or that of a person if the label is one."""
+    boxes = config.boxes
+    is_sized = boxes.height_m is not None or boxes.width_m is not None
+    return boxes if is_sized or config.target.label != PERSON else boxes.model_copy(update=PERSON_M)
 
 
 def aim_at(target: Target, robot: PredictedMotion, camera: CameraModel, ahead_s: float) -> Aim:

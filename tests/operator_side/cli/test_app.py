@@ -8,12 +8,14 @@ import re
 import subprocess
 import sys
 import tomllib
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 import typer
 
 from sightline.operator_side.cli import app as cli
+from sightline.operator_side.cli import operate
 from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError, HardwareError, LinkError, SightlineError
@@ -207,6 +209,21 @@ def test_a_robot_may_be_given_by_its_address(capsys, monkeypatch):
     assert [(config.robot, config.connect) for config in seen] == [
         ("r1", ("ws-legacy://127.0.0.1:9091",)), ("r7", ("ws://127.0.0.1:9090",)),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("mission", "option"), [("follow", "target.label"), ("legs", "label")])
+def test_label_of_a_mission_is_its_option(capsys, monkeypatch, mission, option):
+    requests = []
+
+    class Missions:
+        def request(self, name, *, options):
+            requests.append((name, options))
+            raise LinkError("the test ends here")
+
+    monkeypatch.setattr(operate, "_missions", lambda _target: nullcontext(Missions()))
+    run(capsys, "mission", "r1", mission, "--label", "person", "--set", "steer.bearing_kp=2", "--connect",
+        "tcp/127.0.0.1:9")
+    assert requests == [(mission, {"steer.bearing_kp": 2, option: "person"})]
 
 
 def test_misspelled_environment_name_stops_any_service(capsys, monkeypatch):

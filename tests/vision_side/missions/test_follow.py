@@ -92,6 +92,17 @@ def test_detection_is_a_box_without_pixels_or_without_an_outline_if_a_size_is_kn
     assert located == [("box", CAMERA, boxes, 0.9) if kind == "box" else ("sphere", CAMERA, 0.25)]
 
 
+@pytest.mark.parametrize(("label", "sizes", "used"), [
+    ("person", {}, {"height_m": 1.7, "width_m": 0.45}), ("person", {"height_m": 1.2}, {"height_m": 1.2}),
+    ("ball", {}, None), ("", {}, None),
+])  # fmt: skip
+def test_person_is_a_box_of_an_adults_size_unless_a_size_is_configured(located, label, sizes, used):
+    target = TargetConfig(radius_m=0.25, label=label)
+    follow_of(boxes=BoxesConfig(**sizes), target=target).step(view(at(1.0, label=label or "cup"), picture=PICTURE))
+    [(kind, _, size, *_)] = located
+    assert (kind, size) == ("sphere", 0.25) if used is None else (kind, size) == ("box", BoxesConfig(**used))
+
+
 @pytest.mark.parametrize(("picture", "wanted", "label", "meant"), [
     (PICTURE, "", "ball", True), (PICTURE, "", "legs", False), (PICTURE, "legs", "legs", True),
     (PICTURE, "ball", "legs", False), (PICTURE, "ball", "ball", True),
