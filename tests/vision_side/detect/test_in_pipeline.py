@@ -10,10 +10,12 @@ from sightline.protocol.messages import MAX_DETECTED_BOXES, MAX_INTEGER, FrameHe
 from sightline.vision_side.config import DetectorConfig, TargetConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.detectors import Hsv
+from sightline.vision_side.detect.onnx.detector import OnnxDetector
 from sightline.vision_side.detect.plugin_calls import checked_results, validated
 from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Maker, result_of
 from sightline.vision_side.pipeline import NO_ANSWER, Frame, Pipeline
 from tests.fixtures.vision.detector import Bench, Told, box
+from tests.fixtures.vision.onnx import brightness_model
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
@@ -44,6 +46,16 @@ def test_empty_result_starts_a_search_and_no_answer_does_not() -> None:
         assert (answers[0].skipped, answers[1].skipped) == ("", NO_ANSWER)
     assert answers[0].twist is not None and answers[0].seen.phase == "searching"
     assert answers[1].twist is None and answers[1].seen.phase == "no answer"
+
+
+def test_image_of_another_size_in_the_middle_of_a_run_moves_nothing(tmp_path, no_gpu) -> None:
+    path = brightness_model(tmp_path / "m.onnx", [[140.0, 100.0, 180.0, 140.0]], [0])
+    model = pipeline(OnnxDetector(OnnxDetector.Config(address=str(path), refine=())))
+    other = jpeg_of(np.full((480, 640, 3), 140, np.uint8))
+    answers = [model.step(frame(seq, other if seq == 3 else EMPTY)) for seq in range(1, 6)]
+    assert [one.skipped for one in answers] == ["", "", "MALFORMED", "", ""]
+    assert answers[2].twist is None and answers[2].result is None and "640x480" in answers[2].seen.note
+    assert all(one.twist is not None and one.seen.phase == "tracking" for one in answers[3:])
 
 
 def test_mission_continues_after_a_missing_answer() -> None:

@@ -86,10 +86,20 @@ def open_engine(path: Path, device: Device, threads: int) -> "Engine":
     except HardwareError:
         raise
     except Exception as error:  # ONNX Runtime raises classes of its own for a bad file
-        raise ConfigError(f"model {path} cannot be opened: {' '.join(str(error).split())}"[:_LONGEST]) from None
+        raise ConfigError(f"model {path} cannot be opened: {_unfit(path, error)}"[:_LONGEST]) from None
     if device not in ("auto", engine.device):
         raise HardwareError(f"--device {device}: {engine.name} runs {path.name} on {engine.device} instead; {_FIX}")
     return engine
+
+
+def _unfit(path: Path, error: Exception) -> str:
+    """Return why a file is not a model that opens: the usual reasons, or what ONNX Runtime reports."""
+    with path.open("rb") as file:
+        head = file.read(2)
+    if head == b"PK" or head[:1] == b"\x80":
+        return "it is a file of PyTorch, not of ONNX; export it to ONNX, or use --detector torch:FILE"
+    text = " ".join(str(error).split())
+    return "it is not an ONNX file, or truncated; fetch it again" if "INVALID_PROTOBUF" in text else text
 
 
 class Engine:

@@ -1,6 +1,7 @@
 """The detector `onnx`: the metadata of a file, its inputs, its outputs, and its device."""
 
 import json
+import pickle
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -203,8 +204,9 @@ def test_gpu_that_the_model_did_not_get_is_rejected(
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(None, "No such file"), (b"", "0 bytes"), (b"no model", "cannot be opened"),
-     (part(7, part(2, "empty")), "cannot be opened")],
+    [(None, "No such file"), (b"", "0 bytes"), (b"no model", "cannot be opened: it is not an ONNX file, or truncated"),
+     (part(7, part(2, "empty")), "cannot be opened"), (pickle.dumps(1), "a file of PyTorch, not of ONNX"),
+     (b"PK\x03\x04", "a file of PyTorch, not of ONNX")],
 )
 def test_file_that_is_not_a_model_gives_one_error_line(tmp_path: Path, content: bytes | None, words: str) -> None:
     path = tmp_path / "bad.onnx"
@@ -213,6 +215,17 @@ def test_file_that_is_not_a_model_gives_one_error_line(tmp_path: Path, content: 
     with pytest.raises(ConfigError, match=words) as refused:
         detector(path)
     assert "\n" not in str(refused.value) and str(path) in str(refused.value)
+
+
+def test_truncated_model_and_model_of_2_gb_are_one_line(tmp_path: Path) -> None:
+    whole = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]).read_bytes()
+    (tmp_path / "cut.onnx").write_bytes(whole[: len(whole) - 5])
+    with pytest.raises(ConfigError, match=r"cut\.onnx cannot be opened: it is not an ONNX file, or truncated; "):
+        detector(tmp_path / "cut.onnx")
+    with (tmp_path / "large.onnx").open("wb") as file:
+        file.truncate(2**31)
+    with pytest.raises(ConfigError, match="has 2147483648 bytes; a model file has between 1 and 2147483648"):
+        detector(tmp_path / "large.onnx")
 
 
 def test_without_the_runtime_one_line_names_what_to_install(tmp_path: Path, monkeypatch) -> None:
