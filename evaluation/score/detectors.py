@@ -12,7 +12,7 @@ from typing import Final, Literal
 from sightline.sim.scenes.model import LabelledBox, Scene
 from sightline.vision_side.detect.port import Detection, corners, overlap
 
-BALL_LABELS: Final = ("ball", "target")
+BALL_LABELS: Final = ("ball", "sports ball", "target")
 HIT_OVERLAP: Final = 0.5
 """Intersection by union, with the box of what is in view or of the whole ball, whichever is nearer."""
 CENTRED_FROM: Final = 0.98

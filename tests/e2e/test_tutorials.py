@@ -7,6 +7,7 @@ requires that comment, or a reason, before each one. Ports and folders come from
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from sightline.vision_side.detect.onnx.detector import NANODET
 from tests.fixtures.commands import service
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
@@ -99,10 +101,19 @@ def test_readme_starts_three_services_and_the_operator_commands(terminals):
     assert "reset" in terminals.run(page["arm"])
 
 
+@pytest.mark.alone
 def test_own_model_is_checked_scored_and_drives(terminals, tmp_path):
-    page = blocks("docs/tutorials/your-own-model.md")
-    assert list(page) == ["check", "score", "demo"]
-    assert "sightline.onnx" in terminals.run(page["check"])
-    assert "nominal" in terminals.run(page["score"])
-    [words] = page["demo"]
+    """NanoDet stands for the reader's YOLO: it has the same labels, and an output of the same form."""
+    page = "docs/tutorials/your-own-model.md"
+    steps = {name: [[word.replace("yolo11n.onnx", str(tmp_path / "yolo11n.onnx")).replace(
+        "vision.toml", str(tmp_path / "vision.toml")) for word in words] for words in commands]
+        for name, commands in blocks(page).items()}
+    assert list(steps) == ["check", "score", "demo", "configure"]
+    shutil.copy(NANODET, tmp_path / "yolo11n.onnx")
+    assert "FAIL" not in terminals.run(steps["check"])
+    assert "yolo11n.onnx" in terminals.run(steps["score"])
+    [words] = steps["demo"]
     assert "acquired_s" in terminals.run([[*words, "--out", str(tmp_path / "run")]])
+    [settings] = re.findall(r"```toml\n(.*?)```", (ROOT / page).read_text("utf-8"), re.DOTALL)
+    (tmp_path / "vision.toml").write_text(settings.replace("yolo11n.onnx", str(tmp_path / "yolo11n.onnx")))
+    terminals.run(steps["configure"])

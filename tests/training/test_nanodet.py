@@ -10,7 +10,7 @@ import pytest
 
 from tests.fixtures import demanded
 
-pytest.importorskip("onnx", reason="onnx is not installed")
+demanded.module("onnx", "train")
 demanded.module("pybullet", "sim")
 
 from sightline.training import nanodet

@@ -27,7 +27,7 @@ from sightline.vision_side.tracking.track import Target, Track, from_odometry
 PERSON: Final = "person"
 """Label of a whole human, as in COCO."""
 PERSON_M: Final = {"height_m": 1.7, "width_m": 0.45}
-"""Size of a standing adult, unless the configuration has a size. Without it a person is located as a ball at 0.3 m."""
+"""Size of a standing adult, unless the configuration has a size. Without it a human is located as a ball at 0.3 m."""
 
 
 class Follow:
@@ -135,7 +135,7 @@ class Follow:
 
 
 def _sizes(config: Follow.Config) -> BoxesConfig:
-    """Return the size of a box's object: as configured, or that of a person if the label is one."""
+    """Return the size of a box's object: as configured, or that of an adult if the label is `person`."""
     boxes = config.boxes
     is_sized = boxes.height_m is not None or boxes.width_m is not None
     return boxes if is_sized or config.target.label != PERSON else boxes.model_copy(update=PERSON_M)

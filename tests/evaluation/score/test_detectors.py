@@ -49,6 +49,7 @@ def test_overlap_is_intersection_by_union():
     ([found(*OTHER, label="legs")], "none"),  # another label is not followed
     ([found(*OTHER), found(100, 100, 140, 140)], "wrong object"),  # the first is the answer
     ([found(100, 100, 140, 140, label="target")], "hit"),  # what the colour detectors call it
+    ([found(100, 100, 140, 140, label="sports ball")], "hit"),  # what models of COCO call it
 ])
 def test_first_answer_decides(detections, verdict):
     assert frame_result(detections, scene()).verdict == verdict

@@ -1,5 +1,6 @@
 """The detectors `torch`, `ultralytics`, `transformers`: pickles, missing packages, models with random weights."""
 
+import importlib
 import pickle
 import sys
 from pathlib import Path
@@ -298,9 +299,16 @@ def test_torch_without_a_gpu_rejects_cuda(torch, tmp_path: Path) -> None:
 # --- Transformers and Ultralytics, where they are installed -----------------------------------------------------------
 
 
+def framework(name: str):
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        return demanded.do_without(name, f"no {name} ({error}); run: pip install {name}")
+
+
 @pytest.mark.slow
 def test_random_model_of_transformers_keeps_its_labels_and_the_image(torch, tmp_path: Path) -> None:
-    transformers = pytest.importorskip("transformers", reason="transformers is not installed")
+    transformers = framework("transformers")
     settings = transformers.YolosConfig(
         hidden_size=32, num_hidden_layers=2, num_attention_heads=2, intermediate_size=32, image_size=[64, 64],
         num_detection_tokens=10, id2label={0: "cup", 1: "plate"}, label2id={"cup": 0, "plate": 1})
@@ -315,7 +323,7 @@ def test_random_model_of_transformers_keeps_its_labels_and_the_image(torch, tmp_
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["yolo11n.yaml", "yolov8n-seg.yaml"])
 def test_random_model_of_ultralytics_keeps_its_labels_and_the_image(torch, tmp_path: Path, name: str) -> None:
-    ultralytics = pytest.importorskip("ultralytics", reason="ultralytics is not installed")
+    ultralytics = framework("ultralytics")
     path = tmp_path / "random.pt"
     ultralytics.YOLO(name).save(path)
     assert "is a Python pickle" in rejected(UltralyticsDetector, address=str(path))

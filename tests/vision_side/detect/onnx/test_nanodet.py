@@ -1,4 +1,4 @@
-"""The model `onnx:nanodet`: people in a photograph, its labels, and a mission that follows a person."""
+"""The model `onnx:nanodet`: a human in a photograph, and none in a forest."""
 
 from pathlib import Path
 
