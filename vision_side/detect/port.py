@@ -213,6 +213,8 @@ class Detector(Protocol):
         maker         the `Maker` of its results
         attach(link)  called with the link of each robot before its first frame
         close()       called once at the end
+        missing()     on the class; returns why it cannot work here, e.g. a missing package, or ""
+        read_model(config)  on the class; loads what `config` names, so that a check of the configuration finds errors
         waits = True  on the class, if it waits for another service; each robot then gets its own detector and thread
     """
 
