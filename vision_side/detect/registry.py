@@ -39,7 +39,7 @@ def configured_detector(config: VisionConfig) -> Detector:
     check_device(config)
     _check_fallback(config)
     detector = build_detector(one.kind, one.options, config)
-    _check_mission(detector, config)
+    _check_used_labels(one.kind, getattr(detector, "labels", ()), config)
     if one.fallback:
         from sightline.vision_side.detect.remote.fallback import Fallback
 
@@ -48,8 +48,9 @@ def configured_detector(config: VisionConfig) -> Detector:
     if one.shadow:
         from sightline.vision_side.detect.shadow import ShadowDetector
 
-        second = _narrowed(build_detector(one.shadow, one.shadow_options, config), config)
-        detector = ShadowDetector(detector, second, one.shadow, config.max_pixels)
+        second = build_detector(one.shadow, one.shadow_options, config)
+        _check_labels("detector.labels", one.shadow, one.labels, getattr(second, "labels", ()))
+        detector = ShadowDetector(detector, _narrowed(second, config), one.shadow, config.max_pixels)
     return detector
 
 
@@ -66,20 +67,18 @@ def _check_no_detector(config: VisionConfig) -> None:
 def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
     one = config.detector
     if one.labels:
-        _check_labels("detector.labels", one.kind, one.labels, getattr(detector, "labels", ()))
         detector = LabelFilter(detector, one.labels)
     if one.only_color:
         detector = ColorFilter(detector, config.hsv.ranges)
     return TrackIds(detector) if one.tracked else detector
 
 
-def _check_mission(detector: Detector, config: VisionConfig) -> None:
-    """Raise ConfigError for a mission that follows a label which is not among those that the detector lists."""
-    known = getattr(detector, "labels", ())
-    if not known:
-        return
-    mission = configured_mission(config)
-    _check_labels(f"mission {mission.name!r}", config.detector.kind, (mission.label,) if mission.label else (), known)
+def _check_used_labels(kind: str, known: Sequence[str], config: VisionConfig) -> None:
+    """Raise ConfigError for a label of the filter or of the mission that is not among those that the detector lists."""
+    _check_labels("detector.labels", kind, config.detector.labels, known)
+    mission = configured_mission(config) if known else None
+    if mission is not None and mission.label:
+        _check_labels(f"mission {mission.name!r}", kind, (mission.label,), known)
 
 
 def _check_labels(place: str, kind: str, wanted: Sequence[str], known: Sequence[str]) -> None:
@@ -159,16 +158,24 @@ def check_vision(config: VisionConfig) -> None:
     _check_fallback(config)
     for kind, options in ((one.kind, one.options), (one.fallback, {}), (one.shadow, one.shadow_options)):
         if kind:
-            check_choice(kind, options, config)
+            known = check_choice(kind, options, config)
+            if kind == one.kind:
+                _check_used_labels(kind, known, config)
 
 
-def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) -> None:
-    """Raise ConfigError for what can be known to be wrong before the detector is built: its name, options, model."""
+def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Sequence[str]:
+    """Raise ConfigError for what can be known to be wrong before the detector is built: its name, options, model.
+
+    Returns:
+        The labels of its model, or none if they are unknown.
+    """
     plugin, settings = _checked(kind, options, config)
-    read_model: Callable[[Any], object] | None = getattr(plugin, "read_model", None)
-    if read_model is not None:
-        with plugin_guard(f"{kind}, when its model is read,"):
-            read_model(settings)
+    read_model: Callable[[Any], Any] | None = getattr(plugin, "read_model", None)
+    if read_model is None:
+        return ()
+    with plugin_guard(f"{kind}, when its model is read,"):
+        labels: Sequence[str] = getattr(read_model(settings), "labels", ())
+        return labels
 
 
 def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tuple[Any, Any]:

@@ -21,6 +21,7 @@ from sightline.vision_side.detect.port import DetectFrame, NoDetector, result_of
 from sightline.vision_side.detect.registry import (
     REGISTRY,
     build_detector,
+    check_vision,
     configured_detector,
     split_kind,
 )
@@ -149,11 +150,20 @@ def test_every_mistake_is_one_line(detector: dict, words: str) -> None:
         ({"mission": {"kind": "follow", "options": {"target": {"label": "bal"}}}}, "mission 'follow': onnx has no"),
         ({"mission": {"kind": "legs", "options": {"label": "person"}}}, "mission 'legs': onnx has no label 'person'"),
         ({"detector": {"kind": "onnx", "labels": ["bal"]}}, "detector.labels: onnx has no label 'bal'"),
+        ({"detector": {"kind": "onnx", "labels": ["bal"], "fallback": "hsv"}}, "detector.labels: onnx has no label"),
     ],
 )
 def test_label_that_the_model_never_gives_is_rejected(settings: dict, words: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(words)):
-        configured_detector(VisionConfig.model_validate({"detector": {"kind": "onnx"}, **settings}))
+    vision = VisionConfig.model_validate({"detector": {"kind": "onnx"}, **settings})
+    for check in (check_vision, configured_detector):
+        with pytest.raises(ConfigError, match=re.escape(words)):
+            check(vision)
+
+
+def test_label_that_only_the_shadow_lacks_is_rejected_with_its_name(tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0], words=("cup", "plate"))
+    with pytest.raises(ConfigError, match=re.escape(f"detector.labels: onnx:{path} has no label 'ball'")):
+        configured_detector(config(kind="hsv", labels=("ball",), shadow=f"onnx:{path}"))
 
 
 @pytest.mark.parametrize("settings", [{"mission": {"kind": "legs"}}, {"target": {"label": "ball"}}, {}])

@@ -189,6 +189,11 @@ class LoadedModel:
     own_min_score: float
     digest: str
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """All labels that it can give; empty where it has only numbers."""
+        return self.form.labels
+
 
 def read_onnx_model(config: OnnxDetector.Config) -> LoadedModel:
     """Load the model that `config` names.
