@@ -11,6 +11,8 @@ from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.onnx.detector import NANODET
 from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, Detector, corners, overlap
 from sightline.vision_side.detect.registry import configured_detector
+from sightline.vision_side.pipeline import Frame, Pipeline
+from tests.fixtures.vision.vision import camera
 
 pytestmark = [
     pytest.mark.usefixtures("no_gpu"),
@@ -41,6 +43,14 @@ def test_person_in_a_photograph_has_the_golden_box(nanodet: Detector) -> None:
     (one,) = found_in(nanodet, PERSON)
     assert one.label == "person" and one.score == pytest.approx(0.68, abs=0.04)
     assert overlap(corners(one), (12, 8, 221, 234)) > 0.95
+
+
+def test_mission_turns_to_a_human_on_the_left(nanodet: Detector) -> None:
+    follow = Pipeline(VisionConfig(target=TargetConfig(label="person")), camera(), nanodet)
+    for seq in range(1, 4):
+        answer = follow.step(Frame(FrameHeader(session="0000abcd", seq=seq, t_us=seq * 33_333), PERSON))
+    assert answer.seen.phase == "tracking" and answer.seen.target.label == "person"
+    assert answer.seen.bearing_rad > 0 and answer.twist.angular_rad_s > 0
 
 
 def test_photograph_without_people_has_no_person(nanodet: Detector) -> None:
