@@ -246,7 +246,9 @@ class RawZenoh:
 
     def declare_token(self, token: Token) -> Callable[[], None]:
         """Declare a token. It ends with the returned function. Raises LinkError without an answer."""
-        return declare_token(self._opened(), token)
+        withdraw = declare_token(self._opened(), token)
+        self._ending.callback(withdraw)  # keeps it: without a reference Zenoh ends the token
+        return withdraw
 
     def has_token(self, token: Token) -> bool:
         """Return True if a peer declares this token. Raises LinkError without an answer."""
