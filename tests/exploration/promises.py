@@ -55,6 +55,7 @@ class Promises:
         self.ended = FRAMES  # ticks since the newest STOP, disarm, fault or loss of the human
         self.seen = (False,) * THIEF
         self.holder, self.left, self.live = NOBODY, 0, 0
+        self.tokens = self.fenced = self.bound = 0  # bits of drivers: present, never again; the holder has a token
         self.command = (NOBODY, NOBODY, NOBODY)  # age of the image, age of the arrival, driver
         self.auto = auto and not stopped
         self.stored = stopped  # STOP is on the disk
@@ -67,7 +68,8 @@ class Promises:
         """Return all of it."""
         return (
             _STATES[self.state], *self.images, self.last, self.previous, self.since_new, self.frozen, self.started,
-            self.ended, *self.seen, self.holder, self.left, self.live, *self.command, self.auto,
+            self.ended, *self.seen, self.holder, self.left, self.live, *self.command, self.tokens, self.fenced,
+            self.bound, self.auto,
             self.stored, self.held, self.idle, self.quiet, self.speed_mps, self.way_m,
         )
 
@@ -78,7 +80,8 @@ class Promises:
         self.seen = saved[13:16]
         self.holder, self.left, self.live = saved[16:19]
         self.command = saved[19:22]
-        self.auto, self.stored, self.held, self.idle, self.quiet, self.speed_mps, self.way_m = saved[22:]
+        self.tokens, self.fenced, self.bound = saved[22:25]
+        self.auto, self.stored, self.held, self.idle, self.quiet, self.speed_mps, self.way_m = saved[25:]
 
     # --- what happens ----------------------------------------------------------------------------------------------
 
@@ -114,6 +117,10 @@ class Promises:
             return
         demand(valid, "an honest command is accepted")
         self.live = min(LIVE, self.live + 1 if self.holder == driver else 1)
+        if self.holder != driver:
+            if self.holder != NOBODY and RANK[DRIVERS[self.holder].source] == RANK[DRIVERS[driver].source]:
+                self.fenced |= 1 << self.holder
+            self.bound = self.tokens >> driver & 1
         self.holder, self.left = driver, LEASE
         demand((reason == "") <= (self.state in ARMED), "2: only an armed robot applies commands")
         demand((reason == "") >= (self.state in ARMED), "an honest command is applied")
@@ -164,6 +171,18 @@ class Promises:
         demand(granted or not may, f"an honest {verb} is granted")
         demand(may or not granted, "2: one driver at a time")
 
+    def on_token(self, driver: int, is_present: bool) -> None:
+        """The token of a driver appeared or ended."""
+        if is_present:
+            self.tokens |= 1 << driver
+            self.bound |= self.holder == driver
+        else:
+            self.tokens &= ~(1 << driver)
+            if self.bound and self.holder == driver:
+                self.fenced |= 1 << driver
+                self.left = 0
+                self._lose_holder()
+
     def on_restart(self, auto: bool) -> None:
         """The driver process started again."""
         self.begin(auto=auto, stopped=self.stored)
@@ -211,9 +230,13 @@ class Promises:
         return self.holder != NOBODY and DRIVERS[self.holder] == DRIVERS[driver]
 
     def _may_take(self, driver: int) -> bool:
-        if driver == NOBODY or self.holder in (NOBODY, driver):
-            return driver != NOBODY
-        return RANK[DRIVERS[driver].source] > RANK[DRIVERS[self.holder].source]
+        if driver == NOBODY or self.fenced >> driver & 1:
+            return False
+        if self.holder in (NOBODY, driver):
+            return True
+        rank, other = RANK[DRIVERS[driver].source], RANK[DRIVERS[self.holder].source]
+        is_silent = LEASE - self.left > STALE
+        return rank > other or bool(rank == other and self.bound and is_silent and self.tokens >> driver & 1)
 
     def _is_beside_human(self, driver: int) -> bool:
         return self.holder not in (NOBODY, driver) and DRIVERS[self.holder] is HUMAN
@@ -236,7 +259,7 @@ class Promises:
             self._lose_holder()
 
     def _lose_holder(self) -> None:
-        human, self.holder = DRIVERS[self.holder] is HUMAN, NOBODY
+        human, self.holder, self.bound = DRIVERS[self.holder] is HUMAN, NOBODY, 0
         if human:
             if self.state in ARMED:
                 self._leave(State.DISARMED)

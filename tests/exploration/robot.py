@@ -50,11 +50,14 @@ STATUSES = (0, 2, 21)
 """Ages of the statuses that an operator cites; the last one is too old for any request."""
 LIVE = 2
 PLAIN, AUTO, KEYS = range(3)
-"""Configurations: an operator arms; the robot arms itself; an operator arms, and drivers prove their identity."""
+"""Configurations: an operator arms; the robot arms itself; an operator arms, and drivers prove their identity.
+
+In the last one drivers have tokens, too.
+"""
 SAFETY = {"live_commands_to_arm": LIVE, "disarm_after_hold_s": 1}
 HELD = 11  # ticks in HOLD until it ends
 RECORD_FIELDS = 2 * FRAMES + 4
-ROBOT_FIELDS = RECORD_FIELDS + 19
+ROBOT_FIELDS = RECORD_FIELDS + 22
 
 
 class Image(Enum):
@@ -85,6 +88,10 @@ def _chain(secret: bytes) -> tuple[str, ...]:
 CHAINS = tuple(_chain(bytes(15) + bytes([driver])) for driver in range(len(DRIVERS)))
 """Each state has the proofs of the same three commands, since a proof counts only by those before it."""
 OLD_PROOF, LAST_PROOF, NEXT_PROOF = range(3)
+TOKENS = tuple(sha256(bytes.fromhex(chain[OLD_PROOF])).digest()[:16].hex() for chain in CHAINS)
+"""The commitment of each driver."""
+SHARING = (0, 1)
+"""The drivers that may declare their token: two vision services."""
 _OWNER = {proof: driver for driver, chain in enumerate(CHAINS) for proof in chain}
 
 # All of these are pure, and the same arguments come in many states. Without this most of the time is spent in them.
@@ -189,6 +196,9 @@ class Robot:
             min(self._started, STATUSES[1]),
             _STATE_INDEX[gate.state],
             *[key in sequence._drivers or key in sequence._others for key in _SENDERS],
+            sum((TOKENS[driver] in lease._tokens) << driver for driver in SHARING),
+            sum((DRIVERS[driver] in lease._fenced) << driver for driver in SHARING),
+            bool(lease.token),
             self._holder(),
             max(0, (lease.expires_us - now_us) // TICK_US),
             min(gate._live_commands, LIVE),
@@ -233,8 +243,8 @@ class Robot:
         """Put the robot into a state of `save`."""
         self._record = saved = state[:RECORD_FIELDS]
         (
-            self._mode, self._disk, self._started, state_index, *seen, holder, left, live, denied, arms_itself, held,
-            echo, arrival, commanded, applied, speed, acceleration,
+            self._mode, self._disk, self._started, state_index, *seen, present, fenced, bound, holder, left, live,
+            denied, arms_itself, held, echo, arrival, commanded, applied, speed, acceleration,
         ) = state[RECORD_FIELDS:]  # fmt: skip
         self.now_us, self._images = NOW_US, (1, 2)
         self.core = core = self._cores[self._mode]
@@ -248,6 +258,9 @@ class Robot:
         self._forget()
         lease.holder = None if holder < 0 else DRIVERS[holder]
         lease.expires_us = NOW_US + left * TICK_US
+        lease._tokens = OrderedDict((TOKENS[driver], None) for driver in SHARING if present >> driver & 1)
+        lease._fenced = OrderedDict((DRIVERS[driver], None) for driver in SHARING if fenced >> driver & 1)
+        lease.token = TOKENS[holder] if bound else ""
         gate.state = STATES[state_index]
         gate._live_commands = live
         gate.arms_itself = arms_itself
@@ -304,6 +317,11 @@ class Robot:
         gate.last_rejection = None
         self.core.on_request(_request_message(who, verb, age, proof), NOW_US)
         return gate.last_rejection.reason if gate.last_rejection else ""
+
+    def token(self, driver: int, is_present: bool) -> None:
+        """Deliver the token of a driver, or its end."""
+        self._forget()
+        self.core.on_token(TOKENS[driver], is_present, NOW_US)
 
     def fault(self) -> None:
         """Report a failure of the drive."""

@@ -26,6 +26,7 @@ from tests.exploration.robot import (
     ROBOT,
     ROBOT_FIELDS,
     SECOND,
+    SHARING,
     THIEF,
     VISION,
     Image,
@@ -109,6 +110,17 @@ def _proof_request(driver: int, verb: Verb, words: str, proof: str | None) -> Ev
     return Event(f"{verb} {words} arrives", happen)
 
 
+def _token(driver: int, is_present: bool) -> Event:
+    def happen(robot: Robot, promises: Promises) -> None:
+        robot.token(driver, is_present)
+        promises.on_token(driver, is_present)
+
+    def possible(promises: Promises) -> bool:
+        return bool(promises.tokens >> driver & 1) != is_present
+
+    return Event(f"the token of {_NAMES[DRIVERS[driver]]} {'appears' if is_present else 'ends'}", happen, possible)
+
+
 def _restart(robot: Robot, promises: Promises) -> None:
     robot.restart()
     promises.on_restart(robot.core.config.safety.auto_arm)
@@ -163,6 +175,12 @@ IDENTITY = (
     _proof_request(NOBODY, Verb.RELEASE, "of a thief, without a proof,", None),
 )
 
+TOKENED = (
+    *(_token(driver, is_present) for driver in SHARING for is_present in (True, False)),
+    IDENTITY[0],
+    _proof_twist(1, "of the second vision service, with its next proof,", CHAINS[1][NEXT_PROOF]),
+)
+
 LIFE = (
     NEW, V, NEW, V, ARM, V, NEW, V, NEW, V, NEW, V, NEW, V,  # vision drives at top speed
     H, NEW, H, NEW, H, NEW, H, NEW, H, NEW, LEASE[1], NEW, NEW, NEW,  # teleop takes over and lets go
@@ -198,6 +216,7 @@ PARTS = {
     "lease": Part((NEW, V, S, H, STOP, ARM, RESET, *LEASE), modes=(PLAIN,)),
     "latch": Part((NEW, V, H, STOP, DISARM, ARM, RESET, *LATE, RESTART, WRITE, FAULT)),
     "identity": Part((NEW, *IDENTITY, STOP, ARM, RESET), modes=(KEYS,)),
+    "tokens": Part((NEW, *TOKENED, ARM), modes=(KEYS,)),
     "images": Part((NEW, *IMAGES[:2], V, *(_twist(VISION, age) for age in (2, 4, 5)), ARM), modes=(PLAIN,)),
 }
 """The first has each event, for a few events from each state of a life. The others have fewer, and go deeper."""
