@@ -24,7 +24,7 @@ from sightline.protocol.codec import decode
 from sightline.protocol.messages import AnswerHeader, State
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.zenoh.link import open_zenoh
-from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
 from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
 
@@ -36,7 +36,9 @@ class GatedRobot(PlayedRobot):
 
     def __init__(self, name: str, link: Link, settings: Settings, due_us: int) -> None:
         super().__init__(name, link, settings, due_us)
-        self.core = DriverCore(RobotConfig(robot=name, safety=SafetyConfig(auto_arm=True)), self._session)
+        log = PluginChoice(kind="log")  # without a range sensor
+        config = RobotConfig(robot=name, camera=log, drive=log, safety=SafetyConfig(auto_arm=True))
+        self.core = DriverCore(config, self._session)
         self.accepted: list[tuple[int, str, int]] = []
         self._answers = 0
         self.holds: list[list[int]] = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Final
@@ -14,29 +14,54 @@ from sightline.protocol.errors import ConfigError, LinkError, SightlineError, Wi
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, parse_zenoh_endpoint
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.security import ROBOT_ROLE
+from sightline.protocol.transports.tokens import DriverToken, RobotToken, Token, VisionToken
 from sightline.protocol.transports.zenoh.discovery import Discovered, discover, find_listeners
 from sightline.protocol.transports.zenoh.presence import PeerInfo
 
 _ROLE_WIDTH = 9
 
 
-def lines(statuses: dict[str, Message], peers: list[PeerInfo]) -> Iterator[str]:
+def lines(found: Discovered) -> Iterator[str]:
     """Format a line for each: robots first, then the other peers."""
+    statuses, peers, shared = found.statuses, found.peers, shared_robots(found.tokens)
     robots = {peer.presence.robot: peer for peer in peers if peer.presence.role == ROBOT_ROLE}
     for robot in sorted({*statuses, *robots}):
         state = _status_words(robot, statuses[robot]) if robot in statuses else f"{robot}: no status"
-        yield f"{ROBOT_ROLE:{_ROLE_WIDTH}} {state}{_about(robots.get(robot))}"
+        services = f"; {_services(*shared[robot])}" if robot in shared else ""
+        yield f"{ROBOT_ROLE:{_ROLE_WIDTH}} {state}{_about(robots.get(robot))}{services}"
     for peer in peers:
         if peer.presence.role != ROBOT_ROLE:
             yield f"{peer.presence.role:{_ROLE_WIDTH}} of {peer.presence.robot}{_about(peer)}"
 
 
-def as_object(statuses: dict[str, Message], peers: list[PeerInfo]) -> dict[str, Any]:
+def as_object(found: Discovered) -> dict[str, Any]:
     """Return the robots and the other peers as JSON types, for scripts."""
+    shared = shared_robots(found.tokens)
+    robots = [_status_object(name, found.statuses[name]) for name in sorted(found.statuses)]
+    for robot in robots:
+        if robot["robot"] in shared:
+            robot["driven_by"], robot["standby"] = shared[robot["robot"]]
+    return {"robots": robots, "peers": [_peer_object(peer) for peer in found.peers]}
+
+
+def shared_robots(tokens: Collection[Token]) -> dict[str, tuple[str, str]]:
+    """Return the services that share each robot: the one that drives it, and the one that stands by; "" without one."""
+    weights = {token.name: token.weight for token in tokens if isinstance(token, VisionToken)}
+    if not weights:
+        return {}
+    from sightline.vision_side.serving.assignment import assign
+
+    robots = [token.robot for token in tokens if isinstance(token, RobotToken)]
+    drivers = {token.robot: token.name for token in tokens if isinstance(token, DriverToken)}
     return {
-        "robots": [_status_object(name, statuses[name]) for name in sorted(statuses)],
-        "peers": [_peer_object(peer) for peer in peers],
+        robot: (drivers.get(robot, ""), next((one for one in choices if one != drivers.get(robot)), ""))
+        for robot, choices in assign(robots, weights).items()
     }
+
+
+def _services(driver: str, standby: str) -> str:
+    words = f"service {driver}" if driver else "no service drives it"
+    return f"{words}, standby {standby}" if standby else words
 
 
 def _about(peer: PeerInfo | None) -> str:
@@ -92,7 +117,7 @@ class DiscoveryReport:
             if isinstance(found, SightlineError):
                 yield f"{place}: {found}"
                 continue
-            for line in lines(found.statuses, found.peers):
+            for line in lines(found):
                 yield line if len(self.places) == 1 else f"{place}: {line}"
 
     def as_object(self) -> dict[str, Any]:
@@ -102,7 +127,7 @@ class DiscoveryReport:
             if isinstance(found, SightlineError):
                 whole["errors"][place] = str(found)
                 continue
-            for name, rows in as_object(found.statuses, found.peers).items():
+            for name, rows in as_object(found).items():
                 whole[name] += [{**row, "at": place} for row in rows]
         return whole
 

@@ -71,7 +71,6 @@ SMALL_FILES = {  # with one importer, in their own folder: the reason why each i
     "robot_side/guardian/stop_receiver.py": "a process of its own",
     "robot_side/hardware/log_zero.py": "all that the guardian imports of the drive log",
     "robot_side/driver/persistence.py": "the STOP latch on disk: the one place that a restart depends on",
-    "vision_side/serving/assignment.py": "one rule with golden vectors: services of any version must agree on it",
 }
 
 

@@ -106,7 +106,8 @@ class Fleet:
     def counts(self) -> list[ServiceCounts]:
         """Count the frames of each robot so far; from any thread."""
         services = list(self.services.items())
-        return [replace(service.counts(), restarts=self._restarts[robot]) for robot, service in services]
+        return [replace(service.counts(), drives=not service.is_standby, restarts=self._restarts[robot])
+                for robot, service in services]
 
     def turn(self) -> None:
         """Add new robots, and answer at most one frame of each robot without a thread of its own.

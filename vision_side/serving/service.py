@@ -46,6 +46,8 @@ class ServiceCounts:
     compute_us: int
     latency_us: int | None
     """Capture to accepted command, as the robot measured it."""
+    drives: bool = True
+    """False for a robot that this service only stands by for."""
     restarts: int = 0
     """Times that this robot's service failed and another one was started."""
 

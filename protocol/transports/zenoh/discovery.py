@@ -16,6 +16,8 @@ from sightline.protocol.errors import ConfigError, install_command
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_zenoh_endpoint
 from sightline.protocol.transports.link import LinkRules, Message
 from sightline.protocol.transports.security import RoleKeys, load_role_keys
+from sightline.protocol.transports.tokens import ALL_TOKENS, Token
+from sightline.protocol.transports.zenoh.link import watch_tokens
 from sightline.protocol.transports.zenoh.presence import (
     MAX_PEERS,
     QUERY_ROUNDS,
@@ -33,16 +35,18 @@ OPERATOR_ROLE: Final = "operator"
 VIEWER_ROLE: Final = "viewer"
 _BETWEEN_QUERIES_S: Final = 0.05
 
-# Security limit: no more answers than this are kept.
+# Security limits: no more answers and tokens than this are kept.
 MAX_LISTENERS: Final = 64
+MAX_TOKENS: Final = 10_000
 
 
 @dataclass(frozen=True, slots=True)
 class Discovered:
-    """The newest status of each robot, and all peers that answered."""
+    """The newest status of each robot, all peers that answered, and the tokens of services that share robots."""
 
     statuses: dict[str, Message]
     peers: list[PeerInfo]
+    tokens: frozenset[Token] = frozenset()
 
 
 def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discovered:
@@ -51,7 +55,16 @@ def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discov
     with ExitStack() as ending:
         session = open_session((), connect, seconds, _own_keys(secure))
         ending.callback(session.close)
-        return Discovered(_statuses(session, ending), _listen(session, seconds))
+        tokens: set[Token] = set()
+        ending.callback(watch_tokens(session, ALL_TOKENS, lambda token, is_present: _note(tokens, token, is_present)))
+        return Discovered(_statuses(session, ending), _listen(session, seconds), frozenset(tokens))
+
+
+def _note(tokens: set[Token], token: Token, is_present: bool) -> None:
+    if not is_present:
+        tokens.discard(token)
+    elif len(tokens) < MAX_TOKENS:
+        tokens.add(token)
 
 
 def list_robots(connect: Sequence[str], seconds: float, secure: str = "") -> dict[str, Message]:

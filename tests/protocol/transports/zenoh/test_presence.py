@@ -5,7 +5,7 @@ import time
 import pytest
 
 from sightline.operator_side.cli import app as cli
-from sightline.operator_side.client.discovery import as_object, lines
+from sightline.operator_side.client.discovery import as_object, lines, shared_robots
 from sightline.operator_side.setup import keys
 from sightline.protocol.channels import SOURCES_OF_ROLE, STATUS
 from sightline.protocol.codec import encode
@@ -13,7 +13,8 @@ from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.messages import Stamp, State, Status
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.security import certificate_role
-from sightline.protocol.transports.zenoh.discovery import discover, peers_at
+from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
+from sightline.protocol.transports.zenoh.discovery import Discovered, discover, peers_at
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.presence import (
     MAX_PEERS,
@@ -83,15 +84,30 @@ def test_operator_reads_state_version_machine_and_round_trip():
     heard = {"r1": Message(STATUS, "", encode(Stamp(session="0000abcd", seq=1, t_us=1)), status),
              "js9": Message(STATUS, "", b"{", b"")}
     peers = [_peer(), _peer(role="vision", session="00000002", robot="r*")]
-    assert list(lines(heard, peers)) == [
+    assert list(lines(Discovered(heard, peers))) == [
         "robot     js9: invalid status: Stamp: Invalid JSON: EOF while parsing an object at line 1 column 1"
         "  (no version reported)",
         "robot     r1: DISARMED (waiting)  sightline 9 on shed, round trip 2.0 ms",
         "vision    of r*  sightline 9 on shed, round trip 2.0 ms",
     ]
-    whole = as_object(heard, peers)
+    whole = as_object(Discovered(heard, peers))
     assert [row["role"] for row in whole["peers"]] == ["robot", "vision"]
     assert whole["peers"][0]["round_trip_ms"] == 2.0 and "error" in whole["robots"][0]
+
+
+def test_robots_that_services_share_are_listed_with_their_driver_and_standby():
+    robots = [RobotToken("r1"), RobotToken("r2"), RobotToken("r3")]
+    services = [VisionToken(name, 1.0, "0000000a") for name in ("a", "b")]
+    tokens = {*robots, *services, DriverToken("r1", "a", "0" * 32), DriverToken("r2", "b", "1" * 32)}
+    found = Discovered({"r2": Message(STATUS, "", b"{", b"")}, [_peer()], frozenset(tokens))
+    said = list(lines(found))
+    assert said[0].endswith("; service a, standby b")
+    assert said[1].endswith("; service b, standby a")
+    assert as_object(found)["robots"][0] | {"error": ""} == {
+        "robot": "r2", "error": "", "driven_by": "b", "standby": "a"
+    }
+    assert shared_robots({*robots, services[0]}) == dict.fromkeys(("r1", "r2", "r3"), ("", "a")), "nothing drives yet"
+    assert shared_robots(robots) == {}, "no service shares"
 
 
 # --- over real sessions ----------------------------------------------------------------------------------------------

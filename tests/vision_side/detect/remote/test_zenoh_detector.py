@@ -22,7 +22,7 @@ from sightline.protocol.messages import (
     State,
     Status,
 )
-from sightline.protocol.transports.zenoh.discovery import peers_at
+from sightline.protocol.transports.zenoh.discovery import Discovered, peers_at
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.vision_side.config import DetectorConfig, HsvConfig
 from sightline.vision_side.decode import Decoder
@@ -202,9 +202,10 @@ def test_presence_shows_model_device_and_health_of_a_service(bench):
     detector = bench.detector("r1")
     assert until(lambda: _result(robot, detector))
     peers = peers_at([bench.endpoint], 2.0)
-    said = next(line for line in lines({}, peers) if line.startswith("detector"))
+    said = next(line for line in lines(Discovered({}, peers)) if line.startswith("detector"))
     assert "of *" in said and "hsv on cpu: 1 robots" in said and "p95 age" in said
-    assert "hsv on cpu" in next(one["about"] for one in as_object({}, peers)["peers"] if one["role"] == "detector")
+    whole = as_object(Discovered({}, peers))
+    assert "hsv on cpu" in next(one["about"] for one in whole["peers"] if one["role"] == "detector")
 
 
 def test_lost_service_gives_no_answer_by_the_deadline_and_recovers():
