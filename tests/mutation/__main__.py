@@ -20,11 +20,16 @@ _GATE = (
     "tests/robot_side/safety/test_gate_requests.py",
     "tests/robot_side/safety/test_gate_lease.py",
     "tests/robot_side/safety/test_gate_proof.py",
+    "tests/robot_side/safety/test_gate_tokens.py",
 )
 _SAFETY = sorted(path.stem for path in Path("robot_side/safety").glob("[!_]*.py"))
 TABLES = {
     **{f"robot_side/safety/{name}.py": (f"tests/robot_side/safety/test_{name}.py",) for name in _SAFETY},
     "robot_side/safety/gate.py": _GATE,
+    "robot_side/safety/lease.py": (
+        "tests/robot_side/safety/test_lease.py",
+        "tests/robot_side/safety/test_gate_tokens.py",
+    ),
     "robot_side/safety/states.py": _GATE,
     "robot_side/kinematics.py": ("tests/robot_side/test_kinematics.py",),
     "robot_side/driver/core.py": ("tests/robot_side/driver/test_core.py",),
@@ -33,6 +38,7 @@ TABLES = {
     "robot_side/network/stream.py": ("tests/robot_side/network/test_credit.py",),
     "robot_side/network/bitrate_control.py": ("tests/robot_side/network/test_bitrate_control.py",),
     "robot_side/network/congestion_window.py": ("tests/robot_side/network/test_congestion_window.py",),
+    "vision_side/serving/assignment.py": ("tests/vision_side/serving/test_assignment.py",),
     "vision_side/missions/switch.py": ("tests/vision_side/missions/test_switch.py",),
     "vision_side/missions/follow.py": ("tests/vision_side/missions/test_follow.py",),
     "vision_side/tracking/locate.py": ("tests/vision_side/tracking/test_locate.py",),

@@ -18,15 +18,13 @@ from numpy.typing import NDArray
 
 MAX_LOAD: Final = 1.25
 """Most robots of a service, in shares of what its weight stands for."""
-_CHOICES: Final = 8
-"""Choices of a robot that are sorted at first. Few robots need more."""
 
 
 def ranked(robot: str, weights: Mapping[str, float]) -> list[str]:
     """Return all services, the best choice of `robot` first, without regard to their load."""
     names = sorted(weights)
-    scores = _scores([robot], names, weights)[0]
-    return [names[index] for index in np.argsort(-scores, kind="stable")]
+    (scores,) = _scores([robot], names, weights)
+    return [names[index] for index in np.argsort(-scores)]
 
 
 def assign(robots: Collection[str], weights: Mapping[str, float]) -> dict[str, tuple[str, str]]:
@@ -40,29 +38,18 @@ def assign(robots: Collection[str], weights: Mapping[str, float]) -> dict[str, t
         robot -> (owner, standby). The standby is "" with one service. Empty without services.
     """
     names, all_robots = sorted(weights), sorted(robots)
-    if not names or not all_robots:
+    if not names:
         return {}
-    scores = _scores(all_robots, names, weights)
     total = sum(weights[name] for name in names)
     room = [ceil(MAX_LOAD * len(all_robots) * weights[name] / total) for name in names]
-    first = _order(scores, min(_CHOICES, len(names)))
+    order = np.argsort(-_scores(all_robots, names, weights)).tolist()
     found: dict[str, tuple[str, str]] = {}
-    for robot, row, some in zip(all_robots, scores, first, strict=True):
-        choices = some
-        owner = next((one for one in choices if room[one] > 0), None)
-        if owner is None:
-            choices = np.argsort(-row, kind="stable")
-            owner = next(one for one in choices if room[one] > 0)
+    for row, robot in enumerate(all_robots):
+        choices = order[row]
+        owner = next(one for one in choices if room[one] > 0)
         room[owner] -= 1
         found[robot] = names[owner], next((names[one] for one in choices if one != owner), "")
     return found
-
-
-def _order(scores: NDArray[np.float64], count: int) -> NDArray[np.intp]:
-    """Return the `count` highest columns of each row, the highest first."""
-    best = np.sort(np.argpartition(-scores, count - 1, axis=1)[:, :count], axis=1)
-    order = np.argsort(-np.take_along_axis(scores, best, axis=1), axis=1, kind="stable")
-    return np.take_along_axis(best, order, axis=1)
 
 
 def _scores(robots: list[str], names: list[str], weights: Mapping[str, float]) -> NDArray[np.float64]:

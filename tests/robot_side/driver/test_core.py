@@ -3,6 +3,7 @@
 import array
 import math
 from collections import Counter
+from random import Random
 
 import pytest
 
@@ -27,7 +28,7 @@ from sightline.protocol.messages import (
     Twist,
     Verb,
 )
-from sightline.protocol.proof import session_digest
+from sightline.protocol.proof import ProofChain, session_digest
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
@@ -50,9 +51,9 @@ def echo_of(seq=7, t_us=NOW_US, session=ROBOT, channel="frame"):
     return Echo(channel=channel, session=session, seq=seq, t_us=t_us)
 
 
-def twist(payload=b"0.1|0.2", *, number=1, compute_us=900, header=None, **echo):
+def twist(payload=b"0.1|0.2", *, number=1, compute_us=900, header=None, proof=None, **echo):
     answer = AnswerHeader(
-        source="vision", session=VISION, seq=number, echo=echo_of(**echo), compute_us=compute_us
+        source="vision", session=VISION, seq=number, echo=echo_of(**echo), compute_us=compute_us, proof=proof
     )  # fmt: skip
     return Message(TWIST, "vision", encode(answer) if header is None else header, payload)
 
@@ -117,6 +118,17 @@ def test_command_for_a_frame_of_the_future_returns_no_credit_and_for_a_stale_one
     assert core.gate.last_rejection.reason == "FROM_FUTURE"
     assert core.on_twist(twist(number=2), NOW_US + 9_000_000) is not None
     assert core.gate.last_rejection.reason == "STALE"
+
+
+def test_lease_ends_with_the_token_of_the_driver():
+    core, chain = core_of(), ProofChain(Random(1).randbytes)
+    core.on_token(chain.commitment, True, NOW_US)
+    core.on_issued(7, NOW_US, 0)
+    core.on_twist(twist(proof=chain.next().proof), NOW_US)
+    core.on_token("0" * 32, False, NOW_US)
+    assert core.gate.holder(NOW_US) is not None
+    core.on_token(chain.commitment, False, NOW_US)
+    assert core.gate.holder(NOW_US) is None
 
 
 def test_command_without_a_proof_returns_no_credit():

@@ -219,6 +219,18 @@ def test_model_of_another_image_size_is_announced_before_its_first_frame():
     assert decode(CameraModel, core.announce_camera(MODEL, 5).payload) == MODEL
 
 
+def test_model_is_announced_again_for_a_driver_that_arrives_and_then_each_half_second():
+    core = core_of()
+    core.announce_camera(MODEL, 0)
+    assert core.announce_camera(MODEL, 10) is None
+    core.announce_again()
+    assert core.announce_camera(MODEL, 0) is not None
+    core.announce_again()
+    assert core.announce_camera(MODEL, 20) is not None
+    assert core.announce_camera(MODEL, 500_019) is None
+    assert core.announce_camera(MODEL, 500_020) is not None
+
+
 def test_same_model_is_found_without_a_comparison_of_its_fields():
     """The comparison takes longer than a frame may, for a model that is the same object 30 times a second."""
 

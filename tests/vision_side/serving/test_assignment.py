@@ -4,9 +4,10 @@ from collections import Counter
 from math import ceil
 from random import Random
 
+import numpy as np
 import pytest
 
-from sightline.vision_side.serving.assignment import MAX_LOAD, assign, ranked
+from sightline.vision_side.serving.assignment import MAX_LOAD, _mixed, assign, ranked
 
 GOLDEN = {
     "r1": ("west", "east"), "r2": ("east", "west"), "r3": ("east", "south"), "r4": ("south", "east"),
@@ -23,6 +24,20 @@ def test_golden_vectors():
     """Services of any machine and version must agree: these results never change."""
     assert assign(GOLDEN, WEIGHTS) == GOLDEN
     assert ranked("r1", WEIGHTS) == ["west", "east", "south", "north"]
+
+
+def test_numbers_are_mixed_as_by_splitmix64():
+    """The output of SplitMix64 with the seed 1234567 is that of its reference implementation."""
+    states = [(1_234_567 + step * 0x9E3779B97F4A7C15) % 2**64 for step in range(1, 6)]
+    assert _mixed(np.array(states, dtype=np.uint64)).tolist() == [
+        6457827717110365317, 3203168211198807973, 9817491932198370423, 4593380528125082431, 16408922859458223821,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("robots", "services", "most"), [(320, 40, 10), (840, 40, 27), (10, 1, 10), (3, 5, 1)])
+def test_most_robots_of_a_service_are_a_quarter_more_than_its_share(robots, services, most):
+    load = Counter(owner for owner, _ in assign(names(robots, "r"), dict.fromkeys(names(services, "v"), 1.0)).values())
+    assert max(load.values()) == most
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -363,3 +363,29 @@ def test_after_any_events_the_owners_drive(seed):
         service.hangs = False
     site.run(6_000).assert_owners_drive()
     assert all(site.now_us - robot.heard_us < 200 * MS for robot in site.robots.values())
+
+
+def test_robot_that_leaves_is_forgotten_with_its_drivers():
+    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
+    token = DriverToken("r1", "b", "1" * 32)
+    sharing.on_token(RobotToken("r1"), True, 0)
+    sharing.on_token(token, True, 0)
+    sharing.on_token(RobotToken("r1"), False, 1)
+    assert sharing.robots == {} and sharing.step(1) == {}
+    sharing.on_token(RobotToken("r1"), False, 1)
+    sharing.on_status("r1", Status(state=State.HOLD, reason=""), is_mine=False, sent=0, now_us=2)
+    sharing.on_token(RobotToken("r1"), True, 2)
+    assert sharing.robots["r1"].drivers == {token}, "its driver is still there"
+    sharing.on_token(RobotToken("r1"), False, 3)
+    sharing.on_token(token, False, 4)
+    sharing.on_token(RobotToken("r1"), True, 5)
+    assert sharing.robots["r1"].drivers == set()
+
+
+def test_own_tokens_count_for_nothing():
+    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
+    sharing.on_token(sharing.own, True, 0)
+    sharing.on_token(RobotToken("r1"), True, 0)
+    sharing.on_token(DriverToken("r1", "a", "1" * 32), True, 0)
+    assert sharing.services() == {"a": 1.0} and not sharing.has_twin
+    assert sharing.step(0) == {"r1": SharingPart.DRIVE}
