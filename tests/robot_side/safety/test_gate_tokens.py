@@ -198,3 +198,15 @@ def test_at_any_order_of_events_one_session_drives_and_no_ended_one_again(seed):
                 ended.add(one.session)
                 assert rig.gate.holder(rig.now_us - 1 * MS) is None
     assert ended, "the test must end tokens of holders"
+
+
+@pytest.mark.parametrize(("silent_us", "succeeds"), [(400_000, False), (400_001, True)])
+def test_the_succession_begins_to_the_microsecond(silent_us, succeeds):
+    rig = Rig(auto_arm=True)
+    driver, other = Driver(rig), Driver(rig, NEXT, seed=2)
+    driver.declare()
+    other.declare()
+    rig.offer(header=rig.header(session=VISION, proof=driver.chain.next()))
+    rig.now_us += silent_us
+    rig.offer(header=rig.header(session=NEXT, proof=other.chain.next()))
+    assert rig.gate.holder(rig.now_us) == (other.holder if succeeds else driver.holder)
