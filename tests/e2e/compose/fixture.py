@@ -62,7 +62,8 @@ PROFILES = [
             "fleet-vision"),
     Profile("shared", {"r1": ("shared-robot", "sim"), "r2": ("shared-robot-r2", "sim-r2"),
                        "r3": ("shared-robot-r3", "sim-r3")}, "vision-shared", "shared-status", "shared-router-a",
-            second_router="shared-router-b", scale="vision-shared=3"),
+            # Three services and two routers beside three simulations: on two cores images wait longer.
+            max_bearing_rad=0.2, second_router="shared-router-b", scale="vision-shared=3"),
 ]
 
 
@@ -164,10 +165,28 @@ class Containers:
         lines = self.inside(sim, "python", "-c", _TRUTH).splitlines()
         return [[float(word) for word in line.split()] for line in lines]
 
+    def replicas(self, service: str) -> list[str]:
+        """Return all containers of a service."""
+        label = "label=com.docker.compose"
+        filters = ("--filter", f"{label}.project={self._project}", "--filter", f"{label}.service={service}")
+        return ask("docker", "ps", "--all", *filters, "--format", "{{.ID}}").stdout.split()
+
+    def motor_rows(self, sim: str) -> list[tuple[float, float, float]]:
+        """Return the motor commands as (time in us, left, right in rad/s), oldest first."""
+        rows = [line.split(",") for line in (self._folder / sim / "motors.csv").read_text().splitlines()[1:]]
+        return [(float(row[0]), float(row[1]), float(row[2])) for row in rows if len(row) >= 3]
+
     def speeds(self, sim: str) -> list[tuple[float, float]]:
         """Return the commanded motor speeds as (left, right) in rad/s, oldest first."""
-        rows = [line.split(",") for line in (self._folder / sim / "motors.csv").read_text().splitlines()[1:]]
-        return [(float(row[1]), float(row[2])) for row in rows]
+        return [(left, right) for _, left, right in self.motor_rows(sim)]
+
+    def stood_s(self, sim: str, first: int) -> float:
+        """Return the longest time without motion since motor command number `first`, s."""
+        longest_us, began_us = 0.0, None
+        for t_us, left, right in self.motor_rows(sim)[first:]:
+            began_us = None if left or right else t_us if began_us is None else began_us
+            longest_us = max(longest_us, 0.0 if began_us is None else t_us - began_us)
+        return longest_us / 1e6
 
     def health(self) -> dict[str, str]:
         """Return the engine's health status of every service that has a health check."""

@@ -130,6 +130,21 @@ def test_robots_meet_again_after_the_router_was_restarted(running):
     assert all(running.drives(robot) for robot in running.profile.robots)
 
 
+def test_robots_go_on_when_a_vision_service_or_a_router_is_killed(running):
+    only(running, "shared")
+    visions, sims = running.replicas("vision-shared"), [sim for _, sim in running.profile.robots.values()]
+    assert len(visions) == 3
+    for container, bound_s in ((visions[0], 0.3), (visions[1], 0.3), (running.container("shared-router-a"), 2.0)):
+        before = {sim: len(running.motor_rows(sim)) for sim in sims}
+        assert ask("docker", "kill", container).returncode == 0
+        time.sleep(6)
+        stood = {sim: running.stood_s(sim, before[sim]) for sim in sims}
+        assert max(stood.values()) <= bound_s, (stood, running.compose("logs", "--tail", "20"))
+        assert ask("docker", "start", container).returncode == 0
+        assert all(running.drives(robot) for robot in running.profile.robots)
+        time.sleep(3)
+
+
 def test_stop_stops_one_robot_until_reset_and_armed(running):
     (robot, (service, sim)), *others = running.profile.robots.items()
     stopped = running.sightline("stop", robot)
