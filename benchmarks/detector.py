@@ -1,9 +1,10 @@
-"""Measure a remote detector, and one service for many streams, with a deliberately slow detector. Shell."""
+"""Measure a remote detector, and services for many streams, with a deliberately slow detector. Shell."""
 
+import os
 import subprocess
 import sys
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
@@ -32,18 +33,24 @@ class SlowDetector:
     """`--serve sightline.benchmarks.detector:SlowDetector`."""
 
     class Config(Settings):
-        """Time per frame."""
+        """Time per frame and per batch."""
 
         each_us: Annotated[int, Field(ge=0, le=1_000_000)] = 1_667
         """The time that one frame takes, in a batch or alone: 600 a second."""
+        batch_us: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+        """The time that a batch takes in addition, as on a GPU."""
+        pixels: bool = False
+        """True if it decodes each image before."""
 
     def __init__(self, config: Config) -> None:
-        self._each_s = config.each_us / 1e6
+        self._each_s, self._batch_s, self._pixels = config.each_us / 1e6, config.batch_us / 1e6, config.pixels
         self._found = (Detection(10, 10, 30, 30, 0.9, "thing"),)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
-        """Return an empty result after the delay, without the pixels."""
-        time.sleep(self._each_s * len(frames))
+        """Return one box in each frame after the delay."""
+        for frame in frames if self._pixels else ():
+            frame.picture()
+        time.sleep(self._batch_s + self._each_s * len(frames))
         return [result_of(frame, self._found, Maker("slow", device="cpu")) for frame in frames]
 
 
@@ -103,19 +110,47 @@ def _header(number: int) -> FrameHeader:
     return FrameHeader(session="0000abcd", seq=number, t_us=monotonic_us())
 
 
-# Many streams at one detector service, more than it can look at: age, fairness, memory. Shell (processes, the clock).
+# Many streams at one or several detector services: rate, age, fairness, memory, double answers. Shell (processes, the
+# clock).
 #
-# The service is the real one, in a process of its own; robots are links of this process, which is where they all meet.
+# The services are the real ones, in processes of their own; robots are links of this process, which is where all meet.
 
 
 DEADLINE_MS: Final = 100.0
 FAIRNESS_PERCENT: Final = 10.0
 MEMORY_MB: Final = 5.0
 OVERLOAD: Final = 2.0
+ANSWERS_PER_FRAME: Final = 1.01
+LEAST_FPS: Final = 900.0
+BATCH_P95_MS: Final = 70.0
+"""Bounds of a run with a detector that takes 5 ms for a batch, on two cores."""
 _FPS: Final = 30
 _WARM_S: Final = 5.0
 _STATUS_S: Final = 0.1
-_READY_S: Final = 30.0
+_READY_S: Final = 60.0
+_REMEMBERED: Final = 64
+"""Frames of a robot whose answers are counted; a second answer comes within a deadline."""
+
+
+@dataclass(frozen=True, slots=True)
+class StreamPlan:
+    """A run: robots with 30 frames per second each, and services that look at the same frames."""
+
+    streams: int = 40
+    seconds: float = 60.0
+    services: int = 1
+    batch_us: int = 0
+    """The detector decodes and takes this time for a batch. With 0 it has time for half of the frames."""
+    arguments: tuple[str, ...] = ()
+    """Further arguments of each service."""
+
+    def command(self, endpoint: str) -> list[str]:
+        """Return the command of one service."""
+        each_us = 0 if self.batch_us else round(OVERLOAD * 1e6 / (self.streams * _FPS))
+        options = {"each_us": each_us, "batch_us": self.batch_us, "pixels": str(self.batch_us > 0).lower()}
+        sets = [text for name, value in options.items() for text in ("--set", f"detector.options.{name}={value}")]
+        return [sys.executable, "-u", "-P", "-m", "sightline.operator_side.cli.app", "detector", "--serve",
+                "sightline.benchmarks.detector:SlowDetector", "--connect", endpoint, *sets, *self.arguments]
 
 
 @dataclass
@@ -124,9 +159,14 @@ class Load:
 
     offered: int = 0
     answered: Counter[str] = field(default_factory=Counter)
+    repeated: int = 0
+    """Answers to frames that were answered before."""
     ages_ms: list[float] = field(default_factory=list)
     memory_mb: list[float] = field(default_factory=list)
-    """Of the service, once a second."""
+    """Of the first service, once a second."""
+    cpu_s: float = 0.0
+    """CPU time of all services."""
+    seconds: float = 0.0
 
     @property
     def p95_ms(self) -> float:
@@ -151,6 +191,22 @@ class Load:
         """Return the frames offered for each answered frame."""
         return self.offered / max(1, sum(self.answered.values()))
 
+    @property
+    def fps(self) -> float:
+        """Return the frames answered per second, of all robots."""
+        return sum(self.answered.values()) / self.seconds if self.seconds else 0.0
+
+    @property
+    def answers_per_frame(self) -> float:
+        """Return the answers for each answered frame: 1 if no service repeats the work of another."""
+        frames = sum(self.answered.values())
+        return (frames + self.repeated) / frames if frames else float("inf")
+
+    @property
+    def cpu_ms(self) -> float:
+        """Return the CPU time of all services for each answered frame, ms."""
+        return self.cpu_s * 1000 / max(1, sum(self.answered.values()))
+
 
 class _Streams:
     """The robots."""
@@ -158,23 +214,36 @@ class _Streams:
     def __init__(self, links: list[ZenohLink], jpeg: bytes) -> None:
         self._links, self._jpeg, self.load = links, jpeg, Load()
         self._seq = 0
+        self._said_s = 0.0
         self.counting = False
         for link in links:
             link.subscribe(DETECTIONS, self._heard(link.robot))
 
     def _heard(self, robot: str) -> Callable[[Message], None]:
+        seen: deque[int] = deque(maxlen=_REMEMBERED)
+
         def note(message: Message) -> None:
+            now_us = monotonic_us()
             try:
                 echo = decode(DetectionsHeader, message.header).echo
             except WireError:
                 return
-            if echo is not None and self.counting:
-                self.load.answered[robot] += 1
-                self.load.ages_ms.append((monotonic_us() - echo.t_us) / 1000)
+            if echo is None or not self.counting:
+                return
+            if echo.seq in seen:
+                self.load.repeated += 1
+                return
+            seen.append(echo.seq)
+            self.load.answered[robot] += 1
+            self.load.ages_ms.append((now_us - echo.t_us) / 1000)
 
         return note
 
     def say(self) -> None:
+        """Publish each robot's status, once a second: a robot without one has left."""
+        if time.monotonic() - self._said_s < _STATUS_S:
+            return
+        self._said_s = time.monotonic() + 1.0 - _STATUS_S if self.counting else time.monotonic()
         stamp = encode(Stamp(session="0000abcd", seq=self._seq, t_us=monotonic_us()))
         for link in self._links:
             link.publish(STATUS, stamp, encode(Status(state=State.HOLD, reason="bench")))
@@ -186,57 +255,69 @@ class _Streams:
         self.load.offered += self.counting
 
 
-def measure_streams(endpoint: str, folder: Path, streams: int = 40, seconds: float = 60.0) -> Load:
-    """Offer `streams` streams at twice what the service can look at. Raises SightlineError if it does not start."""
-    each_us = round(OVERLOAD * 1e6 / (streams * _FPS))
+def measure_streams(endpoint: str, folder: Path, plan: StreamPlan) -> Load:
+    """Offer streams to services as planned. Raises SightlineError if a service does not start."""
     write_pictures(folder, 320, 240)
     jpeg = sorted(folder.glob("*.jpg"))[0].read_bytes()
     with ExitStack() as ending:
         session = ending.enter_context(closing(open_session([endpoint], (), 5.0)))
-        links = [ZenohLink(session, LinkRules(f"s{index}", "robot"), shared=True) for index in range(streams)]
+        links = [ZenohLink(session, LinkRules(f"s{index}", "robot"), shared=True) for index in range(plan.streams)]
         for link in links:
             ending.callback(link.close)
-        service = _service(endpoint, each_us, folder / "detector.log")
-        ending.callback(service.wait, 10)
-        ending.callback(service.terminate)
+        services = [_Service(plan, endpoint, folder / f"detector-{index}.log", ending)
+                    for index in range(plan.services)]
         robots = _Streams(links, jpeg)
-        _wait_ready(robots, folder / "detector.log", streams, service)
-        _offer(robots, streams, _WARM_S, service.pid)
+        _wait_ready(robots, plan, services)
+        _offer(robots, plan.streams, _WARM_S, services)
         robots.load.memory_mb.clear()
         robots.counting = True
-        _offer(robots, streams, seconds, service.pid)
+        before_s = sum(one.cpu_s() for one in services)
+        began_s = time.monotonic()
+        _offer(robots, plan.streams, plan.seconds, services)
+        robots.load.seconds = time.monotonic() - began_s
+        robots.load.cpu_s = sum(one.cpu_s() for one in services) - before_s
     return robots.load
 
 
-def _service(endpoint: str, each_us: int, log: Path) -> "subprocess.Popen[bytes]":
-    command = [
-        sys.executable,
-        "-u",
-        "-P",
-        "-m",
-        "sightline.operator_side.cli.app",
-        "detector",
-        "--serve",
-        "sightline.benchmarks.detector:SlowDetector",
-        "--connect",
-        endpoint,
-        "--set",
-        f"detector.options.each_us={each_us}",
-    ]
-    with log.open("wb") as out:
-        return subprocess.Popen(command, stdout=out, stderr=out)
+class _Service:
+    """A service in a process of its own, until `ending`."""
+
+    def __init__(self, plan: StreamPlan, endpoint: str, log: Path, ending: ExitStack) -> None:
+        self._log = log
+        with log.open("wb") as out:
+            self._process = subprocess.Popen(plan.command(endpoint), stdout=out, stderr=out)
+        ending.callback(self._process.wait, 10)
+        ending.callback(self._process.terminate)
+
+    def receives(self) -> int:
+        """Count the robots whose frames it has received. Raises SightlineError if it has ended."""
+        text = self._log.read_text("utf-8", "replace")
+        if self._process.poll() is not None:
+            raise SightlineError(f"the detector service did not start: {text[-300:]}")
+        return text.count("receives the frames")
+
+    def cpu_s(self) -> float:
+        """Return the CPU time so far, s."""
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(") ")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def memory_mb(self) -> float:
+        """Return its memory, MB."""
+        text = Path(f"/proc/{self._process.pid}/status").read_text()
+        return int(text.partition("VmRSS:")[2].split()[0]) / 1024
 
 
-def _wait_ready(robots: _Streams, log: Path, streams: int, service: "subprocess.Popen[bytes]") -> None:
+def _wait_ready(robots: _Streams, plan: StreamPlan, services: Sequence[_Service]) -> None:
+    """Wait until each service has started, and each robot's frames are received."""
     deadline_s = time.monotonic() + _READY_S
-    while log.read_text("utf-8", "replace").count("receives the frames") < streams:
-        if time.monotonic() > deadline_s or service.poll() is not None:
-            raise SightlineError(f"the detector service did not start: {log.read_text('utf-8', 'replace')[-300:]}")
+    while not (all(counts := [one.receives() for one in services]) and sum(counts) >= plan.streams):
+        if time.monotonic() > deadline_s:
+            raise SightlineError(f"the detector services did not start: they receive the frames of {counts} robots")
         robots.say()
         time.sleep(_STATUS_S)
 
 
-def _offer(robots: _Streams, streams: int, seconds: float, pid: int) -> None:
+def _offer(robots: _Streams, streams: int, seconds: float, services: Sequence[_Service]) -> None:
     """Frames of one stream after the other, evenly spaced; the newest of each, as robots send them."""
     began_s = time.monotonic()
     for index in range(round(seconds * streams * _FPS)):
@@ -245,10 +326,6 @@ def _offer(robots: _Streams, streams: int, seconds: float, pid: int) -> None:
         if left_s > 0:
             time.sleep(left_s)
         if index % (streams * _FPS) == 0:
-            robots.load.memory_mb.append(_memory_mb(pid))
+            robots.load.memory_mb.append(services[0].memory_mb())
+        robots.say()
         robots.frame(index % streams)
-
-
-def _memory_mb(pid: int) -> float:
-    text = Path(f"/proc/{pid}/status").read_text()
-    return int(text.partition("VmRSS:")[2].split()[0]) / 1024

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from sightline.benchmarks.detector import DEADLINE_MS, measure_streams
+from sightline.benchmarks.detector import DEADLINE_MS, StreamPlan, measure_streams
 from sightline.evaluation.processes import Processes
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.transports.zenoh.link import open_zenoh
@@ -80,7 +80,7 @@ def test_detector_service_ends_within_a_second_of_a_signal(tmp_path):
 
 
 def test_overloaded_service_serves_streams_fairly_and_in_time(tmp_path):
-    load = measure_streams(free_endpoint(), tmp_path, streams=8, seconds=4)
+    load = measure_streams(free_endpoint(), tmp_path, StreamPlan(streams=8, seconds=4))
     assert len(load.answered) == 8 and load.overload > 1.5
     # Wide bounds, because other tests load this machine. `sightline bench streams` has the strict ones.
     assert load.p95_ms <= 2 * DEADLINE_MS and load.unfair_percent <= 25
