@@ -47,6 +47,7 @@ PURE = (
     "vision_side/serving/sharing.py",
     "vision_side/tracking/*.py",
     "vision_side/missions/*.py",
+    "vision_side/serving/detector_queue.py",
     "vision_side/detect/port.py",
     "vision_side/detect/color/*.py",
     "protocol/*.py",

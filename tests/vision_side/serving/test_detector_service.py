@@ -1,5 +1,7 @@
 """The detector service over a link in memory: its messages, drops and counts for every answer of the detector."""
 
+import threading
+import time
 from dataclasses import replace
 
 import pytest
@@ -13,8 +15,9 @@ from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.port import Circle, Detection, Maker, result_of
-from sightline.vision_side.serving.detector_service import DetectorService, ServingOptions
-from tests.fixtures.vision.remote import BALL_JPEG
+from sightline.vision_side.serving.detector_service import DetectorService, ServingOptions, _BatchDecoder
+from tests.fixtures.links import until
+from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG
 
 HSV = Hsv(Hsv.Config(hsv=HsvConfig()))
 GOOD = Detection(10.0, 10.0, 50.0, 50.0, 0.9, "ball")
@@ -57,12 +60,16 @@ class Bench:
     def link(self, robot):
         return self.network.link(robot, role="detector")
 
+    def send(self, robot, jpeg=BALL_JPEG):
+        """Let a robot send one more frame."""
+        self.seq += 1
+        robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=self.seq, t_us=self.seq)), jpeg)
+        self.network.advance(self.network.now_us + 1)
+
     def look(self, jpeg=BALL_JPEG):
         """Return the service's answer to one more frame; None without an answer."""
         self.service.turn()
-        self.seq += 1
-        self.robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=self.seq, t_us=self.seq)), jpeg)
-        self.network.advance(self.network.now_us + 1)
+        self.send(self.robot, jpeg)
         self.service.turn()
         self.network.advance(self.network.now_us + 1)
         message = self.heard.take()
@@ -169,3 +176,95 @@ def test_answer_after_the_deadline_is_late_and_not_rejected(answers):
     bench = Bench(Late(answers), deadline_us=5_000)
     assert bench.look() is None
     assert (bench.tally().late, bench.tally().rejected) == (1, 0)
+
+
+class Partial:
+    """A detector that uses pixels, remembers which images were decoded before, and fails on the frames of one robot."""
+
+    def __init__(self, failing=""):
+        self.failing, self.decoded, self.batches, self.slow = failing, [], [], threading.Event()
+
+    def detect(self, frames, deadline_us):
+        self.batches.append([one.robot for one in frames])
+        self.decoded += [one.decoded is not None for one in frames]
+        if any(one.robot == self.failing for one in frames):
+            raise RuntimeError(f"cannot bear {self.failing}")
+        for one in frames:
+            one.picture()
+        if self.slow.is_set():
+            time.sleep(0.02)
+        return [result_of(one, (GOOD,), Maker("partial")) for one in frames]
+
+
+def test_failure_on_the_frame_of_one_robot_costs_no_other_robot_its_answer():
+    bench = Bench(Partial("r1"))
+    others = [bench.network.link(name) for name in ("r2", "r3")]
+    heard = [link.latest(DETECTIONS) for link in (bench.robot, *others)]
+    bench.present = ["r1", "r2", "r3"]
+    bench.service.turn()
+    for link in (bench.robot, *others):
+        bench.send(link)
+    bench.service.turn()
+    bench.network.advance(bench.network.now_us + 1)
+    assert [slot.take() is not None for slot in heard] == [False, True, True]
+    assert [bench.service.counters()[name].rejected for name in ("r1", "r2", "r3")] == [1, 0, 0]
+
+
+def test_images_are_decoded_before_the_detector_needs_them():
+    detector = Partial()
+    bench = Bench(detector)
+    for _ in range(3):
+        assert bench.look() is not None
+    assert detector.decoded == [False, True, True], "a detector that uses no pixels costs no decoding"
+    assert bench.look(BALL_JPEG[:700]) is None and bench.tally().rejected == 1 and len(detector.decoded) == 3
+
+
+def test_detector_without_use_of_pixels_costs_no_decoding():
+    bench = Bench(Named(GOOD))
+    for _ in range(3):
+        assert bench.look(BALL_JPEG[:700]) is not None
+
+
+def test_pixels_of_a_batch_stay_while_the_next_one_is_decoded():
+    """A detector on another thread may still look at them."""
+    pixels, header = _BatchDecoder(320 * 240), FrameHeader(session="0000abcd", seq=1, t_us=1)
+    frames = []
+    for jpeg in (BALL_JPEG, GREY_JPEG, BALL_JPEG):
+        pixels.next_batch()
+        frames.append(pixels.frame("r1", header, jpeg, (320, 240)))
+        before = frames[-2].picture().bgr.copy() if len(frames) > 1 else None
+        frames[-1].picture()
+        assert before is None or (frames[-2].picture().bgr == before).all()
+    assert frames[0].picture().bgr is frames[2].picture().bgr, "two batches have pixels, and no more"
+
+
+def test_two_batches_are_in_progress_and_a_slow_detector_gets_the_newest_frames():
+    detector = Partial()
+    bench = Bench(detector)
+    bench.present = ["r1", "r2"]
+    other, over = bench.network.link("r2"), threading.Event()
+    detector.slow.set()
+    thread = threading.Thread(target=bench.service.serve, args=(over,), daemon=True)
+    thread.start()
+    assert until(lambda: len(bench.words) == 2)
+    sent = 0
+    while len(detector.batches) < 8:
+        bench.send(bench.robot)
+        bench.send(other)
+        sent += 1
+        time.sleep(0.002)
+    over.set()
+    thread.join(5)
+    assert not thread.is_alive()
+    tally = bench.service.counters()
+    assert all(one.overtaken > one.served >= 2 and one.late == 0 for one in tally.values()), (sent, tally)
+    assert abs(tally["r1"].served - tally["r2"].served) <= 1
+
+
+def test_failure_outside_the_detector_ends_the_service_with_its_error(monkeypatch):
+    bench = Bench(Named(GOOD))
+    monkeypatch.setattr(bench.service, "_detect", lambda batch: 1 / 0)
+    bench.service.turn()
+    bench.send(bench.robot)
+    with pytest.raises(ZeroDivisionError):
+        bench.service.serve(threading.Event())
