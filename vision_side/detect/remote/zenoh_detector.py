@@ -4,8 +4,12 @@
     sightline vision --detector zenoh --connect tcp/192.168.1.20:7447
 
 Nothing is sent: robot and service find each other. This end waits, until the deadline, for boxes that cite the frame.
+
+Of several services this end prefers the one whose boxes it used last. Boxes of another service with the same model take
+their place when those of the preferred one do not come: it ended, or services that share robots have moved this one.
 """
 
+from dataclasses import dataclass
 from typing import ClassVar, Final
 
 from sightline.protocol.channels import DETECTIONS, FRAME
@@ -34,58 +38,88 @@ _NEWER_US: Final = 1_000_000
 """Boxes of a frame that is newer than the requested one by up to this are kept for it. A frame that claims to be from
 later may never come, and one such message would stand in the way of all others."""
 _SILENT_US: Final = 500_000
-"""A service that is silent for so long is gone; another one of its name takes its place."""
-
-
-class _SourceSlot(LatestSlot[Message]):
-    """The newest boxes of one source, and of one service while several speak as that: what one of them tracks or calls
-    a thing is nothing to the other."""
-
-    def __init__(self, source: str) -> None:
-        super().__init__()
-        self._source = source
-        self._session, self._received_us = "", 0
-        self.others = 0
-        """Boxes of other services than the preferred one."""
-
-    def put(self, item: Message) -> None:
-        """Drop the boxes of other sources and services. Boxes that cannot be read pass: `detect` counts them."""
-        if item.source == self._source and self._is_preferred(item):
-            super().put(item)
-
-    def prefer(self, session: str) -> None:
-        """Drop the boxes of other services than `session`, whose boxes were valid: only such exclude others."""
-        self._session, self._received_us = session, monotonic_us()
-
-    def _is_preferred(self, item: Message) -> bool:
-        try:
-            session = decode(DetectionsHeader, item.header).session
-        except WireError:
-            return True
-        now_us = monotonic_us()
-        if session == self._session:
-            self._received_us = now_us
-        elif self._session and now_us - self._received_us <= _SILENT_US:
-            self.others += 1
-            return False
-        return True
+"""A service that is silent for so long is gone; another one takes its place, also with another model."""
+_FIRST_RIGHT: Final = 0.5
+"""Part of the time left that the preferred service has for its boxes, once those of another one have come."""
+_MANY: Final = 10
+"""Boxes of a second service, after which it is reported. Where a robot moves, two services answer for a moment."""
 
 
 class _RobotDetections:
-    """Boxes received of one robot's frames."""
+    """The newest boxes of one robot's frames, first those of the preferred service.
+
+    What two models call a thing, or two trackers its number, is nothing to each other. So boxes of another service
+    count only with the same model, when those of the preferred one are missing, or after a longer silence.
+    """
 
     def __init__(self, link: Link, source: str) -> None:
-        self.slot = _SourceSlot(source)
+        self._source = source
+        self._slot: LatestSlot[tuple[str, Message]] = LatestSlot()
+        self._has_preferred = False
+        """True while boxes of the preferred service wait in the slot."""
+        self._session, self._received_us = "", 0
+        self._maker: tuple[str, str] = ("", "")
+        self.missed = False
+        """True if the preferred service did not answer the last request."""
+        self.others = 0
+        """Boxes of other services than the preferred one."""
         self.kept: Message | None = None
         """Boxes of a frame that was not requested yet."""
         self.reported = False
         """True once it was reported that there are several services."""
-        link.subscribe(DETECTIONS, self.slot.put)
+        link.subscribe(DETECTIONS, self._put)
 
-    def take(self, wait_s: float) -> Message | None:
-        """Take the newest boxes."""
-        message, self.kept = self.kept or self.slot.take(wait_s), None
-        return message
+    def take(self, wait_s: float) -> tuple[Message, bool] | None:
+        """Take the newest boxes.
+
+        Returns:
+            The message, and True if it is of another service than the preferred one; None if none came in time.
+        """
+        if self.kept is not None:
+            message, self.kept = self.kept, None
+            return message, self._is_other(_session_of(message))
+        taken = self._slot.take(wait_s)
+        self._has_preferred = False
+        return (taken[1], self._is_other(taken[0])) if taken else None
+
+    def prefer(self, session: str, result: DetectionResult) -> None:
+        """Prefer a service whose boxes were valid: only such exclude others."""
+        if session != self._session:
+            self.others = 0
+        self._session, self._received_us = session, monotonic_us()
+        self._maker, self.missed = _model_of(result), False
+
+    def may_replace(self, result: DetectionResult) -> bool:
+        """Return True if boxes of another service may replace missing ones of the preferred service."""
+        return _model_of(result) == self._maker or monotonic_us() - self._received_us > _SILENT_US
+
+    def _put(self, item: Message) -> None:
+        """Drop the boxes of other sources. Boxes that cannot be read pass: `detect` counts them."""
+        if item.source != self._source:
+            return
+        session = _session_of(item)
+        if self._is_other(session):
+            self.others += 1
+            if self._has_preferred:
+                return
+        else:
+            self._has_preferred, self._received_us = True, monotonic_us()
+        self._slot.put((session, item))
+
+    def _is_other(self, session: str) -> bool:
+        return bool(session and self._session and session != self._session)
+
+
+def _session_of(message: Message) -> str:
+    """Return the service that sent the boxes, or "" if they cannot be read."""
+    try:
+        return decode(DetectionsHeader, message.header).session
+    except WireError:
+        return ""
+
+
+def _model_of(result: DetectionResult) -> tuple[str, str]:
+    return result.detector, result.model_hash
 
 
 class ZenohDetector(FrameByFrame):
@@ -121,30 +155,70 @@ class ZenohDetector(FrameByFrame):
 
     def _wait(self, received: _RobotDetections, frame: DetectFrame, deadline_us: int) -> DetectionResult:
         """Wait for boxes that cite `frame`. Raises NoAnswerError at the deadline, or after boxes of a newer frame."""
-        while True:
-            message = received.take(seconds_left(deadline_us))
-            if received.slot.others and not received.reported:
-                received.reported = True
-                self._error_counters.notices.add(f"detector zenoh ({self._config.source}): several services look at "
-                                                 f"robot {frame.robot}; the first is used. End the others, or divide "
-                                                 "the robots among them with --robot")
-            if message is None:
-                raise NoAnswerError(
-                    NoAnswerReason.LATE, f"no boxes from {self._config.source} by the deadline; does it run?"
-                )
-            try:
-                header, ahead = _cites(message, frame)
-            except NoAnswerError as error:
-                self._error_counters.reject(error)
+        second: _Answer | None = None
+        until_us = deadline_us
+        self._note_second(received, frame.robot)
+        while (taken := received.take(seconds_left(until_us))) is not None:
+            message, is_other = taken
+            answer = self._read(message, frame, is_other)
+            if answer is None or (is_other and not received.may_replace(answer.result)):
                 continue
+            if not is_other or received.missed:
+                return _used(received, answer)
+            if second is None:
+                until_us = monotonic_us() + round(_FIRST_RIGHT * max(0, deadline_us - monotonic_us()))
+            if second is None or not answer.is_newer:
+                second = answer
+        received.missed = True
+        if second is not None:
+            return _used(received, second)
+        raise NoAnswerError(NoAnswerReason.LATE, f"no boxes from {self._config.source} by the deadline; does it run?")
+
+    def _read(self, message: Message, frame: DetectFrame, is_other: bool) -> "_Answer | None":
+        """Return the boxes; None for those of another frame.
+
+        Raises NoAnswerError for invalid boxes of the preferred service. All others are only counted: they must not end
+        the wait for valid ones.
+        """
+        cited = False
+        try:
+            header, ahead = _cites(message, frame)
             if ahead < 0:  # counted as late when that frame was requested
-                continue
-            if ahead > 0:
-                received.kept = message
-                raise NoAnswerError(NoAnswerReason.OTHER_FRAME, "it looked at a newer frame instead")
-            result = _result(message, header, frame, self._config.min_score)
-            received.slot.prefer(header.session)
-            return result
+                return None
+            cited = True
+            return _Answer(message, header.session, ahead > 0, _result(message, header, frame, self._config.min_score))
+        except NoAnswerError as error:
+            if cited and not is_other:
+                raise
+            self._error_counters.reject(error)
+            return None
+
+    def _note_second(self, received: _RobotDetections, robot: str) -> None:
+        if received.others >= _MANY and not received.reported:
+            received.reported = True
+            self._error_counters.notices.add(
+                f"detector zenoh ({self._config.source}): several services look at robot {robot}; the first is used. "
+                "Start them with --share, end the others, or divide the robots among them with --robot"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class _Answer:
+    """Valid boxes of the requested frame, or of a newer one."""
+
+    message: Message
+    session: str
+    is_newer: bool
+    result: DetectionResult
+
+
+def _used(received: _RobotDetections, answer: _Answer) -> DetectionResult:
+    """Return the result, and prefer its service. Raises NoAnswerError for boxes of a newer frame, which are kept."""
+    received.prefer(answer.session, answer.result)
+    if answer.is_newer:
+        received.kept = answer.message
+        raise NoAnswerError(NoAnswerReason.OTHER_FRAME, "it looked at a newer frame instead")
+    return answer.result
 
 
 def _cites(message: Message, frame: DetectFrame) -> tuple[DetectionsHeader, int]:

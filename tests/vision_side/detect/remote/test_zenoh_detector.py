@@ -60,11 +60,11 @@ class Robot:
         self.link.publish(FRAME, encode(stamp) if header is None else header, jpeg)
         return DetectFrame(self.name, stamp, jpeg, Decoder(320, 240, 1920 * 1080))
 
-    def say(self, asked, *boxes, source=ROLE, by="00000009", width_px=320, **changes):
+    def say(self, asked, *boxes, source=ROLE, by="00000009", model="", width_px=320, **changes):
         """Publish boxes as a service does, or as a hostile service does."""
         echo = Echo(channel="frame", session=asked.header.session, seq=asked.header.seq, t_us=asked.header.t_us)
         header = DetectionsHeader(source=ROLE, session=by, seq=1, echo=echo.model_copy(update=changes))
-        said = Detections(width_px=width_px, height_px=240, boxes=boxes)
+        said = Detections(width_px=width_px, height_px=240, boxes=boxes, model=model)
         self.link.publish(DETECTIONS, encode(header), encode(said), source)
 
 
@@ -228,6 +228,13 @@ def test_lost_service_gives_no_answer_by_the_deadline_and_recovers():
 # --- hostile answers -------------------------------------------------------------------------------------------------
 
 BOX = DetectedBox(label="ball", score=0.9, x1_px=10.0, y1_px=10.0, x2_px=30.0, y2_px=30.0)
+OTHER = DetectedBox(label="box", score=0.9, x1_px=50.0, y1_px=10.0, x2_px=90.0, y2_px=30.0)
+
+
+def _label(waiting, asked, seconds=1.0):
+    """Return the label of the first box in a frame, or None without an answer."""
+    result = waiting.detect([asked], within(seconds))[0]
+    return result and result.detections[0].label
 
 
 @pytest.fixture
@@ -294,18 +301,60 @@ def test_boxes_of_an_older_frame_are_dropped_without_a_log_line(pair):
 def test_first_of_two_services_is_used_until_it_is_silent(pair):
     """Two trackers' identities, or two models' boxes in turns, would steer by neither."""
     robot, waiting = pair
-    other = DetectedBox(label="box", score=0.9, x1_px=50.0, y1_px=10.0, x2_px=90.0, y2_px=30.0)
     robot.say(frame(2), BOX, by="00000001")
-    labels = {one.label for one in waiting.detect([frame(2)], within(1.0))[0].detections}
-    for seq in range(3, 9):
-        for box, by in sorted(((BOX, "00000001"), (other, "00000002")), key=lambda pair: pair[1], reverse=seq % 2):
-            robot.say(frame(seq), box, by=by)
-        labels |= {one.label for one in waiting.detect([frame(seq)], within(1.0))[0].detections}
+    labels = {_label(waiting, frame(2))}
+    for seq in range(3, 20):
+        for box, by in sorted(((BOX, "00000001"), (OTHER, "00000002")), key=lambda pair: pair[1], reverse=seq % 2):
+            robot.say(frame(seq), box, by=by, model=8 * by[-1])
+        labels.add(_label(waiting, frame(seq)))
     assert labels == {"ball"} and not waiting.rejected
     assert sum("several services look at robot r1" in line for line in waiting.notices()) == 1
+    robot.say(frame(20), OTHER, by="00000002", model="22222222")
+    assert _label(waiting, frame(20), 0.1) is None, "a model of its own"
     time.sleep(0.6)
-    robot.say(frame(9), other, by="00000002")
-    assert waiting.detect([frame(9)], within(1.0))[0].detections[0].label == "box", "the first one is gone"
+    robot.say(frame(21), OTHER, by="00000002", model="22222222")
+    assert _label(waiting, frame(21)) == "box", "the first one is gone"
+
+
+def test_service_with_the_same_model_replaces_a_missing_answer_in_time(pair):
+    """It is the next one of several that share the robots: the first one has ended."""
+    robot, waiting = pair
+    robot.say(frame(2), BOX, by="00000001", model="11111111")
+    assert _label(waiting, frame(2)) == "ball"
+    robot.say(frame(3), OTHER, by="00000002", model="11111111")
+    began_s = time.monotonic()
+    assert _label(waiting, frame(3), 0.2) == "box" and 0.05 < time.monotonic() - began_s < 0.2
+    began_s = time.monotonic()
+    robot.say(frame(4), BOX, by="00000002", model="11111111")
+    assert _label(waiting, frame(4)) == "ball" and time.monotonic() - began_s < 0.2, "it is the preferred one now"
+    assert not waiting.rejected and waiting.notices() == ["detector zenoh (detector) answers"]
+
+
+def test_service_with_the_same_model_is_used_immediately_after_a_missed_answer(pair):
+    robot, waiting = pair
+    robot.say(frame(2), BOX, by="00000001")
+    assert _label(waiting, frame(2)) == "ball" and _label(waiting, frame(3), 0.05) is None
+    robot.say(frame(4), OTHER, by="00000002")
+    began_s = time.monotonic()
+    assert _label(waiting, frame(4), 1.0) == "box" and time.monotonic() - began_s < 0.4
+
+
+def test_preferred_service_that_is_a_little_later_is_used(pair):
+    robot, waiting = pair
+    for seq, by in ((2, "00000001"), (3, "00000002"), (3, "00000001")):
+        robot.say(frame(seq), BOX if by == "00000001" else OTHER, by=by)
+        if seq == 2:
+            assert _label(waiting, frame(2)) == "ball"
+    assert _label(waiting, frame(3)) == "ball"
+
+
+def test_newer_boxes_of_the_next_service_are_stored_for_their_frame(pair):
+    robot, waiting = pair
+    robot.say(frame(2), BOX, by="00000001")
+    assert _label(waiting, frame(2)) == "ball"
+    robot.say(frame(4), OTHER, by="00000002")
+    assert _label(waiting, frame(3), 0.1) is None and waiting.rejected == {"OTHER_FRAME": 1}
+    assert _label(waiting, frame(4), 0.0) == "box"
 
 
 def test_invalid_service_does_not_block_a_valid_service(pair):
