@@ -29,7 +29,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import report_fault
 from sightline.protocol.messages import Verb
 from sightline.protocol.transports.endpoints import check_robot_id
-from sightline.protocol.transports.tokens import Token
+from sightline.protocol.transports.tokens import AnyToken, DetectorToken, Token
 
 Item = TypeVar("Item")
 
@@ -304,12 +304,20 @@ class FleetLink(Closing):
 
 
     @abstractmethod
-    def declare_token(self, token: Token) -> Callable[[], None]:
+    def declare_token(self, token: AnyToken) -> Callable[[], None]:
         """Declare a token. It ends with the returned function, which the caller keeps, with the session or process."""
 
     @abstractmethod
     def watch_tokens(self, callback: Callable[[Token, bool], None]) -> None:
-        """Call `callback` on a transport thread with each valid token of others, and whether it is present."""
+        """Call `callback` on a transport thread with each token of robots and vision services, and its presence."""
+
+    @abstractmethod
+    def watch_detectors(self, group: str, callback: Callable[[DetectorToken, bool], None]) -> Callable[[], None]:
+        """Call `callback` on a transport thread with each token in `group`, and whether it is present.
+
+        Returns:
+            What ends it. It ends with the session, too.
+        """
 
 
 class LinkWrapper(Link):

@@ -25,7 +25,7 @@ from sightline.protocol.channels import (
 )
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_zenoh_endpoint, with_allowed
-from sightline.protocol.transports.tokens import ALL_TOKENS, DRIVER_KIND, ROBOT_KIND, VISION_KIND
+from sightline.protocol.transports.tokens import ALL_TOKENS, DETECTOR_KIND, DRIVER_KIND, ROBOT_KIND, VISION_KIND
 from sightline.protocol.transports.tokens import PREFIX as TOKEN_PREFIX
 
 ROBOT_ROLE: Final = "robot"
@@ -169,8 +169,9 @@ def _presence_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
 
 
 def _token_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
-    """Return the rules of liveliness tokens. A robot declares its own kind, vision the others, and all may see them."""
-    own = {ROBOT_ROLE: [ROBOT_KIND], "vision": [VISION_KIND, DRIVER_KIND]}.get(role, [])
+    """Return the rules of liveliness tokens. All may see them, and three roles declare their kinds."""
+    kinds = {ROBOT_ROLE: [ROBOT_KIND], "vision": [VISION_KIND, DRIVER_KIND], "detector": [DETECTOR_KIND]}
+    own = kinds.get(role, [])
     return [
         ("is alive", "ingress", ["liveliness_token"], [f"{TOKEN_PREFIX}/{kind}/**" for kind in own]),
         ("watches", "ingress", ["liveliness_query", "declare_liveliness_subscriber"], [ALL_TOKENS]),

@@ -1,8 +1,9 @@
-"""Define the liveliness tokens: who is present, and who drives a robot. Pure.
+"""Define the liveliness tokens: which robots and services are present, and which service drives a robot. Pure.
 
-    sightline-token/robot/ROBOT                      a robot
-    sightline-token/vision/NAME/WEIGHT/INSTANCE      a vision service that shares robots
-    sightline-token/driver/ROBOT/NAME/COMMITMENT     a session of it that drives a robot, or is about to
+    sightline-token/robot/ROBOT                            a robot
+    sightline-token/vision/NAME/WEIGHT/INSTANCE            a vision service that shares robots
+    sightline-token/driver/ROBOT/NAME/COMMITMENT           a session of it that drives a robot, or is about to
+    sightline-token/detector/GROUP/WEIGHT/SESSION/ROBOTS   a detector service that shares robots
 
 A token ends with its process, some milliseconds later, or with its link. `COMMITMENT` is the start of the driver's hash
 chain (`protocol/proof.py`): only the driver can send a twist that continues it, so a robot knows whose token it is.
@@ -12,18 +13,24 @@ import re
 from typing import Final, NamedTuple
 
 PREFIX: Final = "sightline-token"
-ROBOT_KIND, VISION_KIND, DRIVER_KIND = "robot", "vision", "driver"
+ROBOT_KIND, VISION_KIND, DRIVER_KIND, DETECTOR_KIND = "robot", "vision", "driver", "detector"
 ALL_TOKENS: Final = f"{PREFIX}/**"
 LEAST_WEIGHT, MOST_WEIGHT = 0.01, 1000.0
 
 NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}"
 """Pattern of the name of a vision service, as of a robot id."""
+_WEIGHT: Final = r"\d{1,4}(?:\.\d{1,3})?"
 # Exact: a peer may declare a token with a wildcard, which would end the tokens of others with its own.
 _KEYS: Final = re.compile(
     rf"{PREFIX}/(?:robot/(?P<robot>{NAME})"
-    rf"|vision/(?P<name>{NAME})/(?P<weight>\d{{1,4}}(?:\.\d{{1,3}})?)/(?P<instance>[0-9a-f]{{8}})"
-    rf"|driver/(?P<driven>{NAME})/(?P<driver>{NAME})/(?P<commitment>[0-9a-f]{{32}}))"
+    rf"|vision/(?P<name>{NAME})/(?P<weight>{_WEIGHT})/(?P<instance>[0-9a-f]{{8}})"
+    rf"|driver/(?P<driven>{NAME})/(?P<driver>{NAME})/(?P<commitment>[0-9a-f]{{32}})"
+    rf"|detector/(?P<group>[0-9a-f]{{8}})/(?P<share>{_WEIGHT})/(?P<session>[0-9a-f]{{8}})"
+    r"/(?P<pattern>[A-Za-z0-9_.+=-]{1,32}))",
+    re.ASCII,
 )
+# A key of a token has no wildcards, so a pattern of robots has `+` and `=` for them there.
+_TO_KEY, _FROM_KEY = str.maketrans("*?", "+="), str.maketrans("+=", "*?")
 
 
 class RobotToken(NamedTuple):
@@ -64,7 +71,28 @@ class DriverToken(NamedTuple):
         return f"{PREFIX}/{DRIVER_KIND}/{self.robot}/{self.name}/{self.commitment}"
 
 
+class DetectorToken(NamedTuple):
+    """A detector service is present and shares robots with those of its group."""
+
+    group: str
+    """8 hex digits, equal for services that can do each other's work."""
+    weight: float
+    """Its share of them, relative to the other services, with at most three decimals."""
+    session: str
+    """The session of its answers."""
+    robots: str = "*"
+    """Pattern of the robots that it serves, with `*` and `?`."""
+
+    @property
+    def key(self) -> str:
+        """Return its key."""
+        robots = self.robots.translate(_TO_KEY)
+        # `:g` has six digits: enough for three decimals up to 1000.
+        return f"{PREFIX}/{DETECTOR_KIND}/{self.group}/{self.weight:g}/{self.session}/{robots}"
+
+
 Token = RobotToken | VisionToken | DriverToken
+AnyToken = Token | DetectorToken
 
 
 def drivers_of(robot: str) -> str:
@@ -72,7 +100,12 @@ def drivers_of(robot: str) -> str:
     return f"{PREFIX}/{DRIVER_KIND}/{robot}/*/*"
 
 
-def parse_token(key: str) -> Token | None:
+def detectors_of(group: str) -> str:
+    """Return the key expression of the tokens of the detector services in `group`."""
+    return f"{PREFIX}/{DETECTOR_KIND}/{group}/*/*/*"
+
+
+def parse_token(key: str) -> AnyToken | None:
     """Parse the exact key of a token. Return None for any other text, also for a weight out of bounds."""
     parts = _KEYS.fullmatch(key)
     if parts is None:
@@ -81,5 +114,9 @@ def parse_token(key: str) -> Token | None:
         return RobotToken(parts["robot"])
     if parts["driven"]:
         return DriverToken(parts["driven"], parts["driver"], parts["commitment"])
-    weight = float(parts["weight"])
-    return VisionToken(parts["name"], weight, parts["instance"]) if LEAST_WEIGHT <= weight <= MOST_WEIGHT else None
+    weight = float(parts["weight"] or parts["share"])
+    if not LEAST_WEIGHT <= weight <= MOST_WEIGHT:
+        return None
+    if parts["group"]:
+        return DetectorToken(parts["group"], weight, parts["session"], parts["pattern"].translate(_FROM_KEY))
+    return VisionToken(parts["name"], weight, parts["instance"])

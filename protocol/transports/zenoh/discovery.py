@@ -16,7 +16,7 @@ from sightline.protocol.errors import ConfigError, install_command
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_zenoh_endpoint
 from sightline.protocol.transports.link import LinkRules, Message
 from sightline.protocol.transports.security import RoleKeys, load_role_keys
-from sightline.protocol.transports.tokens import ALL_TOKENS, Token
+from sightline.protocol.transports.tokens import ALL_TOKENS, AnyToken, DetectorToken, Token
 from sightline.protocol.transports.zenoh.link import watch_tokens
 from sightline.protocol.transports.zenoh.presence import (
     MAX_PEERS,
@@ -60,7 +60,9 @@ def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discov
         return Discovered(_statuses(session, ending), _listen(session, seconds), frozenset(tokens))
 
 
-def _note(tokens: set[Token], token: Token, is_present: bool) -> None:
+def _note(tokens: set[Token], token: AnyToken, is_present: bool) -> None:
+    if isinstance(token, DetectorToken):
+        return
     if not is_present:
         tokens.discard(token)
     elif len(tokens) < MAX_TOKENS:

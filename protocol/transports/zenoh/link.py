@@ -22,7 +22,17 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
 from sightline.protocol.transports.link import NOT_A_PUT, BaseLink, FleetLink, Link, LinkRules, Message
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
-from sightline.protocol.transports.tokens import ALL_TOKENS, DriverToken, RobotToken, Token, drivers_of, parse_token
+from sightline.protocol.transports.tokens import (
+    ALL_TOKENS,
+    AnyToken,
+    DetectorToken,
+    DriverToken,
+    RobotToken,
+    Token,
+    detectors_of,
+    drivers_of,
+    parse_token,
+)
 from sightline.protocol.transports.zenoh.presence import PeerInfo, PresenceAnnouncer, query_presence
 from sightline.protocol.transports.zenoh.session import CLOSED_SESSION, open_session
 
@@ -168,7 +178,7 @@ class ZenohLink(BaseLink):
 
     def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
         """Call `callback` on a thread of Zenoh with the commitment of each driver's token, and if it is present."""
-        def note(token: Token, is_present: bool) -> None:
+        def note(token: AnyToken, is_present: bool) -> None:
             if isinstance(token, DriverToken) and token.robot == self.robot:
                 callback(token.commitment, is_present)
 
@@ -239,7 +249,7 @@ class ZenohLink(BaseLink):
         self._session = CLOSED_SESSION
 
 
-def declare_token(session: zenoh.Session, token: Token) -> Callable[[], None]:
+def declare_token(session: zenoh.Session, token: AnyToken) -> Callable[[], None]:
     """Declare a token. It ends with the returned function, which the caller keeps until then, or with the session."""
     import zenoh
 
@@ -254,7 +264,7 @@ def declare_token(session: zenoh.Session, token: Token) -> Callable[[], None]:
 
 
 def watch_tokens(
-    session: zenoh.Session, pattern: str, callback: Callable[[Token, bool], None]
+    session: zenoh.Session, pattern: str, callback: Callable[[AnyToken, bool], None]
 ) -> Callable[[], None]:
     """Call `callback` on a thread of Zenoh with each valid token, also those of before, and if it is present."""
     import zenoh
@@ -427,13 +437,29 @@ class ZenohFleet(FleetLink):
         self._ending.close()
         self._session = CLOSED_SESSION
 
-    def declare_token(self, token: Token) -> Callable[[], None]:
+    def declare_token(self, token: AnyToken) -> Callable[[], None]:
         """Declare a token. It ends with the returned function, which the caller keeps, with the session or process."""
         return declare_token(self._session, token)
 
     def watch_tokens(self, callback: Callable[[Token, bool], None]) -> None:
-        """Call `callback` on a thread of Zenoh with each valid token, and whether it is present."""
-        self._ending.callback(watch_tokens(self._session, ALL_TOKENS, callback))
+        """Call `callback` on a thread of Zenoh with each token of robots and vision services, and its presence."""
+        def note(token: AnyToken, is_present: bool) -> None:
+            # Detectors have groups of their own. `watch_detectors` reports one of them.
+            if not isinstance(token, DetectorToken):
+                callback(token, is_present)
+
+        self._ending.callback(watch_tokens(self._session, ALL_TOKENS, note))
+
+    def watch_detectors(self, group: str, callback: Callable[[DetectorToken, bool], None]) -> Callable[[], None]:
+        """Call `callback` on a thread of Zenoh with each token in `group`, and whether it is present."""
+        def note(token: AnyToken, is_present: bool) -> None:
+            if isinstance(token, DetectorToken):
+                callback(token, is_present)
+
+        # Not all tokens: a site has many robots, and a detector service needs none of their tokens.
+        end = watch_tokens(self._session, detectors_of(group), note)
+        self._ending.callback(end)
+        return end
 
     def listen(self) -> None:
         """Find robots by their status."""

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 import pytest
 
 from sightline.operator_side.setup import keys
-from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
+from sightline.protocol.transports.tokens import DetectorToken, DriverToken, RobotToken, VisionToken
 from sightline.protocol.transports.zenoh.link import declare_token, open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
 from tests.fixtures.links import until
@@ -76,6 +76,24 @@ def test_a_robot_sees_the_drivers_of_itself_alone_and_their_end(site):
     assert {token for token, _ in before.seen} == {TOKENS[0], TOKENS[2]}
 
 
+def test_detectors_see_those_of_their_group_and_vision_services_see_none_of_them(site):
+    _, fleet = site
+    first, second, vision, watchers = fleet(0), fleet(1), fleet(0), [Watcher() for _ in range(3)]
+    own = [DetectorToken("0000000a", 1.0, "00000001"), DetectorToken("0000000a", 2.0, "00000002", "r*")]
+    other = DetectorToken("0000000b", 1.0, "00000003")
+    vision.watch_tokens(watchers[2])
+    declared = [first.declare_token(own[0]), first.declare_token(other)]
+    ends = [first.watch_detectors("0000000a", watchers[0])]
+    declared.append(second.declare_token(own[1]))
+    assert until(lambda: watchers[0].present == set(own))
+    ends[0]()
+    ends.append(first.watch_detectors("0000000a", watchers[1]))
+    assert until(lambda: watchers[1].present == set(own)), "a new watch has the tokens of before, also its own"
+    second.close()
+    assert until(lambda: watchers[1].present == {own[0]})
+    assert watchers[0].present == set(own) and watchers[2].present == {RobotToken("r1")}
+
+
 @pytest.mark.parametrize("number", [0, 1])
 def test_another_connection_that_declares_and_withdraws_the_same_token_ends_nothing(site, number):
     robot, fleet = site
@@ -98,20 +116,25 @@ def test_on_links_with_keys_each_role_declares_only_its_tokens(tmp_path):
     keys.make(folder, ["robot.local"])
     secure = str(folder)
     with open_zenoh("r1", listen=[endpoint], role="robot", secure=secure) as robot, ExitStack() as ending:
-        drivers, tokens = Watcher(), Watcher()
+        drivers, tokens, detectors = Watcher(), Watcher(), Watcher()
         robot.watch_drivers(drivers)
-        watching = open_fleet("*", connect=[endpoint], role="vision", by_status=False, secure=secure)
-        ending.enter_context(watching)
-        watching.watch_tokens(tokens)
+        for role in ("vision", "detector"):
+            watching = open_fleet("*", connect=[endpoint], role=role, by_status=False, secure=secure)
+            ending.enter_context(watching)
+            if role == "vision":
+                watching.watch_tokens(tokens)
+            else:
+                watching.watch_detectors("0000000a", detectors)
         roles = ("viewer", "operator", "detector", "vision")
         for number, role in enumerate(roles):
             peer = ending.enter_context(open_zenoh("r1", connect=[endpoint], role=role, secure=secure))
             session = peer._session
             for token in (DriverToken("r1", role, TOKENS[number]), VisionToken(role, 1.0, f"{number:08x}"),
-                          RobotToken(f"robot-of-{role}")):
+                          RobotToken(f"robot-of-{role}"), DetectorToken("0000000a", 1.0, f"{number:08x}")):
                 ending.callback(declare_token(session, token))
         vision = {DriverToken("r1", "vision", TOKENS[3]), VisionToken("vision", 1.0, "00000003"), RobotToken("r1")}
-        assert until(lambda: tokens.present >= vision and drivers.present)
+        assert until(lambda: tokens.present >= vision and drivers.present and detectors.present)
         time.sleep(0.2)
         assert drivers.present == {TOKENS[3]}
+        assert detectors.present == {DetectorToken("0000000a", 1.0, "00000002")}
         assert tokens.present == vision
