@@ -121,6 +121,7 @@ FAIRNESS_PERCENT: Final = 10.0
 MEMORY_MB: Final = 5.0
 OVERLOAD: Final = 2.0
 ANSWERS_PER_FRAME: Final = 1.01
+KILL_GAP_MS: Final = 250.0
 LEAST_FPS: Final = 900.0
 BATCH_P95_MS: Final = 70.0
 """Bounds of a run with a detector that takes 5 ms for a batch, on two cores."""
@@ -143,6 +144,8 @@ class StreamPlan:
     """The detector decodes and takes this time for a batch. With 0 it has time for half of the frames."""
     arguments: tuple[str, ...] = ()
     """Further arguments of each service."""
+    kill: bool = False
+    """True to kill the last service in the middle of the run."""
 
     def command(self, endpoint: str) -> list[str]:
         """Return the command of one service."""
@@ -162,10 +165,14 @@ class Load:
     repeated: int = 0
     """Answers to frames that were answered before."""
     ages_ms: list[float] = field(default_factory=list)
+    answered_us: dict[str, int] = field(default_factory=dict)
+    """Time of the newest answer to a robot."""
+    gap_us: int = 0
+    """Longest time between two answers to a robot."""
     memory_mb: list[float] = field(default_factory=list)
     """Of the first service, once a second."""
-    cpu_s: float = 0.0
-    """CPU time of all services."""
+    cpu_ms: float = 0.0
+    """CPU time of all services for each answered frame, in the first half."""
     seconds: float = 0.0
 
     @property
@@ -202,11 +209,6 @@ class Load:
         frames = sum(self.answered.values())
         return (frames + self.repeated) / frames if frames else float("inf")
 
-    @property
-    def cpu_ms(self) -> float:
-        """Return the CPU time of all services for each answered frame, ms."""
-        return self.cpu_s * 1000 / max(1, sum(self.answered.values()))
-
 
 class _Streams:
     """The robots."""
@@ -234,6 +236,8 @@ class _Streams:
                 self.load.repeated += 1
                 return
             seen.append(echo.seq)
+            self.load.gap_us = max(self.load.gap_us, now_us - self.load.answered_us.get(robot, now_us))
+            self.load.answered_us[robot] = now_us
             self.load.answered[robot] += 1
             self.load.ages_ms.append((now_us - echo.t_us) / 1000)
 
@@ -273,9 +277,13 @@ def measure_streams(endpoint: str, folder: Path, plan: StreamPlan) -> Load:
         robots.counting = True
         before_s = sum(one.cpu_s() for one in services)
         began_s = time.monotonic()
-        _offer(robots, plan.streams, plan.seconds, services)
+        _offer(robots, plan.streams, plan.seconds / 2, services)
+        took_s = sum(one.cpu_s() for one in services) - before_s
+        robots.load.cpu_ms = took_s * 1000 / max(1, sum(robots.load.answered.values()))
+        if plan.kill:
+            services[-1].kill()
+        _offer(robots, plan.streams, plan.seconds / 2, services)
         robots.load.seconds = time.monotonic() - began_s
-        robots.load.cpu_s = sum(one.cpu_s() for one in services) - before_s
     return robots.load
 
 
@@ -300,6 +308,10 @@ class _Service:
         """Return the CPU time so far, s."""
         fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(") ")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    def kill(self) -> None:
+        """End it without a warning."""
+        self._process.kill()
 
     def memory_mb(self) -> float:
         """Return its memory, MB."""

@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -340,6 +341,8 @@ def streams(
     batch_ms: Annotated[
         float, typer.Option("--batch-ms", min=0, max=500, help="Time for a batch; 0: time for half of the frames.")
     ] = 0.0,
+    share: Annotated[bool, typer.Option("--share/--no-share", help="Several services divide the robots.")] = True,
+    kill: Annotated[bool, typer.Option("--kill", help="Kill one service in the middle of the run.")] = False,
     as_json: Json = False,
 ) -> int:
     """Measure detector services for many robots
@@ -351,7 +354,8 @@ def streams(
         from sightline.evaluation.checks import Check, at_most
         from sightline.evaluation.processes import free_port
 
-    plan = bench.StreamPlan(streams, seconds, services, round(batch_ms * 1000))
+    plan = bench.StreamPlan(streams, seconds, services, round(batch_ms * 1000),
+                            ("--share",) if share and services > 1 else (), kill)
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
         load = bench.measure_streams(f"tcp/127.0.0.1:{free_port()}", Path(folder), plan)
     checks = [
@@ -363,7 +367,7 @@ def streams(
         checks += [
             Check("answered per second", load.fps, "", bench.LEAST_FPS, load.fps >= bench.LEAST_FPS),
             at_most("age of boxes, p95", load.p95_ms, "ms", bench.BATCH_P95_MS),
-            at_most("CPU time of the services for each answered frame", load.cpu_ms, "ms", float("inf")),
+            at_most("CPU time of the services for each answered frame", load.cpu_ms, "ms", inf),
         ]
     else:
         least = 0.9 * bench.OVERLOAD
@@ -371,7 +375,10 @@ def streams(
             Check("offered per answered frame", load.overload, "", bench.OVERLOAD, load.overload >= least),
             at_most("age of boxes, p95", load.p95_ms, "ms", bench.DEADLINE_MS),
         ]
-    checks.append(at_most("answers per answered frame", load.answers_per_frame, "", bench.ANSWERS_PER_FRAME))
+    checks += [
+        at_most("answers per answered frame", load.answers_per_frame, "", bench.ANSWERS_PER_FRAME),
+        at_most("longest time between two answers", load.gap_us / 1000, "ms", bench.KILL_GAP_MS if kill else inf),
+    ]
     return _print_checks(checks, as_json)
 
 

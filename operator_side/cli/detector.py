@@ -24,6 +24,7 @@ from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import print_table
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import start_log
+from sightline.protocol.transports.tokens import LEAST_WEIGHT, MOST_WEIGHT
 
 if TYPE_CHECKING:
     from sightline.protocol.config import PluginRegistry
@@ -38,6 +39,12 @@ DeadlineMs = Annotated[
     float, typer.Option("--deadline-ms", min=5, max=1000, help="Longest time from a frame's arrival to its boxes.")
 ]
 MaxBatch = Annotated[int, typer.Option("--max-batch", min=1, max=256, help="Most frames in one batch.")]
+Share = Annotated[bool, typer.Option("--share", help="Divide the robots with other services that have --share.")]
+Weight = Annotated[
+    float,
+    typer.Option("--weight", min=LEAST_WEIGHT, max=MOST_WEIGHT,
+                 help="With --share: its part of the robots, e.g. 2 for twice."),
+]
 _REMOTE = ("zenoh", "boxes")
 _RECOMMENDED = (
     ("balls, legs and traffic lights", "onnx"),
@@ -71,6 +78,8 @@ def serve(
     device: Device = None,
     deadline_ms: DeadlineMs = 100.0,
     max_batch: MaxBatch = 16,
+    share: Share = False,
+    weight: Weight = 1.0,
     config: ConfigFile = None,
     sets: Sets = None,
     log: LogForm = None,
@@ -96,6 +105,8 @@ def serve(
     given = load_service("vision", file=config, sets=sets or (), options=options, environ=os.environ)
     every_robot = {} if given.origin(("robot",)) != "default" else {"robot": "*"}
     loaded: Any = given.config.model_copy(update=every_robot)
+    if weight != 1.0 and not share:
+        raise ConfigError("--weight has no effect alone; add --share")
     with needs("vision"):
         from sightline.vision_side.detect.plugin_calls import close_detector
         from sightline.vision_side.detect.registry import configured_detector
@@ -103,7 +114,9 @@ def serve(
 
         detector = configured_detector(loaded)
         try:
-            return run(loaded, detector, ServingOptions(name, round(deadline_ms * 1000), max_batch, loaded.max_pixels))
+            serving = ServingOptions(name, round(deadline_ms * 1000), max_batch, loaded.max_pixels,
+                                     weight if share else None, loaded.robot)
+            return run(loaded, detector, serving)
         finally:
             close_detector(detector)
 

@@ -73,6 +73,11 @@ class FairQueue(Generic[Item]):
         self._waiting.pop(robot, None)
         return self.counters.pop(robot, FrameCounters())
 
+    @property
+    def waits(self) -> bool:
+        """Return True if a frame waits."""
+        return any(turn is not None for turn in self._waiting.values())
+
     def take(self, now_us: int, each_us: int = 0) -> list[QueuedFrame[Item]]:
         """Take waiting frames as one batch that fits in half a deadline if a frame takes `each_us`; may be empty."""
         most = self._max_batch
@@ -147,9 +152,9 @@ class BatchClock:
 
     def end(self, count: int, now_us: int) -> None:
         """Note that the detector has examined `count` frames since `begin`."""
-        took_us = now_us - (now_us if self._busy_since_us is None else self._busy_since_us)
+        took_us = self.busy_us(now_us)
+        self._busy_us += now_us - max(self._counted_us, now_us - took_us)
         self._busy_since_us = None
-        self._busy_us += took_us
         self._detect_us = _smoothed(self._detect_us, took_us)
         self._each_us = _smoothed(self._each_us, (took_us + self._prepare_us) / count)
 
@@ -157,11 +162,14 @@ class BatchClock:
         """Note the age of a frame whose boxes are sent now."""
         self._answer_ages_us.append(age_us)
 
+    def busy_us(self, now_us: int) -> int:
+        """Return for how long the detector has examined the present batch, us; 0 without one."""
+        return 0 if self._busy_since_us is None else now_us - self._busy_since_us
+
     def busy_ratio(self, now_us: int) -> float:
         """Return the share of the time since the last call in which the detector was busy, 0 to 1."""
-        if self._busy_since_us is not None:
-            self._busy_us, self._busy_since_us = self._busy_us + now_us - self._busy_since_us, now_us
-        ratio = self._busy_us / max(1, now_us - self._counted_us)
+        period_us = now_us - self._counted_us
+        ratio = (self._busy_us + min(self.busy_us(now_us), period_us)) / max(1, period_us)
         self._busy_us, self._counted_us = 0, now_us
         return min(1.0, ratio)
 

@@ -5,7 +5,8 @@
 It drives nothing and returns no credit: boxes name the frame in which they were found, and a vision service that
 steers by them (`--detector zenoh`) answers that frame. `sightline robots` shows it and its health.
 
-One thread takes batches and decodes them, with others, while another thread detects in the batch before.
+The detector stays on the thread that serves. Under load another thread takes the next batch and decodes it meanwhile.
+With `--share` several services divide the robots among them (`detector_sharing`).
 """
 
 import logging
@@ -16,15 +17,18 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from hashlib import blake2b
 from typing import Final
 
+import numpy as np
+import simplejpeg
 from pydantic import ValidationError
 
 from sightline.protocol.channels import DETECTIONS, FRAME
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.config import first_problem
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import ConfigError, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import (
     LEAST_SIDE_PX,
@@ -34,12 +38,15 @@ from sightline.protocol.messages import (
     FrameHeader,
 )
 from sightline.protocol.transports.link import FleetLink, LatestSlot, Link, Message
+from sightline.protocol.transports.tokens import DetectorToken, parse_token
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.per_robot import DecoderPool
 from sightline.vision_side.detect.plugin_calls import checked_results, maker_of, notices_of
 from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector, detections_payload
 from sightline.vision_side.serving.detector_queue import BatchClock, FairQueue, FrameCounters, QueuedFrame
+from sightline.vision_side.serving.detector_sharing import Assignment, Duty
 from sightline.vision_side.serving.process import ends_on_signal
+from sightline.vision_side.serving.service import LIVE_S
 
 _log: Final = logging.getLogger(__name__)
 
@@ -54,6 +61,15 @@ _MAX_REASONS: Final = 8
 """Reasons that are reported: a plug-in's may be another each time."""
 _OVERLOAD: Final = 0.1
 """Share of unanswered frames, above which an overload is reported."""
+_LOOK_PERIOD_S: Final = 0.02
+"""Between two looks at robots and other services, unless one of them has changed."""
+_FOREIGN: Final = 10
+"""Answers of a service that does not share, after which they are reported. One that joins may answer before its token
+has come."""
+_JOIN_S: Final = 0.2
+"""Time for the tokens of the other services to come, before this one serves its first robot."""
+_WARM_UP_PX: Final = (320, 240)
+_WARM_UP_US: Final = 60_000_000
 LogLine = Callable[[str], None]
 
 
@@ -66,10 +82,32 @@ class ServingOptions:
     """From a frame's arrival to its boxes; later they are of no use, so they are not sent."""
     max_batch: int = 16
     max_pixels: int = 1920 * 1080
+    weight: float | None = None
+    """Its share of the robots, if it divides them with other services of the same detector."""
+    robots: str = "*"
+    """Pattern of the robots that it shares."""
 
 
-def run(config: VisionConfig, detector: Detector, options: ServingOptions) -> int:
-    """Serve until SIGTERM or SIGINT; returns the exit code 0. Raises ConfigError, LinkError as `open_fleet` does."""
+@dataclass(frozen=True, slots=True)
+class ServiceHealth:
+    """The state of a service now; `counters` are those of all robots so far."""
+
+    robots: int
+    services: int
+    busy_ratio: float
+    queue_p95_us: int
+    answer_p95_us: int
+    counters: FrameCounters
+
+
+def run(
+    config: VisionConfig, detector: Detector, options: ServingOptions,
+    observe: "Callable[[DetectorService], None] | None" = None,
+) -> int:
+    """Serve until SIGTERM or SIGINT; returns the exit code 0. `observe` receives the service once it is ready.
+
+    Raises ConfigError, LinkError as `open_fleet` does.
+    """
     from sightline.protocol.transports.flood_limits import limit_floods
     from sightline.protocol.transports.zenoh.link import open_fleet
 
@@ -84,16 +122,21 @@ def run(config: VisionConfig, detector: Detector, options: ServingOptions) -> in
             services.append(DetectorService(fleet_link, detector, options, _log.info))
             where = ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)])
             _log.info("detector: %s for robots %s at %s", options.name, config.robot, where)
+            if options.weight is not None:
+                services[0].join(options.weight, options.robots)
+            if observe is not None:
+                observe(services[0])
             services[0].serve(ending)
     return 0
 
 
 @dataclass(frozen=True, slots=True)
 class _Batch:
-    """Frames that are ready for the detector, and when they were taken."""
+    """Frames that are ready for the detector, when they were taken, and the earliest deadline once it begins."""
 
     frames: list[QueuedFrame[DetectFrame]]
     taken_us: int
+    deadline_us: int = 0
 
 
 class DetectorService:
@@ -101,53 +144,78 @@ class DetectorService:
 
     def __init__(self, fleet_link: FleetLink, detector: Detector, options: ServingOptions, report: LogLine) -> None:
         self._fleet_link, self._detector, self._options, self._report = fleet_link, detector, options, report
+        self._session = secrets.token_hex(4)
         self._guard = threading.Lock()
         self._queue: FairQueue[Message] = FairQueue(options.max_batch, options.deadline_us)
         self._batch_clock = BatchClock(options.deadline_us, monotonic_us())
         self._bell: LatestSlot[bool] = LatestSlot()
         self._links: dict[str, Link] = {}
+        self._sharing: _Sharing | None = None
+        self._changed = threading.Event()
+        """Set when robots or other services have changed."""
         self._pixels = _BatchDecoder(options.max_pixels)
-        self._prepared: LatestSlot[_Batch | None] = LatestSlot()
-        self._place = threading.Semaphore(1)
-        """Free while no prepared batch waits for the detector."""
+        self._preparing = threading.Lock()
+        self._prepared: _Batch | None = None
+        """A batch that was decoded while the detector was busy."""
+        self._ahead: LatestSlot[bool] = LatestSlot()
+        """True to prepare the next batch while the detector is busy, False to end."""
         self._detected = threading.Event()
+        """Set while the detector is free."""
         self._failure: Exception | None = None
-        self._session = secrets.token_hex(4)
         self._seq = 0
         maker = maker_of(detector)
         self._maker = (maker.model_hash[:8], maker.device) if maker else ("", "")
         self._load_checked_s = time.monotonic()
         self._load_before = (0, 0)
         self._overloaded = False
-        self._busy_ratio: float | None = None
+        self._busy_ratio = 0.0
+        self._duties: dict[str, Duty] = {}
+        self._looked_s = time.monotonic()
         self._gone = FrameCounters()
         """Of the robots that have left."""
         self._reasons: set[str] = set()
-        fleet_link.on_new_robot(lambda: self._bell.put(True))
+        fleet_link.on_new_robot(self._on_change)
+
+    def join(self, weight: float, robots: str) -> None:
+        """Warm the detector up, then divide the robots with the other services of the same model.
+
+        Raises:
+            ConfigError: no other service would accept the share.
+        """
+        self._warm_up()
+        maker = maker_of(self._detector)
+        what = maker.model_hash if maker is not None and maker.model_hash else self._options.name
+        # A token has three decimals. All services must compute with one weight.
+        own = DetectorToken(blake2b(what.encode(), digest_size=4).hexdigest(), round(weight, 3), self._session, robots)
+        if parse_token(own.key) != own:
+            raise ConfigError(f"invalid share (weight {weight:g}, robots {robots!r}): expected a weight from 0.01 to "
+                              "1000, and up to 32 letters, digits or '_.-*?'")
+        self._sharing = _Sharing(own, self._options.deadline_us, self._fleet_link, self._report, self._on_change)
 
     def serve(self, ending: threading.Event) -> None:
         """Serve until `ending` is set."""
-        thread = threading.Thread(target=self._detect_prepared, name="detect", daemon=True)
+        thread = threading.Thread(target=self._prepare_ahead, name="prepare", daemon=True)
         thread.start()
-        while not ending.is_set() and self._failure is None:
-            self._look_around()
-            if not self._hand_over():
-                self._bell.take(_WAIT_S)
-            self._check_load(time.monotonic())
-        self._prepared.put(None)
-        thread.join(_END_S)
-        self._pixels.close()
+        try:
+            while not ending.is_set() and self._failure is None:
+                self._look_if_due(time.monotonic())
+                if not self._serve_batch():
+                    self._bell.take(_WAIT_S)
+                self._check_load(time.monotonic())
+        finally:
+            self._ahead.put(False)
+            if self._sharing is not None:
+                self._sharing.leave()
+            thread.join(_END_S)
+            self._pixels.close()
         if self._failure is not None:
             raise self._failure
         self._report(f"detector: ended; {self.about()}")
 
     def turn(self) -> bool:
-        """Serve one batch in this thread; False if nothing waited."""
+        """Look around, and serve one batch; False if nothing waited."""
         self._look_around()
-        batch = self._prepare()
-        if batch is not None:
-            self._detect(batch)
-        return batch is not None
+        return self._serve_batch()
 
     def counters(self) -> dict[str, FrameCounters]:
         """Outcomes of each robot's frames."""
@@ -156,65 +224,131 @@ class DetectorService:
 
     def about(self) -> str:
         """Return model, device and health in one line, for `sightline robots`."""
-        served, dropped = self._totals()
-        with self._guard:
-            age_us, queue_us = self._batch_clock.answer_p95_us(), self._batch_clock.queue_p95_us()
-        age = f", p95 age {age_us / 1000:.0f} ms" if age_us is not None else ""
-        age += f" ({queue_us / 1000:.0f} in the queue)" if age and queue_us is not None else ""
-        busy = f", {self._busy_ratio:.0%} busy" if self._busy_ratio is not None else ""
+        now = self.health()
+        served, dropped = now.counters.served, now.counters.dropped
+        age = f", p95 age {now.answer_p95_us / 1000:.0f} ms ({now.queue_p95_us / 1000:.0f} in the queue)"
+        busy = f", {now.busy_ratio:.0%} busy"
         model, device = self._maker
         what = self._options.name + (f" {model}" if model else "") + (f" on {device}" if device else "")
         state = "overloaded, " if self._overloaded else ""
-        return f"{what}: {state}{len(self._links)} robots, {served} frames answered, {dropped} dropped{age}{busy}"
+        shared = f" of {now.services} services" if self._sharing is not None else ""
+        load = age + busy if served else ""
+        return f"{what}: {state}{now.robots} robots{shared}, {served} frames answered, {dropped} dropped{load}"
 
-    def _totals(self) -> tuple[int, int]:
-        counters = [*self.counters().values(), self._gone]
-        return sum(one.served for one in counters), sum(one.dropped for one in counters)
+    def health(self) -> ServiceHealth:
+        """Return the present state, for a supervisor. From any thread."""
+        total = sum(self.counters().values(), self._gone)
+        robots = list(self._duties.copy().values()).count(Duty.SERVE)
+        services = self._sharing.services if self._sharing is not None else 1
+        with self._guard:
+            queue_us, answer_us = self._batch_clock.queue_p95_us(), self._batch_clock.answer_p95_us()
+        return ServiceHealth(robots, services, self._busy_ratio, queue_us or 0, answer_us or 0, total)
+
+    def is_live(self) -> bool:
+        """Return True while the service turns, and its detector ends each batch."""
+        with self._guard:
+            busy_us = self._batch_clock.busy_us(monotonic_us())
+        return busy_us < LIVE_S * 1e6 and time.monotonic() - self._looked_s <= LIVE_S
+
+    def _on_change(self) -> None:
+        self._changed.set()
+        self._bell.put(True)
+
+    def _look_if_due(self, now_s: float) -> None:
+        if self._changed.is_set() or now_s - self._looked_s >= _LOOK_PERIOD_S:
+            self._changed.clear()
+            self._looked_s = now_s
+            self._look_around()
 
     def _look_around(self) -> None:
-        """Report the detector's notices, drop robots that left, and add new ones."""
+        """Report the detector's notices, drop robots that left, add new ones, and take up or end their service."""
         for line in notices_of(self._detector):
             self._report(f"detector: {line}")
         present = self._fleet_link.robots()
-        for robot in self._links.keys() - present:
+        for robot in self._duties.keys() - present:
             self._forget(robot)
+        if self._sharing is not None:
+            self._sharing.update(monotonic_us())
         for robot in present:
-            if robot not in self._links:
-                self._add_robot(robot)
+            duty = self._sharing.duty(robot, monotonic_us()) if self._sharing is not None else Duty.SERVE
+            before = self._duties.get(robot, Duty.NOTHING)
+            self._duties[robot] = duty
+            if duty is not before:
+                self._change_duty(robot, before, duty)
 
     def _forget(self, robot: str) -> None:
-        self._links.pop(robot).close()
+        if link := self._links.pop(robot, None):
+            link.close()
+        del self._duties[robot]
         with self._guard:
             self._gone += self._queue.forget(robot)
+        if self._sharing is not None:
+            self._sharing.forget(robot)
         self._report(f"detector: {robot} left")
 
-    def _add_robot(self, robot: str) -> None:
-        link = self._links[robot] = self._fleet_link.link(robot)
+    def _change_duty(self, robot: str, before: Duty, now: Duty) -> None:
+        """Subscribe to what the new duty needs, and end what it does not need."""
+        if now is Duty.NOTHING:
+            self._links.pop(robot).close()
+        elif robot not in self._links:
+            self._links[robot] = self._fleet_link.link(robot)
+            if self._sharing is not None:
+                self._links[robot].subscribe(DETECTIONS, self._sharing.receiver(robot))
+        had_frames, has_frames = (duty in (Duty.WATCH, Duty.SERVE) for duty in (before, now))
+        if has_frames and not had_frames:
+            self._links[robot].subscribe(FRAME, self._receiver(robot))
+        elif had_frames and now is Duty.STAND_BY:
+            self._links[robot].unsubscribe(FRAME)
+        if now is Duty.SERVE:
+            self._report(f"detector: receives the frames of {robot}")
+        elif before is Duty.SERVE:
+            self._report(f"detector: {robot} is served by another service")
 
+    def _receiver(self, robot: str) -> Callable[[Message], None]:
         def receive(message: Message) -> None:
+            now_us = monotonic_us()
+            if self._sharing is not None and not self._sharing.serves(robot, now_us):
+                return
             with self._guard:
-                self._queue.offer(robot, message, monotonic_us())
+                self._queue.offer(robot, message, now_us)
             self._bell.put(True)
 
-        link.subscribe(FRAME, receive)
-        self._report(f"detector: receives the frames of {robot}")
+        return receive
 
-    # --- batches: taken and decoded on one thread, detected on another ---
+    def _warm_up(self) -> None:
+        """Detect in a gray image: the first one takes seconds on some devices."""
+        jpeg = simplejpeg.encode_jpeg(np.full((*reversed(_WARM_UP_PX), 3), 128, np.uint8))
+        header = FrameHeader(session="00000000", seq=0, t_us=0)
+        frame = self._pixels.frame("", header, jpeg, _WARM_UP_PX)
+        checked_results(self._detector, [frame], monotonic_us() + _WARM_UP_US, monotonic_us)
 
-    def _hand_over(self) -> bool:
-        """Prepare the next batch just in time for the detector. Returns False if no frame waits."""
-        if not self._place.acquire(timeout=_WAIT_S):
-            return True
-        with self._guard:
-            wait_us = self._batch_clock.wait_us(monotonic_us())
-        if wait_us:
-            self._detected.wait(wait_us / 1e6)
-        batch = self._prepare()
-        if batch is None or not batch.frames:
-            self._place.release()
-        else:
-            self._prepared.put(batch)
-        return batch is not None
+    # --- batches: taken and decoded, here or ahead on another thread, then examined here ---
+
+    def _serve_batch(self) -> bool:
+        with self._preparing:
+            batch, self._prepared = self._prepared or self._prepare(), None
+        if batch is None:
+            return False
+        begun, is_more = self._begin(batch)
+        if is_more:
+            self._ahead.put(True)
+        self._examine(begun)
+        return True
+
+    def _prepare_ahead(self) -> None:
+        """Prepare each next batch just in time for the end of the one before."""
+        try:
+            while self._ahead.take(threading.TIMEOUT_MAX):
+                with self._guard:
+                    wait_us = self._batch_clock.wait_us(monotonic_us())
+                if self._detected.wait(wait_us / 1e6):
+                    continue
+                with self._preparing:
+                    if self._prepared is None and not self._detected.is_set():
+                        self._prepared = self._prepare()
+        except Exception as error:
+            self._failure = error
+            self._bell.put(True)
 
     def _prepare(self) -> _Batch | None:
         """Take and decode the next batch; None if no frame waits. Frames without an image are counted."""
@@ -247,39 +381,37 @@ class DetectorService:
             return None
         return QueuedFrame(turn.robot, self._pixels.frame(turn.robot, header, jpeg, sides), turn.arrived_us)
 
-    def _detect_prepared(self) -> None:
-        """Detect in one prepared batch after the other, until None comes."""
-        try:
-            while (batch := self._next_prepared()) is not None:
-                self._detect(batch)
-        except Exception as error:
-            self._failure = error
-            self._bell.put(True)
+    def _begin(self, batch: _Batch) -> tuple[_Batch, bool]:
+        """Note the begin of a batch.
 
-    def _next_prepared(self) -> _Batch | None:
-        batch = self._prepared.take(threading.TIMEOUT_MAX)
-        self._detected.clear()
-        self._place.release()
-        return batch
-
-    def _detect(self, batch: _Batch) -> None:
+        Returns:
+            The batch without the frames whose deadline has passed, which are counted; and True if more frames wait.
+        """
         with self._guard:
             fresh, deadline_us = self._batch_clock.begin(batch.frames, monotonic_us())
+            is_more = len(batch.frames) > 1 or self._queue.waits
+        if fresh:
+            self._detected.clear()
         examined = {turn.robot for turn in fresh}
         for turn in batch.frames:
             if turn.robot not in examined:
                 self._count(turn.robot, "stale")
-        if not fresh:
+        return _Batch(fresh, batch.taken_us, deadline_us), is_more
+
+    def _examine(self, batch: _Batch) -> None:
+        """Detect in a batch that has begun, and answer its frames."""
+        if not batch.frames:
             return
-        results = checked_results(self._detector, [turn.item for turn in fresh], deadline_us, monotonic_us)
+        frames = [turn.item for turn in batch.frames]
+        results = checked_results(self._detector, frames, batch.deadline_us, monotonic_us)
         ended_us = monotonic_us()
         with self._guard:
-            self._batch_clock.end(len(fresh), ended_us)
+            self._batch_clock.end(len(frames), ended_us)
         self._detected.set()
-        self._pixels.learn(fresh)
-        for turn, result in zip(fresh, results, strict=True):
+        self._pixels.learn(batch.frames)
+        for turn, result in zip(batch.frames, results, strict=True):
             if isinstance(result, str):
-                self._reject(turn.robot, result, late=ended_us > deadline_us)
+                self._reject(turn.robot, result, late=ended_us > batch.deadline_us)
             else:
                 self._answer(turn, result, ended_us - batch.taken_us)
 
@@ -330,6 +462,89 @@ class DetectorService:
             self._overloaded = overloaded
             self._report(f"detector: {'overloaded' if overloaded else 'no longer overloaded'}: {served} "
                       f"answered, {dropped} dropped in {_LOAD_PERIOD_S:.0f} s")
+
+
+class _Sharing:
+    """The duties of this service among those that share the robots. Tokens and answers arrive on the link's threads."""
+
+    def __init__(
+        self, own: DetectorToken, deadline_us: int, fleet_link: FleetLink, report: LogLine,
+        on_change: Callable[[], None],
+    ) -> None:
+        """Find the other services, and show that this one is ready. `on_change` is called after each change of them."""
+        self._own, self._fleet_link, self._report, self._on_change = own, fleet_link, report, on_change
+        self._guard = threading.Lock()
+        self._assignment = Assignment(own, deadline_us)
+        self._foreign = 0
+        """Answers of services that do not share."""
+        self._end_watch = self._watch()
+        time.sleep(_JOIN_S)
+        self.leave = fleet_link.declare_token(own)
+
+    def _watch(self) -> Callable[[], None]:
+        def note(token: DetectorToken, is_present: bool) -> None:
+            with self._guard:
+                self._assignment.on_token(token, is_present)
+            self._on_change()
+
+        return self._fleet_link.watch_detectors(self._own.group, note)
+
+    @property
+    def services(self) -> int:
+        """Return the number of services that share."""
+        return self._assignment.services
+
+    def update(self, now_us: int) -> None:
+        """Find out which services are present."""
+        with self._guard:
+            needs_tokens = self._assignment.needs_tokens()
+            was_shared, is_other = self._assignment.is_shared, self._assignment.update(now_us)
+            is_shared, count = self._assignment.is_shared, self._assignment.services
+        if needs_tokens:
+            ended, self._end_watch = self._end_watch, self._watch()
+            ended()
+        if is_shared and is_other:
+            self._report(f"detector: {count} services share the robots")
+        elif was_shared and not is_shared:
+            self._report("detector: more services than sharing supports; this one serves every robot until some end")
+
+    def duty(self, robot: str, now_us: int) -> Duty:
+        """Return what this service does for a robot now."""
+        with self._guard:
+            return self._assignment.duty(robot, now_us)
+
+    def serves(self, robot: str, now_us: int) -> bool:
+        """Note a frame. Returns True if this service answers it."""
+        with self._guard:
+            return self._assignment.on_frame(robot, now_us)
+
+    def receiver(self, robot: str) -> Callable[[Message], None]:
+        """Return what receives the answers of other services to a robot's frames."""
+
+        def receive(message: Message) -> None:
+            try:
+                service = decode(DetectionsHeader, message.header).session
+            except WireError:
+                return
+            if message.source != ROLE or service == self._own.session:
+                return
+            with self._guard:
+                is_sharing = self._assignment.on_answer(robot, service, monotonic_us())
+            if not is_sharing:
+                self._note_foreign(robot)
+
+        return receive
+
+    def forget(self, robot: str) -> None:
+        """Forget a robot that has left."""
+        with self._guard:
+            self._assignment.forget(robot)
+
+    def _note_foreign(self, robot: str) -> None:
+        self._foreign += 1
+        if self._foreign == _FOREIGN:
+            self._report(f"detector: another service also detects for {robot}; start it with --share and the same "
+                         "detector")
 
 
 class _BatchDecoder:

@@ -93,6 +93,10 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("detector", "check", "hsv", "--device", "gpu"), 2, "device"),
         (("detector", "check", "onnx:/nowhere.onnx"), 2, "No such file"),
         (("detector", "--serve", "hsv", "list"), 2, "exclude each other"),
+        (("detector", "--serve", "hsv", "--weight", "2"), 2, "add --share"),
+        (("detector", "--serve", "hsv", "--share", "--weight", "0"), 2, "0.01"),
+        (("detector", "--serve", "hsv", "--share", "--weight", "nan"), 2, "weight"),
+        (("detector", "--serve", "hsv", "--share", "--robot", "a/b", "--listen", "tcp/127.0.0.1:1"), 2, "a/b"),
         (("vision", "--detector", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
         (("vision", "--shadow", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
         (("vision", "--dry-run", "--detector", "boxes"), 2, "needs a local detector"),
@@ -169,6 +173,16 @@ def test_detector_service_reads_its_robots_from_settings(
     served = []
     monkeypatch.setattr(detector_service, "run", lambda config, *_: served.append(config.robot) or 0)
     assert run(capsys, "detector", "--serve", "hsv", *given)[0] == 0 and served == [robot]
+
+
+@pytest.mark.parametrize(("given", "share"), [
+    ((), (None, "*")), (("--share",), (1.0, "*")), (("--share", "--weight", "2.5", "--robot", "r*"), (2.5, "r*")),
+])  # fmt: skip
+def test_share_of_a_detector_service_has_its_weight_and_robots(capsys, monkeypatch, given, share) -> None:
+    served = []
+    monkeypatch.setattr(detector_service, "run", lambda _config, _detector, options: served.append(options) or 0)
+    assert run(capsys, "detector", "--serve", "hsv", *given)[0] == 0
+    assert [(one.weight, one.robots) for one in served] == [share]
 
 
 def test_detector_group_without_a_subcommand_shows_its_help(capsys) -> None:

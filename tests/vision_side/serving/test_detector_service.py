@@ -173,7 +173,7 @@ class Late:
 
 @pytest.mark.parametrize("answers", [True, False])
 def test_answer_after_the_deadline_is_late_and_not_rejected(answers):
-    bench = Bench(Late(answers), deadline_us=5_000)
+    bench = Bench(Late(answers), deadline_us=50_000)
     assert bench.look() is None
     assert (bench.tally().late, bench.tally().rejected) == (1, 0)
 
@@ -182,11 +182,12 @@ class Partial:
     """A detector that uses pixels, remembers which images were decoded before, and fails on the frames of one robot."""
 
     def __init__(self, failing=""):
-        self.failing, self.decoded, self.batches, self.slow = failing, [], [], threading.Event()
+        self.failing, self.decoded, self.batches, self.seqs, self.slow = failing, [], [], [], threading.Event()
 
     def detect(self, frames, deadline_us):
         self.batches.append([one.robot for one in frames])
         self.decoded += [one.decoded is not None for one in frames]
+        self.seqs += [one.header.seq for one in frames]
         if any(one.robot == self.failing for one in frames):
             raise RuntimeError(f"cannot bear {self.failing}")
         for one in frames:
@@ -259,12 +260,35 @@ def test_two_batches_are_in_progress_and_a_slow_detector_gets_the_newest_frames(
     tally = bench.service.counters()
     assert all(one.overtaken > one.served >= 2 and one.late == 0 for one in tally.values()), (sent, tally)
     assert abs(tally["r1"].served - tally["r2"].served) <= 1
+    assert len(detector.seqs) == len(set(detector.seqs)), "each frame is examined once"
 
 
-def test_failure_outside_the_detector_ends_the_service_with_its_error(monkeypatch):
-    bench = Bench(Named(GOOD))
-    monkeypatch.setattr(bench.service, "_detect", lambda batch: 1 / 0)
+def test_batch_that_waited_too_long_is_counted_and_not_examined():
+    detector = Partial()
+    bench = Bench(detector, deadline_us=5_000)
     bench.service.turn()
     bench.send(bench.robot)
+    batch = bench.service._prepare()
+    time.sleep(0.006)
+    bench.service._examine(bench.service._begin(batch)[0])
+    assert len(batch.frames) == 1 and detector.batches == [] and bench.tally().stale == 1
+
+
+def test_failure_on_the_thread_that_prepares_ends_the_service_with_its_error(monkeypatch):
+    detector, bench = Partial(), None
+
+    def fail():
+        if threading.current_thread().name == "prepare":
+            raise ZeroDivisionError
+        for link in (bench.robot, other):
+            bench.send(link)
+        return prepare()
+
+    detector.slow.set()
+    bench = Bench(detector)
+    bench.present, other = ["r1", "r2"], bench.network.link("r2")
+    bench.service.turn()
+    prepare = bench.service._prepare
+    monkeypatch.setattr(bench.service, "_prepare", fail)
     with pytest.raises(ZeroDivisionError):
         bench.service.serve(threading.Event())

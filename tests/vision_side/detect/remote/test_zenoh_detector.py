@@ -366,6 +366,19 @@ def test_invalid_service_does_not_block_a_valid_service(pair):
         assert waiting.detect([frame(seq + 10)], within(1.0))[0]
 
 
+def test_invalid_boxes_end_the_wait_only_if_they_are_of_the_preferred_service(pair):
+    robot, waiting = pair
+    robot.say(frame(2), BOX, by="00000001")
+    assert _label(waiting, frame(2)) == "ball"
+    robot.say(frame(3), BOX, by="00000002", width_px=640)
+    time.sleep(0.02)
+    robot.say(frame(3), BOX, by="00000001")
+    assert _label(waiting, frame(3)) == "ball" and set(waiting.rejected) <= {"OTHER_SIZE"}
+    robot.say(frame(4), BOX, by="00000001", width_px=640)
+    began_s = time.monotonic()
+    assert _label(waiting, frame(4), 1.5) is None and time.monotonic() - began_s < 1.0
+
+
 def test_boxes_of_another_source_are_ignored(pair):
     robot, waiting = pair
     asked = frame(3)
