@@ -4,6 +4,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from sightline.protocol.config import PluginRegistry
     from sightline.vision_side.detect.contract import PromiseResult, Times
     from sightline.vision_side.detect.port import Detector
+    from sightline.vision_side.serving.detector_service import ServingOptions
 
 
 Robots = Annotated[
@@ -44,6 +46,10 @@ Weight = Annotated[
     float,
     typer.Option("--weight", min=LEAST_WEIGHT, max=MOST_WEIGHT,
                  help="With --share: its part of the robots, e.g. 2 for twice."),
+]
+Metrics = Annotated[
+    str | None,
+    typer.Option("--metrics", metavar="[HOST:]PORT", help="Serve /metrics, /live, /ready at this port, e.g. 9466."),
 ]
 _REMOTE = ("zenoh", "boxes")
 _RECOMMENDED = (
@@ -80,6 +86,7 @@ def serve(
     max_batch: MaxBatch = 16,
     share: Share = False,
     weight: Weight = 1.0,
+    metrics: Metrics = None,
     config: ConfigFile = None,
     sets: Sets = None,
     log: LogForm = None,
@@ -110,15 +117,28 @@ def serve(
     with needs("vision"):
         from sightline.vision_side.detect.plugin_calls import close_detector
         from sightline.vision_side.detect.registry import configured_detector
-        from sightline.vision_side.serving.detector_service import ServingOptions, run
+        from sightline.vision_side.serving.detector_service import ServingOptions
 
         detector = configured_detector(loaded)
         try:
             serving = ServingOptions(name, round(deadline_ms * 1000), max_batch, loaded.max_pixels,
                                      weight if share else None, loaded.robot)
-            return run(loaded, detector, serving)
+            return _run(loaded, detector, serving, metrics)
         finally:
             close_detector(detector)
+
+
+def _run(config: Any, detector: "Detector", options: "ServingOptions", metrics: str | None) -> int:
+    from sightline.vision_side.serving.detector_service import run
+
+    if metrics is None:
+        return run(config, detector, options)
+    with needs("metrics"):
+        import_module("prometheus_client")
+    from sightline.operator_side.cockpit.detector_metrics import served
+
+    with served(metrics) as observe:
+        return run(config, detector, options, observe)
 
 
 def list_detectors(as_json: Json = False) -> int:

@@ -72,9 +72,14 @@ def served(where: str) -> Iterator[Observe]:
         ConfigError: the address is invalid.
         LinkError: the port is in use.
     """
+    metrics = VisionMetrics()
+    with serving(metrics, *listening_address(where)):
+        yield metrics.look_at
+
+
+def listening_address(where: str) -> tuple[str, int]:
+    """Return host and port of `[HOST:]PORT`. Raises ConfigError for an invalid one."""
     match = _WHERE.fullmatch(where)
     if match is None or not 1 <= int(match[2]) <= 65_535:
         raise ConfigError(f"invalid --metrics '{where}': expected PORT or HOST:PORT, e.g. 9465 or 0.0.0.0:9465")
-    metrics = VisionMetrics()
-    with serving(metrics, match[1] or _LOOPBACK, int(match[2])):
-        yield metrics.look_at
+    return match[1] or _LOOPBACK, int(match[2])

@@ -97,6 +97,7 @@ def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
         (("detector", "--serve", "hsv", "--share", "--weight", "0"), 2, "0.01"),
         (("detector", "--serve", "hsv", "--share", "--weight", "nan"), 2, "weight"),
         (("detector", "--serve", "hsv", "--share", "--robot", "a/b", "--listen", "tcp/127.0.0.1:1"), 2, "a/b"),
+        (("detector", "--serve", "hsv", "--metrics", "x"), 2, "expected PORT or HOST:PORT"),
         (("vision", "--detector", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
         (("vision", "--shadow", "hsw", "--connect", "tcp/127.0.0.1:1"), 2, "did you mean 'hsv'"),
         (("vision", "--dry-run", "--detector", "boxes"), 2, "needs a local detector"),
