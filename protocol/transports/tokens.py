@@ -55,7 +55,7 @@ class VisionToken(NamedTuple):
     @property
     def key(self) -> str:
         """Return its key."""
-        return f"{PREFIX}/{VISION_KIND}/{self.name}/{self.weight:g}/{self.instance}"
+        return f"{PREFIX}/{VISION_KIND}/{self.name}/{self.weight:.7g}/{self.instance}"
 
 
 class DriverToken(NamedTuple):

@@ -218,7 +218,8 @@ class SharedFleet(Fleet):
         self._withdraw: dict[str, Callable[[], None]] = {}
         """Ends the token with which a robot is driven."""
         instance = secrets.token_hex(4)
-        own = VisionToken(config.share.name or f"vision-{instance}", config.share.weight, instance)
+        # The key of a token has three decimals.
+        own = VisionToken(config.share.name or f"vision-{instance}", round(config.share.weight, 3), instance)
         named = () if set("*?") & set(config.robot) else (config.robot,)
         self.sharing = Sharing(own, named)
         self._twin_reported = False

@@ -32,7 +32,7 @@ def test_each_token_has_one_key(token, key):
     assert parse_token(key) == token
 
 
-@pytest.mark.parametrize("weight", [0.01, 0.125, 1.0, 3.5, 999.999, 1000.0])
+@pytest.mark.parametrize("weight", [0.01, 0.125, 1.0, 3.5, 999.999, 1000.0, 123.457])
 def test_a_weight_survives_its_key(weight):
     for token in (VisionToken("v", weight, "0a1b2c3d"), DetectorToken("0a1b2c3d", weight, "00000001")):
         assert parse_token(token.key) == token
