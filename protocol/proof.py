@@ -4,7 +4,7 @@ An element is the hash of the one that follows it. Only the sender knows the ele
 nothing secret crosses the network. A receiver hashes a new element until it meets the last one that it accepted.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from hashlib import sha256
 from typing import Final, NamedTuple
 
@@ -12,7 +12,7 @@ ELEMENT_BYTES: Final = 16
 """Security level: 128 bits."""
 MAX_LOST: Final = 64
 """Security limit: hashes for one command. So many commands may be lost in a row, more than in the life of a lease."""
-CHAIN_LENGTH: Final = 1024
+_LENGTH: Final = 1024
 _ANNOUNCED: Final = 2 * MAX_LOST
 """The next chain is announced in so many commands, so that the robot receives one of them."""
 
@@ -37,8 +37,8 @@ class ProofChain:
     def __init__(self, draw: Callable[[int], bytes]) -> None:
         self._draw = draw
         self._elements = self._new()
-        self.commitment: Final = _hashed(self._elements[-1]).hex()
-        """What the first proof continues. It proves nothing and reveals nothing."""
+        self.token: Final = _token(self._elements[-1])
+        """What the token of this driver contains. Before the first proof only this sender can compute it."""
         self._following: list[bytes] = []
         self._announced: str | None = None
 
@@ -55,22 +55,37 @@ class ProofChain:
 
     def _new(self) -> list[bytes]:
         elements = [self._draw(ELEMENT_BYTES)]
-        for _ in range(CHAIN_LENGTH - 1):
+        for _ in range(_LENGTH - 1):
             elements.append(_hashed(elements[-1]))
         return elements
 
 
-def continues(proof: str | None, last: Proof, most: int = MAX_LOST) -> bool:
-    """Return True if `proof` was revealed by the sender of `last`, at most `most` commands later."""
+def continues(proof: str | None, last: Proof) -> bool:
+    """Return True if `proof` was revealed by the sender of `last`, at most MAX_LOST commands later."""
     if proof is None or last.proof is None:
         return False
     known = {bytes.fromhex(one) for one in last if one is not None}
     element = bytes.fromhex(proof)
-    for _ in range(most):
+    for _ in range(MAX_LOST):
         element = _hashed(element)
         if element in known:
             return True
     return False
+
+
+def tokens_of(proof: str | None) -> Iterator[str]:
+    """Yield the tokens of a driver whose `proof` is one of its first MAX_LOST."""
+    if proof is None:
+        return
+    element = bytes.fromhex(proof)
+    for _ in range(MAX_LOST):
+        yield _token(element)
+        element = _hashed(element)
+
+
+def _token(element: bytes) -> str:
+    # A hash of its own kind: else the hash of one token would be another token of the same driver.
+    return sha256(b"sightline-token/" + element).digest()[:ELEMENT_BYTES].hex()
 
 
 def _hashed(element: bytes) -> bytes:

@@ -5,7 +5,7 @@
                         REJECTED     what the transport rejected so far: how often, by reason
                         FAULTS       exceptions since the last such packet: how often, by part
                         READY        the endpoint is open
-                        TOKEN        the token of a driver appeared or ended: its commitment
+                        TOKEN        the token of a driver appeared or ended
               aside     ISSUED       a frame is about to be published: seq, capture time, fingerprint
     driver -> network   COMMAND_ACK  a twist was validated: whose, which frame, computing time, and the holder
                         PUBLISH      bytes to publish: channel, header, payload

@@ -229,7 +229,7 @@ class Sender:
 
     def declare(self) -> Callable[[], None]:
         """Declare the token of this session; it ends with the returned function. Not applicable without tokens."""
-        return self.bench.declare_token(self.proofs.commitment)
+        return self.bench.declare_token(self.proofs.token)
 
     def drive(self, text: bytes | None = CRAWL) -> None:
         """From now on answer every frame with this twist; None: go back to acknowledging."""

@@ -254,7 +254,7 @@ class Link(Closing):
         """Return True if a peer subscribes to `channel`. Use it to save work, never for safety."""
 
     def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
-        """Call `callback` with the commitment of each driver's token of this robot, and whether it is present.
+        """Call `callback` with each driver's token of this robot, and whether it is present.
 
         Only Zenoh has tokens (`protocol/transports/tokens.py`); on other links the lease alone ends.
         """

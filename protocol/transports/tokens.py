@@ -5,8 +5,8 @@
     sightline-token/driver/ROBOT/NAME/COMMITMENT           a session of it that drives a robot, or is about to
     sightline-token/detector/GROUP/WEIGHT/SESSION/ROBOTS   a detector service that shares robots
 
-A token ends with its process, some milliseconds later, or with its link. `COMMITMENT` is the start of the driver's hash
-chain (`protocol/proof.py`): only the driver can send a twist that continues it, so a robot knows whose token it is.
+A token ends with its process, some milliseconds later, or with its link. `TOKEN` follows from the first proof of the
+driver (`protocol/proof.py`): only the driver can compute it before, so a robot knows whose token it is.
 """
 
 import re
@@ -24,7 +24,7 @@ _WEIGHT: Final = r"\d{1,4}(?:\.\d{1,3})?"
 _KEYS: Final = re.compile(
     rf"{PREFIX}/(?:robot/(?P<robot>{NAME})"
     rf"|vision/(?P<name>{NAME})/(?P<weight>{_WEIGHT})/(?P<instance>[0-9a-f]{{8}})"
-    rf"|driver/(?P<driven>{NAME})/(?P<driver>{NAME})/(?P<commitment>[0-9a-f]{{32}})"
+    rf"|driver/(?P<driven>{NAME})/(?P<driver>{NAME})/(?P<token>[0-9a-f]{{32}})"
     rf"|detector/(?P<group>[0-9a-f]{{8}})/(?P<share>{_WEIGHT})/(?P<session>[0-9a-f]{{8}})"
     r"/(?P<pattern>[A-Za-z0-9_.+=-]{1,32}))",
     re.ASCII,
@@ -63,12 +63,12 @@ class DriverToken(NamedTuple):
 
     robot: str
     name: str
-    commitment: str
+    token: str
 
     @property
     def key(self) -> str:
         """Return its key."""
-        return f"{PREFIX}/{DRIVER_KIND}/{self.robot}/{self.name}/{self.commitment}"
+        return f"{PREFIX}/{DRIVER_KIND}/{self.robot}/{self.name}/{self.token}"
 
 
 class DetectorToken(NamedTuple):
@@ -113,7 +113,7 @@ def parse_token(key: str) -> AnyToken | None:
     if parts["robot"]:
         return RobotToken(parts["robot"])
     if parts["driven"]:
-        return DriverToken(parts["driven"], parts["driver"], parts["commitment"])
+        return DriverToken(parts["driven"], parts["driver"], parts["token"])
     weight = float(parts["weight"] or parts["share"])
     if not LEAST_WEIGHT <= weight <= MOST_WEIGHT:
         return None

@@ -111,7 +111,7 @@ class DriverCore:
     def on_token(self, token: str, is_present: bool, now_us: int) -> None:
         """Note that the token of a driver appeared or ended."""
         if is_present:
-            self.gate.add_token(token, now_us)
+            self.gate.add_token(token)
         else:
             self.gate.end_token(token, now_us)
 

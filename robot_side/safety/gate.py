@@ -378,9 +378,9 @@ class SafetyGate:
             self._end(Event.HUMAN_LOST, "the operator released control; arm again")
         return "released"
 
-    def add_token(self, token: str, now_us: int) -> None:
+    def add_token(self, token: str) -> None:
         """Store the token of a driver (`protocol/transports/tokens.py`)."""
-        self._lease.add_token(token, now_us)
+        self._lease.add_token(token)
 
     def end_token(self, token: str, now_us: int) -> bool:
         """End the lease of the driver with this token, and return True if it held it.

@@ -1,19 +1,18 @@
 """Grant the lease to one (role, session) at a time, by rank, while its commands are accepted. Pure."""
 
 from collections import OrderedDict
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import Holder
-from sightline.protocol.proof import CHAIN_LENGTH, MAX_LOST, NO_PROOF, Proof, continues
+from sightline.protocol.proof import NO_PROOF, Proof, continues, tokens_of
 
 # Roles that may drive. STOP ranks above all of them and is not a role.
 RANKS = {"guest": 0, "vision": 1, "teleop": 2}
 # After the loss of one of these drivers, the robot stops and must be armed again.
 HUMANS = frozenset({"teleop"})
-# Security limits: tokens of drivers, and sessions that drive no more. A driver's own tokens leave last.
-_MAX_TOKENS, _MAX_FENCED = 8, 64
+# Security limits: tokens of drivers, and sessions that drive no more. The token of the holder leaves last.
+_MAX_TOKENS, _MAX_FENCED = 64, 64
 
 
 @dataclass(slots=True)
@@ -55,7 +54,7 @@ class Lease:
             return True
         silent_us = now_us - (self.expires_us - self.life_us)
         return bool(self.token) and silent_us > self.succession_us and who.source == holder.source \
-            and any(self._tokens_of(proof, MAX_LOST))
+            and bool(self._token_of(proof))
 
     def check_proof(self, who: Holder, proof: Proof, now_us: int) -> None:
         """Check that a message which names the holder is of the holder.
@@ -74,7 +73,9 @@ class Lease:
         if holder != who:
             if holder is not None and holder.source == who.source:
                 self._fence(holder)
-            self.token = "" if who.source in HUMANS else next(self._tokens_of(proof, CHAIN_LENGTH), "")
+            # The same session goes on after a silence: its first proofs are long ago.
+            goes_on = who == self.holder and self.token in self._tokens
+            self.token = self.token if goes_on else "" if who.source in HUMANS else self._token_of(proof)
         self.holder, self.expires_us, self.proof = who, now_us + self.life_us, proof
 
     def advance(self, who: Holder, proof: Proof, now_us: int) -> None:
@@ -86,14 +87,11 @@ class Lease:
         """End the lease now."""
         self.holder, self.expires_us, self.proof, self.token = None, 0, NO_PROOF, ""
 
-    def add_token(self, token: str, now_us: int) -> None:
-        """Store the token of a driver, which may be the holder."""
+    def add_token(self, token: str) -> None:
+        """Store the token of a driver that may take the lease. It costs no hash: a peer may declare any number."""
         self._tokens[token] = None
         if len(self._tokens) > _MAX_TOKENS:
             del self._tokens[next(one for one in self._tokens if one != self.token)]
-        holder = self.live_holder(now_us)
-        if holder is not None and holder.source not in HUMANS and not self.token:
-            self.token = next(self._tokens_of(self.proof, CHAIN_LENGTH), "")
 
     def end_token(self, token: str, now_us: int) -> bool:
         """Return True if the lease ended with this token. Its session never drives again."""
@@ -105,9 +103,9 @@ class Lease:
         self.drop()
         return True
 
-    def _tokens_of(self, proof: Proof, most: int) -> Iterator[str]:
-        """Yield the tokens whose driver revealed `proof`, at most `most` commands after its first one."""
-        return (token for token in self._tokens if continues(proof.proof, Proof(token), most))
+    def _token_of(self, proof: Proof) -> str:
+        """Return the token whose driver revealed `proof`, or "" without one."""
+        return next((token for token in tokens_of(proof.proof) if token in self._tokens), "") if self._tokens else ""
 
     def _fence(self, who: Holder) -> None:
         self._fenced[who] = None

@@ -175,7 +175,6 @@ class Promises:
         """The token of a driver appeared or ended."""
         if is_present:
             self.tokens |= 1 << driver
-            self.bound |= self.holder == driver
         else:
             self.tokens &= ~(1 << driver)
             if self.bound and self.holder == driver:

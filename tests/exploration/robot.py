@@ -14,7 +14,7 @@ from pathlib import Path
 from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import STILL, AnswerHeader, Echo, Holder, Request, RequestHeader, State, Twist, Verb
-from sightline.protocol.proof import NO_PROOF, Proof
+from sightline.protocol.proof import NO_PROOF, Proof, tokens_of
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver import core as driver_core
@@ -88,8 +88,7 @@ def _chain(secret: bytes) -> tuple[str, ...]:
 CHAINS = tuple(_chain(bytes(15) + bytes([driver])) for driver in range(len(DRIVERS)))
 """Each state has the proofs of the same three commands, since a proof counts only by those before it."""
 OLD_PROOF, LAST_PROOF, NEXT_PROOF = range(3)
-TOKENS = tuple(sha256(bytes.fromhex(chain[OLD_PROOF])).digest()[:16].hex() for chain in CHAINS)
-"""The commitment of each driver."""
+TOKENS = tuple(next(tokens_of(chain[OLD_PROOF])) for chain in CHAINS)
 SHARING = (0, 1)
 """The drivers that may declare their token: two vision services."""
 _OWNER = {proof: driver for driver, chain in enumerate(CHAINS) for proof in chain}
@@ -98,6 +97,7 @@ _OWNER = {proof: driver for driver, chain in enumerate(CHAINS) for proof in chai
 driver_core.decode = cache(driver_core.decode)
 driver_core.parse_twist = cache(driver_core.parse_twist)
 safety_lease.continues = cache(safety_lease.continues)
+safety_lease.tokens_of = cache(lambda proof: tuple(tokens_of(proof)))
 safety_gate.LastRejection = cache(safety_gate.LastRejection)
 safety_gate.Holder = driver_core.Holder = _holder
 Holder.__eq__ = object.__eq__  # of each value there is one

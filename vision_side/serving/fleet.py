@@ -309,7 +309,7 @@ class SharedFleet(Fleet):
     def _renew(self, robot: str, service: Service) -> None:
         """Drive with a new session from now on. Its token is there before its first command."""
         sender = DriverSession()
-        token = DriverToken(robot, self.sharing.own.name, sender.proofs.commitment)
+        token = DriverToken(robot, self.sharing.own.name, sender.proofs.token)
         withdraw = self._fleet_link.declare_token(token)
         service.sender = sender
         self._withdraw_token(robot)

@@ -26,8 +26,8 @@ BETWEEN_CHANGES_US: Final = 1_000_000
 """Shortest time between two claims of one robot by one service."""
 NOT_MINE_US: Final = 300_000
 """Time without the lease, although commands leave, after which a driver needs a new session."""
-FRESH_COMMANDS: Final = 900
-"""Commands of one session without the lease. After 1024 a robot no longer knows whose token it is."""
+FRESH_COMMANDS: Final = 48
+"""Commands of one session without the lease. After 64 a robot no longer knows whose token it is."""
 MAX_ROBOTS, MAX_SERVICES, MAX_DRIVERS = 10_000, 256, 16
 """Security limits: robots, services, and drivers of one robot. Further tokens do not count."""
 

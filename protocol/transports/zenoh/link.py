@@ -177,10 +177,10 @@ class ZenohLink(BaseLink):
                 self._ending.callback(declare_token(self._session, RobotToken(self.robot)))
 
     def watch_drivers(self, callback: Callable[[str, bool], None]) -> None:
-        """Call `callback` on a thread of Zenoh with the commitment of each driver's token, and if it is present."""
+        """Call `callback` on a thread of Zenoh with the token of each driver, and if it is present."""
         def note(token: AnyToken, is_present: bool) -> None:
             if isinstance(token, DriverToken) and token.robot == self.robot:
-                callback(token.commitment, is_present)
+                callback(token.token, is_present)
 
         with self._declaring:
             if not self._closed:

@@ -122,12 +122,12 @@ def test_command_for_a_frame_of_the_future_returns_no_credit_and_for_a_stale_one
 
 def test_lease_ends_with_the_token_of_the_driver():
     core, chain = core_of(), ProofChain(Random(1).randbytes)
-    core.on_token(chain.commitment, True, NOW_US)
+    core.on_token(chain.token, True, NOW_US)
     core.on_issued(7, NOW_US, 0)
     core.on_twist(twist(proof=chain.next().proof), NOW_US)
     core.on_token("0" * 32, False, NOW_US)
     assert core.gate.holder(NOW_US) is not None
-    core.on_token(chain.commitment, False, NOW_US)
+    core.on_token(chain.token, False, NOW_US)
     assert core.gate.holder(NOW_US) is None
 
 

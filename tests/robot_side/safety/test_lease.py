@@ -123,7 +123,7 @@ class Vision:
     def __init__(self, seed):
         self.who = Holder(source="vision", session=f"{seed:08x}")
         self._chain = ProofChain(Random(seed).randbytes)
-        self.token, self.proof = self._chain.commitment, self._chain.next()
+        self.token, self.proof = self._chain.token, self._chain.next()
 
     def later(self, commands):
         """The proof that many commands after the first one."""
@@ -136,27 +136,20 @@ def held(token_first=True):
     """A lease of 1000 us that a driver with a token took at 0, with a succession after 400 us, and the driver."""
     lease, first = Lease(1_000, 400), Vision(1)
     if token_first:
-        lease.add_token(first.token, 0)
+        lease.add_token(first.token)
     lease.take(first.who, 0, first.proof)
     return lease, first
 
 
-@pytest.mark.parametrize("token_first", [True, False])
-def test_token_is_of_the_driver_whose_proof_continues_it(token_first):
-    lease, first = held(token_first)
-    lease.add_token(Vision(2).token, 0)
-    assert lease.token == (first.token if token_first else "")
-    lease.add_token(first.token, 999)
-    assert lease.token == first.token
-
-
-def test_token_of_a_driver_that_is_gone_is_of_no_holder():
-    lease, first = held(token_first=False)
-    lease.add_token(first.token, 1_000)
-    assert lease.token == ""
+def test_token_is_of_the_driver_that_takes_the_lease_while_it_is_there():
     lease, first = held()
-    lease.add_token(Vision(2).token, 0)
-    assert lease.token == first.token, "it has one"
+    assert lease.token == first.token
+    lease.add_token(Vision(2).token)
+    assert lease.token == first.token
+    lease, first = held(token_first=False)
+    lease.add_token(first.token)
+    lease.take(first.who, 10, first.later(1))
+    assert lease.token == "", "it came later"
 
 
 @pytest.mark.parametrize(("at_us", "ends"), [(0, True), (999, True), (1_000, False)])
@@ -177,7 +170,7 @@ def test_empty_token_ends_no_lease():
 def test_token_that_ended_is_of_no_later_driver():
     lease, first = held()
     second = Vision(2)
-    lease.add_token(second.token, 0)
+    lease.add_token(second.token)
     lease.end_token(second.token, 0)
     lease.end_token(first.token, 0)
     lease.take(second.who, 10, second.proof)
@@ -187,7 +180,7 @@ def test_token_that_ended_is_of_no_later_driver():
 def test_holder_keeps_its_token_in_its_later_chains():
     lease, first = held()
     lease.take(first.who, 10, first.later(2_000))
-    lease.add_token(Vision(2).token, 10)
+    lease.add_token(Vision(2).token)
     assert lease.token == first.token
 
 
@@ -201,7 +194,7 @@ def test_dropped_lease_has_no_token():
 def test_driver_with_a_token_is_succeeded_after_its_silence_by_one_with_a_token(at_us, succeeds):
     lease, first = held()
     second = Vision(2)
-    lease.add_token(second.token, 0)
+    lease.add_token(second.token)
     assert lease.may_take(second.who, at_us, second.proof) is succeeds
     assert not lease.may_take(second.who, at_us), "without its proof"
     assert not lease.may_take(Vision(3).who, at_us, Vision(3).proof), "without its token"
@@ -213,7 +206,7 @@ def test_driver_with_a_token_is_succeeded_after_its_silence_by_one_with_a_token(
 def test_driver_without_a_token_is_not_succeeded():
     lease, _ = held(token_first=False)
     second = Vision(2)
-    lease.add_token(second.token, 0)
+    lease.add_token(second.token)
     assert not lease.may_take(second.who, 900, second.proof)
 
 
@@ -221,20 +214,27 @@ def test_driver_without_a_token_is_not_succeeded():
 def test_successor_proves_within_its_first_64_commands_whose_token_it_is(commands, succeeds):
     lease, _ = held()
     second = Vision(2)
-    lease.add_token(second.token, 0)
+    lease.add_token(second.token)
     assert lease.may_take(second.who, 500, second.later(commands)) is succeeds
 
 
-@pytest.mark.parametrize(("commands", "known"), [(1_023, True), (1_024, False)])
-def test_driver_proves_within_its_first_chain_whose_token_it_is(commands, known):
+@pytest.mark.parametrize(("commands", "known"), [(63, True), (64, False)])
+def test_driver_proves_within_its_first_64_commands_whose_token_it_is(commands, known):
     lease, first = Lease(1_000, 400), Vision(1)
-    lease.add_token(first.token, 0)
+    lease.add_token(first.token)
     lease.take(first.who, 0, first.later(commands))
     assert (lease.token == first.token) is known
-    lease, first = Lease(1_000, 400), Vision(1)
-    lease.take(first.who, 0, first.later(commands))
-    lease.add_token(first.token, 0)
-    assert (lease.token == first.token) is known
+
+
+@pytest.mark.parametrize("gap_us", [0, 1_000, 50_000])
+def test_holder_that_takes_the_lease_again_keeps_its_token_unless_it_ended(gap_us):
+    lease, first = held()
+    lease.take(first.who, 900, first.later(500))
+    lease.take(first.who, 1_900 + gap_us, first.later(500))
+    assert lease.token == first.token
+    lease.end_token(first.token, 5_000 + gap_us)
+    lease.take(first.who, 5_000 + gap_us, first.later(500))
+    assert lease.token == "", "it ended while the lease was over"
 
 
 def test_succeeded_driver_is_fenced_and_one_whose_lease_ended_or_that_a_human_displaced_is_not():
@@ -248,35 +248,35 @@ def test_succeeded_driver_is_fenced_and_one_whose_lease_ended_or_that_a_human_di
     lease.take(second.who, 1_500, second.proof)
     assert not lease.is_fenced(first.who) and lease.token == ""
     human = Holder(source="teleop", session="0000000f")
-    lease.add_token(first.token, 1_500)
+    lease.add_token(first.token)
     lease.take(human, 1_600, first.proof)
     assert not lease.is_fenced(second.who) and lease.token == "", "a human has no token"
-    lease.add_token(Vision(4).token, 1_600)
+    lease.add_token(Vision(4).token)
     assert lease.token == ""
 
 
 def test_human_that_holds_the_lease_gets_no_token():
     lease, vision = Lease(1_000, 400), Vision(1)
     lease.take(Holder(source="teleop", session="0000000f"), 0, vision.proof)
-    lease.add_token(vision.token, 0)
+    lease.add_token(vision.token)
     assert lease.token == ""
 
 
-@pytest.mark.parametrize("count", [7, 8, 50])
+@pytest.mark.parametrize("count", [63, 64, 100])
 def test_tokens_are_bounded_and_that_of_the_holder_stays(count):
     lease, first = held()
     others = [Vision(number) for number in range(2, 2 + count)]
     for other in others:
-        lease.add_token(other.token, 0)
+        lease.add_token(other.token)
     kept = [other for other in others if lease.may_take(other.who, 500, other.proof)]
-    assert kept == others[-7:], "eight with that of the holder"
+    assert kept == others[-63:], "64 with that of the holder"
     assert lease.end_token(first.token, 0)
 
 
 def test_fenced_sessions_are_bounded_and_the_oldest_is_forgotten():
     lease, drivers = Lease(1_000, 400), [Vision(number) for number in range(1, 67)]
     for driver in drivers:
-        lease.add_token(driver.token, 0)
+        lease.add_token(driver.token)
         lease.take(driver.who, 0, driver.proof)
         assert lease.end_token(driver.token, 0)
     assert [lease.is_fenced(driver.who) for driver in drivers] == [False] * 2 + [True] * 64

@@ -71,7 +71,7 @@ class Service:
         one = self.sharing.robots.get(name)
         if one is None or one.part is SharingPart.NONE:
             return
-        mine = name in self.tokens and robot.holder == self.tokens[name].commitment[:8]
+        mine = name in self.tokens and robot.holder == self.tokens[name].token[:8]
         self.sharing.on_status(name, robot.status(), is_mine=mine, sent=self.sent.get(name, 0), now_us=now_us)
         if self.sharing.needs_session(name, is_mine=mine, now_us=now_us):
             self.renew(name)
@@ -116,7 +116,7 @@ class Site:
                 self.deliver(service, token, False)
         if isinstance(token, DriverToken):
             robot = self.robots[token.robot]
-            if robot.holder == token.commitment[:8]:
+            if robot.holder == token.token[:8]:
                 robot.fenced.add(robot.holder)
                 robot.holder = ""
 
@@ -155,7 +155,7 @@ class Site:
             self.doubled += len(driving) > 1
             for one in self.chance.sample(driving, len(driving)):
                 one.sent[name] += 1
-                robot.offer(one.tokens[name].commitment[:8], self.now_us)
+                robot.offer(one.tokens[name].token[:8], self.now_us)
 
     def drivers(self):
         return {name: sorted(one.sharing.own.name for one in self.services.values() if name in one.driving)
