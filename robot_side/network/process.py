@@ -67,6 +67,8 @@ _CHECK_STEP_US = 200_000
 _RESTARTED = "; its process was started again"
 _LONGEST_NAP_S = 0.1
 _SHORT_NAP_S = 0.01
+_MAX_WAITING_TOKENS = 64  # security limit
+_BETWEEN_MODELS_US = 200_000
 _AWAKE_US = 1_000_000  # after the token of a driver appeared or ended: its subscription to frames comes or changes now
 _LEAVES_WITHIN_S = 3.0
 _OPENS_WITHIN_S = 20.0
@@ -89,7 +91,9 @@ class NetworkProcess:
         self._no_image_since_us = 0
         """Begin of the wait for an image that is due; 0 without one. Another thread watches it."""
         self._watched_since_us = self._waited_us = self._checked_us = 0
-        self._awake_until_us = 0
+        self._awake_until_us = self._announced_us = 0
+        self._tokens: dict[str, bool] = {}
+        """Tokens of drivers, and whether they are present, that found no room in the pipe. Their end ends a lease."""
         self._faults_reported: Counter[str] = Counter()
         self._rejected_acks: Counter[str] = Counter()
         self._rejected_reported: Counter[str] = Counter()
@@ -235,6 +239,7 @@ class NetworkProcess:
             )
         self._network_end.send(bytes([ipc.PacketKind.STREAM]) + encode(status))
         self._relay.look()
+        self._send_tokens()
         self._report_rejected()
         more = faults() - self._faults_reported
         if more and self._network_end.send(ipc.pack_counts(ipc.PacketKind.FAULTS, more)):
@@ -250,12 +255,25 @@ class NetworkProcess:
             self._rejected_reported = rejected
 
     def _on_driver_token(self, token: str, is_present: bool) -> None:
-        self._network_end.send(ipc.pack_token(token, is_present))
-        self._awake_until_us = monotonic_us() + _AWAKE_US
-        if is_present:
-            with self._lock:
+        now_us = monotonic_us()
+        with self._lock:
+            self._tokens[token] = is_present
+            if is_present and now_us - self._announced_us > _BETWEEN_MODELS_US:
+                self._announced_us = now_us
                 self._network_core.announce_again()
+        self._send_tokens()
+        self._awake_until_us = now_us + _AWAKE_US
         self._credit.set()
+
+    def _send_tokens(self) -> None:
+        """Send the driver process the tokens that wait, as far as there is room now. A flood drops the oldest."""
+        with self._lock:
+            while len(self._tokens) > _MAX_WAITING_TOKENS:
+                del self._tokens[next(iter(self._tokens))]
+            for token in tuple(self._tokens):
+                if not self._network_end.send(ipc.pack_token(token, self._tokens[token])):
+                    return
+                del self._tokens[token]
 
     def _on_ack(self, message: Message) -> None:
         try:

@@ -232,26 +232,34 @@ class SharedFleet(Fleet):
         now_us = monotonic_us()
         while self._tokens:
             self.sharing.on_token(*self._tokens.popleft(), now_us)
-        for robot, service in self.services.items():
-            self._read_status(robot, service, now_us)
         changed = self.sharing.step(now_us)
         super().turn()
-        for robot, service in self.services.items():
-            self._carry_out(robot, service)
         for robot, part in changed.items():
             self._log_part(robot, part)
+        if self.sharing.has_twin and not self._twin_reported:
+            self._twin_reported = True
+            self._report(f"vision: another service is named {self.sharing.own.name}; it drives the robots. Give each "
+                         "service its own --name")
+
+    def _turn_of(self, robot: str) -> None:
+        super()._turn_of(robot)
+        if robot in self.services:
+            self._read_status(robot, self.services[robot], monotonic_us())
+            self._carry_out(robot, self.services[robot])
 
     def _end(self) -> None:
         """Hand the robots over, and end. A robot that no service claims keeps its last command until it is too old."""
         self._leave_services()
         self.sharing.leave()
         until_s = time.monotonic() + _HANDS_OVER_WITHIN_S
-        while self._withdraw and len(self.sharing.services()) and time.monotonic() < until_s:
-            self._wait()
-            self.turn()
-        for robot in tuple(self._withdraw):
-            self._withdraw_token(robot)
-        super()._end()
+        try:
+            while self._withdraw and self.sharing.services() and time.monotonic() < until_s:
+                self._wait()
+                self.turn()
+        finally:
+            for robot in tuple(self._withdraw):
+                self._withdraw_token(robot)
+            super()._end()
 
     def _note(self, token: Token, is_present: bool) -> None:
         robot = token.robot if isinstance(token, RobotToken | DriverToken) else ""
@@ -310,6 +318,7 @@ class SharedFleet(Fleet):
         """Drive with a new session from now on. Its token is there before its first command."""
         sender = DriverSession()
         token = DriverToken(robot, self.sharing.own.name, sender.proofs.token)
+        self.sharing.own_drivers.add(token)
         withdraw = self._fleet_link.declare_token(token)
         service.sender = sender
         self._withdraw_token(robot)
@@ -324,7 +333,3 @@ class SharedFleet(Fleet):
             self._report(f"vision: {robot}: drives it")
         elif part is SharingPart.STANDBY:
             self._report(f"vision: {robot}: stands by")
-        if self.sharing.has_twin and not self._twin_reported:
-            self._twin_reported = True
-            self._report(f"vision: another service is named {self.sharing.own.name}; it drives the robots. Give each "
-                         "service its own --name")

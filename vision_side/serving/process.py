@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Final
 
+from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.config import VisionConfig
@@ -82,6 +83,8 @@ def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe |
     from sightline.vision_side.serving.fleet import Fleet, SharedFleet
 
     shared = config.share.enabled
+    if web := next((one for one in (*config.listen, *config.connect) if shared and "://" in one), ""):
+        raise ConfigError(f"{web}: --share needs Zenoh; write tcp/<host>:<port>")
     opened = open_fleet(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure, by_status=not shared)
     with opened as fleet_link, ends_on_signal(ending):

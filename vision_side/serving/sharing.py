@@ -23,7 +23,8 @@ SILENT_US: Final = 400_000
 NO_DRIVER_US: Final = 1_500_000
 """Time without a token of a driver after which the standby claims a robot, and each further choice a second later."""
 BETWEEN_CHANGES_US: Final = 1_000_000
-"""Shortest time between two claims of one robot by one service."""
+"""Shortest time between two claims of one robot by one service. It doubles while they have no effect."""
+MAX_DOUBLINGS: Final = 5
 NOT_MINE_US: Final = 300_000
 """Time without the lease, although commands leave, after which a driver needs a new session."""
 FRESH_COMMANDS: Final = 48
@@ -53,15 +54,20 @@ class SharedRobot:
     """Drivers that were silent. A new session of them counts again."""
     driverless_us: int = 0
     """Since when there is no driver, or this robot is known."""
-    changed_us: int = -BETWEEN_CHANGES_US
-    accepted: int = -1
+    changed_us: int = -BETWEEN_CHANGES_US << MAX_DOUBLINGS
+    tries: int = 0
+    """Claims and new sessions since this service last held the lease. Each one waits twice as long."""
+    work: tuple[int, int] = (-1, 0)
+    """Commands that arrived at the robot, and frames whose answer did not come, as its newest status shows them."""
     status_us: int = 0
     """Time of the newest status."""
     active_us: int = 0
-    """Last time at which the driver drove, or had no reason to."""
+    """Last time at which the driver worked, or had no reason to."""
     part_us: int = 0
-    first_frames: int = -1
-    """Frames that the robot had sent when the part began. Without a further one, a driver has nothing to answer."""
+    frames: int = -1
+    """Frames that the robot sent, as its newest status shows them."""
+    has_frames: bool = False
+    """True once it sent a frame since the part began. Before that, a driver has nothing to answer."""
     sent: int = 0
     mine_us: int = 0
     """Last time at which this service held the lease, or had no reason to."""
@@ -88,6 +94,8 @@ class Sharing:
     def __init__(self, own: VisionToken, named: tuple[str, ...] = ()) -> None:
         self.own = own
         self._is_leaving = False
+        self.own_drivers: set[DriverToken] = set()
+        """The tokens with which this service drives; its shell adds each one before it declares it."""
         self._drivers: dict[str, set[DriverToken]] = {robot: set() for robot in named}
         self.robots = {robot: SharedRobot(self._drivers[robot]) for robot in named}
         self._named = frozenset(named)
@@ -128,9 +136,13 @@ class Sharing:
         elif not is_present and robot in self.robots and robot not in self._named:
             del self.robots[robot]
             self._choices = None
+            if not self._drivers[robot]:
+                del self._drivers[robot]
 
     def _on_driver(self, token: DriverToken, is_present: bool, now_us: int) -> None:
-        if token.name == self.own.name:
+        if token in self.own_drivers:
+            if not is_present:
+                self.own_drivers.discard(token)
             return
         # The tokens of a robot and of its driver arrive in any order.
         drivers, robot = self._drivers.setdefault(token.robot, set()), self.robots.get(token.robot)
@@ -159,24 +171,32 @@ class Sharing:
             return
         human = status.holder is not None and status.holder.source != "vision"
         needs_no_driver = human or status.state in (State.STOPPED, State.FAULT) or bool(status.stream.camera_fault)
-        waits = status.state is State.DISARMED and status.holder is not None
-        one.first_frames = status.stream.sent if one.accepted < 0 else one.first_frames
-        waits |= status.stream.sent == one.first_frames and now_us - one.part_us < NO_DRIVER_US
-        if needs_no_driver or waits or status.accepted != one.accepted:
+        stream, (arrived, unanswered) = status.stream, one.work
+        work = status.accepted + sum(status.refused.values()), stream.credit_timeouts
+        # A driver that hangs neither sends commands nor gives credit back. Commands that are rejected are work.
+        is_answered = stream.sent != one.frames and work[1] == unanswered
+        one.has_frames |= one.frames not in (-1, stream.sent)
+        waits = not one.has_frames and now_us - one.part_us < NO_DRIVER_US
+        if needs_no_driver or waits or is_answered or work[0] != arrived:
             one.active_us = now_us
         if is_mine or needs_no_driver or sent == one.sent:
             one.mine_us = now_us
-        one.accepted, one.sent, one.status_us = status.accepted, sent, now_us
+        one.tries = 0 if is_mine else one.tries
+        one.work, one.frames, one.sent, one.status_us = work, stream.sent, sent, now_us
 
     def needs_session(self, robot: str, *, is_mine: bool, now_us: int) -> bool:
         """Return True if this service drives but the robot no longer accepts its session, at most once a second."""
         one = self.robots[robot]
         stale = self._is_not_mine(one, now_us) or (not is_mine and one.sent >= FRESH_COMMANDS)
-        if one.part is not SharingPart.DRIVE or not stale or now_us - one.changed_us < BETWEEN_CHANGES_US:
+        if one.part is not SharingPart.DRIVE or not stale or self._changed_lately(one, now_us):
             return False
         one.changed_us = one.mine_us = now_us
-        one.sent = 0
+        one.tries, one.sent = one.tries + 1, 0
         return True
+
+    @staticmethod
+    def _changed_lately(robot: SharedRobot, now_us: int) -> bool:
+        return now_us - robot.changed_us < BETWEEN_CHANGES_US << min(max(0, robot.tries - 1), MAX_DOUBLINGS)
 
     def step(self, now_us: int) -> dict[str, SharingPart]:
         """Decide the part in each robot from now on. Returns the robots whose part changed."""
@@ -194,13 +214,14 @@ class Sharing:
 
     def _change(self, robot: SharedRobot, part: SharingPart, now_us: int) -> None:
         if part is SharingPart.CLAIM:
-            robot.changed_us = now_us
+            robot.changed_us, robot.tries = now_us, robot.tries + 1
         if part is SharingPart.DRIVE:
             robot.ignored |= robot.drivers
             robot.mine_us, robot.sent = now_us, 0
         # Without a part, no status came: what it showed before is over. A standby knows that the driver is silent.
         if part is not SharingPart.CLAIM or robot.part is SharingPart.NONE:
             robot.active_us = robot.part_us = now_us
+            robot.has_frames, robot.frames = False, -1
         robot.part = part
 
     def _next_part(self, name: str, robot: SharedRobot, now_us: int) -> SharingPart:
@@ -219,11 +240,12 @@ class Sharing:
     def _must_leave(self, name: str, robot: SharedRobot, now_us: int) -> bool:
         """Return True if another driver has the better claim."""
         # A silent driver counts again if it has the lease.
-        others = robot.drivers if self._is_not_mine(robot, now_us) else robot.others
-        if not others or self._is_out:
-            return bool(others)
+        is_not_mine = self._is_not_mine(robot, now_us)
+        others = robot.drivers if is_not_mine else robot.others
+        if not others or self._is_out or robot.is_busy:
+            return bool(others) and (self._is_out or is_not_mine)
         before = self._order(name)[: self._place(name)]
-        return not robot.is_busy and any(other.name in before for other in others)
+        return any(other.name in before for other in others)
 
     @staticmethod
     def _is_not_mine(robot: SharedRobot, now_us: int) -> bool:
@@ -238,13 +260,13 @@ class Sharing:
         return self._order(robot).index(self.own.name)
 
     def _may_claim(self, name: str, robot: SharedRobot, owner: str, standby: str, now_us: int) -> bool:
-        if self._is_out or now_us - robot.changed_us < BETWEEN_CHANGES_US:
+        if self._is_out or self._changed_lately(robot, now_us):
             return False
         if owner == self.own.name:
             return True
         waited_us = 0 if robot.drivers else now_us - robot.driverless_us
         if standby == self.own.name:
             return waited_us >= NO_DRIVER_US or (robot.part is SharingPart.STANDBY and robot.is_silent)
-        # The third choice after 2.5 s, the next one a second later. The place is computed only then.
+        # The third choice after 2.5 s, all others a second later. The place is computed only then.
         turns = (waited_us - NO_DRIVER_US) // BETWEEN_CHANGES_US
-        return turns >= 1 and turns >= self._place(name) - 1
+        return turns >= 1 and turns >= min(2, self._place(name) - 1)

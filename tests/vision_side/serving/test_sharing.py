@@ -9,7 +9,7 @@ import pytest
 from sightline.protocol.messages import LeaseHolder, State, Status, StreamStatus
 from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
 from sightline.vision_side.serving.assignment import assign
-from sightline.vision_side.serving.sharing import MAX_SERVICES, Sharing, SharingPart
+from sightline.vision_side.serving.sharing import MAX_ROBOTS, MAX_SERVICES, Sharing, SharingPart
 
 MS = 1_000
 STEP_US, STATUS_US, FRAME_US, SILENT_US = 10 * MS, 100 * MS, 60 * MS, 400 * MS
@@ -25,12 +25,19 @@ class Robot:
     fenced: set = field(default_factory=set)
     gaps: list = field(default_factory=list)
     state: State = State.ACTIVE
+    rejected: int = 0
+    sent: int = 0
+    unanswered: int = 0
+    is_frozen: bool = False
+    """The camera repeats an image, so that each command is STALE."""
 
     def offer(self, session, now_us):
-        if session in self.fenced or self.state is State.STOPPED:
+        if session in self.fenced or self.state is State.STOPPED or self.is_frozen:
+            self.rejected += 1
             return
         if self.holder and self.holder != session:
             if now_us - self.heard_us <= SILENT_US:
+                self.rejected += 1
                 return
             self.fenced.add(self.holder)
         if self.accepted:
@@ -39,7 +46,9 @@ class Robot:
 
     def status(self):
         shown = LeaseHolder(source="vision", digest=self.holder) if self.holder else None
-        return Status(state=self.state, reason="", holder=shown, accepted=self.accepted)
+        stream = StreamStatus(sent=self.sent, credit_timeouts=self.unanswered)
+        return Status(state=self.state, reason="", holder=shown, accepted=self.accepted,
+                      refused={"ANY": self.rejected}, stream=stream)
 
 
 class Service:
@@ -49,7 +58,8 @@ class Service:
         self.site = site
         self.sharing = Sharing(VisionToken(name, weight, instance or f"{site.drawn():08x}"))
         self.tokens, self.sent, self.driving = {}, {}, set()
-        self.hangs = False
+        self.hangs = self.only_acknowledges = False
+        self.renewed = 0
         site.declare(self, self.sharing.own)
 
     def turn(self, now_us):
@@ -62,6 +72,8 @@ class Service:
 
     def renew(self, robot):
         token = DriverToken(robot, self.sharing.own.name, f"{self.site.drawn():08x}" + "0" * 24)
+        self.sharing.own_drivers.add(token)
+        self.renewed += 1
         self.site.declare(self, token)
         if robot in self.tokens:
             self.site.withdraw(self, self.tokens[robot])
@@ -153,7 +165,11 @@ class Site:
         for name, robot in self.robots.items():
             driving = [one for one in awake if name in one.driving]
             self.doubled += len(driving) > 1
+            robot.sent += any(name in one.driving for one in self.services.values())
+            robot.unanswered += not driving
             for one in self.chance.sample(driving, len(driving)):
+                if one.only_acknowledges:
+                    continue
                 one.sent[name] += 1
                 robot.offer(one.tokens[name].token[:8], self.now_us)
 
@@ -254,12 +270,77 @@ def test_robots_that_join_without_a_working_owner_are_driven_within_three_second
     assert all(robot.accepted for robot in site.robots.values())
 
 
-def test_of_two_services_with_one_name_one_drives():
+@pytest.mark.parametrize("order", [("11111111", "22222222"), ("22222222", "11111111")])
+def test_of_two_services_with_one_name_one_drives(order):
     site = Site(robots(6), ())
-    first, second = (site.join("same", instance=one) for one in ("11111111", "22222222"))
-    site.run(3_000)
+    services = {}
+    for instance in order:
+        services[instance] = site.join("same", instance=instance)
+        site.run(3_000)
+    first, second = services["11111111"], services["22222222"]
     assert len(first.driving) == 6 and not second.driving
     assert second.sharing.has_twin and not first.sharing.has_twin
+    before = second.renewed + first.renewed
+    site.run(3_000)
+    assert second.renewed + first.renewed == before
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_after_a_hang_one_service_drives_a_robot_with_a_requested_mission(seed):
+    site = Site(robots(6), SERVICES, seed)
+    hanging = site.named("b")
+    for service in site.services.values():
+        for robot in service.sharing.robots.values():
+            robot.is_busy = True
+    hanging.hangs = True
+    site.run(1_300)
+    hanging.hangs = False
+    site.run(3_000)
+    assert all(len(drivers) == 1 for drivers in site.drivers().values())
+    renewed = hanging.renewed
+    site.run(5_000)
+    assert hanging.renewed <= renewed + 1
+
+
+@pytest.mark.parametrize("how", ["the camera is frozen", "the services only acknowledge"])
+def test_robots_whose_commands_are_not_accepted_change_no_service(how):
+    """The driver works, so that another one would not help."""
+    site = Site(robots(6), SERVICES)
+    site.run(1_000)
+    for robot in site.robots.values():
+        robot.is_frozen = how == "the camera is frozen"
+        robot.holder = ""
+    for service in site.services.values():
+        service.only_acknowledges = how != "the camera is frozen"
+    before, doubled = site.drivers(), site.doubled
+    renewed = sum(one.renewed for one in site.services.values())
+    site.run(12_000)
+    assert site.drivers() == before and site.doubled == doubled
+    # With a wait that doubles: after 1, 2, 4 and 8 s.
+    assert sum(one.renewed for one in site.services.values()) - renewed <= 4 * len(site.robots)
+
+
+@pytest.mark.parametrize("silent", [3, 8])
+def test_a_robot_whose_first_choices_never_claim_it_is_driven_within_four_seconds(silent):
+    site = Site([], ("a",))
+    for number in range(silent):
+        site.declare(None, VisionToken(f"x{number}", 1000.0, f"{number:08x}"))
+    site.run(100)
+    site.robots["r1"] = Robot()
+    site.declare(None, RobotToken("r1"))
+    site.run(4_000)
+    assert site.robots["r1"].accepted
+
+
+def test_robots_that_come_and_go_leave_nothing_behind():
+    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
+    for number in range(MAX_ROBOTS + 2):
+        sharing.on_token(RobotToken(f"r{number}"), True, 0)
+        sharing.on_token(RobotToken(f"r{number}"), False, 0)
+    token = DriverToken("r", "b", "1" * 32)
+    sharing.on_token(token, True, 0)
+    sharing.on_token(RobotToken("r"), True, 0)
+    assert sharing.robots["r"].drivers == {token}
 
 
 def test_a_requested_mission_keeps_its_robot_until_the_service_leaves():
@@ -321,8 +402,8 @@ def test_at_most_one_new_session_a_second():
         sharing.on_status("r1", status, is_mine=False, sent=number, now_us=now_us)
         if sharing.needs_session("r1", is_mine=False, now_us=now_us):
             renewed.append(now_us)
-    assert 5 <= len(renewed) <= 10
-    assert min(later - before for before, later in pairwise(renewed)) >= 1_000 * MS
+    gaps_ms = [(later - before) / MS for before, later in pairwise(renewed)]
+    assert gaps_ms[:2] == [2_000, 4_000] and renewed[0] >= 1_000 * MS, "twice as long each time"
 
 
 def test_floods_of_tokens_are_bounded():
@@ -386,6 +467,8 @@ def test_own_tokens_count_for_nothing():
     sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
     sharing.on_token(sharing.own, True, 0)
     sharing.on_token(RobotToken("r1"), True, 0)
-    sharing.on_token(DriverToken("r1", "a", "1" * 32), True, 0)
+    own = DriverToken("r1", "a", "1" * 32)
+    sharing.own_drivers.add(own)
+    sharing.on_token(own, True, 0)
     assert sharing.services() == {"a": 1.0} and not sharing.has_twin
     assert sharing.step(0) == {"r1": SharingPart.DRIVE}
