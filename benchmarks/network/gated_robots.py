@@ -84,7 +84,7 @@ class GatedRobot(PlayedRobot):
         with self._lock:
             self.core.on_token(token, is_present, monotonic_us())
             if is_present:
-                self._network_core.announce_again()
+                self._network_core.on_new_driver()
 
     def _on_answer(self, message: Message) -> None:
         at_us = monotonic_us()

@@ -138,9 +138,10 @@ class NetworkCore:
         self._camera_seq += 1
         return Message(CAMERA, "", encode(stamp), encode(model))
 
-    def announce_again(self) -> None:
-        """Make the next model due now: a driver arrives, which needs it before its first frame."""
+    def on_new_driver(self) -> None:
+        """Make a frame and the model of the camera due now, for a driver that arrives."""
         self._camera_due_us = 0
+        self._stream.release()
 
     def status(
         self, now_us: int, dropped_commands: int = 0, dropped: Mapping[str, int] | None = None,

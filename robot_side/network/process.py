@@ -260,7 +260,7 @@ class NetworkProcess:
             self._tokens[token] = is_present
             if is_present and now_us - self._announced_us > _BETWEEN_MODELS_US:
                 self._announced_us = now_us
-                self._network_core.announce_again()
+                self._network_core.on_new_driver()
         self._send_tokens()
         self._awake_until_us = now_us + _AWAKE_US
         self._credit.set()

@@ -217,6 +217,10 @@ class Stream:
             del self._in_flight[old]
         return bool(answered)
 
+    def release(self) -> None:
+        """Return the credit of all frames in flight. The driver that comes did not receive them."""
+        self._in_flight.clear()
+
     def on_holder(self, holder: Holder | None, now_us: int) -> None:
         """Pass the credit to a new holder of the lease."""
         if holder is not None and holder != self._owner:

@@ -18,8 +18,9 @@ from sightline.protocol.messages import State, Status
 from sightline.protocol.transports.tokens import DriverToken, RobotToken, Token, VisionToken
 from sightline.vision_side.serving.assignment import assign, ranked
 
-SILENT_US: Final = 400_000
-"""Time without an accepted command after which the standby drives. The robot permits it after the same time."""
+SILENT_US: Final = 380_000
+"""Time without a sign of the driver after which the standby drives: four statuses. The robot permits it after 400 ms,
+and the first command comes later."""
 NO_DRIVER_US: Final = 1_500_000
 """Time without a token of a driver after which the standby claims a robot, and each further choice a second later."""
 BETWEEN_CHANGES_US: Final = 1_000_000
@@ -57,8 +58,12 @@ class SharedRobot:
     changed_us: int = -BETWEEN_CHANGES_US << MAX_DOUBLINGS
     tries: int = 0
     """Claims and new sessions since this service last held the lease. Each one waits twice as long."""
-    work: tuple[int, int] = (-1, 0)
-    """Commands that arrived at the robot, and frames whose answer did not come, as its newest status shows them."""
+    arrived: int = -1
+    """Commands that arrived at the robot, accepted or not, as its newest status shows them."""
+    answered: int = 0
+    """Frames that were answered or are on their way, when `answered_us` was set."""
+    answered_us: int = 0
+    """Last time at which more frames were answered than can be on their way."""
     status_us: int = 0
     """Time of the newest status."""
     active_us: int = 0
@@ -80,7 +85,7 @@ class SharedRobot:
     @property
     def is_silent(self) -> bool:
         """Return True if its statuses show no driver at work."""
-        return self.status_us - self.active_us >= SILENT_US
+        return self.status_us - max(self.active_us, self.answered_us) >= SILENT_US
 
 
 class Sharing:
@@ -171,18 +176,20 @@ class Sharing:
             return
         human = status.holder is not None and status.holder.source != "vision"
         needs_no_driver = human or status.state in (State.STOPPED, State.FAULT) or bool(status.stream.camera_fault)
-        stream, (arrived, unanswered) = status.stream, one.work
-        work = status.accepted + sum(status.refused.values()), stream.credit_timeouts
+        stream, arrived = status.stream, status.accepted + sum(status.refused.values())
         # A driver that hangs neither sends commands nor gives credit back. Commands that are rejected are work.
-        is_answered = stream.sent != one.frames and work[1] == unanswered
+        answered = stream.sent - stream.credit_timeouts
         one.has_frames |= one.frames not in (-1, stream.sent)
         waits = not one.has_frames and now_us - one.part_us < NO_DRIVER_US
-        if needs_no_driver or waits or is_answered or work[0] != arrived:
+        if answered > one.answered + stream.window:
+            one.answered, one.answered_us = answered, now_us
+        if needs_no_driver or waits or arrived != one.arrived:
             one.active_us = now_us
+        one.arrived = arrived
         if is_mine or needs_no_driver or sent == one.sent:
             one.mine_us = now_us
         one.tries = 0 if is_mine else one.tries
-        one.work, one.frames, one.sent, one.status_us = work, stream.sent, sent, now_us
+        one.frames, one.sent, one.status_us = stream.sent, sent, now_us
 
     def needs_session(self, robot: str, *, is_mine: bool, now_us: int) -> bool:
         """Return True if this service drives but the robot no longer accepts its session, at most once a second."""

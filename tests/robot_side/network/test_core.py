@@ -223,12 +223,20 @@ def test_model_is_announced_again_for_a_driver_that_arrives_and_then_each_half_s
     core = core_of()
     core.announce_camera(MODEL, 0)
     assert core.announce_camera(MODEL, 10) is None
-    core.announce_again()
+    core.on_new_driver()
     assert core.announce_camera(MODEL, 0) is not None
-    core.announce_again()
+    core.on_new_driver()
     assert core.announce_camera(MODEL, 20) is not None
     assert core.announce_camera(MODEL, 500_019) is None
     assert core.announce_camera(MODEL, 500_020) is not None
+
+
+def test_driver_that_arrives_gets_a_frame_at_once():
+    core = core_of()
+    core.on_camera(Picture(b"", 1), 0)
+    assert not core.may_capture(100_000, True), "the frame in flight has the only credit"
+    core.on_new_driver()
+    assert core.may_capture(100_000, True)
 
 
 def test_same_model_is_found_without_a_comparison_of_its_fields():

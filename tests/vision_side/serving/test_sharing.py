@@ -28,6 +28,7 @@ class Robot:
     rejected: int = 0
     sent: int = 0
     unanswered: int = 0
+    waits: bool = False
     is_frozen: bool = False
     """The camera repeats an image, so that each command is STALE."""
 
@@ -165,8 +166,13 @@ class Site:
         for name, robot in self.robots.items():
             driving = [one for one in awake if name in one.driving]
             self.doubled += len(driving) > 1
-            robot.sent += any(name in one.driving for one in self.services.values())
-            robot.unanswered += not driving
+            # Without an answer, each frame waits for its timeout before the next one leaves.
+            if any(name in one.driving for one in self.services.values()) and not robot.waits:
+                robot.sent += 1
+                robot.waits = not driving
+            elif robot.waits and self.now_us % (4 * FRAME_US) == 0:
+                robot.unanswered += 1
+                robot.waits = False
             for one in self.chance.sample(driving, len(driving)):
                 if one.only_acknowledges:
                     continue
