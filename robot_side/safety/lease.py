@@ -105,7 +105,7 @@ class Lease:
 
     def _token_of(self, proof: Proof) -> str:
         """Return the token whose driver revealed `proof`, or "" without one."""
-        return next((token for token in tokens_of(proof.proof) if token in self._tokens), "") if self._tokens else ""
+        return next((token for token in tokens_of(proof.proof) if token in self._tokens), "")
 
     def _fence(self, who: Holder) -> None:
         self._fenced[who] = None

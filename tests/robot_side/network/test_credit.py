@@ -38,7 +38,6 @@ class FarLink:
         return self
 
 
-@pytest.mark.parametrize("silent", [False, True])
 def test_released_credit_returns_at_once_and_counts_as_no_timeout():
     stream = Stream(StreamConfig(max_fps=30))
     stream.on_sent(1, 0, 0)
@@ -48,6 +47,7 @@ def test_released_credit_returns_at_once_and_counts_as_no_timeout():
     assert stream.wait_us(50_000) == 0
 
 
+@pytest.mark.parametrize("silent", [False, True])
 def test_new_owner_of_the_credit_begins_with_one_frame_in_flight(silent):
     """The width that a far owner needs would be a queue at its successor: after a hand-over, and after silence."""
     link = FarLink().run(VISION, 3.0, 100_000)

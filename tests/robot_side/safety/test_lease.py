@@ -262,6 +262,15 @@ def test_human_that_holds_the_lease_gets_no_token():
     assert lease.token == ""
 
 
+def test_token_costs_no_hash(monkeypatch):
+    """A peer may declare any number of tokens. Each one with a thousand hashes kept the driver from its ticks."""
+    lease, first = held()
+    monkeypatch.setattr("sightline.robot_side.safety.lease.tokens_of", None)
+    for number in range(1_000):
+        lease.add_token(f"{number:032x}")
+    assert lease.end_token(first.token, 0)
+
+
 @pytest.mark.parametrize("count", [63, 64, 100])
 def test_tokens_are_bounded_and_that_of_the_holder_stays(count):
     lease, first = held()
