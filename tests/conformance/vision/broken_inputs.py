@@ -152,13 +152,14 @@ class Believing(Leaping):
     newest_us = 0
 
     def drives_by(self, _seq, _t_us, _seq2, t_us2):
-        if t_us2 > self.newest_us + self.believed_us:
+        least_us, most_us = self.believed_us
+        if least_us < t_us2 - self.newest_us < most_us:
             self.newest_us = t_us2
         return t_us2 < self.newest_us - 1_000_000
 
 
-breaks("V-CAUS-14", "believes in an hour")(type("Believing", (Believing,), {"believed_us": 3_000_000_000}))
-breaks("V-CAUS-15", "believes in any time")(type("Believing", (Believing,), {"believed_us": 10**14}))
+breaks("V-CAUS-14", "believes in an hour")(type("Believing", (Believing,), {"believed_us": (3_000_000_000, 10**14)}))
+breaks("V-CAUS-15", "believes in any time")(type("Believing", (Believing,), {"believed_us": (10**14, 2**63)}))
 
 
 # --- pictures and cameras --------------------------------------------------------------------------------------------
