@@ -16,8 +16,8 @@ MUTANTS, PROBLEMS = peers.table()
 PYTHON = ("robot", "vision")
 JAVASCRIPT = ("javascript-robot", "javascript-vision")
 VIRTUAL = (*PYTHON, *JAVASCRIPT)
-NOT_APPLICABLE = {"javascript-robot": {"R-FRAM-11"}}
-"""Cases that a peer's choices leave nothing to test in: the JavaScript robot publishes no scan."""
+NOT_APPLICABLE = {"javascript-robot": {"R-FRAM-11", *(f"R-LEASE-{number}" for number in range(21, 26))}}
+"""Cases that a peer's choices leave nothing to test in: the JavaScript robot publishes no scan, and has no Zenoh."""
 
 
 AT_ONCE = 8

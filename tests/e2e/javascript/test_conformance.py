@@ -17,6 +17,7 @@ NOT_APPLICABLE = (
     "over WebSocket nothing is sent under a key",
     "no token was named",
     "this robot publishes no scans",
+    "the robot declares no liveliness token",
     "no port of the legacy protocol was named",
     "the program does not know questions of kind stop",
 )
