@@ -25,7 +25,7 @@ NO_DRIVER_US: Final = 1_500_000
 """Time without a token of a driver after which the standby claims a robot, and each further choice a second later."""
 BETWEEN_CHANGES_US: Final = 1_000_000
 """Shortest time between two claims of one robot by one service. It doubles while they have no effect."""
-MAX_DOUBLINGS: Final = 5
+MAX_DOUBLINGS: Final = 2
 NOT_MINE_US: Final = 300_000
 """Time without the lease, although commands leave, after which a driver needs a new session."""
 FRESH_COMMANDS: Final = 48

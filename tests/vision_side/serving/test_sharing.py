@@ -322,8 +322,8 @@ def test_robots_whose_commands_are_not_accepted_change_no_service(how):
     renewed = sum(one.renewed for one in site.services.values())
     site.run(12_000)
     assert site.drivers() == before and site.doubled == doubled
-    # With a wait that doubles: after 1, 2, 4 and 8 s.
-    assert sum(one.renewed for one in site.services.values()) - renewed <= 4 * len(site.robots)
+    # With a wait that doubles, up to 4 s.
+    assert sum(one.renewed for one in site.services.values()) - renewed <= 5 * len(site.robots)
 
 
 @pytest.mark.parametrize("silent", [3, 8])
