@@ -8,27 +8,18 @@ its frame), `holds`, the times (begin_us, end_us) without motion after the first
 `sent` and of `answers`, accepted or not.
 """
 
-import json
-import signal
 import sys
-import threading
-from contextlib import ExitStack
-from pathlib import Path
-from random import Random
-from typing import Any, Final
+from typing import Any
 
-from sightline.benchmarks.network.robots import PlayedRobot, Settings, play
+from sightline.benchmarks.network.robots import PlayedRobot, Settings, main
 from sightline.protocol.channels import ACK
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.messages import AnswerHeader, State
 from sightline.protocol.transports.link import Link, Message
-from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
 from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
-
-_CONNECT_S: Final = 15.0
 
 
 class GatedRobot(PlayedRobot):
@@ -102,22 +93,5 @@ class GatedRobot(PlayedRobot):
                 self.accepted.append((at_us, header.digest, header.echo.t_us))
 
 
-def main(settings: Settings) -> None:
-    """Play until SIGTERM."""
-    ending, chance = threading.Event(), Random(settings.seed)
-    signal.signal(signal.SIGTERM, lambda *_: ending.set())
-    with ExitStack() as links:
-        begin_us = monotonic_us() + 1_000_000
-        robots = [
-            GatedRobot(name, links.enter_context(
-                open_zenoh(name, connect=settings.endpoint.split(","), role="robot", timeout_s=_CONNECT_S)
-            ), settings, begin_us + round(chance.random() * 1e6 / settings.fps))
-            for name in (f"r{number}" for number in range(1, settings.robots + 1))
-        ]
-        print(f"playing {len(robots)} robots", flush=True)
-        play(robots, ending)
-    Path(settings.notes).write_text(json.dumps({robot.name: robot.record for robot in robots}), "utf-8")
-
-
 if __name__ == "__main__":
-    main(Settings.model_validate_json(sys.argv[1]))
+    main(Settings.model_validate_json(sys.argv[1]), GatedRobot)

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from random import Random
+from typing import Any
 
 from sightline.benchmarks.loop.pictures import camera_of
 from sightline.protocol.channels import ACK, FRAME, STATUS, TWIST
@@ -37,9 +38,10 @@ _CONNECT_S = 15.0
 
 
 class Settings(Config):
-    """Number, rate, images and endpoint of the robots."""
+    """Number, rate, images and endpoints of the robots."""
 
     endpoint: str
+    """With a comma between several."""
     robots: int
     fps: float
     pictures: Path
@@ -65,6 +67,11 @@ class PlayedRobot:
         self._ticks = self._statuses = 0
         for channel in (TWIST, ACK):
             link.subscribe(channel, self._on_answer)
+
+    @property
+    def record(self) -> Any:
+        """Return what is written of this robot."""
+        return self.answers
 
     def play(self, at_us: int) -> int:
         """Publish an image when it is due and has credit, and a status ten times a second."""
@@ -109,21 +116,21 @@ class PlayedRobot:
         self.answers.append((header.echo.t_us, at_us - header.echo.t_us))
 
 
-def main(settings: Settings) -> None:
-    """Play until SIGTERM."""
+def main(settings: Settings, kind: "type[PlayedRobot]" = PlayedRobot) -> None:
+    """Play robots of `kind` until SIGTERM, and write their records."""
     ending, chance = threading.Event(), Random(settings.seed)
     signal.signal(signal.SIGTERM, lambda *_: ending.set())
     with ExitStack() as links:
         begin_us = monotonic_us() + 1_000_000
         robots = [
-            PlayedRobot(name, links.enter_context(
-                open_link(name, connect=[settings.endpoint], role="robot", timeout_s=_CONNECT_S)
+            kind(name, links.enter_context(
+                open_link(name, connect=settings.endpoint.split(","), role="robot", timeout_s=_CONNECT_S)
             ), settings, begin_us + round(chance.random() * 1e6 / settings.fps))
             for name in (f"r{number}" for number in range(1, settings.robots + 1))
         ]
         print(f"playing {len(robots)} robots", flush=True)
         play(robots, ending)
-    settings.notes.write_text(json.dumps({robot.name: robot.answers for robot in robots}), "utf-8")
+    settings.notes.write_text(json.dumps({robot.name: robot.record for robot in robots}), "utf-8")
 
 
 def play(robots: Sequence[PlayedRobot], ending: threading.Event) -> None:

@@ -302,7 +302,6 @@ class FleetLink(Closing):
             ConfigError: the robot id is invalid.
         """
 
-
     @abstractmethod
     def declare_token(self, token: AnyToken) -> Callable[[], None]:
         """Declare a token. It ends with the returned function, which the caller keeps, with the session or process."""

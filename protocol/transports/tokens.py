@@ -2,10 +2,10 @@
 
     sightline-token/robot/ROBOT                            a robot
     sightline-token/vision/NAME/WEIGHT/INSTANCE            a vision service that shares robots
-    sightline-token/driver/ROBOT/NAME/COMMITMENT           a session of it that drives a robot, or is about to
+    sightline-token/driver/ROBOT/NAME/TOKEN                a session of it that drives a robot, or is about to
     sightline-token/detector/GROUP/WEIGHT/SESSION/ROBOTS   a detector service that shares robots
 
-A token ends with its process, some milliseconds later, or with its link. `TOKEN` follows from the first proof of the
+A token ends some milliseconds after its process, or with its link. `TOKEN` follows from the first proof of the
 driver (`protocol/proof.py`): only the driver can compute it before, so a robot knows whose token it is.
 """
 
@@ -20,7 +20,7 @@ LEAST_WEIGHT, MOST_WEIGHT = 0.01, 1000.0
 NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}"
 """Pattern of the name of a vision service, as of a robot id."""
 _WEIGHT: Final = r"\d{1,4}(?:\.\d{1,3})?"
-# Exact: a peer may declare a token with a wildcard, which would end the tokens of others with its own.
+# Exact: a peer may declare a token with a wildcard, which names no robot and no service.
 _KEYS: Final = re.compile(
     rf"{PREFIX}/(?:robot/(?P<robot>{NAME})"
     rf"|vision/(?P<name>{NAME})/(?P<weight>{_WEIGHT})/(?P<instance>[0-9a-f]{{8}})"
@@ -31,6 +31,11 @@ _KEYS: Final = re.compile(
 )
 # A key of a token has no wildcards, so a pattern of robots has `+` and `=` for them there.
 _TO_KEY, _FROM_KEY = str.maketrans("*?", "+="), str.maketrans("+=", "*?")
+
+
+def _weight(weight: float) -> str:
+    """Format a weight for a key: three decimals of at most 1000 are seven digits."""
+    return f"{weight:.7g}"
 
 
 class RobotToken(NamedTuple):
@@ -55,7 +60,7 @@ class VisionToken(NamedTuple):
     @property
     def key(self) -> str:
         """Return its key."""
-        return f"{PREFIX}/{VISION_KIND}/{self.name}/{self.weight:.7g}/{self.instance}"
+        return f"{PREFIX}/{VISION_KIND}/{self.name}/{_weight(self.weight)}/{self.instance}"
 
 
 class DriverToken(NamedTuple):
@@ -87,8 +92,7 @@ class DetectorToken(NamedTuple):
     def key(self) -> str:
         """Return its key."""
         robots = self.robots.translate(_TO_KEY)
-        # `:g` has six digits: enough for three decimals up to 1000.
-        return f"{PREFIX}/{DETECTOR_KIND}/{self.group}/{self.weight:g}/{self.session}/{robots}"
+        return f"{PREFIX}/{DETECTOR_KIND}/{self.group}/{_weight(self.weight)}/{self.session}/{robots}"
 
 
 Token = RobotToken | VisionToken | DriverToken

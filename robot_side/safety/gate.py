@@ -88,7 +88,7 @@ class SafetyGate:
         self.applied = STILL
         self._sequence = SequenceRecord()
         self._repeats = RepeatRecord()
-        # Then no command of the holder is in force, and its next one would be of a frame that is too old.
+        # After so long a silence no command of the holder is in force.
         self._lease = Lease(config.lease_ms * 1000, max(config.silence_ms, config.zero_speed_age_ms) * 1000)
         self._ramp = Ramp(config)
         self._guard = guard

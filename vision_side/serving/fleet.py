@@ -318,7 +318,7 @@ class SharedFleet(Fleet):
         """Drive with a new session from now on. Its token is there before its first command."""
         sender = DriverSession()
         token = DriverToken(robot, self.sharing.own.name, sender.proofs.token)
-        self.sharing.own_drivers.add(token)
+        self.sharing.add_own(token)
         withdraw = self._fleet_link.declare_token(token)
         service.sender = sender
         self._withdraw_token(robot)

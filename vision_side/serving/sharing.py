@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.messages import State, Status
 from sightline.protocol.transports.tokens import DriverToken, RobotToken, Token, VisionToken
 from sightline.vision_side.serving.assignment import assign, ranked
@@ -32,6 +33,8 @@ FRESH_COMMANDS: Final = 48
 """Commands of one session without the lease. After 64 a robot no longer knows whose token it is."""
 MAX_ROBOTS, MAX_SERVICES, MAX_DRIVERS = 10_000, 256, 16
 """Security limits: robots, services, and drivers of one robot. Further tokens do not count."""
+MAX_OWN: Final = 2 * MAX_ROBOTS
+"""Newest tokens of this service that are stored."""
 
 
 class SharingPart(Enum):
@@ -59,7 +62,7 @@ class SharedRobot:
     tries: int = 0
     """Claims and new sessions since this service last held the lease. Each one waits twice as long."""
     arrived: int = -1
-    """Commands that arrived at the robot, accepted or not, as its newest status shows them."""
+    """Commands of its driver, accepted or not, as the newest status shows them."""
     answered: int = 0
     """Frames that were answered or are on their way, when `answered_us` was set."""
     answered_us: int = 0
@@ -99,8 +102,7 @@ class Sharing:
     def __init__(self, own: VisionToken, named: tuple[str, ...] = ()) -> None:
         self.own = own
         self._is_leaving = False
-        self.own_drivers: set[DriverToken] = set()
-        """The tokens with which this service drives; its shell adds each one before it declares it."""
+        self._own_drivers: dict[DriverToken, None] = {}
         self._drivers: dict[str, set[DriverToken]] = {robot: set() for robot in named}
         self.robots = {robot: SharedRobot(self._drivers[robot]) for robot in named}
         self._named = frozenset(named)
@@ -111,6 +113,13 @@ class Sharing:
     def has_twin(self) -> bool:
         """Return True if another service has this name and counts instead of this one."""
         return any(one.name == self.own.name and one.instance < self.own.instance for one in self._services)
+
+    def add_own(self, token: DriverToken) -> None:
+        """Note a token with which this service drives, before it is declared."""
+        # It is never a driver beside this one, also after its end: a link that comes back declares it once more.
+        self._own_drivers[token] = None
+        if len(self._own_drivers) > MAX_OWN:
+            del self._own_drivers[next(iter(self._own_drivers))]
 
     def leave(self) -> None:
         """End the part of this service: each robot goes to the first other service that claims it."""
@@ -145,9 +154,7 @@ class Sharing:
                 del self._drivers[robot]
 
     def _on_driver(self, token: DriverToken, is_present: bool, now_us: int) -> None:
-        if token in self.own_drivers:
-            if not is_present:
-                self.own_drivers.discard(token)
+        if token in self._own_drivers:
             return
         # The tokens of a robot and of its driver arrive in any order.
         drivers, robot = self._drivers.setdefault(token.robot, set()), self.robots.get(token.robot)
@@ -176,8 +183,10 @@ class Sharing:
             return
         human = status.holder is not None and status.holder.source != "vision"
         needs_no_driver = human or status.state in (State.STOPPED, State.FAULT) or bool(status.stream.camera_fault)
-        stream, arrived = status.stream, status.accepted + sum(status.refused.values())
-        # A driver that hangs neither sends commands nor gives credit back. Commands that are rejected are work.
+        # A driver that hangs neither sends commands nor gives credit back. Its rejected commands are work, and those of
+        # other drivers are not.
+        refused = sum(status.refused.values()) - status.refused.get(RejectReason.NOT_HOLDER, 0)
+        stream, arrived = status.stream, status.accepted + refused
         answered = stream.sent - stream.credit_timeouts
         one.has_frames |= one.frames not in (-1, stream.sent)
         waits = not one.has_frames and now_us - one.part_us < NO_DRIVER_US

@@ -73,7 +73,7 @@ class Service:
 
     def renew(self, robot):
         token = DriverToken(robot, self.sharing.own.name, f"{self.site.drawn():08x}" + "0" * 24)
-        self.sharing.own_drivers.add(token)
+        self.sharing.add_own(token)
         self.renewed += 1
         self.site.declare(self, token)
         if robot in self.tokens:
@@ -326,6 +326,21 @@ def test_robots_whose_commands_are_not_accepted_change_no_service(how):
     assert sum(one.renewed for one in site.services.values()) - renewed <= 5 * len(site.robots)
 
 
+@pytest.mark.parametrize(("reason", "claims"), [("NOT_HOLDER", True), ("STALE", False)])
+def test_commands_of_others_do_not_hide_that_the_driver_hangs(reason, claims):
+    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
+    robot = next(name for name in robots(50) if assign([name], {"a": 1.0, "b": 1.0})[name] == ("b", "a"))
+    for token in (VisionToken("b", 1.0, "0000000b"), RobotToken(robot), DriverToken(robot, "b", "1" * 32)):
+        sharing.on_token(token, True, 0)
+    for number in range(20):
+        # Answered frames come to an end after 0.9 s, and so do accepted commands.
+        stream = StreamStatus(sent=2 * min(number, 9))
+        status = Status(state=State.HOLD, reason="", accepted=stream.sent, refused={reason: number}, stream=stream)
+        sharing.step(number * STATUS_US)
+        sharing.on_status(robot, status, is_mine=False, sent=0, now_us=number * STATUS_US)
+    assert (sharing.robots[robot].part is SharingPart.DRIVE) is claims
+
+
 @pytest.mark.parametrize("silent", [3, 8])
 def test_a_robot_whose_first_choices_never_claim_it_is_driven_within_four_seconds(silent):
     site = Site([], ("a",))
@@ -474,7 +489,8 @@ def test_own_tokens_count_for_nothing():
     sharing.on_token(sharing.own, True, 0)
     sharing.on_token(RobotToken("r1"), True, 0)
     own = DriverToken("r1", "a", "1" * 32)
-    sharing.own_drivers.add(own)
-    sharing.on_token(own, True, 0)
+    sharing.add_own(own)
+    for is_present in (True, False, True):  # a link that comes back declares it once more
+        sharing.on_token(own, is_present, 0)
     assert sharing.services() == {"a": 1.0} and not sharing.has_twin
     assert sharing.step(0) == {"r1": SharingPart.DRIVE}
