@@ -203,6 +203,7 @@ class Fleet:
 
 _LONGEST_SHARED_WAIT_S = 0.02
 _HANDS_OVER_WITHIN_S = 0.6
+_MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn
 
 
 class SharedFleet(Fleet):
@@ -213,7 +214,7 @@ class SharedFleet(Fleet):
     ) -> None:
         """Create the fleet, see `Fleet`. It is present from now on."""
         super().__init__(config, fleet_link, report, detector)
-        self._tokens: deque[tuple[Token, bool]] = deque()
+        self._tokens: deque[tuple[Token, bool]] = deque(maxlen=_MAX_TOKENS)
         self._statuses: dict[str, LatestSlot[Message]] = {}
         self._withdraw: dict[str, Callable[[], None]] = {}
         """Ends the token with which a robot is driven."""
