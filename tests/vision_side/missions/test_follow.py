@@ -93,7 +93,8 @@ def test_detection_is_a_box_without_pixels_or_without_an_outline_if_a_size_is_kn
 
 
 @pytest.mark.parametrize(("label", "sizes", "used"), [
-    ("person", {}, {"height_m": 1.7, "width_m": 0.45}), ("person", {"height_m": 1.2}, {"height_m": 1.2}),
+    ("person", {}, {"height_m": 1.7, "width_m": 0.45}),
+    ("person", {"height_m": 1.2}, {"height_m": 1.2}), ("person", {"width_m": 0.4}, {"width_m": 0.4}),
     ("ball", {}, None), ("", {}, None),
 ])  # fmt: skip
 def test_person_is_a_box_of_an_adults_size_unless_a_size_is_configured(located, label, sizes, used):
