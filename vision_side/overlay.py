@@ -1,6 +1,7 @@
 """Draws what vision saw over the image it saw it in: axes, outline, raw and filtered centroid, words. Pure."""
 
 import math
+from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -205,9 +206,8 @@ def _fitting(text: str, room_px: int, font: float) -> str:
     """Cut `text` to the available width."""
     if _width(text, font) <= room_px:
         return text
-    while text and _width(text + "...", font) > room_px:
-        text = text[:-1]
-    return text + "..." if text else ""
+    letters = bisect_right(range(len(text)), room_px, key=lambda count: _width(text[:count] + "...", font)) - 1
+    return text[:letters] + "..." if letters > 0 else ""
 
 
 def _width(text: str, font: float) -> int:

@@ -1,4 +1,4 @@
-"""Publishes `overlay`, `preview` and `detections` while a client subscribes to them. Shell (a thread)."""
+"""Publishes `overlay`, `preview` and `detections` while a client subscribes to them. Shell (threads)."""
 
 import os
 import secrets
@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
@@ -19,7 +20,7 @@ from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.log import error_text, report_fault
 from sightline.protocol.messages import CameraModel, DetectionsHeader, Echo, FrameHeader
-from sightline.protocol.transports.link import LatestSlot, Link
+from sightline.protocol.transports.link import Link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.port import detections_payload
@@ -47,21 +48,28 @@ class RateLimiter:
         return True
 
 
-# The channels `overlay` and `preview`: only while a viewer subscribes, newest only. Shell (a thread).
+# The channels `overlay` and `preview`: only while a viewer subscribes, newest only.
 #
 # The twist never waits for them. A frame is passed on after its answer is sent, as the received JPEG, and a thread of
-# low priority decodes, draws and encodes. Without a viewer, each frame costs one check of the link, and no thread runs.
+# low priority decodes, draws and encodes. Without a viewer, each frame costs one check of the link.
 
 
-IDLE_S: Final = 2.0
-"""Without anything to show for this long the thread ends; the next frame that is watched starts another."""
 KEPT: Final = 4
 """Frames whose answer comes later, from another service's detector: one that is further behind is not shown."""
 NO_PICTURE: Final = "no image"
 """Phase of an image that the pipeline rejected. It is not decoded here either."""
-_NICE: Final = 10  # of this thread: answering the next frame comes first
+_NICE: Final = 10  # of the threads that draw: answering the next frame comes first
 _QUALITIES_BELOW: Final = (50, 30)
 """Tried where an image is over the channel's bound, before it is left out."""
+
+
+def _become_nice() -> None:
+    with suppress(OSError, AttributeError):  # of this thread alone, where the system can
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+
+
+_DRAWING: Final = ThreadPoolExecutor(os.cpu_count(), "viewing", _become_nice)
+"""Shared by the robots of a process: OpenCV 5 loads its font once a thread, which takes 30 ms of CPU."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +90,9 @@ class ViewPublisher:
         self._config, self._link, self._log_change = config, link, log_change
         self._paces = {OVERLAY: RateLimiter(config.viewing.overlay_hz), PREVIEW: RateLimiter(config.viewing.preview_hz)}
         self._kept: deque[tuple[FrameHeader, bytes]] = deque(maxlen=KEPT)
-        self._jobs: LatestSlot[_Job] = LatestSlot()
-        self._starting = threading.Lock()
-        self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+        self._next: _Job | None = None
+        self._is_drawing = False
         self._session = secrets.token_hex(4)
         self._seqs = {OVERLAY: 0, PREVIEW: 0, DETECTIONS: 0}
         self._decoder: Decoder | None = None
@@ -114,8 +122,10 @@ class ViewPublisher:
             return
         shown = OverlayData(header, answer.seen, answer.twist, answer.mission, camera, self._config.target.radius_m,
                       self._clock.age_us(header.session, header.t_us, now_us))
-        self._jobs.put(_Job(shown, jpeg, channels, started_ns))
-        self._wake()
+        with self._lock:
+            self._next = _Job(shown, jpeg, channels, started_ns)
+            if not self._is_drawing:
+                self._submit()
 
     def publish_detections(self, header: FrameHeader, answer: PipelineAnswer, started_ns: int) -> None:
         """Publish what was found in an answered frame, if a client subscribes to it."""
@@ -131,33 +141,24 @@ class ViewPublisher:
     def _kept_of(self, header: FrameHeader) -> bytes | None:
         return next((jpeg for kept, jpeg in self._kept if kept == header), None)
 
-    def _wake(self) -> None:
-        with self._starting:
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="viewing", daemon=True)
-                self._thread.start()
-
-    # --- on the thread -----------------------------------------------------------------------------------------------
-
-    def _run(self) -> None:
-        with suppress(OSError, AttributeError):  # of this thread alone, where the system can
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        while (job := self._next()) is not None:
-            try:
-                self._publish(job)
-            except Exception as error:  # whatever a plug-in's detections hold: people see less, the robot drives on
-                text = report_fault("viewing", error)
-                self._log_change("viewing", f"cannot show an image: {type(error).__name__}: {text}")
-
-    def _next(self) -> _Job | None:
-        job = self._jobs.take(IDLE_S)
+    def _submit(self) -> None:
+        """Queue the newest frame behind those of other robots. The lock is held."""
+        job, self._next = self._next, None
+        self._is_drawing = job is not None
         if job is not None:
-            return job
-        with self._starting:
-            job = self._jobs.take()  # one that came just now would find a thread that is about to end
-            if job is None:
-                self._thread = None
-            return job
+            with suppress(RuntimeError):  # the process ends
+                _DRAWING.submit(self._draw, job)
+
+    # --- on a thread that draws --------------------------------------------------------------------------------------
+
+    def _draw(self, job: _Job) -> None:
+        try:
+            self._publish(job)
+        except Exception as error:  # whatever a plug-in's detections hold: people see less, the robot drives on
+            text = report_fault("viewing", error)
+            self._log_change("viewing", f"cannot show an image: {type(error).__name__}: {text}")
+        with self._lock:
+            self._submit()
 
     def _publish(self, job: _Job) -> None:
         picture = self._decoded(job)
