@@ -1,7 +1,10 @@
 """Overlay and preview over real sessions: only while watched, of the frame they name, after its twist, never queued."""
 
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -16,6 +19,7 @@ from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.zenoh.session import open_session
 from sightline.vision_side import viewing
 from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from sightline.vision_side.serving.service import open_service
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
@@ -212,6 +216,30 @@ def test_remote_boxes_are_drawn_over_their_frame(transport):
         got = []
         assert until(lambda: site.service.turn(0.05) or got.append(overlays.take()) or got[-1])
         assert decode(DetectionsHeader, got[-1].header).echo == echo
+
+
+def test_robots_draw_in_turn_and_only_their_newest_frame(monkeypatch):
+    """One thread, held at its first frame: two more of that robot come, then one of another robot."""
+    order, held, real = [], threading.Event(), viewing.draw_overlay
+
+    def draw(image, shown, width_px):
+        held.wait(5)
+        order.append((shown.header.session, shown.header.seq))
+        return real(image, shown, width_px)
+
+    monkeypatch.setattr(viewing, "draw_overlay", draw)
+    link = SimpleNamespace(has_listener=lambda channel: channel is OVERLAY, publish=lambda *_: None)
+    config = VisionConfig.model_validate({"viewing": {"overlay_hz": 60.0}})
+    with ThreadPoolExecutor(1) as one:
+        monkeypatch.setattr(viewing, "_DRAWING", one)
+        views = {session: viewing.ViewPublisher(config, link, lambda *_: None) for session in ("0000aaaa", "0000bbbb")}
+        for session, seq in (("0000aaaa", 1), ("0000aaaa", 2), ("0000aaaa", 3), ("0000bbbb", 1)):
+            header = FrameHeader(session=session, seq=seq, t_us=seq * 33_333)
+            views[session].show(header, PipelineAnswer(None, Observation("lost")), MODEL, started_ns=0, jpeg=BALL)
+            time.sleep(0.02)  # the next one is due
+        held.set()
+        assert until(lambda: len(order) == 3)
+    assert order == [("0000aaaa", 1), ("0000bbbb", 1), ("0000aaaa", 3)]
 
 
 def test_too_large_for_the_channel_is_sent_coarser_or_not_at_all():
