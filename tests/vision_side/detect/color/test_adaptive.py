@@ -9,6 +9,7 @@ from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.adaptive import AdaptiveConfig, AdaptiveTracker, ColorModel, PixelTrack
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.port import Circle
+from tests.fixtures.vision.vision import speckle
 
 YELLOW = (13, 199, 242)
 FRAME_US = 33_333
@@ -20,7 +21,7 @@ def room(*balls: tuple[float, float, float], light: tuple[float, float, float] =
     bgr = np.full((240, 320, 3), (140, 150, 155), np.float32)
     for x, y, radius in balls:
         cv2.circle(bgr, (round(x * 16), round(y * 16)), round(radius * 16), colour, -1, cv2.LINE_AA, 4)
-    bgr = bgr * np.array(light, np.float32) * gain + np.random.default_rng(seed).normal(0, 2, bgr.shape)
+    bgr = bgr * np.array(light, np.float32) * gain + speckle(bgr.shape, 2, seed)
     return DecodedImage(np.clip(bgr, 0, 255).astype(np.uint8), scale)
 
 
