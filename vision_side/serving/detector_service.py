@@ -477,17 +477,21 @@ class _Sharing:
         self._assignment = Assignment(own, deadline_us)
         self._foreign = 0
         """Answers of services that do not share."""
-        self._end_watch = self._watch()
+        fleet_link.watch_detectors(own.group, self._note)
+        self._end_recall: Callable[[], None] = lambda: None
         time.sleep(_JOIN_S)
         self.leave = fleet_link.declare_token(own)
 
-    def _watch(self) -> Callable[[], None]:
-        def note(token: DetectorToken, is_present: bool) -> None:
-            with self._guard:
-                self._assignment.on_token(token, is_present)
-            self._on_change()
+    def _note(self, token: DetectorToken, is_present: bool) -> None:
+        with self._guard:
+            self._assignment.on_token(token, is_present)
+        self._on_change()
 
-        return self._fleet_link.watch_detectors(self._own.group, note)
+    def _note_recalled(self, token: DetectorToken, is_present: bool) -> None:
+        with self._guard:
+            if is_present:
+                self._assignment.on_recalled(token)
+        self._on_change()
 
     @property
     def services(self) -> int:
@@ -497,12 +501,12 @@ class _Sharing:
     def update(self, now_us: int) -> None:
         """Find out which services are present."""
         with self._guard:
-            needs_tokens = self._assignment.needs_tokens()
+            needs_tokens = self._assignment.needs_tokens(now_us)
             was_shared, is_other = self._assignment.is_shared, self._assignment.update(now_us)
             is_shared, count = self._assignment.is_shared, self._assignment.services
         if needs_tokens:
-            ended, self._end_watch = self._end_watch, self._watch()
-            ended()
+            self._end_recall()
+            self._end_recall = self._fleet_link.watch_detectors(self._own.group, self._note_recalled)
         if is_shared and is_other:
             self._report(f"detector: {count} services share the robots")
         elif was_shared and not is_shared:

@@ -17,7 +17,9 @@ from sightline.vision_side.serving.assignment import ranked
 MAX_SERVICES: Final = 64
 """Security limit: with more services, each one serves every robot."""
 MAX_KEPT_TOKENS: Final = 1_000
-"""Security limit: tokens that are stored. After a flood of more, the caller watches the tokens again."""
+"""Security limit: tokens that are stored. After a flood of more, the caller watches all that are present once more."""
+RECALL_US: Final = 1_000_000
+"""Time in which the second watch has reported the tokens of before."""
 _WATCHED: Final = 2
 """Services that stand by for a robot, behind the one that serves it."""
 SILENT_US: Final = 1_000_000
@@ -69,6 +71,9 @@ class Assignment:
         self._unanswered_us = max(UNANSWERED_US, 2 * deadline_us)
         self._tokens: set[DetectorToken] = set()
         self._left_out = self._changed = False
+        self._ended: set[DetectorToken] | None = None
+        """Tokens that ended since the second watch began, while it reports those of before; else None."""
+        self._recall_us = 0
         self._services = {own.session: own}
         self._robots: dict[str, _Robot] = {}
 
@@ -76,17 +81,32 @@ class Assignment:
         """Note a token that appeared or ended. It counts from the next `update` on."""
         if not is_present:
             self._tokens.discard(token)
+            self._note_end(token)
         elif len(self._tokens) < MAX_KEPT_TOKENS:
             self._tokens.add(token)
         else:
             self._left_out |= token not in self._tokens
         self._changed = True
 
-    def needs_tokens(self) -> bool:
-        """Return True, once, if there is room for tokens that were left out: the caller watches all of them again."""
-        needs = self._left_out and len(self._tokens) <= MAX_SERVICES
-        self._left_out &= not needs
-        return needs
+    def _note_end(self, token: DetectorToken) -> None:
+        if self._ended is not None and len(self._ended) < MAX_KEPT_TOKENS:
+            self._ended.add(token)
+        elif self._ended is not None:  # what the second watch reports may have ended
+            self._ended, self._left_out = None, True
+
+    def needs_tokens(self, now_us: int) -> bool:
+        """Return True, once, if there is room for tokens that were left out: the caller watches them once more."""
+        if self._ended is not None and now_us - self._recall_us >= RECALL_US:
+            self._ended = None
+        if self._ended is not None or not self._left_out or len(self._tokens) > MAX_SERVICES:
+            return False
+        self._left_out, self._ended, self._recall_us = False, set(), now_us
+        return True
+
+    def on_recalled(self, token: DetectorToken) -> None:
+        """Note a token of the second watch. Zenoh may report it after the first watch reported its end."""
+        if self._ended is not None and token not in self._ended:
+            self.on_token(token, True)
 
     def update(self, now_us: int) -> bool:
         """Use the tokens so far. Returns True if other services are present than before."""

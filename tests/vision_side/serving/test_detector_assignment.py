@@ -7,6 +7,7 @@ from sightline.vision_side.serving.assignment import ranked
 from sightline.vision_side.serving.detector_sharing import (
     MAX_KEPT_TOKENS,
     MAX_SERVICES,
+    RECALL_US,
     SILENT_US,
     UNANSWERED_US,
     Assignment,
@@ -206,13 +207,46 @@ def test_service_that_came_in_a_flood_counts_after_it():
     one = service(second)
     flood(one, range(MAX_KEPT_TOKENS))
     one.on_token(token(first), True)
-    assert one.update(0) and not one.needs_tokens() and len(one._tokens) == MAX_KEPT_TOKENS
+    assert one.update(0) and not one.needs_tokens(0) and len(one._tokens) == MAX_KEPT_TOKENS
     flood(one, range(MAX_SERVICES, MAX_KEPT_TOKENS), is_present=False)
-    assert one.needs_tokens() and not one.needs_tokens()
+    assert one.needs_tokens(0) and not one.needs_tokens(0)
     flood(one, range(MAX_SERVICES), is_present=False)
-    one.on_token(token(first), True)
+    one.on_recalled(token(first))
     assert one.update(1) and one.duty("r1", 1) is Duty.STAND_BY and one.services == 2
-    assert not one.needs_tokens()
+    assert not one.needs_tokens(RECALL_US)
+
+
+def after_a_flood():
+    """Return a service whose first flood has ended but for one token, and which watches again."""
+    one = service("s0")
+    flood(one, range(MAX_KEPT_TOKENS + 1))
+    flood(one, range(1, MAX_KEPT_TOKENS + 1), is_present=False)
+    assert one.needs_tokens(0)
+    return one
+
+
+def test_token_whose_end_is_reported_before_its_beginning_has_ended():
+    one, gone, back = after_a_flood(), token("s1"), token("s2")
+    for known, is_present in ((gone, False), (back, False), (back, True)):
+        one.on_token(known, is_present)
+    for known in (gone, back):
+        one.on_recalled(known)
+    one.update(1)
+    assert one._services.keys() == {"s0", "s2", "00000000"}
+
+
+def test_token_that_is_recalled_too_late_does_not_count():
+    one = after_a_flood()
+    assert not one.needs_tokens(RECALL_US)
+    one.on_recalled(token("s1"))
+    assert not one.update(RECALL_US + 1) or "s1" not in one._services
+
+
+def test_flood_that_ends_meanwhile_needs_another_watch():
+    one = after_a_flood()
+    flood(one, range(2 * MAX_KEPT_TOKENS), is_present=False)
+    one.on_recalled(token("s1"))
+    assert not one._tokens and one.needs_tokens(1)
 
 
 def test_token_that_is_known_does_not_count_as_left_out():
@@ -220,4 +254,4 @@ def test_token_that_is_known_does_not_count_as_left_out():
     flood(one, range(MAX_KEPT_TOKENS))
     flood(one, range(MAX_KEPT_TOKENS))
     flood(one, range(MAX_KEPT_TOKENS), is_present=False)
-    assert not one.needs_tokens()
+    assert not one.needs_tokens(0)
