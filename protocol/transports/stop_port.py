@@ -22,7 +22,8 @@ _AT_ONCE: Final = 64
 _PERIOD_MS: Final = 100
 _RETRY_US: Final = 1_000_000
 _LONGEST: Final = 2048
-_KEYS: Final = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP)
+_IGNORED: Final = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP, signal.SIGTERM)
+"""Signals that reach all processes of a terminal or service. STOP is served until the others have ended."""
 
 
 def now_us() -> int:
@@ -145,8 +146,8 @@ def _bound(address: Address) -> socket.socket:
 
 
 def read_arguments() -> tuple[socket.socket, dict[str, Any]]:
-    """Return the pipe and the options of this process, see `StopProcess`. The keys of a terminal do not end it."""
-    for number in _KEYS:
+    """Return the pipe and the options of this process, see `StopProcess`. Only SIGKILL and the end of the pipe end it."""
+    for number in _IGNORED:
         signal.signal(number, signal.SIG_IGN)
     return socket.socket(fileno=int(sys.argv[1])), json.loads(sys.argv[2])
 
@@ -225,8 +226,8 @@ class StopProcess:
             number = self.far.fileno()
             command = [sys.executable, "-I", "-S", "-c", _CHILD.format(self.module), root, str(number)]
             command.append(json.dumps(self.options))
-            # The child inherits the mask, so a key does not interrupt its imports; later it ignores these signals.
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, _KEYS)
+            # The child inherits the mask, so no signal interrupts its imports; later it ignores them.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, _IGNORED)
             with suppress(OSError):  # no process or descriptor is left; later there may be
                 self._process = subprocess.Popen(command, pass_fds=[number], stdin=subprocess.DEVNULL)
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -241,7 +242,7 @@ class StopProcess:
         self.near.close()
         self.far.close()
         if self._process is not None:
-            self._process.terminate()
+            self._process.kill()
             self._process.wait()
 
 

@@ -141,6 +141,16 @@ def test_receiver_outlives_a_driver_process_and_ends_with_the_last_holder_of_its
     assert until(lambda: process._process.poll() == 0, START_S)
 
 
+def test_receiver_serves_on_after_a_signal_to_all_processes_of_the_robot(started, operator):
+    """A supervisor sends SIGTERM to all at once, and the wheels still turn."""
+    address = ("127.0.0.1", free_port())
+    process = started(stop_receiver.start("r1", [address], [], ""))
+    driver = Driver(process)
+    assert stop(operator, address, driver, StopRequests("r1", b"", 7))
+    process._process.terminate()
+    assert stop(operator, address, driver, StopRequests("r1", b"", 70)) and process._process.poll() is None
+
+
 def test_a_killed_receiver_is_logged_and_started_again(started, operator, caplog):
     address = ("127.0.0.1", free_port())
     process = started(stop_receiver.start("r1", [address], [], ""))
@@ -153,8 +163,10 @@ def test_a_killed_receiver_is_logged_and_started_again(started, operator, caplog
     assert caplog.messages == ["STOP receiver ended (-9); starting it again"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP])
-def test_a_key_during_a_start_of_the_receiver_does_not_end_it(started, monkeypatch, number):
+@pytest.mark.parametrize("number", [
+    signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP, signal.SIGTERM,
+])
+def test_a_signal_during_a_start_of_the_receiver_does_not_end_it(started, monkeypatch, number):
     """A traceback of its imports would be the last that the operator reads."""
     monkeypatch.setattr(stop_port, "_CHILD", "import time; time.sleep(30)")
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
