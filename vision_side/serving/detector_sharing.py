@@ -18,8 +18,8 @@ MAX_SERVICES: Final = 64
 """Security limit: with more services, each one serves every robot."""
 MAX_KEPT_TOKENS: Final = 1_000
 """Security limit: tokens that are stored. After a flood of more, the caller watches all that are present once more."""
-RECALL_US: Final = 1_000_000
-"""Time in which the second watch has reported the tokens of before."""
+RECALL_US: Final = 5_000_000
+"""Time in which the second watch has reported the tokens of before, also on a busy machine."""
 _WATCHED: Final = 2
 """Services that stand by for a robot, behind the one that serves it."""
 SILENT_US: Final = 1_000_000
