@@ -138,7 +138,12 @@ def heads_for_wall(now: Truth, arrivals: Sequence[Arrival]) -> bool:
     """Return True where a robot that keeps its newest command meets the east wall within the outage: it drives fast
     toward it, and its newest command is as fast. On a busy machine the two differ."""
     is_on_the_way = now.x_m >= LOST_AT_X_M and abs(now.yaw_rad) < _TOWARD_RAD and now.linear_mps >= _FAST_MPS
-    return is_on_the_way and bool(arrivals) and arrivals[-1].linear_mps >= _FAST_MPS
+    return is_on_the_way and has_fast_command(arrivals)
+
+
+def has_fast_command(arrivals: Sequence[Arrival]) -> bool:
+    """Return True if the newest command is to drive fast."""
+    return bool(arrivals) and arrivals[-1].linear_mps >= _FAST_MPS
 
 
 def compose(safe: Take, naive: Take) -> Story:

@@ -4,12 +4,14 @@ import socket
 import threading
 from contextlib import closing
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sightline.evaluation.baselines.naive import LastCommand, NaiveRobot
 from sightline.evaluation.demo import story as st
+from sightline.evaluation.demo import story_run
 from sightline.evaluation.demo.relay import pump
 from sightline.evaluation.demo.story_film import (
     CLOSING_S,
@@ -125,6 +127,28 @@ def test_radio_is_lost_where_a_robot_that_keeps_its_command_meets_the_wall():
     assert not st.heads_for_wall(truth(0, **on_the_way), [])
     for change in ({"x_m": 1.0}, {"yaw_rad": 1.57}, {"yaw_rad": -3.1}, {"linear_mps": 0.2}):
         assert not st.heads_for_wall(truth(0, **on_the_way | change), [fast])
+
+
+def test_radio_comes_back_where_a_slower_command_had_passed_already():
+    fast, slow = st.Arrival(100, 60, 0.34), st.Arrival(200, 160, 0.1)
+    take, events, arriving = st.Take("naive", arrivals=[fast]), [], [slow, fast]
+
+    def until(happened, _seconds, what):
+        events.append(what)
+        assert what != "way to the wall" or happened(truth(0, x_m=1.2, yaw_rad=0.0, linear_mps=0.35))
+
+    def watch(_seconds):
+        take.arrivals[:] = [arriving.pop(0)] if arriving else take.arrivals
+
+    def send(name, number):
+        events.append(number.name)
+        take.arrivals[:] = [fast]
+
+    stage = SimpleNamespace(take=take, until=until, watch=watch, mark=events.append,
+                            processes=SimpleNamespace(signal=send))
+    story_run._lose_radio(stage)
+    again = ["way to the wall", "wifi lost", "SIGSTOP"]
+    assert events == ["motion", "moving", *again, "SIGCONT", *again]
 
 
 def test_frame_age_counts_from_the_newest_frame():
