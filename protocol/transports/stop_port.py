@@ -146,7 +146,7 @@ def _bound(address: Address) -> socket.socket:
 
 
 def read_arguments() -> tuple[socket.socket, dict[str, Any]]:
-    """Return the pipe and the options of this process, see `StopProcess`. Only SIGKILL and the end of the pipe end it."""
+    """Return the pipe and the options of this process, see `StopProcess`. SIGKILL or the end of the pipe ends it."""
     for number in _IGNORED:
         signal.signal(number, signal.SIG_IGN)
     return socket.socket(fileno=int(sys.argv[1])), json.loads(sys.argv[2])
