@@ -91,8 +91,9 @@ class ViewPublisher:
         self._paces = {OVERLAY: RateLimiter(config.viewing.overlay_hz), PREVIEW: RateLimiter(config.viewing.preview_hz)}
         self._kept: deque[tuple[FrameHeader, bytes]] = deque(maxlen=KEPT)
         self._lock = threading.Lock()
-        self._next: _Job | None = None
+        self._newest: _Job | None = None
         self._is_drawing = False
+        """True from the request for a thread to the end of its drawing."""
         self._session = secrets.token_hex(4)
         self._seqs = {OVERLAY: 0, PREVIEW: 0, DETECTIONS: 0}
         self._decoder: Decoder | None = None
@@ -123,9 +124,8 @@ class ViewPublisher:
         shown = OverlayData(header, answer.seen, answer.twist, answer.mission, camera, self._config.target.radius_m,
                       self._clock.age_us(header.session, header.t_us, now_us))
         with self._lock:
-            self._next = _Job(shown, jpeg, channels, started_ns)
-            if not self._is_drawing:
-                self._submit()
+            self._newest = _Job(shown, jpeg, channels, started_ns)
+            self._draw_newest()
 
     def publish_detections(self, header: FrameHeader, answer: PipelineAnswer, started_ns: int) -> None:
         """Publish what was found in an answered frame, if a client subscribes to it."""
@@ -141,24 +141,27 @@ class ViewPublisher:
     def _kept_of(self, header: FrameHeader) -> bytes | None:
         return next((jpeg for kept, jpeg in self._kept if kept == header), None)
 
-    def _submit(self) -> None:
-        """Queue the newest frame behind those of other robots. The lock is held."""
-        job, self._next = self._next, None
-        self._is_drawing = job is not None
-        if job is not None:
+    def _draw_newest(self) -> None:
+        """Request a thread, behind other robots, unless one is coming or nothing is new. The lock is held."""
+        if self._newest is not None and not self._is_drawing:
+            self._is_drawing = True
             with suppress(RuntimeError):  # the process ends
-                _DRAWING.submit(self._draw, job)
+                _DRAWING.submit(self._draw)
 
     # --- on a thread that draws --------------------------------------------------------------------------------------
 
-    def _draw(self, job: _Job) -> None:
+    def _draw(self) -> None:
+        with self._lock:
+            job, self._newest = self._newest, None
+        assert job is not None
         try:
             self._publish(job)
         except Exception as error:  # whatever a plug-in's detections hold: people see less, the robot drives on
             text = report_fault("viewing", error)
             self._log_change("viewing", f"cannot show an image: {type(error).__name__}: {text}")
         with self._lock:
-            self._submit()
+            self._is_drawing = False
+            self._draw_newest()
 
     def _publish(self, job: _Job) -> None:
         picture = self._decoded(job)

@@ -64,10 +64,10 @@ def site(request):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The images that a thread was given to draw."""
-    jobs, submit = [], viewing._DRAWING.submit
-    monkeypatch.setattr(viewing._DRAWING, "submit", lambda draw, job: jobs.append(job) or submit(draw, job))
-    return jobs
+    """One entry for each image that a thread was requested to draw."""
+    requests, submit = [], viewing._DRAWING.submit
+    monkeypatch.setattr(viewing._DRAWING, "submit", lambda draw: requests.append(draw) or submit(draw))
+    return requests
 
 
 def pixels(message):
@@ -219,10 +219,11 @@ def test_remote_boxes_are_drawn_over_their_frame(transport):
 
 
 def test_robots_draw_in_turn_and_only_their_newest_frame(monkeypatch):
-    """One thread, held at its first frame: two more of that robot come, then one of another robot."""
-    order, held, real = [], threading.Event(), viewing.draw_overlay
+    """One thread, held at its first frame: two more of that robot come, then two of another robot."""
+    order, begun, held, real = [], threading.Event(), threading.Event(), viewing.draw_overlay
 
     def draw(image, shown, width_px):
+        begun.set()
         held.wait(5)
         order.append((shown.header.session, shown.header.seq))
         return real(image, shown, width_px)
@@ -233,13 +234,14 @@ def test_robots_draw_in_turn_and_only_their_newest_frame(monkeypatch):
     with ThreadPoolExecutor(1) as one:
         monkeypatch.setattr(viewing, "_DRAWING", one)
         views = {session: viewing.ViewPublisher(config, link, lambda *_: None) for session in ("0000aaaa", "0000bbbb")}
-        for session, seq in (("0000aaaa", 1), ("0000aaaa", 2), ("0000aaaa", 3), ("0000bbbb", 1)):
+        for session, seq in (("0000aaaa", 1), ("0000aaaa", 2), ("0000aaaa", 3), ("0000bbbb", 1), ("0000bbbb", 2)):
             header = FrameHeader(session=session, seq=seq, t_us=seq * 33_333)
             views[session].show(header, PipelineAnswer(None, Observation("lost")), MODEL, started_ns=0, jpeg=BALL)
             time.sleep(0.02)  # the next one is due
+            assert begun.wait(5)
         held.set()
         assert until(lambda: len(order) == 3)
-    assert order == [("0000aaaa", 1), ("0000bbbb", 1), ("0000aaaa", 3)]
+    assert order == [("0000aaaa", 1), ("0000bbbb", 2), ("0000aaaa", 3)]
 
 
 def test_too_large_for_the_channel_is_sent_coarser_or_not_at_all():
