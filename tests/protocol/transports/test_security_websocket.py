@@ -248,11 +248,14 @@ def test_token_decides_the_role_of_a_client(keys, role, caplog):
             assert robot.has_listener(STATUS)  # every client may watch
             # Logged once each, at once; an acknowledgement that returns no credit is not worth a word.
             forbidden = {"/".join(pair) for pair in sent if pair not in grants_of_role(role) and pair[0] != "ack"}
-            assert until(lambda: caplog.text.count("rejected ") >= min(10, len(forbidden)))  # after it is counted
-            told = [line for line in caplog.messages if line.startswith("rejected ")]
-            named = [line.split()[1] for line in told]
+
+            def told():
+                return [line for line in caplog.messages if line.startswith("rejected ")]
+
+            assert until(lambda: len(told()) >= min(10, len(forbidden)))  # each line follows its count
+            named = [line.split()[1] for line in told()]
             assert set(named) <= forbidden and len(set(named)) == len(named)
-            assert all(" from 127.0.0.1: the role of its token does not permit it" in line for line in told)
+            assert all(" from 127.0.0.1: the role of its token does not permit it" in line for line in told())
 
 
 # --- one of many -----------------------------------------------------------------------------------------------------
