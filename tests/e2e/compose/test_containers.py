@@ -134,8 +134,7 @@ def test_robots_go_on_when_a_vision_service_or_a_router_is_killed(running):
     only(running, "shared")
     visions, sims = running.replicas("vision-shared"), [sim for _, sim in running.profile.robots.values()]
     assert len(visions) == 3
-    # `bench network` has the strict bounds. Here all share two processors.
-    for container, bound_s in ((visions[0], 1.0), (visions[1], 1.0), (running.container("shared-router-a"), 4.0)):
+    for container, bound_s in ((visions[0], 0.3), (visions[1], 0.3), (running.container("shared-router-a"), 2.0)):
         before = {sim: len(running.motor_rows(sim)) for sim in sims}
         assert ask("docker", "kill", container).returncode == 0
         time.sleep(6)
