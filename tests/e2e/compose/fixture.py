@@ -62,8 +62,7 @@ PROFILES = [
             "fleet-vision"),
     Profile("shared", {"r1": ("shared-robot", "sim"), "r2": ("shared-robot-r2", "sim-r2"),
                        "r3": ("shared-robot-r3", "sim-r3")}, "vision-shared", "shared-status", "shared-router-a",
-            # Three services and two routers beside three simulations: on two cores images wait longer.
-            max_bearing_rad=0.2, second_router="shared-router-b", scale="vision-shared=3"),
+            second_router="shared-router-b", scale="vision-shared=3"),
 ]
 
 

@@ -1,12 +1,14 @@
 """Required content of compose.yaml and the Dockerfile, without an engine; `test_containers.py` runs them."""
 
 import ast
+import itertools
 import json
 import re
 import shutil
 import subprocess
 import sys
 import tomllib
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from packaging.requirements import Requirement
@@ -14,9 +16,14 @@ from typer.main import get_command
 
 from sightline.operator_side.cli.app import app
 from sightline.operator_side.config.loading import load_service
+from sightline.protocol.channels import STATUS
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import Status
+from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.robot_side.driver.process import _SHUTDOWN_US
 from sightline.robot_side.pipe import _END_S
 from tests.e2e.compose.fixture import COMPOSE, DEFAULT, HEAVY, PROFILES, ROOT, SERVICES, ask, changed_for
+from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -96,10 +103,12 @@ OF_A_KIND = {test[3]: name for name, test in reversed(CHECKS.items())}
 def test_health_checks_use_the_link_of_the_service(name):
     command, program, minus_c, _, *arguments = CHECKS[name]
     assert (command, program, minus_c) == ("CMD", "python", "-c")
+    assert "sightline." not in CHECKS[name][3], "its modules take CPU that the robots need"
     if name == "vision-shared":
         assert f"--metrics={arguments[0].removeprefix('http://').removesuffix('/ready')}" in SERVICES[name]["command"]
     elif not name.startswith("sim"):
-        endpoint, keys, *robots = arguments
+        endpoint, keys, *asked = arguments
+        robots = asked[1:]
         assert bool(keys) == endpoint.startswith("tls/") == name.startswith("secure")
         known = {robot for profile in PROFILES for robot in profile.robots if name in profile.services}
         assert set(robots) <= known and bool(robots) == ("router" not in name)
@@ -110,14 +119,33 @@ def test_health_checks_fail_without_a_service_and_name_existing_targets(name, tm
     code, *arguments = CHECKS[name][3:]
     nowhere = free_endpoint()
     if name == "sim":
-        code, why = code.replace("/run/sightline", str(tmp_path)), "nothing simulates a robot"
+        arguments[0], why = str(tmp_path / "truth.sock"), "No such file"
     elif name == "vision-shared":
         arguments[0], why = nowhere.replace("tcp/", "http://") + "/ready", "Connection refused"
     else:
-        arguments[0], why = nowhere, f"no answer from {nowhere}"
+        arguments[0], why = nowhere, f"Unable to connect to any of [{nowhere}"
     said = ask(sys.executable, "-c", code, *arguments)
     assert said.returncode == 1
     assert why in said.stderr
+
+
+@pytest.mark.parametrize(("name", "grows", "why"), [
+    ("robot", False, ""),
+    ("vision", True, ""),
+    ("vision", False, "no twists of r1"),
+    ("detector", True, "no detections/* of r1"),
+], ids=["status", "twists", "no twists", "no boxes"])
+def test_health_checks_demand_what_the_service_publishes(name, grows, why):
+    code, *arguments = CHECKS[name][3:]
+    arguments[0] = endpoint = free_endpoint()
+    with open_zenoh("r1", listen=[endpoint], role="robot") as robot, ThreadPoolExecutor() as beside:
+        check = beside.submit(ask, sys.executable, "-c", code, *arguments)
+        for count in itertools.count():
+            robot.publish(STATUS, b"{}", encode(Status(state="HOLD", reason="", refused={"STALE": count * grows})))
+            if until(check.done, 0.05):
+                break
+    assert check.result().returncode == (1 if why else 0), check.result().stderr
+    assert why in check.result().stderr
 
 
 @pytest.mark.parametrize("name", SERVICES)
