@@ -15,6 +15,7 @@ from enum import Enum
 from pathlib import Path
 
 import cv2  # noqa: F401
+import hypothesis  # noqa: F401
 import numpy  # noqa: F401
 import pytest
 
