@@ -39,6 +39,7 @@ TABLES = {
     "robot_side/network/bitrate_control.py": ("tests/robot_side/network/test_bitrate_control.py",),
     "robot_side/network/congestion_window.py": ("tests/robot_side/network/test_congestion_window.py",),
     "vision_side/serving/assignment.py": ("tests/vision_side/serving/test_assignment.py",),
+    "vision_side/serving/sharing.py": ("tests/vision_side/serving/test_sharing_rules.py",),
     "vision_side/missions/switch.py": ("tests/vision_side/missions/test_switch.py",),
     "vision_side/missions/follow.py": ("tests/vision_side/missions/test_follow.py",),
     "vision_side/tracking/locate.py": ("tests/vision_side/tracking/test_locate.py",),

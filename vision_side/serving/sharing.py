@@ -35,6 +35,8 @@ MAX_ROBOTS, MAX_SERVICES, MAX_DRIVERS = 10_000, 256, 16
 """Security limits: robots, services, and drivers of one robot. Further tokens do not count."""
 MAX_OWN: Final = 2 * MAX_ROBOTS
 """Newest tokens of this service that are stored."""
+_UNKNOWN: Final = -1
+"""A time or a count before a status showed it."""
 
 
 class SharingPart(Enum):
@@ -57,27 +59,25 @@ class SharedRobot:
     ignored: set[DriverToken] = field(default_factory=set)
     """Drivers that were silent. A new session of them counts again."""
     driverless_us: int = 0
-    """Since when there is no driver, or this robot is known."""
+    """When the token of a driver ended last, or this robot became known."""
     changed_us: int = -BETWEEN_CHANGES_US << MAX_DOUBLINGS
     tries: int = 0
     """Claims and new sessions since this service last held the lease. Each one waits twice as long."""
-    arrived: int = -1
+    arrived: int = _UNKNOWN
     """Commands of its driver, accepted or not, as the newest status shows them."""
     answered: int = 0
-    """Frames that were answered or are on their way, when `answered_us` was set."""
-    answered_us: int = 0
-    """Last time at which more frames were answered than can be on their way."""
-    status_us: int = 0
+    """Frames that were answered or are on their way, at the last sign of more answers than frames on their way."""
+    status_us: int = _UNKNOWN
     """Time of the newest status."""
-    active_us: int = 0
+    active_us: int = _UNKNOWN
     """Last time at which the driver worked, or had no reason to."""
-    part_us: int = 0
-    frames: int = -1
+    part_us: int = _UNKNOWN
+    frames: int = _UNKNOWN
     """Frames that the robot sent, as its newest status shows them."""
     has_frames: bool = False
     """True once it sent a frame since the part began. Before that, a driver has nothing to answer."""
-    sent: int = 0
-    mine_us: int = 0
+    sent: int = _UNKNOWN
+    mine_us: int = _UNKNOWN
     """Last time at which this service held the lease, or had no reason to."""
 
     @property
@@ -88,7 +88,7 @@ class SharedRobot:
     @property
     def is_silent(self) -> bool:
         """Return True if its statuses show no driver at work."""
-        return self.status_us - max(self.active_us, self.answered_us) >= SILENT_US
+        return self.status_us - self.active_us >= SILENT_US
 
 
 class Sharing:
@@ -107,7 +107,8 @@ class Sharing:
         self.robots = {robot: SharedRobot(self._drivers[robot]) for robot in named}
         self._named = frozenset(named)
         self._services: set[VisionToken] = set()
-        self._choices: dict[str, tuple[str, str]] | None = None
+        self._choices: dict[str, tuple[str, str]] = {}
+        self._is_changed = True
 
     @property
     def has_twin(self) -> bool:
@@ -123,7 +124,7 @@ class Sharing:
 
     def leave(self) -> None:
         """End the part of this service: each robot goes to the first other service that claims it."""
-        self._is_leaving, self._choices = True, None
+        self._is_leaving = self._is_changed = True
 
     def services(self) -> dict[str, float]:
         """Return the weight of each service, this one included. Of two with one name the lower instance counts."""
@@ -141,15 +142,15 @@ class Sharing:
                 self._services.discard(token)
             elif len(self._services) < MAX_SERVICES:
                 self._services.add(token)
-            self._choices = None
+            self._is_changed = True
 
     def _on_robot(self, robot: str, is_present: bool, now_us: int) -> None:
         if is_present and robot not in self.robots and len(self.robots) < MAX_ROBOTS:
             self.robots[robot] = SharedRobot(self._drivers.setdefault(robot, set()), driverless_us=now_us)
-            self._choices = None
+            self._is_changed = True
         elif not is_present and robot in self.robots and robot not in self._named:
             del self.robots[robot]
-            self._choices = None
+            self._is_changed = True
             if not self._drivers[robot]:
                 del self._drivers[robot]
 
@@ -164,7 +165,7 @@ class Sharing:
             drivers.discard(token)
         if robot is not None and not is_present:
             robot.ignored.discard(token)
-            robot.driverless_us = robot.driverless_us if drivers else now_us
+            robot.driverless_us = now_us
         if robot is None and not drivers:
             del self._drivers[token.robot]
 
@@ -179,7 +180,7 @@ class Sharing:
             now_us: monotonic clock.
         """
         one = self.robots.get(robot)
-        if one is None:
+        if one is None or one.part is SharingPart.NONE:
             return
         human = status.holder is not None and status.holder.source != "vision"
         needs_no_driver = human or status.state in (State.STOPPED, State.FAULT) or bool(status.stream.camera_fault)
@@ -188,11 +189,11 @@ class Sharing:
         refused = sum(status.refused.values()) - status.refused.get(RejectReason.NOT_HOLDER, 0)
         stream, arrived = status.stream, status.accepted + refused
         answered = stream.sent - stream.credit_timeouts
-        one.has_frames |= one.frames not in (-1, stream.sent)
+        one.has_frames |= one.frames not in (_UNKNOWN, stream.sent)
         waits = not one.has_frames and now_us - one.part_us < NO_DRIVER_US
-        if answered > one.answered + stream.window:
-            one.answered, one.answered_us = answered, now_us
-        if needs_no_driver or waits or arrived != one.arrived:
+        answers = answered > one.answered + stream.window
+        one.answered = answered if answers else one.answered
+        if needs_no_driver or waits or answers or arrived != one.arrived:
             one.active_us = now_us
         one.arrived = arrived
         if is_mine or needs_no_driver or sent == one.sent:
@@ -216,8 +217,8 @@ class Sharing:
 
     def step(self, now_us: int) -> dict[str, SharingPart]:
         """Decide the part in each robot from now on. Returns the robots whose part changed."""
-        if self._choices is None:
-            self._choices = assign(self.robots, self.services())
+        if self._is_changed:
+            self._choices, self._is_changed = assign(self.robots, self.services()), False
         changed = {}
         for name, robot in self.robots.items():
             before = robot.part
@@ -237,17 +238,18 @@ class Sharing:
         # Without a part, no status came: what it showed before is over. A standby knows that the driver is silent.
         if part is not SharingPart.CLAIM or robot.part is SharingPart.NONE:
             robot.active_us = robot.part_us = now_us
-            robot.has_frames, robot.frames = False, -1
+            robot.has_frames, robot.frames = False, _UNKNOWN
         robot.part = part
 
     def _next_part(self, name: str, robot: SharedRobot, now_us: int) -> SharingPart:
-        owner, standby = (self._choices or {}).get(name, ("", ""))
-        beside = SharingPart.STANDBY if self.own.name in (owner, standby) and not self._is_out else SharingPart.NONE
         if robot.part is SharingPart.CLAIM and (not robot.others or robot.is_silent):
             return SharingPart.DRIVE
+        is_choice = not self._is_out and self.own.name in self._choices[name]
+        beside = SharingPart.STANDBY if is_choice else SharingPart.NONE
         if robot.part in (SharingPart.CLAIM, SharingPart.DRIVE):
             return beside if self._must_leave(name, robot, now_us) else robot.part
-        return SharingPart.CLAIM if self._may_claim(name, robot, owner, standby, now_us) else beside
+        may_claim = not self._is_out and not self._changed_lately(robot, now_us) and self._is_next(name, robot, now_us)
+        return SharingPart.CLAIM if may_claim else beside
 
     @property
     def _is_out(self) -> bool:
@@ -258,31 +260,26 @@ class Sharing:
         # A silent driver counts again if it has the lease.
         is_not_mine = self._is_not_mine(robot, now_us)
         others = robot.drivers if is_not_mine else robot.others
-        if not others or self._is_out or robot.is_busy:
+        if self._is_out or robot.is_busy:
             return bool(others) and (self._is_out or is_not_mine)
-        before = self._order(name)[: self._place(name)]
-        return any(other.name in before for other in others)
+        return any(other.name in self._before(name) for other in others)
 
     @staticmethod
     def _is_not_mine(robot: SharedRobot, now_us: int) -> bool:
         return robot.part is SharingPart.DRIVE and now_us - robot.mine_us >= NOT_MINE_US
 
-    def _order(self, robot: str) -> list[str]:
-        """Return all services in the order in which they may claim a robot."""
-        first = [one for one in (self._choices or {}).get(robot, ()) if one]
-        return first + [one for one in ranked(robot, self.services()) if one not in first]
+    def _before(self, robot: str) -> list[str]:
+        """Return the services that may claim a robot before this one, in their order."""
+        first = self._choices[robot]
+        order = [*first, *(one for one in ranked(robot, self.services()) if one not in first)]
+        return order[: order.index(self.own.name)]
 
-    def _place(self, robot: str) -> int:
-        return self._order(robot).index(self.own.name)
-
-    def _may_claim(self, name: str, robot: SharedRobot, owner: str, standby: str, now_us: int) -> bool:
-        if self._is_out or self._changed_lately(robot, now_us):
-            return False
-        if owner == self.own.name:
-            return True
-        waited_us = 0 if robot.drivers else now_us - robot.driverless_us
-        if standby == self.own.name:
-            return waited_us >= NO_DRIVER_US or (robot.part is SharingPart.STANDBY and robot.is_silent)
-        # The third choice after 2.5 s, all others a second later. The place is computed only then.
-        turns = (waited_us - NO_DRIVER_US) // BETWEEN_CHANGES_US
-        return turns >= 1 and turns >= min(2, self._place(name) - 1)
+    def _is_next(self, name: str, robot: SharedRobot, now_us: int) -> bool:
+        """Return True if it is the turn of this service to claim a robot."""
+        owner, standby = self._choices[name]
+        waited_us = now_us - robot.driverless_us - NO_DRIVER_US
+        has_no_driver = not robot.drivers and waited_us >= 0
+        if self.own.name in (owner, standby):
+            return self.own.name == owner or has_no_driver or robot.is_silent
+        # The third choice after 2.5 s, all others a second later.
+        return has_no_driver and waited_us // BETWEEN_CHANGES_US >= min(2, len(self._before(name)) - 1)

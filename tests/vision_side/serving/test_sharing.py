@@ -1,7 +1,6 @@
 """Several services share robots: who drives after each event, in virtual time with late tokens."""
 
 from dataclasses import dataclass, field
-from itertools import pairwise
 from random import Random
 
 import pytest
@@ -9,7 +8,7 @@ import pytest
 from sightline.protocol.messages import LeaseHolder, State, Status, StreamStatus
 from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
 from sightline.vision_side.serving.assignment import assign
-from sightline.vision_side.serving.sharing import MAX_ROBOTS, MAX_SERVICES, Sharing, SharingPart
+from sightline.vision_side.serving.sharing import Sharing, SharingPart
 
 MS = 1_000
 STEP_US, STATUS_US, FRAME_US, SILENT_US = 10 * MS, 100 * MS, 60 * MS, 400 * MS
@@ -326,21 +325,6 @@ def test_robots_whose_commands_are_not_accepted_change_no_service(how):
     assert sum(one.renewed for one in site.services.values()) - renewed <= 5 * len(site.robots)
 
 
-@pytest.mark.parametrize(("reason", "claims"), [("NOT_HOLDER", True), ("STALE", False)])
-def test_commands_of_others_do_not_hide_that_the_driver_hangs(reason, claims):
-    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
-    robot = next(name for name in robots(50) if assign([name], {"a": 1.0, "b": 1.0})[name] == ("b", "a"))
-    for token in (VisionToken("b", 1.0, "0000000b"), RobotToken(robot), DriverToken(robot, "b", "1" * 32)):
-        sharing.on_token(token, True, 0)
-    for number in range(20):
-        # Answered frames come to an end after 0.9 s, and so do accepted commands.
-        stream = StreamStatus(sent=2 * min(number, 9))
-        status = Status(state=State.HOLD, reason="", accepted=stream.sent, refused={reason: number}, stream=stream)
-        sharing.step(number * STATUS_US)
-        sharing.on_status(robot, status, is_mine=False, sent=0, now_us=number * STATUS_US)
-    assert (sharing.robots[robot].part is SharingPart.DRIVE) is claims
-
-
 @pytest.mark.parametrize("silent", [3, 8])
 def test_a_robot_whose_first_choices_never_claim_it_is_driven_within_four_seconds(silent):
     site = Site([], ("a",))
@@ -351,17 +335,6 @@ def test_a_robot_whose_first_choices_never_claim_it_is_driven_within_four_second
     site.declare(None, RobotToken("r1"))
     site.run(4_000)
     assert site.robots["r1"].accepted
-
-
-def test_robots_that_come_and_go_leave_nothing_behind():
-    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
-    for number in range(MAX_ROBOTS + 2):
-        sharing.on_token(RobotToken(f"r{number}"), True, 0)
-        sharing.on_token(RobotToken(f"r{number}"), False, 0)
-    token = DriverToken("r", "b", "1" * 32)
-    sharing.on_token(token, True, 0)
-    sharing.on_token(RobotToken("r"), True, 0)
-    assert sharing.robots["r"].drivers == {token}
 
 
 def test_a_requested_mission_keeps_its_robot_until_the_service_leaves():
@@ -387,64 +360,6 @@ def test_a_robot_that_must_not_move_changes_no_service(state):
     assert {token for token in site.present if isinstance(token, DriverToken)} == claims
 
 
-def one(status, *, mine=False, sent=(5, 10)):
-    """A service that drives r1 for two seconds with this status; returns whether it needs a new session."""
-    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
-    sharing.on_token(RobotToken("r1"), True, 0)
-    sharing.step(0)
-    assert sharing.robots["r1"].part is SharingPart.DRIVE
-    for number in range(20):
-        now_us = number * 100 * MS
-        sharing.on_status("r1", status, is_mine=mine, sent=sent[0] if number < 2 else sent[1] + number, now_us=now_us)
-        if sharing.needs_session("r1", is_mine=mine, now_us=now_us):
-            return True
-    return False
-
-
-def test_a_driver_whose_session_the_robot_no_longer_accepts_takes_a_new_one():
-    other = LeaseHolder(source="vision", digest="11111111")
-    assert one(Status(state=State.HOLD, reason=""))
-    assert one(Status(state=State.ACTIVE, reason="", holder=other))
-    assert one(Status(state=State.STOPPED, reason=""), sent=(5, 890)), "1024 commands later, no token is its own"
-    assert not one(Status(state=State.ACTIVE, reason=""), mine=True)
-    assert not one(Status(state=State.STOPPED, reason="")) and not one(Status(state=State.FAULT, reason=""))
-    human = LeaseHolder(source="teleop", digest="11111111")
-    assert not one(Status(state=State.ACTIVE, reason="", holder=human))
-    assert not one(Status(state=State.HOLD, reason="", stream=StreamStatus(camera_fault="unplugged")))
-
-
-def test_at_most_one_new_session_a_second():
-    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
-    sharing.on_token(RobotToken("r1"), True, 0)
-    sharing.step(0)
-    status, renewed = Status(state=State.HOLD, reason=""), []
-    for number in range(100):
-        now_us = number * 100 * MS
-        sharing.on_status("r1", status, is_mine=False, sent=number, now_us=now_us)
-        if sharing.needs_session("r1", is_mine=False, now_us=now_us):
-            renewed.append(now_us)
-    gaps_ms = [(later - before) / MS for before, later in pairwise(renewed)]
-    assert gaps_ms[:2] == [2_000, 4_000] and renewed[0] >= 1_000 * MS, "twice as long each time"
-
-
-def test_floods_of_tokens_are_bounded():
-    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
-    for number in range(2_000):
-        sharing.on_token(VisionToken(f"v{number}", 1.0, f"{number:08x}"), True, 0)
-        sharing.on_token(DriverToken("r1", "v1", f"{number:032x}"), True, 0)
-    sharing.on_token(RobotToken("r1"), True, 0)
-    assert len(sharing.services()) == MAX_SERVICES + 1
-    assert len(sharing.robots["r1"].drivers) <= 16
-
-
-def test_a_named_robot_needs_no_token_of_its_own():
-    sharing = Sharing(VisionToken("a", 1.0, "0000000a"), named=("old",))
-    assert sharing.step(0) == {"old": SharingPart.DRIVE}
-    sharing.on_token(RobotToken("old"), True, 1)
-    sharing.on_token(RobotToken("old"), False, 2)
-    assert "old" in sharing.robots
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_after_any_events_the_owners_drive(seed):
     site, chance = Site(robots(8), SERVICES, seed), Random(seed)
@@ -465,32 +380,3 @@ def test_after_any_events_the_owners_drive(seed):
         service.hangs = False
     site.run(6_000).assert_owners_drive()
     assert all(site.now_us - robot.heard_us < 200 * MS for robot in site.robots.values())
-
-
-def test_robot_that_leaves_is_forgotten_with_its_drivers():
-    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
-    token = DriverToken("r1", "b", "1" * 32)
-    sharing.on_token(RobotToken("r1"), True, 0)
-    sharing.on_token(token, True, 0)
-    sharing.on_token(RobotToken("r1"), False, 1)
-    assert sharing.robots == {} and sharing.step(1) == {}
-    sharing.on_token(RobotToken("r1"), False, 1)
-    sharing.on_status("r1", Status(state=State.HOLD, reason=""), is_mine=False, sent=0, now_us=2)
-    sharing.on_token(RobotToken("r1"), True, 2)
-    assert sharing.robots["r1"].drivers == {token}, "its driver is still there"
-    sharing.on_token(RobotToken("r1"), False, 3)
-    sharing.on_token(token, False, 4)
-    sharing.on_token(RobotToken("r1"), True, 5)
-    assert sharing.robots["r1"].drivers == set()
-
-
-def test_own_tokens_count_for_nothing():
-    sharing = Sharing(VisionToken("a", 1.0, "0000000a"))
-    sharing.on_token(sharing.own, True, 0)
-    sharing.on_token(RobotToken("r1"), True, 0)
-    own = DriverToken("r1", "a", "1" * 32)
-    sharing.add_own(own)
-    for is_present in (True, False, True):  # a link that comes back declares it once more
-        sharing.on_token(own, is_present, 0)
-    assert sharing.services() == {"a": 1.0} and not sharing.has_twin
-    assert sharing.step(0) == {"r1": SharingPart.DRIVE}

@@ -1,0 +1,534 @@
+"""Which robots one service takes and leaves: each rule and each bound of `Sharing`, without other services."""
+
+import pytest
+
+from sightline.protocol.messages import LeaseHolder, State, Status, StreamStatus
+from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
+from sightline.vision_side.serving.assignment import assign, ranked
+from sightline.vision_side.serving.sharing import Sharing, SharingPart
+
+NONE, STANDBY, CLAIM, DRIVE = SharingPart
+MS = 1_000
+OWN = VisionToken("a", 1.0, "0000000a")
+OTHERS = [VisionToken(name, 1.0, f"0000000{name}") for name in "bcde"]
+HUMAN = LeaseHolder(source="teleop", digest="11111111")
+VISION = LeaseHolder(source="vision", digest="11111111")
+
+
+def driver(robot, number=1, name="b"):
+    return DriverToken(robot, name, f"{number:032x}")
+
+
+def robot_whose(*order):
+    """Return a robot whose first choices are these services, of `a` to `e`."""
+    weights = dict.fromkeys("abcde", 1.0)
+    return next(name for name in (f"r{number}" for number in range(2_000))
+                if [*ranked(name, weights)][: len(order)] == list(order)
+                and assign([name], weights)[name] == tuple(ranked(name, weights)[:2]))
+
+
+def service(robot, *drivers, at_us=0, others=OTHERS):
+    """Return service `a` with others, a robot and its drivers, after its first decision."""
+    sharing = Sharing(OWN)
+    for token in (*others, RobotToken(robot), *drivers):
+        sharing.on_token(token, True, at_us)
+    sharing.step(at_us)
+    return sharing
+
+
+def part(sharing):
+    (robot,) = sharing.robots.values()
+    return robot.part
+
+
+def see(sharing, at_us, commands=0, *, mine=False, state=State.ACTIVE, holder=None, accepted=0, refused=None, **stream):
+    """Pass a status after `commands` of this session; return whether that needs a new one."""
+    status = Status(state=state, reason="", holder=holder, accepted=accepted, refused=refused or {},
+                    stream=StreamStatus(**stream))
+    (robot,) = sharing.robots
+    sharing.on_status(robot, status, is_mine=mine, sent=commands, now_us=at_us)
+    return sharing.needs_session(robot, is_mine=mine, now_us=at_us)
+
+
+def first_us(happens, until_us=9_000 * MS, step_us=MS // 2):
+    """Return the first time at which `happens(now_us)`."""
+    return next(now_us for now_us in range(0, until_us, step_us) if happens(now_us))
+
+
+# --- claims -----------------------------------------------------------------------------------------------------------
+
+
+def test_an_owner_claims_at_once_and_drives_when_the_former_driver_leaves():
+    robot = robot_whose("a", "b")
+    sharing = service(robot, driver(robot))
+    assert part(sharing) is CLAIM
+    assert sharing.step(10) == {}
+    sharing.on_token(driver(robot), False, 20)
+    assert sharing.step(20) == {robot: DRIVE}
+
+
+def test_an_owner_of_a_robot_without_driver_drives_in_one_step():
+    sharing = Sharing(OWN)
+    sharing.on_token(RobotToken("r1"), True, 0)
+    assert sharing.step(0) == {"r1": DRIVE} and sharing.step(1) == {}
+
+
+@pytest.mark.parametrize(("order", "after_ms"), [("ba", 1_500), ("bca", 2_500), ("bcda", 3_500), ("bcdea", 3_500)])
+@pytest.mark.parametrize("begin_ms", [0, 7_000])
+def test_choice_claims_a_robot_without_a_driver_after_its_turn(order, after_ms, begin_ms):
+    sharing = service(robot_whose(*order), at_us=begin_ms * MS)
+    assert part(sharing) is (STANDBY if order == "ba" else NONE)
+    drives_us = first_us(lambda us: sharing.step(begin_ms * MS + us) and part(sharing) is DRIVE)
+    assert drives_us == after_ms * MS
+
+
+@pytest.mark.parametrize("order", ["ba", "bca"])
+def test_choice_waits_while_a_driver_is_there_and_its_turn_counts_from_the_end_of_the_last(order):
+    robot = robot_whose(*order)
+    first, second = driver(robot, 1, "e"), driver(robot, 2, "e")
+    sharing = service(robot, first, second)
+    assert sharing.step(5_000 * MS) == {}
+    sharing.on_token(first, False, 6_000 * MS)
+    assert sharing.step(9_000 * MS) == {}
+    sharing.on_token(second, False, 9_000 * MS)
+    after_ms = 1_500 if order == "ba" else 2_500
+    assert sharing.step((9_000 + after_ms) * MS - 1) == {}
+    assert sharing.step((9_000 + after_ms) * MS) == {robot: DRIVE}
+
+
+def test_a_later_choice_takes_no_part_before_it_claims():
+    robot = robot_whose("b", "c", "a")
+    sharing = service(robot, driver(robot, 1, "e"))
+    assert part(sharing) is NONE
+    see(sharing, 2_000 * MS)
+    see(sharing, 2_900 * MS)
+    assert sharing.step(2_900 * MS) == {}, "only the standby may succeed a silent driver"
+    sharing.on_token(OTHERS[1], False, 2_900 * MS)
+    assert sharing.step(2_900 * MS) == {robot: STANDBY}, "and what it saw before does not count"
+
+
+# --- a silent driver --------------------------------------------------------------------------------------------------
+
+
+def silent_after_ms(changed, **before):
+    """Pass `changed(ms)` to a standby after the statuses of a driver at work; return when it drives, None if never."""
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    see(sharing, 1_600 * MS, **{**before, "sent": 4, "accepted": 4})
+    see(sharing, 1_700 * MS, **{**before, "sent": 5, "accepted": 5})
+    for ms in range(10, 2_000, 10):
+        see(sharing, (1_700 + ms) * MS, **{"sent": 5, "accepted": 5, **changed(ms)})
+        if sharing.step((1_700 + ms) * MS):
+            return ms
+    return None
+
+
+def test_standby_drives_380_ms_after_the_last_sign_of_the_driver():
+    assert silent_after_ms(lambda ms: {}) == 380
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    see(sharing, 2_000 * MS, accepted=5)
+    see(sharing, 2_380 * MS - 1, accepted=5)
+    assert sharing.step(3_000 * MS) == {}, "the newest status decides, not the clock"
+    see(sharing, 2_380 * MS, accepted=5)
+    assert sharing.step(3_000 * MS) == {robot: DRIVE}
+
+
+@pytest.mark.parametrize("accepted", [0, 1, 2])
+def test_first_status_shows_a_driver_at_work(accepted):
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    see(sharing, 2_000 * MS, accepted=accepted)
+    assert sharing.step(2_000 * MS) == {}
+
+
+@pytest.mark.parametrize(("frames", "succeeds"), [(1, True), (2, False)])
+def test_first_answers_count_above_the_frame_that_may_be_on_its_way(frames, succeeds):
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    see(sharing, 2_000 * MS)
+    see(sharing, 2_380 * MS, sent=frames)
+    assert bool(sharing.step(2_380 * MS)) is succeeds
+
+
+@pytest.mark.parametrize("changed", [
+    lambda ms: {"accepted": 5 + ms},
+    lambda ms: {"refused": {"STALE": ms}},
+    lambda ms: {"refused": {"STALE": ms, "NOT_HOLDER": 9}},
+    lambda ms: {"accepted": 5 + ms, "refused": {"STALE": ms}},
+    lambda ms: {"holder": HUMAN},
+    lambda ms: {"state": State.STOPPED},
+    lambda ms: {"state": State.FAULT},
+    lambda ms: {"camera_fault": "unplugged"},
+    lambda ms: {"sent": 5 + ms},
+    lambda ms: {"sent": 5 + ms, "window": 3},
+], ids=["accepted", "rejected", "rejected beside others", "some of each", "human", "stopped", "fault", "camera",
+        "answered", "window"])
+def test_standby_leaves_a_driver_that_works_or_may_not(changed):
+    assert silent_after_ms(changed) is None
+
+
+@pytest.mark.parametrize("changed", [
+    lambda ms: {"refused": {"NOT_HOLDER": ms}},
+    lambda ms: {"holder": VISION},
+    lambda ms: {"state": State.HOLD},
+    lambda ms: {"sent": 5 + ms, "credit_timeouts": ms},
+    lambda ms: {"sent": 6 if ms < 100 else 7, "window": 3},
+], ids=["commands of others", "held by vision", "hold", "no answers", "frames on their way"])
+def test_standby_succeeds_a_driver_without_a_sign_of_work(changed):
+    assert silent_after_ms(changed) == 380
+
+
+def test_answers_count_above_the_frames_that_may_be_on_their_way():
+    # Four are answered before, and three may be on their way.
+    assert silent_after_ms(lambda ms: {"sent": 7, "window": 3}) == 380
+    assert silent_after_ms(lambda ms: {"sent": 7 if ms < 100 else 8, "window": 3}) == 480
+    assert silent_after_ms(lambda ms: {"sent": 9 if ms < 100 else 10, "window": 3, "credit_timeouts": 2}) == 480
+
+
+@pytest.mark.parametrize("begin_ms", [0, 7_000])
+def test_a_driver_of_a_robot_that_sends_no_frame_is_silent_after_its_first_1_5_s(begin_ms):
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot), at_us=begin_ms * MS)
+    drives = []
+    for ms in range(0, 4_000, 10):
+        see(sharing, (begin_ms + ms) * MS, sent=7)
+        drives += [ms] if sharing.step((begin_ms + ms) * MS) else []
+    assert drives == [1_500 + 370], "the last status in which it waited came at 1,490 ms"
+
+
+def test_what_was_seen_of_a_robot_before_a_part_ended_does_not_count():
+    robot = robot_whose("b", "c", "a", "d")
+    sharing = service(robot)
+    assert sharing.step(2_500 * MS) == {robot: DRIVE}
+    see(sharing, 2_500 * MS, sent=1, accepted=1)
+    see(sharing, 2_550 * MS, sent=2, accepted=1)
+    sharing.on_token(driver(robot, 1, "c"), True, 2_600 * MS)
+    assert sharing.step(2_600 * MS) == {robot: NONE}
+    see(sharing, 9_000 * MS, sent=2, accepted=1)
+    for token in OTHERS[:2]:
+        sharing.on_token(token, False, 9_000 * MS)
+    assert sharing.step(9_000 * MS) == {robot: CLAIM}
+    see(sharing, 9_500 * MS, sent=2, accepted=1)
+    assert sharing.step(9_500 * MS) == {}, "the other driver may wait for its first frame"
+    see(sharing, 10_500 * MS, sent=2, accepted=1)
+    assert sharing.step(10_500 * MS) == {robot: DRIVE}
+
+
+def test_silence_from_the_time_as_driver_does_not_count_for_a_standby():
+    robot = robot_whose("b", "a")
+    sharing = service(robot)
+    sharing.step(1_500 * MS)
+    see(sharing, 3_000 * MS, sent=1, accepted=1)
+    sharing.on_token(driver(robot), True, 3_600 * MS)
+    assert sharing.step(3_600 * MS) == {robot: STANDBY}
+    see(sharing, 3_650 * MS, sent=1, accepted=1)
+    assert sharing.step(3_650 * MS) == {}
+
+
+def test_first_frame_ends_the_wait_for_it():
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    drives = []
+    for ms in range(0, 4_000, 10):
+        see(sharing, ms * MS, sent=7 + (ms >= 500))
+        drives += [ms] if sharing.step(ms * MS) else []
+    assert drives == [500 - 10 + 380]
+
+
+def test_a_driver_that_was_silent_counts_again_with_a_new_token():
+    robot = robot_whose("a", "b")
+    sharing = service(robot, driver(robot))
+    sharing.robots[robot].ignored.add(driver(robot))
+    assert sharing.step(1) == {robot: DRIVE}
+    sharing.on_token(driver(robot), False, 2)
+    sharing.on_token(driver(robot), True, 3)
+    assert sharing.robots[robot].others == {driver(robot)}
+    sharing.robots[robot].ignored.add(driver(robot))
+    sharing.on_token(driver(robot), True, 4)
+    assert sharing.robots[robot].others == set(), "only its end makes it new"
+
+
+# --- leaving ----------------------------------------------------------------------------------------------------------
+
+
+def test_owner_drives_on_beside_a_worse_choice_and_standby_leaves_for_a_better_one():
+    robot = robot_whose("b", "a", "c")
+    sharing = service(robot, at_us=0)
+    assert sharing.step(1_500 * MS) == {robot: DRIVE}
+    sharing.on_token(driver(robot, 1, "c"), True, 1_600 * MS)
+    assert sharing.step(1_600 * MS) == {}
+    sharing.on_token(driver(robot, 2, "b"), True, 1_700 * MS)
+    assert sharing.step(1_700 * MS) == {robot: STANDBY}
+
+
+def test_a_third_choice_leaves_for_the_standby_and_then_has_no_part():
+    robot = robot_whose("b", "c", "a")
+    sharing = service(robot)
+    assert sharing.step(2_500 * MS) == {robot: DRIVE}
+    sharing.on_token(driver(robot, 1, "c"), True, 2_600 * MS)
+    assert sharing.step(2_600 * MS) == {robot: NONE}
+
+
+def test_a_claim_is_withdrawn_for_a_better_one():
+    robot = robot_whose("b", "a")
+    sharing = service(robot)
+    sharing.on_token(driver(robot, 1, "d"), True, 0)
+    sharing.on_token(OTHERS[0], False, 10)
+    assert sharing.step(10) == {robot: CLAIM}
+    sharing.on_token(OTHERS[0], True, 20)
+    sharing.on_token(driver(robot, 2, "b"), True, 20)
+    assert sharing.step(20) == {robot: STANDBY}
+
+
+def test_a_claim_holds_beside_a_better_choice_that_was_silent():
+    robot = robot_whose("b", "a", "d")
+    sharing = service(robot, driver(robot), driver(robot, 1, "d"), others=OTHERS[1:])
+    sharing.robots[robot].ignored.add(driver(robot))
+    assert part(sharing) is CLAIM
+    sharing.on_token(OTHERS[0], True, 900 * MS)
+    assert sharing.step(900 * MS) == {}
+
+
+def test_a_robot_is_claimed_at_most_once_a_second():
+    robot = robot_whose("b", "a")
+    sharing = service(robot, others=OTHERS[1:])
+    assert part(sharing) is DRIVE
+    sharing.on_token(OTHERS[0], True, 100 * MS)
+    sharing.on_token(driver(robot), True, 100 * MS)
+    assert sharing.step(100 * MS) == {robot: STANDBY}
+    sharing.on_token(OTHERS[0], False, 200 * MS)
+    sharing.on_token(driver(robot), False, 200 * MS)
+    assert sharing.step(1_000 * MS - 1) == {}
+    assert sharing.step(1_000 * MS) == {robot: DRIVE}
+
+
+def test_a_mission_keeps_its_robot_while_the_lease_is_here():
+    robot = robot_whose("b", "a")
+    sharing = service(robot)
+    sharing.step(1_500 * MS)
+    sharing.robots[robot].is_busy = True
+    sharing.on_token(driver(robot), True, 1_600 * MS)
+    assert sharing.step(1_799 * MS) == {}
+    assert sharing.step(1_800 * MS) == {robot: STANDBY}, "300 ms without the lease"
+
+
+def test_a_silent_driver_counts_again_when_it_has_the_lease():
+    robot = robot_whose("b", "a")
+    sharing = service(robot)
+    sharing.step(1_500 * MS)
+    token = driver(robot)
+    sharing.on_token(token, True, 1_500 * MS)
+    sharing.robots[robot].ignored.add(token)
+    assert sharing.step(1_800 * MS - 1) == {}
+    assert sharing.step(1_800 * MS) == {robot: STANDBY}
+
+
+def test_a_service_that_leaves_gives_its_robot_to_the_first_that_claims_it():
+    robot = robot_whose("a", "b")
+    sharing = service(robot)
+    sharing.leave()
+    assert sharing.services() == dict.fromkeys("bcde", 1.0)
+    assert sharing.step(10) == {}, "it drives until another one claims"
+    sharing.on_token(driver(robot, 1, "d"), True, 20)
+    assert sharing.step(20) == {robot: NONE}
+    sharing.on_token(driver(robot, 1, "d"), False, 30)
+    assert sharing.step(9_000 * MS) == {}, "and claims nothing"
+
+
+def test_of_two_services_with_one_name_the_lower_instance_counts():
+    robot = robot_whose("a", "b")
+    for instance, is_twin in (("00000009", True), ("0000000b", False)):
+        sharing = Sharing(VisionToken("a", 2.0, "0000000a"))
+        sharing.on_token(VisionToken("a", 3.0, instance), True, 0)
+        sharing.on_token(RobotToken(robot), True, 0)
+        assert sharing.has_twin is is_twin
+        assert sharing.services() == {"a": 3.0 if is_twin else 2.0}
+        assert sharing.step(0) == ({} if is_twin else {robot: DRIVE})
+    sharing = Sharing(OWN)
+    sharing.on_token(VisionToken("b", 1.0, "00000001"), True, 0)
+    sharing.on_token(OWN._replace(weight=9.0), True, 0)
+    assert not sharing.has_twin
+
+
+def test_a_service_that_ends_leaves_its_robots():
+    robot = robot_whose("b", "a")
+    sharing = service(robot)
+    sharing.on_token(OTHERS[0], False, 5)
+    assert sharing.services() == dict.fromkeys("acde", 1.0)
+    assert sharing.step(5) == {robot: DRIVE}
+
+
+# --- robots -----------------------------------------------------------------------------------------------------------
+
+
+def test_robots_join_once_and_leave_with_what_was_known_of_them():
+    sharing = Sharing(OWN)
+    sharing.on_token(RobotToken("r1"), False, 0)
+    assert sharing.robots == {} and sharing.step(0) == {}
+    for _ in range(2):
+        sharing.on_token(RobotToken("r1"), True, 0)
+        assert sharing.step(0) in ({"r1": DRIVE}, {}) and part(sharing) is DRIVE
+    sharing.on_token(RobotToken("r1"), False, 1)
+    sharing.on_token(RobotToken("r1"), False, 1)
+    sharing.on_status("r1", Status(state=State.HOLD, reason=""), is_mine=False, sent=0, now_us=1)
+    assert sharing.robots == {} and sharing.step(1) == {}
+
+
+def test_a_robot_that_leaves_moves_another_to_keep_the_load():
+    services, names = {"a": 1.0, "b": 1.0}, [f"r{number}" for number in range(7)]
+    before, after = assign(names, services), assign({*names} - {"r1"}, services)
+    assert (before["r6"], after["r6"]) == (("b", "a"), ("a", "b"))
+    sharing = Sharing(OWN)
+    for token in (OTHERS[0], *map(RobotToken, names)):
+        sharing.on_token(token, True, 0)
+    for name in names:
+        sharing.on_token(driver(name), before[name][0] == "b", 0)
+    assert sharing.step(0)["r6"] is STANDBY
+    sharing.on_token(RobotToken("r1"), False, 1)
+    assert sharing.step(1) == {"r6": CLAIM}
+
+
+def test_a_robot_that_joins_later_is_driven():
+    sharing = Sharing(OWN)
+    assert sharing.step(0) == {}
+    sharing.on_token(RobotToken("r1"), True, 1)
+    assert sharing.step(1) == {"r1": DRIVE}
+
+
+def test_a_named_robot_needs_no_token_and_stays():
+    assert Sharing(OWN, named=("old",)).step(0) == {"old": DRIVE}
+    robot = robot_whose("b", "a")
+    sharing = Sharing(OWN, named=(robot,))
+    for token in OTHERS:
+        sharing.on_token(token, True, 0)
+    assert sharing.step(0) == {robot: STANDBY}
+    assert sharing.step(1_500 * MS - 1) == {}
+    assert sharing.step(1_500 * MS) == {robot: DRIVE}
+    sharing.on_token(RobotToken(robot), True, 1_600 * MS)
+    sharing.on_token(RobotToken(robot), False, 1_700 * MS)
+    assert part(sharing) is DRIVE
+
+
+def test_drivers_count_from_before_their_robot_and_end_without_it():
+    sharing = Sharing(OWN)
+    token = driver("r1")
+    sharing.on_token(token, True, 0)
+    sharing.on_token(RobotToken("r1"), True, 0)
+    assert sharing.step(0) == {"r1": CLAIM}
+    sharing.on_token(RobotToken("r1"), False, 1)
+    sharing.on_token(RobotToken("r1"), True, 2)
+    assert sharing.robots["r1"].drivers == {token}, "its driver is still there"
+    sharing.on_token(RobotToken("r1"), False, 3)
+    sharing.on_token(driver("r1", 2), True, 4)
+    sharing.on_token(token, False, 4)
+    sharing.on_token(RobotToken("r1"), True, 5)
+    assert sharing.robots["r1"].drivers == {driver("r1", 2)}
+    sharing.on_token(RobotToken("r1"), False, 6)
+    sharing.on_token(driver("r1", 2), False, 7)
+    assert sharing._drivers == {}
+
+
+def test_own_tokens_do_not_count_as_other_drivers():
+    sharing, own = Sharing(OWN), driver("r1", 1, "a")
+    sharing.on_token(OWN, True, 0)
+    sharing.on_token(RobotToken("r1"), True, 0)
+    sharing.add_own(own)
+    for is_present in (True, False, True):  # a link that comes back declares it once more
+        sharing.on_token(own, is_present, 0)
+    assert sharing.robots["r1"].drivers == set() and sharing.services() == {"a": 1.0}
+
+
+# --- new sessions -----------------------------------------------------------------------------------------------------
+
+
+def driven(at_us=0):
+    sharing = service(robot_whose("a", "b"), at_us=at_us)
+    assert part(sharing) is DRIVE
+    return sharing
+
+
+def test_a_driver_without_the_lease_takes_a_new_session_after_300_ms_of_commands():
+    sharing = driven()
+    see(sharing, 1_000 * MS, 1, mine=True)
+    assert not see(sharing, 1_100 * MS, 2)
+    assert not see(sharing, 1_300 * MS - 1, 3)
+    assert see(sharing, 1_300 * MS, 4)
+    assert not see(sharing, 1_300 * MS, 5), "it has begun"
+
+
+@pytest.mark.parametrize("changed", [
+    {"mine": True}, {"state": State.STOPPED}, {"state": State.FAULT}, {"holder": HUMAN}, {"camera_fault": "unplugged"},
+], ids=["held", "stopped", "fault", "human", "camera"])
+def test_time_without_the_lease_counts_from_the_last_reason_to_have_none(changed):
+    sharing = driven()
+    see(sharing, 1_000 * MS, 1, **changed)
+    assert not see(sharing, 1_300 * MS - 1, 3)
+    assert see(sharing, 1_300 * MS, 4)
+
+
+def test_no_new_session_while_no_command_leaves_or_within_a_second_of_the_claim():
+    sharing = driven()
+    assert not any(see(sharing, ms * MS, 7) for ms in range(0, 5_000, 100))
+    sharing = driven()
+    assert first_us(lambda us: see(sharing, us, us), step_us=50 * MS) == 1_000 * MS
+
+
+@pytest.mark.parametrize(("count", "needed"), [(47, False), (48, True)])
+def test_a_new_session_after_48_commands_without_the_lease(count, needed):
+    sharing = driven()
+    see(sharing, 1_000 * MS, count - 1, mine=True)
+    assert see(sharing, 1_010 * MS, count) is needed
+    assert see(driven(), 1_010 * MS, count, state=State.STOPPED) is needed, "later, no token is its own"
+    assert not see(driven(), 1_010 * MS, 90, mine=True), "it has the lease"
+
+
+def test_waits_for_new_sessions_double_to_4_s_and_end_with_the_lease():
+    sharing, begun_ms = driven(), []
+    for ms in range(0, 20_000, 50):
+        begun_ms += [ms] if see(sharing, ms * MS, ms) else []
+    assert begun_ms == [1_000, 3_000, 7_000, 11_000, 15_000, 19_000]
+    assert not see(sharing, 20_000 * MS, 1, mine=True)
+    begun_ms = [ms for ms in range(23_000, 28_000, 50) if see(sharing, ms * MS, ms)]
+    assert begun_ms == [23_000, 24_000, 26_000]
+
+
+def test_commands_count_from_the_begin_of_a_session():
+    for count, needed in ((0, False), (1, True)):
+        sharing = driven()
+        assert see(sharing, 1_000 * MS, 40)
+        see(sharing, 2_900 * MS, count)
+        assert see(sharing, 3_000 * MS, 5) is needed, "the first status of a new session showed no command of it"
+        sharing = driven()
+        see(sharing, 900 * MS, count)
+        assert see(sharing, 1_000 * MS, 5) is needed
+
+
+def test_standby_needs_no_session():
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    assert not any(see(sharing, ms * MS, ms) for ms in range(0, 5_000, 100))
+
+
+# --- limits -----------------------------------------------------------------------------------------------------------
+
+
+def test_tokens_beyond_the_limits_do_not_count():
+    sharing = Sharing(OWN)
+    for number in range(10_002):
+        sharing.on_token(RobotToken(f"r{number}"), True, 0)
+        sharing.on_token(VisionToken(f"v{number}", 1.0, "00000001"), True, 0)
+        sharing.on_token(driver("r1", number), True, 0)
+    assert len(sharing.robots) == 10_000 and len(sharing.services()) == 1 + 256
+    assert len(sharing.robots["r1"].drivers) == 16
+    sharing = Sharing(OWN)
+    for number in range(10_002):
+        sharing.on_token(driver(f"x{number}"), True, 0)
+    assert len(sharing._drivers) == 10_000
+
+
+def test_newest_20_000_own_tokens_are_known():
+    sharing = Sharing(OWN)
+    for number in range(20_001):
+        sharing.add_own(driver("r1", number, "a"))
+    assert len(sharing._own_drivers) == 20_000 and driver("r1", 0, "a") not in sharing._own_drivers
