@@ -110,12 +110,12 @@ def test_a_later_choice_takes_no_part_before_it_claims():
 # --- a silent driver --------------------------------------------------------------------------------------------------
 
 
-def silent_after_ms(changed, **before):
+def silent_after_ms(changed):
     """Pass `changed(ms)` to a standby after the statuses of a driver at work; return when it drives, None if never."""
     robot = robot_whose("b", "a")
     sharing = service(robot, driver(robot))
-    see(sharing, 1_600 * MS, **{**before, "sent": 4, "accepted": 4})
-    see(sharing, 1_700 * MS, **{**before, "sent": 5, "accepted": 5})
+    see(sharing, 1_600 * MS, sent=4, accepted=4)
+    see(sharing, 1_700 * MS, sent=5, accepted=5)
     for ms in range(10, 2_000, 10):
         see(sharing, (1_700 + ms) * MS, **{"sent": 5, "accepted": 5, **changed(ms)})
         if sharing.step((1_700 + ms) * MS):
