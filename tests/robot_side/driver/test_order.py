@@ -191,14 +191,20 @@ def test_hanging_reading_has_the_age_of_its_start_and_its_thread_closes_the_devi
 def test_each_failed_reading_of_the_battery_is_counted_and_its_close_too(monkeypatch):
     monkeypatch.setattr("sightline.robot_side.driver.process._BATTERY_PERIOD_S", 0.01)
 
+    readings, before = [], faults()["battery"]
+
     class Gone:
         def read(self):
+            readings.append(12.0)
+            if len(readings) <= 3:
+                raise OSError("no such battery")
+            return readings[-1]
+
+        def close(self):
             raise OSError("no such battery")
 
-        close = read
-
     reader = BatteryReader(Gone())
-    assert until(lambda: faults()["battery"] >= 3)
+    assert until(lambda: reader.newest)
     reader.close()
-    counted = faults()["battery"]
-    assert until(lambda: not reader._thread.is_alive()) and counted >= 4
+    assert until(lambda: not reader._thread.is_alive())
+    assert faults()["battery"] - before == 4
