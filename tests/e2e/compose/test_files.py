@@ -123,7 +123,7 @@ def test_health_checks_fail_without_a_service_and_name_existing_targets(name, tm
     elif name == "vision-shared":
         arguments[0], why = nowhere.replace("tcp/", "http://") + "/ready", "Connection refused"
     else:
-        arguments[0], why = nowhere, f"Unable to connect to any of [{nowhere}"
+        arguments[0], why = nowhere, f"Unable to connect to any of [Single({nowhere})]"
     said = ask(sys.executable, "-c", code, *arguments)
     assert said.returncode == 1
     assert why in said.stderr
