@@ -4,13 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-import cv2
-import numpy as np
-
 from sightline.protocol.errors import WireError
 from sightline.vision_side.config import HsvRange
-from sightline.vision_side.decode import DecodedImage
-from sightline.vision_side.detect.color.hsv import color_table
+from sightline.vision_side.detect.color.hsv import ColorMask
 from sightline.vision_side.detect.per_robot import PerSession
 from sightline.vision_side.detect.plugin_calls import DetectorWrapper
 from sightline.vision_side.detect.port import (
@@ -43,18 +39,12 @@ class LabelFilter(DetectorWrapper):
 # Combinator: only detections with the configured colors. The model finds balls, the color selects one. Pure.
 
 
-LEAST_SHARE: Final = 0.3
-"""Of the pixels in the box's middle: shade and shine take some of a ball's color, another ball has none of it."""
-_MIDDLE: Final = 0.6
-"""The middle part of a box lies wholly on a ball, whose disk leaves the box's corners out."""
-
-
 class ColorFilter(DetectorWrapper):
     """A detector that leaves out what another one finds in other colors."""
 
     def __init__(self, detector: Detector, ranges: tuple[HsvRange, ...]) -> None:
         super().__init__(detector)
-        self._table = color_table(ranges)
+        self._mask = ColorMask(ranges)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """Return the detections of the inner detector with the colors. Without pixels there is no answer."""
@@ -66,23 +56,8 @@ class ColorFilter(DetectorWrapper):
             picture = frame.picture()
         except WireError:
             return None
-        kept = tuple(one for one in result.detections if self._share(picture, one) >= LEAST_SHARE)
+        kept = tuple(one for one in result.detections if self._mask.has_color(picture, one))
         return result if len(kept) == len(result.detections) else replace(result, detections=kept)
-
-    def _share(self, picture: DecodedImage, one: Detection) -> float:
-        """Return the share of the box's center that has the color."""
-        columns = _middle(one.x1_px, one.x2_px, picture.scale, picture.bgr.shape[1])
-        rows = _middle(one.y1_px, one.y2_px, picture.scale, picture.bgr.shape[0])
-        part = np.ascontiguousarray(picture.bgr[rows, columns])
-        codes = cv2.cvtColor(part, cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
-        return float(np.count_nonzero(self._table[codes])) / codes.size
-
-
-def _middle(low_px: float, high_px: float, scale: int, size: int) -> slice:
-    """Return the middle of the box, at least one pixel of the decoded image."""
-    cut = (high_px - low_px) * (1 - _MIDDLE) / 2
-    first = min(size - 1, max(0, int((low_px + cut) / scale)))
-    return slice(first, max(first + 1, min(size, int((high_px - cut) / scale) + 1)))
 
 
 # Combinator: gives what is found in one frame after the other the same `track_id`, by how much boxes overlap. Pure.

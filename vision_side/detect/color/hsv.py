@@ -22,6 +22,10 @@ COARSE = 4
 MARGIN_PX = 10
 """Around that: the smallest disk reaches 6 pixels from its only one that was looked at; the rest is background."""
 _KERNEL = np.ones((3, 3), np.uint8)
+LEAST_SHARE = 0.3
+"""Of the pixels in the box's middle: shade and shine take some of a ball's color, another ball has none of it."""
+_MIDDLE = 0.6
+"""The middle part of a box lies wholly on a ball, whose disk leaves the box's corners out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +59,22 @@ class ColorMask:
         marked = self._coarse(bgr)
         return cv2.countNonZero(marked) / max(1, marked.size)
 
+    def has_color(self, picture: DecodedImage, one: Detection) -> bool:
+        """Return True if enough of the middle of a detection's box has the color."""
+        columns = _middle(one.x1_px, one.x2_px, picture.scale, picture.bgr.shape[1])
+        rows = _middle(one.y1_px, one.y2_px, picture.scale, picture.bgr.shape[0])
+        codes = codes_565(np.ascontiguousarray(picture.bgr[rows, columns]))
+        return bool(np.count_nonzero(self._table[codes]) >= LEAST_SHARE * codes.size)
+
     def _coarse(self, bgr: NDArray[np.uint8]) -> NDArray[Any]:
         return cv2.LUT(codes_565(bgr[COARSE // 2 :: COARSE])[:, COARSE // 2 :: COARSE].copy(), self._table)
+
+
+def _middle(low_px: float, high_px: float, scale: int, size: int) -> slice:
+    """Return the middle of a box's rows or columns, at least one pixel of the decoded image."""
+    cut = (high_px - low_px) * (1 - _MIDDLE) / 2
+    first = min(size - 1, max(0, int((low_px + cut) / scale)))
+    return slice(first, max(first + 1, min(size, int((high_px - cut) / scale) + 1)))
 
 
 def codes_565(bgr: NDArray[np.uint8]) -> NDArray[np.uint16]:

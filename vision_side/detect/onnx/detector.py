@@ -19,8 +19,9 @@ from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.log import report_fault
 from sightline.protocol.messages import MAX_DETECTED_BOXES
-from sightline.vision_side.config import Device
+from sightline.vision_side.config import Device, HsvConfig
 from sightline.vision_side.decode import DecodedImage
+from sightline.vision_side.detect.color.hsv import ColorMask
 from sightline.vision_side.detect.color.refine import refined
 from sightline.vision_side.detect.onnx.engine import ModelEngine, OnnxHeader, open_engine
 from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
@@ -44,6 +45,8 @@ MAX_BYTES: Final = 2**31
 """A protocol buffer can be no larger."""
 _WARM_UP: Final = 3
 DEFAULT_MIN_SCORE: Final = 0.25  # for a model without `min_score`
+_NOISE: Final = 0.05
+"""Scores below may be of boxes that the model has ruled out."""
 _NAME_LENGTH: Final = 48
 _MAX_BATCH: Final = 32
 """Images in one run: bounds a GPU's memory."""
@@ -73,6 +76,9 @@ class OnnxDetector:
         """Things with these labels are round: their edge is looked for in the image."""
         second_look: bool = True
         """True to enlarge the part of the image where the followed target is expected, if nothing is found there."""
+        hsv: HsvConfig = HsvConfig()
+        color_bonus: Annotated[float, Field(ge=0, le=1)] = 0.3
+        """Where `hsv.ranges` is set: added to the score of a target of that color."""
 
     def __init__(self, config: Config) -> None:
         """Raises ConfigError for a file that is not such a model, HardwareError for a device that is not there."""
@@ -81,6 +87,9 @@ class OnnxDetector:
         self.labels = model.form.labels
         """All that it can call a thing; empty where the model has only numbers."""
         self._refine = frozenset(config.refine)
+        self._color = ColorMask(config.hsv.ranges) if "ranges" in config.hsv.model_fields_set else None
+        self._bonus = config.color_bonus if self._color else 0.0
+        self._least_score = min(self._min_score, max(_NOISE, self._min_score - self._bonus))
         # A model of any size gets the image unscaled, and a part of it would be no larger.
         self._second_look = config.second_look and model.form.size is not None
         self._engine = model.engine
@@ -137,11 +146,27 @@ class OnnxDetector:
         return results
 
     def _detections(self, shown: Sequence[tuple[DetectFrame, DecodedImage]]) -> list[Sequence[Detection]]:
-        together = _found(self._engine, [picture for _, picture in shown], self._form, self._min_score)
+        together = self._look([frame for frame, _ in shown], [picture for _, picture in shown])
         if self._second_look:
             together = [self._with_second_look(*one, found) for one, found in zip(shown, together, strict=True)]
         return [tuple(refined(picture, one) if one.label in self._refine else one for one in found)
                 for (_, picture), found in zip(shown, together, strict=True)]
+
+    def _look(
+        self, frames: Sequence[DetectFrame], pictures: Sequence[DecodedImage]
+    ) -> list[tuple[Detection, ...]]:
+        """Run the model. A target of the configured color may have a lower score."""
+        together = _found(self._engine, pictures, self._form, self._least_score)
+        return [self._with_bonus(*one) for one in zip(frames, pictures, together, strict=True)]
+
+    def _with_bonus(
+        self, frame: DetectFrame, picture: DecodedImage, found: tuple[Detection, ...]
+    ) -> tuple[Detection, ...]:
+        if self._color is None:
+            return found
+        raised = (replace(one, score=min(1.0, one.score + self._bonus))
+                  if frame.goes_by(one.label) and self._color.has_color(picture, one) else one for one in found)
+        return tuple(sorted((one for one in raised if one.score >= self._min_score), key=lambda one: -one.score))
 
     def _with_second_look(
         self, frame: DetectFrame, picture: DecodedImage, found: tuple[Detection, ...]
@@ -152,7 +177,7 @@ class OnnxDetector:
         tile = tile_about(picture, frame.expected_px)
         if any(frame.goes_by(one.label) and tile.shows_middle(one) for one in found):
             return found
-        (more,) = _found(self._engine, [tile.picture], self._form, self._min_score)
+        (more,) = self._look([frame], [tile.picture])
         targets = [tile.in_image(one) for one in more if frame.goes_by(one.label) and tile.shows_all(one)]
         return tuple(sorted((*found, *targets), key=lambda one: -one.score)[:MAX_DETECTED_BOXES])
 
