@@ -66,6 +66,15 @@ def test_what_the_mission_does_not_follow_gets_no_bonus():
     assert found(detector(), squares(), answers, wanted="legs") == [("legs", 40, 0.7), ("legs", 200, 0.6)]
 
 
+def test_the_second_look_has_the_bonus_too():
+    colored = detector(refine=[], second_look=True)
+    looks = iter([0.1, 0.4])
+    colored._engine.run = lambda _pixels: {
+        "boxes": np.float32([[100, 80, 160, 140]]), "scores": np.float32([next(looks)]), "labels": np.float32([BALL])}
+    yellow = jpeg_of(np.full((240, 320, 3), (30, 210, 230), np.uint8))
+    assert found(colored, yellow, expected_px=(160.0, 120.0)) == [("ball", 124, 0.7)]
+
+
 @pytest.mark.parametrize("second_look", [False, True])
 def test_more_far_balls_of_the_color_are_found(second_look):
     model, counts = camera(320, 240), []
