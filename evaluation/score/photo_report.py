@@ -4,7 +4,7 @@ The balls are ray-cast by `photo_balls.py`, of which training has nothing.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal
 
@@ -23,6 +23,11 @@ from sightline.vision_side.detect.port import Detection, DetectionResult
 QUALITY: Final = 85
 SMALL_PX: Final = 12.0
 """Balls of a smaller radius have a column of their own."""
+COLORS: Final = {
+    "yellow": (36, 68, 0.5), "tennis": (50, 85, 0.35), "orange": (10, 36, 0.5), "blue": (195, 250, 0.4),
+    "green": (85, 165, 0.35), "red": (340, 15, 0.5),
+}
+"""Hue from and to, degrees, and the least saturation, as a user would set them for a ball of that kind."""
 _OFF_PX: Final = 20.0
 _OF_EMPTY: Final = 500_000
 _SEEDS: Final = 1_000_003
@@ -106,11 +111,14 @@ def wilson(count: int, total: int) -> tuple[float, float]:
     return max(0.0, (middle - half) / (1 + z * z / total)), min(1.0, (middle + half) / (1 + z * z / total))
 
 
-def photo_pictures(photographs: Sequence[Photograph], each: int, seed: int) -> Iterator[PhotoPicture]:
+def photo_pictures(photographs: Sequence[Photograph], each: int, seed: int,
+                   kinds: Sequence[str] = KINDS) -> Iterator[PhotoPicture]:
     """Render `each` pictures of every kind, over the photographs in turn, then each photograph without a ball."""
     first = seed * _SEEDS
     for number in range(len(KINDS) * each):
         rgb, kind = photographs[number % len(photographs)].rgb, KINDS[number // each]
+        if kind not in kinds:
+            continue
         drawn = photo_with_ball(rgb, kind, first + number)
         yield PhotoPicture(number, kind, _jpeg(drawn.rgb), LabelledBox("ball", drawn.box, drawn.seen), drawn.radius_px)
     for place, one in enumerate(photographs):
@@ -123,11 +131,12 @@ def _jpeg(rgb: Any) -> bytes:
 
 
 def score_photos(asked: Sequence[Subject], photographs: Sequence[Photograph], each: int, seed: int, *, looks: int = 1,
-                 tracked: bool = False, advance: Callable[[], None] = lambda: None) -> PhotoReport:
+                 tracked: bool = False, kinds: Sequence[str] = KINDS,
+                 advance: Callable[[], None] = lambda: None) -> PhotoReport:
     """Show every picture to every detector, `looks` times in a row; with `tracked`, as if a track expected the ball."""
     decoder = Decoder(WIDTH_PX, HEIGHT_PX, WIDTH_PX * HEIGHT_PX)
-    found = {one.name: PhotoFigures({kind: BallTally() for kind in KINDS}, BallTally(), BallTally()) for one in asked}
-    for picture in photo_pictures(photographs, each, seed):
+    found = {one.name: PhotoFigures({kind: BallTally() for kind in kinds}, BallTally(), BallTally()) for one in asked}
+    for picture in photo_pictures(photographs, each, seed, kinds):
         for one in asked:
             answer = answer_of(one.detector, picture.number, picture.jpeg, decoder, looks,
                                expected_px=_expected(picture) if tracked else None)
@@ -182,6 +191,24 @@ def photo_lines(report: PhotoReport) -> list[str]:
               for name, one in report.figures.items() if one.unanswered),
             f"{report.photographs} photographs, {report.each} pictures of each kind, seed {report.seed}"
             + (", each ball expected where it is" if report.tracked else "")]
+
+
+def color_setting(kind: str) -> str:
+    """Write the color of a kind as a setting of the vision service."""
+    low, high, saturation = COLORS[kind]
+    return f"hsv.ranges=[{{hue_low_deg={low}, hue_high_deg={high}, saturation_low={saturation}}}]"
+
+
+def colored_lines(reports: Mapping[str, PhotoReport]) -> list[str]:
+    """The same for one report for each kind, of detectors that were given its color."""
+    rows: list[tuple[str, ...]] = [("balls", "detector", "pictures", "hits", "wrong", "missed", "false alarms")]
+    for kind, report in reports.items():
+        for name, one in report.figures.items():
+            tally = one.kinds[kind]
+            rows.append((kind, name, str(tally.balls), *(f"{100 * count / max(1, tally.balls):.1f} %" for count in (
+                tally.hit, tally.wrong, tally.missed)), f"{one.false_alarms} of {one.empty}"))
+    widths = [max(len(row[place]) for row in rows) for place in range(len(rows[0]))]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 _NAMES: Final = {"small": f"below {SMALL_PX:.0f} px radius", "large": f"from {SMALL_PX:.0f} px radius"}

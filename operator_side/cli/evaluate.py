@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sightline.evaluation.demo.run import DemoOptions
     from sightline.evaluation.faults.report import Results
     from sightline.evaluation.score.detector_report import DetectorReport, Subject
+    from sightline.evaluation.score.photo_report import PhotoReport
     from sightline.operator_side.config.loading import Loaded
     from sightline.training.network import Weights
 
@@ -47,7 +48,7 @@ def demo(
     scenario: Annotated[str, typer.Option(help="A name from `sightline scenarios`, or a .toml file.")] = "circle",
     mission: Annotated[str | None, typer.Option(help="Mission [default: of the scenario].")] = None,
     detector: Annotated[
-        str | None, typer.Option(help="Detector, see `sightline detector list` [default: hsv].")
+        str | None, typer.Option(help="Detector, see `sightline detector list` [default: auto].")
     ] = None,
     seconds: Annotated[
         float | None, typer.Option(help="Length; 0 runs until Ctrl-C [default: 20, or the length of the course].")
@@ -197,6 +198,7 @@ def detectors(
     column: Annotated[str, typer.Option(help="`all`, or names separated by commas, e.g. blur,all at once.")] = "all",
     photos: Annotated[Path | None, typer.Option(metavar="DIR", help=_PHOTOS)] = None,
     tracked: Annotated[bool, typer.Option("--tracked", help="Expect each ball where it is, as a track does.")] = False,
+    colored: Annotated[bool, typer.Option("--colored", help="Set each ball's color, as `pick-color` does.")] = False,
     looks: Annotated[int, typer.Option(min=1, max=100, help="Detections of each scene; `adaptive` needs several.")] = 1,
     demand: Annotated[
         bool, typer.Option("--demand", help="Check the bounds of a learned detector; exit code 5 if it fails.")
@@ -221,10 +223,10 @@ def detectors(
     if photos is not None:
         if demand or column != "all":
             raise ConfigError("--photos scores photographs, without --column and --demand")
-        subjects = _subjects(names or COMPARED, config, sets or (), device)
-        return _score_photos(photos, subjects, frames or PHOTO_FRAMES, looks, tracked=tracked, as_json=as_json)
-    if tracked:
-        raise ConfigError("--tracked belongs to --photos")
+        return _score_photos(photos, lambda more: _subjects(names or COMPARED, config, (*(sets or ()), *more), device),
+                             frames or PHOTO_FRAMES, looks, tracked=tracked, colored=colored, as_json=as_json)
+    if tracked or colored:
+        raise ConfigError("--tracked and --colored belong to --photos")
     if demand and seeds < FROM:
         raise ConfigError(f"--demand needs seeds from {FROM} up, which no training uses; {seeds} is lower")
     columns, shown = _columns(column), frames or (DEMANDED_FRAMES if demand else FRAMES)
@@ -237,21 +239,30 @@ def detectors(
     return _print_report(report, all_detector_checks(report) if demand else None, as_json)
 
 
-def _score_photos(photos: Path, subjects: "list[Subject]", each: int, looks: int, *, tracked: bool,
-                  as_json: bool) -> int:
+def _score_photos(photos: Path, build: "Callable[[Sequence[str]], list[Subject]]", each: int, looks: int, *,
+                  tracked: bool, colored: bool, as_json: bool) -> int:
+    """`build` takes more settings."""
     from sightline.evaluation import photographs as folder
     from sightline.evaluation.score.ball_textures import KINDS
     from sightline.evaluation.score.detector_report import close_subjects
-    from sightline.evaluation.score.photo_report import photo_lines, score_photos
+    from sightline.evaluation.score.photo_report import COLORS, color_setting, colored_lines, photo_lines, score_photos
 
-    try:
-        photographs = folder.read_photographs(folder.SHIPPED if str(photos) == SHIPPED else photos)
+    def scored(settings: Sequence[str], kinds: Sequence[str]) -> "PhotoReport":
+        subjects = build(settings)
+        try:
+            return score_photos(subjects, photographs, each, PHOTO_SEED, looks=looks, tracked=tracked, kinds=kinds,
+                                advance=advance)
+        finally:
+            close_subjects(subjects)
+
+    photographs = folder.read_photographs(folder.SHIPPED if str(photos) == SHIPPED else photos)
+    if not colored:
         with progress_bar(len(KINDS) * each + len(photographs)) as advance:
-            report = score_photos(subjects, photographs, each, PHOTO_SEED, looks=looks, tracked=tracked,
-                                  advance=advance)
-    finally:
-        close_subjects(subjects)
-    return print_result(report.to_dict(), photo_lines(report), as_json)
+            report = scored((), KINDS)
+        return print_result(report.to_dict(), photo_lines(report), as_json)
+    with progress_bar(len(COLORS) * (each + len(photographs))) as advance:
+        reports = {kind: scored((color_setting(kind),), (kind,)) for kind in COLORS}
+    return print_result({kind: one.to_dict() for kind, one in reports.items()}, colored_lines(reports), as_json)
 
 
 def _subjects(

@@ -11,7 +11,7 @@ from sightline.evaluation.score import photo_report
 from sightline.evaluation.score.ball_textures import KINDS
 from sightline.evaluation.score.detector_report import Subject
 from sightline.evaluation.score.photo_balls import photo_with_ball, photo_without_ball
-from sightline.evaluation.score.photo_report import photo_lines, photo_pictures, score_photos, wilson
+from sightline.evaluation.score.photo_report import COLORS, photo_lines, photo_pictures, score_photos, wilson
 from sightline.operator_side.cli import app as cli
 from sightline.vision_side.detect.port import Detection, DetectionResult
 
@@ -158,3 +158,30 @@ def test_balls_are_of_all_sizes_and_some_are_partly_covered():
     drawn = [photo_with_ball(photo, "red", seed) for seed in range(22)]
     assert min(one.radius_px for one in drawn) < 7 and max(one.radius_px for one in drawn) > 35
     assert 1 <= sum(one.seen < 1 for one in drawn) <= 12
+
+
+def test_pictures_of_some_kinds_are_those_of_all_kinds(pictures):
+    some = list(photo_pictures(photographs(), EACH, 1, ("tennis", "red")))
+    assert [one.kind for one in some] == ["tennis", "red", "", "", "", ""]
+    assert {one.number: one.jpeg for one in some}.items() <= {one.number: one.jpeg for one in pictures}.items()
+
+
+def test_each_kind_is_scored_with_its_color_set(tmp_path, capsys):
+    for number, one in enumerate(photographs(FEWEST)):
+        cv2.imwrite(str(tmp_path / f"{number:02}.png"), one.rgb)
+    command = ["score", "detectors", "hsv", "--photos", str(tmp_path), "--frames", "2"]
+    assert cli.run([*command, "--colored", "--json"]) == 0
+    colored = json.loads(capsys.readouterr().out)
+    assert list(colored) == list(COLORS) and set(COLORS) < set(KINDS)
+    hits = {kind: one["figures"]["hsv"]["kinds"][kind]["hit"] for kind, one in colored.items()}
+    assert sum(hits.values()) >= 8 and min(hits["blue"], hits["red"], hits["orange"]) >= 1
+    assert cli.run([*command, "--colored"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].split() == ["balls", "detector", "pictures", "hits", "wrong", "missed", "false", "alarms"]
+    assert [line.split()[:3] for line in lines[1:]] == [[kind, "hsv", "2"] for kind in COLORS]
+    assert all(line.endswith(f"of {FEWEST}") for line in lines[1:])
+
+
+def test_colored_belongs_to_photographs(capsys):
+    assert cli.run(["score", "detectors", "hsv", "--colored"]) == 2
+    assert "--photos" in capsys.readouterr().err
