@@ -21,5 +21,5 @@ def shared_options(plugin: Any, options: Mapping[str, Any], config: VisionConfig
         if not isinstance(section, BaseModel) or field.annotation is not type(section):
             continue
         given = options.get(name, {})
-        merged[name] = section.model_dump(exclude_unset=True) | dict(given) if isinstance(given, Mapping) else given
+        merged[name] = section.model_dump() | dict(given) if isinstance(given, Mapping) else given
     return merged

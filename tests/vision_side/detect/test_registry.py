@@ -1,6 +1,7 @@
 """Detectors by name: what is built in, addresses, options, what goes around them, and every mistake as one line."""
 
 import re
+import sys
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,7 @@ from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.detectors import Adaptive, Hsv
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
-from sightline.vision_side.detect.onnx.detector import OnnxDetector
+from sightline.vision_side.detect.onnx.detector import AutoDetector, OnnxDetector
 from sightline.vision_side.detect.plugin_calls import notices_of
 from sightline.vision_side.detect.port import DetectFrame, NoDetector, result_of
 from sightline.vision_side.detect.registry import (
@@ -77,10 +78,34 @@ def test_kind_is_split_into_name_and_address(kind: str, parts: tuple[str, str]) 
 
 
 def test_the_configured_detector_always_exists() -> None:
-    assert isinstance(configured_detector(VisionConfig()), Hsv)
-    assert isinstance(configured_detector(config(options={"label": "ball"})), Hsv)
+    assert isinstance(configured_detector(VisionConfig()), AutoDetector)
+    assert isinstance(configured_detector(config(kind="hsv", options={"label": "ball"})), Hsv)
     assert isinstance(configured_detector(config(kind="adaptive")), Adaptive)
     assert isinstance(configured_detector(config(kind="boxes")), NoDetector)
+
+
+def test_the_default_is_the_learned_model_where_that_can_find_the_target(monkeypatch) -> None:
+    made = configured_detector(VisionConfig())
+    assert isinstance(made.inner, OnnxDetector) and made.labels[0] == "ball" and not notices_of(made)
+    of_any_shape = configured_detector(VisionConfig.model_validate({"hsv": {"shape": "any"}}))
+    assert isinstance(of_any_shape.inner, Hsv) and not of_any_shape.labels and not notices_of(of_any_shape)
+
+
+def test_without_onnx_runtime_a_color_range_finds_the_target_and_that_is_reported_once(monkeypatch) -> None:
+    monkeypatch.setattr("sightline.vision_side.detect.onnx.detector.find_spec", lambda _name: None)
+    settings = VisionConfig.model_validate({"hsv": {"min_radius_px": 9.0}})
+    check_vision(settings)
+    made = configured_detector(settings)
+    assert isinstance(made.inner, Hsv) and made.inner._hsv_detector._config.min_radius_px == 9.0
+    (line,) = notices_of(made)
+    assert "ONNX Runtime is missing" in line and "pip install" in line and not notices_of(made)
+
+
+def test_a_device_that_is_demanded_needs_onnx_runtime(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    monkeypatch.setattr("sightline.vision_side.detect.onnx.detector.find_spec", lambda _name: None)
+    with pytest.raises(ConfigError, match="onnxruntime is not installed"):
+        configured_detector(config(device="cuda"))
 
 
 def test_own_class_gets_its_options_and_the_vision_values() -> None:
@@ -97,7 +122,7 @@ def test_hsv_takes_the_section_of_its_name_with_its_options_over_it() -> None:
 
 
 def test_wrappers_are_built_from_the_inside_out() -> None:
-    made = configured_detector(config(labels=("ball",), only_color=True, tracked=True, shadow="adaptive"))
+    made = configured_detector(config(kind="hsv", labels=("ball",), only_color=True, tracked=True, shadow="adaptive"))
     assert isinstance(made, ShadowDetector)
     made.close()
     tracked = made._driving
@@ -108,7 +133,7 @@ def test_wrappers_are_built_from_the_inside_out() -> None:
 def test_fallback_has_the_same_label_filter() -> None:
     large = (2000, 1200)
     jpeg = cv2.imencode(".jpg", np.full((large[1], large[0], 3), 120, np.uint8))[1].tobytes()
-    made = configured_detector(config(fallback="adaptive").model_copy(update={"max_pixels": 3_000_000}))
+    made = configured_detector(config(kind="hsv", fallback="adaptive").model_copy(update={"max_pixels": 3_000_000}))
     header = FrameHeader(session="0000abcd", seq=1, t_us=1)
     (result,) = made.detect([DetectFrame("r1", header, jpeg, Decoder(*large, 3_000_000))], monotonic_us() + 2_000_000)
     made.close()

@@ -8,6 +8,7 @@ that open another engine.
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
 
@@ -16,11 +17,12 @@ from pydantic import Field
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config as Settings
-from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.errors import ConfigError, HardwareError, install_command
 from sightline.protocol.log import report_fault
 from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.config import Device, HsvConfig
 from sightline.vision_side.decode import DecodedImage
+from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.color.hsv import ColorMask
 from sightline.vision_side.detect.color.refine import refined
 from sightline.vision_side.detect.onnx.engine import ModelEngine, OnnxHeader, open_engine
@@ -34,6 +36,7 @@ from sightline.vision_side.detect.onnx.tensors import (
     split_batch,
     tile_about,
 )
+from sightline.vision_side.detect.plugin_calls import DetectorWrapper, notices_of
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
 from sightline.vision_side.detect.timing import timed_together
 
@@ -78,7 +81,7 @@ class OnnxDetector:
         """True to enlarge the part of the image where the followed target is expected, if nothing is found there."""
         hsv: HsvConfig = HsvConfig()
         color_bonus: Annotated[float, Field(ge=0, le=1)] = 0.3
-        """Where `hsv.ranges` is set: added to the score of a target of that color."""
+        """Where `hsv.ranges` differs from the default: added to the score of a target of that color."""
 
     def __init__(self, config: Config) -> None:
         """Raises ConfigError for a file that is not such a model, HardwareError for a device that is not there."""
@@ -87,7 +90,7 @@ class OnnxDetector:
         self.labels = model.form.labels
         """All that it can call a thing; empty where the model has only numbers."""
         self._refine = frozenset(config.refine)
-        self._color = ColorMask(config.hsv.ranges) if "ranges" in config.hsv.model_fields_set else None
+        self._color = ColorMask(config.hsv.ranges) if config.hsv.ranges != HsvConfig().ranges else None
         self._bonus = config.color_bonus if self._color else 0.0
         self._least_score = min(self._min_score, max(_NOISE, self._min_score - self._bonus))
         # A model of any size gets the image unscaled, and a part of it would be no larger.
@@ -254,6 +257,41 @@ def _found(
         each = split_batch(engine.run(np.concatenate([pixels for pixels, _ in fitted])), len(pictures))
     return [read_outputs(outputs, form, letterbox, picture, min_score)
             for outputs, (_, letterbox), picture in zip(each, fitted, pictures, strict=True)]
+
+
+class AutoDetector(DetectorWrapper):
+    """The default: the learned model, or the color range where that is the better choice."""
+
+    Config = OnnxDetector.Config
+
+    def __init__(self, config: OnnxDetector.Config) -> None:
+        is_learned = _is_learned(config)
+        super().__init__(OnnxDetector(config) if is_learned else Hsv(Hsv.Config(hsv=config.hsv)))
+        self.labels = self.inner.labels if isinstance(self.inner, OnnxDetector) else ()
+        notices_of(self.inner)  # that no GPU runs it only surprises a user who has named a model
+        self._notices: list[str] = [] if is_learned or config.hsv.shape == "any" else [
+            "a color range finds the target, because ONNX Runtime is missing; for the learned detector: "
+            + install_command("vision")]
+
+    @classmethod
+    def read_model(cls, config: OnnxDetector.Config) -> "LoadedModel | None":
+        """Load the model, where there is one. Raises ConfigError and HardwareError."""
+        return read_onnx_model(config) if _is_learned(config) else None
+
+    def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
+        """Return the results of the chosen detector."""
+        return self.inner.detect(frames, deadline_us)
+
+    def notices(self) -> list[str]:
+        """Return the lines of the chosen detector, and once that ONNX Runtime is missing."""
+        notices, self._notices = self._notices, []
+        return [*notices, *super().notices()]
+
+
+def _is_learned(config: OnnxDetector.Config) -> bool:
+    """Return False for a target of any shape, which no model knows, and where ONNX Runtime is missing and no device is
+    demanded."""
+    return config.hsv.shape != "any" and (config.device != "auto" or find_spec("onnxruntime") is not None)
 
 
 def shipped_digest() -> str:

@@ -31,7 +31,7 @@ def squares():
 
 
 def found(one, jpeg, answers=None, wanted="", expected_px=None):
-    """What `one` finds, as (label, left edge, score); `answers` are (box, score, label) in place of its model's."""
+    """Return (label, left edge, score) of all that `one` finds; `answers` replace its model's: (box, score, label)."""
     frame = DetectFrame("r1", FrameHeader(session="0000abcd", seq=1, t_us=1), jpeg, Decoder(320, 240, 320 * 240))
     frame.goes_by, frame.expected_px = lambda label: is_followable(label, wanted), expected_px
     if answers is not None:
@@ -54,7 +54,7 @@ def test_the_target_of_the_color_comes_first_and_no_score_exceeds_1():
     assert found(detector(refine=[]), squares(), answers) == [("ball", 40, 1.0), ("ball", 200, 0.9)]
 
 
-def test_a_box_that_the_model_has_ruled_out_is_no_target_whatever_its_color():
+def test_a_box_that_the_model_has_ruled_out_does_not_count_whatever_its_color():
     answers = [(AT_YELLOW, 0.0, BALL), (AT_RED, 0.25, BALL)]
     assert found(detector(refine=[], min_score=0.2), squares(), answers) == [("ball", 200, 0.25)]
     assert len(found(detector(refine=[], min_score=0.0), squares(), answers)) == 2
@@ -80,8 +80,8 @@ def test_more_far_balls_of_the_color_are_found(second_look):
     model, counts = camera(320, 240), []
     for one in (detector(color=False, second_look=second_look), detector(second_look=second_look)):
         counts.append(0)
-        for far_m in np.linspace(1.6, 4.0, 9):
+        for far_m in np.linspace(3.6, 8.0, 9):
             middle_px = 160 - model.fx_px * 0.1 / far_m
-            seen = found(one, jpeg_of(scene(model, far_m, 0.1)), expected_px=(middle_px + 8, 120.0))
+            seen = found(one, jpeg_of(scene(model, far_m, 0.1, shaded=True)), expected_px=(middle_px + 8, 120.0))
             counts[-1] += any(abs(left_px - middle_px) < 14 for _, left_px, _ in seen)
     assert counts[0] + 2 <= counts[1]
