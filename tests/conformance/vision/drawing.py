@@ -7,6 +7,7 @@ Baseline or progressive (spectral selection), every component at full size, 8 bi
 all symbols codes of one length: legal, a little larger than the usual ones, and nothing to look up.
 """
 
+import math
 import struct
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -173,7 +174,9 @@ def _put_ac(bits: _Bits, block: Sequence[int]) -> None:
 
 _YELLOW: Final[Pixel] = (191, 28, 165)
 """Y, Cb, Cr of the default target's colour: hue 49 degrees, well saturated."""
+_BLACK: Final[Pixel] = (0, 128, 128)
 _ROOM: Final[Pixel] = (150, 122, 131)
+_FULL: Final = 1000
 _FINE: Final = 4
 """Samples per pixel and axis at the ball's edge."""
 
@@ -198,10 +201,22 @@ class Drawing:
 
     def scene(self) -> Scene:
         last = 1 if self.grey else 3
-        ball, room, every = _YELLOW[:last], _ROOM[:last], _FINE * _FINE
-        mixed = [tuple((one * share + other * (every - share) + every // 2) // every
-                       for one, other in zip(ball, room, strict=True)) for share in range(every + 1)]
-        return lambda x, y: mixed[self._covered(x, y)]
+        ball, dark, room, every = _YELLOW[:last], _BLACK[:last], _ROOM[:last], _FINE * _FINE
+
+        def color(x: int, y: int) -> Pixel:
+            share = self._covered(x, y)
+            light = self._light(x, y) if share else 0
+            lit = (black + (one - black) * light // _FULL for one, black in zip(ball, dark, strict=True))
+            return tuple((one * share + other * (every - share) + every // 2) // every
+                         for one, other in zip(lit, room, strict=True))
+
+        return color
+
+    def _light(self, x: int, y: int) -> int:
+        """The brightness of the ball there, of `_FULL`: a lamp above, a little to the left and behind the camera."""
+        right, down, radius = 2 * (x - self.x_px) + 1, 2 * (y - self.y_px) + 1, 2 * self.radius_px
+        ahead = math.isqrt(max(0, radius**2 - right**2 - down**2))
+        return min(_FULL, 350 + 6500 * max(0, 5 * ahead - 3 * right - 8 * down) // (99 * radius))
 
     def _covered(self, x: int, y: int) -> int:
         """Count the pixel's samples that lie on the ball; the center is a pixel's corner."""
