@@ -36,7 +36,7 @@ from sightline.training.network import (
     network,
 )
 from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, SceneSource, drawn_scenes, sample
-from sightline.training.schedule import Training
+from sightline.training.schedule import START_SHARE, Training
 from sightline.training.shipping import Card, Progress, card_text, chosen_thresholds, final_report, written
 
 _RARE = -4.6  # bias of the heat maps at the beginning: a hundredth of the cells
@@ -172,6 +172,12 @@ def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
         return _trained(scenes, training, device, folder, log)
 
 
+def blended(start: Weights, trained: Weights) -> Weights:
+    """Mix the weights of a trained network with those that it began from, which keeps more of what the start knew and
+    finds more than either (Wortsman et al., Robust fine-tuning of zero-shot models, 2022)."""
+    return {name: START_SHARE * start[name] + (1 - START_SHARE) * one for name, one in trained.items()}
+
+
 def start_from(weights: Weights, scenes: DrawnScenes, training: Training, folder: Path) -> None:
     """Leave a checkpoint of these weights where the last round begins, unless a training has gone on from there."""
     if (folder / CHECKPOINT).exists():
@@ -229,6 +235,7 @@ def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
              log: Callable[[str], None] | None, *, feeders: int = 1) -> Weights:
     """Train in one process; only the one with `log` writes checkpoints."""
     torch.set_num_threads(1)  # two are slower on shared cores: the layers are small
+    torch.backends.cudnn.benchmark = True  # a GPU's first algorithm for depthwise layers is rarely its fastest
     torch.manual_seed(training.seed)
     state = _State(scenes, training, torch.device(device))
     checkpoint = folder / CHECKPOINT
@@ -439,6 +446,8 @@ def run_training(options: TrainOptions, log: Callable[[str], None], progress: Pr
     if options.start is not None:
         start_from(options.start, scenes, options.training, options.out)
     weights = train(scenes, options.training, options.device, options.out, log, feeders=options.jobs)
+    if options.start is not None:
+        weights = blended(options.start, weights)
     log("thresholds are being chosen on scenes of other seeds")
     thresholds = chosen_thresholds(options.out / "unchosen.onnx", weights, options.validated, options.jobs, progress)
     model = options.out / MODEL

@@ -39,7 +39,7 @@ from sightline.sim.scenes.textures import JUDGED, TRAINED, TRAINED_HARDER, TRAIN
 from sightline.training.export import MOST_BOXES, OPSET, onnx_bytes
 from sightline.training.network import Weights
 from sightline.training.scenes import SceneSource
-from sightline.training.schedule import LEAST_SHARE, WHOLE_FROM, Training
+from sightline.training.schedule import LEAST_SHARE, START_SHARE, WHOLE_FROM, Training
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.onnx.engine import open_engine
@@ -146,7 +146,8 @@ def _made(card: Card) -> list[str]:
         f"{training.rate:g} at first, half of that in each round that follows down to {training.rate * LEAST_SHARE:g}, "
         "weights averaged.",
         *_over_photographs(source),
-        *([f"- The last round began from MODEL, of SHA-256 `{training.start}`."] if training.start else []),
+        *([f"- The last round began from MODEL, of SHA-256 `{training.start}`. The weights are {1 - START_SHARE:g} of "
+           f"those trained and {START_SHARE:g} of MODEL's."] if training.start else []),
         f"- Thresholds: {thresholds}, chosen on {card.validated} scenes a column of the seeds from {VALIDATED_FROM}, "
         f"with floors and walls of other families: {_families(VALIDATED)}.",
     ]

@@ -21,7 +21,7 @@ from sightline.sim.scenes.model import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED
 from sightline.training import export as train_export
 from sightline.training import loop as train_run
 from sightline.training.export import onnx_bytes, weights_in
-from sightline.training.loop import TorchNetwork, begin_from, folded, train
+from sightline.training.loop import TorchNetwork, begin_from, blended, folded, train
 from sightline.training.network import AGAINST, OUTPUTS, Layer, network
 from sightline.training.scenes import CUT_PX, DrawnScenes
 from sightline.training.schedule import Training
@@ -173,6 +173,13 @@ def test_a_larger_networks_file_gives_the_layers_that_are_left(monkeypatch):
         content = onnx_bytes({**given, **more}, {})
     left = weights_in(content)
     assert set(left) == set(given) and all(np.array_equal(left[name], value) for name, value in given.items())
+
+
+def test_a_training_from_a_model_ends_with_a_share_of_its_weights():
+    start = {"a": np.float32([[1.0, 2.0]]), "b": np.float32([8.0])}
+    ended = blended(start, {"a": np.float32([[3.0, -2.0]]), "b": np.float32([8.0])})
+    assert ended["a"] == pytest.approx(np.array([[2.6, -1.2]])) and ended["b"] == pytest.approx(8.0)
+    assert {one.dtype for one in ended.values()} == {np.dtype(np.float32)}
 
 
 @pytest.mark.slow
