@@ -17,13 +17,14 @@ import sysconfig
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent
 TICK_S = 10.0
+POLL_S = 0.05
 MIN_PYTHON = (3, 11)
 
 
@@ -51,6 +52,8 @@ DEBUG_SYMBOLS_MB = 125
 BUILD_MB = 500
 BUILD_CPU_MINUTES = 5.4
 BUILD_OBJECTS = 267
+# pip unpacks on one core. The lock is complete, so that no part needs what another one installs.
+PIPS = 2
 # Python's own flags add debug symbols and warnings, which only cost time and space.
 BUILD_FLAGS = "-O2 -g0 -w"
 # Below it a log may lack the line that names the cause.
@@ -148,10 +151,13 @@ class Setup:
     def install(self, wheel: Path | None) -> None:
         """Install the locked packages and Sightline itself, editable, and compile the tests once."""
         with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
-            locked = Path(folder) / "locked.txt"
-            locked.write_text(without(self.lock.read_text(), "pybullet") if wheel else self.lock.read_text())
-            self.pip("installing packages", "install", "--require-hashes", "--no-compile", "-r", locked,
-                     progress=self.installed)
+            pinned = list(entries(without(self.lock.read_text(), "pybullet") if wheel else self.lock.read_text()))
+            parts = [Path(folder) / f"part{number}.txt" for number in range(PIPS)]
+            for number, part in enumerate(parts):
+                part.write_text("".join(pinned[number::PIPS]))
+            self.phase("installing packages", *(
+                self.pip_command("install", "--require-hashes", "--no-deps", "--no-compile", "-r", part)
+                for part in parts), progress=self.installed)
             if wheel:
                 self.pip("installing PyBullet", "install", "--no-deps", "--no-index", "--no-compile", wheel)
             # Metadata and build files of the package belong to neither the checkout nor an earlier build.
@@ -193,21 +199,27 @@ class Setup:
 
     def pip(self, label: str, *words: Any, progress: Callable[[], str] = str, **environ: str) -> None:
         """Run pip with `words` as one phase."""
-        self.phase(label, [self.python, "-m", "pip", "--disable-pip-version-check", "--no-input", *words], progress,
-                   environ)
+        self.phase(label, self.pip_command(*words), progress=progress, environ=environ)
 
-    def phase(self, label: str, command: list[Any], progress: Callable[[], str] = str,
+    def pip_command(self, *words: Any) -> list[Any]:
+        """Return the command that runs pip with `words`."""
+        return [self.python, "-m", "pip", "--disable-pip-version-check", "--no-input", *words]
+
+    def phase(self, label: str, *commands: list[Any], progress: Callable[[], str] = str,
               environ: dict[str, str] | None = None) -> None:
-        """Run `command` with its output in the log, and print a line when it begins, every ten seconds and at its end.
+        """Run `commands` beside one another, with their output in the log, until all have ended or one has failed.
+        Print a line when they begin, every ten seconds and at their end.
 
         Raises:
-            SetupError: the command failed; the line names cause, fix and log.
+            SetupError: a command failed; the line names cause, fix and log.
         """
         begin, begin_of_output = time.monotonic(), self.log.stat().st_size if self.log.exists() else 0
         print(f"  {label} ...", flush=True)
         try:
-            with self.log.open("a+b") as log, started([str(word) for word in command], log, environ or {}) as process:
-                while (code := waited(process, TICK_S)) is None:
+            with self.log.open("a+b") as log, ExitStack() as running:
+                processes = [running.enter_context(started([str(word) for word in command], log, environ or {}))
+                             for command in commands]
+                while (code := waited(processes, TICK_S)) is None:
                     print(f"  {label}: {', '.join(filter(None, (progress(), elapsed(begin))))}", flush=True)
                 log.seek(begin_of_output)
                 output = log.read().decode(errors="replace")
@@ -351,12 +363,17 @@ def restore(handlers: dict[signal.Signals, Any]) -> None:
         signal.signal(number, handler)
 
 
-def waited(process: "subprocess.Popen[bytes]", seconds: float) -> int | None:
-    """Wait for the exit code, or None after `seconds`."""
-    try:
-        return process.wait(seconds)
-    except subprocess.TimeoutExpired:
-        return None
+def waited(processes: "list[subprocess.Popen[bytes]]", seconds: float) -> int | None:
+    """Wait until all have ended or one has failed: the exit code of that one, or 0; None after `seconds`."""
+    end = time.monotonic() + seconds
+    while True:
+        codes = [process.poll() for process in processes]
+        failed = next(filter(None, codes), None)
+        if failed or None not in codes:
+            return failed or 0
+        if time.monotonic() > end:
+            return None
+        time.sleep(POLL_S)
 
 
 def cause(log: str) -> str:

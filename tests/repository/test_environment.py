@@ -223,10 +223,13 @@ def test_compiled_pybullet_is_stored_and_used_again(environment, venv, tmp_path,
     assert {"--no-build-isolation", "--require-hashes", "--no-binary"} <= set(build.split())
     calls.unlink()
     # What pip is to install: PyBullet is not to be compiled by pip again.
-    copy = f"for word; do case $word in */locked.txt) cat $word > {tmp_path}/locked;; esac; done"
+    copy = f"for word; do case $word in */part*.txt) cat $word > {tmp_path}/${{word##*/}};; esac; done"
     monkeypatch.setenv("FAKE_PIP", copy)
     environment.Setup("test", venv).run()
-    assert "\nnumpy==" in (tmp_path / "locked").read_text() and "pybullet" not in (tmp_path / "locked").read_text()
+    parts = [path.read_text() for path in tmp_path.glob("part*.txt")]
+    assert len(parts) == 2 and "pybullet" not in "".join(parts)
+    entries = [entry for part in parts for entry in environment.entries(part)]
+    assert sorted(entries) == sorted(environment.entries(environment.without(ALL.read_text(), "pybullet")))
     text = calls.read_text()
     assert " wheel " not in text and str(wheel) in text and "compiling PyBullet" not in capsys.readouterr().out
 
@@ -241,10 +244,24 @@ def test_failed_compilation_stores_nothing(environment, venv, tmp_path, monkeypa
 
 def test_long_phase_prints_its_progress(environment, venv, monkeypatch, capsys):
     monkeypatch.setattr(environment, "TICK_S", 0.05)
-    environment.Setup("demo", venv).phase("compiling", ["sleep", "0.3"], lambda: "3 of 7 files")
+    environment.Setup("demo", venv).phase("compiling", ["sleep", "0.3"], progress=lambda: "3 of 7 files")
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "  compiling ..." and "  compiling: 3 of 7 files, 0 s" in lines
     assert re.fullmatch(r"  compiling: done after \d s", lines[-1])
+
+
+def test_a_failed_command_ends_those_beside_it(environment, venv):
+    begin = time.monotonic()
+    with pytest.raises(environment.SetupError, match="installing: no such thing; full output in"):
+        environment.Setup("demo", venv).phase("installing", ["sleep", "60"],
+                                              ["sh", "-c", "echo ERROR: no such thing; exit 3"])
+    assert time.monotonic() - begin < 30
+
+
+def test_commands_run_beside_one_another_and_all_of_them(environment, venv, tmp_path):
+    met = f"cd {tmp_path}; touch $0; while [ ! -e $1 ]; do sleep 0.02; done; sleep 0.2; echo $0 >> ended"
+    environment.Setup("demo", venv).phase("installing", ["sh", "-c", met, "a", "b"], ["sh", "-c", met, "b", "a"])
+    assert sorted((tmp_path / "ended").read_text().split()) == ["a", "b"]
 
 
 def test_demo_lock_is_a_part_of_the_whole_lock(environment):
