@@ -161,7 +161,7 @@ def _given(source: SceneSource) -> str:
 
 def _seeds(source: SceneSource) -> str:
     last = (source.count - 1) * source.every
-    return f"seeds 0 to {last}" + (f", each {source.every}th" if source.every > 1 else "")
+    return f"seeds 0 to {last}" + (f", one in {source.every}" if source.every > 1 else "")
 
 
 def _over_photographs(source: SceneSource) -> list[str]:

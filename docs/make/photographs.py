@@ -5,7 +5,7 @@
 
 import platform
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -14,18 +14,22 @@ from sightline.evaluation.photographs import SHIPPED, Photograph, read_photograp
 from sightline.evaluation.score.ball_textures import KINDS
 from sightline.evaluation.score.detector_report import Subject, answer_of, close_subjects, subjects
 from sightline.evaluation.score.photo_report import (
+    COLORS,
     PhotoPicture,
     PhotoReport,
     best_ball,
+    color_setting,
+    colored_lines,
     photo_lines,
     photo_pictures,
     score_photos,
 )
+from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.terminal import progress_bar
 from sightline.vision_side.detect.onnx.detector import shipped_digest
 
 PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "photographs.md"
-NAMES: Final = ("onnx", "hsv")
+NAMES: Final = ("onnx", "onnx:rooms", "hsv")
 EACH, SEED = 60, 1
 """As in the command that the page prints."""
 SHOWN_SEED: Final = 2
@@ -60,7 +64,7 @@ def image_of(picture: PhotoPicture, subject: Subject) -> Any:
     return bgr
 
 
-def page_lines(plain: PhotoReport, tracked: PhotoReport) -> Iterator[str]:
+def page_lines(plain: PhotoReport, tracked: PhotoReport, colored: Mapping[str, PhotoReport]) -> Iterator[str]:
     """Yield the page, block by block."""
     yield "# Photographs\n"
     yield (
@@ -72,26 +76,42 @@ def page_lines(plain: PhotoReport, tracked: PhotoReport) -> Iterator[str]:
     yield (f"Written by `python -m docs.make.photographs` on {platform.machine()} with the model {shipped_digest()}, "
            f"ONNX Runtime {version('onnxruntime')}\nand OpenCV {version('opencv-python-headless')}.\n")
     yield f"![two images of each kind; green: the ball, red: the answer of {NAMES[0]}](photographs/images.jpg)\n"
-    for title, report, option in (("One look", plain, ""), ("Where a track expects the ball", tracked, " --tracked")):
+    for title, lines, option in (
+        ("One look", photo_lines(plain), ""),
+        ("Where a track expects the ball", photo_lines(tracked), " --tracked"),
+        ("With the color of the ball set", colored_lines(colored), " --colored"),
+    ):
         yield f"## {title}\n"
         yield f"```text\n$ sightline score detectors {' '.join(NAMES)} --photos shipped --frames {EACH}{option}"
-        yield from photo_lines(report)
+        yield from lines
         yield "```\n"
+
+
+def _colored(kind: str, photographs: Sequence[Photograph], advance: Callable[[], None]) -> PhotoReport:
+    """Score the detectors with the color of a kind set."""
+    loaded: Any = load_service("vision", file=None, sets=(color_setting(kind),), options={}, environ={}).config
+    asked = subjects(NAMES, loaded)
+    try:
+        return score_photos(asked, photographs, EACH, SEED, kinds=(kind,), advance=advance)
+    finally:
+        close_subjects(asked)
 
 
 def main() -> int:
     """Score the detectors on the shipped photographs, and write the page."""
     photographs, asked = read_photographs(SHIPPED), subjects(NAMES)
     try:
-        with progress_bar(2 * (len(KINDS) * EACH + len(photographs))) as advance:
+        shown = 2 * (len(KINDS) * EACH + len(photographs)) + len(COLORS) * (EACH + len(photographs))
+        with progress_bar(shown) as advance:
             plain, tracked = (score_photos(asked, photographs, EACH, SEED, tracked=told, advance=advance)
                               for told in (False, True))
+            colored = {kind: _colored(kind, photographs, advance) for kind in COLORS}
         folder = PAGE.parent / PAGE.stem
         folder.mkdir(exist_ok=True)
         write_image(folder / "images.jpg", asked[0], photographs)
     finally:
         close_subjects(asked)
-    PAGE.write_text("\n".join(page_lines(plain, tracked)).rstrip() + "\n", "utf-8")
+    PAGE.write_text("\n".join(page_lines(plain, tracked, colored)).rstrip() + "\n", "utf-8")
     return 0
 
 

@@ -1,8 +1,8 @@
 """The detector `onnx:PATH`. Shell.
 
-Without a path it is the model that comes with Sightline, and `onnx:nanodet` its model of the 80 classes of COCO. Before
-the first frame it has run warm, and its answer to a known image was compared. Models of other frameworks are subclasses
-that open another engine.
+Without a path it is the model that comes with Sightline; `onnx:rooms` is its model trained over photographs, and
+`onnx:nanodet` its model of the 80 classes of COCO. Before the first frame it has run warm, and its answer to a known
+image was compared. Models of other frameworks are subclasses that open another engine.
 """
 
 import hashlib
@@ -43,6 +43,7 @@ from sightline.vision_side.detect.timing import timed_together
 _MODELS: Final = Path(__file__).parent.parent.parent / "models"
 SHIPPED: Final = _MODELS / "sightline.onnx"
 NANODET: Final = _MODELS / "nanodet.onnx"
+ROOMS: Final = _MODELS / "rooms.onnx"
 HASH_DIGITS: Final = 16
 MAX_BYTES: Final = 2**31
 """A protocol buffer can be no larger."""
@@ -65,7 +66,8 @@ class OnnxDetector:
 
         renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color"}
         address: str = ""
-        """The file; empty for the model that comes with Sightline, `nanodet` for its model of people and COCO."""
+        """The file; empty for the model that comes with Sightline, `rooms` for its model trained over photographs,
+        `nanodet` for that of people and COCO."""
         device: Device = "auto"
         threads: Annotated[int, Field(ge=1, le=64)] = 1
         """Threads on the CPU. A small image only loses by being split."""
@@ -230,7 +232,8 @@ def read_onnx_model(config: OnnxDetector.Config) -> LoadedModel:
         ConfigError: for a file that is not a model, or of a form unknown here.
         HardwareError: for a device that is not there.
     """
-    path = NANODET if config.address == "nanodet" else Path(config.address).expanduser() if config.address else SHIPPED
+    named = {"": SHIPPED, "nanodet": NANODET, "rooms": ROOMS}
+    path = named.get(config.address) or Path(config.address).expanduser()
     digest = digest_of(path)
     engine = open_engine(path, config.device, config.threads)
     try:
@@ -314,7 +317,7 @@ def _bytes_of(path: Path) -> bytes:
             raise ConfigError(f"model {path} has {size} bytes; a model file has between 1 and {MAX_BYTES}")
         return path.read_bytes()
     except OSError as error:
-        if path in (SHIPPED, NANODET):
+        if path in (SHIPPED, NANODET, ROOMS):
             raise ConfigError("this copy of Sightline has no model; name one, e.g. --detector onnx:ball.onnx, or "
                               "train it (docs/explanation/learned-detector.md)") from None
         why = error.strerror or "it cannot be read"
