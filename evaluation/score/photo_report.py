@@ -24,7 +24,7 @@ QUALITY: Final = 85
 SMALL_PX: Final = 12.0
 """Balls of a smaller radius have a column of their own."""
 COLORS: Final = {
-    "yellow": (38, 66, 0.45), "tennis": (50, 85, 0.35), "orange": (10, 36, 0.5), "blue": (195, 250, 0.4),
+    "yellow": (38, 66, 0.5), "tennis": (50, 85, 0.35), "orange": (10, 36, 0.5), "blue": (195, 250, 0.4),
     "green": (85, 165, 0.35), "red": (340, 15, 0.5),
 }
 """Hue from and to, degrees, and the least saturation, as a user would set them for a ball of that kind."""
