@@ -37,9 +37,17 @@ export function drawPicture(pose, ball, noise = 0) {
   const [across, down] = [WIDTH_PX / 8, HEIGHT_PX / 8];
   return encodeFlat(across, down, (x, y) => {
     if (x === 0 && y === 0) return COLORS.wall.map((level) => level + (noise % 8));
-    if (circle !== null && Math.hypot(x * 8 + 4 - circle.x_px, y * 8 + 4 - circle.y_px) <= circle.radius_px) return COLORS.ball;
+    const light = circle === null ? null : lightAt(circle, x * 8 + 4, y * 8 + 4);
+    if (light !== null) return COLORS.ball.map((level) => Math.round(level * light));
     return y * 8 > HEIGHT_PX / 2 ? COLORS.floor : COLORS.wall;
   });
+}
+
+/** The brightness of the ball at a pixel, 0..1, under a lamp above; null beside the ball. */
+function lightAt(circle, x_px, y_px) {
+  const [right, down] = [(x_px - circle.x_px) / circle.radius_px, (y_px - circle.y_px) / circle.radius_px];
+  const square = 1 - right * right - down * down;
+  return square < 0 ? null : 0.35 + 0.65 * Math.max(0, 0.52 * Math.sqrt(square) - 0.3 * right - 0.8 * down);
 }
 
 function projected(pose, ball) {

@@ -68,7 +68,7 @@ def test_a_shadow_is_compared_and_never_steers(tmp_path: Path) -> None:
     model = brightness_model(tmp_path / "right.onnx", RIGHT, [0])
     with (
         RobotProcess(tmp_path, camera=ball_on_the_left(tmp_path)) as robot,
-        VisionProcess(tmp_path, "--connect", robot.endpoint, "--shadow", f"onnx:{model}") as vision,
+        VisionProcess(tmp_path, "--connect", robot.endpoint, "--detector", "hsv", "--shadow", f"onnx:{model}") as vision,
     ):
         connect = ("--connect", robot.endpoint)
         assert until(lambda: turning(robot) > 0.5, START_S), vision.output()
