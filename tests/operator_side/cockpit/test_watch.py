@@ -88,7 +88,7 @@ def test_the_target_is_printed_as_a_line_an_object_and_a_table(
     assert len(rows) == 2 and list(rows[0]) == list(first) and float(rows[0]["bearing_rad"]) == pytest.approx(
         first["bearing_rad"], abs=0.05)
     assert run(where) == 0
-    assert re.fullmatch(r"( *[+-]\d+\.\d deg +\d\.\d\d m  target \d\.\d\d at .* px, radius .* \(\w+\)\n){2}",
+    assert re.fullmatch(r"( *[+-]\d+\.\d deg +\d\.\d\d m  ball \d\.\d\d at .* px, radius .* \(\w+\)\n){2}",
                         capsys.readouterr().out)
 
 
