@@ -166,7 +166,7 @@ def vision(
     sets: Sets = None,
     detector: Annotated[
         str | None,
-        typer.Option("--detector", metavar="NAME", help="Detector, see `sightline detector list` [default: auto]."),
+        typer.Option("--detector", metavar="NAME", help="Detector, see `sightline detector list` [default: hsv]."),
     ] = None,
     device: Device = None,
     shadow: Annotated[

@@ -124,7 +124,7 @@ def test_signal_ends_all_processes_and_the_run_is_scored(tmp_path, number):
     assert running_in(folder) == []
 
 
-@pytest.mark.slow
+@pytest.mark.alone  # it must end within 2 s
 def test_demo_that_is_killed_leaves_no_process_no_folder_and_stopped_wheels(tmp_path):
     folder = tmp_path / "run"
     with TemporaryDirectory() as temporary:  # a short name, for the path of a socket
