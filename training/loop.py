@@ -173,8 +173,8 @@ def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
 
 
 def blended(start: Weights, trained: Weights) -> Weights:
-    """Mix the weights of a trained network with those that it began from, which keeps more of what the start knew and
-    finds more than either (Wortsman et al., Robust fine-tuning of zero-shot models, 2022)."""
+    """Mix the weights of a trained network with those that it began from, which keeps more of what the start knew
+    (Wortsman et al., Robust fine-tuning of zero-shot models, 2022)."""
     return {name: START_SHARE * start[name] + (1 - START_SHARE) * one for name, one in trained.items()}
 
 

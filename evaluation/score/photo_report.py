@@ -184,9 +184,7 @@ def photo_lines(report: PhotoReport) -> list[str]:
             tally = figures.kinds.get(kind) or getattr(figures, kind)
             rows.append((_NAMES.get(kind, kind), name, str(tally.balls), *(
                 f"{100 * count / max(1, tally.balls):.1f} %" for count in (tally.hit, tally.wrong, tally.missed))))
-    widths = [max(len(row[place]) for row in rows) for place in range(len(rows[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return [*lines, *(_empty_line(name, figures) for name, figures in report.figures.items()),
+    return [*_aligned(rows), *(_empty_line(name, figures) for name, figures in report.figures.items()),
             *(f"{name}: no answer to {one.unanswered} pictures, which count as missed: {one.why}"
               for name, one in report.figures.items() if one.unanswered),
             f"{report.photographs} photographs, {report.each} pictures of each kind, seed {report.seed}"
@@ -207,6 +205,11 @@ def colored_lines(reports: Mapping[str, PhotoReport]) -> list[str]:
             tally = one.kinds[kind]
             rows.append((kind, name, str(tally.balls), *(f"{100 * count / max(1, tally.balls):.1f} %" for count in (
                 tally.hit, tally.wrong, tally.missed)), f"{one.false_alarms} of {one.empty}"))
+    return _aligned(rows)
+
+
+def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """Return one line for each row, with the cells of a column below one another."""
     widths = [max(len(row[place]) for row in rows) for place in range(len(rows[0]))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
