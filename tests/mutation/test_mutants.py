@@ -8,6 +8,7 @@ import pytest
 
 import tests.mutation.__main__ as gate
 from tests.mutation.mutants import mutants
+from tests.mutation.trial import Outcome
 
 
 def changes(source):
@@ -96,6 +97,19 @@ def test_part_of_a_file_has_the_mutants_of_its_names_and_constants_only(tmp_path
     assert {"1", "2", "3", "4"} < before
     monkeypatch.setattr(gate, "PARTS", {str(file): ("_RAMP_", "A")})
     assert {mutant.before for mutant in gate._mutants(str(file))} == {"1", "4", "return 4"}
+
+
+@pytest.mark.parametrize(("outcome", "is_named", "exit_code"), [
+    (Outcome.KILLED, False, 0), (Outcome.SURVIVED, False, 5), (Outcome.TIMEOUT, False, 0),
+    (Outcome.KILLED, True, 5), (Outcome.SURVIVED, True, 0), (Outcome.TIMEOUT, True, 0),
+])
+def test_named_equivalents_are_those_that_no_table_kills(outcome, is_named, exit_code):
+    (mutant,) = mutants("example.py", "assert not a\n")
+    assert gate._result({mutant: outcome}, {mutant.name} if is_named else set()) == exit_code
+
+
+def test_equivalent_of_no_mutant_is_outdated():
+    assert gate._result({}, {("example.py", "", "not a", "a", 1)}) == 5
 
 
 def test_files_of_parts_are_under_the_gate():

@@ -510,6 +510,18 @@ def test_standby_needs_no_session():
     assert not any(see(sharing, ms * MS, ms) for ms in range(0, 5_000, 100))
 
 
+def test_choices_are_computed_again_only_after_a_token(monkeypatch):
+    computed = []
+    monkeypatch.setattr(f"{Sharing.__module__}.assign", lambda *given: computed.append(given) or assign(*given))
+    sharing = service("r1")
+    for now_us in range(5):
+        sharing.step(now_us)
+    assert len(computed) == 1
+    sharing.on_token(RobotToken("r2"), True, 5)
+    sharing.step(5)
+    assert len(computed) == 2
+
+
 # --- limits -----------------------------------------------------------------------------------------------------------
 
 
