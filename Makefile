@@ -25,7 +25,9 @@ test-all: test-environment  ## what is longer: first what can share the machine,
 	$(PYTEST) -m "alone and not long" && exit $$shared
 
 test-long: test-environment  ## once before a release: the fault bench, the exploration, the kit against every broken peer, all mutants
-	$(PYTEST) -m long; tests=$$?; $(MAKE) --no-print-directory mutation && exit $$tests
+	$(PYTEST) -m "long and not alone" --numprocesses auto --dist worksteal; shared=$$?; \
+	$(PYTEST) -m "long and alone"; alone=$$?; \
+	$(MAKE) --no-print-directory mutation && exit $$((shared | alone))
 
 lint: test-environment
 	$(BIN)/ruff check .

@@ -43,8 +43,8 @@ def pytest_collection():
 
 
 def pytest_xdist_auto_num_workers(config):
-    """Three workers for each processor, since most tests wait; one for the second tier, whose tests start several."""
-    return (1 if config.option.markexpr.startswith("slow") else 3) * len(os.sched_getaffinity(0))
+    """Three workers for each processor, since most tests wait; one for longer tests, which start several processes."""
+    return (1 if config.option.markexpr.startswith(("slow", "long")) else 3) * len(os.sched_getaffinity(0))
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)

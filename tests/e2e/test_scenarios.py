@@ -17,8 +17,8 @@ IN_EVERY_TEST_RUN = "legs"
 
 
 def chosen(names: Iterable[str]) -> list[object]:
-    return [pytest.param(name, marks=pytest.mark.slow if name == IN_EVERY_TEST_RUN else pytest.mark.long)
-            for name in names]
+    long = [pytest.mark.long, pytest.mark.alone]
+    return [pytest.param(name, marks=pytest.mark.slow if name == IN_EVERY_TEST_RUN else long) for name in names]
 
 
 def seconds_of(scenario: Scenario) -> float:

@@ -94,6 +94,7 @@ def test_a_short_race_of_the_services_over_each_transport(transport):
 
 
 @pytest.mark.long
+@pytest.mark.alone
 def test_every_peer_answers(tmp_path):
     demanded.module("zmq", "bench")
     race = run_race(replace(SMALL, detector_delay_ms=40.0), lambda _: None)

@@ -71,6 +71,7 @@ def test_mutant_fails_the_cases_that_must_catch_it(stage, mutant):
 
 
 @pytest.mark.long
+@pytest.mark.alone
 @pytest.mark.parametrize("mutant", of("robot-socket", "vision-socket"))
 def test_mutant_on_sockets_fails_exactly_its_case(on_sockets, mutant):
     assert on_sockets[str(mutant)].result(timeout=MOST_S) == set(mutant.caught_by)

@@ -119,6 +119,7 @@ def test_legacy_vision_receives_images_and_drives_within_guest_limits(tmp_path, 
 
 
 @pytest.mark.long
+@pytest.mark.alone
 def test_legacy_vision_receives_95_percent_of_the_images_on_a_quiet_machine(tmp_path, pictures):
     """A figure, and so no part of `make test`: beside others the older vision becomes too slow itself."""
     with old_vision_drives(tmp_path, pictures) as (_, _, log, _):

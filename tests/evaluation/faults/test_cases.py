@@ -1,6 +1,6 @@
 """The fault bench: its checks on invented logs, its rows and report, and the rows themselves on real processes.
 
-The short set is marked `slow`, the rest `faults`.
+The short set is marked `slow`, the rest `long`.
 """
 
 import json
@@ -323,6 +323,7 @@ def test_the_short_set(row, tmp_path):
 
 
 @pytest.mark.long
+@pytest.mark.alone
 @pytest.mark.parametrize("row", [row for row in CASES if not row.short], ids=lambda row: row.id)
 def test_the_long_set(row, tmp_path):
     run_once(row, tmp_path)
