@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from sightline.evaluation.labels import Labels
 from sightline.evaluation.scenario_config import robot_config, vision_config
-from sightline.evaluation.score.figures import RimSpeeds, RunRecord
+from sightline.evaluation.score.figures import AnsweredFrame, RimSpeeds, RunRecord
 from sightline.evaluation.score.sabotage import HEALTHY, SeamDetector, Seams
 from sightline.protocol.channels import ACK, FRAME, SCAN, TWIST
 from sightline.protocol.codec import decode, encode
@@ -185,7 +185,10 @@ class Lockstep:
         if scan is not None:
             self._pipeline.put_scan(*decode_scan(scan.header, scan.payload))
         answer = self._pipeline.step(frame) if self._labels is None else self._follow(self._labels, frame.header)
-        self.run.said.append((frame.header.t_us, answer.seen.phase, answer.seen.note))
+        seen = answer.seen
+        self.run.said.append(
+            AnsweredFrame(frame.header.t_us, seen.phase, seen.note, seen.bearing_rad, seen.distance_m)
+        )
         self._loss.update(frame.header, self._frames.dropped)
         if answer.twist is None:
             return [self._message(frame.header, answer, b"")]

@@ -420,6 +420,7 @@ FIGURES: Mapping[str, Figure] = {
     "bearing_rms_deg": Figure("deg", "rms"),
     "distance_rms_m": Figure("m", "rms"),
     "lost_percent": Figure("%", "share", is_exact=True),
+    "wrong_percent": Figure("%", "share", is_exact=True),
     "wall_contacts": Figure("steps", "count", is_exact=True),
     "wall_contact_s": Figure("s", "count", is_exact=True),
     "target_contacts": Figure("steps", "count", is_exact=True),

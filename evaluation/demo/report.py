@@ -13,7 +13,15 @@ from sightline.evaluation.demo.shaped_vision import INJECTED
 from sightline.evaluation.faults.evidence import read_motors
 from sightline.evaluation.processes import last_line
 from sightline.evaluation.scenario_config import robot_config, robot_of
-from sightline.evaluation.score.figures import NOT_EVALUATED, RimSpeeds, RunRecord, Score, checks_of, score
+from sightline.evaluation.score.figures import (
+    NOT_EVALUATED,
+    AnsweredFrame,
+    RimSpeeds,
+    RunRecord,
+    Score,
+    checks_of,
+    score,
+)
 from sightline.operator_side.client.requests import StatusReport, read_report
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.recording.recorder import read_recording
@@ -63,9 +71,9 @@ def report(run: DemoRun) -> DemoReport:
     if not run.samples:
         raise SightlineError(f"ended before the robot drove; the logs are in {run.folder}")
     recording = run.folder / RECORDING
-    said: list[tuple[int, str, str]] = []
+    said: list[AnsweredFrame] = []
     replayed = replay(recording, lambda step: said.append(_printed(step)))
-    during = [one for one in said if run.samples[0].t_us <= one[0] <= run.samples[-1].t_us]
+    during = [one for one in said if run.samples[0].t_us <= one.t_us <= run.samples[-1].t_us]
     record = RunRecord(run.samples, during, accepted_us(recording), _wheels(run))
     result = score(run.scenario, record)
     injected = _injected(run)
@@ -76,9 +84,10 @@ def report(run: DemoRun) -> DemoReport:
     return judged
 
 
-def _printed(step: Step) -> tuple[int, str, str]:
-    """Return the phase and note of a frame. The same pipeline produces the same for the same frames."""
-    return step.frame.header.t_us, step.answer.seen.phase, step.answer.seen.note
+def _printed(step: Step) -> AnsweredFrame:
+    """Return what the mission reported of a frame. The same pipeline produces the same for the same frames."""
+    seen = step.answer.seen
+    return AnsweredFrame(step.frame.header.t_us, seen.phase, seen.note, seen.bearing_rad, seen.distance_m)
 
 
 def accepted_us(recording: Path) -> int | None:

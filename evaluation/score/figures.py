@@ -17,8 +17,18 @@ ACQUIRED_FOR_S = 1.0
 """So long without a break the target must be within both: a target that only passes through is not acquired."""
 FOUND_WITHIN_DEG = 10.0
 
-MissionPhases = Sequence[tuple[int, str, str]]
-"""Capture time of each frame answered, and the mission's phase and note."""
+WRONG_BY_M = 0.3
+"""A target that the mission reports further than this from the true one is another object."""
+
+
+class AnsweredFrame(NamedTuple):
+    """Report of the mission on one frame: capture time, phase, note, and the place of its target from the lens."""
+
+    t_us: int
+    phase: str
+    note: str
+    bearing_rad: float | None = None
+    distance_m: float | None = None
 
 
 class RimSpeeds(NamedTuple):
@@ -34,8 +44,7 @@ class RunRecord:
     """The record of a run for its score, whether in lockstep or in real time."""
 
     samples: list[Truth] = field(default_factory=list)
-    said: list[tuple[int, str, str]] = field(default_factory=list)
-    """Capture time of each frame that was answered, and the mission's phase and note."""
+    said: list[AnsweredFrame] = field(default_factory=list)
     accepted_us: int | None = None
     """When the robot accepted its first twist; None if it never did."""
     wheels: list[RimSpeeds] = field(default_factory=list)
@@ -163,6 +172,7 @@ def figures_of(scenario: Scenario, run: RunRecord, followed: Sequence[Truth]) ->
     figures: Figures = {
         "wall_contact_s": (samples[-1].wall_contacts - samples[0].wall_contacts) * STEP_S,
         "commanded_m": commanded_m(run.wheels, samples[0].t_us, samples[-1].t_us),
+        "wrong_percent": wrong_percent(followed, run.said),
     }
     if any(isinstance(thing, OnPath) for thing in scenario.things):
         figures["least_passes"] = samples[-1].passes - samples[0].passes
@@ -184,6 +194,23 @@ def commanded_m(wheels: Sequence[RimSpeeds], begin_us: int, end_us: int) -> floa
     ) if wheels else 0.0
 
 
+def wrong_percent(followed: Sequence[Truth], said: Sequence[AnsweredFrame]) -> float | None:
+    """Return the share of the frames since the acquisition in which the mission followed another object, in percent."""
+    times_us = [truth.t_us for truth in followed]
+    frames = [one for one in said if times_us and one.t_us >= times_us[0]]
+    wrong = sum(_is_wrong(followed[bisect_right(times_us, one.t_us) - 1], one) for one in frames)
+    return 100 * wrong / len(frames) if frames else None
+
+
+def _is_wrong(truth: Truth, one: AnsweredFrame) -> bool:
+    """Return True if the target that is tracked in a frame is not where the true one is."""
+    if one.phase != "tracking" or one.bearing_rad is None or one.distance_m is None:
+        return False
+    off_rad = one.bearing_rad - truth.bearing_rad  # by the law of cosines
+    square = one.distance_m**2 + truth.distance_m**2 - 2 * one.distance_m * truth.distance_m * math.cos(off_rad)
+    return square > WRONG_BY_M**2
+
+
 def legs_figures(samples: Sequence[Truth], followed: Sequence[Truth]) -> Figures:
     """Return the distances from the acquisition on, and the smallest of the whole run."""
     distances = [truth.distance_m for truth in followed]
@@ -193,14 +220,14 @@ def legs_figures(samples: Sequence[Truth], followed: Sequence[Truth]) -> Figures
     }
 
 
-def goal_figures(scenario: Scenario, samples: Sequence[Truth], said: MissionPhases) -> Figures:
+def goal_figures(scenario: Scenario, samples: Sequence[Truth], said: Sequence[AnsweredFrame]) -> Figures:
     """Return the time of the last waypoint, the smallest clearance, and the time of "cannot reach"."""
     goals, reached_s = list(scenario.goals_m), None
     for truth in samples:
         if goals and math.dist((truth.x_m, truth.y_m), goals[0]) <= REACHED_WITHIN_M:
             goals.pop(0)
             reached_s = (truth.t_us - samples[0].t_us) / 1e6
-    given_up = next((t_us for t_us, phase, _ in said if phase == "cannot reach"), None)
+    given_up = next((one.t_us for one in said if one.phase == "cannot reach"), None)
     clearances = [truth.clearance_m for truth in samples if truth.clearance_m is not None]
     return {
         "reached_s": None if goals else reached_s, "least_clearance_m": min(clearances, default=None),
@@ -225,7 +252,7 @@ def _most_aside_m(scenario: Scenario, samples: Sequence[Truth]) -> float:
     return max(abs((truth.y_m - y_m) * cos - (truth.x_m - x_m) * sin) for truth in samples)
 
 
-def light_figures(samples: Sequence[Truth], said: MissionPhases) -> Figures:
+def light_figures(samples: Sequence[Truth], said: Sequence[AnsweredFrame]) -> Figures:
     """Crossings of the stop line and what the light showed, how soon it starts, and how often it misread the light."""
     crossings = list(_crossings(samples))
     starts = list(_starts(samples))
@@ -269,12 +296,12 @@ def _starts(samples: Sequence[Truth]) -> Iterator[float]:
             green_us = None
 
 
-def _wrong_percent(samples: Sequence[Truth], said: MissionPhases) -> float | None:
+def _wrong_percent(samples: Sequence[Truth], said: Sequence[AnsweredFrame]) -> float | None:
     """Return the share of frames before the line with a wrong or missing color of the mission, in percent."""
     times_us = [truth.t_us for truth in samples]
     changes = [now.t_us for before, now in pairwise(samples) if before.light != now.light]
     looked = right = 0
-    for t_us, _, note in said:
+    for t_us, _, note, *_ in said:
         after = bisect_right(times_us, t_us)
         if not 0 < after < len(samples):
             continue

@@ -57,7 +57,8 @@ def test_who_is_behind_a_wall_or_behind_the_robot_has_no_box():
 
 
 def test_others_are_labelled_too_and_a_scenario_without_labels_has_none():
-    with World(load_scenario("legs-crowd"), robot_with(), 3) as world:
+    crowd = load_scenario("legs-crowd").model_copy(update={"labels": "legs"})
+    with World(crowd, robot_with(), 3) as world:
         counts = set()
         for _ in range(13):
             for _ in range(250):  # the first of the others crosses after 12 s

@@ -29,6 +29,9 @@ PERSON: Final = "person"
 PERSON_M: Final = {"height_m": 1.7, "width_m": 0.45}
 """Size of a standing adult, unless the configuration has a size. Without it a human is located as a ball at 0.3 m."""
 
+PERSON_APART_M: Final = 0.4
+"""Two humans are at least so far apart, so that what is nearer is a part of one."""
+
 
 class Follow:
     """Follows one target. `phase` is tracking, coasting, searching or lost.
@@ -50,7 +53,8 @@ class Follow:
         self._config = config
         self._camera = camera
         self._sizes = _sizes(config)
-        self._track = Track(config.track)
+        apart_m = max(config.track.apart_m, PERSON_APART_M if config.target.label == PERSON else 0.0)
+        self._track = Track(config.track.model_copy(update={"apart_m": apart_m}))
         self._steer = Steer(config.steer, config.target.stand_off_m)
         self._search = Search(config.search)
         self._motion_predictor = MotionPredictor(config.latency)

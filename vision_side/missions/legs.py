@@ -14,7 +14,7 @@ from pydantic import Field
 from sightline.protocol.messages import CameraModel
 from sightline.vision_side.config import TrackConfig
 from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.missions.follow import Follow
+from sightline.vision_side.missions.follow import PERSON_APART_M, Follow
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.ranges import Points, PoseMemory, about_robot, echoes, in_odometry
 from sightline.vision_side.tracking.locate import Sighting, points_ahead
@@ -30,6 +30,7 @@ class LegsTrack(TrackConfig):
     acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 0.5
     range_noise: Annotated[float, Field(gt=0, le=1)] = 0.03
     gate_m: Annotated[float, Field(gt=0, le=5)] = 0.45
+    apart_m: Annotated[float, Field(ge=0, le=5)] = PERSON_APART_M
 
 
 class Legs(Follow):

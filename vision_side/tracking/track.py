@@ -1,7 +1,11 @@
-"""Track one target in the odometry frame with a Kalman filter. Pure.
+"""Track one target among other objects in the odometry frame. Pure.
 
-In this frame the state is only the target's position and velocity, without the robot's motion. Both axes share one 2x2
-covariance, because they have the same noise. The clock is the capture time of the frames.
+In this frame the state of an object is only its position and velocity, without the robot's motion: a Kalman filter, in
+which both axes share one 2x2 covariance, because they have the same noise. The clock is the capture time of the frames.
+
+The other objects in view are tracked too, so that the target does not become one of them where they cross or hide each
+other. Each sighting belongs to the object that it fits best, by the likelihood of its position. Where two objects could
+be exchanged, neither is corrected: both go on as before, until they are apart. A target that stays in doubt is lost.
 """
 
 import math
@@ -18,10 +22,28 @@ _FIRST_SPEED_MPS = 0.3
 _SURPRISE = 9.0
 _PUSHED_MPS = 0.4
 
+# A limit for boxes of another service; a room has fewer.
+_MAX_OTHERS = 16
+# Sightings after which an object is a rival of the target. Errors of a detector seldom last as long.
+_KNOWN_AFTER = 5
+# Time without a sighting after which another object is forgotten: it may have left the view for a moment. As long after
+# the loss of the target, another object may become the target.
+_MEMORY_US = 3_000_000
+# The same for one with fewer sightings.
+_BRIEFLY_US = 300_000
+# Variance that no filter knows: an outline that is partly hidden, a step, a bump.
+_LEAST_NOISE_M2 = 0.05**2
+# A sighting of unknown range has a larger variance along its ray. Across the ray it is as exact as any other.
+_MOST_NOISE_M2 = 0.15**2
+# Difference of two log-likelihoods, times two, below which two objects could be exchanged: odds of 7 to 1.
+_ODDS = 4.0
+# Longest time in doubt.
+_DOUBT_US = 500_000
+
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Position and velocity of the target in the odometry frame, and the time since its last detection."""
+    """Position and velocity of an object in the odometry frame, and the time since its last detection."""
 
     x_m: float
     y_m: float
@@ -31,13 +53,86 @@ class Target:
     sightings: int
 
 
+class _Object:
+    """Filter of one object."""
+
+    __slots__ = ("_acceleration_mps2", "is_rival", "state", "variance")
+
+    def __init__(self, x_m: float, y_m: float, noise_m2: float, acceleration_mps2: float) -> None:
+        self._acceleration_mps2 = acceleration_mps2
+        self.state = Target(x_m, y_m, 0.0, 0.0, 0, 1)
+        self.variance = (noise_m2, 0.0, _FIRST_SPEED_MPS**2)
+        """Of position, both, velocity."""
+        self.is_rival = False
+        """True once it was seen beside the target, so that it is not the target."""
+
+    def advance(self, dt_s: float) -> None:
+        """Predict with constant velocity and white acceleration."""
+        position, both, velocity = self.variance
+        power = self._acceleration_mps2**2 * dt_s
+        self.variance = (position + dt_s * (2 * both + dt_s * velocity) + power * dt_s**2 / 3,
+                         both + dt_s * velocity + power * dt_s / 2, velocity + power)
+        was = self.state
+        self.state = Target(was.x_m + was.vx_mps * dt_s, was.y_m + was.vy_mps * dt_s, was.vx_mps, was.vy_mps,
+                            was.unseen_us + round(dt_s * 1e6), was.sightings)
+
+    @property
+    def is_known(self) -> bool:
+        """Return True if it was seen often."""
+        return self.state.sightings >= _KNOWN_AFTER
+
+    @property
+    def is_forgotten(self) -> bool:
+        """Return True if it was not seen for so long that it may be gone."""
+        return self.state.unseen_us > (_MEMORY_US if self.is_known else _BRIEFLY_US)
+
+    def away_m(self, place: "_Place") -> float:
+        """Return the distance of a sighting from the expected position."""
+        return _apart_m(self.state, place)
+
+    def misfit(self, place: "_Place") -> float:
+        """Return minus twice the logarithm of the likelihood of a sighting, without its constant."""
+        variance = self.variance[0] + min(max(place.noise_m2, _LEAST_NOISE_M2), _MOST_NOISE_M2)
+        return self.away_m(place) ** 2 / variance + 2 * math.log(variance)
+
+    def correct(self, place: "_Place") -> None:
+        """Correct the prediction with a sighting."""
+        (position, both, velocity), noise, was = self.variance, place.noise_m2, self.state
+        dx, dy = place.x_m - was.x_m, place.y_m - was.y_m
+        if dx * dx + dy * dy > _SURPRISE * 2 * (position + noise):
+            # The larger variances let this sighting move the estimate most of the way.
+            velocity += _PUSHED_MPS**2
+            position += (position + noise)
+        gain, gain_velocity = position / (position + noise), both / (position + noise)
+        self.variance = (position * (1 - gain), both * (1 - gain), velocity - gain_velocity * both)
+        self.state = Target(was.x_m + gain * dx, was.y_m + gain * dy, was.vx_mps + gain_velocity * dx,
+                            was.vy_mps + gain_velocity * dy, 0, was.sightings + 1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """A sighting in the odometry frame."""
+
+    x_m: float
+    y_m: float
+    noise_m2: float
+    sighting: Sighting
+
+
 class Track:
     """Follows at most one target. `target` is None without one."""
 
     def __init__(self, config: TrackConfig) -> None:
         self._config = config
-        self.target: Target | None = None
-        self._variance = (0.0, 0.0, 0.0)  # of position, both, velocity
+        self._followed: _Object | None = None
+        self._others: list[_Object] = []
+        self._unsure_us = 0
+        """Time in doubt, or since the loss of the target."""
+
+    @property
+    def target(self) -> Target | None:
+        """Return the state of the target."""
+        return self._followed.state if self._followed else None
 
     def step(self, dt_s: float, pose: Pose, sightings: Sequence[Sighting]) -> Sighting | None:
         """Advance the track and correct it with the newest sightings.
@@ -45,66 +140,100 @@ class Track:
         Args:
             dt_s: time since the last frame.
             pose: odometry at capture, m, m, rad.
-            sightings: candidates, best first. The best one starts a track, the nearest one in the gate continues it.
+            sightings: candidates, best first. The best one starts a track; the one that fits best continues it.
 
         Returns:
-            The sighting of the target, or None.
+            The sighting of the target, or None if it is hidden or in doubt.
         """
-        if self.target is None:
-            return self._start(pose, sightings)
-        self._advance(self.target, dt_s)
-        seen = self._nearest(self.target, pose, sightings)
-        if seen is not None:
-            self._correct(self.target, to_odometry(pose, seen.x_m, seen.y_m), self._noise(seen))
-        elif self.target.unseen_us > self._config.give_up_s * 1e6:
-            self.target = None
-        return seen
+        places = [_Place(*to_odometry(pose, one.x_m, one.y_m), self._noise(one), one) for one in sightings]
+        for one in self._objects():
+            one.advance(dt_s)
+        fits = self._fits(places)
+        in_doubt = self._in_doubt(self._followed, fits) if self._followed else set()
+        for one, place in fits.items():
+            if one not in in_doubt:
+                one.correct(place)
+        if self._followed is None:
+            seen = self._start(dt_s, places, fits)
+        else:
+            seen = None if in_doubt else fits.get(self._followed)
+            self._unsure_us = self._unsure_us + round(dt_s * 1e6) if in_doubt else 0
+            self._end(self._followed)
+        self._update_others(places, fits, self._followed if seen else None)
+        return seen.sighting if seen else None
 
-    def _start(self, pose: Pose, sightings: Sequence[Sighting]) -> Sighting | None:
-        if not sightings:
-            return None
-        x, y = to_odometry(pose, sightings[0].x_m, sightings[0].y_m)
-        self.target = Target(x, y, 0.0, 0.0, 0, 1)
-        self._variance = (self._noise(sightings[0]), 0.0, _FIRST_SPEED_MPS**2)
-        return sightings[0]
+    def _objects(self) -> list[_Object]:
+        return [self._followed, *self._others] if self._followed else self._others
 
-    def _advance(self, target: Target, dt_s: float) -> None:
-        """Predict with constant velocity and white acceleration."""
-        position, both, velocity = self._variance
-        power = self._config.acceleration_mps2**2 * dt_s
-        self._variance = (position + dt_s * (2 * both + dt_s * velocity) + power * dt_s**2 / 3,
-                          both + dt_s * velocity + power * dt_s / 2, velocity + power)
-        self.target = Target(target.x_m + target.vx_mps * dt_s, target.y_m + target.vy_mps * dt_s, target.vx_mps,
-                             target.vy_mps, target.unseen_us + round(dt_s * 1e6), target.sightings)
+    def _fits(self, places: list[_Place]) -> dict[_Object, _Place]:
+        """Assign places to objects: first to the target and its rivals, then to the others; the best fit first."""
+        fits, apart_m = dict[_Object, _Place](), self._config.apart_m
+        for is_first in (True, False):
+            objects = [one for one in self._objects() if (one is self._followed or one.is_rival) == is_first]
+            pairs = [(one, place) for one in objects for place in places if self._is_near(one, place)]
+            for one, place in sorted(pairs, key=lambda pair: pair[0].misfit(pair[1])):
+                if one not in fits and all(_apart_m(place, taken) > apart_m for taken in fits.values()):
+                    fits[one] = place
+        return fits
 
-    def _nearest(self, target: Target, pose: Pose, sightings: Sequence[Sighting]) -> Sighting | None:
-        # The gate grows while the target is hidden, because its position becomes less certain.
-        gate = self._config.gate_m + self._config.gate_growth_mps * target.unseen_us / 1e6
-        best: Sighting | None = None
-        for one in sightings:
-            x, y = to_odometry(pose, one.x_m, one.y_m)
-            away = math.hypot(x - target.x_m, y - target.y_m)
-            if away < gate:
-                gate, best = away, one
-        return best
+    def _is_near(self, one: _Object, place: _Place) -> bool:
+        # The gate grows while an object is hidden, because its position becomes less certain.
+        return one.away_m(place) < self._config.gate_m + self._config.gate_growth_mps * one.state.unseen_us / 1e6
 
-    def _correct(self, target: Target, seen: tuple[float, float], noise: float) -> None:
-        position, both, velocity = self._variance
-        dx, dy = seen[0] - target.x_m, seen[1] - target.y_m
-        if dx * dx + dy * dy > _SURPRISE * 2 * (position + noise):
-            # The larger variances let this sighting move the estimate most of the way.
-            velocity += _PUSHED_MPS**2
-            position += (position + noise)
-        gain, gain_velocity = position / (position + noise), both / (position + noise)
-        self._variance = (position * (1 - gain), both * (1 - gain), velocity - gain_velocity * both)
-        self.target = Target(target.x_m + gain * dx, target.y_m + gain * dy, target.vx_mps + gain_velocity * dx,
-                             target.vy_mps + gain_velocity * dy, 0, target.sightings + 1)
+    def _in_doubt(self, target: _Object, fits: dict[_Object, _Place]) -> set[_Object]:
+        """Return the target and the rivals that could as well have its sighting, and it theirs; empty if none could."""
+        found = {one for one in self._others if one.is_rival and self._could_exchange(target, one, fits)}
+        return {target, *found} if found else found
+
+    def _could_exchange(self, one: _Object, other: _Object, fits: dict[_Object, _Place]) -> bool:
+        exchanged = [(fits[one], one, other)] if one in fits else []
+        exchanged += [(fits[other], other, one)] if other in fits else []
+        worse = sum(thief.misfit(place) - owner.misfit(place) for place, owner, thief in exchanged)
+        return bool(exchanged) and worse < _ODDS and all(self._is_near(thief, place) for place, _, thief in exchanged)
+
+    def _start(self, dt_s: float, places: list[_Place], fits: dict[_Object, _Place]) -> _Place | None:
+        """Follow the best sighting, but for a while none of an object that was seen beside the last target."""
+        self._unsure_us += round(dt_s * 1e6)
+        rivals = [one for one in self._others if one.is_rival] if self._unsure_us <= _MEMORY_US else []
+        taken = [fits[one] for one in rivals if one in fits]
+        chosen = next((one for one in places if all(_apart_m(one, two) > self._config.apart_m for two in taken)), None)
+        if chosen is not None:
+            known = next((one for one, place in fits.items() if place is chosen), None)
+            self._followed, self._unsure_us = known or self._new(chosen), 0
+        return chosen
+
+    def _end(self, followed: _Object) -> None:
+        """End the track of a target that was hidden or in doubt for too long."""
+        # After doubt, the lost target may be the other object.
+        followed.is_rival = self._unsure_us > _DOUBT_US
+        if followed.is_rival or followed.state.unseen_us > self._config.give_up_s * 1e6:
+            self._others += [followed] if followed.is_rival else []
+            self._followed, self._unsure_us = None, 0
+
+    def _update_others(self, places: list[_Place], fits: dict[_Object, _Place], target: _Object | None) -> None:
+        """Add objects that are new; forget those that were long not seen, and parts of a target that was seen."""
+        apart_m = self._config.apart_m
+        self._others = [one for one in self._others if one is not self._followed and not one.is_forgotten
+                        and not (target and _apart_m(one.state, target.state) < apart_m)]
+        for one in self._others:
+            one.is_rival |= target is not None and one in fits and one.is_known
+        for place in places:
+            is_apart = all(one.away_m(place) > apart_m for one in self._objects())
+            if is_apart and place not in fits.values() and len(self._others) < _MAX_OTHERS:
+                self._others.append(self._new(place))
+
+    def _new(self, place: _Place) -> _Object:
+        return _Object(place.x_m, place.y_m, place.noise_m2, self._config.acceleration_mps2)
 
     def _noise(self, sighting: Sighting) -> float:
         """Return the variance of one position. The range error grows with the square of the range."""
         # A partly hidden outline (low score) gives a less exact range.
         range_m2, score = sighting.x_m**2 + sighting.y_m**2, sighting.detection.score * sighting.exactness
         return float((self._config.range_noise * max(range_m2, 0.1) / max(score, 0.2) ** 2) ** 2)
+
+
+def _apart_m(one: "Target | _Place", other: "Target | _Place") -> float:
+    return math.hypot(one.x_m - other.x_m, one.y_m - other.y_m)
 
 
 def to_odometry(pose: Pose, x_m: float, y_m: float) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from sightline.evaluation.score.figures import (
     EXACT,
     NOT_EVALUATED,
     STEP_S,
+    AnsweredFrame,
     RimSpeeds,
     RunRecord,
     Score,
@@ -59,7 +60,8 @@ def samples(count, period_s=0.02, **changes):
 
 
 def scored(run, scenario=None, *, accepted_us=0, said=(), wheels=()):
-    return score(scenario or scenario_of(), RunRecord(list(run), list(said), accepted_us, list(wheels)))
+    answered = [AnsweredFrame(*one) for one in said]
+    return score(scenario or scenario_of(), RunRecord(list(run), answered, accepted_us, list(wheels)))
 
 
 def acquired(run, accepted_us=0, **scenario):
@@ -135,7 +137,8 @@ def test_figures_of_a_run_with_numbers():
     assert result.lost_percent == result.unseen_percent == pytest.approx(100 * 25 / 102)
     assert (result.wall_contacts, result.target_contacts) == (101, 202)
     assert result.travelled_m == pytest.approx(101 * 0.05) and result.seconds == pytest.approx(2.02)
-    assert result.figures == {"wall_contact_s": pytest.approx(0.404), "commanded_m": 0.0} and STEP_S == 0.004
+    figures = {"wall_contact_s": pytest.approx(0.404), "commanded_m": 0.0, "wrong_percent": None}
+    assert result.figures == figures and STEP_S == 0.004
 
 
 def test_figures_begin_with_the_acquisition():
@@ -228,7 +231,7 @@ def test_scenario_decides_which_figures_a_run_has():
     run = RunRecord(samples(5, light=lambda _: "red", past_line_m=lambda _: -1.0, walls=lambda at: 7 + at,
                             passes=lambda at: 3 + 2 * at),
                     wheels=[RimSpeeds(START_US, 0.5, 0.0)])
-    common = {"wall_contact_s", "commanded_m"}
+    common = {"wall_contact_s", "commanded_m", "wrong_percent"}
     found = {name: figures_of(scenario_of(**changes), run, run.samples) for name, changes in (
         ("sphere", {}), ("legs", {"shape": "legs"}), ("goals", {"goals_m": ((9.0, 9.0),)}),
         ("light", {"light": object()}), ("path", {"things": (object(), OnPath.model_construct())}),
@@ -236,13 +239,53 @@ def test_scenario_decides_which_figures_a_run_has():
     )}  # fmt: skip
     assert set(found["sphere"]) == set(found["things"]) == common
     assert set(found["path"]) == common | {"least_passes"} and found["path"]["least_passes"] == 8
-    assert found["sphere"] == {"wall_contact_s": pytest.approx(0.016), "commanded_m": pytest.approx(0.5 * 0.08)}
+    assert found["sphere"] == {"wall_contact_s": pytest.approx(0.016), "commanded_m": pytest.approx(0.5 * 0.08),
+                               "wrong_percent": None}
     assert set(found["legs"]) == common | {"least_distance_m", "most_distance_m", "least_ever_m"}
     assert set(found["goals"]) == common | {"reached_s", "least_clearance_m", "least_around_deg", "given_up_s"}
     assert set(found["light"]) == common | {
         "least_crossings", "least_red_stops", "most_aside_m", "crossed_on_red", "crossed_late", "start_s",
         "wrong_states_percent",
     }
+
+
+@pytest.mark.parametrize(("bearing_deg", "distance_m", "is_wrong"), [
+    (0.0, 0.8, False), (0.0, 1.0999, False), (0.0, 1.1001, True), (0.0, 0.5001, False), (0.0, 0.4999, True),
+    (21.6, 0.8, False), (-21.6, 0.8, False), (21.7, 0.8, True), (-21.7, 0.8, True), (15.0, 0.98, False),
+    (15.0, 1.0, True),
+])  # fmt: skip
+def test_target_reported_more_than_30_cm_from_the_true_one_is_wrong(bearing_deg, distance_m, is_wrong):
+    """A chord of 2 x 0.8 m x sin(10.8 degrees) is 0.2998 m; at 15 degrees and 0.99 m it is 0.3002 m."""
+    run = samples(60, bearing_deg=lambda _: 1.0)
+    said = [(START_US + 500_000, "tracking", "", math.radians(1.0 + bearing_deg), distance_m)]
+    assert scored(run, said=said).figures["wrong_percent"] == (100.0 if is_wrong else 0.0)
+
+
+def test_target_reported_at_the_very_distance_is_not_wrong():
+    run = samples(60, distance_m=lambda _: 0.0)
+    for distance_m, wrong_percent in ((0.3, 0.0), (0.3001, 100.0)):
+        said = [(START_US, "tracking", "", 0.0, distance_m)]
+        assert scored(run, scenario_of(stand_off_m=0.0), said=said).figures["wrong_percent"] == wrong_percent
+
+
+@pytest.mark.parametrize("row", [("coasting", "", 1.0, 0.8), ("tracking", "", None, 0.8), ("tracking", "", 1.0, None)])
+def test_only_a_target_that_is_tracked_can_be_wrong(row):
+    wrong = ("tracking", "", 1.0, 0.8)
+    said = [(START_US + 100_000, *row), (START_US + 200_000, *wrong)]
+    assert scored(samples(60), said=said).figures["wrong_percent"] == 50.0
+
+
+def test_wrong_frames_count_from_the_acquisition_and_by_the_truth_at_their_capture():
+    """Acquired after 1 s. The target moves aside at 3 s, between two samples."""
+    run = samples(250, bearing_deg=lambda at: 30.0 if at < 50 else 0.0 if at < 150 else -30.0)
+    off = math.radians(-30.0)
+    for t_us, bearing_rad, wrong_percent in (
+        (999_999, off, None), (1_000_000, off, 100.0), (2_999_999, 0.0, 0.0), (3_000_000, 0.0, 100.0),
+        (3_000_000, off, 0.0), (4_990_000, off, 0.0),
+    ):
+        said = [(START_US + t_us, "tracking", "", bearing_rad, 0.8)]
+        assert scored(run, said=said).figures["wrong_percent"] == wrong_percent
+    assert scored(samples(10), said=[(START_US, "tracking", "", off, 0.8)]).figures["wrong_percent"] is None
 
 
 @pytest.mark.parametrize("start_m", [(1.0, 2.0), None])
@@ -283,7 +326,7 @@ def test_course_is_reached_when_each_waypoint_was_within_6_cm_in_order():
 
 def test_course_that_is_given_up_has_the_time_of_the_first_such_report():
     reports = ((0, "driving"), (250_000, "cannot reach"), (400_000, "cannot reach"))
-    said = [(START_US + t_us, phase, "") for t_us, phase in reports]
+    said = [AnsweredFrame(START_US + t_us, phase, "") for t_us, phase in reports]
     assert on_course(((9, 9),), (0, 0), (0, 0), said=said)["given_up_s"] == 0.25
     assert on_course(((9, 9),), (0, 0), said=said[:1])["given_up_s"] is None
 

@@ -7,6 +7,7 @@ import pytest
 
 from sightline.evaluation.score.figures import (
     ACQUIRED_FOR_S,
+    AnsweredFrame,
     RimSpeeds,
     RunRecord,
     broken,
@@ -35,7 +36,7 @@ def samples(count=100, **changes):
 
 def record(run, accepted_us=0, said=(), wheels=()):
     """Return the record of a run with these samples."""
-    return RunRecord(list(run), list(said), accepted_us, list(wheels))
+    return RunRecord(list(run), [AnsweredFrame(*one) for one in said], accepted_us, list(wheels))
 
 
 def scored(run, name="static", **rest):

@@ -104,6 +104,15 @@ def test_person_is_a_box_of_an_adults_size_unless_a_size_is_configured(located, 
     assert (kind, size) == ("sphere", 0.25) if used is None else (kind, size) == ("box", BoxesConfig(**used))
 
 
+@pytest.mark.parametrize(("label", "apart_m", "used_m"), [
+    ("", 0.15, 0.15), ("ball", 0.15, 0.15), ("person", 0.15, 0.4), ("person", 0.6, 0.6), ("ball", 0.0, 0.0),
+])
+def test_two_humans_are_at_least_40_cm_apart(label, apart_m, used_m):
+    follow = follow_of(target=TargetConfig(label=label), track=TrackConfig(apart_m=apart_m, gate_m=0.8))
+    assert (follow._track._config.apart_m, follow._track._config.gate_m) == (used_m, 0.8)
+
+
+
 @pytest.mark.parametrize(("picture", "wanted", "label", "meant"), [
     (PICTURE, "", "ball", True), (PICTURE, "", "legs", False), (PICTURE, "legs", "legs", True),
     (PICTURE, "ball", "legs", False), (PICTURE, "ball", "ball", True),

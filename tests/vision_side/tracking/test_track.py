@@ -1,6 +1,8 @@
-"""The track against a Kalman filter in matrices, and its gate and times with numbers."""
+"""The track against a Kalman filter in matrices; its gate, its times and the other objects with numbers."""
 
 import math
+import random
+from dataclasses import replace
 
 import pytest
 
@@ -140,7 +142,8 @@ def test_sighting_three_sigma_off_means_a_push_and_more_variance(sigmas, pushed)
     gain, gain_velocity = noted / total, both / total
     assert (track.target.x_m, track.target.y_m) == pytest.approx((1 + gain * dx, gain * dy))
     assert (track.target.vx_mps, track.target.vy_mps) == pytest.approx((gain_velocity * dx, gain_velocity * dy))
-    assert track._variance == pytest.approx((noted * noise / total, both * noise / total, velocity - both**2 / total))
+    variance = (noted * noise / total, both * noise / total, velocity - both**2 / total)
+    assert track._followed.variance == pytest.approx(variance)
 
 
 # --- the gate ----------------------------------------------------------------------------------------------------
@@ -196,6 +199,265 @@ def test_target_is_lost_within_two_milliseconds_of_its_time():
     assert track.target is not None
     track.step(0.002, HERE, [])
     assert track.target is None
+
+
+# --- beside other objects ----------------------------------------------------------------------------------------
+
+TARGET = (2.0, 0.0)
+
+
+def beside(*others, frames=5, **config):
+    """Return a track of a target and other objects that stand still, each seen in so many frames."""
+    track = Track(TrackConfig(**config))
+    for _ in range(frames):
+        assert track.step(DT_S, HERE, [at(*TARGET), *(at(*place) for place in others)]).x_m == 2.0
+    return track
+
+
+def others(track):
+    return sorted((one.state.x_m, one.state.y_m) for one in track._others)
+
+
+def steps_until(track, happens, *places, most=100):
+    """Return the number of steps with these sightings until `happens(sighting)`."""
+    return next(number for number in range(1, most) if happens(track.step(DT_S, HERE, [at(*one) for one in places])))
+
+
+@pytest.mark.parametrize(("frames", "is_other"), [(4, False), (5, True)])
+def test_object_that_was_seen_beside_the_target_five_times_is_not_the_target(frames, is_other):
+    track = started(*[TARGET] * 3)
+    for _ in range(frames):
+        track.step(DT_S, HERE, [at(*TARGET), at(2.0, 0.2)])
+    seen = track.step(DT_S, HERE, [at(2.0, 0.2)])
+    assert (seen is None) == is_other and track.target.unseen_us == is_other * 100_000
+
+
+def test_object_that_appears_while_the_target_is_hidden_may_be_the_target():
+    track = started(*[TARGET] * 6, gate_growth_mps=0.0)
+    for _ in range(6):
+        assert track.step(DT_S, HERE, [at(2.0, 0.5)]) is None
+    assert track.step(DT_S, HERE, [at(2.0, 0.3)]).y_m == 0.3
+
+
+def test_object_that_appeared_while_the_target_was_hidden_succeeds_it_at_once_with_its_speed():
+    track = started(*[TARGET] * 6, gate_growth_mps=0.0, give_up_s=0.75)
+    for number in range(8):
+        assert track.step(DT_S, HERE, [at(2.0, 0.5 + 0.02 * number)]) is None
+    assert track.target is None
+    assert track.step(DT_S, HERE, [at(2.0, 0.66)]) is not None
+    assert track.target.sightings == 9 and track.target.vy_mps == pytest.approx(0.2, abs=0.05) and not others(track)
+
+
+def test_object_that_is_hidden_while_the_target_is_seen_was_not_seen_beside_it():
+    track = started(*[TARGET] * 6, gate_growth_mps=0.0)
+    for _ in range(6):
+        track.step(DT_S, HERE, [at(2.0, 0.5)])
+    assert track.step(DT_S, HERE, [at(*TARGET)]) is not None
+    assert track.step(DT_S, HERE, [at(2.0, 0.34)]) is not None
+
+
+def test_sighting_of_the_target_far_from_its_place_adds_no_object():
+    track = started(*[TARGET] * 20, range_noise=0.05)
+    assert track.step(DT_S, HERE, [at(2.0, 0.3)]) is not None
+    assert track.target.y_m < 0.15 and not others(track)
+
+
+def test_object_beside_the_last_target_is_followed_three_seconds_after_its_loss():
+    track = beside((2.0, 0.5), give_up_s=0.4)
+    assert steps_until(track, lambda _: track.target is None, (2.0, 0.5)) == 5
+    assert steps_until(track, lambda seen: seen, (2.0, 0.5)) == 31
+    assert track.target.y_m == pytest.approx(0.5)
+
+
+def test_best_sighting_that_is_of_no_such_object_is_followed_first():
+    track = beside((2.0, 0.5), give_up_s=0.4)
+    steps_until(track, lambda _: track.target is None, (2.0, 0.5))
+    assert track.step(DT_S, HERE, [at(2.0, 0.5), at(1.0, -0.9), at(1.0, -0.5)]).y_m == -0.9
+    assert others(track) == [(1.0, -0.5), pytest.approx((2.0, 0.5))]
+
+
+@pytest.mark.parametrize(("y_m", "is_followed"), [(0.625, False), (0.626, True)])
+def test_part_of_an_object_beside_the_last_target_is_not_followed_either(y_m, is_followed):
+    track = beside((2.0, 0.5), give_up_s=0.4, apart_m=0.125)
+    steps_until(track, lambda _: track.target is None, (2.0, 0.5))
+    assert (track.step(DT_S, HERE, [at(2.0, 0.5), at(2.0, y_m)]) is not None) == is_followed
+
+
+def test_time_since_the_loss_counts_from_the_last_loss():
+    track = beside((2.0, 0.5), give_up_s=0.4)
+    for most in (2, 31):
+        steps_until(track, lambda _: track.target is None, (2.0, 0.5))
+        for _ in range(most - 1):
+            assert track.step(DT_S, HERE, [at(2.0, 0.5)]) is None
+        assert track.step(DT_S, HERE, [at(*TARGET), at(2.0, 0.5)]) is not None
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_target_stays_the_same_while_others_cross_and_hide_it(seed):
+    """One crosses between robot and target, one behind the target; what is behind another one is hidden."""
+    draw = random.Random(seed)
+    side, near_m, far_m = draw.choice((-1, 1)), draw.uniform(0.9, 1.4), draw.uniform(2.4, 3.0)
+    speeds = [draw.uniform(-0.2, 0.2), side * draw.uniform(0.3, 0.8), -side * draw.uniform(0.2, 0.5)]
+    starts = [(2.0, 0.0), (near_m, -side * 0.9), (far_m, side * 0.9)]
+    track = Track(TrackConfig())
+    for frame in range(120):
+        now = [(x_m, y_m + speed * max(0, frame - 15) / 30) for (x_m, y_m), speed in zip(starts, speeds, strict=True)]
+        shown = [one for one in now if not any(
+            other[0] < one[0] and abs(other[1] / other[0] - one[1] / one[0]) < 0.1 / other[0] for other in now)]
+        sightings = [at(x_m + draw.gauss(0, 0.01), y_m + draw.gauss(0, 0.005)) for x_m, y_m in shown]
+        if frame:
+            draw.shuffle(sightings)
+        seen = track.step(1 / 30, HERE, sightings)
+        assert seen is None or abs(seen.x_m - 2.0) < 0.1
+        assert (seen is not None) == (now[0] in shown) or frame < 5
+    assert (track.target.x_m, track.target.y_m) == pytest.approx(now[0], abs=0.05)
+
+
+def spread_m2(one, range_noise):
+    """Return the variance of a sighting at 2 m in the next step: of the prediction and, in bounds, of the sighting."""
+    position, both, velocity = one.variance
+    predicted = position + DT_S * (2 * both + DT_S * velocity) + 0.35**2 * DT_S**3 / 3
+    return predicted + min(max((range_noise * 4.0) ** 2, 0.05**2), 0.15**2)
+
+
+def about(chord_m):
+    """Return a place as far from the robot as the target is, and so far from the target."""
+    angle = 2 * math.asin(chord_m / 4)
+    return 2 * math.cos(angle), 2 * math.sin(angle)
+
+
+def pair(chord_m, *, hidden=0, range_noise=0.05, **config):
+    """Return a track of a target and another object that came so near, after some frames without the target."""
+    config = {"acceleration_mps2": 0.35, "apart_m": 0.0, "gate_m": 1.0, **config}
+    track = beside(about(0.9), frames=20, range_noise=range_noise, **config)
+    for _ in range(hidden):
+        track.step(DT_S, HERE, [at(*about(0.9))])
+    (other,) = track._others
+    x_m, y_m = about(chord_m)
+    other.state = replace(other.state, x_m=x_m, y_m=y_m)
+    return track
+
+
+@pytest.mark.parametrize(("share", "in_doubt"), [(0.999, True), (1.001, False)])
+@pytest.mark.parametrize(("shown", "hidden"), [("both", 0), ("target", 0), ("other", 0), ("other", 2)])
+@pytest.mark.parametrize("range_noise", [0.05, 0.025, 0.008])
+def test_objects_that_could_be_exchanged_at_odds_of_seven_to_one_are_both_left(
+    shown, hidden, range_noise, share, in_doubt
+):
+    """By the likelihoods of the places: d^2 / s + 2 ln s of the wrong one, `d` apart, and 2 ln s of the right one."""
+    apart = pair(0.9, hidden=hidden, range_noise=range_noise)
+    of_target, of_other = spread_m2(apart._followed, range_noise), spread_m2(apart._others[0], range_noise)
+    places = 2 if shown == "both" else 1
+    chord_m = share * math.sqrt(of_target * (4 - 2 * math.log(of_target / of_other)) / places)
+    track = pair(chord_m, hidden=hidden, range_noise=range_noise)
+    shown_at = {"both": [TARGET, about(chord_m)], "target": [TARGET], "other": [about(chord_m)]}[shown]
+    seen = track.step(DT_S, HERE, [at(*one) for one in shown_at])
+    (other,) = track._others
+    assert (seen is None) == (in_doubt or shown == "other")
+    assert track.target.unseen_us == (100_000 * (hidden + 1) if seen is None else 0)
+    assert other.state.unseen_us == (100_000 if in_doubt or shown == "target" else 0)
+
+
+@pytest.mark.parametrize(("gate_m", "in_doubt"), [(0.21, True), (0.19, False)])
+def test_no_object_is_exchanged_with_one_beyond_its_gate(gate_m, in_doubt):
+    track = pair(0.2, gate_m=gate_m, gate_growth_mps=0.0)
+    assert (track.step(DT_S, HERE, [at(*TARGET), at(*about(0.2))]) is None) == in_doubt
+
+
+def test_objects_are_exchanged_only_if_each_is_in_the_gate_of_the_other():
+    """That of the target has grown while it was hidden."""
+    places = [at(*TARGET), at(*about(0.22))]
+    assert pair(0.22, hidden=2, gate_m=0.1, gate_growth_mps=1.3).step(DT_S, HERE, places) is None
+    assert pair(0.22, hidden=2, gate_m=0.1, gate_growth_mps=1.0).step(DT_S, HERE, places) is not None
+
+
+def test_object_that_is_not_known_yet_causes_no_doubt():
+    track = started(*[TARGET] * 20, range_noise=0.05, gate_m=1.0)
+    for _ in range(4):
+        assert track.step(DT_S, HERE, [at(*TARGET), at(*about(0.2))]) is not None
+
+
+def test_target_that_was_in_doubt_for_half_a_second_is_lost_and_neither_is_followed():
+    track = pair(0.2, give_up_s=5.0)
+    places = [at(*TARGET), at(*about(0.2))]
+    for _ in range(2):
+        for _ in range(5):
+            assert track.step(DT_S, HERE, places) is None
+        assert track.target is not None
+        track.step(1e-6, HERE, places)
+        assert track.target is None and len(others(track)) == 2
+        for _ in range(30):
+            assert track.step(DT_S, HERE, places) is None
+        assert track.step(1e-6, HERE, places) is places[0]
+        assert len(others(track)) == 1
+
+
+def test_time_in_doubt_counts_from_the_last_frame_without():
+    track = pair(0.2, give_up_s=5.0)
+    for _ in range(2):
+        for _ in range(5):
+            assert track.step(DT_S, HERE, [at(*TARGET), at(*about(0.2))]) is None
+        track.step(DT_S, HERE, [])
+    assert track.target is not None
+
+
+@pytest.mark.parametrize(("frames", "steps"), [(4, 3), (5, 30)])
+def test_object_without_sightings_is_forgotten_after_three_seconds_or_soon_if_hardly_seen(frames, steps):
+    track = beside((2.0, 0.5), frames=frames)
+    for _ in range(steps):
+        track.step(DT_S, HERE, [at(*TARGET)])
+    assert others(track)
+    track.step(1e-6, HERE, [at(*TARGET)])
+    assert not others(track)
+
+
+def test_object_is_known_again_where_it_was_forgotten():
+    track = beside((2.0, 0.5))
+    assert steps_until(track, lambda _: not others(track), TARGET) == 31
+    track.step(DT_S, HERE, [at(*TARGET), at(2.0, 0.5)])
+    assert others(track) == [(2.0, 0.5)]
+
+
+@pytest.mark.parametrize(("place", "count"), [
+    ((2.0, 0.15), 1), ((2.0, 0.151), 2), ((2.0, 0.651), 1), ((2.0, 0.653), 2),
+])
+def test_sighting_within_15_cm_of_an_object_adds_no_object(place, count):
+    track = beside((2.0, 0.5), gate_m=0.1)
+    track.step(DT_S, HERE, [at(*TARGET), at(2.0, 0.502), at(*place)])
+    assert len(others(track)) == count
+
+
+def test_part_of_the_target_is_not_the_object_that_was_hidden_beside_it():
+    """It is as far as is configured, or further."""
+    for place, unseen_us in (((2.0, 0.25), 200_000), ((2.0, 0.251), 0)):
+        track = beside((2.0, 0.5), apart_m=0.25)
+        track.step(DT_S, HERE, [at(*TARGET)])
+        assert track.step(DT_S, HERE, [at(*TARGET), at(*place)]) is not None
+        assert [one.state.unseen_us for one in track._others] == [unseen_us]
+
+
+@pytest.mark.parametrize(("y_m", "is_part"), [(0.199, True), (0.2, False)])
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_object_that_comes_nearer_to_the_target_than_objects_can_is_a_part_of_it(y_m, is_part, is_seen):
+    track = pair(0.5, apart_m=0.2, gate_m=0.1, gate_growth_mps=0.0)
+    track._others[0].state = replace(track._others[0].state, x_m=2.0, y_m=y_m)
+    assert (track.step(DT_S, HERE, [at(*TARGET)] if is_seen else []) is not None) == is_seen
+    assert (not others(track)) == (is_part and is_seen)
+
+
+def test_at_most_sixteen_objects_are_tracked_beside_the_target():
+    track = beside(*((2.0, 0.3 * number) for number in range(1, 20)))
+    assert len(others(track)) == 16
+
+
+def test_others_move_with_their_own_speed_while_they_are_hidden():
+    track = started(*[TARGET] * 3)
+    for number in range(10):
+        track.step(DT_S, HERE, [at(*TARGET), at(3.0, -1.0 + 0.05 * number)])
+    for _ in range(10):
+        assert track.step(DT_S, HERE, [at(*TARGET)]) is not None
+    ((x_m, y_m),) = others(track)
+    assert (x_m, y_m) == (pytest.approx(3.0), pytest.approx(-0.05, abs=0.1))
 
 
 # --- the odometry frame ------------------------------------------------------------------------------------------
