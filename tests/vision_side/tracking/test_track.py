@@ -269,6 +269,12 @@ def test_object_beside_the_last_target_is_followed_three_seconds_after_its_loss(
     assert track.target.y_m == pytest.approx(0.5)
 
 
+def test_object_elsewhere_is_followed_at_once_also_while_the_others_are_hidden():
+    track = beside((2.0, 0.5), give_up_s=0.4)
+    steps_until(track, lambda _: track.target is None, (2.0, 0.5))
+    assert track.step(DT_S, HERE, [at(1.0, -0.9)]).y_m == -0.9
+
+
 def test_best_sighting_that_is_of_no_such_object_is_followed_first():
     track = beside((2.0, 0.5), give_up_s=0.4)
     steps_until(track, lambda _: track.target is None, (2.0, 0.5))
