@@ -53,8 +53,7 @@ class Follow:
         self._config = config
         self._camera = camera
         self._sizes = _sizes(config)
-        apart_m = max(config.track.apart_m, PERSON_APART_M if config.target.label == PERSON else 0.0)
-        self._track = Track(config.track.model_copy(update={"apart_m": apart_m}))
+        self._track = Track(_track(config))
         self._steer = Steer(config.steer, config.target.stand_off_m)
         self._search = Search(config.search)
         self._motion_predictor = MotionPredictor(config.latency)
@@ -143,6 +142,14 @@ def _sizes(config: Follow.Config) -> BoxesConfig:
     boxes = config.boxes
     is_sized = boxes.height_m is not None or boxes.width_m is not None
     return boxes if is_sized or config.target.label != PERSON else boxes.model_copy(update=PERSON_M)
+
+
+def _track(config: Follow.Config) -> TrackConfig:
+    """Return the configuration of the track. With the label `person`, objects are as far apart as humans are."""
+    track = config.track
+    if config.target.label != PERSON:
+        return track
+    return track.model_copy(update={"apart_m": max(track.apart_m, PERSON_APART_M)})
 
 
 def aim_at(target: Target, robot: PredictedMotion, camera: CameraModel, ahead_s: float) -> Aim:
