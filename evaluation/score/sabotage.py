@@ -126,7 +126,7 @@ UNAFFECTED: Mapping[str, tuple[str, frozenset[str]]] = {
         frozenset({
             "ball", "ball-eight", "behind", "blocks", "blocks-eight", "blocks-red", "blocks-yellow", "blue-sphere",
             "blue-sphere-eight", "chaser", "chaser-circle", "chaser-eight", "circle", "eight", "pushed", "static",
-            "traffic-light", "traffic-light-boxes", "walls",
+            "three-balls", "three-boxes", "traffic-light", "traffic-light-boxes", "walls",
         }),
     ),
     "detector-blind": _WITHOUT_DETECTOR,
