@@ -25,7 +25,7 @@ from sightline.evaluation.score.figures import (
 from sightline.operator_side.client.requests import StatusReport, read_report
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.recording.recorder import read_recording
-from sightline.operator_side.recording.replay import Replayed, Step, replay
+from sightline.operator_side.recording.replay import Replayed, replay
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import SightlineError, WireError
 
@@ -72,7 +72,8 @@ def report(run: DemoRun) -> DemoReport:
         raise SightlineError(f"ended before the robot drove; the logs are in {run.folder}")
     recording = run.folder / RECORDING
     said: list[AnsweredFrame] = []
-    replayed = replay(recording, lambda step: said.append(_printed(step)))
+    # The same pipeline produces the same for the same frames.
+    replayed = replay(recording, lambda step: said.append(AnsweredFrame.of(step.frame.header.t_us, step.answer.seen)))
     during = [one for one in said if run.samples[0].t_us <= one.t_us <= run.samples[-1].t_us]
     record = RunRecord(run.samples, during, accepted_us(recording), _wheels(run))
     result = score(run.scenario, record)
@@ -82,12 +83,6 @@ def report(run: DemoRun) -> DemoReport:
     (run.folder / "score.json").write_text(json.dumps(judged.to_dict(), indent=2) + "\n", "utf-8")
     _draw(run, recording)
     return judged
-
-
-def _printed(step: Step) -> AnsweredFrame:
-    """Return what the mission reported of a frame. The same pipeline produces the same for the same frames."""
-    seen = step.answer.seen
-    return AnsweredFrame(step.frame.header.t_us, seen.phase, seen.note, seen.bearing_rad, seen.distance_m)
 
 
 def accepted_us(recording: Path) -> int | None:

@@ -6,11 +6,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
 from statistics import median
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from sightline.evaluation.checks import Check
 from sightline.sim.scenario import AT_LEAST, FIGURES, OnPath, Scenario
 from sightline.sim.truth import Truth
+
+if TYPE_CHECKING:
+    from sightline.vision_side.pipeline import Observation
 
 ACQUIRED_WITHIN_M = 0.05
 ACQUIRED_FOR_S = 1.0
@@ -29,6 +32,11 @@ class AnsweredFrame(NamedTuple):
     note: str
     bearing_rad: float | None = None
     distance_m: float | None = None
+
+    @classmethod
+    def of(cls, t_us: int, seen: "Observation") -> "AnsweredFrame":
+        """Create it from the answer to the frame of `t_us`."""
+        return cls(t_us, seen.phase, seen.note, seen.bearing_rad, seen.distance_m)
 
 
 class RimSpeeds(NamedTuple):

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -266,6 +267,11 @@ def test_target_reported_at_the_very_distance_is_not_wrong():
     for distance_m, wrong_percent in ((0.3, 0.0), (0.3001, 100.0)):
         said = [(START_US, "tracking", "", 0.0, distance_m)]
         assert scored(run, scenario_of(stand_off_m=0.0), said=said).figures["wrong_percent"] == wrong_percent
+
+
+def test_answered_frame_has_what_the_mission_reported():
+    seen = SimpleNamespace(phase="tracking", note="x", bearing_rad=0.1, distance_m=0.7)
+    assert AnsweredFrame.of(5, seen) == (5, "tracking", "x", 0.1, 0.7)
 
 
 @pytest.mark.parametrize("row", [("coasting", "", 1.0, 0.8), ("tracking", "", None, 0.8), ("tracking", "", 1.0, None)])

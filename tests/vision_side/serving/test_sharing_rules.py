@@ -50,11 +50,6 @@ def see(sharing, at_us, commands=0, *, mine=False, state=State.ACTIVE, holder=No
     return sharing.needs_session(robot, is_mine=mine, now_us=at_us)
 
 
-def first_us(happens, step_us):
-    """Return the first time at which `happens(now_us)`."""
-    return next(now_us for now_us in range(0, 9_000 * MS, step_us) if happens(now_us))
-
-
 # --- claims -----------------------------------------------------------------------------------------------------------
 
 
@@ -473,7 +468,7 @@ def test_no_new_session_while_no_command_leaves_or_within_a_second_of_the_claim(
     sharing = driven()
     assert not any(see(sharing, ms * MS, 7) for ms in range(0, 5_000, 100))
     sharing = driven()
-    assert first_us(lambda us: see(sharing, us, us), step_us=50 * MS) == 1_000 * MS
+    assert next(us for us in range(0, 9_000 * MS, 50 * MS) if see(sharing, us, us)) == 1_000 * MS
 
 
 @pytest.mark.parametrize(("count", "needed"), [(47, False), (48, True)])
