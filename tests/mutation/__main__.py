@@ -6,10 +6,10 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import groupby
 from pathlib import Path
 
 from tests.mutation.changes import EQUIVALENTS, select
+from tests.mutation.in_place import try_in_place
 from tests.mutation.mutants import Mutant, Name, equivalents, mutants
 from tests.mutation.planted import main as plant
 from tests.mutation.trial import Outcome, finish, start, uncovered
@@ -73,9 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print("error:", error, file=sys.stderr)
         return 2
-    found = [mutant for file in files for mutant in _mutants(file)]
     if options.list:
-        print(*map(_line, found), sep="\n")
+        print(*(_line(mutant) for file in files for mutant in _mutants(file)), sep="\n")
         return 0
     if not files:
         return 0
@@ -84,9 +83,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if missing:
         print(missing, "error: the tables fail or miss lines or branches (above); correct or extend them", sep="\n")
         return 5
-    reasons = equivalents(Path(EQUIVALENTS).read_text())
-    outcomes = _run(found, options.jobs)
-    return _result(outcomes, {name for name in reasons if name[0] in files})
+    named = {name for name in equivalents(Path(EQUIVALENTS).read_text()) if name[0] in files}
+    return _result(_run(files, named, options.jobs), named)
 
 
 def _options(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -125,21 +123,25 @@ def _mutants(file: str) -> Iterator[Mutant]:
             yield mutant
 
 
-def _run(found: list[Mutant], jobs: int) -> dict[Mutant, Outcome]:
+def _run(files: Iterable[str], named: set[Name], jobs: int) -> dict[Mutant, Outcome]:
     began_s, outcomes = time.monotonic(), dict[Mutant, Outcome]()
-    for file, trials in groupby(_trials(found, jobs), key=lambda trial: trial[0].file):
-        file_began_s, before = time.monotonic(), len(outcomes)
-        outcomes |= trials
-        print(f"{file}: {len(outcomes) - before} mutants in {time.monotonic() - file_began_s:.0f} s", flush=True)
+    for file in files:
+        file_began_s, found = time.monotonic(), list(_mutants(file))
+        expected = [mutant for mutant in found if mutant.name not in named]
+        ended, order = try_in_place(expected, compile(Path(file).read_text(), file, "exec"), TABLES[file], jobs)
+        outcomes |= ended
+        outcomes |= _trials((mutant for mutant in found if mutant not in ended), order, jobs)
+        seconds = time.monotonic() - file_began_s
+        print(f"{file}: {len(found)} mutants in {seconds:.0f} s, {len(ended)} of them in place", flush=True)
     counts = ", ".join(f"{count} {outcome.value}" for outcome, count in Counter(outcomes.values()).items())
-    print(f"{len(found)} mutants in {time.monotonic() - began_s:.0f} s: {counts}")
+    print(f"{len(outcomes)} mutants in {time.monotonic() - began_s:.0f} s: {counts}")
     return outcomes
 
 
-def _trials(found: Iterable[Mutant], jobs: int) -> Iterator[tuple[Mutant, Outcome]]:
+def _trials(found: Iterable[Mutant], order: Sequence[str], jobs: int) -> Iterator[tuple[Mutant, Outcome]]:
     running: list[tuple[Mutant, int, float]] = []
     for mutant in found:
-        running.append((mutant, start(mutant, TABLES[mutant.file]), time.monotonic()))
+        running.append((mutant, start(mutant, TABLES[mutant.file], order), time.monotonic()))
         if len(running) >= jobs:
             oldest, pid, started_s = running.pop(0)
             yield oldest, finish(pid, started_s)

@@ -41,17 +41,19 @@ def equivalents(text: str) -> dict[Name, str]:
 
 
 def mutants(file: str, source: str) -> Iterator[Mutant]:
-    """Give every mutant of `source`, compiled. Of mutants with the same text it gives the first."""
+    """Give every mutant of `source`, compiled. Of mutants of a statement with the same text it gives the first."""
     tree = ast.parse(source)
-    seen, count = {ast.unparse(tree)}, Counter[tuple[str, str, str]]()
-    for owner, field, index, where in list(_places(tree, "")):
+    seen, count = set[tuple[int, str]](), Counter[tuple[str, str, str]]()
+    for owner, field, index, where, statement in list(_places(tree, "", tree)):
         # A field that holds one node is handled as a list of one.
         nodes = getattr(owner, field) if index is not None else [getattr(owner, field)]
         original = nodes[index or 0]
-        for changed in _changes(owner, original, where):
-            nodes[index or 0] = ast.copy_location(changed, original)
+        seen.add((id(statement), ast.unparse(statement)))
+        for change in _changes(owner, original, where):
+            # A copy: a change may be a part of the original, which keeps its own location.
+            nodes[index or 0] = changed = ast.copy_location(copy.copy(change), original)
             setattr(owner, field, nodes if index is not None else nodes[0])
-            text = ast.unparse(tree)
+            text = id(statement), ast.unparse(changed if original is statement else statement)
             if text not in seen:
                 seen.add(text)
                 key = where, ast.unparse(original), ast.unparse(changed)
@@ -62,16 +64,20 @@ def mutants(file: str, source: str) -> Iterator[Mutant]:
         setattr(owner, field, nodes if index is not None else original)
 
 
-def _places(node: ast.AST, where: str) -> Iterator[tuple[ast.AST, str, int | None, str]]:
-    """Give (owner, field, index, qualified name) of every node below `node`, without decorators and docstrings."""
+def _places(node: ast.AST, where: str, statement: ast.AST) -> Iterator[tuple[ast.AST, str, int | None, str, ast.AST]]:
+    """Give (owner, field, index, qualified name, statement) of every node below `node`, without decorators, docstrings.
+
+    The statement is the innermost one that the node is or is in.
+    """
     inside = f"{where}.{node.name}".lstrip(".") if isinstance(node, ast.FunctionDef | ast.ClassDef) else where
     for field, value in ast.iter_fields(node):
         if field != "decorator_list":
             for index, child in enumerate(value if isinstance(value, list) else [value]):
                 docstring = isinstance(child, ast.Expr) and isinstance(child.value, ast.Constant)
                 if isinstance(child, ast.AST) and not docstring:
-                    yield node, field, index if isinstance(value, list) else None, inside
-                    yield from _places(child, inside)
+                    within = child if isinstance(child, ast.stmt) else statement
+                    yield node, field, index if isinstance(value, list) else None, inside, within
+                    yield from _places(child, inside, within)
 
 
 def _changes(owner: ast.AST, node: ast.AST, where: str) -> Iterator[ast.AST]:
@@ -185,6 +191,8 @@ def _conditional(node: ast.IfExp) -> Iterator[ast.AST]:
 
 
 def _condition(node: ast.If | ast.While) -> Iterator[ast.AST]:
+    if isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+        return  # what only the type checker imports decides nothing
     yield _with(node, test=ast.UnaryOp(ast.Not(), node.test))
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.mutation.trial import OPTIONS, finish, fork, install, silence
+from tests.mutation.trial import OPTIONS, demand_not_imported, finish, fork, install, silence
 
 PLANTED = "tests/mutation/planted.toml"
 # The tests of all bugs together. They import the transports, NumPy and OpenCV.
@@ -73,7 +73,8 @@ def _failed(bug: Bug, tests: Sequence[str]) -> set[str]:
                 pytest.main([*OPTIONS, *tests], plugins=[_Failures(report.name)])
             return 0
 
-        finish(fork(run, bug.file, _CPU_SECONDS), time.monotonic())
+        demand_not_imported(bug.file)
+        finish(fork(run, _CPU_SECONDS), time.monotonic())
         lines = report.read().splitlines()
     if lines[-1:] != ["end"]:
         raise ValueError(f"{PLANTED}: '{bug.name}': the tests did not run to their end; run them without the bug first")

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import tests.mutation.__main__ as gate
+from tests.mutation.in_place import _changed
 from tests.mutation.mutants import mutants
 from tests.mutation.trial import Outcome
 
@@ -38,6 +39,8 @@ def changes(source):
         ("math.sin(a)", {("math.sin(a)", "math.cos(a)")}),
         ("abs(a)", {("abs(a)", "a")}),
         ("Field(gt=a)", {("Field(gt=a)", "Field(ge=a)")}),
+        ("while a:\n    b()", {("while a:\n    b()", "while not a:\n    b()")}),
+        ("if TYPE_CHECKING:\n    import a", set()),
         ("a if b else c", {("a if b else c", "a"), ("a if b else c", "c")}),
         ("Verb.RELEASE", {("Verb.RELEASE", "Verb.ARM")}),
         ("[a for a in b if a]", {("for a in b if a", "for a in b")}),
@@ -81,6 +84,7 @@ def test_mutant_of_an_imported_module_is_rejected():
 import sightline.protocol.jpeg
 from pathlib import Path
 import tests.mutation.__main__ as gate
+from tests.mutation.in_place import _changed
 from tests.mutation.mutants import mutants
 from tests.mutation.trial import start
 mutant = next(mutants("protocol/jpeg.py", Path("protocol/jpeg.py").read_text()))
@@ -88,6 +92,37 @@ start(mutant, ["tests/protocol/test_text_and_jpeg_boundaries.py"])
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ran.returncode == 1 and "imported before its mutants" in ran.stderr
+
+
+def test_in_place_only_the_code_of_one_function_is_exchanged():
+    source = "A = 1\nclass B:\n    c = 2\n    def d(self, e=3):\n        return lambda: -f(4)\ndef g():\n    return 5\n"
+    original = compile(source, "example.py", "exec")
+    places = {mutant.before: _changed(original, mutant.code) for mutant in mutants("example.py", source)}
+    names = {before: change and change[0].co_name for before, change in places.items()}
+    assert names.pop("return lambda: -f(4)") == "d"
+    assert names == {"1": None, "2": None, "3": None, "-f(4)": "d", "4": "d", "return 5": "g", "5": "g"}
+
+
+def test_mutants_end_in_place_as_in_trials_of_their_own():
+    code = """
+import time
+from pathlib import Path
+from tests.mutation.__main__ import TABLES
+from tests.mutation.in_place import try_in_place
+from tests.mutation.in_place import _changed
+from tests.mutation.mutants import mutants
+from tests.mutation.trial import Outcome, finish, start
+file = "vision_side/serving/assignment.py"
+source, tables = Path(file).read_text(), TABLES[file]
+found = list(mutants(file, source))[::12]
+ended, order = try_in_place(found, compile(source, file, "exec"), tables, jobs=2)
+assert len(ended) > 3 and set(ended.values()) == {Outcome.KILLED} and len(order) > 10, (ended, order)
+assert {finish(start(mutant, tables, order), time.monotonic()) for mutant in ended} == {Outcome.KILLED}
+others = try_in_place(found, compile(source, file, "exec"), [*tables, "-k", "no_such_test"], jobs=2)
+assert others == ({}, []), others
+"""
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
 
 
 def test_part_of_a_file_has_the_mutants_of_its_names_and_constants_only(tmp_path, monkeypatch):

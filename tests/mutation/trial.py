@@ -63,23 +63,24 @@ def uncovered(files: Iterable[str], suites: Iterable[str]) -> str:
     return ""
 
 
-def start(mutant: Mutant, suites: Sequence[str]) -> int:
-    """Fork a child that runs `suites` with `mutant` in place; return its pid.
+def start(mutant: Mutant, suites: Sequence[str], order: Sequence[str] = ()) -> int:
+    """Fork a child that runs `suites` with `mutant` in place, the tests named in `order` first; return its pid.
 
     Raises:
         RuntimeError: this process has imported the mutant's module already, so every trial would end as if killed.
     """
-    return fork(lambda: _run(mutant, suites), mutant.file)
+    demand_not_imported(mutant.file)
+    return fork(lambda: _run(mutant, suites, order))
 
 
-def fork(work: Callable[[], int], file: str, cpu_seconds: int = _CPU_SECONDS) -> int:
-    """Fork a child that exits with the result of `work`, which changes `file` in memory; return its pid.
-
-    Raises:
-        RuntimeError: this process has imported the module of `file` already, so every trial would end as if killed.
-    """
+def demand_not_imported(file: str) -> None:
+    """Raise RuntimeError if this process has imported the module of `file`: a change of it would not be noticed."""
     if module_name(file) in sys.modules:
         raise RuntimeError(f"{file} was imported before its mutants; find its importer in this process")
+
+
+def fork(work: Callable[[], int], cpu_seconds: int = _CPU_SECONDS) -> int:
+    """Fork a child that exits with the result of `work`; return its pid."""
     pid = os.fork()
     if pid:
         return pid
@@ -93,13 +94,13 @@ def fork(work: Callable[[], int], file: str, cpu_seconds: int = _CPU_SECONDS) ->
         os._exit(status)  # the child never returns into the parent's code, whatever the mutant raised
 
 
-def finish(pid: int, started_s: float) -> Outcome:
-    """Wait for a child of `start`, which began at `started_s` (time.monotonic)."""
+def finish(pid: int, started_s: float, wall_seconds: float = _WALL_SECONDS) -> Outcome:
+    """Wait for a child of `fork`, which began at `started_s` (time.monotonic); it ends after `wall_seconds`."""
     while True:
         ended, status = os.waitpid(pid, os.WNOHANG)
         if ended:
             break
-        if time.monotonic() - started_s > _WALL_SECONDS:
+        if time.monotonic() - started_s > wall_seconds:
             os.kill(pid, signal.SIGKILL)
         time.sleep(0.005)
     if os.WIFSIGNALED(status):
@@ -107,13 +108,22 @@ def finish(pid: int, started_s: float) -> Outcome:
     return Outcome.KILLED if os.waitstatus_to_exitcode(status) else Outcome.SURVIVED
 
 
-def _run(mutant: Mutant, suites: Sequence[str]) -> int:
+def _run(mutant: Mutant, suites: Sequence[str], order: Sequence[str]) -> int:
     with silence():
         try:
             install(mutant.file, mutant.code)
-            return int(pytest.main(["-x", *OPTIONS, *suites]))
+            return int(pytest.main(["-x", *OPTIONS, *suites], plugins=[_Order(order)]))
         except BaseException:  # a mutant may raise anything at import: the table notices it
             return 1
+
+
+class _Order:
+    def __init__(self, names: Sequence[str]) -> None:
+        self._rank = {name: rank for rank, name in enumerate(names)}
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items.sort(key=lambda item: self._rank.get(item.nodeid, len(self._rank)))
 
 
 @contextlib.contextmanager
