@@ -10,7 +10,7 @@ import tomllib
 from pathlib import Path
 
 from tests.mutation.planted import Bug
-from tests.mutation.trial import fork, install
+from tests.mutation.trial import demand_not_imported, fork, install
 
 PLANTED = Path(__file__).with_name("planted.toml")
 _STATES, _CPU_SECONDS = 20_000, 60
@@ -36,7 +36,8 @@ def found(bug: Bug, part: str) -> list[str]:
             Path(report.name).write_text("\n".join([result.promise, *result.words, str(len(result.states))]))
             return 0
 
-        os.waitpid(fork(run, bug.file, _CPU_SECONDS), 0)
+        demand_not_imported(bug.file)
+        os.waitpid(fork(run, _CPU_SECONDS), 0)
         return report.read().splitlines()
 
 

@@ -9,10 +9,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from tests.mutation.changes import EQUIVALENTS, select
-from tests.mutation.in_place import try_in_place
+from tests.mutation.forks import try_mutants
 from tests.mutation.mutants import Mutant, Name, equivalents, mutants
 from tests.mutation.planted import main as plant
-from tests.mutation.trial import Outcome, finish, start, uncovered
+from tests.mutation.trial import Outcome, uncovered
 
 _GATE = (
     "tests/robot_side/safety/test_gate_commands.py",
@@ -127,25 +127,11 @@ def _run(files: Iterable[str], named: set[Name], jobs: int) -> dict[Mutant, Outc
     began_s, outcomes = time.monotonic(), dict[Mutant, Outcome]()
     for file in files:
         file_began_s, found = time.monotonic(), list(_mutants(file))
-        expected = [mutant for mutant in found if mutant.name not in named]
-        ended, order = try_in_place(expected, compile(Path(file).read_text(), file, "exec"), TABLES[file], jobs)
-        outcomes |= ended
-        outcomes |= _trials((mutant for mutant in found if mutant not in ended), order, jobs)
-        seconds = time.monotonic() - file_began_s
-        print(f"{file}: {len(found)} mutants in {seconds:.0f} s, {len(ended)} of them in place", flush=True)
+        outcomes |= try_mutants(found, named, TABLES[file], jobs)
+        print(f"{file}: {len(found)} mutants in {time.monotonic() - file_began_s:.0f} s", flush=True)
     counts = ", ".join(f"{count} {outcome.value}" for outcome, count in Counter(outcomes.values()).items())
     print(f"{len(outcomes)} mutants in {time.monotonic() - began_s:.0f} s: {counts}")
     return outcomes
-
-
-def _trials(found: Iterable[Mutant], order: Sequence[str], jobs: int) -> Iterator[tuple[Mutant, Outcome]]:
-    running: list[tuple[Mutant, int, float]] = []
-    for mutant in found:
-        running.append((mutant, start(mutant, TABLES[mutant.file], order), time.monotonic()))
-        if len(running) >= jobs:
-            oldest, pid, started_s = running.pop(0)
-            yield oldest, finish(pid, started_s)
-    yield from ((mutant, finish(pid, started_s)) for mutant, pid, started_s in running)
 
 
 def _result(outcomes: dict[Mutant, Outcome], named: set[Name]) -> int:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import tests.mutation.__main__ as gate
-from tests.mutation.in_place import _changed
+from tests.mutation.forks import _changed
 from tests.mutation.mutants import mutants
 from tests.mutation.trial import Outcome
 
@@ -84,11 +84,11 @@ def test_mutant_of_an_imported_module_is_rejected():
 import sightline.protocol.jpeg
 from pathlib import Path
 import tests.mutation.__main__ as gate
-from tests.mutation.in_place import _changed
+from tests.mutation.forks import _changed
 from tests.mutation.mutants import mutants
-from tests.mutation.trial import start
-mutant = next(mutants("protocol/jpeg.py", Path("protocol/jpeg.py").read_text()))
-start(mutant, ["tests/protocol/test_text_and_jpeg_boundaries.py"])
+from tests.mutation.forks import try_mutants
+found = list(mutants("protocol/jpeg.py", Path("protocol/jpeg.py").read_text()))
+try_mutants(found, (), ["tests/protocol/test_text_and_jpeg_boundaries.py"], 2)
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert ran.returncode == 1 and "imported before its mutants" in ran.stderr
@@ -103,26 +103,25 @@ def test_in_place_only_the_code_of_one_function_is_exchanged():
     assert names == {"1": None, "2": None, "3": None, "-f(4)": "d", "4": "d", "return 5": "g", "5": "g"}
 
 
-def test_mutants_end_in_place_as_in_trials_of_their_own():
+def test_mutants_end_as_in_a_process_of_their_own_where_the_tests_are_collected_already():
+    """The expected equivalents are tried there alone."""
     code = """
-import time
 from pathlib import Path
 from tests.mutation.__main__ import TABLES
-from tests.mutation.in_place import try_in_place
-from tests.mutation.in_place import _changed
+from tests.mutation.forks import try_mutants
 from tests.mutation.mutants import mutants
-from tests.mutation.trial import Outcome, finish, start
+from tests.mutation.trial import Outcome
 file = "vision_side/serving/assignment.py"
-source, tables = Path(file).read_text(), TABLES[file]
-found = list(mutants(file, source))[::12]
-ended, order = try_in_place(found, compile(source, file, "exec"), tables, jobs=2)
-assert len(ended) > 3 and set(ended.values()) == {Outcome.KILLED} and len(order) > 10, (ended, order)
-assert {finish(start(mutant, tables, order), time.monotonic()) for mutant in ended} == {Outcome.KILLED}
-others = try_in_place(found, compile(source, file, "exec"), [*tables, "-k", "no_such_test"], jobs=2)
-assert others == ({}, []), others
+found, tables = list(mutants(file, Path(file).read_text()))[::9], TABLES[file]
+ends = try_mutants(found, (), tables, 2)
+assert ends == try_mutants(found, {one.name for one in found}, tables, 2)
+assert list(ends) == found and Outcome.KILLED in ends.values(), ends
+of_one = [*tables, "-k", "test_without_robots"]
+assert list(try_mutants(found, (), of_one, 2).values()).count(Outcome.SURVIVED) > 3
+try_mutants(found, (), ["tests/no_such_test.py"], 2)
 """
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr
+    assert ran.stderr.endswith("RuntimeError: the tests did not start: tests/no_such_test.py\n"), ran.stderr
 
 
 def test_part_of_a_file_has_the_mutants_of_its_names_and_constants_only(tmp_path, monkeypatch):

@@ -10,18 +10,16 @@ import sys
 import tempfile
 import time
 import types
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
 from pathlib import Path
 
 import cv2  # noqa: F401
 import hypothesis  # noqa: F401
 import numpy  # noqa: F401
-import pytest
 
 # All children share what is loaded here. It imports no file that has mutants, or no mutant of that file would run.
 import sightline.protocol.messages  # noqa: F401
-from tests.mutation.mutants import Mutant
 
 # A table takes well under one second of CPU. The bounds end a mutant that loops or allocates without end.
 _CPU_SECONDS = 5
@@ -63,16 +61,6 @@ def uncovered(files: Iterable[str], suites: Iterable[str]) -> str:
     return ""
 
 
-def start(mutant: Mutant, suites: Sequence[str], order: Sequence[str] = ()) -> int:
-    """Fork a child that runs `suites` with `mutant` in place, the tests named in `order` first; return its pid.
-
-    Raises:
-        RuntimeError: this process has imported the mutant's module already, so every trial would end as if killed.
-    """
-    demand_not_imported(mutant.file)
-    return fork(lambda: _run(mutant, suites, order))
-
-
 def demand_not_imported(file: str) -> None:
     """Raise RuntimeError if this process has imported the module of `file`: a change of it would not be noticed."""
     if module_name(file) in sys.modules:
@@ -106,24 +94,6 @@ def finish(pid: int, started_s: float, wall_seconds: float = _WALL_SECONDS) -> O
     if os.WIFSIGNALED(status):
         return Outcome.TIMEOUT
     return Outcome.KILLED if os.waitstatus_to_exitcode(status) else Outcome.SURVIVED
-
-
-def _run(mutant: Mutant, suites: Sequence[str], order: Sequence[str]) -> int:
-    with silence():
-        try:
-            install(mutant.file, mutant.code)
-            return int(pytest.main(["-x", *OPTIONS, *suites], plugins=[_Order(order)]))
-        except BaseException:  # a mutant may raise anything at import: the table notices it
-            return 1
-
-
-class _Order:
-    def __init__(self, names: Sequence[str]) -> None:
-        self._rank = {name: rank for rank, name in enumerate(names)}
-
-    @pytest.hookimpl(trylast=True)
-    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        items.sort(key=lambda item: self._rank.get(item.nodeid, len(self._rank)))
 
 
 @contextlib.contextmanager
