@@ -29,7 +29,7 @@ from sightline.vision_side.detect.registry import check_choice
 from sightline.vision_side.missions.registry import REGISTRY, configured_mission
 
 Result = TypeVar("Result")
-_MOST_NOTICES: Final = 3
+MOST_NOTICES: Final = 3
 """Of each group: later ones repeat the first with higher counts."""
 
 
@@ -163,7 +163,7 @@ def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCa
     for case in wanted:
         for line in results[case][1]:
             news.setdefault(case.group, []).append(line)
-    told = {group: list(dict.fromkeys(lines))[:_MOST_NOTICES] for group, lines in news.items()}
+    told = {group: list(dict.fromkeys(lines))[:MOST_NOTICES] for group, lines in news.items()}
     unbounded = {name for name in {case.scenario for case in wanted} if not load_scenario(name).bounds}
     unevaluated = list(dict.fromkeys(case.group for case in wanted if case.scenario in unbounded))
     return ScoreReport(runs, scored_figures(runs), unevaluated, told)

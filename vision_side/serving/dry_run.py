@@ -138,7 +138,7 @@ class LocalRun:
 
     def _log_notices(self) -> None:
         for line in notices_of(self._detector):
-            self._report(f"vision: {line}")
+            self._report(f"vision: detector: {line}")
 
     def _complain(self, fault: str) -> None:
         if fault != self._fault:

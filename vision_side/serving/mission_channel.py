@@ -232,7 +232,7 @@ class MissionChannel:
     def log_notices(self) -> None:
         """Log what the detector reports."""
         for line in notices_of(self._detector):
-            self._log_change("detector", line)
+            self._log_change("detector", f"detector: {line}")
 
     def _apply(self, message: Message, pipeline: Pipeline, frame: FrameHeader) -> None:
         try:

@@ -73,6 +73,23 @@ def test_demo_of_a_scenario_without_bounds_is_not_evaluated(lights, monkeypatch)
     assert demo_report.report(legacy).ok is None
 
 
+def test_summary_shows_what_the_detector_reported_each_line_once_and_the_first_three(lights, monkeypatch):
+    monkeypatch.setattr(demo_report, "_draw", lambda *_given: None)
+    judged = demo_report.report(lights)
+    before = demo_report.summary(judged)
+    assert not any("detector: " in line for line in before)
+    lines = [f"2026-03-01T10:00:00.{number:03}Z info vision: detector: the color range marks {number // 2} %"
+             for number in range(9)]
+    log = lights.folder / "vision.log"
+    log.write_text("\n".join(["2026-03-01T10:00:00.000Z info vision: target seen", *lines, ""]))
+    try:
+        after = demo_report.summary(judged)
+    finally:
+        log.write_text("")
+    told = [f"detector: the color range marks {share} %" for share in (0, 1, 2)]
+    assert after == [*before[:-2], *told, *before[-2:]]
+
+
 class StatusLink:
     """Publishes to the recorder what a test gives it."""
 

@@ -46,11 +46,11 @@ class DryBench(DrivingBench):
 def test_dry_run_detects_in_the_images_of_a_robot():
     said = []
     AckingService(CONFIG, MemoryNetwork(seed=3).link("r1", role="vision"), said.append)
-    assert f"vision: {STARTS}" in said, "before any frame"
+    assert f"vision: detector: {STARTS}" in said, "before any frame"
     bench = DryBench(CONFIG)
     bench.said.clear()
     bench.frame()
-    assert f"vision: {GONE}" in bench.said
+    assert f"vision: detector: {GONE}" in bench.said
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,6 @@ def test_a_detector_has_as_long_as_when_it_drives():
 def test_dry_run_detects_in_the_images_of_a_local_camera():
     said = []
     watching = LocalRun(CONFIG, Camera(), said.append)
-    assert said == [f"vision: {STARTS}"]
+    assert said == [f"vision: detector: {STARTS}"]
     watching.turn()
-    assert f"vision: {GONE}" in said
+    assert f"vision: detector: {GONE}" in said
