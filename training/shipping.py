@@ -47,9 +47,10 @@ from sightline.vision_side.detect.onnx.self_test import KEY, golden_picture, gol
 from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.registry import build_detector
 
-MOST_FALSE: Final = 0.02
+MOST_FALSE: Final = 0.03
 """Share of false alarms and of wrong objects, in every column. An acceptance test allows 5 of a hundred frames without
-a ball: a detector with 2 % exceeds that once in sixty such hundreds, one with 3 % once in twelve."""
+a ball: a detector with 3 % exceeds that once in twelve such hundreds. With 2 % it would, once in sixty, but find fewer
+balls in drawn scenes than the model before it."""
 _TRIED: Final = tuple(round(float(one), 2) for one in np.arange(0.06, 0.95, 0.01))
 _DEFAULT_THRESHOLD: Final = 0.3  # for a label that no scene showed
 
