@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from sightline.protocol.messages import CameraModel, FrameHeader
-from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector
 from sightline.vision_side.detect.onnx.detector import OnnxDetector, read_onnx_model
@@ -93,7 +93,8 @@ def time_learned(frames: int = 600) -> LearnedTime:
 
 def _time_size(size: tuple[int, int], frames: int, paced_frames: int) -> StepTime:
     pictures = _pictures(*size)
-    config, decoder = VisionConfig(), Decoder(*size, size[0] * size[1])
+    config = VisionConfig(detector=DetectorConfig(kind="hsv"))
+    decoder = Decoder(*size, size[0] * size[1])
     pipeline = Pipeline(config, _camera(*size), configured_detector(config))
     source = _frames(pictures)
     for _ in range(_WARM_UP):

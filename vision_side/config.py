@@ -54,7 +54,7 @@ class DetectorConfig(Config):
     """The detector: one of `sightline detector list`, or `boxes`, which another service publishes as `detections`."""
 
     renamed_keys: ClassVar[Mapping[str, str]] = {"only_colour": "only_color"}
-    kind: Annotated[str, Field(min_length=1, max_length=256)] = "hsv"
+    kind: Annotated[str, Field(min_length=1, max_length=256)] = "auto"
     """A name, or `package.module:Name`; a file or address follows a colon: onnx:ball.onnx, oip+http://... `auto` is the
     learned model, or `hsv` without ONNX Runtime and for `hsv.shape` `any`."""
     options: dict[str, Any] = Field(default_factory=dict)

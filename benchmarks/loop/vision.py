@@ -19,7 +19,7 @@ from sightline.protocol.messages import FrameHeader
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
-from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline
@@ -56,7 +56,7 @@ class PipelineVision:
     """Images in, `linear|angular` out."""
 
     def __init__(self, width_px: int, height_px: int, delay_ms: float = 0.0, busy_ms: float = 0.0) -> None:
-        config = VisionConfig()
+        config = VisionConfig(detector=DetectorConfig(kind="hsv"))  # as all rivals
         detector = delayed_detector(config, delay_ms, busy_ms)
         self._pipeline = Pipeline(config, camera_of(width_px, height_px), detector)
         self._seq = 0

@@ -16,7 +16,15 @@ from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.network.cases import NetworkCase
 from sightline.benchmarks.network.figures import moves_again_s, sent_between
 from sightline.benchmarks.network.robots import Settings
-from sightline.benchmarks.network.stage import EVERYWHERE, NetworkRun, ShapedWire, Stage, start_robot, start_vision
+from sightline.benchmarks.network.stage import (
+    DETECTOR,
+    EVERYWHERE,
+    NetworkRun,
+    ShapedWire,
+    Stage,
+    start_robot,
+    start_vision,
+)
 from sightline.benchmarks.network.stop_client import RESET, STOPPED
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import REQUESTED, MotorRow, measure_stop, moved_on_old_sight, wheel_mps
@@ -250,7 +258,7 @@ def fleet(row: NetworkCase, stage: Stage) -> NetworkRun:
                         notes=stage.folder / "notes.json", seed=stage.seed)
     with stage.wire() as wire, stage.processes("processes") as processes:
         before = wire.shape(stage.seeded(row.phases[0].shapes))
-        arguments = ["vision", "--robot", "r*", "--listen", f"tcp/{EVERYWHERE}:7447"]
+        arguments = ["vision", "--robot", "r*", "--detector", DETECTOR, "--listen", f"tcp/{EVERYWHERE}:7447"]
         processes.start("vision", arguments, namespace=wire.far_side)
         processes.wait_line("vision", "looking for robots")
         processes.start("robots", [settings.model_dump_json()], module="sightline.benchmarks.network.robots",

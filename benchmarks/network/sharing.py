@@ -15,7 +15,7 @@ from typing import Any, Final
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.network.cases import CUT_S, NetworkCase, both
 from sightline.benchmarks.network.robots import Settings
-from sightline.benchmarks.network.stage import NetworkRun, ShapedWire, Stage
+from sightline.benchmarks.network.stage import DETECTOR, NetworkRun, ShapedWire, Stage
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.processes import Processes
 from sightline.protocol.clock import monotonic_us
@@ -144,8 +144,8 @@ class Site:
     def start_service(self, name: str) -> None:
         """Start a service that shares. It has its name at the next start too."""
         namespace = self.wire.far_side if self.bounds.beyond and name == "v0" else self.wire.robot_side
-        self._start(name, "shares robots", "vision", "--share", "--name", name, *_connect(self.endpoints),
-                    namespace=namespace)
+        self._start(name, "shares robots", "vision", "--share", "--name", name, "--detector", DETECTOR,
+                    *_connect(self.endpoints), namespace=namespace)
 
     def kill(self, name: str) -> None:
         """End a process with -9."""

@@ -20,11 +20,12 @@ from sightline.evaluation.scenario_config import robot_of, vision_config
 from sightline.evaluation.score.runs import ScoreCase, ScoredFigure, cases, run_cases
 from sightline.operator_side.terminal import progress_bar
 from sightline.sim.scenario import Scenario, load_scenario, look_named, scenario_names
+from sightline.vision_side.config import DetectorConfig
 
 PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "real-look.md"
 LOOK: Final = "real"
 LATENCY_MS, LOSS = 50.0, 0.1
-LEARNED: Final = "onnx"
+LEARNED, COLOR = "onnx", "hsv"
 LEAST_PER_S: Final = 30.0
 """Images that must be drawn in a second, 320x240."""
 SHOWN: Final = ("circle", "walls", "traffic-light", "legs-crowd")
@@ -96,7 +97,8 @@ def write_image(path: Path) -> None:
 
 def wanted_cases(names: Sequence[str], seeds: Sequence[int]) -> list[ScoreCase]:
     """Return the runs with the look of each scenario and with `LOOK`, and those of the learned detector for balls."""
-    own = [case for look in (None, LOOK) for case in cases(names, seeds, [LATENCY_MS], [LOSS], None, look=look)]
+    own = [replace(case, detector=color_detector(case.scenario)) for look in (None, LOOK)
+           for case in cases(names, seeds, [LATENCY_MS], [LOSS], None, look=look)]
     balls = [name for name in names if load_scenario(name).target.shape == "ball"]
     return own + (cases(balls, seeds, [LATENCY_MS], [LOSS], None, look=LOOK, detector=LEARNED) if balls else [])
 
@@ -108,7 +110,14 @@ def own_detector(name: str) -> str:
         return "none: range sensor"
     if scenario.labels:
         return "none: labels of the simulation"
-    return f"`{vision_config(scenario, robot_of(scenario)).detector.kind}`"
+    return f"`{color_detector(name) or vision_config(scenario, robot_of(scenario)).detector.kind}`"
+
+
+def color_detector(name: str) -> str | None:
+    """Return the color detector for a scenario that leaves the choice, and None for all others."""
+    scenario = load_scenario(name)
+    leaves_it = vision_config(scenario, robot_of(scenario)).detector.kind == DetectorConfig().kind
+    return COLOR if leaves_it and not scenario.labels and not scenario.goals_m else None
 
 
 def page_lines(
@@ -163,7 +172,7 @@ def _table(wanted: Sequence[ScoreCase], scored: Sequence[ScoredFigure]) -> Itera
     for case in sorted(_groups(wanted), key=lambda one: one.scenario):
         figures = [one for one in scored if one.group == case.group]
         broken = "; ".join(_broken(one) for one in figures if not one.ok)
-        own = "" if case.detector else _result(replace(case, look=None), scored)
+        own = "" if case.detector == LEARNED else _result(replace(case, look=None), scored)
         yield f"| {case.scenario} | {_detector(case)} | {own} | {_result(case, scored)} | {broken} |"
     yield ""
 

@@ -58,7 +58,7 @@ from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
 from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
 from sightline.sim.bus import SimCamera, SimDrive, SimSocketConfig
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.color.hsv import HsvDetector
+from sightline.vision_side.detect.onnx.detector import AutoDetector
 from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
 from sightline.vision_side.serving.process import serve
 
@@ -670,15 +670,15 @@ FAULTS: Final[dict[str, Callable[[], None]]] = {
 
 def _spoil_detector(fault: str, pulled: threading.Event, ledger: EventLog) -> None:
     """Every detector built from now on does `fault` before it detects, once the trigger is pulled."""
-    detect = HsvDetector.detect
+    detect = AutoDetector.detect
 
-    def spoiled(self: HsvDetector, picture: Any) -> Any:
+    def spoiled(self: AutoDetector, *given: Any) -> Any:
         if pulled.is_set():
             ledger.note(INJECTED)
             FAULTS[fault]()
-        return detect(self, picture)
+        return detect(self, *given)
 
-    HsvDetector.detect = spoiled  # type: ignore[method-assign]
+    AutoDetector.detect = spoiled  # type: ignore[assignment, method-assign]
 
 
 def run_vision(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:

@@ -151,8 +151,9 @@ def list_detectors(as_json: Json = False) -> int:
         listed = [{"name": name, "usable": not why, "why": why} for name, why in rows]
         typer.echo(json.dumps({"detectors": listed, "model_hash": model}))
     else:
-        comes = f", with model {model}" if model else "; without a model: give onnx:PATH"
-        print_table((name, f"{why or 'ok'}{comes if name == 'onnx' and not why else ''}") for name, why in rows)
+        more = {"auto": ", the default: onnx or hsv",
+                "onnx": f", with model {model}" if model else "; without a model: give onnx:PATH"}
+        print_table((name, why or f"ok{more.get(name, '')}") for name, why in rows)
         typer.echo("also: package.module:Name for your own class, and boxes for those of another publisher")
         typer.echo("\nrecommended:")
         print_table((f"  {what}", name) for what, name in _RECOMMENDED)

@@ -48,7 +48,7 @@ def demo(
     scenario: Annotated[str, typer.Option(help="A name from `sightline scenarios`, or a .toml file.")] = "circle",
     mission: Annotated[str | None, typer.Option(help="Mission [default: of the scenario].")] = None,
     detector: Annotated[
-        str | None, typer.Option(help="Detector, see `sightline detector list` [default: hsv].")
+        str | None, typer.Option(help="Detector, see `sightline detector list` [default: auto].")
     ] = None,
     seconds: Annotated[
         float | None, typer.Option(help="Length; 0 runs until Ctrl-C [default: 20, or the length of the course].")

@@ -166,7 +166,7 @@ def vision(
     sets: Sets = None,
     detector: Annotated[
         str | None,
-        typer.Option("--detector", metavar="NAME", help="Detector, see `sightline detector list` [default: hsv]."),
+        typer.Option("--detector", metavar="NAME", help="Detector, see `sightline detector list` [default: auto]."),
     ] = None,
     device: Device = None,
     shadow: Annotated[

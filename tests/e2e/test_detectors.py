@@ -66,9 +66,10 @@ def ball_on_the_left(folder: Path) -> dict:
 def test_a_shadow_is_compared_and_never_steers(tmp_path: Path) -> None:
     """The hsv detector finds the ball on the left; the model reports a ball on the right."""
     model = brightness_model(tmp_path / "right.onnx", RIGHT, [0])
+    both = ("--detector", "hsv", "--shadow", f"onnx:{model}")
     with (
         RobotProcess(tmp_path, camera=ball_on_the_left(tmp_path)) as robot,
-        VisionProcess(tmp_path, "--connect", robot.endpoint, "--shadow", f"onnx:{model}") as vision,
+        VisionProcess(tmp_path, "--connect", robot.endpoint, *both) as vision,
     ):
         connect = ("--connect", robot.endpoint)
         assert until(lambda: turning(robot) > 0.5, START_S), vision.output()

@@ -77,7 +77,8 @@ def test_operator_sends_a_robot_to_a_goal_and_cancels(tmp_path, transport):
 def _course(robot, connect, said):
     assert until(lambda: any("frames from robot r1" in line for line in said), START_S)
     told = sightline("mission", "r1", *connect)
-    assert told.returncode == 0 and "r1: follow: lost" in told.stdout and "detector: hsv, on cpu" in told.stdout
+    assert told.returncode == 0 and "r1: follow: lost" in told.stdout
+    assert "detector: onnx:sightline.onnx, on cpu, model" in told.stdout
     assert robot.speed() == 0.0
     # The goal is so far away that the robot still drives at every request below.
     sent = sightline("goto", "r1", "30", "-10", *connect)

@@ -161,7 +161,7 @@ def test_completion_of_the_shell_offers_commands_and_options():
         (["config", "check", "vision", "--set", "detector.options.colr=1"], 2, "'colr'"),
         (["config", "check", "vision", "--set", "detector.fallback=onnx:no.onnx"], 2, "no.onnx"),
         (["config", "check", "vision", "--set", "detector.shadow=adaptve"], 2, "did you mean 'adaptive'"),
-        (["config", "check", "vision", "--set", "detector.device=cuda"], 2, "no device to choose"),
+        (["config", "check", "vision", "--set", "detector.kind=hsv", "--set", "detector.device=cuda"], 2, "no device"),
         (["config", "check", "vision", "--set", "detector.kind=boxes", "--set", "detector.tracked=true"], 2, "tracked"),
         (["robot", "--robot", "a/b"], 2, "'a/b'"),
         (["robot", "--robot", "*"], 2, "'*'"),

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from sightline.operator_side.cli import detector as cli_detector
+from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.onnx import detector as onnx_detector
 from sightline.vision_side.serving import detector_service
@@ -147,7 +148,9 @@ def test_installation_without_a_model_is_reported(capsys, monkeypatch, tmp_path:
     assert code == 2 and "has no model" in err and err.count("\n") == 1
     assert re.search("onnx +ok; without a model", run(capsys, "detector", "list")[1])
     brightness_model(tmp_path / "sightline.onnx", [[1, 1, 9, 9]], [0])
-    assert re.search(f"onnx +ok, with model {onnx_detector.shipped_digest()}", run(capsys, "detector", "list")[1])
+    shown = run(capsys, "detector", "list")[1]
+    assert re.search(f"onnx +ok, with model {onnx_detector.shipped_digest()}", shown)
+    assert re.search(f"{VisionConfig().detector.kind} +ok, the default: onnx or hsv", shown)
     assert json.loads(run(capsys, "detector", "list", "--json")[1])["model_hash"] == onnx_detector.shipped_digest()
 
 

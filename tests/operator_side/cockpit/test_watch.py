@@ -81,14 +81,14 @@ def test_the_target_is_printed_as_a_line_an_object_and_a_table(
     where = ["watch", "r1", "target", "--connect", site.at(end), "--count", "2", "--seconds", "10"]
     assert run([*where, "--json"]) == 0
     first, second = (json.loads(line) for line in capsys.readouterr().out.splitlines())
-    assert first["robot"] == "r1" and first["label"] == "target" and 0.2 < first["distance_m"] < 3.0
+    assert first["robot"] == "r1" and first["label"] == "ball" and 0.2 < first["distance_m"] < 3.0
     assert 0 < second["t_us"] - first["t_us"] < 1_000_000, "of new images"
     assert run([*where, "--csv"]) == 0
     rows = list(csv.DictReader(capsys.readouterr().out.splitlines()))
     assert len(rows) == 2 and list(rows[0]) == list(first) and float(rows[0]["bearing_rad"]) == pytest.approx(
         first["bearing_rad"], abs=0.05)
     assert run(where) == 0
-    assert re.fullmatch(r"( *[+-]\d+\.\d deg +\d\.\d\d m  target \d\.\d\d at .* px, radius .* \(\w+\)\n){2}",
+    assert re.fullmatch(r"( *[+-]\d+\.\d deg +\d\.\d\d m  ball \d\.\d\d at .* px, radius .* \(\w+\)\n){2}",
                         capsys.readouterr().out)
 
 

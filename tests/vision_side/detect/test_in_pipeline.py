@@ -223,7 +223,7 @@ def test_report_names_detector_device_and_time() -> None:
 
 
 def test_the_color_detector_reports_how_long_it_took() -> None:
-    bench = Bench(VisionConfig())
+    bench = Bench(VisionConfig(detector=DetectorConfig(kind="hsv")))
     bench.frame()
     report = bench.report()
     assert (report.detector, report.device) == ("hsv", "cpu")

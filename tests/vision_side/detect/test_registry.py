@@ -78,24 +78,22 @@ def test_kind_is_split_into_name_and_address(kind: str, parts: tuple[str, str]) 
 
 
 def test_the_configured_detector_always_exists() -> None:
-    assert isinstance(configured_detector(VisionConfig()), Hsv)
-    assert isinstance(configured_detector(config(kind="auto")), AutoDetector)
+    assert isinstance(configured_detector(VisionConfig()), AutoDetector)
     assert isinstance(configured_detector(config(kind="hsv", options={"label": "ball"})), Hsv)
     assert isinstance(configured_detector(config(kind="adaptive")), Adaptive)
     assert isinstance(configured_detector(config(kind="boxes")), NoDetector)
 
 
-def test_auto_is_the_learned_model_where_that_can_find_the_target() -> None:
-    made = configured_detector(config(kind="auto"))
+def test_the_default_is_the_learned_model_where_that_can_find_the_target(monkeypatch) -> None:
+    made = configured_detector(VisionConfig())
     assert isinstance(made.inner, OnnxDetector) and made.labels[0] == "ball" and not notices_of(made)
-    settings = {"detector": {"kind": "auto"}, "hsv": {"shape": "any"}}
-    of_any_shape = configured_detector(VisionConfig.model_validate(settings))
+    of_any_shape = configured_detector(VisionConfig.model_validate({"hsv": {"shape": "any"}}))
     assert isinstance(of_any_shape.inner, Hsv) and not of_any_shape.labels and not notices_of(of_any_shape)
 
 
 def test_without_onnx_runtime_a_color_range_finds_the_target_and_that_is_reported_once(monkeypatch) -> None:
     monkeypatch.setattr("sightline.vision_side.detect.onnx.detector.find_spec", lambda _name: None)
-    settings = VisionConfig.model_validate({"detector": {"kind": "auto"}, "hsv": {"min_radius_px": 9.0}})
+    settings = VisionConfig.model_validate({"hsv": {"min_radius_px": 9.0}})
     check_vision(settings)
     made = configured_detector(settings)
     assert isinstance(made.inner, Hsv) and made.inner._hsv_detector._config.min_radius_px == 9.0
@@ -107,7 +105,7 @@ def test_a_device_that_is_demanded_needs_onnx_runtime(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     monkeypatch.setattr("sightline.vision_side.detect.onnx.detector.find_spec", lambda _name: None)
     with pytest.raises(ConfigError, match="onnxruntime is not installed"):
-        configured_detector(config(kind="auto", device="cuda"))
+        configured_detector(config(device="cuda"))
 
 
 def test_own_class_gets_its_options_and_the_vision_values() -> None:

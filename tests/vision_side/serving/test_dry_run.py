@@ -9,13 +9,14 @@ from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import AnswerHeader, FrameHeader, Stamp, Twist
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.robot_side.ports import Picture
-from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from sightline.vision_side.serving.dry_run import AckingService, ProgressPrinter, watch_camera, watch_robot
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
+COLOR = VisionConfig(detector=DetectorConfig(kind="hsv"))
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
 PICTURES = [BALL, BALL, b"no picture", BALL, jpeg_of(scene(MODEL, 3.0, -0.2)), BALL]
 
@@ -40,7 +41,7 @@ class Scripted:
 
 def watch(script):
     said = []
-    assert watch_camera(VisionConfig(), Scripted(script), said.append) == 0
+    assert watch_camera(COLOR, Scripted(script), said.append) == 0
     return said
 
 
@@ -50,7 +51,7 @@ def test_a_robot_gets_acknowledgements_and_never_a_twist():
     acks, twists = [], []
     robot.subscribe(ACK, acks.append)
     robot.subscribe(TWIST, twists.append)
-    service = AckingService(VisionConfig(), network.link("r1", role="vision"), said.append)
+    service = AckingService(COLOR, network.link("r1", role="vision"), said.append)
     robot.publish(CAMERA, encode(Stamp(session="0000abcd", seq=1, t_us=0)), encode(MODEL))
     for seq, jpeg in enumerate(PICTURES):
         header = FrameHeader(session="0000abcd", seq=seq, t_us=(seq + 1) * 33_333)
@@ -102,7 +103,7 @@ def test_a_local_camera_is_opened_by_kind_and_options_and_closed(tmp_path):
     (tmp_path / "a.jpg").write_bytes(BALL)
     said = []
     with local_camera("still", [f"path={tmp_path / 'a.jpg'}", "fps=100", "hfov_deg=80"]) as still:
-        assert watch_camera(VisionConfig(), still, said.append, seconds=0.3) == 0
+        assert watch_camera(COLOR, still, said.append, seconds=0.3) == 0
     assert "not calibrated" in said[0]
     assert said[1].startswith("tracking: bearing +11.")
 

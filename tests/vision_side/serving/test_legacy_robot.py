@@ -132,7 +132,7 @@ def test_a_service_assumes_a_camera_for_a_legacy_robot_once_and_drives(bench):
     service = Service(VisionConfig(connect=("ws-legacy://127.0.0.1:9091",)), bench.link, said.append)
     for seq in range(1, 4):
         header = FrameHeader(session="0000abcd", seq=seq, t_us=seq * 33_333)
-        bench.far.publish(FRAME, encode(header), jpeg_of(scene(camera(), 1.0, 0.2)))
+        bench.far.publish(FRAME, encode(header), jpeg_of(scene(camera(), 1.0, 0.2, shaded=True)))
         bench.advance()
         service.turn(0.0)
         bench.advance()

@@ -37,6 +37,7 @@ from tests.fixtures.vision.vision import camera, jpeg_of, scene
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
 FRAME_US = 33_333
+COLOR = VisionConfig(detector=DetectorConfig(kind="hsv"))
 TARGET = Detection(100.0, 40.0, 140.0, 80.0, 0.9, "ball", Circle(120.0, 70.0, 20.0), track_id=7)
 LONG = "\N{LARGE YELLOW CIRCLE}" * 200
 SESSION, ASKER = "0000abcd", "0000feed"
@@ -50,7 +51,7 @@ class Bench:
         self.robot, self.person = self.network.link("r1"), self.network.link("r1", role="operator")
         self.twists, self.reports, self.said, self.seq = self.robot.latest(TWIST), [], [], 0
         self.person.subscribe(REPORT, self.reports.append)
-        self.service = service(config or VisionConfig(), self.network.link("r1", role="vision"), self.said.append)
+        self.service = service(config or COLOR, self.network.link("r1", role="vision"), self.said.append)
         self.robot.publish(CAMERA, encode(Stamp(session=SESSION, seq=1, t_us=0)), encode(MODEL))
         self.turn()
 

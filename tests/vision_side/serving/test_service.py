@@ -16,7 +16,7 @@ from sightline.protocol.proof import session_digest
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Message
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.serving.process import serve
 from sightline.vision_side.serving.service import Service
 from tests.fixtures.ports import free_endpoint
@@ -26,6 +26,7 @@ MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
 EMPTY = jpeg_of(np.full((240, 320, 3), 140, np.uint8))
 SHOWN, OTHER = (session_digest("robot", session) for session in ("0000abcd", "0000beef"))
+COLOR = VisionConfig(detector=DetectorConfig(kind="hsv"))
 
 
 class Bench:
@@ -37,7 +38,7 @@ class Bench:
         self.twists: LatestSlot[Message] = self.robot.latest(TWIST)
         self.acks: LatestSlot[Message] = self.robot.latest(ACK)
         self.said: list[str] = []
-        self.service = Service(VisionConfig(), self.network.link("r1", role="vision"), self.said.append)
+        self.service = Service(COLOR, self.network.link("r1", role="vision"), self.said.append)
         self.now_us = 0
 
     def camera(self, model: CameraModel = MODEL) -> None:

@@ -263,7 +263,7 @@ def _found(
 
 
 class AutoDetector(DetectorWrapper):
-    """The learned model, or the color range where that model cannot find the target."""
+    """The default: the learned model, or the color range where that model cannot find the target."""
 
     Config = OnnxDetector.Config
 
