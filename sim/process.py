@@ -331,6 +331,8 @@ class SimConfig(SimSocketConfig):
     """A name (`sim/robots/`) or the path of a `.toml` file; empty for the one that the scenario names."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of the start and the noise."""
+    fps: Annotated[float, Field(gt=0, le=240)] | None = None
+    """Images per second; those of the robot's camera if not set."""
     motor_log: str | None = None
     """CSV file of every motor command, with its arrival time."""
     seconds: Annotated[float, Field(gt=0)] | None = None
@@ -345,7 +347,7 @@ class Simulation:
         self._motors = MotorPort(config.motor_log)
         self._clients = BusClients(folder, self._hellos(), self._motors.take)
         self._encoders, self._truth = PeriodicTimer(ENCODERS_US), PeriodicTimer(TRUTH_US)
-        self._frames = PeriodicTimer(1e6 / world.robot.camera.fps)
+        self._frames = PeriodicTimer(1e6 / (config.fps or world.robot.camera.fps))
         self._scans = PeriodicTimer(1e6 / world.robot.lidar.rate_hz)
         self._offset_us = monotonic_us()
         self._lag_us = 0

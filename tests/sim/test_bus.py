@@ -111,6 +111,17 @@ def test_pictures_are_fresh_distinct_and_paced(sim):
     assert sorted(ages_us)[7] < 30_000
 
 
+def test_pictures_come_at_the_requested_rate(tmp_path):
+    simulator = started(tmp_path, fps=10.0)
+    try:
+        camera = SimCamera(simulator.config())
+        stamps = [camera.read(1.0).t_us for _ in range(4)]
+    finally:
+        simulator.process.kill()
+        simulator.process.wait(10)
+    assert min(later - earlier for earlier, later in pairwise(stamps)) >= 96_000, "one physics step less than 0.1 s"
+
+
 def test_a_picture_that_came_too_late_is_not_given_to_the_next_read(sim):
     camera = SimCamera(sim.config())
     assert camera.read(0.0) is None
