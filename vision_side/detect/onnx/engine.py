@@ -5,6 +5,7 @@ silently runs on the CPU when it cannot have it.
 """
 
 import importlib
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,6 +75,8 @@ def open_engine(path: Path, device: Device, threads: int) -> "Engine":
         ConfigError: without ONNX Runtime, or for a file that is not a model.
         HardwareError: for a device that the model did not get.
     """
+    # Otherwise it sends telemetry, and stores a number of the device. It reads this once, when it is imported.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     try:
         runtime = importlib.import_module("onnxruntime")
     except ImportError:

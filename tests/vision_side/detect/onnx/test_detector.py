@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.decode import DecodedImage, Decoder
-from sightline.vision_side.detect.onnx.detector import OnnxDetector
+from sightline.vision_side.detect.onnx.detector import SHIPPED, OnnxDetector
 from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor, open_engine
 from sightline.vision_side.detect.onnx.self_test import difference, golden_picture, golden_text, read_golden
 from sightline.vision_side.detect.onnx.tensors import Letterbox, ModelFormat, fit_picture, model_format, read_outputs
@@ -48,6 +49,17 @@ def test_model_file_names_its_inputs_and_outputs(tmp_path: Path) -> None:
     assert header.inputs == (Tensor("image", "uint8", (1, 240, 320, 3)),)
     assert [one.name for one in header.outputs] == ["boxes", "scores", "labels"]
     assert header.metadata == {"labels": '["ball", "legs"]', "min_score": "0.4"}
+
+
+def test_onnx_runtime_stores_no_identity_of_the_machine_and_reports_nothing(tmp_path: Path) -> None:
+    """By default it sends telemetry to its maker, and stores a number of the device and what it has not sent yet."""
+    script = ("import sys; from pathlib import Path; from sightline.vision_side.detect.onnx.engine import open_engine; "
+              "print(open_engine(Path(sys.argv[1]), 'cpu', 1).header.inputs[0].name)")
+    # Nothing else of the environment: in CI it reports nothing by itself.
+    home = {"HOME": str(tmp_path), "TMPDIR": str(tmp_path)}
+    opened = subprocess.run([sys.executable, "-B", "-c", script, str(SHIPPED)], env=home, check=True,
+                            capture_output=True, text=True)
+    assert opened.stdout == "image\n" and list(tmp_path.iterdir()) == []
 
 
 def test_constant_input_is_not_an_input(tmp_path: Path) -> None:
