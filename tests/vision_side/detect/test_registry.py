@@ -84,7 +84,7 @@ def test_the_configured_detector_always_exists() -> None:
     assert isinstance(configured_detector(config(kind="boxes")), NoDetector)
 
 
-def test_the_default_is_the_learned_model_where_that_can_find_the_target(monkeypatch) -> None:
+def test_the_default_is_the_learned_model_where_that_can_find_the_target() -> None:
     made = configured_detector(VisionConfig())
     assert isinstance(made.inner, OnnxDetector) and made.labels[0] == "ball" and not notices_of(made)
     of_any_shape = configured_detector(VisionConfig.model_validate({"hsv": {"shape": "any"}}))
