@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from docs.make.real_look import color_detector
 from sightline.evaluation.checks import Check, number
 from sightline.evaluation.lockstep import Conditions, run_lockstep
 from sightline.evaluation.plots import ROBOT_COLOR, plot_run
@@ -77,8 +78,8 @@ class Row:
 
     def cases(self, seeds: Sequence[int], look: str | None = None) -> list[ScoreCase]:
         """Its runs in one light, the scenario's own if None."""
-        mission = self.baseline or None
-        return [ScoreCase(self.scenario, LATENCY_MS, LOSS, seed, self.seconds, mission, self.robot, look)
+        mission, detector = self.baseline or None, color_detector(self.scenario)
+        return [ScoreCase(self.scenario, LATENCY_MS, LOSS, seed, self.seconds, mission, self.robot, look, detector)
                 for seed in seeds]
 
     def all_cases(self, seeds: Sequence[int]) -> list[ScoreCase]:
@@ -259,7 +260,7 @@ def page_lines(
         f"Each scenario by name, in lockstep on {len(seeds)} starts (seeds {names}), +{LATENCY_MS:g} ms latency, "
         f"{LOSS:.0%} loss on each leg, scored from the\nworld's own record: the median over the starts, then "
         "the worst. A baseline is a legacy controller with its own numbers, next to the default\nmission. It has no "
-        "bounds. "
+        "bounds. Where a scenario leaves the detector, it is `hsv`.\n"
         "[Robots and scenarios](../robots-and-scenarios.md) describes each robot and scenario.\n"
     )
     yield (
