@@ -49,8 +49,8 @@ from sightline.vision_side.detect.registry import build_detector
 
 MOST_FALSE: Final = 0.03
 """Share of false alarms and of wrong objects, in every column. An acceptance test allows 5 of a hundred frames without
-a ball: a detector with 3 % exceeds that once in twelve such hundreds. With 2 % it would, once in sixty, but find fewer
-balls in drawn scenes than the model before it."""
+a ball: a detector with 3 % exceeds that once in twelve such hundreds, one with 2 % once in sixty. At 2 % the shipped
+weights would find fewer balls in drawn scenes than those before them."""
 _TRIED: Final = tuple(round(float(one), 2) for one in np.arange(0.06, 0.95, 0.01))
 _DEFAULT_THRESHOLD: Final = 0.3  # for a label that no scene showed
 

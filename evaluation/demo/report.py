@@ -177,12 +177,12 @@ def summary(judged: DemoReport) -> list[str]:
         lines.append(f"the recording ends early: {run.recorder_failed}")
     if run.killed:
         lines.append(f"had to be killed: {', '.join(run.killed)}; see their logs")
-    lines += detector_lines(run.folder / "vision.log")
+    lines += _detector_lines(run.folder / "vision.log")
     lines.append(f"left in {run.folder}: score.json trajectory.png run.mp4 run.mcap motors.csv *.log")
     return [*lines, _next_thing(run)]
 
 
-def detector_lines(log: Path) -> list[str]:
+def _detector_lines(log: Path) -> list[str]:
     """Return what the detector reported in a log of vision, e.g. that the color range marks the floor."""
     parts = (line.partition(" vision: detector: ") for line in log.read_text("utf-8", "replace").splitlines())
     told = dict.fromkeys(line for _, found, line in parts if found)

@@ -68,6 +68,13 @@ def _size(dimension: object) -> int | None:
     return dimension if isinstance(dimension, int) and dimension > 0 else None
 
 
+def import_runtime() -> Any:
+    """Import ONNX Runtime. Raises ImportError."""
+    # Otherwise it sends telemetry, and stores a number of the device. It reads this once, when it is imported.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    return importlib.import_module("onnxruntime")
+
+
 def open_engine(path: Path, device: Device, threads: int) -> "Engine":
     """Load the model.
 
@@ -75,10 +82,8 @@ def open_engine(path: Path, device: Device, threads: int) -> "Engine":
         ConfigError: without ONNX Runtime, or for a file that is not a model.
         HardwareError: for a device that the model did not get.
     """
-    # Otherwise it sends telemetry, and stores a number of the device. It reads this once, when it is imported.
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     try:
-        runtime = importlib.import_module("onnxruntime")
+        runtime = import_runtime()
     except ImportError:
         raise ConfigError(
             f"onnxruntime is not installed: {install_command('vision')}, or [vision-gpu] for an NVIDIA GPU; "
