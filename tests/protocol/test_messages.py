@@ -37,7 +37,7 @@ MODELS = sorted(
     {channel.header for channel in CHANNELS.values()} | {c.payload for c in CHANNELS.values() if c.payload},
     key=lambda model: model.__name__,
 )
-sessions = st.from_regex(r"[0-9a-f]{8}", fullmatch=True)
+sessions = st.text("0123456789abcdef", min_size=8, max_size=8)
 sources = st.from_regex(r"[a-z][a-z0-9_]{0,15}", fullmatch=True)
 integers = st.integers(0, MAX_INTEGER)
 numbers = st.floats(-1e6, 1e6)
