@@ -7,30 +7,44 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import av
 import pytest
 
-from sightline.evaluation.processes import ProcessError, Processes
+from sightline.evaluation.processes import ProcessError, Processes, children_of
 from sightline.protocol.errors import SightlineError
 from tests.fixtures.links import until
 
 COMMAND = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "demo"]
 
 
+def running() -> dict[int, str]:
+    """Command lines of all living processes."""
+    found = {}
+    for entry in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):
+            if command := entry.read_bytes().replace(b"\0", b" ").decode():
+                found[int(entry.parent.name)] = command
+    return found
+
+
 def running_in(folder: Path) -> list[str]:
     """Command lines of living processes that name `folder`."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            command = entry.read_bytes().replace(b"\0", b" ").decode()
-        except OSError:
-            continue
-        if str(folder) in command:
-            found.append(command)
-    return found
+    return [command for command in running().values() if str(folder) in command]
+
+
+def processes_of(pid: int) -> set[int]:
+    """The process and all below it."""
+    return {pid}.union(*(processes_of(child) for child in children_of(pid)))
+
+
+def all_of(demo: subprocess.Popen) -> set[int]:
+    """The processes of a demo: it, simulation, guardian, driver (perhaps a second one), network, STOP, vision."""
+    assert until(lambda: len(processes_of(demo.pid)) >= 7, 10), [running().get(pid) for pid in processes_of(demo.pid)]
+    return processes_of(demo.pid)
 
 
 def demo(folder: Path, *options: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -116,12 +130,12 @@ def test_signal_ends_all_processes_and_the_run_is_scored(tmp_path, number):
     for line in process.stderr:
         if "ACTIVE" in line:
             break
-    assert len(running_in(folder)) == 4
+    started = all_of(process)
     process.send_signal(number)
     said, _ = process.communicate(timeout=40)
     assert json.loads(said)["interrupted"]
     assert process.returncode in (0, 5)
-    assert running_in(folder) == []
+    assert running_in(folder) == [] and not started & running().keys()
 
 
 @pytest.mark.alone  # it must end within 2 s
@@ -134,10 +148,11 @@ def test_demo_that_is_killed_leaves_no_process_no_folder_and_stopped_wheels(tmp_
             try:
                 assert any("ACTIVE" in line for line in process.stderr)
                 assert until(lambda: wheel_speeds(folder)[0] > 3.0, 20)
+                started = all_of(process)
             finally:
                 process.kill()
                 killed_s = time.monotonic()
-        assert until(lambda: not running_in(folder) and not any(Path(temporary).iterdir()), 5)
+        assert until(lambda: not started & running().keys() and not any(Path(temporary).iterdir()), 5)
     assert time.monotonic() - killed_s < 2.0
     assert wheel_speeds(folder) == (0.0, 0.0)
 

@@ -104,7 +104,7 @@ def _yellow_ball(folder):
     folder.mkdir()
     for number, x in enumerate((380, 390, 400)):
         picture = np.full((480, 640, 3), (120, 125, 118), np.uint8)
-        cv2.circle(picture, (x, 240), 40, (20, 200, 235), -1)
+        cv2.circle(picture, (x, 240), 28, (20, 200, 235), -1)
         cv2.imwrite(str(folder / f"{number}.jpg"), picture, [cv2.IMWRITE_JPEG_QUALITY, 80])
     return folder
 
