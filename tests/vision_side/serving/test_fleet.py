@@ -134,6 +134,24 @@ def test_a_robot_may_come_later():
     assert list(fleet.services) == ["r7"]
 
 
+def test_a_crowd_that_comes_keeps_no_robot_waiting(monkeypatch):
+    """Each turn adds some, and the next turn follows at once."""
+    site = _NoRobots()
+    fleet = Fleet(VisionConfig(robot="r*"), site, lambda line: None)
+    site.robots().append("r0")
+    fleet.turn()
+    turns = []
+    monkeypatch.setattr(fleet.services["r0"], "turn", lambda wait_s: turns.append(len(fleet.services)))
+    monkeypatch.setattr(_Silent, "subscribe", lambda *_: time.sleep(0.004))
+    site.robots().extend(f"r{number}" for number in range(1, 31))
+    while len(fleet.services) < 31:
+        fleet.turn()
+        assert len(fleet.services) == 31 or fleet._bell.is_set()
+    added = [after - before for before, after in zip([1, *turns], turns, strict=False)]
+    assert max(added) <= 5, "r0 had its turn after a few others"
+    assert min(added) >= 1
+
+
 def test_several_robots_need_zenoh():
     with pytest.raises(ConfigError, match="need Zenoh"):
         open_fleet("r*", connect=["ws://127.0.0.1:9090"])
