@@ -23,6 +23,7 @@ from sightline.sim.scenes.model import (
     HEIGHT_PX,
     LABELS,
     LATER_FROM,
+    STATES,
     TRAINED,
     VALIDATED_FROM,
     WIDTH_PX,
@@ -156,6 +157,9 @@ def drawn_scenes(folder: Path, source: SceneSource, jobs: int, advance: Callable
     if not 0 < source.count * source.every <= VALIDATED_FROM:
         raise ConfigError(f"--scenes {source.count}: 1 to {VALIDATED_FROM // source.every}; seeds from "
                           f"{VALIDATED_FROM} up validate and score")
+    if source.every % len(STATES) == 0:
+        raise ConfigError(f"--every {source.every}: all traffic lights of these scenes have one color; choose a number "
+                          f"that {len(STATES)} does not divide")
     if source.photos is not None:
         _check_photographs(source.photos)
     pictures, notes = folder / "scenes.npy", folder / "scenes.json"

@@ -205,6 +205,12 @@ def test_no_scene_of_another_purpose_is_trained_on(tmp_path):
             drawn_scenes(tmp_path, source, 1, lambda _: None)
 
 
+@pytest.mark.parametrize("every", [3, 6])
+def test_scenes_of_one_color_of_lights_are_rejected(tmp_path, every):
+    with pytest.raises(ConfigError, match=f"--every {every}: all traffic lights .* that 3 does not divide"):
+        drawn_scenes(tmp_path, SceneSource(9, every=every), 1, lambda _: None)
+
+
 @pytest.fixture
 def photographs(tmp_path):
     folder = tmp_path / "photographs"
@@ -216,10 +222,10 @@ def photographs(tmp_path):
 
 
 def test_scenes_over_photographs_are_half_of_what_is_shown(tmp_path, photographs):
-    drawn = drawn_scenes(tmp_path, SceneSource(2, 3, photographs, every=75_000), 1, lambda _: None)
+    drawn = drawn_scenes(tmp_path, SceneSource(2, 3, photographs, every=75_001), 1, lambda _: None)
     assert drawn.own == 2 and len(drawn.truths) == 5
     with SceneRenderer() as renderer:
-        assert np.array_equal(drawn.pictures[1], renderer.scene(75_000, HARDER).rgb)
+        assert np.array_equal(drawn.pictures[1], renderer.scene(75_001, HARDER).rgb)
     pictures = [one.rgb for one in read_photographs(photographs)]
     assert np.array_equal(drawn.pictures[3], photo_scene(pictures, 1).rgb)
     shown_at = Training((1, 1, 10)).shown_at(5, drawn.own)
