@@ -12,7 +12,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -66,6 +66,10 @@ class PeriodicTimer:
 
 
 LOG_HEADER = b"t_us,left_rad_s,right_rad_s,left_rad,right_rad\n"
+COASTING_US = 20_000
+"""Between two lines of wheels that roll out without an owner: a tick of the driver."""
+COASTING_RAD = 0.003
+"""Smallest way in that time, 5 mm/s at the rim: half of what counts as at rest."""
 
 
 class MotorPort:
@@ -76,6 +80,10 @@ class MotorPort:
         self.angles_rad = (0.0, 0.0)
         """Total angle of each wheel, from the last physics step."""
         self.refused = 0
+        self._lock = threading.Lock()
+        """Lines are in the order of their times."""
+        self._logged_us, self._logged_rad = 0, (0.0, 0.0)
+        self._may_roll = False
         self.lines_lost = 0
         """Commands that were applied and could not be logged, e.g. on a full disk."""
         try:
@@ -88,18 +96,34 @@ class MotorPort:
 
     def take(self, data: bytes) -> None:
         """Take one packet of a drive. A packet without two finite speeds is counted and changes nothing."""
-        t_us = monotonic_us()
         speeds = MOTION_SET.unpack(data) if len(data) == MOTION_SET.size else (math.nan, math.nan)
         if not all(map(math.isfinite, speeds)):
             self.refused += 1
             return
-        try:
-            self._write(b"%d,%.5f,%.5f,%.5f,%.5f\n" % (t_us, *speeds, *self.angles_rad))
-        except OSError as error:  # the command counts more than its line
-            if not self.lines_lost:
-                _log.warning("motor log: %s; commands are applied without a line", error.strerror)
-            self.lines_lost += 1
-        self.speeds_rad_s = (speeds[0], speeds[1])
+        with self._lock:
+            try:
+                self._log_line(monotonic_us(), speeds)
+            except OSError as error:  # the command counts more than its line
+                if not self.lines_lost:
+                    _log.warning("motor log: %s; commands are applied without a line", error.strerror)
+                self.lines_lost += 1
+            self.speeds_rad_s = (speeds[0], speeds[1])
+            self._may_roll = True
+
+    def coast(self) -> None:
+        """Log how wheels without an owner roll out: until the next command nothing else shows when they stand."""
+        with self._lock:
+            now_us = monotonic_us()
+            if any(self.speeds_rad_s) or not self._may_roll or now_us - self._logged_us < COASTING_US:
+                return
+            rolled = (abs(now - before) for now, before in zip(self.angles_rad, self._logged_rad, strict=True))
+            self._may_roll = max(rolled) > COASTING_RAD
+            with suppress(OSError):  # no command is lost
+                self._log_line(now_us, self.speeds_rad_s)
+
+    def _log_line(self, t_us: int, speeds: Sequence[float]) -> None:
+        self._logged_us, self._logged_rad = t_us, self.angles_rad
+        self._write(b"%d,%.5f,%.5f,%.5f,%.5f\n" % (t_us, *speeds, *self.angles_rad))
 
     def _write(self, line: bytes) -> None:
         """Write a whole line. Raises OSError; what a full disk took of the line ends before the next line."""
@@ -189,6 +213,11 @@ class BusClients:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="sim-sockets", daemon=True)
         self._thread.start()
+
+    @property
+    def has_motor_owner(self) -> bool:
+        """Return True if the last command came from a client that is still connected."""
+        return self._motor_owner is not None
 
     def has(self, name: str) -> bool:
         """Return True if a client is connected there."""
@@ -334,7 +363,7 @@ class SimConfig(SimSocketConfig):
     fps: Annotated[float, Field(gt=0, le=240)] | None = None
     """Images per second; those of the robot's camera if not set."""
     motor_log: str | None = None
-    """CSV file of every motor command, with its arrival time."""
+    """CSV file of every motor command, with its arrival time, and of wheels that roll out without an owner."""
     seconds: Annotated[float, Field(gt=0)] | None = None
     """The simulation ends after this time."""
 
@@ -369,6 +398,8 @@ class Simulation:
             self._world.set_wheels(*self._motors.speeds_rad_s)
             self._world.step()
             self._motors.angles_rad = self._world.wheels_turned()
+            if not self._clients.has_motor_owner:
+                self._motors.coast()
             self._publish(self._world.now_us)
 
     def _wait(self) -> None:

@@ -1,5 +1,9 @@
 """The simulated motors: a command is applied, whatever becomes of its line in the log."""
 
+import pytest
+
+from sightline.evaluation.faults.evidence import measure_stop, read_motors
+from sightline.sim import process
 from sightline.sim.bus import MOTION_SET
 from sightline.sim.process import LOG_HEADER, MotorPort
 
@@ -38,3 +42,30 @@ class Short:
 
     def write(self, line):
         return self.log.write(line[:4])
+
+
+@pytest.mark.parametrize("time_constant_s", [0.03, 0.1, 0.3])
+def test_wheels_that_roll_out_without_an_owner_are_logged_until_they_stand(tmp_path, monkeypatch, time_constant_s):
+    """Else a stop seems to last until the next driver starts."""
+    log, now_us, speed_rad_s = tmp_path / "motors.csv", 1_000_000, 15.0
+    monkeypatch.setattr(process, "monotonic_us", lambda: now_us)
+    motors = MotorPort(str(log))
+    motors.coast()
+    assert log.read_bytes() == LOG_HEADER, "no wheel has turned yet"
+    motors.take(MOTION_SET.pack(speed_rad_s, speed_rad_s))
+    now_us += 100_000
+    motors.coast()
+    assert len(read_motors(log.read_text())) == 1, "a motor that turns is in the log until it is set otherwise"
+    motors.take(MOTION_SET.pack(0.0, 0.0))
+    stands_ms = 0.0
+    for step in range(500):
+        now_us += 4_000
+        speed_rad_s *= 1 - 0.004 / time_constant_s
+        angle_rad = motors.angles_rad[0] + speed_rad_s * 0.004
+        motors.angles_rad = (angle_rad, angle_rad)
+        motors.coast()
+        stands_ms = 4.0 * step if speed_rad_s * 0.033 > 0.01 else stands_ms
+    rows = read_motors(log.read_text())
+    motors.close()
+    assert measure_stop(rows, 1_100_000).zero_ms == pytest.approx(stands_ms, abs=30)
+    assert len(rows) < 2 + 50 * 10 * time_constant_s + 3, "and no line after that"
