@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from docs.make.performance import CHECK_FAILED, processor
+from sightline.evaluation.faults.cases import CASES
 from sightline.evaluation.faults.report import figure_text, value_text
 
 DOCS: Final = Path(__file__).parents[1]
@@ -70,14 +71,16 @@ def merged(record: Record, newer: Record) -> Record:
     again = {row["id"]: row for row in newer["rows"]}
     rows = {row["id"]: row for row in record["rows"]} | again
     checks = [one for one in record["checks"] if _id_of(one) not in again] + newer["checks"]
-    note = {"command": newer["command"], "rows": [row["what"] for row in newer["rows"]]}
+    note = {"command": newer["command"], "machine": newer["machine"], "rows": list(again)}
     return {**record, "rows": list(rows.values()), "checks": checks, "again": [*record["again"], note]}
 
 
-def report_page(record: Record) -> str:
-    """The whole of docs/reference/results/faults.md."""
+def report_page(record: Record, known: Iterable[str] = ()) -> str:
+    """The whole of docs/reference/results/faults.md, which names those `known` rows that `record` has not."""
     ran = _ran(record)
-    again = [f"run again by `{one['command']}`: {'; '.join(one['rows'])}" for one in record["again"]]
+    missing = [f"`{row}`" for row in known if row not in {one["id"] for one in record["rows"]}]
+    again = [f"by `{one['command']}` on {one['machine'][0].removeprefix('CPU: ')}: "
+             + ", ".join(f"`{row}`" for row in one["rows"]) for one in record["again"]]
     return "\n".join([
         "# Fault results",
         "",
@@ -86,6 +89,7 @@ def report_page(record: Record) -> str:
         *_LEGEND,
         "",
         *(f"- {line}" for line in [*record["machine"], *again]),
+        *([f"- not measured yet: {', '.join(missing)}"] if missing else []),
         "",
         f"| row | fault | required | worst of {max(row['runs'] for row in record['rows'])} | pass |",
         "|---|---|---|---|---|",
@@ -156,7 +160,7 @@ def main(arguments: Sequence[str], docs: Path = DOCS) -> int:
     if "--only" in arguments and file.exists():
         record = merged(json.loads(file.read_text("utf-8")), record)
     file.write_text(json.dumps(record, indent=1, ensure_ascii=False) + "\n", "utf-8")
-    (docs / RESULTS / "faults.md").write_text(report_page(record), "utf-8")
+    (docs / RESULTS / "faults.md").write_text(report_page(record, (row.id for row in CASES)), "utf-8")
     safety.write_text(safety_page(safety.read_text("utf-8"), record), "utf-8")
     return 0 if all(row["ok"] for row in _ran(record)) else CHECK_FAILED
 

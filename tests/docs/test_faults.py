@@ -7,6 +7,7 @@ import pytest
 
 from docs.make import faults
 from docs.make.faults import DOCS, RESULTS, SAFETY, main, merged, report_page, safety_page
+from sightline.evaluation.faults.cases import CASES
 
 PAGE = "before\n<!-- worst values: x -->\nold\n<!-- /worst values -->\nafter\n"
 USUAL = "falls <= 340 ms, zero <= 700 ms, <= 0.25 m"
@@ -64,6 +65,7 @@ def test_the_report_has_a_row_for_each_fault_and_counts_rows_that_ran():
     assert "| injected 1 times, falls 150 ms, zero 560 ms, distance 0.19 m, memory 0.1 MB | yes |" in text
     assert "zero never ms" in text and "| needs root | not run |" in text
     assert "| `vision.SIGKILL` | vision: SIGKILL |" in text and "| `network.cut` | network: cut |" in text
+    assert "- not measured yet: `a.2`\n" in report_page(record(row("a: 1", USUAL)), ["a.1", "a.2"])
     assert "exit code" not in report_page(record(row("a: b", USUAL, **{"exit code": 0})))
     assert "inconclusive, exit code 1 | **no** |" in report_page(
         record(row("a: b", USUAL, ok=False, trouble="inconclusive", **{"exit code": 1})))
@@ -72,7 +74,7 @@ def test_the_report_has_a_row_for_each_fault_and_counts_rows_that_ran():
 def test_committed_pages_are_made_of_the_committed_results():
     results = json.loads((DOCS / RESULTS / "faults.json").read_text())
     safety = (DOCS / SAFETY).read_text()
-    assert report_page(results) == (DOCS / RESULTS / "faults.md").read_text()
+    assert report_page(results, (one.id for one in CASES)) == (DOCS / RESULTS / "faults.md").read_text()
     assert safety_page(safety, results) == safety and "| vision |" in safety
 
 
@@ -80,7 +82,7 @@ def test_rows_that_ran_again_replace_their_own_and_no_others():
     old = record(row("a: 1", "stop", falls=1), row("b: 1", "stop", ok=False, falls=9), row("c: 1", "stop", falls=1))
     report = report_page(merged(old, record(row("b: 1", "stop", falls=2), command="sightline faults --only b")))
     assert "3 of 3 rows passed" in report and "Written by `sightline faults --repeat 2`" in report
-    assert "- run again by `sightline faults --only b`: b: 1\n\n| row | fault" in report
+    assert "- by `sightline faults --only b` on one: `b.1`\n\n| row | fault" in report
     lines = [line for line in report.splitlines() if "stop" in line and line.startswith("| ")]
     assert [line.split(" | ")[1] for line in lines] == ["a: 1", "b: 1", "c: 1"]
     assert "falls 2 ms" in report and "falls 9 ms" not in report
