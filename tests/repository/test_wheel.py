@@ -39,7 +39,7 @@ def test_the_wheel_has_one_package_at_its_top_with_its_data(wheel):
         f"sightline/{path}" for path in files if "__pycache__" not in path.parts}
 
 
-@pytest.mark.slow
+@pytest.mark.alone  # beside other tests the demo does not reach its bounds
 def test_the_demo_drives_from_the_wheel_in_a_folder_that_shadows_our_names(wheel, tmp_path):
     """An environment with the wheel and the dependencies alone: no checkout is on its path."""
     environment, folder = tmp_path / "environment", tmp_path / "folder"

@@ -142,7 +142,7 @@ def test_any_end_commands_zero_soon_and_releases_the_robot(seat, how):
         seat.terminal.types({"Ctrl-C": "\x03", "Ctrl-D": "\x04", "q": "q"}[how])
     assert seat.terminal.process.wait(5) == 0, seat.terminal.text()
     found = until(lambda: seat.recorder.first_zero_s(ended_s), 2)  # the recorder may run later than the end of teleop
-    assert found, (ended_s, seat.recorder.commands[-9:], seat.terminal.text(), seat.robot.output())
+    assert found, f"{ended_s}\n{seat.recorder.commands[-9:]}\n{seat.terminal.text()}\n{seat.robot.output()}"
     zero_s = seat.recorder.first_zero_s(ended_s)
     print(f"\n{how}: zero command after {(zero_s - ended_s) * 1e3:.0f} ms")
     assert zero_s - ended_s <= ZERO_S
