@@ -60,7 +60,8 @@ class PeriodicTimer:
         return is_due
 
 
-# The motor commands: stamped, logged, latched. Shell (clock, file); called from the receiving thread.
+# The motor commands: stamped, logged, latched. Shell (clock, file); `take` is called from the receiving thread, `coast`
+# from the physics loop.
 #
 # The log measures a stop. Each line is with the kernel before its command is applied, so that it survives kill -9.
 
@@ -363,7 +364,7 @@ class SimConfig(SimSocketConfig):
     fps: Annotated[float, Field(gt=0, le=240)] | None = None
     """Images per second; those of the robot's camera if not set."""
     motor_log: str | None = None
-    """CSV file of every motor command, with its arrival time, and of wheels that roll out without an owner."""
+    """CSV file of every motor command, with its arrival time; wheels that roll out without a driver have lines, too."""
     seconds: Annotated[float, Field(gt=0)] | None = None
     """The simulation ends after this time."""
 

@@ -118,10 +118,16 @@ def _worst_values(record: Record) -> str:
     groups: dict[tuple[str, str], list[Record]] = {}
     for row in _ran(record):
         bound = _STOP_BOUND.search(row["demanded"])
-        groups.setdefault((row["what"].partition(":")[0], bound[0] if bound else "-"), []).append(row)
+        groups.setdefault((_broken(row["what"]), bound[0] if bound else "-"), []).append(row)
     lines = [_summary_row(record, group, bound, rows) for (group, bound), rows in groups.items()]
-    source = f"The worst of every run of `{record['command']}`, of what broke in the same way."
+    later = "\n[Fault results](results/faults.md) names the later runs of some rows." if record["again"] else ""
+    source = f"The worst of every run of `{record['command']}`, of what broke in the same way.{later}"
     return "\n".join([source, "", _HEAD, "|---" * (_HEAD.count("|") - 1) + "|", *lines, ""])
+
+
+def _broken(what: str) -> str:
+    """Return what broke, without the variant in parentheses."""
+    return what.partition(":")[0].partition(" (")[0]
 
 
 def _summary_row(record: Record, group: str, bound: str, rows: Sequence[Record]) -> str:

@@ -48,6 +48,8 @@ def test_the_worst_of_each_kind_and_bound_is_shown():
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert [one[0] for one in rows] == ["vision", "STOP", "network"]
     assert rows[0][1] == "2" and rows[0][3:] == ["170", "1234", "0.19", "0.1", "1 of 2"]
+    variants = record(row("legacy (a), x: 1", USUAL, falls=1), row("legacy (b), y: 2", USUAL, falls=2))
+    assert sum(line.startswith("| legacy | 2 |") for line in block(variants)) == 1
     assert rows[1][4] == "never" and rows[1][2].startswith("falls <= 340 ms, zero <= 2000 ms, <= 1 m")
     assert rows[2][1:] == ["1", "-", "-", "-", "-", "0.2", "1 of 1"]
 

@@ -152,7 +152,8 @@ def test_demo_that_is_killed_leaves_no_process_no_folder_and_stopped_wheels(tmp_
             finally:
                 process.kill()
                 killed_s = time.monotonic()
-        assert until(lambda: not started & running().keys() and not any(Path(temporary).iterdir()), 5)
+        assert until(lambda: not running_in(folder) and not started & running().keys(), 5)
+        assert until(lambda: not any(Path(temporary).iterdir()), 5)
     assert time.monotonic() - killed_s < 2.0
     assert wheel_speeds(folder) == (0.0, 0.0)
 

@@ -165,6 +165,22 @@ def test_motors_latch_and_the_log_outlives_killed_clients_and_a_killed_simulatio
     assert second[4] > 8.0 > first[4]
 
 
+def test_wheels_that_roll_out_have_lines_unless_a_driver_owns_them(sim):
+    drive = SimDrive(sim.config())
+    drive.set(8.0, 8.0)
+    eventually(lambda: (angles := drive.wheels()) and angles.right_rad > 3.0)
+    drive.set(0.0, 0.0)
+    eventually(lambda: len(sim.rows()) > 1 and drive.wheels().t_us > sim.rows()[1][0] + 600_000)  # they stand
+    assert len(sim.rows()) == 2
+    drive.set(8.0, 8.0)
+    eventually(lambda: drive.wheels().right_rad > sim.rows()[-1][4] + 3.0)
+    drive.set(0.0, 0.0)
+    drive.close()
+    eventually(lambda: len(sim.rows()) > 8 and sim.rows()[-1][4] - sim.rows()[-2][4] < 0.003)
+    coasting = sim.rows()[3:]
+    assert all(row[1:3] == [0.0, 0.0] and later[4] >= row[4] for row, later in pairwise(coasting))
+
+
 def test_last_command_counts_of_a_client_that_dies_without_reading_its_packets(sim):
     """The kernel reports the unread packets as a reset, before what the client had sent."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
