@@ -12,6 +12,7 @@ from sightline.protocol.channels import FRAME
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
+from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.vision_side.config import ShareConfig, VisionConfig
 from sightline.vision_side.serving.assignment import assign
 from sightline.vision_side.serving.fleet import SharedFleet
@@ -84,6 +85,14 @@ def stood(robots, since_us):
     return [hold for robot in robots for hold in robot.holds if hold[0] > since_us]
 
 
+def withdrawn(robots, since_us):
+    """Return the times without motion that began since then although the last accepted command was still in force."""
+    limits = SafetyConfig()
+    return [(robot.name, hold) for robot in robots for hold in robot.holds if hold[0] > since_us and any(
+        hold[0] - at_us < limits.silence_ms * 1000 and hold[0] - capture_us < limits.max_age_us
+        for at_us, _, capture_us in robot.accepted if at_us <= hold[0])]
+
+
 def test_services_share_the_robots_and_each_frame_goes_to_one(site):
     robots, (first, second), _ = site
     assert not first.driving & second.driving
@@ -98,16 +107,16 @@ def test_services_share_the_robots_and_each_frame_goes_to_one(site):
 
 
 @pytest.mark.parametrize("how", ["die", "end"])
-def test_no_robot_stands_when_a_service_dies_or_ends(site, how):
+def test_no_command_is_withdrawn_when_a_service_dies_or_ends(site, how):
     robots, (first, second), _ = site
     since_us = monotonic_us()
     getattr(first, how)()
     assert until(lambda: second.driving == {robot.name for robot in robots})
     assert drives_on(robots, monotonic_us())
-    assert stood(robots, since_us) == []
+    assert withdrawn(robots, since_us) == []
 
 
-def test_a_service_that_comes_takes_robots_and_none_stands(site):
+def test_a_service_that_comes_takes_robots_and_withdraws_no_command(site):
     robots, visions, endpoint = site
     since_us = monotonic_us()
     visions.append(Vision("c", endpoint))
@@ -116,6 +125,19 @@ def test_a_service_that_comes_takes_robots_and_none_stands(site):
     assert mine and until(lambda: visions[2].driving == mine)
     assert drives_on(robots, monotonic_us())
     assert sum(len(vision.driving) for vision in visions) == len(robots)
+    assert withdrawn(robots, since_us) == []
+
+
+@pytest.mark.alone
+def test_no_robot_stands_when_services_come_end_and_die(site):
+    robots, visions, endpoint = site
+    names = {robot.name for robot in robots}
+    since_us = monotonic_us()
+    visions.append(Vision("c", endpoint))
+    for change in (lambda: None, visions[0].end, visions[1].die):
+        change()
+        assert until(lambda: sum(len(one.driving) for one in visions if one._thread.is_alive()) == len(names))
+        assert drives_on(robots, monotonic_us())
     assert stood(robots, since_us) == []
 
 
