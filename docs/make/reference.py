@@ -20,7 +20,7 @@ from typing import Any, Final
 import click
 import typer
 
-from sightline.operator_side.cli.app import COMMANDS, EXIT_CODES, app
+from sightline.operator_side.cli.commands import COMMANDS, EXIT_CODES, app
 from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.operator_side.config.loading import SERVICES, model_of
 from sightline.operator_side.teleop.control import LAYOUTS

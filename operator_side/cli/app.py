@@ -1,165 +1,40 @@
-"""The `sightline` command: finds the module of a subcommand, and turns every error into one line and an exit code.
-Shell.
+"""The process of the `sightline` command: runs it, and turns every error into one line and an exit code. Shell.
 
-The help of the program comes from the table below, so that it imports no command. A command's module is imported when
-the command is used.
+A plain `sightline stop` imports only what a STOP datagram needs. All other command lines are read by typer, which takes
+longer to import than a STOP takes.
 """
 
+import json
 import os
 import re
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
-from importlib import import_module
-from typing import Annotated, Any, Final, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
 
-import typer
-from typer.core import TyperGroup
-
+from sightline.operator_side.client.stop import stop_robot
+from sightline.operator_side.config.context import stop_secret_of, target_of
 from sightline.protocol.errors import SightlineError
-from sightline.protocol.log import error_line, report_ending
+
+if TYPE_CHECKING:
+    import typer
 
 INTERRUPTED: Final = 130
 UNEXPECTED: Final = 1
 USAGE: Final = 2
 
-EXIT_CODES: Final = {
-    0: "success",
-    UNEXPECTED: "unexpected error; please report it",
-    USAGE: "invalid usage or configuration",
-    3: "a device or the simulation cannot be used",
-    4: "no connection, or no answer",
-    5: "a check failed, or the robot rejected the request",
-    INTERRUPTED: "interrupted by Ctrl-C",
-}
-"""Each exit code of every command."""
-
-
-class Entry(NamedTuple):
-    """A command in the program's help: its heading, the module in this folder that registers it, its summary."""
-
-    heading: str
-    module: str
-    summary: str
-
-
-COMMANDS: Final = {
-    "demo": Entry("Run", "evaluate", "Simulate, drive, score and film a run on this machine"),
-    "sim": Entry("Run", "services", "Simulate a robot's hardware"),
-    "robot": Entry("Run", "services", "Run a robot: motors, camera and link"),
-    "vision": Entry("Run", "services", "Run a vision service that steers a robot"),
-    "router": Entry("Run", "services", "Run a router to which all machines of a site connect"),
-    "scenarios": Entry("Run", "services", "List scenarios, or write the configuration of one"),
-    "arm": Entry("Drive", "operate", "Arm a robot so that it may move"),
-    "disarm": Entry("Drive", "operate", "Stop the wheels and disarm a robot"),
-    "stop": Entry("Drive", "stop", "STOP a robot and latch the stop until reset"),
-    "reset": Entry("Drive", "operate", "Clear a latched STOP or a drive fault"),
-    "teleop": Entry("Drive", "operate", "Drive a robot with the keyboard or a gamepad"),
-    "mission": Entry("Drive", "operate", "Show or start a robot's mission"),
-    "goto": Entry("Drive", "operate", "Send a robot to one or more waypoints"),
-    "robots": Entry("Observe", "operate", "List robots and the services connected to them"),
-    "status": Entry("Observe", "operate", "Show a robot's state and its reason"),
-    "watch": Entry("Observe", "watch", "Show a robot's images or messages live"),
-    "capture": Entry("Observe", "watch", "Save an image or a video from a robot"),
-    "metrics": Entry("Observe", "services", "Serve a robot's status to Prometheus"),
-    "use": Entry("Set up", "admin", "Save, show or clear the default robot address"),
-    "config": Entry("Set up", "services", "Check or show a service's configuration"),
-    "keys": Entry("Set up", "admin", "Create or show certificates for secure links"),
-    "install": Entry("Set up", "admin", "Install a service under systemd"),
-    "doctor": Entry("Set up", "admin", "Find common problems and print how to fix them"),
-    "calibrate": Entry("Set up", "calibrate", "Measure a robot's camera or drive"),
-    "pick-color": Entry("Set up", "calibrate", "Pick the target's color in an image"),
-    "score": Entry("Evaluate", "evaluate", "Score missions over many starts in virtual time"),
-    "faults": Entry("Evaluate", "evaluate", "Inject faults into real processes and check each stop"),
-    "bench": Entry("Evaluate", "bench", "Measure performance on this machine"),
-    "conform": Entry("Develop", "conform", "Test a robot, vision service or codec against the protocol"),
-    "detector": Entry("Develop", "detector", "List, check or serve detectors"),
-    "labels": Entry("Develop", "services", "Publish the simulation's labels in place of a detector"),
-    "train": Entry("Develop", "evaluate", "Train the learned detector"),
-}
-"""Each command, in the order of the help."""
-
 _UNKNOWN_COMMAND = re.compile(r"No such command '([^']*)'")
-
-
-class _Commands(Mapping[str, Any]):
-    """The commands by name; a module is imported when one of its commands is looked up."""
-
-    def __getitem__(self, name: str) -> Any:
-        return _registered(COMMANDS[name].module)[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(COMMANDS)
-
-    def __len__(self) -> int:
-        return len(COMMANDS)
-
-
-@cache
-def _registered(module: str) -> Mapping[str, Any]:
-    group = typer.Typer(rich_markup_mode=None)
-    import_module(f"sightline.operator_side.cli.{module}").register(group)
-    return typer.main.get_group(group).commands
-
-
-class _Program(TyperGroup):
-    def __init__(self, **settings: Any) -> None:
-        super().__init__(**settings | {"commands": _Commands()})
-
-    def format_commands(self, _ctx: Any, formatter: Any) -> None:
-        width = max(map(len, COMMANDS))
-        for heading in dict.fromkeys(entry.heading for entry in COMMANDS.values()):
-            with formatter.section(heading):
-                formatter.write_dl([(f"{name:{width}}", entry.summary) for name, entry in COMMANDS.items()
-                                    if entry.heading == heading])
-        with formatter.section("Exit codes"):
-            formatter.write_dl([(f"{code:<{width}}", meaning) for code, meaning in EXIT_CODES.items()])
-
-
-app = typer.Typer(
-    name="sightline",
-    cls=_Program,
-    help="Steer a small robot from a bigger computer over Wi-Fi\n\n"
-    "The robot ignores commands that answer an old image, and stops. Start with the simulated robot; it needs no "
-    "hardware.\n\n"
-    "Example: sightline demo",
-    epilog="`sightline COMMAND --help` describes a command.",
-    rich_markup_mode=None,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-)
-
-
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        from importlib.metadata import version
-
-        typer.echo(f"sightline {version('sightline-robot')}")
-        raise typer.Exit
-
-
-@app.callback(invoke_without_command=True)
-def _help_by_default(
-    context: typer.Context,
-    _version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Show the version and exit.")
-    ] = False,
-) -> None:
-    if context.invoked_subcommand is None:
-        typer.echo(context.get_help())
 
 
 def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code; never raises."""
     try:
-        code = _stopped(arguments)
-        if code is None:
-            code = app(list(arguments), standalone_mode=False, prog_name="sightline")
+        options = plain_options(arguments[1:]) if arguments[:1] == ["stop"] else None
+        code = _typed(arguments) if options is None else send_stop(**options)
         return code if isinstance(code, int) else 0
     except SightlineError as error:
         return _print_error(str(error), error.exit_code)
-    except (KeyboardInterrupt, typer.Abort):
+    except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:  # `sightline status --watch | head`: the reader has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -168,13 +43,57 @@ def run(arguments: Sequence[str]) -> int:
         return _unexpected(error)
 
 
-def _stopped(arguments: Sequence[str]) -> int | None:
-    """Run a plain `sightline stop` without typer, which imports pydantic to read any command line; or return None."""
-    if arguments[:1] != ["stop"]:
-        return None
-    module = import_module("sightline.operator_side.cli.stop")
-    options = module.plain_options(arguments[1:])
-    return None if options is None else module.stop(**options) or 0
+def _typed(arguments: Sequence[str]) -> Any:
+    """Run a command line that typer reads. Returns the command's result."""
+    import typer
+
+    from sightline.operator_side.cli.commands import app
+
+    try:
+        return app(list(arguments), standalone_mode=False, prog_name="sightline")
+    except typer.Abort:
+        return INTERRUPTED
+
+
+def plain_options(arguments: Sequence[str]) -> dict[str, Any] | None:
+    """Return the options of `stop` if all words are plain: ROBOT, --connect, --secure and --json; else None."""
+    given: dict[str, Any] = {"robot": None, "connect": [], "secure": "", "as_json": False}
+    words = iter(arguments)
+    for word in words:
+        name, has_value, value = word.partition("=")
+        if word == "--json":
+            given["as_json"] = True
+        elif name in ("--connect", "--secure"):
+            value = value if has_value else next(words, "")
+            if not value or value.startswith("-"):
+                return None
+            given[name[2:]] = [*given["connect"], value] if name == "--connect" else value
+        elif not word or word.startswith("-") or given["robot"] is not None:
+            return None
+        else:
+            given["robot"] = word
+    return given
+
+
+def send_stop(robot: str | None, connect: list[str] | None, secure: str, as_json: bool) -> int:
+    """Run `sightline stop` with its options as given. Returns 0; raises SightlineError if the robot may still move."""
+
+    def on_slow() -> None:
+        print(f"STOP of {target.robot} is not confirmed, repeating; be ready to cut its power by hand", file=sys.stderr)
+
+    target = target_of(robot, connect, secure, announce=True)
+    done = stop_robot(
+        target.robot, target.connect, target.secure, stop_secret_of(target), on_slow, thread_name=ABANDONED_THREAD
+    )
+    if not done.stored:
+        print(f"STOP of {target.robot} is not on its disk, so that a restart ends it; is the disk full?",
+              file=sys.stderr)
+    detail = done.status.reason if done.status else "wheels at zero"
+    if as_json:
+        print(json.dumps({"robot": target.robot, "ok": True, "state": "STOPPED", "detail": detail}), flush=True)
+    else:
+        print(f"{target.robot}: STOPPED ({detail})", flush=True)
+    return 0
 
 
 def _unexpected(error: Exception) -> int:
@@ -185,17 +104,20 @@ def _unexpected(error: Exception) -> int:
         return _print_error(line, getattr(error, "exit_code", USAGE))
     if os.environ.get("SIGHTLINE_DEBUG") == "1":
         raise error
+    from sightline.protocol.log import report_ending
+
     report_ending("program", error)
     where = f"{type(error).__name__}: {' '.join(str(error).split())}"
     return _print_error(f"unexpected {where}; SIGHTLINE_DEBUG=1 shows where, please report it", UNEXPECTED)
 
 
-def _usage_line(text: str, context: typer.Context | None) -> str:
+def _usage_line(text: str, context: "typer.Context | None") -> str:
     """Add the nearest command of the same group to a usage error that is about a command."""
     unknown = _UNKNOWN_COMMAND.match(text)
     path = context.command_path if context else "sightline"
     if unknown is None:
         return f"{text.rstrip('.')}; see {path} --help"
+    from sightline.operator_side.cli.commands import COMMANDS
     from sightline.operator_side.config.errors import no_such_name
 
     here = list(getattr(context and context.command, "commands", COMMANDS))
@@ -205,7 +127,9 @@ def _usage_line(text: str, context: typer.Context | None) -> str:
 
 
 def _print_error(line: str, code: int) -> int:
-    typer.echo(error_line(line), err=True)
+    from sightline.protocol.log import error_line
+
+    print(error_line(line), file=sys.stderr)
     return code
 
 

@@ -29,10 +29,9 @@ from sightline.operator_side.cli.options import (
     Sets,
     command_group,
     numbers,
-    target_of,
 )
 from sightline.operator_side.client.pictures import Pictures, viewer_role
-from sightline.operator_side.config.context import RobotAddress
+from sightline.operator_side.config.context import RobotAddress, target_of
 from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import check_out_file, needs

@@ -1,4 +1,4 @@
-"""Commands for a running robot: robots, status, arm, disarm, reset, mission, goto, teleop. Shell."""
+"""Commands for a running robot: robots, status, arm, disarm, stop, reset, mission, goto, teleop. Shell."""
 
 import json
 import secrets
@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from sightline.operator_side.cli.options import REJECTED_EXIT, Connect, Json, Robot, Secure, stop_secret_of, target_of
+from sightline.operator_side.cli.app import send_stop
+from sightline.operator_side.cli.options import REJECTED_EXIT, Connect, Json, Robot, Secure
 from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import reply_line, short_lines, status_lines
-from sightline.operator_side.config.context import RobotAddress
+from sightline.operator_side.config.context import RobotAddress, stop_secret_of, target_of
 from sightline.operator_side.table import print_block
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.messages import MissionReport, Reply, State, Status, Verb
@@ -33,6 +34,7 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: sightline status r1 --watch")(status)
     app.command(epilog="Example: sightline arm r1 --connect tcp/192.168.1.20:7447")(arm)
     app.command(epilog="Example: sightline disarm r1")(disarm)
+    app.command(epilog="Example: sightline stop r1 --connect tcp/192.168.1.20:7447")(stop)
     app.command(epilog="Example: sightline reset r1 && sightline arm r1")(reset)
     app.command(epilog="Example: sightline mission r1 follow")(mission)
     app.command(
@@ -156,6 +158,14 @@ def disarm(robot: Robot = None, connect: Connect = None, secure: Secure = "", as
     """
     with _operator(target_of(robot, connect, secure, announce=True)) as operator:
         return _print_reply(operator, Verb.DISARM, operator.request(Verb.DISARM), as_json)
+
+
+def stop(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_json: Json = False) -> int:
+    """STOP a robot and latch the stop until reset
+
+    The wheels stay at zero until `sightline reset`. STOP needs the network, so it is not an emergency stop.
+    """
+    return send_stop(robot, connect, secure, as_json)
 
 
 def reset(robot: Robot = None, connect: Connect = None, secure: Secure = "", as_json: Json = False) -> int:

@@ -1,16 +1,12 @@
-"""Options, exit codes and the target robot that several command groups share. Shell (typer)."""
+"""Options and exit codes that several command groups share. Shell (typer)."""
 
 import json
-import os
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Final, TypeVar
 
 import typer
 
-from sightline.operator_side.config.context import RobotAddress, find_address
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.endpoints import check_endpoint, check_robot_id
-from sightline.protocol.transports.stop_port import stop_secret_file
 
 REJECTED_EXIT: Final = 5
 
@@ -116,28 +112,3 @@ def command_group(summary: str) -> typer.Typer:
 def _list_subcommands(context: typer.Context) -> None:
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
-
-
-def target_of(robot: str | None, connect: list[str] | None, secure: str, *, announce: bool = False) -> RobotAddress:
-    """Find the robot that a client command addresses. Raises ConfigError for an invalid id or address.
-
-    Args:
-        robot, connect, secure: values of the options, as given.
-        announce: whether to print address and origin on stderr, for commands that move or stop a robot.
-    """
-    target = find_address(os.environ, robot, connect, secure)
-    check_robot_id(target.robot)
-    for endpoint in target.connect:
-        check_endpoint(endpoint)
-    if announce:
-        typer.echo(str(target), err=True)
-    return target
-
-
-def stop_secret_of(target: RobotAddress) -> str:
-    """Return the file of the STOP secret; print one line where the keys lack it."""
-    try:
-        return stop_secret_file(target.secure) if target.secure else ""
-    except ConfigError as error:
-        typer.echo(str(error), err=True)
-        return ""

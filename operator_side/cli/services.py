@@ -29,8 +29,8 @@ from sightline.operator_side.cli.options import (
     Sets,
     SocketDir,
     command_group,
-    target_of,
 )
+from sightline.operator_side.config.context import target_of
 from sightline.operator_side.config.loading import load_service, model_of
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.operator_side.preflight import needs

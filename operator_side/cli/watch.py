@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from sightline.operator_side.cli.operate import follow_status
-from sightline.operator_side.cli.options import Connect, Json, Port, Robot, Secure, target_of
+from sightline.operator_side.cli.options import Connect, Json, Port, Robot, Secure
 from sightline.operator_side.client.messages import (
     TARGET_COLUMNS,
     ChannelInbox,
@@ -24,6 +24,7 @@ from sightline.operator_side.client.messages import (
 )
 from sightline.operator_side.client.missions import MissionClient
 from sightline.operator_side.client.pictures import Pictures, viewer_role
+from sightline.operator_side.config.context import target_of
 from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.preflight import needs
 from sightline.protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, REPORT, Channel, Direction

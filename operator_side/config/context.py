@@ -5,7 +5,7 @@ Shell (files).
 """
 
 import os
-import tempfile
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, check_endpoint, check_robot_id
+from sightline.protocol.transports.stop_port import stop_secret_file
 
 CONNECT_VARIABLE: Final = "SIGHTLINE_CONNECT"
 DEFAULT_ROBOT: Final = "r1"
@@ -68,6 +69,31 @@ def find_address(
         return RobotAddress(robot or saved.robot, (saved.connect,), secure or saved.secure, shown(path))
     default = DEFAULT_ENDPOINT.replace("tcp/", "tls/") if secure else DEFAULT_ENDPOINT
     return RobotAddress(robot or DEFAULT_ROBOT, (default,), secure, "default")
+
+
+def target_of(robot: str | None, connect: list[str] | None, secure: str, *, announce: bool = False) -> RobotAddress:
+    """Find the robot that a client command addresses. Raises ConfigError for an invalid id or address.
+
+    Args:
+        robot, connect, secure: values of the options, as given.
+        announce: whether to print address and origin on stderr, for commands that move or stop a robot.
+    """
+    target = find_address(os.environ, robot, connect, secure)
+    check_robot_id(target.robot)
+    for endpoint in target.connect:
+        check_endpoint(endpoint)
+    if announce:
+        print(str(target), file=sys.stderr)
+    return target
+
+
+def stop_secret_of(target: RobotAddress) -> str:
+    """Return the file of the STOP secret; print one line where the keys lack it."""
+    try:
+        return stop_secret_file(target.secure) if target.secure else ""
+    except ConfigError as error:
+        print(str(error), file=sys.stderr)
+        return ""
 
 
 def _from_variable(text: str) -> tuple[str, ...]:
@@ -134,6 +160,8 @@ def _check(check: Any, value: str, place: str, fix: str) -> None:
 
 def write_context(path: Path, context: Context) -> None:
     """Save the context: the file changes as a whole or not at all. Raises ConfigError if it cannot be written."""
+    import tempfile
+
     from sightline.operator_side.config.toml_text import toml_text
 
     table = {key: value for key in _KEYS if (value := getattr(context, key))}

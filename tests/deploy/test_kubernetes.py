@@ -18,7 +18,7 @@ import yaml
 from kubernetes_validate import utils as schemas
 from typer.main import get_command
 
-from sightline.operator_side.cli.app import app
+from sightline.operator_side.cli.commands import app
 from sightline.operator_side.cockpit.vision_metrics import served
 from sightline.operator_side.config.loading import load_service
 from sightline.protocol.errors import ConfigError, LinkError

@@ -6,7 +6,7 @@ from functools import cache
 import pytest
 from typer.main import get_command
 
-from sightline.operator_side.cli.app import app
+from sightline.operator_side.cli.commands import app
 from tests.docs.test_pages import FENCE, PAGES, SHELL, TOP, shown
 
 INLINE = re.compile(r"`([^`\n]+)`")

@@ -7,7 +7,7 @@ import pytest
 
 from docs.make import performance as report
 from docs.make.performance import SECTIONS, page_with, sections_named, write_report
-from sightline.operator_side.cli.app import app
+from sightline.operator_side.cli.commands import app
 from sightline.protocol.errors import ConfigError
 
 NAMED = {section.name: section for section in SECTIONS}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from sightline.operator_side.cli import app as cli
+from sightline.operator_side.cli.commands import app
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.teleop.control import LAYOUTS
 from sightline.robot_side.hardware.gpio import GpioDriveConfig
@@ -31,7 +31,7 @@ def commands(page):
 @pytest.mark.parametrize("words", [*commands(CAR), *commands(TELEOP)], ids=" ".join)
 def test_every_command_is_one(words):
     """Parsed by the program's own parser, and not run."""
-    command, context = typer.main.get_command(cli.app), None
+    command, context = typer.main.get_command(app), None
     while hasattr(command, "commands"):
         name, *words = words
         command = command.commands[name]

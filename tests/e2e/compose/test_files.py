@@ -14,7 +14,7 @@ import pytest
 from packaging.requirements import Requirement
 from typer.main import get_command
 
-from sightline.operator_side.cli.app import app
+from sightline.operator_side.cli.commands import app
 from sightline.operator_side.config.loading import load_service
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import encode

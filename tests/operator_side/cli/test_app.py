@@ -15,6 +15,7 @@ import pytest
 import typer
 
 from sightline.operator_side.cli import app as cli
+from sightline.operator_side.cli import commands as table
 from sightline.operator_side.cli import operate
 from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.operator_side.preflight import needs
@@ -23,7 +24,7 @@ from tests.fixtures.commands import run
 
 
 def commands(group=None, path=()):
-    group = group or typer.main.get_command(cli.app)
+    group = group or typer.main.get_command(table.app)
     for name, command in group.commands.items():
         if hasattr(command, "commands"):
             yield from commands(command, (*path, name))
@@ -32,7 +33,7 @@ def commands(group=None, path=()):
 
 
 COMMANDS = dict(commands())
-COMMANDS_AND_GROUPS = typer.main.get_command(cli.app).commands
+COMMANDS_AND_GROUPS = typer.main.get_command(table.app).commands
 
 
 def test_the_commands_of_this_version_exist():
@@ -97,15 +98,15 @@ def test_program_help_lists_every_command_uncut(capsys, monkeypatch):
     assert (code, err) == (0, "")
     for heading in ("Run", "Drive", "Observe", "Set up", "Evaluate", "Develop"):
         assert f"\n{heading}:\n" in out
-    for name, entry in cli.COMMANDS.items():
+    for name, entry in table.COMMANDS.items():
         assert_is_summary(entry.summary)
         assert re.search(rf"^  {name} +{re.escape(entry.summary)}$", out, re.MULTILINE), name
     assert max(map(len, out.splitlines())) <= 80 and "..." not in out.partition("Options:")[2]
 
 
-@pytest.mark.parametrize("name", cli.COMMANDS)
+@pytest.mark.parametrize("name", table.COMMANDS)
 def test_summary_in_the_program_help_is_that_of_the_command(name):
-    summary = cli.COMMANDS[name].summary
+    summary = table.COMMANDS[name].summary
     assert COMMANDS_AND_GROUPS[name].help.split("\n")[0].strip() == summary
 
 
@@ -113,7 +114,7 @@ def test_exit_codes_in_the_program_help_are_those_of_the_errors(capsys):
     _, out, _ = run(capsys, "--help")
     errors = (SightlineError, ConfigError, HardwareError, LinkError)
     for code in (0, *(error.exit_code for error in errors), CHECK_FAILED):
-        assert re.search(rf"^  {code} +{cli.EXIT_CODES[code]}", out, re.MULTILINE), code
+        assert re.search(rf"^  {code} +{table.EXIT_CODES[code]}", out, re.MULTILINE), code
 
 
 def test_version_is_that_of_the_distribution(capsys):
@@ -127,7 +128,7 @@ def test_group_without_a_subcommand_lists_its_subcommands(capsys, group):
     code, out, err = run(capsys, *group)
     assert (code, err) == (0, "")
     assert f"Usage: sightline {' '.join(group[:1])}".rstrip() in out
-    names = [path[1] for path in COMMANDS if path[:1] == group[:1] and len(path) > 1] if group else cli.COMMANDS
+    names = [path[1] for path in COMMANDS if path[:1] == group[:1] and len(path) > 1] if group else table.COMMANDS
     for name in names:
         assert re.search(rf"^  {name} ", out, re.MULTILINE), name
 
@@ -290,21 +291,22 @@ def test_nothing_heavy_is_imported_before_it_is_needed(arguments):
 
 
 @pytest.mark.waits
-@pytest.mark.parametrize(("arguments", "group"), [
-    (["stop"], "app options stop"), (["status"], "app operate options"), (["teleop"], "app operate options"),
+@pytest.mark.parametrize(("command", "group", "libraries"), [
+    ("stop", "app", ""), ("status", "app commands operate options", "typer"),
+    ("teleop", "app commands operate options", "typer"),
 ], ids=["stop", "status", "teleop"])
-def test_operator_commands_import_their_own_group_and_no_image_library(arguments, group):
+def test_operator_commands_import_their_own_group_and_no_image_library(command, group, libraries):
     script = (
         "import sys; from sightline.operator_side.cli import app as cli; cli.run(sys.argv[1:]);"
         "group = 'sightline.operator_side.cli.';"
         "print(*sorted(name[len(group):] for name in sys.modules if name.startswith(group)));"
-        "print(*{'numpy', 'cv2', 'pybullet', 'matplotlib'} & set(sys.modules))"
+        "print(*{'numpy', 'cv2', 'pybullet', 'matplotlib', 'typer'} & set(sys.modules))"
     )
     endpoint = ["--connect", "tcp/127.0.0.1:1"]
-    result = subprocess.run([sys.executable, "-P", "-c", script, *arguments, *endpoint], capture_output=True, text=True,
+    result = subprocess.run([sys.executable, "-P", "-c", script, command, *endpoint], capture_output=True, text=True,
                             check=True, stdin=subprocess.DEVNULL)
     assert result.stderr.splitlines()[-1].startswith("error: ")
-    assert result.stdout.splitlines() == [group, ""]
+    assert result.stdout.splitlines() == [group, libraries]
 
 
 @pytest.fixture

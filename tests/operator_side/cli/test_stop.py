@@ -5,7 +5,6 @@ from random import Random
 import pytest
 
 from sightline.operator_side.cli import app as cli
-from sightline.operator_side.cli import stop as command
 from sightline.operator_side.client.stop import Stopped
 
 WORDS = ("r1", "r2", "--json", "--connect", "--connect=tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447", "--secure",
@@ -23,12 +22,12 @@ def stopped(monkeypatch):
 
     monkeypatch.delenv("SIGHTLINE_CONNECT", raising=False)
     monkeypatch.setenv("XDG_CONFIG_HOME", "/nowhere")
-    monkeypatch.setattr(command, "stop_robot", stop_robot)
+    monkeypatch.setattr(cli, "stop_robot", stop_robot)
     return sent
 
 
 def test_plain_words_are_read_without_typer(stopped, monkeypatch, capsys):
-    monkeypatch.setattr(cli, "app", None)
+    monkeypatch.setattr(cli, "_typed", None)
     assert cli.run(["stop", "r7", "--connect", "tcp/10.0.0.1:7447", "--json", "--connect=tcp/10.0.0.2:7447"]) == 0
     assert stopped == [("r7", ("tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447"), "")]
     assert '"state": "STOPPED"' in capsys.readouterr().out
@@ -38,11 +37,11 @@ def test_plain_words_are_read_without_typer(stopped, monkeypatch, capsys):
 def test_every_line_has_the_result_that_typer_gives_it(stopped, monkeypatch, capsys, seed):
     random = Random(seed)
     lines = [random.choices(WORDS, k=random.randrange(5)) for _ in range(60)]
-    plain = [line for line in lines if command.plain_options(line) is not None]
+    plain = [line for line in lines if cli.plain_options(line) is not None]
     assert 5 < len(plain) < 55
     results = []
-    for reader in (command.plain_options, lambda _words: None):
-        monkeypatch.setattr(command, "plain_options", reader)
+    for reader in (cli.plain_options, lambda _words: None):
+        monkeypatch.setattr(cli, "plain_options", reader)
         stopped.clear()
         codes = [cli.run(["stop", *line]) for line in lines]
         results.append((codes, tuple(stopped), capsys.readouterr()))
@@ -51,4 +50,4 @@ def test_every_line_has_the_result_that_typer_gives_it(stopped, monkeypatch, cap
 
 @pytest.mark.parametrize("words", [["-h"], ["--help"], ["r1", "r2"], ["--connect"], ["--secure", "--json"], ["--now"]])
 def test_other_words_are_left_to_typer(words):
-    assert command.plain_options(words) is None
+    assert cli.plain_options(words) is None

@@ -7,6 +7,7 @@ import pytest
 from typer.main import get_command
 
 from sightline.operator_side.cli import app as cli
+from sightline.operator_side.cli.commands import app
 from sightline.operator_side.setup import install
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice, RobotConfig
@@ -145,7 +146,7 @@ def test_command_line_accepts_the_commands_of_the_unit(service, instances, tmp_p
     assert [command[:2] for command in commands] == [[str(PROGRAM), service]] * len(commands) and commands
     for _, name, *options in commands:
         words = [name, *options]
-        get_command(cli.app).commands[name].make_context(name, words[1:]).close()
+        get_command(app).commands[name].make_context(name, words[1:]).close()
 
 
 @pytest.mark.parametrize(("first", "then", "ended", "left"), [

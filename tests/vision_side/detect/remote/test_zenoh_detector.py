@@ -155,7 +155,7 @@ def test_a_bad_image_and_a_bad_header_get_no_answer_and_are_counted(bench):
         asked = robot.frame(jpeg, header)
         assert detector.detect([asked], within(0.05)) == [None]
         # The service detects in the newest frame alone: one that is sent before may be replaced and never counted.
-        assert until(lambda: bench.service.counters()["r1"].rejected == before + count)
+        assert until(lambda count=count: bench.service.counters()["r1"].rejected == before + count)
     assert _result(robot, detector) is not None
 
 
