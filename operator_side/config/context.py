@@ -7,9 +7,8 @@ Shell (files).
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, check_endpoint, check_robot_id
@@ -21,8 +20,7 @@ _KEYS: Final = ("connect", "robot", "secure")
 _CLEAR: Final = "run `sightline use --clear`"
 
 
-@dataclass(frozen=True, slots=True)
-class Context:
+class Context(NamedTuple):
     """A saved address: endpoint, robot id, and the folder of keys or ""."""
 
     connect: str
@@ -30,8 +28,7 @@ class Context:
     secure: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class RobotAddress:
+class RobotAddress(NamedTuple):
     """The robot that a command addresses, and where the address came from."""
 
     robot: str

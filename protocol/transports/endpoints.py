@@ -3,8 +3,7 @@
 import ipaddress
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from sightline.protocol.errors import ConfigError
 
@@ -104,8 +103,7 @@ _WITH_DASHED: Final = {"swapped", "nonnegative"}
 _FROM: Final = "from="
 
 
-@dataclass(frozen=True, slots=True)
-class LegacyOptions:
+class LegacyOptions(NamedTuple):
     """The variant of the legacy protocol."""
 
     newlines: bool = True
@@ -120,8 +118,7 @@ class LegacyOptions:
     """At a robot: boxes are accepted too, as detections of a guest. Toward a legacy robot: boxes in place of twists."""
 
 
-@dataclass(frozen=True, slots=True)
-class WebSocketEndpoint:
+class WebSocketEndpoint(NamedTuple):
     """A valid endpoint. `text` is the original text."""
 
     text: str
