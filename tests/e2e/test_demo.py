@@ -61,7 +61,7 @@ def driven(tmp_path_factory):
     return folder, demo(folder, "--scenario", "circle", "--seconds", "5", "--json", **about)
 
 
-@pytest.mark.slow
+@pytest.mark.alone  # it must reach its bounds within 5 s
 def test_demo_drives_and_prints_json_for_a_script(driven):
     folder, result = driven
     said = json.loads(result.stdout)
@@ -74,7 +74,7 @@ def test_demo_drives_and_prints_json_for_a_script(driven):
     assert "ready: circle, raspberry, seed 1," in (folder / "sim.log").read_text(), "the environment chooses none"
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_replay_gives_the_twists_of_the_wire(driven):
     folder, _ = driven
     script = (
@@ -87,7 +87,7 @@ def test_replay_gives_the_twists_of_the_wire(driven):
     assert fresh.returncode == 0, fresh.stdout + fresh.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_demo_writes_images_that_open(driven):
     folder, _ = driven
     assert (folder / "trajectory.png").read_bytes().startswith(b"\x89PNG")
@@ -102,7 +102,7 @@ def test_demo_writes_images_that_open(driven):
         assert float(stream.duration * stream.time_base) == pytest.approx(5, abs=0.5)
 
 
-@pytest.mark.slow
+@pytest.mark.alone
 def test_motor_log_ends_at_zero(driven):
     folder, _ = driven
     with (folder / "motors.csv").open() as file:
