@@ -7,11 +7,9 @@ import argparse
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from docs.make.real_look import color_detector
 from sightline.evaluation.score.runs import (
     SabotagedPair,
     ScoredFigure,
@@ -50,7 +48,7 @@ def page_lines(
     yield (f"Each listed scenario runs with one broken part, in lockstep from seeds {listed}, "
            f"+{LATENCY_MS:g} ms latency,\n{LOSS:.0%} loss on each leg. The score must notice it in each run. A cell "
            "names the bound that broke, over all starts.\nA pair in which nothing can change runs from the first seed "
-           "alone. Where a scenario leaves the detector, it is `hsv`.\n")
+           "alone. The detector is that of the scenario, or else the default one.\n")
     yield (f"Written by `python -m docs.make.sabotage --seeds {listed}{only}`.\n"
            "Break one yourself with `sightline score --scenario NAME --sabotage NAME`.\n")
     yield "| sabotage | broken part |\n|---|---|"
@@ -86,8 +84,7 @@ def _cell(pair: SabotagedPair, reasons: list[str]) -> str:
 
 def write_page(page: Path, seeds: Sequence[int], jobs: int, names: Sequence[str]) -> bool:
     """Run everything and write `page`. True if each sabotage was noticed and no healthy run failed."""
-    wanted = [replace(case, detector=color_detector(case.scenario))
-              for case in cases(names, seeds, [LATENCY_MS], [LOSS], None)]
+    wanted = cases(names, seeds, [LATENCY_MS], [LOSS], None)
     broken = sabotaged(wanted, list(SABOTAGES))
     with progress_bar(len(wanted) + len(broken)) as advance:
         noticed = run_all_sabotaged(broken, jobs, lambda _case: advance())
