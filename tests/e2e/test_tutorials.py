@@ -23,18 +23,23 @@ from tests.fixtures.ports import free_endpoint
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parent.parent.parent
-BLOCK = re.compile(r"<!-- run: (\w+) -->\n```sh\n(.*?)```", re.DOTALL)
+BLOCK = re.compile(r"<!-- run: (\w+) -->\n```sh\n(.*?)```(?:\n\n```text\n(.*?)```)?", re.DOTALL)
 READY = {"sim": "simulation ready", "robot": "robot r1: on", "vision": "vision: frames from robot r1"}
 
 
 def blocks(page: str) -> dict[str, list[list[str]]]:
     """Return the commands of each marked block of a page, without `sightline`, comments and empty lines."""
     found = {}
-    for name, text in BLOCK.findall((ROOT / page).read_text("utf-8")):
+    for name, text, _ in BLOCK.findall((ROOT / page).read_text("utf-8")):
         lines = [shlex.split(line, comments=True) for line in text.splitlines()]
         assert all(words[0] == "sightline" for words in lines if words), lines
         found[name] = [words[1:] for words in lines if words]
     return found
+
+
+def shown(page: str) -> dict[str, str]:
+    """Return the output that a page shows below each marked block."""
+    return {name: output for name, _, output in BLOCK.findall((ROOT / page).read_text("utf-8")) if output}
 
 
 class Terminals:
@@ -80,12 +85,13 @@ def terminals(tmp_path):
 
 
 def test_first_drive_starts_arms_drives_stops_and_drives_again(terminals):
-    page = blocks("docs/tutorials/first-drive.md")
+    page, outputs = blocks("docs/tutorials/first-drive.md"), shown("docs/tutorials/first-drive.md")
     assert list(page) == ["services", "arm", "drive", "stop", "again", "harder"]
     terminals.run(page["services"])
-    assert "armed" in terminals.run(page["arm"])
+    assert terminals.run(page["arm"]) == outputs.pop("arm")
     assert until(lambda: "ACTIVE" in terminals.run(page["drive"]), 30)
-    assert "STOPPED" in terminals.run(page["stop"])
+    assert terminals.run(page["stop"]) == outputs.pop("stop")
+    assert not outputs
     assert "armed" in terminals.run(page["again"])
 
 
