@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from sightline.protocol.errors import LinkError, SightlineError
 from sightline.protocol.transports.endpoints import stop_addresses
@@ -131,13 +131,6 @@ def _resolve(address: tuple[str, int]) -> list[tuple[socket.AddressFamily, tuple
     return [(family, (str(place[0]), int(place[1])))]
 
 
-class Stopped(NamedTuple):
-    """A robot that is stopped: its status, if that came by the link, and whether the STOP is on its disk."""
-
-    status: "Status | None"
-    stored: bool
-
-
 class _LinkStop(threading.Thread):
     """Opens the link and sends STOP there."""
 
@@ -172,7 +165,7 @@ class _LinkStop(threading.Thread):
 def stop_robot(
     robot: str, connect: Sequence[str], secure: str, secret_file: str, on_slow: Callable[[], None], *,
     timeout_s: float = 10.0, thread_name: str = "stop link",
-) -> Stopped:
+) -> bool:
     """Stop a robot by datagrams, and by its link without an answer. Returns once it is STOPPED, its wheels at zero.
 
     Args:
@@ -183,6 +176,9 @@ def stop_robot(
         on_slow: called once if the robot has not shown STOPPED after 300 ms.
         timeout_s: longest wait, s.
         thread_name: of the thread that opens the link. It may still run when this function returns.
+
+    Returns:
+        False if the robot answers that the STOP is not on its disk.
 
     Raises:
         SightlineError: that of the link, if no datagram is answered; or at `timeout_s`. The robot may still move.
@@ -199,19 +195,17 @@ def stop_robot(
                 link.join(_LINK_CLOSES_S)
 
 
-def _wait(
-    robot: str, sender: StopSender, link: _LinkStop, on_slow: Callable[[], None], timeout_s: float
-) -> Stopped:
+def _wait(robot: str, sender: StopSender, link: _LinkStop, on_slow: Callable[[], None], timeout_s: float) -> bool:
     began_s = time.monotonic()
     stopped_s: float | None = None
     warned = False
     while (now_s := time.monotonic()) - began_s < timeout_s:
         if sender.is_stored:
-            return Stopped(link.status, True)
+            return True
         if sender.is_stopped or link.status is not None:
             stopped_s = stopped_s or now_s
             if not sender.is_answered or now_s - stopped_s > _STORED_S:
-                return Stopped(link.status, not sender.is_answered)
+                return not sender.is_answered
         elif link.error is not None and not sender.is_answered and now_s - began_s > _ANSWERED_S:
             raise link.error
         elif link.ident is None and now_s - began_s > _ANSWERED_S:  # it is applied, but the wheels are not at zero

@@ -5,7 +5,6 @@ from random import Random
 import pytest
 
 from sightline.operator_side.cli import app as cli
-from sightline.operator_side.client.stop import Stopped
 
 WORDS = ("r1", "r2", "--json", "--connect", "--connect=tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447", "--secure",
          "--secure=k", "--connect=", "--", "-h", "--jso", "-1", "", "=", "stop")  # fmt: skip
@@ -18,7 +17,7 @@ def stopped(monkeypatch):
 
     def stop_robot(*given, **_options):
         sent.append(given[:3])
-        return Stopped(None, True)
+        return True
 
     monkeypatch.delenv("SIGHTLINE_CONNECT", raising=False)
     monkeypatch.setenv("XDG_CONFIG_HOME", "/nowhere")
