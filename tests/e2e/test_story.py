@@ -29,6 +29,7 @@ def events(folder: Path) -> dict[str, int]:
     return json.loads((folder / "events.json").read_text())
 
 
+@pytest.mark.alone  # the naive robot has to drive fast when the radio is lost
 def test_story_shows_that_the_robot_stops_and_the_naive_robot_does_not(filmed):
     folder, result = filmed
     assert result.returncode == 0, result.stdout + result.stderr
@@ -40,6 +41,7 @@ def test_story_shows_that_the_robot_stops_and_the_naive_robot_does_not(filmed):
         assert line in result.stderr, "progress is on stderr"
 
 
+@pytest.mark.alone
 def test_figures_come_from_the_motor_log(filmed):
     folder, result = filmed
     stops = json.loads(result.stdout)["stops"]
@@ -50,6 +52,7 @@ def test_figures_come_from_the_motor_log(filmed):
         assert (stops[name]["zero_ms"], stops[name]["distance_m"]) == (stop.zero_ms, stop.distance_m)
 
 
+@pytest.mark.alone
 def test_film_is_small_and_lasts_25_to_30_seconds(filmed):
     folder, _ = filmed
     path = folder / "story.webp"

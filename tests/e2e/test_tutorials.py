@@ -95,6 +95,7 @@ def test_first_drive_starts_arms_drives_stops_and_drives_again(terminals):
     assert "armed" in terminals.run(page["again"])
 
 
+@pytest.mark.alone  # it must reach the bounds of its scenario
 def test_first_drive_drives_over_a_harder_link(terminals, tmp_path):
     [words] = blocks("docs/tutorials/first-drive.md")["harder"]
     assert "acquired_s" in terminals.run([[*words, "--out", str(tmp_path / "run")]])

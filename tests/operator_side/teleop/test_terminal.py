@@ -98,6 +98,12 @@ class Seat:
         rows = [t_us / 1e6 for t_us, left, right in self.robot.motor_rows() if left or right]
         return next((at_s for at_s in rows if at_s >= since_s), None)
 
+    def falls_s(self):
+        """Return the time of the first motor command after which the wheels only slow down, to zero."""
+        rows = [(t_us / 1e6, max(abs(left), abs(right))) for t_us, left, right in self.robot.motor_rows()]
+        faster = [at for at in range(1, len(rows)) if rows[at][1] >= rows[at - 1][1] and rows[at][1] > 0]
+        return rows[faster[-1] + 1][0]
+
 
 @pytest.fixture
 def seat(tmp_path):
@@ -127,7 +133,7 @@ def test_a_key_moves_the_wheels_soon_and_its_release_is_a_zero_command_soon(seat
 
 @pytest.mark.alone
 @pytest.mark.parametrize("how", ["the terminal is closed", "SIGHUP", "SIGTERM", "Ctrl-C", "Ctrl-D", "q"])
-def test_any_end_commands_zero_soon_and_releases_the_robot(seat, how):
+def test_any_end_stops_the_wheels_soon_and_releases_the_robot(seat, how):
     seat.sit()
     seat.fingers.press("w")
     time.sleep(0.8)
@@ -141,13 +147,11 @@ def test_any_end_commands_zero_soon_and_releases_the_robot(seat, how):
     else:
         seat.terminal.types({"Ctrl-C": "\x03", "Ctrl-D": "\x04", "q": "q"}[how])
     assert seat.terminal.process.wait(5) == 0, seat.terminal.text()
-    found = until(lambda: seat.recorder.first_zero_s(ended_s), 2)  # the recorder may run later than the end of teleop
-    assert found, f"{ended_s}\n{seat.recorder.commands[-9:]}\n{seat.terminal.text()}\n{seat.robot.output()}"
-    zero_s = seat.recorder.first_zero_s(ended_s)
-    print(f"\n{how}: zero command after {(zero_s - ended_s) * 1e3:.0f} ms")
-    assert zero_s - ended_s <= ZERO_S
     assert until(lambda: seat.robot.speed() == 0, 2)
     assert until(lambda: "released control" in seat.robot.output(), 2), "immediately, not at the end of its lease"
+    fall_s = seat.falls_s() - ended_s
+    print(f"\n{how}: the wheels fall after {fall_s * 1e3:.0f} ms")
+    assert 0 < fall_s <= ZERO_S
 
 
 @pytest.mark.slow
