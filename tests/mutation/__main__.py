@@ -42,6 +42,7 @@ TABLES = {
     "vision_side/serving/sharing.py": ("tests/vision_side/serving/test_sharing_rules.py",),
     "vision_side/missions/switch.py": ("tests/vision_side/missions/test_switch.py",),
     "vision_side/missions/follow.py": ("tests/vision_side/missions/test_follow.py",),
+    "vision_side/tracking/appearance.py": ("tests/vision_side/tracking/test_appearance.py",),
     "vision_side/tracking/locate.py": ("tests/vision_side/tracking/test_locate.py",),
     "vision_side/tracking/prediction.py": ("tests/vision_side/tracking/test_prediction.py",),
     "vision_side/tracking/track.py": ("tests/vision_side/tracking/test_track.py",),

@@ -5,7 +5,8 @@ another service is located by its height or width.
 """
 
 import math
-from typing import Final
+from dataclasses import replace
+from typing import ClassVar, Final
 
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.messages import STILL, CameraModel, FrameHeader, Pose, Twist
@@ -19,6 +20,7 @@ from sightline.vision_side.config import (
 )
 from sightline.vision_side.detect.port import Detection, is_followable
 from sightline.vision_side.missions.port import Plan, View
+from sightline.vision_side.tracking.appearance import look_of
 from sightline.vision_side.tracking.locate import Sighting, locate_box, locate_sphere
 from sightline.vision_side.tracking.prediction import MotionPredictor, PredictedMotion
 from sightline.vision_side.tracking.steering import Aim, Search, Steer
@@ -29,6 +31,8 @@ PERSON: Final = "person"
 PERSON_M: Final = {"height_m": 1.7, "width_m": 0.45}
 """Size of a standing adult, unless the configuration has a size. Without it a human is located as a ball at 0.3 m."""
 
+_LOOKS_EACH: Final = 8
+"""Frames. A look takes as long as a tenth of the rest of a step, and changes slowly while an object is alone."""
 PERSON_APART_M: Final = 0.4
 """Two humans are at least so far apart, so that what is nearer is a part of one."""
 
@@ -49,6 +53,9 @@ class Follow:
         search: SearchConfig = SearchConfig()
         boxes: BoxesConfig = BoxesConfig()
 
+    has_look: ClassVar[bool] = True
+    """Whether the middle of a box shows the object. That of two legs shows what is behind them."""
+
     def __init__(self, config: Config, camera: CameraModel) -> None:
         self._config = config
         self._camera = camera
@@ -62,7 +69,7 @@ class Follow:
         """Compute the plan for one frame."""
         places = self._places(view)
         self._hear(view)
-        seen = self._track.step(view.dt_s, view.header.pose, self._sightings(places))
+        seen = self._track.step(view.dt_s, view.header.pose, self._sightings(places, view))
         plan = self._act(view, seen)
         self._motion_predictor.sent(view.header.t_us, plan.twist)
         return plan
@@ -95,9 +102,15 @@ class Follow:
         label = self._config.target.label
         return (view.picture is None and not label) or is_followable(one.label, label)
 
-    def _sightings(self, places: list[Sighting | None]) -> list[Sighting]:
-        target = self._config.target
-        return [one for one in places if one and one.x_m**2 + one.y_m**2 <= target.max_range_m**2]
+    def _sightings(self, places: list[Sighting | None], view: View) -> list[Sighting]:
+        """Return the places within the range, with the look of each object where it may matter."""
+        most_m = self._config.target.max_range_m
+        near = [one for one in places if one and one.x_m**2 + one.y_m**2 <= most_m**2]
+        target = self._track.target
+        is_alone = len(near) < 2 and target is not None and not target.unseen_us
+        if view.picture is None or not self.has_look or (is_alone and view.header.seq % _LOOKS_EACH):
+            return near
+        return [replace(one, look=look_of(view.picture, one.detection)) for one in near]
 
     def _expected_m(self, pose: Pose) -> float:
         """Return the assumed distance of a box without a known size, in m: its last one, or the stand-off."""

@@ -51,6 +51,7 @@ class Legs(Follow):
         max_scan_age_s: Annotated[float, Field(gt=0, le=2)] = 0.4
 
     wants_scan: ClassVar[bool] = True
+    has_look: ClassVar[bool] = False
 
     def __init__(self, config: Config, camera: CameraModel) -> None:
         super().__init__(config, camera)

@@ -8,7 +8,7 @@ axis, and holds for each part of the outline that is in view.
 
 import math
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import cv2
@@ -21,6 +21,7 @@ from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import CameraModel, DetectedBox, Detections, DetectionsHeader, FrameHeader
 from sightline.vision_side.config import BoxesConfig
 from sightline.vision_side.detect.port import Circle, Detection
+from sightline.vision_side.tracking.appearance import Look
 
 Column = NDArray[np.float64]
 
@@ -40,12 +41,14 @@ class Sighting:
         y_m: left.
         detection: its detection.
         exactness: above 0 to 1. Less than 1 for a range that is partly assumed.
+        look: its look, or None if it is unknown.
     """
 
     x_m: float
     y_m: float
     detection: Detection
     exactness: float = 1.0
+    look: Look | None = field(default=None, compare=False, repr=False)
 
 
 def locate_sphere(detection: Detection, camera: CameraModel, radius_m: float) -> Sighting | None:

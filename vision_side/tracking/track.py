@@ -4,8 +4,9 @@ In this frame the state of an object is only its position and velocity, without 
 which both axes share one 2x2 covariance, because they have the same noise. The clock is the capture time of the frames.
 
 The other objects in view are tracked too, so that the target does not become one of them where they cross or hide each
-other. Each sighting belongs to the object that it fits best, by the likelihood of its position. Where two objects could
-be exchanged, neither is corrected: both go on as before, until they are apart. A target that stays in doubt is lost.
+other. Each sighting belongs to the object that it fits best, by the likelihood of its position and its look. Where two
+objects could be exchanged, neither is corrected: both go on as before, until they are apart. A target that stays in
+doubt is lost. For a while after its loss nothing is followed that looks like another object.
 """
 
 import math
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 
 from sightline.protocol.messages import Pose
 from sightline.vision_side.config import TrackConfig
+from sightline.vision_side.tracking.appearance import OTHER, Look, difference, updated
 from sightline.vision_side.tracking.locate import Sighting
 
 # 1 sigma of the speed of a new target.
@@ -27,14 +29,16 @@ _MAX_OTHERS = 16
 # Sightings after which an object is a rival of the target. Errors of a detector seldom last as long.
 _KNOWN_AFTER = 5
 # Time without a sighting after which another object is forgotten: it may have left the view for a moment. As long after
-# the loss of the target, another object may become the target.
+# the loss of the target, another object, or one of another look, may become the target.
 _MEMORY_US = 3_000_000
-# The same for one with fewer sightings.
+# The same for one with fewer sightings. After as long, a sighting of another look is another object.
 _BRIEFLY_US = 300_000
 # Variance that no filter knows: an outline that is partly hidden, a step, a bump.
 _LEAST_NOISE_M2 = 0.05**2
 # A sighting of unknown range has a larger variance along its ray. Across the ray it is as exact as any other.
 _MOST_NOISE_M2 = 0.15**2
+# Minus twice the log-likelihood of a look without a common color. Looks of one object differ by a tenth of that.
+_LOOK_MISFIT = 12.0
 # Difference of two log-likelihoods, times two, below which two objects could be exchanged: odds of 7 to 1.
 _ODDS = 4.0
 # Longest time in doubt.
@@ -56,13 +60,14 @@ class Target:
 class _Object:
     """Filter of one object."""
 
-    __slots__ = ("_acceleration_mps2", "is_rival", "state", "variance")
+    __slots__ = ("_acceleration_mps2", "is_rival", "look", "state", "variance")
 
-    def __init__(self, x_m: float, y_m: float, noise_m2: float, acceleration_mps2: float) -> None:
+    def __init__(self, place: "_Place", acceleration_mps2: float) -> None:
         self._acceleration_mps2 = acceleration_mps2
-        self.state = Target(x_m, y_m, 0.0, 0.0, 0, 1)
-        self.variance = (noise_m2, 0.0, _FIRST_SPEED_MPS**2)
+        self.state = Target(place.x_m, place.y_m, 0.0, 0.0, 0, 1)
+        self.variance = (place.noise_m2, 0.0, _FIRST_SPEED_MPS**2)
         """Of position, both, velocity."""
+        self.look = place.sighting.look
         self.is_rival = False
         """True once it was seen beside the target, so that it is not the target."""
 
@@ -93,11 +98,13 @@ class _Object:
     def misfit(self, place: "_Place") -> float:
         """Return minus twice the logarithm of the likelihood of a sighting, without its constant."""
         variance = self.variance[0] + min(max(place.noise_m2, _LEAST_NOISE_M2), _MOST_NOISE_M2)
-        return self.away_m(place) ** 2 / variance + 2 * math.log(variance)
+        unlike = difference(self.look, place.sighting.look)
+        return self.away_m(place) ** 2 / variance + 2 * math.log(variance) + _LOOK_MISFIT * unlike
 
     def correct(self, place: "_Place") -> None:
         """Correct the prediction with a sighting."""
         (position, both, velocity), noise, was = self.variance, place.noise_m2, self.state
+        self.look = updated(self.look, place.sighting.look)
         dx, dy = place.x_m - was.x_m, place.y_m - was.y_m
         if dx * dx + dy * dy > _SURPRISE * 2 * (position + noise):
             # The larger variances let this sighting move the estimate most of the way.
@@ -126,6 +133,7 @@ class Track:
         self._config = config
         self._followed: _Object | None = None
         self._others: list[_Object] = []
+        self._lost_look: Look | None = None
         self._unsure_us = 0
         """Time in doubt, or since the loss of the target."""
 
@@ -177,8 +185,10 @@ class Track:
         return fits
 
     def _is_near(self, one: _Object, place: _Place) -> bool:
-        # The gate grows while an object is hidden, because its position becomes less certain.
-        return one.away_m(place) < self._config.gate_m + self._config.gate_growth_mps * one.state.unseen_us / 1e6
+        # The gate grows while an object is hidden, because its position becomes less certain. Its look does not.
+        gate_m = self._config.gate_m + self._config.gate_growth_mps * one.state.unseen_us / 1e6
+        is_alike = one.state.unseen_us <= _BRIEFLY_US or difference(one.look, place.sighting.look) < OTHER
+        return is_alike and one.away_m(place) < gate_m
 
     def _in_doubt(self, target: _Object, fits: dict[_Object, _Place]) -> set[_Object]:
         """Return the target and the rivals that could as well have its sighting, and it theirs; empty if none could."""
@@ -192,11 +202,13 @@ class Track:
         return bool(exchanged) and worse < _ODDS and all(self._is_near(thief, place) for place, _, thief in exchanged)
 
     def _start(self, dt_s: float, places: list[_Place], fits: dict[_Object, _Place]) -> _Place | None:
-        """Follow the best sighting, but for a while none of an object that was seen beside the last target."""
+        """Follow the best sighting; for a while none of a rival of the last target, and none that looks other."""
         self._unsure_us += round(dt_s * 1e6)
-        rivals = [one for one in self._others if one.is_rival] if self._unsure_us <= _MEMORY_US else []
-        taken = [fits[one] for one in rivals if one in fits]
-        chosen = next((one for one in places if all(_apart_m(one, two) > self._config.apart_m for two in taken)), None)
+        if self._unsure_us <= _MEMORY_US:
+            taken = [fits[one] for one in self._others if one.is_rival and one in fits]
+            places = [one for one in places if difference(self._lost_look, one.sighting.look) < OTHER
+                      and all(_apart_m(one, two) > self._config.apart_m for two in taken)]
+        chosen = next(iter(places), None)
         if chosen is not None:
             known = next((one for one, place in fits.items() if place is chosen), None)
             self._followed, self._unsure_us = known or self._new(chosen), 0
@@ -208,6 +220,7 @@ class Track:
         followed.is_rival = self._unsure_us > _DOUBT_US
         if followed.is_rival or followed.state.unseen_us > self._config.give_up_s * 1e6:
             self._others += [followed] if followed.is_rival else []
+            self._lost_look = followed.look
             self._followed, self._unsure_us = None, 0
 
     def _update_others(self, places: list[_Place], fits: dict[_Object, _Place], target: _Object | None) -> None:
@@ -223,7 +236,7 @@ class Track:
                 self._others.append(self._new(place))
 
     def _new(self, place: _Place) -> _Object:
-        return _Object(place.x_m, place.y_m, place.noise_m2, self._config.acceleration_mps2)
+        return _Object(place, self._config.acceleration_mps2)
 
     def _noise(self, sighting: Sighting) -> float:
         """Return the variance of one position. The range error grows with the square of the range."""

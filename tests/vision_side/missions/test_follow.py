@@ -7,9 +7,11 @@ import pytest
 
 from sightline.protocol.messages import STILL, CameraModel, FrameHeader, Twist
 from sightline.vision_side.config import BoxesConfig, LatencyConfig, SearchConfig, TargetConfig, TrackConfig
+from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions import follow as module
 from sightline.vision_side.missions.follow import Follow, aim_at
+from sightline.vision_side.missions.legs import Legs
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.tracking.locate import Sighting
 from sightline.vision_side.tracking.prediction import PredictedMotion
@@ -21,7 +23,7 @@ CAMERA = CameraModel(
 )
 DT_S = 0.1
 COMMANDED = Twist(linear_mps=0.2, angular_rad_s=0.3)
-PICTURE = object()
+PICTURE = DecodedImage(np.zeros((240, 320, 3), np.uint8), 1)
 
 
 class NotedSteer:
@@ -70,8 +72,8 @@ def at(x_m, y_m=0.0, label="ball", outline=False):
     return Detection(x_m, y_m, x_m + 1, y_m + 1, 1.0, label, outline_px=np.zeros((8, 2)) if outline else None)
 
 
-def view(*detections, t_us=1_000_000, dt_s=DT_S, picture=PICTURE, **header):
-    frame = FrameHeader(session="0000000a", seq=1, t_us=t_us, **header)
+def view(*detections, t_us=1_000_000, dt_s=DT_S, picture=PICTURE, seq=1, **header):
+    frame = FrameHeader(session="0000000a", seq=seq, t_us=t_us, **header)
     return View(frame, dt_s, 0.0, CAMERA, detections, picture)
 
 
@@ -147,6 +149,46 @@ def test_box_of_a_known_size_is_expected_where_it_was_last_else_at_the_stand_off
     for _ in range(2):
         mission.step(view(at(1.3, 0.85), picture=None, pose=pose))
     assert [call[3] for call in located] == [0.8, pytest.approx(expected_m)]
+
+
+# --- its look ----------------------------------------------------------------------------------------------------
+
+
+def painted(*bgr):
+    return DecodedImage(np.full((240, 320, 3), bgr, np.uint8), 1)
+
+
+YELLOW, BLUE = painted(13, 199, 242), painted(204, 77, 26)
+
+
+def ball(x_m, y_m=0.0):
+    return Detection(x_m, y_m, 40.0, 40.0, 1.0, "ball")
+
+
+@pytest.mark.parametrize(("mission", "is_other"), [(Follow, True), (Legs, False)])
+def test_ball_of_another_color_is_not_the_hidden_target_and_what_stands_behind_legs_does_not_count(
+    monkeypatch, mission, is_other
+):
+    monkeypatch.setattr(Legs, "_places", Follow._places)
+    follow = mission(mission.Config(**({"label": "ball"} if mission is Legs else {})), CAMERA)
+    assert follow.step(view(ball(1.5), picture=YELLOW)).phase == "tracking"
+    for _ in range(4):
+        assert follow.step(view(picture=YELLOW)).phase == "coasting"
+    assert follow.step(view(ball(1.5, 0.2), picture=BLUE)).phase == ("coasting" if is_other else "tracking")
+    assert follow.step(view(ball(1.5, 0.2), picture=YELLOW)).phase == "tracking"
+
+
+def test_look_is_computed_where_it_matters(monkeypatch):
+    looks = []
+    monkeypatch.setattr(module, "look_of", lambda _picture, one: looks.append(one) or np.eye(64, dtype=np.float32)[0])
+    follow, counts = follow_of(), []
+    frames = [((1.5,), 1), ((1.5,), 2), ((1.5, 2.0), 3), ((1.5,), 8), ((1.5,), 9), ((), 10), ((1.5,), 11), ((1.5,), 12)]
+    for places, seq in frames:
+        follow.step(view(*map(ball, places), seq=seq))
+        counts.append(len(looks))
+    assert counts == [1, 1, 3, 4, 4, 4, 5, 5], "at the start, of several, each eighth frame, after a frame without"
+    follow.step(view(ball(1.5), ball(2.0), picture=None))
+    assert len(looks) == 5, "boxes of another service come without pixels"
 
 
 # --- the plan ----------------------------------------------------------------------------------------------------

@@ -4,10 +4,12 @@ import math
 import random
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from sightline.vision_side.config import TrackConfig
 from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.tracking.appearance import OTHER
 from sightline.vision_side.tracking.locate import Sighting
 from sightline.vision_side.tracking.track import Target, Track, from_odometry, to_odometry
 
@@ -282,6 +284,57 @@ def test_best_sighting_that_is_of_no_such_object_is_followed_first():
     assert others(track) == [(1.0, -0.5), pytest.approx((2.0, 0.5))]
 
 
+def look(share):
+    """Return a look that differs by so much from that of a target with look(0)."""
+    looks = np.zeros(64, np.float32)
+    looks[:2] = 1 - share, math.sqrt(1 - (1 - share) ** 2)
+    return looks
+
+
+def lost(of):
+    """Return a track that has just lost a target with this look, which was seen alone."""
+    track = Track(TrackConfig(give_up_s=0.4))
+    for _ in range(6):
+        assert track.step(DT_S, HERE, [at(*TARGET, look=of)]) is not None
+    assert steps_until(track, lambda _: track.target is None) == 5
+    return track
+
+
+@pytest.mark.parametrize(("of", "shown", "steps"), [
+    (look(0.0), look(0.0), 1), (look(0.0), look(OTHER - 0.01), 1), (look(0.0), look(OTHER + 0.01), 31),
+    (look(0.0), look(1.0), 31), (None, look(1.0), 1), (look(0.0), None, 1),
+])
+def test_object_of_another_look_is_followed_three_seconds_after_the_loss(of, shown, steps):
+    track = lost(of)
+    taken = (number for number in range(1, 99) if track.step(DT_S, HERE, [at(1.0, -0.9, look=shown)]))
+    assert next(taken) == steps
+
+
+def test_object_that_looks_as_the_lost_target_is_followed_and_not_the_best_one():
+    track, places = lost(look(0.0)), [at(1.0, -0.9, look=look(0.9)), at(1.0, 0.9, look=look(0.2))]
+    assert track.step(DT_S, HERE, places) is places[1]
+
+
+@pytest.mark.parametrize(("unlike", "hidden", "is_target"), [
+    (1.0, 2, True), (1.0, 3, False), (OTHER + 0.01, 3, False), (OTHER - 0.01, 3, True), (0.0, 8, True),
+])
+def test_object_of_another_look_is_not_the_target_that_was_hidden_for_300_ms(unlike, hidden, is_target):
+    track = Track(TrackConfig())
+    track.step(DT_S, HERE, [at(*TARGET, look=look(0.0))])
+    for _ in range(hidden):
+        assert track.step(DT_S, HERE, []) is None
+    assert (track.step(DT_S, HERE, [at(2.0, 0.3, look=look(unlike))]) is not None) == is_target
+
+
+def test_look_of_the_target_follows_the_light():
+    track = Track(TrackConfig(give_up_s=0.4))
+    for number in range(40):
+        assert track.step(DT_S, HERE, [at(*TARGET, look=look(number / 40))]) is not None
+    steps_until(track, lambda _: track.target is None)
+    assert track.step(DT_S, HERE, [at(*TARGET, look=look(0.0))]) is None
+    assert track.step(DT_S, HERE, [at(*TARGET, look=look(1.0))]) is not None
+
+
 @pytest.mark.parametrize(("y_m", "is_followed"), [(0.625, False), (0.626, True)])
 def test_part_of_an_object_beside_the_last_target_is_not_followed_either(y_m, is_followed):
     track = beside((2.0, 0.5), give_up_s=0.4, apart_m=0.125)
@@ -362,6 +415,17 @@ def test_objects_that_could_be_exchanged_at_odds_of_seven_to_one_are_both_left(
     assert (seen is None) == (in_doubt or shown == "other")
     assert track.target.unseen_us == (100_000 * (hidden + 1) if seen is None else 0)
     assert other.state.unseen_us == (100_000 if in_doubt or shown == "target" else 0)
+
+
+@pytest.mark.parametrize(("unlike", "in_doubt"), [(0.0, True), (0.1665, True), (0.1669, False), (1.0, False)])
+def test_objects_of_other_looks_are_not_exchanged_where_they_meet(unlike, in_doubt):
+    """Looks that differ by a sixth have the same odds of 7 to 1: 12 / 6 for each of the two sightings."""
+    track = pair(0.001)
+    (other,) = track._others
+    track._followed.look, other.look = look(0.0), look(unlike)
+    places = [at(*TARGET, look=look(0.0)), at(*about(0.001), look=look(unlike))]
+    assert track.step(DT_S, HERE, places) is (None if in_doubt else places[0])
+    assert other.state.unseen_us == in_doubt * 100_000
 
 
 @pytest.mark.parametrize(("gate_m", "in_doubt"), [(0.21, True), (0.19, False)])
