@@ -122,7 +122,11 @@ def _bounded(value: float, limit: float) -> float:
 # The bounded search: turn on the spot after "saw nothing", toward the side where the target was last seen. Pure.
 #
 # Only decoded images without a target count. The turn in odometry consumes the budget, so that a disarmed robot does
-# not use up its search.
+# not use up its search. Where the robot turned and then stands, an obstacle is in its way: it turns the other way.
+
+
+_BLOCKED_S = 1.0
+_TURNED_RAD = 0.1
 
 
 class Search:
@@ -137,6 +141,7 @@ class Search:
         """Start the next search from the beginning, to the left for a positive `side`."""
         self._side = math.copysign(1.0, side)
         self._nothing_s = self._turning_s = self._turned_rad = 0.0
+        self._standing_s = self._one_way_rad = 0.0
         self._yaw_rad: float | None = None
 
     def step(self, dt_s: float, pose: Pose, applied: Planar) -> Twist | None:
@@ -159,7 +164,13 @@ class Search:
 
     def _spend(self, dt_s: float, yaw_rad: float, applied_rad_s: float) -> None:
         before = yaw_rad if self._yaw_rad is None else self._yaw_rad
-        self._turned_rad += abs(math.remainder(yaw_rad - before, 2 * math.pi))
+        turned_rad = abs(math.remainder(yaw_rad - before, 2 * math.pi))
+        self._turned_rad += turned_rad
         self._yaw_rad = yaw_rad
         self._nothing_s += dt_s
-        self._turning_s += dt_s if abs(applied_rad_s) > 1e-3 else 0.0
+        is_turning = abs(applied_rad_s) > 1e-3
+        self._turning_s += dt_s if is_turning else 0.0
+        self._standing_s = 0.0 if is_turning else self._standing_s + dt_s
+        self._one_way_rad += turned_rad
+        if self._standing_s >= _BLOCKED_S and self._one_way_rad >= _TURNED_RAD:  # one that is not armed never turned
+            self._side, self._one_way_rad = -self._side, 0.0

@@ -1,5 +1,7 @@
 """The search, image by image: when it begins, which way it turns, and what its budget counts."""
 
+import math
+
 import pytest
 
 from sightline.protocol.messages import Twist
@@ -87,3 +89,50 @@ def test_reset_restores_the_whole_budget_and_the_waiting_time():
 def test_disabled_search_never_turns():
     search = Search(SearchConfig(enabled=False, after_s=0.0))
     assert not any(turns(search, 0.0) for _ in range(3))
+
+
+def way(search, yaw_rad, applied=TURNING, dt_s=0.249):
+    """Return the side to which it turns, 1 left and -1 right."""
+    return math.copysign(1, search.step(dt_s, (0.0, 0.0, yaw_rad), applied).angular_rad_s)
+
+
+STANDS = (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("yaw_rad", "turns_back"), [(0.1, True), (-0.1, True), (0.0995, False), (0.0, False)])
+def test_robot_that_turned_and_stands_for_a_second_turns_the_other_way(yaw_rad, turns_back):
+    search = Search(SearchConfig(after_s=0.0))
+    ways = [way(search, 0.0), way(search, yaw_rad), *(way(search, yaw_rad, STANDS) for _ in range(6))]
+    assert ways == [1] * 6 + [-1 if turns_back else 1] * 2
+
+
+@pytest.mark.parametrize(("dt_s", "rests"), [(0.25, 3), (0.2475, 4)])
+def test_a_second_at_rest_is_whole(dt_s, rests):
+    search = Search(SearchConfig(after_s=0.0))
+    assert [way(search, 0.0, dt_s=dt_s), way(search, 0.5, dt_s=dt_s)] == [1, 1]
+    ways = [way(search, 0.5, STANDS, dt_s) for _ in range(5)]
+    assert ways == [1] * rests + [-1] * (5 - rests)
+
+
+@pytest.mark.parametrize(("back_rad", "turns_again"), [(0.1, True), (0.0995, False)])
+def test_it_turns_back_again_where_the_other_way_is_blocked_too(back_rad, turns_again):
+    search = Search(SearchConfig(after_s=0.0))
+    ways = [way(search, yaw_rad, applied) for yaw_rad, applied in (
+        (0.5, TURNING), (0.0, TURNING), *[(0.0, STANDS)] * 12, (0.0, TURNING), (back_rad, TURNING),
+        *[(back_rad, STANDS)] * 6)]
+    assert ways == [1] * 6 + [-1] * 14 + [1 if turns_again else -1] * 2, "while it stands, it waits for the turn"
+
+
+@pytest.mark.parametrize("again", ["it turns", "it sees the target"])
+def test_a_short_rest_is_no_obstacle(again):
+    search = Search(SearchConfig(after_s=0.0))
+    way(search, 0.0)
+    way(search, 0.5)
+    for _ in range(4):
+        for _ in range(4):
+            assert way(search, 0.5, STANDS) == 1
+        if again == "it turns":
+            assert way(search, 0.5, (0.0, 0.002)) == 1
+        else:
+            search.reset(1.0)
+            assert [way(search, 0.5), way(search, 0.6)] == [1, 1]
