@@ -3,6 +3,7 @@
 What a picture holds is computed once per picture and process: the pictures of the kit are few, the runs are many.
 """
 
+from dataclasses import dataclass
 from functools import cache
 
 from sightline.conformance.benches import TO_ROBOT, VirtualBench
@@ -11,9 +12,9 @@ from sightline.protocol.errors import WireError
 from sightline.protocol.messages import CameraModel, FrameHeader
 from sightline.protocol.transports.memory import MemoryLink, MemoryNetwork
 from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.decode import Decoder
+from sightline.vision_side.decode import DecodedImage, Decoder
 from sightline.vision_side.detect.color.hsv import HsvDetector
-from sightline.vision_side.detect.port import Maker, result_of
+from sightline.vision_side.detect.port import Detection, Maker, result_of
 from sightline.vision_side.pipeline import Pipeline, PipelineAnswer
 from sightline.vision_side.serving.service import Service
 
@@ -22,18 +23,25 @@ COMPUTE_US = 2_000
 CONFIG = VisionConfig()
 
 
+@dataclass(frozen=True, slots=True)
+class SeenImage(DecodedImage):
+    """An image and what is in it."""
+
+    detections: tuple[Detection, ...]
+
+
 @cache
 def _looked_at(width_px, height_px, jpeg):
-    """Return the detections in an image, or the error that makes it invalid."""
+    """Return the image, or the error that makes it invalid."""
     try:
         picture = Decoder(width_px, height_px, CONFIG.max_pixels).decode(jpeg)
     except WireError as error:
         return error
-    return HsvDetector(CONFIG.hsv).detect(picture)
+    return SeenImage(picture.bgr, picture.scale, tuple(HsvDetector(CONFIG.hsv).detect(picture)))
 
 
 class RememberingDecoder:
-    """Hands on the detections as if they were the picture."""
+    """Decodes each image once in a process."""
 
     def __init__(self, camera: CameraModel) -> None:
         self.size_px = camera.width_px, camera.height_px
@@ -48,10 +56,10 @@ class RememberingDecoder:
 
 
 class RememberingDetector:
-    """Detector that returns the detections from the decoder."""
+    """Returns what the decoder has seen."""
 
     def detect(self, frames, deadline_us):
-        return [result_of(frame, frame.picture(), Maker("hsv", device="cpu")) for frame in frames]
+        return [result_of(frame, frame.picture().detections, Maker("hsv", device="cpu")) for frame in frames]
 
 
 class VirtualVision(Service):

@@ -124,7 +124,7 @@ def test_it_turns_back_again_where_the_other_way_is_blocked_too(back_rad, turns_
 
 
 @pytest.mark.parametrize("again", ["it turns", "it sees the target"])
-def test_a_short_rest_is_no_obstacle(again):
+def test_a_short_rest_does_not_turn_it_back(again):
     search = Search(SearchConfig(after_s=0.0))
     way(search, 0.0)
     way(search, 0.5)
