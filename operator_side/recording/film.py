@@ -86,6 +86,10 @@ class Film:
         """Return the time from the first image to the last."""
         return max(0, self._last_ticks) / _TICKS_PER_S
 
+    def since_first_s(self, t_us: int) -> float:
+        """Return the time from the first image to `t_us`; 0 before the first image."""
+        return 0.0 if self._first_us < 0 else (t_us - self._first_us) / 1e6
+
     def close(self) -> None:
         """Write the rest of the encoder's data and the index."""
         if self._stream is not None:
@@ -161,13 +165,18 @@ def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
 
 
 def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Captured:
-    """Write the images of `seconds`, or until Ctrl-C, to `path`. Raises LinkError if none arrives."""
+    """Write the images of `seconds`, or until Ctrl-C, to `path`. Raises LinkError if none arrives.
+
+    It ends by the capture times: a first image that comes late makes no longer film.
+    """
     unfinished = path.with_name(f".{path.name}.part.mp4")
     size = (0, 0)
     try:
         with Film(unfinished, _FPS) as made, suppress(KeyboardInterrupt):
             ends_s = 0.0  # counted from the first image
             while (shot := _wanted(pictures, wanted, ends_s or time.monotonic() + PATIENCE_S)) is not None:
+                if made.since_first_s(shot.t_us) > seconds:
+                    break
                 ends_s = ends_s or time.monotonic() + seconds
                 size = size if any(size) else (shot.width_px, shot.height_px)
                 with suppress(WireError):  # an invalid image
