@@ -167,7 +167,7 @@ def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
 def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Captured:
     """Write the images of `seconds`, or until Ctrl-C, to `path`. Raises LinkError if none arrives.
 
-    It ends by the capture times: a first image that comes late makes no longer film.
+    The capture times end it, so that a first image that comes late does not make the film longer.
     """
     unfinished = path.with_name(f".{path.name}.part.mp4")
     size = (0, 0)

@@ -18,7 +18,7 @@ OTHER: Final = 0.4
 _BINS = 8
 # Share of the width and height of a box that is looked at: its corners show the background of a ball.
 _MIDDLE = 0.6
-# Looked at on each side, at most, and at least in all.
+# Most pixels along each side that count, and fewest in all.
 _SIDE_PX = 20
 _LEAST_PIXELS = 16
 # Weight of the newest look, so that a look follows the light.

@@ -172,5 +172,6 @@ class Search:
         self._turning_s += dt_s if is_turning else 0.0
         self._standing_s = 0.0 if is_turning else self._standing_s + dt_s
         self._one_way_rad += turned_rad
-        if self._standing_s >= _BLOCKED_S and self._one_way_rad >= _TURNED_RAD:  # one that is not armed never turned
+        # A robot that is disarmed stands too, but has not turned.
+        if self._standing_s >= _BLOCKED_S and self._one_way_rad >= _TURNED_RAD:
             self._side, self._one_way_rad = -self._side, 0.0

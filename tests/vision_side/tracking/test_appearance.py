@@ -44,7 +44,7 @@ def test_other_colors_are_other_looks(one, other):
 
 
 def look_by_pixels(bgr, corners, scale):
-    """The definition: colors by their shares of green and red in the middle 0.6 of a box, at most 40 pixels a side."""
+    """The definition: colors by their shares of green and red in the middle 0.6 of a box, at most 20 pixels a side."""
     x1, y1, x2, y2 = (value / scale for value in corners)
     left, right = (max(0, round((x1 + x2) / 2 + sign * 0.3 * (x2 - x1))) for sign in (-1, 1))
     top, bottom = (max(0, round((y1 + y2) / 2 + sign * 0.3 * (y2 - y1))) for sign in (-1, 1))
