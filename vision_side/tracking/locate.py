@@ -48,7 +48,7 @@ class Sighting:
     y_m: float
     detection: Detection
     exactness: float = 1.0
-    look: Look | None = field(default=None, compare=False, repr=False)
+    look: Look | None = field(default=None, compare=False)
 
 
 def locate_sphere(detection: Detection, camera: CameraModel, radius_m: float) -> Sighting | None:
