@@ -10,6 +10,7 @@ import pytest
 
 from sightline.operator_side.setup import keys, router
 from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.session import MAX_ROUTER_SESSIONS, MAX_SESSIONS, open_session
 from tests.fixtures.links import until
@@ -70,6 +71,19 @@ def test_a_router_serves_more_sessions_than_a_robot_does():
         assert soft == resource.RLIM_INFINITY or soft >= min(4 * MAX_ROUTER_SESSIONS, hard)
         for _ in range(MAX_SESSIONS + 4):
             ending.callback(open_session((), [endpoint], 5.0).close)
+
+
+@pytest.mark.long
+def test_session_beyond_the_limit_of_a_router_gets_the_limit_in_its_error():
+    endpoint, (soft, hard) = free_endpoint(), resource.getrlimit(resource.RLIMIT_NOFILE)
+    with _router("--listen", endpoint) as process, ExitStack() as ending:
+        assert " on " in process.stdout.readline()
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+        ending.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        for _ in range(MAX_ROUTER_SESSIONS):
+            ending.callback(open_session((), [endpoint], 5.0).close)
+        with pytest.raises(LinkError, match=r"has its limit of 64 sessions \(1000 at a router\)"):
+            open_session((), [endpoint], 1.0)
 
 
 @pytest.mark.parametrize(("limits", "expected"), [
