@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -60,14 +60,18 @@ def unresolved_host(hosts: Iterable[str]) -> str:
     return ""
 
 
+OWN_HOST: Final = "127.0.0.1"
+
+
 def connection_ends(ports: Collection[int]) -> dict[tuple[str, str], str]:
     """List the TCP connections to `ports` of this machine, including those that are closing.
 
     Returns:
-        Both ends of each connection, as in the table, and its remote host.
+        Both ends of each connection, as in the table, and its remote host, which is `OWN_HOST` for this machine at
+        any address of its own.
     """
     # The kernel writes the table in pieces, so a row can come twice while other sockets open and close.
-    return {(row[1], row[2]): _host(row[2]) for row in _rows(ports) if row[3] != _LISTEN}
+    return {(row[1], row[2]): _remote_host(row) for row in _rows(ports) if row[3] != _LISTEN}
 
 
 _OPENED: Final = {"snmp": "PassiveOpens", "netstat": "TCPDeferAcceptDrop"}
@@ -104,6 +108,11 @@ def _rows(ports: Collection[int]) -> Iterator[list[str]]:
             for line in table:
                 if line.split(None, 2)[1].endswith(endings):
                     yield line.split()
+
+
+def _remote_host(row: Sequence[str]) -> str:
+    local, remote = _host(row[1]), _host(row[2])
+    return OWN_HOST if remote == local else remote
 
 
 def _host(address: str) -> str:

@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 
 from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.log import RepeatLimiter
-from sightline.protocol.transports.diagnosis import connection_ends, listening_inodes, opened_connections
+from sightline.protocol.transports.diagnosis import OWN_HOST, connection_ends, listening_inodes, opened_connections
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint, parse_zenoh_endpoint
 from sightline.protocol.transports.zenoh.session import MAX_SESSIONS
 
@@ -38,7 +38,7 @@ MAX_BLOCKED: Final = 64
 _CHECK_S: Final = 0.2
 _QUIET_US: Final = 2_000_000
 """Longest time between two looks at the table. A flood that opens no connection is found so late."""
-_OWN: Final = ("127.0.0.1", "::1")
+_OWN: Final = (OWN_HOST, "::1")
 """This machine: its floods are reported and not blocked, because its services share one address."""
 
 

@@ -19,6 +19,8 @@ _ROWS = "  sl  local_address rem_address   st\n   0: {local} {remote} {state} 0 
     ("tcp", "0100007F:1D17", "0701A8C0:C001", "192.168.1.7"),
     ("tcp6", "00000000000000000000000000000000:1D17", "0000000000000000FFFF00000701A8C0:C001", "192.168.1.7"),
     ("tcp6", "00000000000000000000000000000000:1D17", "000080FE000000000000000001000000:C001", "fe80::1"),
+    ("tcp", "0701A8C0:1D17", "0701A8C0:C001", "127.0.0.1"),
+    ("tcp6", "0000000000000000FFFF00000701A8C0:1D17", "0000000000000000FFFF00000701A8C0:C001", "127.0.0.1"),
 ])  # fmt: skip
 def test_remote_host_is_read_from_the_table(monkeypatch, tmp_path, table, local, remote, host):
     (tmp_path / table).write_text(_ROWS.format(local=local, remote=remote, state="01"))
