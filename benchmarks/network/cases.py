@@ -185,7 +185,13 @@ CASES: Final = (
             ("shared-alone", "one vision service that shares: its link cut for 5 s"),
             ("shared-router", "3 vision services and 2 routers: each router killed with -9 in turn"),
             ("shared-router-frozen", "3 vision services and 2 routers: each router stopped for 5 s in turn"),
+            ("shared-parted", "3 vision services and 2 routers: the link between the routers cut for 5 s"),
+            ("shared-joined", "3 vision services that share: one more robot joins"),
         )
+    ),
+    NetworkCase(
+        "shared-200", "200 robots, 5 fps, one router, 3 vision services that share", (NetworkPhase(_NEAR),),
+        scene="shared", transports=_SITE,
     ),
 )
 

@@ -4,8 +4,8 @@
 
 A robot here has its own session, credit, status, driver core and gate, and no motors: the gate decides. Written at
 SIGTERM as JSON, for each robot: `accepted`, the accepted commands as (arrival_us, digest of the sender, capture_us of
-its frame), `holds`, the times (begin_us, end_us) without motion after the first command, and the numbers of frames
-`sent` and of `answers`, accepted or not.
+its frame), `holds`, the times (begin_us, end_us) without motion after the first command, `began_us`, the time of its
+first image, and the numbers of frames `sent` and of `answers`, accepted or not.
 """
 
 import sys
@@ -33,14 +33,14 @@ class GatedRobot(PlayedRobot):
         self.accepted: list[tuple[int, str, int]] = []
         self._answers = 0
         self.holds: list[list[int]] = []
-        self._tick_due_us = due_us
+        self._tick_due_us = self._began_us = due_us
         link.watch_drivers(self._on_token)
 
     @property
     def record(self) -> dict[str, Any]:
         """Return what is written of this robot."""
         return {"accepted": self.accepted, "holds": self.holds, "answers": self._answers,
-                "sent": self._network_core.status(0).sent}
+                "began_us": self._began_us, "sent": self._network_core.status(0).sent}
 
     def play(self, at_us: int) -> int:
         """Do the due work, also the gate's."""

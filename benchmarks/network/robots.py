@@ -1,4 +1,4 @@
-"""Twenty robots in one process, for `bench network`: real sessions, real headers and credit, recorded images. Shell.
+"""Many robots in one process, for `bench network`: real sessions, real headers and credit, recorded images. Shell.
 
     python -m sightline.benchmarks.network.robots SETTINGS_AS_JSON
 
@@ -47,6 +47,10 @@ class Settings(Config):
     pictures: Path
     notes: Path
     seed: int
+    first: int = 1
+    """Number of the first robot."""
+    pause_s: float = 1.0
+    """From the start to the first image."""
 
 
 class PlayedRobot:
@@ -121,12 +125,12 @@ def main(settings: Settings, kind: "type[PlayedRobot]" = PlayedRobot) -> None:
     ending, chance = threading.Event(), Random(settings.seed)
     signal.signal(signal.SIGTERM, lambda *_: ending.set())
     with ExitStack() as links:
-        begin_us = monotonic_us() + 1_000_000
+        begin_us = monotonic_us() + round(settings.pause_s * 1e6)
         robots = [
             kind(name, links.enter_context(
                 open_link(name, connect=settings.endpoint.split(","), role="robot", timeout_s=_CONNECT_S)
             ), settings, begin_us + round(chance.random() * 1e6 / settings.fps))
-            for name in (f"r{number}" for number in range(1, settings.robots + 1))
+            for name in (f"r{number}" for number in range(settings.first, settings.first + settings.robots))
         ]
         print(f"playing {len(robots)} robots", flush=True)
         play(robots, ending)

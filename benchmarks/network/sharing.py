@@ -1,9 +1,10 @@
-"""Rows of `bench network` with several vision services that share twenty robots: their harms and checks. Shell.
+"""Rows of `bench network` with several vision services that share their robots: their harms and checks. Shell.
 
 The robots have their real gates (`gated_robots.py`). The score is theirs: accepted commands, and times without motion.
 """
 
 import json
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,29 +21,34 @@ from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.processes import Processes
 from sightline.protocol.clock import monotonic_us
 from sightline.sim.network_emulator import LinkShapes
-from sightline.sim.tun_emulator import ADDRESS_A
+from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B
 
-ROBOTS: Final = 20
-WIDTH_PX, HEIGHT_PX, FPS = 320, 240, 15.0
+WIDTH_PX, HEIGHT_PX = 320, 240
 MOST_LOOKS: Final = 1.05
 """Most answers for each frame. Two services that look at the same frames make two."""
 ENDS_S: Final = 1.0
+JOINS_S: Final = 0.5
+"""Longest time from the first image of a robot that joins to its first accepted command."""
 _SETTLE_S: Final = 4.0
 _PORTS: Final = (7447, 7448)
 _FROZEN_S: Final = 3.0
+_HEALED_S: Final = 5.0
 Record = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class SharingBounds:
-    """Bounds of a row. `gap_ms` is the longest time between two accepted commands of a robot, or None."""
+    """Bounds and site of a row. A bound that is None is not demanded."""
 
     services: int
-    stands_s: float
+    stands_s: float | None
     gap_ms: float | None = None
+    """Longest time between two accepted commands of a robot, after the last of the row's harms."""
     routers: int = 1
-    beyond: bool = False
-    """True for services beyond the shaped wire; the routers are then on the robots' side."""
+    beyond: tuple[str, ...] = ()
+    """What runs beyond the shaped wire. All else is on the robots' side."""
+    robots: int = 20
+    fps: float = 15.0
 
 
 BOUNDS: Final[Mapping[str, SharingBounds]] = {
@@ -50,10 +56,13 @@ BOUNDS: Final[Mapping[str, SharingBounds]] = {
     "shared-rolling": SharingBounds(3, 0.0, gap_ms=150),
     "shared-scaled": SharingBounds(3, 0.0, gap_ms=150),
     "shared-frozen": SharingBounds(3, 0.5),
-    "shared-cut": SharingBounds(2, 0.5, beyond=True),
-    "shared-alone": SharingBounds(1, CUT_S + 0.5, beyond=True),
+    "shared-cut": SharingBounds(2, 0.5, beyond=("v0",)),
+    "shared-alone": SharingBounds(1, CUT_S + 0.5, beyond=("v0",)),
     "shared-router": SharingBounds(3, 0.5, routers=2),
     "shared-router-frozen": SharingBounds(3, 3.0, routers=2),
+    "shared-parted": SharingBounds(3, 0.6, gap_ms=150, routers=2, beyond=("v0", "router1")),
+    "shared-joined": SharingBounds(3, 0.0),
+    "shared-200": SharingBounds(3, None, gap_ms=3000, robots=200, fps=5.0),
 }
 
 
@@ -103,14 +112,16 @@ def looks_per_frame(records: Mapping[str, Record]) -> float:
 
 
 def sharing_checks(
-    bounds: SharingBounds, records: Mapping[str, Record], spans_us: Sequence[tuple[int, int]]
+    bounds: SharingBounds, records: Mapping[str, Record], spans_us: Sequence[tuple[int, int]], each: int = 1
 ) -> Iterator[Check]:
-    """Yield the checks of a row. `spans_us` are the times from each harm to the next one."""
-    stands = max(longest_stand_s(records, *span) for span in spans_us)
-    yield at_least("robots that drive", float(sum(len(one["accepted"]) > 0 for one in records.values())), "", ROBOTS)
-    yield at_most(f"a robot stands, worst of {len(spans_us)} times", stands, "s", bounds.stands_s)
+    """Yield the checks of a row. `spans_us` are the times from each harm to the next one, of `each` harms in turn."""
+    driven = sum(len(one["accepted"]) > 0 for one in records.values())
+    yield at_least("robots that drive", float(driven), "", bounds.robots)
+    if bounds.stands_s is not None:
+        stands = max(longest_stand_s(records, *span) for span in spans_us)
+        yield at_most(f"a robot stands, worst of {len(spans_us)} times", stands, "s", bounds.stands_s)
     if bounds.gap_ms is not None:
-        gap = max(worst_gap_ms(records, *span) for span in spans_us)
+        gap = max(worst_gap_ms(records, *span) for span in spans_us[each - 1 :: each])
         yield at_most("between two commands, worst robot", gap, "ms", bounds.gap_ms)
     changed = changes_of_driver(records)
     yield at_most(f"two drivers at once, in {changed} changes", float(drivers_that_return(records)), "", 0)
@@ -129,23 +140,46 @@ class Site:
     processes: Processes
     wire: ShapedWire
     bounds: SharingBounds
-    endpoints: tuple[str, ...]
+    settings: Settings
     running: dict[str, str] = field(default_factory=dict)
     """The name of each router and service -> that of its process."""
     ended_s: list[float] = field(default_factory=list)
+    joined_s: list[float] = field(default_factory=list)
+    """Of each robot that joined: from its first image, also while it still connects, to its first accepted command."""
     _starts: int = 0
 
     def start_router(self, number: int) -> None:
         """Start a router that connects to the other one."""
-        others = [endpoint for index, endpoint in enumerate(self.endpoints) if index != number]
+        others = [endpoint for index, endpoint in enumerate(_endpoints(self.bounds)) if index != number]
         listen = f"tcp/0.0.0.0:{_PORTS[number]}"
         self._start(f"router{number}", "router: on", "router", "--listen", listen, *_connect(others))
 
     def start_service(self, name: str) -> None:
         """Start a service that shares. It has its name at the next start too."""
-        namespace = self.wire.far_side if self.bounds.beyond and name == "v0" else self.wire.robot_side
+        # To the router on its side first.
+        near = ADDRESS_B if name in self.bounds.beyond else ADDRESS_A
+        endpoints = sorted(_endpoints(self.bounds), key=lambda endpoint: near not in endpoint)
         self._start(name, "shares robots", "vision", "--share", "--name", name, "--detector", DETECTOR,
-                    *_connect(self.endpoints), namespace=namespace)
+                    *_connect(endpoints))
+
+    def start_robots(self, settings: Settings) -> str:
+        """Start a process of robots. Returns its name."""
+        name = f"robots-{settings.first}"
+        self.processes.start(name, [settings.model_dump_json()], namespace=self.wire.robot_side,
+                             module="sightline.benchmarks.network.gated_robots")
+        self.processes.wait_line(name, f"playing {settings.robots} robots")
+        return name
+
+    def join(self, number: int) -> None:
+        """Let another robot join for a while."""
+        notes = self.stage.folder / f"joined{number}.json"
+        alone = {"robots": 1, "first": self.bounds.robots + 1 + number, "notes": notes, "pause_s": 0.0}
+        name = self.start_robots(self.settings.model_copy(update=alone))
+        time.sleep(3.0)
+        self.processes.end_one(name)
+        (record,) = json.loads(notes.read_text("utf-8")).values()
+        first_us = record["accepted"][0][0] if record["accepted"] else math.inf
+        self.joined_s.append((first_us - record["began_us"]) / 1e6)
 
     def kill(self, name: str) -> None:
         """End a process with -9."""
@@ -163,12 +197,19 @@ class Site:
         time.sleep(seconds)
         self.processes.signal(self.running[name], signal.SIGCONT)
 
-    def _start(self, name: str, line: str, *arguments: str, namespace: str = "") -> None:
+    def _start(self, name: str, line: str, *arguments: str) -> None:
         # Each start has a log of its own, whose first line is waited for.
         self._starts += 1
         process = self.running[name] = f"{name}-{self._starts}"
-        self.processes.start(process, list(arguments), namespace=namespace or self.wire.robot_side)
+        namespace = self.wire.far_side if name in self.bounds.beyond else self.wire.robot_side
+        self.processes.start(process, list(arguments), namespace=namespace)
         self.processes.wait_line(process, line)
+
+
+def _endpoints(bounds: SharingBounds) -> list[str]:
+    """Return the endpoint of each router."""
+    return [f"tcp/{ADDRESS_B if f'router{number}' in bounds.beyond else ADDRESS_A}:{_PORTS[number]}"
+            for number in range(bounds.routers)]
 
 
 def _connect(endpoints: Sequence[str]) -> list[str]:
@@ -220,49 +261,66 @@ def _router_frozen(site: Site, number: int) -> None:
     time.sleep(4.0)
 
 
-HARMS: Final[Mapping[str, Callable[[Site, int], None]]] = {
-    "shared-killed": _restarted(Site.kill), "shared-rolling": _restarted(Site.end), "shared-scaled": _scaled,
-    "shared-frozen": _frozen, "shared-cut": _cut, "shared-alone": _cut, "shared-router": _router_killed,
-    "shared-router-frozen": _router_frozen,
+def _parted(site: Site, _number: int) -> None:
+    site.wire.shape(site.stage.seeded(both(cut=True)))
+    time.sleep(CUT_S)
+
+
+def _healed(site: Site, _number: int) -> None:
+    site.wire.shape(site.stage.seeded(both(delay_ms=1)))
+    time.sleep(_HEALED_S)
+
+
+def _nothing(_site: Site, _number: int) -> None:
+    time.sleep(5.0)
+
+
+HARMS: Final[Mapping[str, Sequence[Callable[[Site, int], None]]]] = {
+    "shared-killed": (_restarted(Site.kill),), "shared-rolling": (_restarted(Site.end),), "shared-scaled": (_scaled,),
+    "shared-frozen": (_frozen,), "shared-cut": (_cut,), "shared-alone": (_cut,), "shared-router": (_router_killed,),
+    "shared-router-frozen": (_router_frozen,), "shared-parted": (_parted, _healed), "shared-joined": (Site.join,),
+    "shared-200": (_nothing,),
 }
+"""What is done in turn."""
 
 
 def shared(row: NetworkCase, stage: Stage) -> NetworkRun:
-    """Do the harm of the row until the end of the time."""
-    bounds, harm = BOUNDS[row.name], HARMS[row.name]
+    """Do the harms of the row, each as often as the others, until the end of the time."""
+    bounds, harms = BOUNDS[row.name], HARMS[row.name]
     begins_us: list[int] = []
-    with _site(row, stage, bounds) as (site, settings):
+    with _site(row, stage, bounds) as site:
         end_s = time.monotonic() + stage.setting.seconds
         while not begins_us or time.monotonic() < end_s:
-            begins_us.append(monotonic_us())
-            harm(site, len(begins_us) - 1)
+            for harm in harms:
+                begins_us.append(monotonic_us())
+                harm(site, len(begins_us) - 1)
         spans_us = list(pairwise([*begins_us, monotonic_us()]))
         site.processes.end()
-    records = json.loads(settings.notes.read_text("utf-8"))
-    checks = [at_least("injected", float(len(spans_us)), "times", 1.0), *sharing_checks(bounds, records, spans_us)]
+    records = json.loads(site.settings.notes.read_text("utf-8"))
+    checks = [at_least("injected", float(len(spans_us)), "times", 1.0),
+              *sharing_checks(bounds, records, spans_us, len(harms))]
+    if site.joined_s:
+        checks.append(at_most("a robot joins, slowest", max(site.joined_s), "s", JOINS_S))
     if site.ended_s:
         checks.append(at_most("a service ends, slowest", max(site.ended_s), "s", ENDS_S))
     return NetworkRun(row, stage.seed, len(spans_us), (), tuple(checks))
 
 
 @contextmanager
-def _site(row: NetworkCase, stage: Stage, bounds: SharingBounds) -> Iterator[tuple[Site, Settings]]:
+def _site(row: NetworkCase, stage: Stage, bounds: SharingBounds) -> Iterator[Site]:
     pictures = stage.folder / "small"
     pictures.mkdir()
     write_pictures(pictures, WIDTH_PX, HEIGHT_PX)
-    endpoints = tuple(f"tcp/{ADDRESS_A}:{port}" for port in _PORTS[: bounds.routers])
-    settings = Settings(endpoint=",".join(endpoints), robots=ROBOTS, fps=FPS, pictures=pictures,
+    settings = Settings(endpoint=",".join(_endpoints(bounds)), robots=bounds.robots, fps=bounds.fps, pictures=pictures,
                         notes=stage.folder / "notes.json", seed=stage.seed)
     with stage.wire() as wire, stage.processes("processes") as processes:
         wire.shape(stage.seeded(row.phases[0].shapes))
-        site = Site(stage, processes, wire, bounds, endpoints)
+        site = Site(stage, processes, wire, bounds, settings)
         for number in range(bounds.routers):
             site.start_router(number)
         for number in range(bounds.services):
             site.start_service(f"v{number}")
-        processes.start("robots", [settings.model_dump_json()], namespace=wire.robot_side,
-                        module="sightline.benchmarks.network.gated_robots")
-        processes.wait_line("robots", f"playing {ROBOTS} robots")
+        site.start_robots(settings)
         time.sleep(_SETTLE_S)
-        yield site, settings
+        yield site
         wire.shape(LinkShapes())

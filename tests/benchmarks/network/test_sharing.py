@@ -1,12 +1,13 @@
 """The checks of the rows with several vision services: each finds the failure that it is for."""
 
+from itertools import pairwise
+
 import pytest
 
 from sightline.benchmarks.network.cases import CASES
 from sightline.benchmarks.network.sharing import (
     BOUNDS,
     HARMS,
-    ROBOTS,
     changes_of_driver,
     drivers_that_return,
     longest_stand_s,
@@ -26,10 +27,10 @@ def record(drivers, step_us=STEP_US, holds=(), answers_per_frame=1.0):
     return {"accepted": accepted, "holds": list(holds), "sent": sent, "answers": round(sent * answers_per_frame)}
 
 
-def failed(bounds, records, end_us=6_000 * MS):
+def failed(bounds, records, ends_us=(6_000 * MS,), each=1):
     """Names of the checks that fail."""
-    full = {f"r{number}": records.get(f"r{number}", record("a" * 91)) for number in range(ROBOTS)}
-    return [check.name for check in sharing_checks(bounds, full, [(0, end_us)]) if not check.ok]
+    full = {f"r{number}": records.get(f"r{number}", record("a" * 91)) for number in range(bounds.robots)}
+    return [check.name for check in sharing_checks(bounds, full, list(pairwise((0, *ends_us))), each) if not check.ok]
 
 
 KILLED = BOUNDS["shared-killed"]
@@ -67,6 +68,20 @@ def test_a_gap_counts_for_the_span_that_it_reaches_into():
     assert worst_gap_ms({"r1": gap}, 0, 42 * STEP_US) >= 3 * 66 - 1
 
 
+def test_a_gap_counts_only_after_the_last_harm_of_several():
+    gap, parted = record("a" * 91), BOUNDS["shared-parted"]
+    del gap["accepted"][20:25]
+    assert failed(parted, {"r1": gap}, (3_000 * MS, 6_000 * MS), each=2) == []
+    assert failed(parted, {"r1": gap}, (1_000 * MS, 6_000 * MS), each=2) == ["between two commands, worst robot"]
+    assert failed(parted, {"r1": gap}, (2_500 * MS, 3_000 * MS, 4_000 * MS, 6_000 * MS), each=2) == []
+
+
+def test_a_robot_that_joined_and_was_forgotten_is_found():
+    lost = record("a" * 20)
+    assert failed(BOUNDS["shared-200"], {"r150": lost}) == ["between two commands, worst robot"]
+    assert failed(BOUNDS["shared-200"], {"r150": record("")})[0] == "robots that drive"
+
+
 def test_standing_is_found_also_until_the_end():
     stood = record("a" * 91, holds=[(1_000 * MS, 1_600 * MS), (2_000 * MS, 2_100 * MS)])
     assert longest_stand_s({"r1": stood}, 0, 6_000 * MS) == pytest.approx(0.6)
@@ -76,7 +91,7 @@ def test_standing_is_found_also_until_the_end():
 
 
 def test_frames_that_two_services_look_at_are_found():
-    twice = {f"r{number}": record("a" * 91, answers_per_frame=2.0) for number in range(ROBOTS)}
+    twice = {f"r{number}": record("a" * 91, answers_per_frame=2.0) for number in range(KILLED.robots)}
     assert looks_per_frame(twice) == 2.0
     assert failed(KILLED, twice) == ["answers of all services over frames"]
     assert failed(BOUNDS["shared-alone"], twice) == [], "one service cannot"
