@@ -259,8 +259,9 @@ class SharedFleet(Fleet):
 
     def _turn_of(self, robot: str) -> None:
         super()._turn_of(robot)
-        self._read_status(robot, self.services[robot], monotonic_us())
-        self._carry_out(robot, self.services[robot])
+        now_us = monotonic_us()
+        self._read_status(robot, self.services[robot], now_us)
+        self._carry_out(robot, self.services[robot], now_us)
 
     def _end(self) -> None:
         """Hand the robots over, and end. A robot that no service claims keeps its last command until it is too old."""
@@ -317,15 +318,17 @@ class SharedFleet(Fleet):
         elif self.sharing.needs_session(robot, is_mine=mine, now_us=now_us):
             self._renew(robot, service)
 
-    def _carry_out(self, robot: str, service: Service) -> None:
+    def _carry_out(self, robot: str, service: Service, now_us: int) -> None:
         shared = self.sharing.robots.get(robot)
         part = shared.part if shared else SharingPart.NONE
+        if self.sharing.is_about_to_drive(robot, now_us):
+            service.listen()  # before the token, so that the former driver leaves when this one has frames
+        elif part is not SharingPart.DRIVE:
+            service.rest()
         if part in (SharingPart.CLAIM, SharingPart.DRIVE) and robot not in self._withdraw:
             self._renew(robot, service)
         if part is SharingPart.DRIVE and service.is_standby:
             service.begin()
-        elif part is not SharingPart.DRIVE and not service.is_standby:
-            service.rest()
         if part in (SharingPart.NONE, SharingPart.STANDBY):
             self._withdraw_token(robot)
 

@@ -209,9 +209,10 @@ class Service:
         attach_detector(self._detector, link)
         self._cameras: LatestSlot[Message] = link.latest(CAMERA)
         self._frames = self._arrivals()
-        self.is_standby = is_standby
+        self._ahead = LatestSlot[Message]()
+        self._is_subscribed, self.is_standby = False, is_standby
         if not is_standby:
-            self._subscribe()
+            self.listen()
         self._camera: CameraModel | None = None
         self._pipeline: Pipeline | None = None
         self.sender = DriverSession()
@@ -234,20 +235,31 @@ class Service:
         """Return the slot of the messages to answer."""
         return LatestSlot()
 
-    def _subscribe(self) -> None:
-        for channel in self._looks_at:
-            self._link.subscribe(channel, self._frames.put)
+    def listen(self) -> None:
+        """Receive frames from now on. A standby keeps the newest for `begin`."""
+        if not self._is_subscribed:
+            self._is_subscribed = True
+            for channel in self._looks_at:
+                self._link.subscribe(channel, self._receive)
+
+    def _receive(self, message: Message) -> None:
+        (self._ahead if self.is_standby else self._frames).put(message)
 
     def begin(self) -> None:
-        """Receive frames from now on. The frames before were not lost."""
-        self.is_standby, self._loss, self._heard_s = False, FrameLoss(), time.monotonic()
-        self._subscribe()
+        """Answer frames from now on, first the newest one. Those before were not lost."""
+        self._loss, self._heard_s = FrameLoss(), time.monotonic()
+        self.listen()
+        if (newest := self._ahead.take()) is not None:
+            self._frames.put(newest)
+        self.is_standby = False
 
     def rest(self) -> None:
         """Receive no more frames, but the model of the camera and requested missions."""
         self.is_standby = True
-        for channel in self._looks_at:
-            self._link.unsubscribe(channel)
+        if self._is_subscribed:
+            self._is_subscribed = False
+            for channel in self._looks_at:
+                self._link.unsubscribe(channel)
 
     def note_status(self, stamp: Stamp) -> None:
         """Take in a requested mission without a frame: it cites a status that is about as old as this one."""

@@ -3,11 +3,12 @@
     tokens of robots and services -> assignment -> owner and standby of each robot
     part      subscribes to           its token of a driver   left when
     STANDBY   camera model, status    no                      the robot gets another owner or standby
-    CLAIM     the same                yes                     no other driver is left, or it is silent
-    DRIVE     frames too              yes                     a better choice claims the robot
+    CLAIM     frames too              yes                     no other driver is left, or it is silent
+    DRIVE     the same                yes                     a better choice claims the robot
 
-The owner claims; the former driver sees the token and leaves; then the owner drives. So two services never look at the
-frames of one robot, except while one of them hangs. The robot decides by its lease who drives. Nothing here does.
+The owner claims; the former driver sees the token and leaves; then the owner drives, first by the newest frame. A claim
+that has no effect for a second, e.g. because a mission goes on, receives no more frames. So two services never look at
+the frames of one robot, except while one of them hangs. The robot decides by its lease who drives. Nothing here does.
 """
 
 from dataclasses import dataclass, field
@@ -210,6 +211,12 @@ class Sharing:
         one.changed_us = one.mine_us = now_us
         one.tries, one.sent = one.tries + 1, 0
         return True
+
+    def is_about_to_drive(self, robot: str, now_us: int) -> bool:
+        """Return True during the first second of a claim."""
+        one = self.robots.get(robot)
+        return (one is not None and one.part is SharingPart.CLAIM
+                and now_us - one.changed_us < BETWEEN_CHANGES_US)
 
     @staticmethod
     def _changed_lately(robot: SharedRobot, now_us: int) -> bool:

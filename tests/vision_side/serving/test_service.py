@@ -32,13 +32,14 @@ COLOR = VisionConfig(detector=DetectorConfig(kind="hsv"))
 class Bench:
     """A robot's end of the link, and the service on the other."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_standby: bool = False) -> None:
         self.network = MemoryNetwork(seed=1)
         self.robot = self.network.link("r1")
         self.twists: LatestSlot[Message] = self.robot.latest(TWIST)
         self.acks: LatestSlot[Message] = self.robot.latest(ACK)
         self.said: list[str] = []
-        self.service = Service(COLOR, self.network.link("r1", role="vision"), self.said.append)
+        link = self.network.link("r1", role="vision")
+        self.service = Service(COLOR, link, self.said.append, is_standby=is_standby)
         self.now_us = 0
 
     def camera(self, model: CameraModel = MODEL) -> None:
@@ -75,6 +76,34 @@ def test_a_frame_is_answered_by_a_twist_that_names_it(bench: Bench) -> None:
         assert (header.echo.session, header.echo.seq, header.echo.t_us) == ("0000abcd", seq, seq * 33_333)
         assert (header.seq, header.compute_us > 0) == (seq, True)
         assert parse_twist(message.payload).angular_rad_s > 0
+
+
+def test_a_standby_that_listens_answers_nothing_until_it_begins_and_then_the_newest_frame_first() -> None:
+    bench = Bench(is_standby=True)
+    bench.camera()
+    bench.frame(BALL, 1)
+    bench.service.listen()
+    bench.service.listen()
+    for seq in (2, 3):
+        bench.frame(BALL, seq)
+    assert bench.twists.take() is bench.acks.take() is None
+    bench.service.begin()
+    answered = []
+    for seq in (4, 5):
+        bench.turn()
+        answered.append(bench.twists.take())
+        bench.frame(BALL, seq)
+        answered.append(bench.twists.take())
+    assert [message and decode(AnswerHeader, message.header).echo.seq for message in answered] == [3, 4, None, 5]
+    bench.service.rest()
+    bench.service.rest()
+    bench.frame(BALL, 6)
+    assert bench.twists.take() is None
+    bench.service.begin()
+    bench.turn()
+    assert bench.twists.take() is None, "a frame from before the rest is not answered"
+    bench.frame(BALL, 7)
+    assert bench.twists.take() is not None
 
 
 def test_on_a_lossy_link_a_twist_is_sent_twice_with_a_new_number_and_a_new_proof(bench: Bench) -> None:

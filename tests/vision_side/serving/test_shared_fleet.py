@@ -2,6 +2,7 @@
 
 import threading
 from contextlib import ExitStack
+from itertools import pairwise
 
 import pytest
 
@@ -139,6 +140,20 @@ def test_no_robot_stands_when_services_come_end_and_die(site):
         assert until(lambda: sum(len(one.driving) for one in visions if one._thread.is_alive()) == len(names))
         assert drives_on(robots, monotonic_us())
     assert stood(robots, since_us) == []
+
+
+@pytest.mark.alone
+def test_no_frame_is_lost_when_services_come_and_end(site):
+    robots, visions, endpoint = site
+    visions.append(Vision("c", endpoint))
+    for change in (lambda: None, visions[0].end, visions[1].end):
+        since_us = monotonic_us()
+        change()
+        assert until(lambda: sum(len(one.driving) for one in visions if one._thread.is_alive()) == len(robots))
+        assert drives_on(robots, monotonic_us())
+        for robot in robots:
+            captured_us = sorted(capture_us for at_us, _, capture_us in robot.accepted if at_us > since_us)
+            assert max(after - before for before, after in pairwise(captured_us)) < 1.5e6 / 15
 
 
 def test_a_robot_that_rejects_the_session_gets_a_new_one(site):

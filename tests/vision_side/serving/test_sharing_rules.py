@@ -62,6 +62,18 @@ def test_an_owner_claims_at_once_and_drives_when_the_former_driver_leaves():
     assert sharing.step(20) == {robot: DRIVE}
 
 
+def test_an_owner_is_about_to_drive_in_the_first_second_of_its_claim():
+    robot = robot_whose("a", "b")
+    assert not service(robot_whose("b", "a")).is_about_to_drive(robot_whose("b", "a"), 0), "a standby"
+    sharing = service(robot, driver(robot), at_us=5_000)
+    assert not sharing.is_about_to_drive("unknown", 5_000)
+    assert [sharing.is_about_to_drive(robot, 5_000 + us) for us in (0, 1_000 * MS - 1, 1_000 * MS)] == [
+        True, True, False]
+    sharing.on_token(driver(robot), False, 6_000)
+    sharing.step(6_000)
+    assert not sharing.is_about_to_drive(robot, 6_000), "it drives"
+
+
 def test_an_owner_of_a_robot_without_driver_drives_in_one_step():
     sharing = Sharing(OWN)
     sharing.on_token(RobotToken("r1"), True, 0)
