@@ -283,6 +283,11 @@ class Link(Closing):
 class FleetLink(Closing):
     """The links to all robots of one session."""
 
+    @property
+    @abstractmethod
+    def connected(self) -> bool:
+        """Return True if at least one peer is connected. It becomes False just after the tokens of the peer end."""
+
     @abstractmethod
     def robots(self) -> list[str]:
         """Return the ids of the present robots, in the order of their first message. A silent robot is forgotten."""

@@ -217,6 +217,8 @@ class Fleet:
 
 
 _LONGEST_SHARED_WAIT_S = 0.02
+_TOKEN_ENDS_AFTER_US = 5_000
+"""If the link ends, the tokens beyond it end a fraction of a millisecond before that is known."""
 _HANDS_OVER_WITHIN_S = 0.6
 _MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn
 
@@ -229,7 +231,9 @@ class SharedFleet(Fleet):
     ) -> None:
         """Create the fleet, see `Fleet`. It is present from now on."""
         super().__init__(config, fleet_link, report, detector)
-        self._tokens: deque[tuple[Token, bool]] = deque(maxlen=_MAX_TOKENS)
+        self._tokens: deque[tuple[Token, bool, int]] = deque(maxlen=_MAX_TOKENS)
+        """Each with its presence and the time from which it counts."""
+        self._is_up = True
         self._statuses: dict[str, LatestSlot[Message]] = {}
         self._withdraw: dict[str, Callable[[], None]] = {}
         """Ends the token with which a robot is driven."""
@@ -246,8 +250,10 @@ class SharedFleet(Fleet):
     def turn(self) -> None:
         """Decide the part in each robot, then serve those that it drives."""
         now_us = monotonic_us()
-        while self._tokens:
-            self.sharing.on_token(*self._tokens.popleft(), now_us)
+        self._watch_link(now_us)
+        while self._tokens and self._tokens[0][2] <= now_us:
+            token, is_present, _ = self._tokens.popleft()
+            self.sharing.on_token(token, is_present, now_us)
         changed = self.sharing.step(now_us)
         super().turn()
         for robot, part in changed.items():
@@ -256,6 +262,15 @@ class SharedFleet(Fleet):
             self._twin_reported = True
             self._report(f"vision: another service is named {self.sharing.own.name}; it drives the robots. Give each "
                          "service its own --name")
+
+    def _watch_link(self, now_us: int) -> None:
+        """Note the end and the return of the link to a router. With it, robots lost the sessions that drove them."""
+        is_up = bool(self._config.listen) or self._fleet_link.connected
+        if is_up is not self._is_up:
+            self._is_up = is_up
+            self.sharing.on_link(is_up, now_us)
+            for robot in tuple(self._withdraw) if is_up else ():
+                self._renew(robot, self.services[robot])
 
     def _turn_of(self, robot: str) -> None:
         super()._turn_of(robot)
@@ -280,11 +295,11 @@ class SharedFleet(Fleet):
     def _note(self, token: Token, is_present: bool) -> None:
         robot = token.robot if isinstance(token, RobotToken | DriverToken) else ""
         if not robot or fnmatchcase(robot, self._config.robot):
-            self._tokens.append((token, is_present))
+            self._tokens.append((token, is_present, monotonic_us() + (0 if is_present else _TOKEN_ENDS_AFTER_US)))
             self._bell.set()
 
     def _wait(self) -> None:
-        self._bell.wait(_LONGEST_SHARED_WAIT_S)
+        self._bell.wait(_TOKEN_ENDS_AFTER_US / 1e6 if self._tokens else _LONGEST_SHARED_WAIT_S)
         self._bell.clear()
 
     def _present(self) -> list[str]:

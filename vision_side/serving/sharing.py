@@ -32,6 +32,9 @@ NOT_MINE_US: Final = 300_000
 """Time without the lease, although commands leave, after which a driver needs a new session."""
 FRESH_COMMANDS: Final = 48
 """Commands of one session without the lease. After 64 a robot no longer knows whose token it is."""
+RETURN_US: Final = 2_000_000
+"""Time from the return of the link of this service until a token that ended with it, and is not back, counts as ended.
+Robots and services try to connect once a second, or more often."""
 MAX_ROBOTS, MAX_SERVICES, MAX_DRIVERS = 10_000, 256, 16
 """Security limits: robots, services, and drivers of one robot. Further tokens do not count."""
 MAX_OWN: Final = 2 * MAX_ROBOTS
@@ -91,6 +94,11 @@ class SharedRobot:
         """Return True if its statuses show no driver at work."""
         return self.status_us - self.active_us >= SILENT_US
 
+    def begin_part(self, now_us: int) -> None:
+        """Forget what the statuses showed before."""
+        self.active_us = self.part_us = now_us
+        self.has_frames, self.frames = False, _UNKNOWN
+
 
 class Sharing:
     """The robots of one vision service among others.
@@ -110,6 +118,9 @@ class Sharing:
         self._services: set[VisionToken] = set()
         self._choices: dict[str, tuple[str, str]] = {}
         self._is_changed = True
+        self._is_up, self._up_us = True, 0
+        self._ended: set[Token] = set()
+        """Tokens that ended with the link of this service, which says nothing of what they stand for."""
 
     @property
     def has_twin(self) -> bool:
@@ -132,9 +143,19 @@ class Sharing:
         present = sorted((*self._services, self.own), key=lambda one: one.instance, reverse=True)
         return {one.name: one.weight for one in present if not (self._is_leaving and one == self.own)}
 
+    def on_link(self, is_up: bool, now_us: int) -> None:
+        """Note the end or the return of the link of this service. Until it is back, nothing changes."""
+        self._is_up, self._up_us = is_up, now_us
+        for robot in self.robots.values():
+            robot.begin_part(now_us)
+            robot.driverless_us, robot.mine_us, robot.sent = now_us, now_us, 0
+
     def on_token(self, token: Token, is_present: bool, now_us: int) -> None:
-        """Note a token that appeared or ended."""
-        if isinstance(token, DriverToken):
+        """Note a token that appeared or ended, before the end of the link that ended it."""
+        self._ended.discard(token)
+        if not is_present and not self._is_up:
+            self._ended.add(token)
+        elif isinstance(token, DriverToken):
             self._on_driver(token, is_present, now_us)
         elif isinstance(token, RobotToken):
             self._on_robot(token.robot, is_present, now_us)
@@ -224,6 +245,11 @@ class Sharing:
 
     def step(self, now_us: int) -> dict[str, SharingPart]:
         """Decide the part in each robot from now on. Returns the robots whose part changed."""
+        if not self._is_up:
+            return {}
+        if now_us - self._up_us >= RETURN_US:
+            while self._ended:
+                self.on_token(self._ended.pop(), False, now_us)
         if self._is_changed:
             self._choices, self._is_changed = assign(self.robots, self.services()), False
         changed = {}
@@ -244,8 +270,7 @@ class Sharing:
             robot.mine_us, robot.sent = now_us, 0
         # Without a part, no status came: what it showed before is over. A standby knows that the driver is silent.
         if part is not SharingPart.CLAIM or robot.part is SharingPart.NONE:
-            robot.active_us = robot.part_us = now_us
-            robot.has_frames, robot.frames = False, _UNKNOWN
+            robot.begin_part(now_us)
         robot.part = part
 
     def _next_part(self, name: str, robot: SharedRobot, now_us: int) -> SharingPart:

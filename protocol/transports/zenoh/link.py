@@ -406,6 +406,12 @@ class ZenohFleet(FleetLink):
         self._ending.callback(session.close)
         self._heard_s: dict[str, float] = {}
         self._on_new_robot: Callable[[], None] = lambda: None
+        self._peers = _ConnectedPeers(session, self._ending)
+
+    @property
+    def connected(self) -> bool:
+        """Return True if at least one peer is connected, see `FleetLink`."""
+        return bool(self._peers.zids)
 
     def announce(self, here: PresenceAnnouncer) -> None:
         """Answer presence queries."""

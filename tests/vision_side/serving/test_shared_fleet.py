@@ -1,7 +1,9 @@
 """Vision services that share robots over real Zenoh sessions; the robots have their real gate."""
 
+import subprocess
+import sys
 import threading
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 
 import pytest
@@ -50,6 +52,16 @@ class Vision:
         self._ending.set()
 
 
+@contextmanager
+def router_at(endpoint):
+    """A router in a process of its own. A test may kill it: one that ends in order first ends the tokens."""
+    code = f"from {open_session.__module__} import *; one = open_session([{endpoint!r}], (), 5.0); print(1); input()"
+    with subprocess.Popen([sys.executable, "-Pc", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout.read(1)
+        yield process
+        process.kill()
+
+
 @pytest.fixture
 def site(tmp_path):
     """Four robots and two services at a router."""
@@ -59,7 +71,7 @@ def site(tmp_path):
     endpoint, ending = free_endpoint(), threading.Event()
     settings = Settings(endpoint=endpoint, robots=4, fps=15, pictures=pictures, notes=tmp_path / "notes", seed=1)
     with ExitStack() as closing:
-        closing.callback(open_session([endpoint], (), 5.0).close)
+        router = closing.enter_context(router_at(endpoint))
         visions = [Vision(name, endpoint) for name in ("a", "b")]
         links = [closing.enter_context(open_zenoh(f"r{number}", connect=[endpoint], role="robot"))
                  for number in range(1, 5)]
@@ -68,7 +80,7 @@ def site(tmp_path):
         playing.start()
         assert until(lambda: all(len(robot.accepted) > 10 for robot in robots), 10)
         assert until(lambda: visions[0].driving | visions[1].driving == {robot.name for robot in robots})
-        yield robots, visions, endpoint
+        yield robots, visions, endpoint, router
         for vision in visions:
             if vision._thread.is_alive():
                 vision.end()
@@ -95,7 +107,7 @@ def withdrawn(robots, since_us):
 
 
 def test_services_share_the_robots_and_each_frame_goes_to_one(site):
-    robots, (first, second), _ = site
+    robots, (first, second), *_ = site
     assert not first.driving & second.driving
     since_us = monotonic_us()
     sent = sum(robot.record["sent"] for robot in robots)
@@ -109,7 +121,7 @@ def test_services_share_the_robots_and_each_frame_goes_to_one(site):
 
 @pytest.mark.parametrize("how", ["die", "end"])
 def test_no_command_is_withdrawn_when_a_service_dies_or_ends(site, how):
-    robots, (first, second), _ = site
+    robots, (first, second), *_ = site
     since_us = monotonic_us()
     getattr(first, how)()
     assert until(lambda: second.driving == {robot.name for robot in robots})
@@ -118,7 +130,7 @@ def test_no_command_is_withdrawn_when_a_service_dies_or_ends(site, how):
 
 
 def test_a_service_that_comes_takes_robots_and_withdraws_no_command(site):
-    robots, visions, endpoint = site
+    robots, visions, endpoint, _ = site
     since_us = monotonic_us()
     visions.append(Vision("c", endpoint))
     mine = {robot for robot, (owner, _) in assign([one.name for one in robots], dict.fromkeys("abc", 1.0)).items()
@@ -131,7 +143,7 @@ def test_a_service_that_comes_takes_robots_and_withdraws_no_command(site):
 
 @pytest.mark.alone
 def test_no_robot_stands_when_services_come_end_and_die(site):
-    robots, visions, endpoint = site
+    robots, visions, endpoint, _ = site
     names = {robot.name for robot in robots}
     since_us = monotonic_us()
     visions.append(Vision("c", endpoint))
@@ -144,7 +156,7 @@ def test_no_robot_stands_when_services_come_end_and_die(site):
 
 @pytest.mark.alone
 def test_no_frame_is_lost_when_services_come_and_end(site):
-    robots, visions, endpoint = site
+    robots, visions, endpoint, _ = site
     visions.append(Vision("c", endpoint))
     for change in (lambda: None, visions[0].end, visions[1].end):
         since_us = monotonic_us()
@@ -156,8 +168,25 @@ def test_no_frame_is_lost_when_services_come_and_end(site):
             assert max(after - before for before, after in pairwise(captured_us)) < 1.5e6 / 15
 
 
+@pytest.mark.slow
+def test_services_outlive_the_end_of_their_router_and_drive_at_its_return(site):
+    robots, visions, endpoint, router = site
+    before = [(vision.fleet.services, vision.driving, dict(vision.fleet.services)) for vision in visions]
+    digests = {robot.name: robot.accepted[-1][1] for robot in robots}
+    router.kill()
+    assert until(lambda: not any(vision.link.connected for vision in visions))
+    assert until(lambda: not any(robot.core.gate._lease.token for robot in robots)), "each robot ends the lease"
+    with router_at(endpoint):
+        since_us = monotonic_us()
+        assert drives_on(robots, since_us)
+        for services, driving, same in before:
+            assert services == same and {robot for robot, one in services.items() if not one.is_standby} == driving
+        assert all(digests[robot.name] != digest for robot in robots for at_us, digest, _ in robot.accepted
+                   if at_us > since_us), "a session whose token ended drives no more"
+
+
 def test_a_robot_that_rejects_the_session_gets_a_new_one(site):
-    robots, _, _ = site
+    robots, *_ = site
     robot, since_us = robots[0], monotonic_us()
     fenced = robot.accepted[-1][1]
     with robot._lock:
@@ -168,7 +197,7 @@ def test_a_robot_that_rejects_the_session_gets_a_new_one(site):
 
 
 def test_the_standby_has_the_camera_and_no_frames(site):
-    robots, visions, _ = site
+    robots, visions, *_ = site
     for vision in visions:
         standby = {name: one for name, one in vision.fleet.services.items() if one.is_standby}
         assert standby, "each of two services stands by for the robots of the other"

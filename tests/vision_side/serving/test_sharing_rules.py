@@ -50,6 +50,70 @@ def see(sharing, at_us, commands=0, *, mine=False, state=State.ACTIVE, holder=No
     return sharing.needs_session(robot, is_mine=mine, now_us=at_us)
 
 
+# --- the own link ----------------------------------------------------------------------------------------------------
+
+
+def test_nothing_changes_while_the_own_link_is_down_and_what_is_not_back_in_two_seconds_has_ended():
+    mine, driven, gone = robot_whose("a", "b"), robot_whose("b", "a"), robot_whose("c", "a")
+    sharing = service(mine, driver(driven))
+    for token in (RobotToken(driven), RobotToken(gone)):
+        sharing.on_token(token, True, 0)
+    sharing.step(0)
+    before = {robot: one.part for robot, one in sharing.robots.items()}
+    assert before == {mine: DRIVE, driven: STANDBY, gone: STANDBY}
+    sharing.on_link(False, 10 * MS)
+    for token in (*OTHERS, driver(driven), *map(RobotToken, before)):
+        sharing.on_token(token, False, 10 * MS)
+    assert sharing.step(9_000 * MS) == {}
+    sharing.on_link(True, 10_000 * MS)
+    for token in (*OTHERS, RobotToken(mine), RobotToken(driven)):
+        sharing.on_token(token, True, 10_300 * MS)
+    assert sharing.step(11_400 * MS) == {}
+    sharing.step(12_000 * MS - 1)
+    assert gone in sharing.robots and len(sharing.robots[driven].drivers) == 1
+    sharing.step(12_000 * MS)
+    assert {robot: one.part for robot, one in sharing.robots.items()} == {mine: DRIVE, driven: STANDBY}
+    assert not sharing.robots[driven].drivers and len(sharing.services()) == 5
+    sharing.on_token(OTHERS[0], False, 13_000 * MS)
+    assert len(sharing.services()) == 4, "an end counts at once again"
+
+
+def test_time_without_a_driver_counts_from_the_return_of_the_own_link():
+    sharing = service(robot_whose("b", "a"))
+    sharing.on_link(False, 100 * MS)
+    sharing.on_link(True, 5_000 * MS)
+    assert sharing.step(6_500 * MS - 1) == {} != sharing.step(6_500 * MS)
+
+
+@pytest.mark.parametrize(("seen_ms", "after_ms"), [(100, 480), (400, 780)])
+def test_standby_gives_a_driver_time_after_the_own_link_returned(seen_ms, after_ms):
+    """The robot may return later than this service, and shows an older silence."""
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    for ms in range(0, 400, 100):
+        see(sharing, ms * MS, accepted=ms, sent=ms)
+    sharing.on_link(False, 500 * MS)
+    sharing.on_link(True, 3_000 * MS)
+    for ms in range(seen_ms, 3_000, 10):
+        see(sharing, (3_000 + ms) * MS, accepted=400, sent=400 + (ms == seen_ms + 10))
+        sharing.step((3_000 + ms) * MS)
+        if part(sharing) is not STANDBY:
+            break
+    assert ms == pytest.approx(after_ms, abs=20)
+
+
+def test_driver_is_not_without_the_lease_while_the_own_link_is_down():
+    robot = robot_whose("a", "b")
+    sharing = service(robot)
+    see(sharing, 0, commands=5, mine=True, holder=VISION)
+    sharing.on_link(False, 100 * MS)
+    sharing.on_link(True, 3_000 * MS)
+    assert not see(sharing, 3_100 * MS, commands=0)
+    assert not see(sharing, 3_200 * MS, commands=2)
+    assert not see(sharing, 3_399 * MS, commands=4)
+    assert see(sharing, 3_400 * MS, commands=5)
+
+
 # --- claims -----------------------------------------------------------------------------------------------------------
 
 
