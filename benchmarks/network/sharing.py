@@ -33,6 +33,8 @@ _SETTLE_S: Final = 4.0
 _PORTS: Final = (7447, 7448)
 _FROZEN_S: Final = 3.0
 _HEALED_S: Final = 5.0
+_ROBOT_PROCESSES: Final = 5
+"""With all robots in one process, its sessions wait for each other: 40 ms for each when they lose a router."""
 Record = Mapping[str, Any]
 
 
@@ -162,22 +164,29 @@ class Site:
         self._start(name, "shares robots", "vision", "--share", "--name", name, "--detector", DETECTOR,
                     *_connect(endpoints))
 
-    def start_robots(self, settings: Settings) -> str:
+    def start_robots(self, first: int, robots: int, pause_s: float) -> str:
         """Start a process of robots. Returns its name."""
-        name = f"robots-{settings.first}"
+        name = f"robots-{first}"
+        changes = {"first": first, "robots": robots, "pause_s": pause_s, "notes": self.stage.folder / f"{name}.json"}
+        settings = self.settings.model_copy(update=changes)
         self.processes.start(name, [settings.model_dump_json()], namespace=self.wire.robot_side,
                              module="sightline.benchmarks.network.gated_robots")
-        self.processes.wait_line(name, f"playing {settings.robots} robots")
         return name
+
+    def records(self) -> dict[str, Record]:
+        """Return what the robots wrote that were there from the beginning."""
+        records: dict[str, Record] = {}
+        for notes in self.stage.folder.glob("robots-*.json"):
+            records |= json.loads(notes.read_text("utf-8"))
+        return {name: record for name, record in records.items() if int(name[1:]) <= self.bounds.robots}
 
     def join(self, number: int) -> None:
         """Let another robot join for a while."""
-        notes = self.stage.folder / f"joined{number}.json"
-        alone = {"robots": 1, "first": self.bounds.robots + 1 + number, "notes": notes, "pause_s": 0.0}
-        name = self.start_robots(self.settings.model_copy(update=alone))
+        name = self.start_robots(self.bounds.robots + 1 + number, 1, 0.0)
+        self.processes.wait_line(name, "playing")
         time.sleep(3.0)
         self.processes.end_one(name)
-        (record,) = json.loads(notes.read_text("utf-8")).values()
+        (record,) = json.loads((self.stage.folder / f"{name}.json").read_text("utf-8")).values()
         first_us = record["accepted"][0][0] if record["accepted"] else math.inf
         self.joined_s.append((first_us - record["began_us"]) / 1e6)
 
@@ -296,7 +305,7 @@ def shared(row: NetworkCase, stage: Stage) -> NetworkRun:
                 harm(site, len(begins_us) - 1)
         spans_us = list(pairwise([*begins_us, monotonic_us()]))
         site.processes.end()
-    records = json.loads(site.settings.notes.read_text("utf-8"))
+    records = site.records()
     checks = [at_least("injected", float(len(spans_us)), "times", 1.0),
               *sharing_checks(bounds, records, spans_us, len(harms))]
     if site.joined_s:
@@ -320,7 +329,10 @@ def _site(row: NetworkCase, stage: Stage, bounds: SharingBounds) -> Iterator[Sit
             site.start_router(number)
         for number in range(bounds.services):
             site.start_service(f"v{number}")
-        site.start_robots(settings)
+        each = bounds.robots // _ROBOT_PROCESSES
+        names = [site.start_robots(first, each, 1.0) for first in range(1, bounds.robots + 1, each)]
+        for name in names:
+            processes.wait_line(name, "playing")
         time.sleep(_SETTLE_S)
         yield site
         wire.shape(LinkShapes())
