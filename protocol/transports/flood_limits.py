@@ -8,14 +8,12 @@ docs/explanation/decisions/0010-floods.md states what else was tried.
 
 import ctypes
 import ipaddress
-import os
 import socket
 import struct
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -23,6 +21,7 @@ from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.diagnosis import OWN_HOST, connection_ends, listening_inodes, opened_connections
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint, parse_zenoh_endpoint
+from sightline.protocol.transports.sockets import close_without_waiting, own_sockets
 from sightline.protocol.transports.zenoh.session import MAX_SESSIONS
 
 MAX_OPEN: Final = MAX_SESSIONS
@@ -145,6 +144,7 @@ def _watch(ports: set[int], zenoh_ports: set[int], report: Callable[[str], None]
         # A connection that comes between these two lines is not counted, which a flood does not need.
         accepted = dict(_accepted)
         _accepted.clear()
+        close_without_waiting()
         floods = detector.sample(connection_ends(ports), now_us, accepted)
         # Before the report, so that what the log states is true.
         if detector.blocked(now_us) != blocked:
@@ -175,18 +175,9 @@ _ACKED_BYTES: Final = struct.Struct("120xQ")
 _DEFER_S: Final = 10
 
 
-def _sockets(wanted: Callable[[str], bool]) -> Iterator[socket.socket]:
-    """Yield the sockets of this process whose entry in `/proc/self/fd` is wanted, each to be used before the next."""
-    for link in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):  # closed meanwhile, or another system
-            if wanted(str(link.readlink())):
-                with socket.socket(fileno=os.dup(int(link.name))) as one:
-                    yield one
-
-
 def _defer(inodes: set[str]) -> None:
     """Let the kernel accept a connection with its first byte, which an honest peer sends when it connects."""
-    for listener in _sockets(inodes.__contains__):
+    for listener in own_sockets(inodes.__contains__):
         # The option may be set while the socket listens already. It holds for connections from now on.
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, _DEFER_S)
 
@@ -197,7 +188,7 @@ def _end_half_open(ports: set[int], hosts: Sequence[str], waiting: set[Peer]) ->
     A session that is open has received bytes. A peer that is silent, or stops amid a handshake, has not.
     """
     unanswered: set[Peer] = set()
-    for one in _sockets(lambda name: name.startswith("socket:")):
+    for one in own_sockets():
         with suppress(OSError):  # no TCP socket
             if one.family not in (socket.AF_INET, socket.AF_INET6) or one.getsockname()[1] not in ports:
                 continue
@@ -249,7 +240,7 @@ def _block(ports: set[int], hosts: Sequence[str]) -> None:
     program = b"".join(_INSTRUCTION.pack(*row) for row in source_filter(addresses))
     buffer = ctypes.create_string_buffer(program)
     pointer = struct.pack("HP", len(program) // _INSTRUCTION.size, ctypes.addressof(buffer))
-    for listener in _sockets(_listeners(ports).__contains__):
+    for listener in own_sockets(_listeners(ports).__contains__):
         listener.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, pointer)
 
 

@@ -286,7 +286,12 @@ class FleetLink(Closing):
     @property
     @abstractmethod
     def connected(self) -> bool:
-        """Return True if at least one peer is connected. It becomes False just after the tokens of the peer end."""
+        """Return True if at least one peer is connected."""
+
+    @property
+    @abstractmethod
+    def losses(self) -> int:
+        """Return how often the last peer was lost. It increases just after the tokens of that peer ended."""
 
     @abstractmethod
     def robots(self) -> list[str]:

@@ -22,6 +22,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
 from sightline.protocol.transports.link import NOT_A_PUT, BaseLink, FleetLink, Link, LinkRules, Message
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
+from sightline.protocol.transports.sockets import close_without_waiting
 from sightline.protocol.transports.tokens import (
     ALL_TOKENS,
     AnyToken,
@@ -110,7 +111,7 @@ class ZenohLink(BaseLink):
         self._ending.callback(lambda: self._undeclare([one for some in self._subscribers.values() for one in some]))
         self._declaring = threading.Lock()
         self._in_callback = threading.local()
-        self._peers = _ConnectedPeers(session, self._ending)
+        self._peers = _ConnectedPeers(session, self._ending, shared)
 
     @property
     def connected(self) -> bool:
@@ -325,10 +326,12 @@ class _MatchedPublisher:
 class _ConnectedPeers:
     """The connected peers. A thread of Zenoh updates them."""
 
-    def __init__(self, session: zenoh.Session, ending: ExitStack) -> None:
+    def __init__(self, session: zenoh.Session, ending: ExitStack, shared: bool = False) -> None:
         import zenoh
 
+        self._shared = shared
         self.zids: set[str] = set()
+        self.losses = 0
         handler = zenoh.handlers.Callback(self._note, indirect=False)
         listener = session.info.declare_transport_events_listener(handler, history=True)
         ending.callback(listener.undeclare)
@@ -336,8 +339,13 @@ class _ConnectedPeers:
     def _note(self, event: zenoh.TransportEvent) -> None:
         import zenoh
 
-        change = self.zids.add if event.kind == zenoh.SampleKind.PUT else self.zids.discard
-        change(str(event.transport.zid))
+        if event.kind == zenoh.SampleKind.PUT:
+            if not self._shared:
+                close_without_waiting()
+            self.zids.add(str(event.transport.zid))
+        else:
+            self.zids.discard(str(event.transport.zid))
+            self.losses += not self.zids
 
 
 # Many robots over one Zenoh session: their ids, and a `Link` to each. Shell.
@@ -410,8 +418,13 @@ class ZenohFleet(FleetLink):
 
     @property
     def connected(self) -> bool:
-        """Return True if at least one peer is connected, see `FleetLink`."""
+        """Return True if at least one peer is connected."""
         return bool(self._peers.zids)
+
+    @property
+    def losses(self) -> int:
+        """Return how often the last peer was lost, see `FleetLink`."""
+        return self._peers.losses
 
     def announce(self, here: PresenceAnnouncer) -> None:
         """Answer presence queries."""

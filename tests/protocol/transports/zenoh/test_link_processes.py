@@ -6,6 +6,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import pytest
 
@@ -108,6 +109,30 @@ def test_a_client_reconnects_after_being_away_longer_than_its_timeout(start):
 
 @pytest.mark.waits
 @pytest.mark.own_process
+def test_sessions_of_a_process_reach_the_next_router_when_one_hangs_with_data_on_its_way(start):
+    """The close of such a connection waited for 10 s, in a thread that receives for every session of the process."""
+    endpoints = [free_endpoint(), free_endpoint()]
+    routers = [start("import zenoh\nfrom sightline.protocol.transports.zenoh.session import open_session\n"
+                     "session = open_session([endpoint], (), 5.0)\nprint('ready', flush=True)\ntime.sleep(60)", one)
+               for one in endpoints]
+    assert all(router.stdout.readline() for router in routers)
+    robots = [f"r{number}" for number in range(4)]
+    with ExitStack() as closing:
+        links = [closing.enter_context(open_zenoh(robot, connect=endpoints)) for robot in robots]
+        for robot in robots:
+            closing.enter_context(open_zenoh(robot, connect=endpoints)).latest(FRAME)
+        first = set.union(*(link._peers.zids for link in links))
+        assert until(lambda: all(link.has_listener(FRAME) for link in links))
+        routers[0].send_signal(signal.SIGSTOP)
+
+        def are_at_the_next():
+            for link in links:
+                link.publish(FRAME, b"{}", b"x" * 10_000)
+            return all(not link._peers.zids & first and link.has_listener(FRAME) for link in links)
+
+        assert until(are_at_the_next, 6.0)
+
+
 def test_a_stopped_peer_costs_neither_time_nor_memory_nor_others(start):
     endpoint = free_endpoint()
     with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as healthy:
