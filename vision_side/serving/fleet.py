@@ -233,7 +233,7 @@ class SharedFleet(Fleet):
         super().__init__(config, fleet_link, report, detector)
         self._tokens: deque[tuple[Token, bool, int]] = deque(maxlen=_MAX_TOKENS)
         """Each with its presence and the time from which it counts."""
-        self._is_up = True
+        self._is_up, self._losses = True, fleet_link.losses
         self._statuses: dict[str, LatestSlot[Message]] = {}
         self._withdraw: dict[str, Callable[[], None]] = {}
         """Ends the token with which a robot is driven."""
@@ -251,9 +251,7 @@ class SharedFleet(Fleet):
         """Decide the part in each robot, then serve those that it drives."""
         now_us = monotonic_us()
         self._watch_link(now_us)
-        while self._tokens and self._tokens[0][2] <= now_us:
-            token, is_present, _ = self._tokens.popleft()
-            self.sharing.on_token(token, is_present, now_us)
+        self._take_tokens(now_us, now_us)
         changed = self.sharing.step(now_us)
         super().turn()
         for robot, part in changed.items():
@@ -265,12 +263,23 @@ class SharedFleet(Fleet):
 
     def _watch_link(self, now_us: int) -> None:
         """Note the end and the return of the link to a router. With it, robots lost the sessions that drove them."""
-        is_up = bool(self._config.listen) or self._fleet_link.connected
-        if is_up is not self._is_up:
-            self._is_up = is_up
-            self.sharing.on_link(is_up, now_us)
-            for robot in tuple(self._withdraw) if is_up else ():
+        if self._config.listen:
+            return
+        if self._losses != self._fleet_link.losses:
+            self._losses, self._is_up = self._fleet_link.losses, False
+            self.sharing.on_link(False, now_us)
+            self._take_tokens(now_us, now_us + _TOKEN_ENDS_AFTER_US)
+        if not self._is_up and self._fleet_link.connected:
+            self._is_up = True
+            self.sharing.on_link(True, now_us)
+            for robot in tuple(self._withdraw):
                 self._renew(robot, self.services[robot])
+
+    def _take_tokens(self, now_us: int, until_us: int) -> None:
+        """Note the tokens that count from `until_us` or before."""
+        while self._tokens and self._tokens[0][2] <= until_us:
+            token, is_present, _ = self._tokens.popleft()
+            self.sharing.on_token(token, is_present, now_us)
 
     def _turn_of(self, robot: str) -> None:
         super()._turn_of(robot)
