@@ -273,7 +273,10 @@ class SharedFleet(Fleet):
             self._is_up = True
             self.sharing.on_link(True, now_us)
             for robot in tuple(self._withdraw):
-                self._renew(robot, self.services[robot])
+                service = self.services[robot]
+                self._renew(robot, service)
+                if not service.is_standby:
+                    service.begin()
 
     def _take_tokens(self, now_us: int, until_us: int) -> None:
         """Note the tokens that count from `until_us` or before."""

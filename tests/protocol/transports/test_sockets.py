@@ -10,6 +10,7 @@ from sightline.protocol.transports.sockets import close_without_waiting, own_soc
 
 
 def linger(one):
+    """Return whether a socket waits when it closes, and the time in seconds, which counts only then."""
     return struct.unpack("ii", one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8))
 
 
@@ -20,7 +21,7 @@ def test_each_open_socket_of_this_process_is_found_and_can_be_chosen():
         assert {server.getsockname(), other.getsockname()} <= {one.getsockname() for one in own_sockets()}
 
 
-@pytest.mark.parametrize(("before", "after"), [((1, 10), (0, 0)), ((1, 3), (1, 3)), ((0, 0), (0, 0))])
+@pytest.mark.parametrize(("before", "after"), [((1, 10), (0, 10)), ((1, 3), (1, 3)), ((0, 0), (0, 0))])
 def test_only_a_connection_with_the_time_to_linger_of_zenoh_is_changed(before, after):
     with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as one:
         one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", *before))
