@@ -238,7 +238,7 @@ class Service:
     def listen(self) -> None:
         """Receive frames from now on. A standby keeps the newest for `begin`."""
         if not self._is_subscribed:
-            self._is_subscribed = True
+            self._is_subscribed, self._ahead = True, LatestSlot()
             for channel in self._looks_at:
                 self._link.subscribe(channel, self._receive)
 
@@ -260,6 +260,8 @@ class Service:
             self._is_subscribed = False
             for channel in self._looks_at:
                 self._link.unsubscribe(channel)
+            while self._frames.take() is not None:  # the next driver has it too
+                pass
 
     def note_status(self, stamp: Stamp) -> None:
         """Take in a requested mission without a frame: it cites a status that is about as old as this one."""

@@ -95,14 +95,18 @@ def test_a_standby_that_listens_answers_nothing_until_it_begins_and_then_the_new
         bench.frame(BALL, seq)
         answered.append(bench.twists.take())
     assert [message and decode(AnswerHeader, message.header).echo.seq for message in answered] == [3, 4, None, 5]
+    bench.robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=6, t_us=6 * 33_333)), BALL)
+    bench.network.advance(bench.now_us + 1)
     bench.service.rest()
     bench.service.rest()
-    bench.frame(BALL, 6)
-    assert bench.twists.take() is None
+    bench.frame(BALL, 7)
+    bench.service.listen()
+    bench.frame(BALL, 8)
+    bench.service.rest()
     bench.service.begin()
     bench.turn()
-    assert bench.twists.take() is None, "a frame from before the rest is not answered"
-    bench.frame(BALL, 7)
+    assert bench.twists.take() is None, "frames of before are not answered"
+    bench.frame(BALL, 9)
     assert bench.twists.take() is not None
 
 
