@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import ipaddress
+import os
 import socket
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -93,6 +94,23 @@ def opened_connections() -> int | None:
             total += int(dict(zip(names, values, strict=True))[counter])
         return total
     return None
+
+
+def own_sockets(wanted: Callable[[str], bool] = lambda name: name.startswith("socket:")) -> Iterator[socket.socket]:
+    """Yield the sockets of this process, also those that a library opened, each to be used before the next.
+
+    Args:
+        wanted: returns True for the target of an entry in `/proc/self/fd`. By default all sockets.
+    """
+    try:
+        links = list(Path("/proc/self/fd").iterdir())
+    except OSError:  # another system
+        return
+    for link in links:
+        with suppress(OSError):  # closed meanwhile
+            if wanted(str(link.readlink())):
+                with socket.socket(fileno=os.dup(int(link.name))) as one:
+                    yield one
 
 
 def listening_inodes(ports: Collection[int]) -> set[str]:

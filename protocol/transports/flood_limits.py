@@ -19,10 +19,15 @@ from typing import Final, NamedTuple
 
 from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.log import RepeatLimiter
-from sightline.protocol.transports.diagnosis import OWN_HOST, connection_ends, listening_inodes, opened_connections
+from sightline.protocol.transports.diagnosis import (
+    OWN_HOST,
+    connection_ends,
+    listening_inodes,
+    opened_connections,
+    own_sockets,
+)
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint, parse_zenoh_endpoint
-from sightline.protocol.transports.sockets import close_without_waiting, own_sockets
-from sightline.protocol.transports.zenoh.session import MAX_SESSIONS
+from sightline.protocol.transports.zenoh.session import MAX_SESSIONS, close_without_waiting
 
 MAX_OPEN: Final = MAX_SESSIONS
 """Connections of one address, half-open ones included: as many as Zenoh accepts from all addresses, and more than

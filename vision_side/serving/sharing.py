@@ -120,7 +120,7 @@ class Sharing:
         self._is_changed = True
         self._is_up, self._up_us = True, 0
         self._ended: set[Token] = set()
-        """Tokens that ended with the link of this service, which says nothing of what they stand for."""
+        """Tokens that ended with the link of this service, so that nothing is known of what they stand for."""
 
     @property
     def has_twin(self) -> bool:

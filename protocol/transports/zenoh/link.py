@@ -22,7 +22,6 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints
 from sightline.protocol.transports.link import NOT_A_PUT, BaseLink, FleetLink, Link, LinkRules, Message
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
-from sightline.protocol.transports.sockets import close_without_waiting
 from sightline.protocol.transports.tokens import (
     ALL_TOKENS,
     AnyToken,
@@ -35,7 +34,7 @@ from sightline.protocol.transports.tokens import (
     parse_token,
 )
 from sightline.protocol.transports.zenoh.presence import PeerInfo, PresenceAnnouncer, query_presence
-from sightline.protocol.transports.zenoh.session import CLOSED_SESSION, open_session
+from sightline.protocol.transports.zenoh.session import CLOSED_SESSION, close_without_waiting, open_session
 
 if TYPE_CHECKING:
     import zenoh

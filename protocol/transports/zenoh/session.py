@@ -10,12 +10,14 @@ import json
 import logging
 import re
 import socket
+import struct
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError, install_command
-from sightline.protocol.transports.diagnosis import diagnose_tls, port_owner, unresolved_host
+from sightline.protocol.transports.diagnosis import diagnose_tls, own_sockets, port_owner, unresolved_host
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
 from sightline.protocol.transports.security import RoleKeys, size_limit_section
 
@@ -61,6 +63,9 @@ MAX_SESSIONS: Final = 64
 MAX_ROUTER_SESSIONS: Final = 1000
 _OVER_UDP: Final = ("udp", "quic")
 _PROBE_TIMEOUT_S: Final = 0.3
+# Fixed in Zenoh for TCP and TLS. Nothing else in a process of ours sets it.
+_LINGERS_S: Final = 10
+_LINGER: Final = struct.Struct("ii")
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
@@ -117,6 +122,16 @@ def open_session(
             if not _tries_each_once(listen, connect) or time.monotonic() >= until_s:
                 raise _error_of(str(error), listen, connect, timeout_s, secured) from None
         time.sleep(RETRY["period_init_ms"] / 1000)
+
+
+def close_without_waiting() -> None:
+    """Let no connection of Zenoh wait when it closes. The system still sends what is left."""
+    # For the 10 s that Zenoh sets, the close of a link whose other end hangs or is out of reach, with data left to
+    # send, blocks a thread that receives for all sessions of the process.
+    for one in own_sockets():
+        with suppress(OSError):  # no such option
+            if one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.size) == _LINGER.pack(1, _LINGERS_S):
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _LINGER.pack(0, 0))
 
 
 def _tries_each_once(listen: Sequence[str], connect: Sequence[str]) -> bool:

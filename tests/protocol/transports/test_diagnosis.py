@@ -1,14 +1,16 @@
 """The hosts connected to a port: the system's table of TCP sockets, and reports of a host with too many connections."""
 
+import os
 import socket
+import struct
 from contextlib import ExitStack
 
 import pytest
 
 from sightline.protocol.transports import diagnosis, flood_limits
-from sightline.protocol.transports.diagnosis import connection_ends, opened_connections
+from sightline.protocol.transports.diagnosis import connection_ends, opened_connections, own_sockets
 from sightline.protocol.transports.flood_limits import limit_floods
-from sightline.protocol.transports.zenoh.session import MAX_SESSIONS
+from sightline.protocol.transports.zenoh.session import MAX_SESSIONS, close_without_waiting
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
 
@@ -86,3 +88,25 @@ def test_a_flood_of_connections_is_reported_once_with_its_address():
             "67 connections from 127.0.0.1, 22 new ones a second, more than the total limit of 64; "
             "end the program on this machine"
         ]
+
+
+def linger(one):
+    """Return whether a socket waits when it closes, and the time in seconds, which counts only then."""
+    return struct.unpack("ii", one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8))
+
+
+def test_each_open_socket_of_this_process_is_found_and_can_be_chosen():
+    place = ("127.0.0.1", free_port())
+    with socket.create_server(place) as server, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        wanted = f"socket:[{os.fstat(server.fileno()).st_ino}]"
+        assert [one.getsockname() for one in own_sockets(wanted.__eq__)] == [server.getsockname()]
+        assert {server.getsockname(), other.getsockname()} <= {one.getsockname() for one in own_sockets()}
+
+
+@pytest.mark.parametrize(("before", "after"), [((1, 10), (0, 10)), ((1, 3), (1, 3)), ((0, 0), (0, 0))])
+def test_only_a_connection_with_the_time_to_linger_of_zenoh_is_changed(before, after):
+    place = ("127.0.0.1", free_port())
+    with socket.create_server(place), socket.create_connection(place) as one:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", *before))
+        close_without_waiting()
+        assert linger(one) == after

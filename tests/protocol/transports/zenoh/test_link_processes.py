@@ -107,8 +107,6 @@ def test_a_client_reconnects_after_being_away_longer_than_its_timeout(start):
         assert frames.take(4) is not None
 
 
-@pytest.mark.waits
-@pytest.mark.own_process
 def test_sessions_of_a_process_reach_the_next_router_when_one_hangs_with_data_on_its_way(start):
     """The close of such a connection waited for 10 s, in a thread that receives for every session of the process."""
     endpoints = [free_endpoint(), free_endpoint()]
@@ -133,6 +131,8 @@ def test_sessions_of_a_process_reach_the_next_router_when_one_hangs_with_data_on
         assert until(are_at_the_next, 6.0)
 
 
+@pytest.mark.waits
+@pytest.mark.own_process
 def test_a_stopped_peer_costs_neither_time_nor_memory_nor_others(start):
     endpoint = free_endpoint()
     with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as healthy:
