@@ -4,7 +4,7 @@ from functools import partial
 from typing import Any, Final
 
 from sightline.evaluation.checks import at_least, at_most
-from sightline.evaluation.faults.evidence import INJECTED, ZERO_MS, most_gain_mps2, wheel_mps
+from sightline.evaluation.faults.evidence import FLOOD_AT_LEAST, INJECTED, ZERO_MS, most_gain_mps2, wheel_mps
 from sightline.evaluation.faults.fixture import SESSION, RobotFixture, Setup
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.protocol.clock import monotonic_us
@@ -19,13 +19,13 @@ GAIN_MPS2: Final = SafetyConfig().max_acceleration_mps2 * 1.05
 ENOUGH: Final = 30
 PERSON: Final = "0e0e0e0e"
 _STOPS: Final = f"then STOP: zero <= {ZERO_MS:g} ms after the first packet, exit code 0"
-FLOOD_AT_LEAST: Final = 20_000
 
 
 def _attack(rig: RobotFixture, at_least_times: int = ENOUGH) -> Injected:
     """From the trigger on, send only commands that must be rejected."""
     at_us = rig.trigger()
     rig.watch(ATTACKED_S)
+    rig.until(lambda: rig.injected() >= at_least_times, 2 * ATTACKED_S, f"an attack with {at_least_times} commands")
     times = rig.injected()
     return Injected(times, at_us, checks=(at_least("sent", times, "times", at_least_times),))
 

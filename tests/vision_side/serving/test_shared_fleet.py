@@ -19,6 +19,7 @@ from sightline.vision_side.config import ShareConfig, VisionConfig
 from sightline.vision_side.serving.assignment import assign
 from sightline.vision_side.serving.fleet import SharedFleet
 from sightline.vision_side.serving.service import Service
+from sightline.vision_side.serving.sharing import Sharing
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 
@@ -141,6 +142,12 @@ def test_a_service_that_comes_takes_robots_and_withdraws_no_command(site):
     assert withdrawn(robots, since_us) == []
 
 
+def may_claim_again(visions):
+    """Return True when no service has claimed a robot within the last second: none changes more than once a second."""
+    return until(lambda: not any(Sharing._changed_lately(one, monotonic_us())
+                                 for vision in visions for one in vision.fleet.sharing.robots.copy().values()))
+
+
 @pytest.mark.alone
 def test_no_robot_stands_when_services_come_end_and_die(site):
     robots, visions, endpoint, _ = site
@@ -148,6 +155,7 @@ def test_no_robot_stands_when_services_come_end_and_die(site):
     since_us = monotonic_us()
     visions.append(Vision("c", endpoint))
     for change in (lambda: None, visions[0].end, visions[1].die):
+        assert may_claim_again(visions)
         change()
         assert until(lambda: sum(len(one.driving) for one in visions if one._thread.is_alive()) == len(names))
         assert drives_on(robots, monotonic_us())
