@@ -309,7 +309,8 @@ def shared(row: NetworkCase, stage: Stage) -> NetworkRun:
     checks = [at_least("injected", float(len(spans_us)), "times", 1.0),
               *sharing_checks(bounds, records, spans_us, len(harms))]
     if site.joined_s:
-        checks.append(at_most("a robot joins, slowest", max(site.joined_s), "s", JOINS_S))
+        slowest_s = max(site.joined_s)
+        checks.append(at_most("a robot joins, slowest", slowest_s if slowest_s < math.inf else None, "s", JOINS_S))
     if site.ended_s:
         checks.append(at_most("a service ends, slowest", max(site.ended_s), "s", ENDS_S))
     return NetworkRun(row, stage.seed, len(spans_us), (), tuple(checks))
