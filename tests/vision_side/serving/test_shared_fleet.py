@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import threading
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 
 import pytest
 
@@ -64,24 +64,35 @@ def router_at(endpoint):
 
 
 @pytest.fixture
-def site(tmp_path):
+def router(request):
+    """The endpoint of a router in this process, or with the parameter True in one of its own, and that process."""
+    endpoint = free_endpoint()
+    if getattr(request, "param", False):
+        with router_at(endpoint) as process:
+            yield endpoint, process
+    else:
+        with closing(open_session([endpoint], (), 5.0)):
+            yield endpoint, None
+
+
+@pytest.fixture
+def site(tmp_path, router):
     """Four robots and two services at a router."""
     pictures = tmp_path / "pictures"
     pictures.mkdir()
     write_pictures(pictures, 160, 120)
-    endpoint, ending = free_endpoint(), threading.Event()
+    (endpoint, process), ending = router, threading.Event()
     settings = Settings(endpoint=endpoint, robots=4, fps=15, pictures=pictures, notes=tmp_path / "notes", seed=1)
-    with ExitStack() as closing:
-        router = closing.enter_context(router_at(endpoint))
+    with ExitStack() as open_links:
         visions = [Vision(name, endpoint) for name in ("a", "b")]
-        links = [closing.enter_context(open_zenoh(f"r{number}", connect=[endpoint], role="robot"))
+        links = [open_links.enter_context(open_zenoh(f"r{number}", connect=[endpoint], role="robot"))
                  for number in range(1, 5)]
         robots = [GatedRobot(link.robot, link, settings, monotonic_us()) for link in links]
         playing = threading.Thread(target=play, args=(robots, ending), daemon=True)
         playing.start()
         assert until(lambda: all(len(robot.accepted) > 10 for robot in robots), 10)
         assert until(lambda: visions[0].driving | visions[1].driving == {robot.name for robot in robots})
-        yield robots, visions, endpoint, router
+        yield robots, visions, endpoint, process
         for vision in visions:
             if vision._thread.is_alive():
                 vision.end()
@@ -162,6 +173,7 @@ def test_no_robot_stands_when_services_come_end_and_die(site):
     assert stood(robots, since_us) == []
 
 
+@pytest.mark.slow
 def test_the_next_owner_receives_frames_before_the_former_one_leaves_but_not_for_long(site, monkeypatch):
     robots, visions, endpoint, _ = site
     monkeypatch.setattr(Service, "has_request", property(lambda service: not service.is_standby))
@@ -177,11 +189,12 @@ def test_the_next_owner_receives_frames_before_the_former_one_leaves_but_not_for
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("router", [True], indirect=True)
 def test_services_outlive_the_end_of_their_router_and_drive_at_its_return(site):
-    robots, visions, endpoint, router = site
+    robots, visions, endpoint, process = site
     before = [(vision.fleet.services, vision.driving, dict(vision.fleet.services)) for vision in visions]
     digests = {robot.name: robot.accepted[-1][1] for robot in robots}
-    router.kill()
+    process.kill()
     assert until(lambda: not any(vision.link.connected for vision in visions))
     assert until(lambda: not any(robot.core.gate._lease.token for robot in robots)), "each robot ends the lease"
     with router_at(endpoint):
