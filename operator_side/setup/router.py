@@ -18,7 +18,7 @@ from sightline.protocol.transports.endpoints import check_zenoh_endpoints, stop_
 from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
 from sightline.protocol.transports.stop_port import StopProcess, read_packets, stop_secret_file
-from sightline.protocol.transports.zenoh.session import MAX_ROUTER_SESSIONS, open_session
+from sightline.protocol.transports.zenoh.session import MAX_ROUTER_SESSIONS, close_without_waiting, open_session
 from sightline.robot_side.guardian import stop_forwarder
 from sightline.robot_side.guardian.stop_core import unpack_ignored
 
@@ -50,6 +50,7 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
             forwarder.keep_alive(monotonic_us())
         _log.info("router: on %s; %s", ", ".join(listen), rules)
         while not ending.wait(_WATCHED_S):
+            close_without_waiting()
             if forwarder is not None:
                 _watch(forwarder)
     _log.info("router: ended")

@@ -27,7 +27,7 @@ from sightline.protocol.transports.diagnosis import (
     own_sockets,
 )
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint, parse_zenoh_endpoint
-from sightline.protocol.transports.zenoh.session import MAX_SESSIONS, close_without_waiting
+from sightline.protocol.transports.zenoh.session import MAX_SESSIONS
 
 MAX_OPEN: Final = MAX_SESSIONS
 """Connections of one address, half-open ones included: as many as Zenoh accepts from all addresses, and more than
@@ -149,7 +149,6 @@ def _watch(ports: set[int], zenoh_ports: set[int], report: Callable[[str], None]
         # A connection that comes between these two lines is not counted, which a flood does not need.
         accepted = dict(_accepted)
         _accepted.clear()
-        close_without_waiting()
         floods = detector.sample(connection_ends(ports), now_us, accepted)
         # Before the report, so that what the log states is true.
         if detector.blocked(now_us) != blocked:

@@ -4,6 +4,7 @@ import resource
 import signal
 import subprocess
 import sys
+import time
 from contextlib import ExitStack, contextmanager
 
 import pytest
@@ -71,6 +72,34 @@ def test_a_router_serves_more_sessions_than_a_robot_does():
         assert soft == resource.RLIM_INFINITY or soft >= min(4 * MAX_ROUTER_SESSIONS, hard)
         for _ in range(MAX_SESSIONS + 4):
             ending.callback(open_session((), [endpoint], 5.0).close)
+
+
+@pytest.mark.slow
+@pytest.mark.waits
+def test_clients_that_hang_do_not_keep_a_router_from_serving_the_others():
+    """Each close waited for 10 s, in a thread that receives for all sessions."""
+    endpoint = free_endpoint()
+    subscribe = (f"import time\nfrom {open_session.__module__} import *\n"
+                 f"kept = [open_session([], [{endpoint!r}], 5.0) for _ in range(6)]\n"
+                 "kept += [one.declare_subscriber('**', print) for one in kept]\nprint(1, flush=True)\ntime.sleep(60)")
+    with (
+        _router("--listen", endpoint) as router,
+        subprocess.Popen([sys.executable, "-c", subscribe], stdout=subprocess.PIPE) as hanging,
+        open_zenoh("r1", connect=[endpoint]) as robot,
+        open_zenoh("r1", connect=[endpoint]) as vision,
+        ExitStack() as ending,
+    ):
+        ending.callback(hanging.kill)
+        assert " on " in router.stdout.readline() and hanging.stdout.read(1)
+        frames = vision.latest(FRAME)
+        assert until(lambda: robot.has_listener(FRAME))
+        time.sleep(1.1)  # the router looks at its connections once a second
+        hanging.send_signal(signal.SIGSTOP)
+        end_s = time.monotonic() + 5.0
+        while time.monotonic() < end_s:
+            robot.publish(FRAME, b"{}", b"x" * 10_000)
+            assert frames.take(1.0), "a frame passes, also after the lease of 2 s"
+            time.sleep(0.03)
 
 
 @pytest.mark.long
