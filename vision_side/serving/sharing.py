@@ -32,9 +32,12 @@ NOT_MINE_US: Final = 300_000
 """Time without the lease, although commands leave, after which a driver needs a new session."""
 FRESH_COMMANDS: Final = 48
 """Commands of one session without the lease. After 64 a robot no longer knows whose token it is."""
-RETURN_US: Final = 2_000_000
-"""Time from the return of the link of this service until a token that ended with it, and is not back, counts as ended.
-Robots and services try to connect once a second, or more often."""
+ROBOT_RETURNS_US: Final = 2_000_000
+"""Time from the return of the link of this service until the token of a robot that ended with it, and is not back,
+counts as ended. A robot tries to connect once a second, or more often."""
+SERVICE_RETURNS_US: Final = 300_000
+"""The same for tokens of services and drivers. A service may have died with its router, and its robots stand. One that
+returns later gets its robots back."""
 MAX_ROBOTS, MAX_SERVICES, MAX_DRIVERS = 10_000, 256, 16
 """Security limits: robots, services, and drivers of one robot. Further tokens do not count."""
 MAX_OWN: Final = 2 * MAX_ROBOTS
@@ -151,7 +154,7 @@ class Sharing:
             robot.driverless_us, robot.mine_us, robot.sent = now_us, now_us, 0
 
     def on_token(self, token: Token, is_present: bool, now_us: int) -> None:
-        """Note a token that appeared or ended, before the end of the link that ended it."""
+        """Note a token that appeared or ended. If it ended with the link of this service, note that first."""
         self._ended.discard(token)
         if not is_present and not self._is_up:
             self._ended.add(token)
@@ -247,9 +250,10 @@ class Sharing:
         """Decide the part in each robot from now on. Returns the robots whose part changed."""
         if not self._is_up:
             return {}
-        if now_us - self._up_us >= RETURN_US:
-            while self._ended:
-                self.on_token(self._ended.pop(), False, now_us)
+        for token in tuple(self._ended):
+            returns_us = ROBOT_RETURNS_US if isinstance(token, RobotToken) else SERVICE_RETURNS_US
+            if now_us - self._up_us >= returns_us:
+                self.on_token(token, False, now_us)
         if self._is_changed:
             self._choices, self._is_changed = assign(self.robots, self.services()), False
         changed = {}
