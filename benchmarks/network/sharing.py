@@ -251,11 +251,19 @@ def _frozen(site: Site, number: int) -> None:
     time.sleep(4.0)
 
 
-def _cut(site: Site, _number: int) -> None:
+def _parted(site: Site, _number: int) -> None:
     site.wire.shape(site.stage.seeded(both(cut=True)))
     time.sleep(CUT_S)
+
+
+def _healed(site: Site, _number: int) -> None:
     site.wire.shape(site.stage.seeded(both(delay_ms=1)))
-    time.sleep(4.0)
+    time.sleep(_HEALED_S)
+
+
+def _cut(site: Site, number: int) -> None:
+    _parted(site, number)
+    _healed(site, number)
 
 
 def _router_killed(site: Site, number: int) -> None:
@@ -268,16 +276,6 @@ def _router_killed(site: Site, number: int) -> None:
 def _router_frozen(site: Site, number: int) -> None:
     site.freeze(f"router{number % 2}", 5.0)
     time.sleep(4.0)
-
-
-def _parted(site: Site, _number: int) -> None:
-    site.wire.shape(site.stage.seeded(both(cut=True)))
-    time.sleep(CUT_S)
-
-
-def _healed(site: Site, _number: int) -> None:
-    site.wire.shape(site.stage.seeded(both(delay_ms=1)))
-    time.sleep(_HEALED_S)
 
 
 def _nothing(_site: Site, _number: int) -> None:

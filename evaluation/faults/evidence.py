@@ -206,7 +206,7 @@ def stop_checks(stop: Stop, zero_ms: float = ZERO_MS, distance_m: float = DISTAN
 GOOD: Final = "good"
 INJECTED: Final = "injected"
 FLOOD_AT_LEAST: Final = 20_000
-"""Commands of a flood. Where a process cannot send 10,000 a second, it lasts longer, up to three times as long."""
+"""Commands of a flood. It lasts longer where a process cannot send 10,000 a second."""
 REQUESTED: Final = "told"
 
 

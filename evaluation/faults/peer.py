@@ -537,9 +537,7 @@ def flood(script: Script) -> None:
     """One old command at 10 kHz, or as fast as this process can."""
     _, header, text = script.sent[0]
     started_s, batches = time.monotonic(), 0
-    while (lasted_s := time.monotonic() - started_s) < FLOOD_S or (
-        batches * FLOOD_BATCH < FLOOD_AT_LEAST and lasted_s < 3 * FLOOD_S
-    ):
+    while time.monotonic() - started_s < FLOOD_S or batches * FLOOD_BATCH < FLOOD_AT_LEAST:
         for _ in range(FLOOD_BATCH):
             script.attack(header, text)
         batches += 1

@@ -1,7 +1,6 @@
 """A battery from its plug-in to the motors' log: full speed, half speed, HOLD; a broken plug-in slows the robot."""
 
 import time
-from statistics import median
 
 import pytest
 
@@ -39,6 +38,7 @@ def test_simulated_battery_keeps_the_contract(sim):
 
 
 @pytest.mark.slow
+@pytest.mark.alone  # a command that comes late on a busy machine slows the wheels
 def test_battery_drains_on_the_way_slows_the_robot_to_half_and_holds_it(sim, tmp_path):
     drive = {"kind": "sim", "options": {"socket_dir": sim.socket_dir}}
     battery = {"kind": "sim", "options": {"socket_dir": sim.socket_dir, "range_m": RANGE_M}}
@@ -60,8 +60,7 @@ def test_battery_drains_on_the_way_slows_the_robot_to_half_and_holds_it(sim, tmp
     at = {volts: RANGE_M * (8.4 - volts) / 2.4 for volts in (7.2, 6.6)}  # meters driven at that voltage
     assert max(speed for way, speed in rows if way < at[7.2]) == pytest.approx(FULL_RAD_S, rel=0.01)
     slow = [speed for way, speed in rows if at[7.2] + LATE_M < way < at[6.6]]
-    # A command that comes late on a busy machine slows the wheels for a moment.
-    assert [max(slow), median(slow)] == pytest.approx([HALF_RAD_S] * 2, rel=0.01)
+    assert slow and slow == pytest.approx([HALF_RAD_S] * len(slow), rel=0.01)
     assert at[6.6] - 0.05 < way_m < at[6.6] + LATE_M
 
 
