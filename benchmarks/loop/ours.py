@@ -67,9 +67,8 @@ def running_services(setting: LoopSetting, folder: Path, processes: Processes) -
     processes.wait_line("robot", f"robot {ROBOT}: on")
     with open_link(ROBOT, connect=[endpoint], role="operator") as link:
         tally = folder / "headers.json"
-        config = {"robot": ROBOT, "connect": [endpoint]}
-        slow = {"delay_ms": setting.detector_delay_ms, "busy_ms": setting.busy_ms}
-        settings = {"config": config, "tally": str(tally), **slow}
+        settings = {"robot": ROBOT, "connect": [endpoint], "tally": str(tally),
+                    "delay_ms": setting.detector_delay_ms, "busy_ms": setting.busy_ms}
         vision = processes.start("vision", [json.dumps(settings)], module="sightline.benchmarks.loop.vision")
         robot = {"guardian": guardian, "driver": processes.driver("robot"), "network": processes.network("robot")}
         pids = {**robot, "vision": vision}

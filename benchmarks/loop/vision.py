@@ -19,7 +19,7 @@ from sightline.protocol.messages import FrameHeader
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
-from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline
@@ -46,6 +46,11 @@ class DelayedDetector:
         return results
 
 
+def contestant_config(**settings: object) -> VisionConfig:
+    """Return these settings with the detector that all contestants have: the service, the floor and the rivals."""
+    return VisionConfig.model_validate({**settings, "detector": {"kind": "hsv"}})
+
+
 def delayed_detector(config: VisionConfig, delay_ms: float, busy_ms: float) -> Detector:
     """Return the detector of the services, slowed down if the setting requests it."""
     detector = configured_detector(config)
@@ -56,7 +61,7 @@ class PipelineVision:
     """Images in, `linear|angular` out."""
 
     def __init__(self, width_px: int, height_px: int, delay_ms: float = 0.0, busy_ms: float = 0.0) -> None:
-        config = VisionConfig(detector=DetectorConfig(kind="hsv"))  # as all rivals
+        config = contestant_config()
         detector = delayed_detector(config, delay_ms, busy_ms)
         self._pipeline = Pipeline(config, camera_of(width_px, height_px), detector)
         self._seq = 0
@@ -133,7 +138,7 @@ class TappedService(Service):
 
 def main(settings: dict[str, object]) -> None:
     """Serve until SIGTERM, then write the headers as (seq, t_us, latency_us)."""
-    config = VisionConfig.model_validate(settings["config"])
+    config = contestant_config(robot=settings["robot"], connect=settings["connect"])
     ending = threading.Event()
     with open_link(config.robot, connect=config.connect, role=SOURCE) as link:
         signal.signal(signal.SIGTERM, lambda *_: ending.set())
