@@ -16,7 +16,8 @@ from sightline.evaluation.score.ball_textures import KINDS
 from sightline.evaluation.score.detector_report import Subject, answer_of, detections
 from sightline.evaluation.score.detectors import is_hit
 from sightline.evaluation.score.photo_balls import photo_with_ball, photo_without_ball
-from sightline.sim.scenes.model import HEIGHT_PX, WIDTH_PX, LabelledBox
+from sightline.sim.scenes.model import HEIGHT_PX, WIDTH_PX, Column, LabelledBox
+from sightline.sim.scenes.plan import with_defects
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.port import Detection, DetectionResult
 
@@ -95,6 +96,8 @@ class PhotoReport:
     tracked: bool
     """True if each detector knew where a track would expect the ball."""
     figures: dict[str, PhotoFigures]
+    column: str = ""
+    """Name of the column whose camera took the pictures, or empty."""
 
     def to_dict(self) -> dict[str, Any]:
         """For --json."""
@@ -112,31 +115,37 @@ def wilson(count: int, total: int) -> tuple[float, float]:
 
 
 def photo_pictures(photographs: Sequence[Photograph], each: int, seed: int,
-                   kinds: Sequence[str] = KINDS) -> Iterator[PhotoPicture]:
-    """Render `each` pictures of every kind, over the photographs in turn, then each photograph without a ball."""
+                   kinds: Sequence[str] = KINDS, column: Column | None = None) -> Iterator[PhotoPicture]:
+    """Render `each` pictures of every kind, over the photographs in turn, then each photograph without a ball.
+
+    All are taken with the camera of `column`, if there is one.
+    """
     first = seed * _SEEDS
     for number in range(len(KINDS) * each):
         rgb, kind = photographs[number % len(photographs)].rgb, KINDS[number // each]
         if kind not in kinds:
             continue
         drawn = photo_with_ball(rgb, kind, first + number)
-        yield PhotoPicture(number, kind, _jpeg(drawn.rgb), LabelledBox("ball", drawn.box, drawn.seen), drawn.radius_px)
+        yield PhotoPicture(number, kind, _jpeg(drawn.rgb, number, column), LabelledBox("ball", drawn.box, drawn.seen),
+                           drawn.radius_px)
     for place, one in enumerate(photographs):
         number = _OF_EMPTY + place
-        yield PhotoPicture(number, "", _jpeg(photo_without_ball(one.rgb, first + number)), None, 0.0)
+        yield PhotoPicture(number, "", _jpeg(photo_without_ball(one.rgb, first + number), number, column), None, 0.0)
 
 
-def _jpeg(rgb: Any) -> bytes:
+def _jpeg(rgb: Any, number: int, column: Column | None) -> bytes:
+    if column is not None:
+        return with_defects(rgb, column, np.random.default_rng([number, 23]))
     return bytes(simplejpeg.encode_jpeg(rgb, QUALITY, "RGB", "420"))
 
 
 def score_photos(asked: Sequence[Subject], photographs: Sequence[Photograph], each: int, seed: int, *, looks: int = 1,
-                 tracked: bool = False, kinds: Sequence[str] = KINDS,
+                 tracked: bool = False, kinds: Sequence[str] = KINDS, column: Column | None = None,
                  advance: Callable[[], None] = lambda: None) -> PhotoReport:
     """Show every picture to every detector, `looks` times in a row; with `tracked`, as if a track expected the ball."""
     decoder = Decoder(WIDTH_PX, HEIGHT_PX, WIDTH_PX * HEIGHT_PX)
     found = {one.name: PhotoFigures({kind: BallTally() for kind in kinds}, BallTally(), BallTally()) for one in asked}
-    for picture in photo_pictures(photographs, each, seed, kinds):
+    for picture in photo_pictures(photographs, each, seed, kinds, column):
         for one in asked:
             answer = answer_of(one.detector, picture.number, picture.jpeg, decoder, looks,
                                expected_px=_expected(picture) if tracked else None)
@@ -145,7 +154,7 @@ def score_photos(asked: Sequence[Subject], photographs: Sequence[Photograph], ea
                 found[one.name].unanswered += 1
                 found[one.name].why = found[one.name].why or answer
         advance()
-    return PhotoReport(len(photographs), each, seed, tracked, found)
+    return PhotoReport(len(photographs), each, seed, tracked, found, column.name if column else "")
 
 
 def _expected(picture: PhotoPicture) -> tuple[float, float]:
@@ -188,6 +197,7 @@ def photo_lines(report: PhotoReport) -> list[str]:
             *(f"{name}: no answer to {one.unanswered} pictures, which count as missed: {one.why}"
               for name, one in report.figures.items() if one.unanswered),
             f"{report.photographs} photographs, {report.each} pictures of each kind, seed {report.seed}"
+            + (f", column {report.column}" if report.column else "")
             + (", each ball expected where it is" if report.tracked else "")]
 
 

@@ -181,6 +181,7 @@ COMPARED = ("hsv", "onnx")
 PHOTO_FRAMES, PHOTO_SEED = 60, 1
 SHIPPED = "shipped"
 _PHOTOS = f"Score balls put into these photographs, and false alarms; `{SHIPPED}` are those that come along."
+_COLUMN = "`all`, or names separated by commas, e.g. blur,all at once. With --photos, one name: its camera takes them."
 FRAMES = 100
 FROM = 900_000
 """The same as in sim/scenes/model.py, whose imports are too heavy for the command line. A test compares them."""
@@ -195,7 +196,7 @@ def detectors(
         int | None, typer.Option(min=1, max=100_000, help="Scenes in each column [default: 100; with --demand 500].")
     ] = None,
     seeds: Annotated[int, typer.Option(min=0, max=10**9, metavar="FROM", help="Seed of the first scene.")] = FROM,
-    column: Annotated[str, typer.Option(help="`all`, or names separated by commas, e.g. blur,all at once.")] = "all",
+    column: Annotated[str, typer.Option(help=_COLUMN)] = "all",
     photos: Annotated[Path | None, typer.Option(metavar="DIR", help=_PHOTOS)] = None,
     tracked: Annotated[bool, typer.Option("--tracked", help="Expect each ball where it is, as a track does.")] = False,
     colored: Annotated[bool, typer.Option("--colored", help="Set each ball's color, as `pick-color` does.")] = False,
@@ -221,10 +222,11 @@ def detectors(
             score_scenes,
         )
     if photos is not None:
-        if demand or column != "all":
-            raise ConfigError("--photos scores photographs, without --column and --demand")
+        if demand:
+            raise ConfigError("--demand checks the bounds of generated scenes; leave out --photos")
         return _score_photos(photos, lambda more: _subjects(names or COMPARED, config, (*(sets or ()), *more), device),
-                             frames or PHOTO_FRAMES, looks, tracked=tracked, colored=colored, as_json=as_json)
+                             frames or PHOTO_FRAMES, looks, column=column, tracked=tracked, colored=colored,
+                             as_json=as_json)
     if tracked or colored:
         raise ConfigError("--tracked and --colored belong to --photos")
     if demand and seeds < FROM:
@@ -240,18 +242,24 @@ def detectors(
 
 
 def _score_photos(photos: Path, build: "Callable[[Sequence[str]], list[Subject]]", each: int, looks: int, *,
-                  tracked: bool, colored: bool, as_json: bool) -> int:
+                  column: str, tracked: bool, colored: bool, as_json: bool) -> int:
     """`build` takes more settings."""
     from sightline.evaluation import photographs as folder
     from sightline.evaluation.score.ball_textures import KINDS
     from sightline.evaluation.score.detector_report import close_subjects
     from sightline.evaluation.score.photo_report import COLORS, color_setting, colored_lines, photo_lines, score_photos
+    from sightline.sim.scenes.model import COLUMNS
+
+    columns = [] if column == "all" else _columns(column)
+    if len(columns) > 1:
+        raise ConfigError(f"--column {column}: with --photos one column at a time")
+    camera = COLUMNS[columns[0]] if columns else None
 
     def scored(settings: Sequence[str], kinds: Sequence[str]) -> "PhotoReport":
         subjects = build(settings)
         try:
             return score_photos(subjects, photographs, each, PHOTO_SEED, looks=looks, tracked=tracked, kinds=kinds,
-                                advance=advance)
+                                column=camera, advance=advance)
         finally:
             close_subjects(subjects)
 

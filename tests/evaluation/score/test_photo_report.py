@@ -20,6 +20,7 @@ from sightline.evaluation.score.photo_report import (
     wilson,
 )
 from sightline.operator_side.cli import app as cli
+from sightline.sim.scenes.model import COLUMNS
 from sightline.vision_side.detect.port import Detection, DetectionResult
 
 EACH = 1
@@ -133,10 +134,22 @@ def test_the_command_prints_json(folder, capsys):
     assert json.loads(capsys.readouterr().out)["figures"]["hsv"]["empty"] == FEWEST
 
 
-@pytest.mark.parametrize("arguments", [["--demand"], ["--column", "blur"]])
+@pytest.mark.parametrize("arguments", [["--demand"], ["--column", "blur,nominal"], ["--column", "easy"]])
 def test_options_of_the_scenes_are_rejected_with_photographs(folder, arguments, capsys):
     assert cli.run(["score", "detectors", "hsv", "--photos", str(folder), *arguments]) == 2
-    assert "--photos" in capsys.readouterr().err
+    assert arguments[0] in capsys.readouterr().err
+
+
+def test_the_camera_of_a_column_takes_the_pictures(folder, capsys):
+    clear, blurred = (list(photo_pictures(photographs(), EACH, 1, ("red",), column))
+                      for column in (None, COLUMNS["blur"]))
+    for one, other in zip(clear, blurred, strict=True):
+        assert (one.number, one.ball, one.radius_px) == (other.number, other.ball, other.radius_px)
+        sharp, soft = (cv2.Laplacian(cv2.imdecode(np.frombuffer(jpeg, np.uint8), 0), cv2.CV_32F).std()
+                       for jpeg in (one.jpeg, other.jpeg))
+        assert soft != sharp and (one.ball is None or soft < sharp)
+    command = ["score", "detectors", "hsv", "--photos", str(folder), "--frames", "1", "--column", "quality 30"]
+    assert cli.run(command) == 0 and "column quality 30" in capsys.readouterr().out
 
 
 # --- the balls themselves ----------------------------------------------------------------------------------------
