@@ -35,6 +35,7 @@ class Client:
         serve: Callable[[Connection], None],
         count_rejection: Callable[[str], None],
         keys: tuple[str, str] = ("", ""),
+        max_bytes: int = MAX_HELLO_BYTES,
     ) -> None:
         """Start to connect.
 
@@ -43,6 +44,7 @@ class Client:
             serve: called for each connection until it is gone; it raises PeerError to drop the connection.
             count_rejection: counts a rejection by its reason.
             keys: folder with the token and the trusted authority of this end, and the role of the link.
+            max_bytes: security limit for a message that comes with the answer to the handshake.
 
         Raises:
             ConfigError: a file of the folder is invalid.
@@ -50,7 +52,7 @@ class Client:
         self.endpoint = endpoint
         self._token = "" if endpoint.legacy else own_token(*keys)
         self._context = client_tls_context(keys[0]) if endpoint.secure else None
-        self._serve, self._count_rejection = serve, count_rejection
+        self._serve, self._count_rejection, self._max_bytes = serve, count_rejection, max_bytes
         self._closing = threading.Event()
         self.trouble = ""
         """Cause of the last failure, for the operator. Empty without an answer."""
@@ -123,7 +125,7 @@ class Client:
         protocol = ClientProtocol(
             parse_uri(f"{'wss' if end.secure else 'ws'}://{name}:{end.port}/"),
             subprotocols=None if end.legacy else [subprotocol],
-            max_size=MAX_HELLO_BYTES,
+            max_size=self._max_bytes,
             **PROTOCOL_OPTIONS,
         )
         request = protocol.connect()

@@ -24,7 +24,13 @@ from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_web
 from sightline.protocol.transports.link import INEXACT_KEY, BaseLink, LinkRules, Message
 from sightline.protocol.transports.websocket.client import Client as Dialer
 from sightline.protocol.transports.websocket.connection import Connection
-from sightline.protocol.transports.websocket.framing import Hello, IncomingMessage, PeerCodec, SightlineV1
+from sightline.protocol.transports.websocket.framing import (
+    MAX_HELLO_BYTES,
+    Hello,
+    IncomingMessage,
+    PeerCodec,
+    SightlineV1,
+)
 from sightline.protocol.transports.websocket.legacy import (
     DriverSlot,
     LegacyClient,
@@ -32,6 +38,7 @@ from sightline.protocol.transports.websocket.legacy import (
     LegacyToRobot,
     LegacyToVision,
 )
+from sightline.protocol.transports.websocket.legacy_text import text_bound
 from sightline.protocol.transports.websocket.peer import Peer, Promote, Publication, exchange_hellos
 from sightline.protocol.transports.websocket.server import KeyFolder, Server
 
@@ -246,9 +253,11 @@ class WebSocketLink(BaseLink):
         for end in near:
             self._listeners.append(Server(end, partial(self._serve, end), refuse, self._tell, keys))
         for end in far:
-            if end.legacy is not None:
+            max_bytes = MAX_HELLO_BYTES
+            if end.legacy is not None:  # a legacy robot may send its first image at once
+                max_bytes = text_bound(self._rules.payload_bound(FRAME))
                 self._commands[end.text] = LegacyCommands(end.text, end.legacy, self._tell)
-            self._dialers.append(Dialer(end, partial(self._serve, end), refuse, keys))
+            self._dialers.append(Dialer(end, partial(self._serve, end), refuse, keys, max_bytes))
 
     def wait_connected(self, timeout_s: float) -> None:
         """Wait for the first peer. Raises LinkError with the cause after `timeout_s`."""

@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.server import ServerProtocol
 from websockets.sync.client import connect
 from websockets.sync.server import serve
 
@@ -427,6 +428,31 @@ def test_invalid_image_ends_the_connection_which_recovers(message, code, counted
         assert until(lambda: vision.rejected == {counted: 1})
         assert until(lambda: robot.said in ([f"closed {code}"], ["closed 0"]) and robot.clients)
         assert until(lambda: robot.send(TEXT) or frames.take(0.05))
+
+
+def test_a_robot_may_send_an_image_with_its_answer_to_the_handshake():
+    endpoint, connections, images = free_endpoint("ws-legacy://"), [], []
+
+    def answer(server):
+        with suppress(OSError):
+            while True:
+                connections.append(server.accept()[0])
+                protocol = ServerProtocol()
+                while not (requests := protocol.events_received()):
+                    protocol.receive_data(connections[-1].recv(4096))
+                protocol.send_response(protocol.accept(requests[0]))
+                protocol.send_text(TEXT.encode())
+                answered = b"".join(protocol.data_to_send())
+                connections[-1].sendall(answered)
+                images.append(answered[answered.index(b"\r\n\r\n") + 4:])
+
+    with socket.create_server(("127.0.0.1", parse_websocket_endpoint(endpoint).port)) as server:
+        threading.Thread(target=answer, args=(server,), daemon=True).start()
+        with open_websocket("r1", connect=endpoint, role="vision", max_frame_bytes=20_000) as vision:
+            frames = vision.latest(FRAME)
+            assert until(lambda: connections[0].sendall(images[0]) or frames.take(0.05))
+            assert vision.rejected == {} and len(connections) == 1
+            connections[0].close()
 
 
 @pytest.mark.parametrize("text", ["no base64", "AAA", "0|0", base64.b64encode(bytes(20_001)).decode("ascii")])
