@@ -119,14 +119,20 @@ def test_stop_returns_when_the_wheels_are_at_zero(robot, link, port):
     assert time.monotonic() - one.stopped_s >= 0.3
 
 
-def test_an_answered_datagram_needs_no_link(robot, link, port):
+@pytest.fixture
+def busy(monkeypatch):
+    """A robot on a busy machine has more time for its first answer."""
+    monkeypatch.setattr(client, "_FIRST_S", 3.0)
+
+
+def test_an_answered_datagram_needs_no_link(robot, link, port, busy):
     robot(turns_s=0.2)
     assert stop(port) and not link.begun_s
 
 
-def test_an_answer_without_wheels_at_zero_opens_the_link_after_all(robot, link, port):
-    one = robot(turns_s=1.4)
-    assert stop(port) and link.begun_s - one.stopped_s == pytest.approx(1.0, abs=0.3)
+def test_an_answer_without_wheels_at_zero_opens_the_link_after_a_second(robot, link, port, busy):
+    one = robot(turns_s=2.0)
+    assert stop(port) and 1.0 <= link.begun_s - one.stopped_s < 2.0
 
 
 def test_the_first_datagram_leaves_before_the_libraries_of_the_link_are_imported(port):
