@@ -34,7 +34,7 @@ from sightline.protocol.transports.tokens import (
     parse_token,
 )
 from sightline.protocol.transports.zenoh.presence import PeerInfo, PresenceAnnouncer, query_presence
-from sightline.protocol.transports.zenoh.session import CLOSED_SESSION, close_without_waiting, open_session
+from sightline.protocol.transports.zenoh.session import close_without_waiting, open_session
 
 if TYPE_CHECKING:
     import zenoh
@@ -246,7 +246,6 @@ class ZenohLink(BaseLink):
         # borrowed", a RuntimeError). The close of the session, which always runs last, ends it.
         with suppress(zenoh.ZError, RuntimeError):
             self._ending.close()
-        self._session = CLOSED_SESSION
 
 
 def declare_token(session: zenoh.Session, token: AnyToken) -> Callable[[], None]:
@@ -453,7 +452,6 @@ class ZenohFleet(FleetLink):
         for link in self._links.values():
             link.close()
         self._ending.close()
-        self._session = CLOSED_SESSION
 
     def declare_token(self, token: AnyToken) -> Callable[[], None]:
         """Declare a token. It ends with the returned function, which the caller keeps, with the session or process."""

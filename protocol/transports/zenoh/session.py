@@ -6,6 +6,7 @@ network therefore do not find it. It never connects to a peer that it found. Exp
 
 from __future__ import annotations
 
+import ctypes
 import json
 import logging
 import re
@@ -69,19 +70,12 @@ _LINGER: Final = struct.Struct("ii")
 RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 1.5}
 
 
-class _ClosedSession:
-    """Replaces a closed session. Every access raises ZError, as the closed session does."""
-
-    def __getattr__(self, name: str) -> Any:
-        import zenoh
-
-        raise zenoh.ZError("the session is closed")
-
-
-# A link drops its reference to a closed session immediately. To free a router's session can block every Python thread
-# for up to 10 s while another session of the process receives data: eclipse-zenoh 1.10.2 waits for a task and holds
-# the lock of the interpreter. In a reference cycle, the garbage collector does that at any later time.
-CLOSED_SESSION: Final[Any] = _ClosedSession()
+def _keep(session: zenoh.Session) -> zenoh.Session:
+    """Return a session that listens, which stays in memory after its close, with 16 KiB."""
+    # To free it, Zenoh (1.10.2) waits for a task with Python's global lock held. The thread of that task may run a
+    # callback of another session, which needs the lock: then all of Python stands for 10 s.
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))
+    return session
 
 
 def open_session(
@@ -117,7 +111,8 @@ def open_session(
     until_s = time.monotonic() + timeout_s
     while True:
         try:
-            return _open(session_config(listen, connect, timeout_s, secured, max_sessions))
+            opened = _open(session_config(listen, connect, timeout_s, secured, max_sessions))
+            return _keep(opened) if listen else opened
         except zenoh.ZError as error:
             if not _tries_each_once(listen, connect) or time.monotonic() >= until_s:
                 raise _error_of(str(error), listen, connect, timeout_s, secured) from None
