@@ -151,7 +151,7 @@ def test_a_stopped_peer_costs_neither_time_nor_memory_nor_others(start):
             seen += message is not None and message.payload[:2] == number.to_bytes(2)
         assert seen > 140
         assert resident_kib() - before_kib < 8_000
-        assert max(took_s) < 0.06
+        assert sorted(took_s)[-2] < 0.06, "a peer that does not read delays each message, a busy machine one"
         stalled.send_signal(signal.SIGCONT)
 
 
