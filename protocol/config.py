@@ -97,6 +97,8 @@ class PluginRegistry:
 
     noun: str
     group: str
+    also: tuple[str, ...] = ()
+    """Names that stand beside those of the plug-ins in an error, and that `load` does not take."""
 
     def names(self) -> list[str]:
         """Return every name that `load` accepts."""
@@ -116,12 +118,12 @@ class PluginRegistry:
                 report_ending(self.noun, error)
             hint = "" if entry is not None else self._hint(kind)
             raise ConfigError(f"{self.noun} {kind!r} cannot be loaded: {_why(error, kind)}{hint}") from None
-        there = f"there are {', '.join(self.names())}, or package.module:Name"
+        there = f"there are {', '.join(sorted((*self.names(), *self.also)))}, or package.module:Name"
         raise ConfigError(f"no {self.noun} called {kind!r}{self._hint(kind)}; {there}")
 
     def _hint(self, kind: str) -> str:
         """Return the nearest name. Text after a colon is not part of a name."""
-        nearest = difflib.get_close_matches(kind.partition(":")[0], self.names(), n=1)
+        nearest = difflib.get_close_matches(kind.partition(":")[0], (*self.names(), *self.also), n=1)
         return f"; did you mean {nearest[0]!r}?" if nearest else ""
 
     def settings(self, kind: str, plugin: Any, options: Mapping[str, Any]) -> Any:
@@ -148,7 +150,12 @@ def _imported(path: str) -> Any:
     if str(Path.cwd()) not in sys.path:  # a class of one's own lies where the service is started
         sys.path.append(str(Path.cwd()))  # last: a file there is not to stand in for what is installed
     module, _, name = path.partition(":")
-    return getattr(importlib.import_module(module), name)
+    found = importlib.import_module(module)
+    if not hasattr(found, name):
+        nearest = difflib.get_close_matches(name, dir(found), n=1)
+        hint = f"; did you mean {module}:{nearest[0]}?" if nearest else ""
+        raise ImportError(f"{getattr(found, '__file__', None) or module} has no {name}{hint}")
+    return getattr(found, name)
 
 
 class _OldPackages:

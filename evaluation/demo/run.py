@@ -77,10 +77,14 @@ class DemoOptions:
 
     def __post_init__(self) -> None:
         """Raise ConfigError for what cannot be run."""
-        if not 0 <= self.seconds <= 3600 or not 0 <= self.latency_ms <= 10_000 or not 0 <= self.loss < 1:
-            raise ConfigError("--seconds 0 to 3600, --latency-ms 0 to 10000 and --loss 0 to below 1, e.g. --loss 0.1")
-        if not 0 <= self.seed < 2**32:
-            raise ConfigError(f"--seed {self.seed}: 0 to 4294967295")
+        for option, value, is_valid, expected in (
+            ("--seconds", self.seconds, 0 <= self.seconds <= 3600, "0 to 3600"),
+            ("--latency-ms", self.latency_ms, 0 <= self.latency_ms <= 10_000, "0 to 10000"),
+            ("--loss", self.loss, 0 <= self.loss < 1, "a share from 0 to below 1, e.g. 0.1"),
+            ("--seed", self.seed, 0 <= self.seed < 2**32, "0 to 4294967295"),
+        ):
+            if not is_valid:
+                raise ConfigError(f"{option} {value}: expected {expected}")
         if self.transport not in TRANSPORTS:
             raise ConfigError(f"--transport {self.transport!r}: {', '.join(TRANSPORTS)}")
 

@@ -49,6 +49,8 @@ def _typed(arguments: Sequence[str]) -> Any:
 
     from sightline.operator_side.cli.commands import app
 
+    if arguments[:1] == ["help"]:
+        arguments = [*arguments[1:], "--help"]
     try:
         return app(list(arguments), standalone_mode=False, prog_name="sightline")
     except typer.Abort:

@@ -1,6 +1,7 @@
 """Commands for a running robot: robots, status, arm, disarm, stop, reset, mission, goto, teleop. Shell."""
 
 import json
+import re
 import secrets
 import time
 from collections.abc import Iterator
@@ -268,6 +269,8 @@ def goto(
     from sightline.operator_side.client.missions import cannot, mission_line, request_of
     from sightline.operator_side.config.toml_text import options_of
 
+    if re.fullmatch(r"-?[0-9.]+", robot) and len(numbers or ()) % 2:
+        raise ConfigError(f"the robot is missing: write sightline goto ROBOT {' '.join((robot, *(numbers or ())))}")
     waypoints, options = _waypoints(numbers or [], file), options_of(sets or ())
     request_of(0, "goto", waypoints, options)
     target = target_of(robot, connect, secure, announce=True)

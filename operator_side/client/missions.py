@@ -57,7 +57,8 @@ def waypoints_of_file(text: str, name: str) -> Waypoints:
 
 def _number(text: str, where: str) -> float:
     if not _NUMBER.fullmatch(text):
-        raise ConfigError(f"{where}: invalid number '{text}'")
+        hint = f"; write {text.replace(',', '.')}" if _NUMBER.fullmatch(text.replace(",", ".")) else ""
+        raise ConfigError(f"{where}: invalid number '{text}'{hint}")
     value = float(text)
     if not abs(value) <= MAX_WAYPOINT_M:
         raise ConfigError(f"{where}: {text} m is out of range; expected {-MAX_WAYPOINT_M:g} to {MAX_WAYPOINT_M:g} m")

@@ -6,6 +6,7 @@
 Environment names are SIGHTLINE_<SERVICE>__<KEY>, `__` for each dot: SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPS=0.3.
 """
 
+import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -102,6 +103,7 @@ def load(
         *_from_options(options or {}),
     ):
         _put(given, one)
+    _check_service(given, service, file)
     _check_names(given, service)
     return Loaded(service, _validated(model, given), given)
 
@@ -132,8 +134,16 @@ def _from_file(file: str, origin: str) -> Iterable[Given]:
     except OSError as error:
         raise ConfigError(f"cannot read {file}: {error.strerror}; check --config") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{file}: invalid TOML: {error}") from None
+        raise ConfigError(f"{file}: invalid TOML: {error}{_decimal_hint(file, error)}") from None
     return [Given(key, value, origin) for key, value in _leaves(table)]
+
+
+def _decimal_hint(file: str, error: Exception) -> str:
+    """Return the fix of a number with a decimal comma in the line of the error, or an empty text."""
+    place = re.search(r"at line (\d+)", str(error))
+    lines = Path(file).expanduser().read_text("utf-8").splitlines() if place else []
+    found = re.search(r"=\s*(-?\d+),(\d+)\s*(#|$)", lines[int(place[1]) - 1]) if place and lines else None
+    return f"; write {found[1]}.{found[2]} with a point" if found else ""
 
 
 def _leaves(table: Mapping[str, Any], above: Key = ()) -> Iterable[tuple[Key, Any]]:
@@ -181,6 +191,14 @@ def _put(given: dict[Key, Given], one: Given) -> None:
     for other in [old for old in given if old[: len(key)] == key or key[: len(old)] == old]:
         del given[other]
     given[key] = one
+
+
+def _check_service(given: Mapping[Key, Given], service: str, file: str | None) -> None:
+    """Raise ConfigError for a file of another service."""
+    names = {key[0] for key, one in given.items() if file and one.origin == file}
+    for other in SERVICES:
+        if not names <= model_of(service).model_fields.keys() and names <= model_of(other).model_fields.keys():
+            raise ConfigError(f"{file} is a configuration of `sightline {other}`, not of `sightline {service}`")
 
 
 def _check_names(given: Mapping[Key, Given], service: str) -> None:

@@ -135,7 +135,9 @@ def _general_name(host: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(host))
     except ValueError:
-        if not host.isascii() or not all(part.replace("-", "a").isalnum() for part in host.split(".")):
+        parts = host.split(".")
+        # A name whose last part is a number is an address with a mistake.
+        if not host.isascii() or not all(part.replace("-", "a").isalnum() for part in parts) or parts[-1].isdigit():
             raise ConfigError(
                 f"invalid host '{host}'; expected a name or address, e.g. robot.local or 192.168.1.20"
             ) from None

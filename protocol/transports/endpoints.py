@@ -98,6 +98,7 @@ def check_zenoh_endpoints(listen: Sequence[str], connect: Sequence[str]) -> None
 _WEBSOCKET_ENDPOINT: Final = re.compile(
     r"(ws|wss|ws-legacy)://(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]@]+):([0-9]{1,5})/?(?:\?([^\s?#]*))?", re.ASCII
 )
+_NEVER_WEBSOCKET: Final = ("tcp", "tls", "quic", "udp")
 _WORDS: Final = ("dashed", "swapped", "nonnegative", "oneline", "boxes")
 _WITH_DASHED: Final = {"swapped", "nonnegative"}
 _FROM: Final = "from="
@@ -146,6 +147,9 @@ def parse_websocket_endpoint(text: str) -> WebSocketEndpoint:
     Raises:
         ConfigError: the endpoint is invalid; the text shows the correct form.
     """
+    scheme, _, rest = text.partition("://")
+    if scheme in _NEVER_WEBSOCKET:
+        raise ConfigError(f"invalid endpoint {text!r}: write {scheme}/{rest}")
     match = _WEBSOCKET_ENDPOINT.fullmatch(text)
     port = int(match[3]) if match else 0
     if match is None or not 1 <= port <= 65_535 or (match[4] is not None and match[1] != "ws-legacy"):

@@ -7,6 +7,7 @@ Names are those of the entry points `sightline.detectors`, or, from a configurat
 
 import difflib
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final
 
 from sightline.protocol.config import PluginRegistry, config_model, warn_renamed
@@ -21,7 +22,7 @@ from sightline.vision_side.plugins import shared_options
 
 BOXES: Final = "boxes"
 """No detector here: boxes of another publisher, see vision_side/serving/service.py."""
-REGISTRY: Final = PluginRegistry("detector", "sightline.detectors")
+REGISTRY: Final = PluginRegistry("detector", "sightline.detectors", (BOXES,))
 _FILLED: Final = ("robot", "connect", "listen", "secure", "max_frame_bytes", "max_pixels")
 _MOST_NAMED: Final = 12
 _OF_DETECTOR: Final = ("device", "deadline_s")
@@ -128,10 +129,17 @@ def _has_field(kind: str, field: str) -> bool:
 
 
 def split_kind(kind: str) -> tuple[str, str]:
-    """Split a kind into name and address. `package.module:Name` is all name."""
-    name, _, rest = kind.partition(":")
+    """Split a kind into name and address. `package.module:Name` is all name.
+
+    Raises ConfigError for a file without the name of a detector, and for a colon without an address.
+    """
+    name, colon, rest = kind.partition(":")
     if name not in REGISTRY.names():
+        if Path(kind).is_file():
+            raise ConfigError(f"detector {kind!r} is a file: write onnx:{kind}, or torch:{kind} for a model of PyTorch")
         return kind, ""
+    if colon and not rest:
+        raise ConfigError(f"detector {kind!r} has nothing after its colon; write {EXAMPLES.get(name, name)}")
     return name, kind if rest.startswith("//") else rest
 
 
@@ -195,7 +203,7 @@ def _checked(kind: str, options: Mapping[str, Any], config: VisionConfig) -> tup
         raise ConfigError(f"detector {name!r} has no address: write e.g. {EXAMPLES[name]}")
     own = REGISTRY.settings(name, plugin, shared_options(plugin, given | dict(options), config))
     if not callable(getattr(plugin, "detect", None)):
-        raise ConfigError(f"detector {kind!r}: the class has no method detect; see docs/how-to/detectors.md")
+        raise ConfigError(f"detector {kind!r}: the class has no method detect; see docs/how-to/write-a-detector.md")
     if hasattr(plugin, OLD_NOTICES) and not hasattr(plugin, "notices"):
         warn_renamed(f"detector {kind!r}: method", OLD_NOTICES, "notices")
     return plugin, own

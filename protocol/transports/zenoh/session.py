@@ -99,7 +99,7 @@ def open_session(
         secured.check((*listen, *connect))
     elif keyless := next((one for one in (*listen, *connect) if one.startswith(("tls/", "quic/"))), ""):
         kind = keyless.partition("/")[0]
-        raise LinkError(f"cannot connect to {keyless}: a {kind}/ endpoint needs keys; pass --secure DIR")
+        raise ConfigError(f"{keyless}: a {kind}/ endpoint needs keys; pass --secure DIR")
     try:
         import zenoh
     except ImportError:

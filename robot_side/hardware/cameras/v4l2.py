@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field
 
@@ -23,6 +23,8 @@ from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
 from sightline.robot_side.hardware.cameras.timing import CaptureClock, LatestPicture, read_clocks
 from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
 
+_SET: Final = "set camera.options.device, after --camera with --camera-set device=/dev/videoN"
+
 
 def check_device(path: Path) -> None:
     """Raise HardwareError if `path` is absent, not a device, or not permitted. OpenCV reports only "failed"."""
@@ -32,7 +34,7 @@ def check_device(path: Path) -> None:
         raise _trouble(path, error) from None
     try:
         if not stat.S_ISCHR(os.fstat(descriptor).st_mode):
-            raise HardwareError(f"{path} is not a camera device{_others(path)}; set camera.options.device")
+            raise HardwareError(f"{path} is not a camera device{_others(path)}; {_SET}")
     finally:
         os.close(descriptor)
 
@@ -44,7 +46,7 @@ def open_error(path: Path) -> HardwareError:
         return HardwareError(f"camera {path} is busy: {owner} has it open; end that program")
     return HardwareError(
         f"camera {path} does not open: busy, or the second node of a camera, which delivers no images"
-        f"{_others(path)}; set camera.options.device"
+        f"{_others(path)}; {_SET}"
     )
 
 
@@ -55,7 +57,7 @@ def device_owner(path: Path) -> str:
 
 def _trouble(path: Path, error: OSError) -> HardwareError:
     if error.errno in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.ENOTDIR):
-        return HardwareError(f"camera {path} is not there{_others(path)}; plug it in, or set camera.options.device")
+        return HardwareError(f"camera {path} is not there{_others(path)}; plug it in, or {_SET}")
     if error.errno in (errno.EACCES, errno.EPERM):
         return HardwareError(
             f"camera {path} may not be opened by this user, only by its group {_group(path)!r}: "
@@ -63,7 +65,7 @@ def _trouble(path: Path, error: OSError) -> HardwareError:
         )
     if error.errno == errno.EBUSY:
         return open_error(path)
-    return HardwareError(f"camera {path} cannot be opened: {error.strerror}; set camera.options.device")
+    return HardwareError(f"camera {path} cannot be opened: {error.strerror}; {_SET}")
 
 
 def _others(path: Path) -> str:

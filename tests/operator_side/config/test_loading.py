@@ -114,7 +114,9 @@ def test_several_errors_are_shown_as_the_first_and_a_count(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "expected"),
-    [("= 1", "invalid TOML"), ("[safety]\nmax_linear_mps = inf", "= inf: expected a finite number")],
+    [("= 1", "invalid TOML"), ("[safety]\nmax_linear_mps = -0,30 # slow", "; write -0.30 with a point"),
+     ("[target]\nradius_m = 0.1", "is a configuration of `sightline vision`, not of `sightline robot`"),
+     ("[safety]\nmax_linear_mps = inf", "= inf: expected a finite number")],
 )
 def test_a_bad_file_is_named(tmp_path, text, expected):
     path = tmp_path / "robot.toml"

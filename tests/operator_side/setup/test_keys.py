@@ -29,3 +29,10 @@ def test_a_folder_without_keys_gets_no_secret(tmp_path):
     with pytest.raises(ConfigError, match="sightline keys init"):
         keys.add(tmp_path, "stop", [])
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("host", ["300.1.1.1", "192.168.1", "robot local", "robot/1"])
+def test_an_invalid_host_is_rejected_before_anything_is_written(tmp_path, host):
+    with pytest.raises(ConfigError, match=f"invalid host '{host}'"):
+        keys.make(tmp_path / "keys", ["robot.local", host])
+    assert not (tmp_path / "keys").exists()

@@ -6,6 +6,7 @@ silently runs on the CPU when it cannot have it.
 
 import importlib
 import os
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,7 @@ _BEHIND: Final = {"tensorrt": ("tensorrt", "cuda", "cpu"), "cuda": ("cuda", "cpu
 """Providers that a session for a device may fall back on for single operations."""
 _FIX: Final = ("install onnxruntime-gpu in place of onnxruntime (never both), see that `nvidia-smi` shows the GPU, or "
                "take --device auto")
+_NO_MODEL: Final = re.compile("INVALID_PROTOBUF|No graph was found")
 _ERRORS_ONLY: Final = 3
 _LONGEST: Final = 200
 
@@ -107,7 +109,7 @@ def _unfit(path: Path, error: Exception) -> str:
     if head == b"PK" or head[:1] == b"\x80":
         return "it is a file of PyTorch, not of ONNX; export it to ONNX, or use --detector torch:FILE"
     text = " ".join(str(error).split())
-    return "it is not an ONNX file, or truncated; fetch it again" if "INVALID_PROTOBUF" in text else text
+    return "it is not an ONNX file, or truncated; fetch it again" if _NO_MODEL.search(text) else text
 
 
 class Engine:

@@ -104,7 +104,8 @@ def _one_line(address: str) -> "Iterator[None]":
 def _allowed_pickle(path: Path, config: Any) -> str:
     """Return the risk, for the operator. Raises ConfigError unless the configuration requests the pickle."""
     if not config.pickle:
-        raise ConfigError(f"model {path} {_RISK}; export it to ONNX, or pass the option pickle=true if you trust it")
+        raise ConfigError(f"model {path} {_RISK}; export it to ONNX, or if you trust it, "
+                          "--set detector.options.pickle=true (`detector check`: --set pickle=true)")
     return f"it {_RISK}"
 
 
