@@ -109,7 +109,13 @@ def own_sockets(wanted: Callable[[str], bool] = lambda name: name.startswith("so
     for link in links:
         with suppress(OSError):  # closed meanwhile
             if wanted(str(link.readlink())):
-                with socket.socket(fileno=os.dup(int(link.name))) as one:
+                number = os.dup(int(link.name))
+                try:
+                    one = socket.socket(fileno=number)
+                except OSError:  # no socket any more
+                    os.close(number)
+                    continue
+                with one:
                     yield one
 
 

@@ -134,11 +134,10 @@ def _port(endpoint: str) -> int:
 
 def _watch(ports: set[int], zenoh_ports: set[int], report: Callable[[str], None], ending: threading.Event) -> None:
     detector, limiter, blocked, silent = FloodDetector(), RepeatLimiter(), list[str](), set[Peer]()
-    deferred, floods, opened, read_us = set[str](), list[Flood](), None, 0
+    deferred, floods, opened, read_us = 0, list[Flood](), None, 0
     while not ending.wait(_CHECK_S):
-        if len(deferred) < len(zenoh_ports):  # a link opens its ports some time after this thread begins
-            deferred = _listeners(zenoh_ports)
-            _defer(deferred)
+        if deferred < len(zenoh_ports):  # a link opens its ports some time after this thread begins
+            deferred = _defer(_listeners(zenoh_ports))
         now_us = heartbeat_us()
         # Without a new connection there is hardly a new flood, and the table takes 3 ms to read.
         opened_before, opened = opened, opened_connections()
@@ -179,11 +178,16 @@ _ACKED_BYTES: Final = struct.Struct("120xQ")
 _DEFER_S: Final = 10
 
 
-def _defer(inodes: set[str]) -> None:
-    """Let the kernel accept a connection with its first byte, which an honest peer sends when it connects."""
-    for listener in own_sockets(inodes.__contains__):
+def _defer(inodes: set[str]) -> int:
+    """Let the kernel accept a connection with its first byte, which an honest peer sends when it connects.
+
+    Returns the number of own sockets among `inodes`. Others may listen on the same port of another address.
+    """
+    count = 0
+    for count, listener in enumerate(own_sockets(inodes.__contains__), 1):
         # The option may be set while the socket listens already. It holds for connections from now on.
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, _DEFER_S)
+    return count
 
 
 def _end_half_open(ports: set[int], hosts: Sequence[str], waiting: set[Peer]) -> set[Peer]:

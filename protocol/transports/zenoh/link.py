@@ -444,6 +444,7 @@ class ZenohFleet(FleetLink):
         rules = LinkRules(robot, self._role, self._max_frame_bytes)
         if robot in self._links:
             self._links[robot].close()
+        self._links = {name: one for name, one in self._links.items() if not one._closed}
         self._links[robot] = ZenohLink(self._session, rules, shared=True)
         return self._links[robot]
 

@@ -103,6 +103,14 @@ def test_each_open_socket_of_this_process_is_found_and_can_be_chosen():
         assert {server.getsockname(), other.getsockname()} <= {one.getsockname() for one in own_sockets()}
 
 
+def test_a_number_that_is_no_socket_any_more_is_not_kept_open(tmp_path):
+    with (tmp_path / "file").open("w") as file:
+        assert list(own_sockets(str(tmp_path / "file").__eq__)) == []
+        kept = [link for link in os.listdir("/proc/self/fd") if os.path.exists(f"/proc/self/fd/{link}")
+                and os.path.samefile(f"/proc/self/fd/{link}", file.name)]
+        assert kept == [str(file.fileno())]
+
+
 @pytest.mark.parametrize(("before", "after"), [((1, 10), (0, 10)), ((1, 3), (1, 3)), ((0, 0), (0, 0))])
 def test_only_a_connection_with_the_time_to_linger_of_zenoh_is_changed(before, after):
     place = ("127.0.0.1", free_port())

@@ -1,6 +1,8 @@
 """Limits of connections per address at the ports of the links: the kernel drops a flood, open sessions go on."""
 
 import socket
+import subprocess
+import sys
 import time
 from contextlib import ExitStack, closing, suppress
 
@@ -153,6 +155,19 @@ def test_what_a_flooding_address_begins_is_dropped_and_all_others_go_on(family, 
         session.sendall(b"x" * 100_000)
         assert accepted.recv(10, socket.MSG_WAITALL) == b"helloxxxxx"
         assert len(reported) == 1
+
+
+@pytest.mark.waits
+def test_a_listener_of_another_process_at_the_port_of_another_address_is_none_of_ours():
+    port = free_port()
+    code = f"import socket; one = socket.create_server(('127.0.0.2', {port})); print(1, flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdout.read(1)
+        with limit_floods([f"tcp/127.0.0.1:{port}"], lambda _line: None):
+            time.sleep(0.5)  # two looks, which find the other listener alone
+            with socket.create_server(("127.0.0.1", port)) as server:
+                assert until(lambda: is_deferred(server), 5.0)
+        other.kill()
 
 
 def test_a_connection_is_accepted_with_its_first_byte():

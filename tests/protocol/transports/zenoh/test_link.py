@@ -276,3 +276,12 @@ def test_a_closed_link_does_nothing_and_its_session_that_listened_is_never_freed
     del end, links, link
     gc.collect()
     assert sys.getrefcount(session) == 3, "this test's, the question's, and one that stays"
+
+
+def test_a_fleet_forgets_closed_links():
+    with open_fleet("r*", listen=[free_endpoint()], role="vision") as fleet:
+        open_one = fleet.link("r0")
+        for number in range(1, 9):
+            fleet.link(f"r{number}").close()
+        assert set(fleet._links) == {"r0", "r8"}
+        assert not open_one._closed
