@@ -94,14 +94,14 @@ class Lease:
             del self._tokens[next(one for one in self._tokens if one != self.token)]
 
     def end_token(self, token: str, now_us: int) -> bool:
-        """Return True if the lease ended with this token. Its session never drives again."""
+        """Return True if the lease ended with this token. Its session never drives again, also if it was over."""
         self._tokens.pop(token, None)
-        holder = self.live_holder(now_us)
-        if not token or token != self.token or holder is None:
+        if not token or token != self.token or self.holder is None:
             return False
-        self._fence(holder)
+        was_live = self.live_holder(now_us) is not None
+        self._fence(self.holder)
         self.drop()
-        return True
+        return was_live
 
     def _token_of(self, proof: Proof) -> str:
         """Return the token whose driver revealed `proof`, or "" without one."""

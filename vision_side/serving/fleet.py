@@ -217,8 +217,9 @@ class Fleet:
 
 
 _LONGEST_SHARED_WAIT_S = 0.02
-_TOKEN_ENDS_AFTER_US = 5_000
-"""If the link ends, the tokens beyond it end a fraction of a millisecond before that is known."""
+_TOKEN_ENDS_AFTER_US, _ROBOT_ENDS_AFTER_US = 5_000, 500_000
+"""If the link ends, the tokens beyond it end before that is known: those of 200 robots for 0.1 s. A robot whose own
+link is cut for a moment is back so soon. The end of a driver or service must count at once."""
 _HANDS_OVER_WITHIN_S = 0.6
 _MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn
 
@@ -232,7 +233,9 @@ class SharedFleet(Fleet):
         """Create the fleet, see `Fleet`. It is present from now on."""
         super().__init__(config, fleet_link, report, detector)
         self._tokens: deque[tuple[Token, bool, int]] = deque(maxlen=_MAX_TOKENS)
-        """Each with its presence and the time from which it counts."""
+        """Each with its presence and the time when that was noted."""
+        self._ends_us: dict[Token, int] = {}
+        """When the ends of tokens count that may be back before."""
         self._is_up, self._losses = True, fleet_link.losses
         self._statuses: dict[str, LatestSlot[Message]] = {}
         self._withdraw: dict[str, Callable[[], None]] = {}
@@ -251,7 +254,7 @@ class SharedFleet(Fleet):
         """Decide the part in each robot, then serve those that it drives."""
         now_us = monotonic_us()
         self._watch_link(now_us)
-        self._take_tokens(now_us, now_us)
+        self._take_tokens(now_us)
         changed = self.sharing.step(now_us)
         super().turn()
         for robot, part in changed.items():
@@ -268,21 +271,33 @@ class SharedFleet(Fleet):
         if self._losses != self._fleet_link.losses:
             self._losses, self._is_up = self._fleet_link.losses, False
             self.sharing.on_link(False, now_us)
-            self._take_tokens(now_us, now_us + _TOKEN_ENDS_AFTER_US)
+            self._take_tokens(now_us)
         if not self._is_up and self._fleet_link.connected:
             self._is_up = True
             self.sharing.on_link(True, now_us)
             for robot in tuple(self._withdraw):
-                service = self.services[robot]
-                self._renew(robot, service)
-                if not service.is_standby:
-                    service.begin()
+                self._attempt(robot, self._drive_again)
 
-    def _take_tokens(self, now_us: int, until_us: int) -> None:
-        """Note the tokens that count from `until_us` or before."""
-        while self._tokens and self._tokens[0][2] <= until_us:
-            token, is_present, _ = self._tokens.popleft()
-            self.sharing.on_token(token, is_present, now_us)
+    def _drive_again(self, robot: str) -> None:
+        self._renew(robot)
+        if not self.services[robot].is_standby:
+            self.services[robot].begin()
+
+    def _take_tokens(self, now_us: int) -> None:
+        """Note the tokens that came, and those whose end counts by now. Without a link each end counts at once."""
+        while self._tokens:
+            token, is_present, at_us = self._tokens.popleft()
+            if is_present:
+                is_back = self._ends_us.pop(token, None) is not None and self._is_up
+                if is_back and isinstance(token, RobotToken) and token.robot in self._withdraw:
+                    self._attempt(token.robot, self._drive_again)
+                self.sharing.on_token(token, True, now_us)
+            else:
+                after_us = _ROBOT_ENDS_AFTER_US if isinstance(token, RobotToken) else _TOKEN_ENDS_AFTER_US
+                self._ends_us[token] = at_us + after_us
+        for token in [one for one, end_us in self._ends_us.items() if end_us <= now_us or not self._is_up]:
+            del self._ends_us[token]
+            self.sharing.on_token(token, False, now_us)
 
     def _turn_of(self, robot: str) -> None:
         super()._turn_of(robot)
@@ -307,11 +322,11 @@ class SharedFleet(Fleet):
     def _note(self, token: Token, is_present: bool) -> None:
         robot = token.robot if isinstance(token, RobotToken | DriverToken) else ""
         if not robot or fnmatchcase(robot, self._config.robot):
-            self._tokens.append((token, is_present, monotonic_us() + (0 if is_present else _TOKEN_ENDS_AFTER_US)))
+            self._tokens.append((token, is_present, monotonic_us()))
             self._bell.set()
 
     def _wait(self) -> None:
-        self._bell.wait(_TOKEN_ENDS_AFTER_US / 1e6 if self._tokens else _LONGEST_SHARED_WAIT_S)
+        self._bell.wait(_TOKEN_ENDS_AFTER_US / 1e6 if self._ends_us else _LONGEST_SHARED_WAIT_S)
         self._bell.clear()
 
     def _present(self) -> list[str]:
@@ -343,7 +358,7 @@ class SharedFleet(Fleet):
         if service.is_standby:
             service.note_status(stamp)
         elif self.sharing.needs_session(robot, is_mine=mine, now_us=now_us):
-            self._renew(robot, service)
+            self._renew(robot)
 
     def _carry_out(self, robot: str, service: Service, now_us: int) -> None:
         shared = self.sharing.robots.get(robot)
@@ -353,19 +368,19 @@ class SharedFleet(Fleet):
         elif part is not SharingPart.DRIVE:
             service.rest()
         if part in (SharingPart.CLAIM, SharingPart.DRIVE) and robot not in self._withdraw:
-            self._renew(robot, service)
+            self._renew(robot)
         if part is SharingPart.DRIVE and service.is_standby:
             service.begin()
         if part in (SharingPart.NONE, SharingPart.STANDBY):
             self._withdraw_token(robot)
 
-    def _renew(self, robot: str, service: Service) -> None:
+    def _renew(self, robot: str) -> None:
         """Drive with a new session from now on. Its token is there before its first command."""
         sender = DriverSession()
         token = DriverToken(robot, self.sharing.own.name, sender.proofs.token)
         self.sharing.add_own(token)
         withdraw = self._fleet_link.declare_token(token)
-        service.sender = sender
+        self.services[robot].sender = sender
         self._withdraw_token(robot)
         self._withdraw[robot] = withdraw
 

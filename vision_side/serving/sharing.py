@@ -32,6 +32,13 @@ NOT_MINE_US: Final = 300_000
 """Time without the lease, although commands leave, after which a driver needs a new session."""
 FRESH_COMMANDS: Final = 48
 """Commands of one session without the lease. After 64 a robot no longer knows whose token it is."""
+STATUS_GAP_US: Final = 150_000
+"""Longest time between two statuses of a link that works. Of a longer gap nothing is known."""
+OF_DRIVERS: Final = (
+    RejectReason.STALE, RejectReason.OUT_OF_ORDER, RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME,
+    RejectReason.FROM_FUTURE, RejectReason.DISARMED,
+)
+"""Rejections that show a driver at work. Strangers, and drivers without the lease, cause the others."""
 ROBOT_RETURNS_US: Final = 2_000_000
 """Time from the return of the link of this service until the token of a robot that ended with it, and is not back,
 counts as ended. A robot tries to connect once a second, or more often."""
@@ -84,6 +91,9 @@ class SharedRobot:
     has_frames: bool = False
     """True once it sent a frame since the part began. Before that, a driver has nothing to answer."""
     sent: int = _UNKNOWN
+    """Commands of the session of this service."""
+    held: int = 0
+    """Those when it last held the lease."""
     mine_us: int = _UNKNOWN
     """Last time at which this service held the lease, or had no reason to."""
 
@@ -97,10 +107,14 @@ class SharedRobot:
         """Return True if its statuses show no driver at work."""
         return self.status_us - self.active_us >= SILENT_US
 
+    def begin_session(self, now_us: int) -> None:
+        """Forget the commands of the session before."""
+        self.mine_us, self.sent, self.held = now_us, 0, 0
+
     def begin_part(self, now_us: int) -> None:
         """Forget what the statuses showed before."""
         self.active_us = self.part_us = now_us
-        self.has_frames, self.frames = False, _UNKNOWN
+        self.has_frames, self.frames, self.status_us = False, _UNKNOWN, _UNKNOWN
 
 
 class Sharing:
@@ -151,7 +165,8 @@ class Sharing:
         self._is_up, self._up_us = is_up, now_us
         for robot in self.robots.values():
             robot.begin_part(now_us)
-            robot.driverless_us, robot.mine_us, robot.sent = now_us, now_us, 0
+            robot.driverless_us = now_us
+            robot.begin_session(now_us)
 
     def on_token(self, token: Token, is_present: bool, now_us: int) -> None:
         """Note a token that appeared or ended. If it ended with the link of this service, note that first."""
@@ -209,11 +224,15 @@ class Sharing:
             return
         human = status.holder is not None and status.holder.source != "vision"
         needs_no_driver = human or status.state in (State.STOPPED, State.FAULT) or bool(status.stream.camera_fault)
-        # A driver that hangs neither sends commands nor gives credit back. Its rejected commands are work, and those of
-        # other drivers are not.
-        refused = sum(status.refused.values()) - status.refused.get(RejectReason.NOT_HOLDER, 0)
-        stream, arrived = status.stream, status.accepted + refused
+        if one.status_us != _UNKNOWN:
+            # While no status came, the link was cut, also for the driver: that is no silence of it.
+            gap_us = max(0, now_us - one.status_us - STATUS_GAP_US)
+            one.active_us, one.mine_us = min(now_us, one.active_us + gap_us), min(now_us, one.mine_us + gap_us)
+        # A driver that hangs neither sends commands nor gives credit back. Its rejected commands are work.
+        stream, arrived = status.stream, status.accepted + sum(status.refused.get(reason, 0) for reason in OF_DRIVERS)
         answered = stream.sent - stream.credit_timeouts
+        if stream.sent < one.answered:  # the robot was restarted
+            one.answered = 0
         one.has_frames |= one.frames not in (_UNKNOWN, stream.sent)
         waits = not one.has_frames and now_us - one.part_us < NO_DRIVER_US
         answers = answered > one.answered + stream.window
@@ -223,17 +242,18 @@ class Sharing:
         one.arrived = arrived
         if is_mine or needs_no_driver or sent == one.sent:
             one.mine_us = now_us
-        one.tries = 0 if is_mine else one.tries
+        if is_mine:
+            one.tries, one.held = 0, sent
         one.frames, one.sent, one.status_us = stream.sent, sent, now_us
 
     def needs_session(self, robot: str, *, is_mine: bool, now_us: int) -> bool:
         """Return True if this service drives but the robot no longer accepts its session, at most once a second."""
         one = self.robots[robot]
-        stale = self._is_not_mine(one, now_us) or (not is_mine and one.sent >= FRESH_COMMANDS)
+        stale = self._is_not_mine(one) or (not is_mine and one.sent - one.held >= FRESH_COMMANDS)
         if one.part is not SharingPart.DRIVE or not stale or self._changed_lately(one, now_us):
             return False
-        one.changed_us = one.mine_us = now_us
-        one.tries, one.sent = one.tries + 1, 0
+        one.begin_session(now_us)
+        one.changed_us, one.tries = now_us, one.tries + 1
         return True
 
     def is_about_to_drive(self, robot: str, now_us: int) -> bool:
@@ -271,7 +291,7 @@ class Sharing:
             robot.changed_us, robot.tries = now_us, robot.tries + 1
         if part is SharingPart.DRIVE:
             robot.ignored |= robot.drivers
-            robot.mine_us, robot.sent = now_us, 0
+            robot.begin_session(now_us)
         # Without a part, no status came: what it showed before is over. A standby knows that the driver is silent.
         if part is not SharingPart.CLAIM or robot.part is SharingPart.NONE:
             robot.begin_part(now_us)
@@ -283,7 +303,7 @@ class Sharing:
         is_choice = not self._is_out and self.own.name in self._choices[name]
         beside = SharingPart.STANDBY if is_choice else SharingPart.NONE
         if robot.part in (SharingPart.CLAIM, SharingPart.DRIVE):
-            return beside if self._must_leave(name, robot, now_us) else robot.part
+            return beside if self._must_leave(name, robot) else robot.part
         may_claim = not self._is_out and not self._changed_lately(robot, now_us) and self._is_next(name, robot, now_us)
         return SharingPart.CLAIM if may_claim else beside
 
@@ -291,18 +311,18 @@ class Sharing:
     def _is_out(self) -> bool:
         return self._is_leaving or self.has_twin
 
-    def _must_leave(self, name: str, robot: SharedRobot, now_us: int) -> bool:
+    def _must_leave(self, name: str, robot: SharedRobot) -> bool:
         """Return True if another driver has the better claim."""
         # A silent driver counts again if it has the lease.
-        is_not_mine = self._is_not_mine(robot, now_us)
+        is_not_mine = self._is_not_mine(robot)
         others = robot.drivers if is_not_mine else robot.others
         if self._is_out or robot.is_busy:
             return bool(others) and (self._is_out or is_not_mine)
         return any(other.name in self._before(name) for other in others)
 
     @staticmethod
-    def _is_not_mine(robot: SharedRobot, now_us: int) -> bool:
-        return robot.part is SharingPart.DRIVE and now_us - robot.mine_us >= NOT_MINE_US
+    def _is_not_mine(robot: SharedRobot) -> bool:
+        return robot.part is SharingPart.DRIVE and robot.status_us - robot.mine_us >= NOT_MINE_US
 
     def _before(self, robot: str) -> list[str]:
         """Return the services that may claim a robot before this one, in their order."""

@@ -152,13 +152,15 @@ def test_token_is_of_the_driver_that_takes_the_lease_while_it_is_there():
     assert lease.token == "", "it came later"
 
 
-@pytest.mark.parametrize(("at_us", "ends"), [(0, True), (999, True), (1_000, False)])
-def test_lease_ends_with_its_token_while_it_lasts(at_us, ends):
+@pytest.mark.parametrize(("at_us", "ends"), [(0, True), (999, True), (1_000, False), (9_000, False)])
+def test_lease_ends_with_its_token_while_it_lasts_and_its_session_never_drives_again(at_us, ends):
     lease, first = held()
+    second = Vision(2)
+    lease.add_token(second.token)
     assert lease.end_token(first.token, at_us) is ends
-    assert lease.is_fenced(first.who) is ends
-    assert (lease.holder is None) is ends and (lease.token == "") is ends
-    assert lease.may_take(first.who, 5_000) is (not ends)
+    assert lease.is_fenced(first.who) and lease.holder is None and lease.token == ""
+    assert not lease.may_take(first.who, at_us + 1, first.later(1)), "a late command keeps no other session waiting"
+    assert lease.may_take(second.who, at_us + 1, second.proof)
 
 
 def test_empty_token_ends_no_lease():
@@ -227,14 +229,11 @@ def test_driver_proves_within_its_first_64_commands_whose_token_it_is(commands, 
 
 
 @pytest.mark.parametrize("gap_us", [0, 1_000, 50_000])
-def test_holder_that_takes_the_lease_again_keeps_its_token_unless_it_ended(gap_us):
+def test_holder_that_takes_the_lease_again_keeps_its_token(gap_us):
     lease, first = held()
     lease.take(first.who, 900, first.later(500))
     lease.take(first.who, 1_900 + gap_us, first.later(500))
     assert lease.token == first.token
-    lease.end_token(first.token, 5_000 + gap_us)
-    lease.take(first.who, 5_000 + gap_us, first.later(500))
-    assert lease.token == "", "it ended while the lease was over"
 
 
 def test_succeeded_driver_is_fenced_and_one_whose_lease_ended_or_that_a_human_displaced_is_not():

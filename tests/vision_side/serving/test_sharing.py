@@ -11,7 +11,7 @@ from sightline.vision_side.serving.assignment import assign
 from sightline.vision_side.serving.sharing import Sharing, SharingPart
 
 MS = 1_000
-STEP_US, STATUS_US, FRAME_US, SILENT_US = 10 * MS, 100 * MS, 60 * MS, 400 * MS
+STEP_US, STATUS_US, FRAME_US, SILENT_US, LEASE_US = 10 * MS, 100 * MS, 60 * MS, 400 * MS, 1_000 * MS
 
 
 @dataclass
@@ -25,6 +25,8 @@ class Robot:
     gaps: list = field(default_factory=list)
     state: State = State.ACTIVE
     rejected: int = 0
+    strange: int = 0
+    """Rejected commands of a program that is no driver."""
     sent: int = 0
     unanswered: int = 0
     waits: bool = False
@@ -44,11 +46,12 @@ class Robot:
             self.gaps.append((self.heard_us, now_us - self.heard_us))
         self.holder, self.heard_us, self.accepted = session, now_us, self.accepted + 1
 
-    def status(self):
-        shown = LeaseHolder(source="vision", digest=self.holder) if self.holder else None
+    def status(self, now_us):
+        holds = self.holder and now_us - self.heard_us < LEASE_US
+        shown = LeaseHolder(source="vision", digest=self.holder) if holds else None
         stream = StreamStatus(sent=self.sent, credit_timeouts=self.unanswered)
         return Status(state=self.state, reason="", holder=shown, accepted=self.accepted,
-                      refused={"ANY": self.rejected}, stream=stream)
+                      refused={"STALE": self.rejected, "UNKNOWN_SOURCE": self.strange}, stream=stream)
 
 
 class Service:
@@ -83,8 +86,9 @@ class Service:
         one = self.sharing.robots.get(name)
         if one is None or one.part is SharingPart.NONE:
             return
-        mine = name in self.tokens and robot.holder == self.tokens[name].token[:8]
-        self.sharing.on_status(name, robot.status(), is_mine=mine, sent=self.sent.get(name, 0), now_us=now_us)
+        status = robot.status(now_us)
+        mine = name in self.tokens and bool(status.holder) and robot.holder == self.tokens[name].token[:8]
+        self.sharing.on_status(name, status, is_mine=mine, sent=self.sent.get(name, 0), now_us=now_us)
         if self.sharing.needs_session(name, is_mine=mine, now_us=now_us):
             self.renew(name)
 
@@ -93,7 +97,7 @@ class Site:
     """Robots, services and the tokens between them. Each token arrives at each service after its own delay."""
 
     def __init__(self, robots, services, seed=0, weights=None):
-        self.chance, self.now_us, self.doubled = Random(seed), 10_000_000, 0
+        self.chance, self.now_us, self.doubled, self.is_stalled = Random(seed), 10_000_000, 0, False
         self.robots, self.services, self.present, self.late = {}, {}, {}, []
         for name in robots:
             self.robots[name] = Robot()
@@ -153,13 +157,19 @@ class Site:
             for _, service, token, is_present in due:
                 service.sharing.on_token(token, is_present, self.now_us)
             for service in awake:
-                if self.now_us % STATUS_US == 0:
+                if self.now_us % STATUS_US == 0 and not self.is_stalled:
                     for name, robot in self.robots.items():
                         service.see(name, robot, self.now_us)
                 service.turn(self.now_us)
-            if self.now_us % FRAME_US == 0:
+            if self.now_us % FRAME_US == 0 and not self.is_stalled:
                 self.frames(awake)
         return self
+
+    def stall(self, ms):
+        """Let nothing pass between robots and services."""
+        self.is_stalled = True
+        self.run(ms)
+        self.is_stalled = False
 
     def frames(self, awake):
         for name, robot in self.robots.items():
@@ -247,6 +257,39 @@ def test_a_service_that_hangs_is_succeeded_and_drives_its_robots_again_later(see
     assert site.worst_gap_ms(began_us) <= 800
     hanging.hangs = False
     site.run(4_000).assert_owners_drive()
+
+
+@pytest.mark.parametrize("ms", [200, 450, 610, 1_050, 1_110, 1_900])
+def test_a_link_that_stalls_changes_neither_drivers_nor_sessions(ms):
+    site = Site(robots(12), SERVICES)
+    before, tokens = site.drivers(), set(site.present)
+    for _ in range(5):
+        site.stall(ms)
+        site.run(2_000)
+    assert site.drivers() == before and set(site.present) == tokens
+
+
+def test_rejected_commands_of_a_stranger_hide_no_driver_that_hangs():
+    site = Site(robots(4), ("a", "b"))
+    began_us, hanging = site.now_us, site.named("a")
+    hanging.hangs = True
+    for _ in range(150):
+        for robot in site.robots.values():
+            robot.strange += 1
+        site.run(10)
+    assert site.worst_gap_ms(began_us) <= 800
+
+
+def test_a_robot_that_restarts_forgets_how_many_frames_were_answered():
+    """Its driver gives credit back and sends no command, e.g. without a target."""
+    site = Site(["r1"], ("a", "b"))
+    for service in site.services.values():
+        service.only_acknowledges = True
+    site.run(20_000)
+    before = site.drivers()
+    site.robots["r1"] = Robot()
+    site.run(5_000)
+    assert site.drivers() == before
 
 
 def test_a_service_that_never_answers_keeps_no_robot():

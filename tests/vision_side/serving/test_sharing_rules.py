@@ -122,6 +122,7 @@ def test_driver_is_not_without_the_lease_while_the_own_link_is_down():
     sharing.on_link(True, 3_000 * MS)
     assert not see(sharing, 3_100 * MS, commands=0)
     assert not see(sharing, 3_200 * MS, commands=2)
+    assert not see(sharing, 3_300 * MS, commands=3)
     assert not see(sharing, 3_399 * MS, commands=4)
     assert see(sharing, 3_400 * MS, commands=5)
 
@@ -212,8 +213,8 @@ def test_standby_drives_380_ms_after_the_last_sign_of_the_driver():
     assert silent_after_ms(lambda ms: {}) == 380
     robot = robot_whose("b", "a")
     sharing = service(robot, driver(robot))
-    see(sharing, 2_000 * MS, accepted=5)
-    see(sharing, 2_380 * MS - 1, accepted=5)
+    for us in (2_000 * MS, 2_130 * MS, 2_260 * MS, 2_380 * MS - 1):
+        see(sharing, us, accepted=5)
     assert sharing.step(3_000 * MS) == {}, "the newest status decides, not the clock"
     see(sharing, 2_380 * MS, accepted=5)
     assert sharing.step(3_000 * MS) == {robot: DRIVE}
@@ -231,7 +232,8 @@ def test_first_status_shows_a_driver_at_work(accepted):
 def test_first_answers_count_above_the_frame_that_may_be_on_its_way(frames, succeeds):
     robot = robot_whose("b", "a")
     sharing = service(robot, driver(robot))
-    see(sharing, 2_000 * MS)
+    for ms in (2_000, 2_130, 2_260):
+        see(sharing, ms * MS)
     see(sharing, 2_380 * MS, sent=frames)
     assert bool(sharing.step(2_380 * MS)) is succeeds
 
@@ -296,8 +298,11 @@ def test_what_was_seen_of_a_robot_before_a_part_ended_does_not_count():
     assert sharing.step(9_000 * MS) == {robot: CLAIM}
     see(sharing, 9_500 * MS, sent=2, accepted=1)
     assert sharing.step(9_500 * MS) == {}, "the other driver may wait for its first frame"
-    see(sharing, 10_500 * MS, sent=2, accepted=1)
-    assert sharing.step(10_500 * MS) == {robot: DRIVE}
+    for ms in range(9_600, 10_800, 100):
+        see(sharing, ms * MS, sent=2, accepted=1)
+        assert sharing.step(ms * MS) == {}
+    see(sharing, 10_800 * MS, sent=2, accepted=1)
+    assert sharing.step(10_800 * MS) == {robot: DRIVE}
 
 
 def test_silence_from_the_time_as_driver_does_not_count_for_a_standby():
@@ -394,7 +399,10 @@ def test_a_mission_keeps_its_robot_while_the_lease_is_here():
     sharing.step(1_500 * MS)
     sharing.robots[robot].is_busy = True
     sharing.on_token(driver(robot), True, 1_600 * MS)
-    assert sharing.step(1_799 * MS) == {}
+    for commands, ms in enumerate((1_600, 1_700, 1_799), 1):
+        see(sharing, ms * MS, commands)
+        assert sharing.step(ms * MS) == {}
+    see(sharing, 1_800 * MS, 4)
     assert sharing.step(1_800 * MS) == {robot: STANDBY}, "300 ms without the lease"
 
 
@@ -405,8 +413,39 @@ def test_a_silent_driver_counts_again_when_it_has_the_lease():
     token = driver(robot)
     sharing.on_token(token, True, 1_500 * MS)
     sharing.robots[robot].ignored.add(token)
-    assert sharing.step(1_800 * MS - 1) == {}
+    for commands, us in enumerate((1_600 * MS, 1_700 * MS, 1_800 * MS - 1), 1):
+        see(sharing, us, commands)
+        assert sharing.step(us) == {}
+    see(sharing, 1_800 * MS, 4)
     assert sharing.step(1_800 * MS) == {robot: STANDBY}
+
+
+@pytest.mark.parametrize("gap_ms", [200, 500, 3_000])
+def test_time_without_statuses_shows_no_silence_of_a_driver(gap_ms):
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    for ms in (1_900, 2_000, 2_000 + gap_ms, 2_100 + gap_ms, 2_200 + gap_ms, 2_229 + gap_ms):
+        see(sharing, ms * MS, accepted=5 + (ms >= 2_000))
+        assert sharing.step(ms * MS) == {}
+    see(sharing, (2_230 + gap_ms) * MS, accepted=6)
+    assert sharing.step((2_230 + gap_ms) * MS) == {robot: DRIVE}, "150 ms of the gap count"
+
+
+def test_answers_count_from_zero_after_a_restart_of_the_robot():
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    for number in range(40):
+        see(sharing, (2_000 + 100 * number) * MS, sent=3 * (number % 20) + 1)
+        assert sharing.step((2_000 + 100 * number) * MS) == {}
+
+
+@pytest.mark.parametrize("gap_ms", [200, 500, 3_000])
+def test_time_without_statuses_is_no_time_without_the_lease(gap_ms):
+    sharing = driven()
+    see(sharing, 2_000 * MS, 1, mine=True)
+    for commands, ms in enumerate((2_000, 2_100, 2_149), 2):
+        assert not see(sharing, (ms + gap_ms) * MS, commands)
+    assert see(sharing, (2_150 + gap_ms) * MS, 9)
 
 
 def test_a_service_that_leaves_gives_its_robot_to_the_first_that_claims_it():
@@ -537,9 +576,10 @@ def test_a_driver_without_the_lease_takes_a_new_session_after_300_ms_of_commands
     sharing = driven()
     see(sharing, 1_000 * MS, 1, mine=True)
     assert not see(sharing, 1_100 * MS, 2)
-    assert not see(sharing, 1_300 * MS - 1, 3)
-    assert see(sharing, 1_300 * MS, 4)
-    assert not see(sharing, 1_300 * MS, 5), "it has begun"
+    assert not see(sharing, 1_200 * MS, 3)
+    assert not see(sharing, 1_300 * MS - 1, 4)
+    assert see(sharing, 1_300 * MS, 5)
+    assert not see(sharing, 1_300 * MS, 6), "it has begun"
 
 
 @pytest.mark.parametrize("changed", [
@@ -548,6 +588,7 @@ def test_a_driver_without_the_lease_takes_a_new_session_after_300_ms_of_commands
 def test_time_without_the_lease_counts_from_the_last_reason_to_have_none(changed):
     sharing = driven()
     see(sharing, 1_000 * MS, 1, **changed)
+    see(sharing, 1_150 * MS, 2)
     assert not see(sharing, 1_300 * MS - 1, 3)
     assert see(sharing, 1_300 * MS, 4)
 
@@ -562,8 +603,11 @@ def test_no_new_session_while_no_command_leaves_or_within_a_second_of_the_claim(
 @pytest.mark.parametrize(("count", "needed"), [(47, False), (48, True)])
 def test_a_new_session_after_48_commands_without_the_lease(count, needed):
     sharing = driven()
-    see(sharing, 1_000 * MS, count - 1, mine=True)
+    see(sharing, 1_000 * MS, count - 1, holder=HUMAN)
     assert see(sharing, 1_010 * MS, count) is needed
+    sharing = driven()
+    see(sharing, 1_000 * MS, 500, mine=True)
+    assert see(sharing, 1_010 * MS, 500 + count) is needed
     assert see(driven(), 1_010 * MS, count, state=State.STOPPED) is needed, "later, no token is its own"
     assert not see(driven(), 1_010 * MS, 90, mine=True), "it has the lease"
 
@@ -582,8 +626,11 @@ def test_commands_count_from_the_begin_of_a_session():
     for count, needed in ((0, False), (1, True)):
         sharing = driven()
         assert see(sharing, 1_000 * MS, 40)
-        see(sharing, 2_900 * MS, count)
-        assert see(sharing, 3_000 * MS, 5) is needed, "the first status of a new session showed no command of it"
+        for ms in range(1_100, 2_800, 100):
+            see(sharing, ms * MS, 0, holder=HUMAN)
+        see(sharing, 2_800 * MS, count)
+        see(sharing, 2_940 * MS, count + 1)
+        assert see(sharing, 3_050 * MS, 5) is needed, "the first status of a new session showed no command of it"
         sharing = driven()
         see(sharing, 900 * MS, count)
         assert see(sharing, 1_000 * MS, 5) is needed
