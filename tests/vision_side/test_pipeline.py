@@ -21,7 +21,7 @@ from sightline.vision_side.pipeline import Frame, FrameLoss, Observation, Pipeli
 from tests.fixtures.vision.vision import Rig, camera, eight, jpeg_of, scene
 
 MODEL = camera()
-BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
+BALL = jpeg_of(scene(MODEL, 1.0, 0.2, shaded=True))
 EMPTY = jpeg_of(np.full((240, 320, 3), 140, np.uint8))
 FRAME_US = 33_333
 

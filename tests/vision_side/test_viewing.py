@@ -26,7 +26,7 @@ from tests.fixtures.ports import free_endpoint
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
-BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
+BALL = jpeg_of(scene(MODEL, 1.0, 0.2, shaded=True))
 BAD = b"\xff\xd8 no picture"
 
 

@@ -35,7 +35,7 @@ from sightline.vision_side.serving.service import Service
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
-BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
+BALL = jpeg_of(scene(MODEL, 1.0, 0.2, shaded=True))
 FRAME_US = 33_333
 COLOR = VisionConfig(detector=DetectorConfig(kind="hsv"))
 TARGET = Detection(100.0, 40.0, 140.0, 80.0, 0.9, "ball", Circle(120.0, 70.0, 20.0), track_id=7)
