@@ -49,8 +49,8 @@ from sightline.vision_side.detect.registry import build_detector
 
 MOST_FALSE: Final = 0.03
 """Share of false alarms and of wrong objects, in every column. An acceptance test allows 5 of a hundred frames without
-a ball: a detector with 3 % exceeds that once in twelve such hundreds, one with 2 % once in sixty. At 2 % the shipped
-weights would find fewer balls in drawn scenes than those before them."""
+a ball: a detector with 3 % exceeds that once in twelve such hundreds, one with 2 % once in sixty. The files that ship
+have stricter thresholds, or others; their cards name them."""
 _TRIED: Final = tuple(round(float(one), 2) for one in np.arange(0.06, 0.95, 0.01))
 _DEFAULT_THRESHOLD: Final = 0.3  # for a label that no scene showed
 
