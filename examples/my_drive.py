@@ -4,10 +4,11 @@ A drive is a class with a `Config`, `set`, `wheels`, `close` and `zero` (robot_s
 each).
 """
 
+import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from sightline.protocol.config import Config
 from sightline.protocol.errors import HardwareError
@@ -20,23 +21,29 @@ class MyDriveConfig(Config):
     port: Path
 
 
+def opened(port: Path) -> TextIO:
+    """Open the port to write lines."""
+    try:
+        # Without O_CREAT: where the port is missing, the user root would create a file and drive that.
+        return os.fdopen(os.open(port, os.O_WRONLY | os.O_NOCTTY), "w", buffering=1)
+    except OSError as error:
+        raise HardwareError(f"motor controller {port}: {error.strerror}; is it plugged in?") from None
+
+
 class MyDrive:
     """A drive without encoders: the wheels are assumed to turn at the set speeds."""
 
     Config = MyDriveConfig
 
     def __init__(self, config: MyDriveConfig) -> None:
-        try:
-            self._port = config.port.open("w", buffering=1)
-        except OSError as error:
-            raise HardwareError(f"motor controller {config.port}: {error.strerror}; is it plugged in?") from None
+        self._port = opened(config.port)
         self._speeds = (0.0, 0.0)
         self._angles = WheelAngles(0.0, 0.0, time.monotonic_ns() // 1000)
 
     @staticmethod
     def zero(config: Mapping[str, Any]) -> None:
         """Stop the wheels after the process of the drive has died."""
-        with Path(config["port"]).open("w") as port:
+        with opened(Path(config["port"])) as port:
             port.write("0 0\n")
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:

@@ -6,6 +6,7 @@ import pytest
 
 from examples.my_drive import MyDrive
 from sightline.evaluation.processes import Processes
+from sightline.protocol.errors import HardwareError
 from sightline.robot_side.hardware.log_drive import LogDrive
 from sightline.robot_side.ports import WheelAngles
 from tests.contracts.drives import check_drive
@@ -21,7 +22,17 @@ def test_the_log_drive(tmp_path):
 
 def test_the_drive_to_copy(tmp_path):
     config = MyDrive.Config(port=tmp_path / "port")
+    config.port.touch()
     check_drive(lambda: MyDrive(config), lambda: MyDrive.zero(config.model_dump(mode="json")))
+
+
+def test_drive_to_copy_creates_no_file_for_a_missing_port(tmp_path):
+    port = tmp_path / "ttyUSB0"
+    with pytest.raises(HardwareError, match=f"motor controller {port}: No such file or directory; is it plugged in"):
+        MyDrive(MyDrive.Config(port=port))
+    with pytest.raises(HardwareError, match=f"motor controller {port}: No such file or directory; is it plugged in"):
+        MyDrive.zero({"port": str(port)})
+    assert not port.exists()
 
 
 @pytest.mark.slow
