@@ -18,8 +18,16 @@ from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.clock import heartbeat_us, monotonic_us
 from sightline.protocol.codec import decode
 from sightline.protocol.config import PLUGIN_ERRORS
-from sightline.protocol.errors import RejectReason, SightlineError, WireError
-from sightline.protocol.log import RepeatLimiter, faults, report_fault, start_log, start_log_thread
+from sightline.protocol.errors import HardwareError, RejectReason, SightlineError, WireError
+from sightline.protocol.log import (
+    RepeatLimiter,
+    error_text,
+    faults,
+    report_ending,
+    report_fault,
+    start_log,
+    start_log_thread,
+)
 from sightline.protocol.messages import LastRejection, State, StreamStatus
 from sightline.protocol.transports.endpoints import check_robot_id
 from sightline.protocol.transports.stop_port import read_packets, send_packet
@@ -104,7 +112,14 @@ def zero_motors(config: RobotConfig) -> int:
     Raises ConfigError for a drive without `zero`, HardwareError if the motors may still turn.
     """
     zero, options = zero_of(config)
-    zero(options)
+    try:
+        zero(options)
+    except SightlineError:
+        raise
+    except PLUGIN_ERRORS as error:
+        report_ending("drive", error)
+        what = f"drive '{config.drive.kind}' raised {type(error).__name__}: {error_text(error)}"
+        raise HardwareError(f"motors NOT set to zero: {what}; switch off their supply") from None
     return 0
 
 

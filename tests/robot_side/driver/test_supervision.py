@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.process import zero_motors
 from sightline.robot_side.driver.supervision import DRIVER_PRIORITY, GUARDIAN_PRIORITY, SystemdNotifier
 from sightline.robot_side.guardian.core import ENDS_WITHIN_US
+from sightline.robot_side.hardware.log_drive import LogDrive
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess
 
@@ -67,6 +68,34 @@ def test_motors_are_zeroed_without_gate_or_network(tmp_path):
 def test_motors_of_a_drive_without_zero_are_a_configuration_error():
     with pytest.raises(ConfigError, match="has no static method zero"):
         zero_motors(RobotConfig(drive=PluginChoice(kind="tests.fixtures.dying:ZerolessDrive")))
+
+
+class GoneDrive(LogDrive):
+    """A drive whose port is gone."""
+
+    @staticmethod
+    def zero(config):
+        raise FileNotFoundError(2, "No such file or directory", "/dev/ttyUSB0")
+
+
+class LeavingDrive(LogDrive):
+    """A drive of a library that ends the program."""
+
+    @staticmethod
+    def zero(config):
+        raise SystemExit("no controller")
+
+
+@pytest.mark.parametrize(("drive", "text"), [
+    (GoneDrive, "FileNotFoundError: [Errno 2] No such file or directory: '/dev/ttyUSB0'"),
+    (LeavingDrive, "SystemExit: no controller"),
+])  # fmt: skip
+def test_zero_that_raises_is_a_hardware_error_with_its_traceback_in_the_log(caplog, drive, text):
+    kind = f"{__name__}:{drive.__name__}"
+    with pytest.raises(HardwareError) as raised:
+        zero_motors(RobotConfig(drive=PluginChoice(kind=kind)))
+    assert str(raised.value) == f"motors NOT set to zero: drive '{kind}' raised {text}; switch off their supply"
+    assert any(record.exc_info for record in caplog.records)
 
 
 def test_driver_scheduling_is_not_inherited(tmp_path):
