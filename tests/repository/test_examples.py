@@ -1,10 +1,17 @@
 """The examples run as they stand."""
 
+import os
+import re
+import shlex
+import subprocess
+import sys
+import textwrap
 from pathlib import Path
 
 from sightline.operator_side.config.loading import load_service
 from sightline.robot_side.plugins import DRIVES
 from sightline.robot_side.ports import WheelAngles
+from tests.fixtures.commands import service
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision
@@ -13,8 +20,8 @@ ROOT = Path(__file__).parent.parent.parent
 
 
 def test_example_robot_drives(tmp_path, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    config = load_service("robot", file="examples/my_robot.toml", environ={}).config
+    monkeypatch.chdir(ROOT / "examples")
+    config = load_service("robot", file="my_robot.toml", environ={}).config
     serial = tmp_path / "serial"
     serial.touch()
     drive = {"kind": config.drive.kind, "options": {"port": str(serial)}}
@@ -24,7 +31,8 @@ def test_example_robot_drives(tmp_path, monkeypatch):
     assert serial.read_text().splitlines()[-1] == "0.000 0.000"
 
 
-def test_example_drive_keeps_the_contract(tmp_path):
+def test_example_drive_keeps_the_contract(monkeypatch):
+    monkeypatch.chdir(ROOT / "examples")
     config = load_service("robot", file=str(ROOT / "examples/my_robot.toml"), environ={}).config
     drive = DRIVES.build(config.drive)
     drive.set(10.0, -10.0)
@@ -32,3 +40,25 @@ def test_example_drive_keeps_the_contract(tmp_path):
     assert isinstance(first, WheelAngles)
     assert until(lambda: drive.wheels().left_rad > first.left_rad + 0.1)
     drive.close()
+
+
+def test_steps_of_the_own_robot_page_work_from_an_empty_folder(tmp_path):
+    page = (ROOT / "docs/how-to/own-robot.md").read_text("utf-8").partition("## Choose what")[0]
+    home, folder = tmp_path / "home", tmp_path / "robot"
+    home.mkdir()
+    folder.mkdir()
+    (home / "sightline").symlink_to(ROOT)
+    copy, check, run = (shlex.split(one) for one in re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
+    words = [word.replace("~", str(home)) for word in copy]
+    subprocess.run(words, cwd=folder, check=True)
+    changed = "\n".join(textwrap.dedent(one) for one in re.findall(r"```toml\n(.*?)```", page, re.DOTALL))
+    env = {**os.environ, "SIGHTLINE_ROBOT__LISTEN": f'["{free_endpoint()}"]',
+           "SIGHTLINE_ROBOT__STATE_DIR": str(tmp_path / "state")}  # fmt: skip
+    program = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
+    with service([*program, *run[1:]], "robot r1: on", tmp_path, 20, cwd=folder, env=env):
+        pass
+    for text in (None, changed):
+        if text is not None:
+            (folder / "my_robot.toml").write_text(text)
+        done = subprocess.run([*program, *check[1:]], cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == 0 and "valid" in done.stdout, done.stderr
