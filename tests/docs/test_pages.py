@@ -89,6 +89,27 @@ def test_every_shell_block_of_a_tutorial_runs_or_states_why_not(page):
         assert re.fullmatch(r"<!-- (run: \w+|not run: .{15,}) -->", before), (shown(page), block[2][:60])
 
 
+@pytest.mark.parametrize("name", [
+    "README.md", "README.zh-CN.md", "docs/how-to/cameras.md", "docs/tutorials/two-machines.md",
+    "docs/tutorials/build-the-car.md",
+])  # fmt: skip
+def test_page_that_installs_creates_and_activates_an_environment_first(name):
+    text = (ROOT / name).read_text("utf-8")
+    blocks = "\n".join(body for language, body in FENCE.findall(text) if language.strip() in SHELL)
+    blocks = re.sub(r"^(car\$|git clone) .*$", "", blocks, flags=re.MULTILINE)
+    created = re.search(r"python3 -m venv \.venv && \. \.venv/bin/activate", blocks)
+    assert created and not re.search(r"sightline|pip install", blocks[: created.start()])
+
+
+def test_two_machines_page_names_the_keys_of_each_machine():
+    page = (DOCS / "tutorials" / "two-machines.md").read_text("utf-8")
+    files = {machine: re.findall(r"`([^`]+)`", row)
+             for machine, row in re.findall(r"^\| (robot|laptop) \| (.*) \|$", page, re.MULTILINE)}
+    assert files == {
+        "robot": ["ca.pem", "robot.*", "stop.secret"], "laptop": ["ca.pem", "vision.*", "operator.*", "stop.secret"],
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize("page", [*TUTORIALS, *GUIDES], ids=shown)
 def test_guide_states_its_result_and_how_to_continue(page):
     text = page.read_text("utf-8")
