@@ -241,6 +241,9 @@ def doctor(
 
     It checks this machine, and with --peer the link to a robot. Exit code 5 means that it found a problem.
     """
+    if "/" in robot:
+        raise ConfigError(f"robot '{robot}' is an address; run `sightline doctor --peer {robot}`")
+    check_robot_id(robot)
     if peer is not None:
         check_endpoint(peer)
     found: list[Finding] = []

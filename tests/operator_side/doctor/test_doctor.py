@@ -194,6 +194,17 @@ def test_invalid_endpoint_is_rejected(capsys):
     assert "error: invalid endpoint 'foo'" in said.err and said.out == "", "before anything is looked at"
 
 
+def test_address_without_peer_is_rejected_with_the_option(capsys):
+    assert cli.run(["doctor", "tcp/127.0.0.1:7447"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err == (
+        "error: robot 'tcp/127.0.0.1:7447' is an address; run `sightline doctor --peer tcp/127.0.0.1:7447`\n"
+    )
+    assert cli.run(["doctor", "r*"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.startswith("error: invalid robot id 'r*': ")
+
+
 def test_missing_camera_is_reported(capsys):
     check = _checks(capsys, "--camera", "v4l2", "--camera-set", "device=/dev/video99")["camera v4l2"]
     assert not check["ok"] and "is not there" in check["value"]
