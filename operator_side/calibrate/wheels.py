@@ -174,7 +174,7 @@ def _pins_of(options: object, side: str) -> str:
     return other if getattr(options, "swapped", False) else side
 
 
-def check_confirmed(confirmed: bool, is_terminal: bool, what: str) -> None:
-    """Raise ConfigError without a confirmation and without a terminal to prompt on."""
+def check_confirmed(confirmed: bool, is_terminal: bool, what: str, precaution: str) -> None:
+    """Raise ConfigError, with the precaution to take, without a confirmation and without a terminal to prompt on."""
     if not confirmed and not is_terminal:
-        raise ConfigError(f"{what} turns the wheels and has no terminal to confirm on; lift the robot, then add --yes")
+        raise ConfigError(f"{what} turns the wheels and has no terminal to confirm on; {precaution}, then add --yes")

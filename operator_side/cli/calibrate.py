@@ -60,7 +60,7 @@ def run_task(task: str, config: RobotConfig, confirmed: bool) -> int:
     if task not in TASKS:
         hint = f" (a robot's id is given with --robot {task})" if not task.startswith("test") else ""
         raise ConfigError(no_such_name("task", task, TASKS) + hint)
-    check_confirmed(confirmed, sys.stdin.isatty(), task)
+    check_confirmed(confirmed, sys.stdin.isatty(), task, "lift the robot")
     is_right = try_wheels(config, None if confirmed else _prompt, typer.echo, _guard)
     return 0 if is_right else _CHECK_FAILED
 
@@ -91,7 +91,7 @@ def drive(
     """
     robot: Any = load_service("robot", file=config, sets=sets or (), environ=os.environ).config
     duties = _rising_duties(duty)
-    check_confirmed(yes, sys.stdin.isatty(), "calibrate drive")
+    check_confirmed(yes, sys.stdin.isatty(), "calibrate drive", "put the robot on the floor, free the way ahead")
     check_out_file(out)
     rows = _measured_rows(robot, duties, seconds, confirmed=yes)
     text = table_text(rows, f"measured by `sightline calibrate drive`, {seconds:g} s at each duty")

@@ -117,7 +117,8 @@ def test_any_key_or_terminal_end_sets_zero(monkeypatch, robot, number):
     (["robot", "test-wheels"], "lift the robot, then add --yes"),
     (["robot", "test-wheel"], "unknown task 'test-wheel'; did you mean 'test-wheels'?"),
     (["robot", "r7"], "--robot r7"),
-    (["calibrate", "drive", "--set", "drive.kind=log"], "add --yes"),
+    (["calibrate", "drive", "--set", "drive.kind=log"],
+     "no terminal to confirm on; put the robot on the floor, free the way ahead, then add --yes"),
     (["calibrate", "drive", "--duty", "0.4,0.3"], "rising numbers"),
     (["calibrate", "drive", "--duty", "0.4,x"], "--duty"),
     (["calibrate", "drive", "--duty", "0.4,1.4"], "up to 1"),
@@ -194,7 +195,7 @@ def test_measurements_that_make_no_table_are_not_written(tmp_path, capsys, monke
 
 
 def test_wheels_turn_only_after_a_confirmation():
-    wheel_test.check_confirmed(True, False, "x")
-    wheel_test.check_confirmed(False, True, "x")
+    wheel_test.check_confirmed(True, False, "x", "wait")
+    wheel_test.check_confirmed(False, True, "x", "wait")
     with pytest.raises(ConfigError):
-        wheel_test.check_confirmed(False, False, "x")
+        wheel_test.check_confirmed(False, False, "x", "wait")
