@@ -249,7 +249,7 @@ def _of_column(column: str, one: DetectorFigures) -> Iterator[Check]:
     for what, share in (("wrong object", one.wrong_object), ("false alarms", one.false_alarms)):
         yield Check(f"{what}, {column}", _percent(share), "%", _percent(MOST_WRONG), share <= MOST_WRONG)
     if column == CLEAN:
-        yield at_most(f"centre p50, {column}", one.centre_p50_px, "px", CENTRE_PX)
+        yield at_most(f"center p50, {column}", one.centre_p50_px, "px", CENTRE_PX)
 
 
 def _of_label(label: str, found: tuple[int, float | None] | None) -> Iterator[Check]:
@@ -271,7 +271,7 @@ def _percent(share: float) -> float:
 # The table of `sightline score detectors`, as text and as Markdown. Pure.
 
 
-_HEAD = ("column", "detector", "hits", "missed", "wrong object", "false alarms", "centre p50 / p95 px", "ms p50")
+_HEAD = ("column", "detector", "hits", "missed", "wrong object", "false alarms", "center p50 / p95 px", "ms p50")
 _MOST_LABELS = 3
 
 

@@ -68,8 +68,8 @@ def test_a_figure_beyond_its_bound_fails_alone(column, worse, name):
 
 def test_the_centre_is_scored_on_clean_pictures_and_has_to_be_there():
     assert failed(report(blur=replace(GOOD, centre_p50_px=4.0))) == []
-    assert failed(report(nominal=replace(GOOD, centre_p50_px=1.01))) == ["centre p50, nominal"]
-    assert failed(report(nominal=replace(GOOD, centre_p50_px=None))) == ["centre p50, nominal"]
+    assert failed(report(nominal=replace(GOOD, centre_p50_px=1.01))) == ["center p50, nominal"]
+    assert failed(report(nominal=replace(GOOD, centre_p50_px=None))) == ["center p50, nominal"]
 
 
 def test_each_label_needs_enough_objects_also_without_detections():
@@ -81,7 +81,7 @@ def test_each_label_needs_enough_objects_also_without_detections():
 def test_a_line_for_each_check_names_whose_it_is():
     lines = check_lines(all_detector_checks(report(nominal=replace(GOOD, centre_p50_px=None, hits=0.84))))
     assert " ".join(lines[0].split()) == "onnx: least hits, nominal 84 % bound 85 FAIL"
-    assert " ".join(lines[3].split()) == "onnx: centre p50, nominal never px bound 1 FAIL"
+    assert " ".join(lines[3].split()) == "onnx: center p50, nominal never px bound 1 FAIL"
     assert sum(line.endswith("  ok") for line in lines) == len(lines) - 2
 
 
