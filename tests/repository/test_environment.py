@@ -306,3 +306,10 @@ def test_announced_sizes_are_those_of_the_packages(environment):
             paths = [Path(package.locate_file(file)) for file in package.files if file.suffix != ".pyc"]
             megabytes += sum(path.stat().st_size for path in paths if path.exists()) / 1e6
         assert 0.85 <= megabytes / environment.SETS[goal].installed_mb <= 1.02
+
+
+def test_first_drive_names_the_size_of_the_environment(environment):
+    demo = environment.SETS["demo"]
+    page = (ROOT / "docs/tutorials/first-drive.md").read_text("utf-8")
+    sizes = f"{demo.ready_made_mb} MB of disk space for the environment, and {demo.download_mb} MB to download"
+    assert f"- {sizes}." in page

@@ -187,6 +187,16 @@ def test_profile_is_complete_and_opens_no_port_twice(profile):
         assert set(service.get("depends_on", ())) <= set(services), "depends on what this profile does not start"
 
 
+def test_page_names_every_published_port_of_each_profile():
+    page = (ROOT / "docs/how-to/containers.md").read_text("utf-8")
+    named = dict(re.findall(r"^\| `([a-z-]+)` \| .* \| (7447[^|]*) \|$", page, re.MULTILINE))
+    for profile in PROFILES:
+        mappings = [port for name in profile.services for port in SERVICES[name].get("ports", ())]
+        ports = [re.fullmatch(r"127\.0\.0\.1:(\d+):\d+(/udp)?", one).groups("") for one in mappings]
+        assert named[profile.name].replace(", TLS", "").split(", ") == ["".join(one) for one in ports], profile.name
+    assert all(f"127.0.0.1:{port}->{port}/{kind}" in page for port, kind in ((7447, "tcp"), (7448, "udp")))
+
+
 def test_shared_profile_is_two_routers_that_every_service_names():
     profile = next(one for one in PROFILES if one.scale)
     both = [f"--connect=tcp/{router}:7447" for router in (profile.router, profile.second_router)]

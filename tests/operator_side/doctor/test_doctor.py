@@ -5,6 +5,7 @@ import os
 import re
 import socket
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -169,6 +170,18 @@ def test_closed_port_and_unknown_host_have_different_fixes(capsys, monkeypatch):
     unknown = _checks(capsys, "--peer", "tcp/no-such-name.invalid:7447")["reach"]
     assert "the port is closed" in refused["fix"] and "does not resolve" in unknown["fix"]
     assert not refused["ok"] and not unknown["ok"]
+
+
+@pytest.mark.parametrize("page", ["how-to/troubleshooting.md", "tutorials/two-machines.md"])
+def test_pages_quote_the_line_of_an_address_without_a_reply(page, monkeypatch):
+    def create_connection(*_address):
+        raise TimeoutError
+
+    monkeypatch.setattr(between.socket, "create_connection", create_connection)
+    monkeypatch.setattr(between, "neighbor", lambda _host: "")
+    (found,) = between.findings("tcp/192.0.2.1:7447", "r1", "")
+    text = (Path(__file__).parent.parent.parent.parent / "docs" / page).read_text("utf-8")
+    assert f"| `{found.fix}` |" in text
 
 
 @pytest.mark.waits
