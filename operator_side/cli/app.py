@@ -9,7 +9,8 @@ import os
 import re
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any, Final
 
 from sightline.operator_side.client.stop import stop_robot
@@ -52,9 +53,26 @@ def _typed(arguments: Sequence[str]) -> Any:
     if arguments[:1] == ["help"]:
         arguments = [*arguments[1:], "--help"]
     try:
-        return app(list(arguments), standalone_mode=False, prog_name="sightline")
+        with _connecting_printed() if "--json" not in arguments else nullcontext():
+            return app(list(arguments), standalone_mode=False, prog_name="sightline")
     except typer.Abort:
         return INTERRUPTED
+
+
+@contextmanager
+def _connecting_printed() -> Iterator[None]:
+    """Print the line of a link that waits for an answer, unless the command has a log, which shows it."""
+    import logging
+
+    opening = logging.getLogger("sightline.protocol.transports.open")
+    handler = logging.StreamHandler()
+    handler.addFilter(lambda _record: not logging.getLogger().handlers)
+    opening.addHandler(handler)
+    opening.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        opening.removeHandler(handler)
 
 
 def plain_options(arguments: Sequence[str]) -> dict[str, Any] | None:

@@ -5,15 +5,21 @@ A robot may listen on several transports. Its link then contains one link of eac
 
 from __future__ import annotations
 
+import logging
+import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from sightline.protocol.channels import CHANNELS, FRAME, Channel
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.link import Link, Message
+
+# A peer that runs answers within this. A silent command of several seconds looks as if it hangs.
+ANNOUNCED_AFTER_S: Final = 1.0
+_log: Final = logging.getLogger(__name__)
 
 
 def open_link(
@@ -50,7 +56,7 @@ def open_link(
     web, zenoh = ([_of_kind(ends, is_web) for ends in (listen, connect)] for is_web in (True, False))
     links: list[Link] = []
     # If one endpoint fails, the others must not stay open, because the robot would answer on one transport only.
-    with ExitStack() as undo:
+    with _announced(connect), ExitStack() as undo:
         # Without any endpoint Zenoh prints the error, because it is the default transport.
         if any(zenoh) or not any(web):
             from sightline.protocol.transports.zenoh.link import open_zenoh
@@ -64,6 +70,20 @@ def open_link(
             links.append(undo.enter_context(of_web))
         undo.pop_all()
     return links[0] if len(links) == 1 else LinkGroup(links)
+
+
+@contextmanager
+def _announced(connect: Sequence[str]) -> Iterator[None]:
+    """Log the addresses once if they do not answer soon."""
+    timer = threading.Timer(ANNOUNCED_AFTER_S, _log.info, ("connecting to %s ...", ", ".join(connect)))
+    # It must not delay the end of a command.
+    timer.daemon = True
+    if connect:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _of_kind(ends: Sequence[str], is_web: bool) -> list[str]:

@@ -21,6 +21,7 @@ from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError, HardwareError, LinkError, SightlineError
 from tests.fixtures.commands import run
+from tests.fixtures.ports import free_endpoint
 
 
 def commands(group=None, path=()):
@@ -392,3 +393,20 @@ def test_a_missing_package_names_the_command_that_installs_it(package, version, 
 def test_missing_module_of_sightline_is_an_unexpected_error():
     with pytest.raises(ModuleNotFoundError), needs("sim"):
         raise ModuleNotFoundError(name="sightline.sim.nothing")
+
+
+@pytest.mark.slow
+def test_command_that_waits_for_a_link_prints_its_address_without_json():
+    address = free_endpoint()
+    program = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
+    commands = {
+        name: subprocess.Popen([*program, *words, "--connect", address], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                               text=True)
+        for name, words in (("plain", ["status"]), ("json", ["status", "--json"]), ("service", ["vision"]))
+    }  # fmt: skip
+    said = {name: process.communicate(timeout=30) for name, process in commands.items()}
+    waits = f"connecting to {address} ..."
+    no_answer = f"error: no answer from {address} after 5 s; start the robot or router, or check the address\n"
+    assert said["plain"] == ("", f"{waits}\n{no_answer}")
+    assert said["json"] == ("", no_answer)
+    assert said["service"][0].endswith(f" info {waits}\n") and said["service"][1] == no_answer

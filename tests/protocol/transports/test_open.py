@@ -1,11 +1,13 @@
 """One robot on several endpoints of different kinds at once."""
 
+import logging
 import socket
 
 import pytest
 
 from sightline.protocol.channels import FRAME, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports import open as open_module
 from sightline.protocol.transports.open import LinkGroup, open_link
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
@@ -56,3 +58,20 @@ def test_host_name_that_does_not_resolve_is_reported(endpoint, monkeypatch):
 def test_links_of_several_robots_are_not_joined():
     with pytest.raises(ConfigError):
         LinkGroup([])
+
+
+def test_open_that_waits_logs_its_addresses_once(caplog, monkeypatch):
+    caplog.set_level(logging.INFO, "sightline")
+    monkeypatch.setattr(open_module, "ANNOUNCED_AFTER_S", 0.05)
+    ends = [free_endpoint(), free_endpoint()]
+    with pytest.raises(LinkError):
+        open_link("r1", connect=ends, role="operator", timeout_s=0.3)
+    assert caplog.messages == [f"connecting to {ends[0]}, {ends[1]} ..."]
+
+
+def test_open_that_is_answered_soon_logs_nothing(caplog):
+    caplog.set_level(logging.INFO, "sightline")
+    endpoint = free_endpoint()
+    with open_link("r1", listen=[endpoint], role="robot"), open_link("r1", connect=[endpoint], role="operator"):
+        pass
+    assert not caplog.messages
