@@ -184,9 +184,10 @@ def _defer(inodes: set[str]) -> int:
     Returns the number of own sockets among `inodes`. Others may listen on the same port of another address.
     """
     count = 0
-    for count, listener in enumerate(own_sockets(inodes.__contains__), 1):
+    for listener in own_sockets(inodes.__contains__):
         # The option may be set while the socket listens already. It holds for connections from now on.
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, _DEFER_S)
+        count += 1
     return count
 
 

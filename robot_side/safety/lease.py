@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from typing import cast
 
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import Holder
@@ -73,9 +74,9 @@ class Lease:
         if holder != who:
             if holder is not None and holder.source == who.source:
                 self._fence(holder)
-            # The same session goes on after a silence: its first proofs are long ago.
-            goes_on = who == self.holder and self.token in self._tokens
-            self.token = self.token if goes_on else "" if who.source in HUMANS else self._token_of(proof)
+            # The same session keeps its token after a silence: its first proofs are long ago.
+            if who != self.holder or not self.token:
+                self.token = "" if who.source in HUMANS else self._token_of(proof)
         self.holder, self.expires_us, self.proof = who, now_us + self.life_us, proof
 
     def advance(self, who: Holder, proof: Proof, now_us: int) -> None:
@@ -96,12 +97,12 @@ class Lease:
     def end_token(self, token: str, now_us: int) -> bool:
         """Return True if the lease ended with this token. Its session never drives again, also if it was over."""
         self._tokens.pop(token, None)
-        if not token or token != self.token or self.holder is None:
+        if not token or token != self.token:
             return False
-        was_live = self.live_holder(now_us) is not None
-        self._fence(self.holder)
+        is_live = self.live_holder(now_us) is not None
+        self._fence(cast(Holder, self.holder))  # only a holder has a token
         self.drop()
-        return was_live
+        return is_live
 
     def _token_of(self, proof: Proof) -> str:
         """Return the token whose driver revealed `proof`, or "" without one."""

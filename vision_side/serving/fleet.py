@@ -357,7 +357,7 @@ class SharedFleet(Fleet):
         self.sharing.robots[robot].is_busy = service.has_request
         if service.is_standby:
             service.note_status(stamp)
-        elif self.sharing.needs_session(robot, is_mine=mine, now_us=now_us):
+        elif self.sharing.needs_session(robot, now_us):
             self._renew(robot)
 
     def _carry_out(self, robot: str, service: Service, now_us: int) -> None:

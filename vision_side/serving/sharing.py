@@ -92,7 +92,7 @@ class SharedRobot:
     """True once it sent a frame since the part began. Before that, a driver has nothing to answer."""
     sent: int = _UNKNOWN
     """Commands of the session of this service."""
-    held: int = 0
+    held: int = _UNKNOWN
     """Those when it last held the lease."""
     mine_us: int = _UNKNOWN
     """Last time at which this service held the lease, or had no reason to."""
@@ -106,6 +106,11 @@ class SharedRobot:
     def is_silent(self) -> bool:
         """Return True if its statuses show no driver at work."""
         return self.status_us - self.active_us >= SILENT_US
+
+    @property
+    def is_not_mine(self) -> bool:
+        """Return True if its statuses show that commands of this service leave and it has no lease."""
+        return self.status_us - self.mine_us >= NOT_MINE_US
 
     def begin_session(self, now_us: int) -> None:
         """Forget the commands of the session before."""
@@ -220,7 +225,7 @@ class Sharing:
             now_us: monotonic clock.
         """
         one = self.robots.get(robot)
-        if one is None or one.part is SharingPart.NONE:
+        if one is None:
             return
         human = status.holder is not None and status.holder.source != "vision"
         needs_no_driver = human or status.state in (State.STOPPED, State.FAULT) or bool(status.stream.camera_fault)
@@ -229,10 +234,10 @@ class Sharing:
             gap_us = max(0, now_us - one.status_us - STATUS_GAP_US)
             one.active_us, one.mine_us = min(now_us, one.active_us + gap_us), min(now_us, one.mine_us + gap_us)
         # A driver that hangs neither sends commands nor gives credit back. Its rejected commands are work.
-        stream, arrived = status.stream, status.accepted + sum(status.refused.get(reason, 0) for reason in OF_DRIVERS)
+        refused = sum(count for reason, count in status.refused.items() if reason in OF_DRIVERS)
+        stream, arrived = status.stream, status.accepted + refused
         answered = stream.sent - stream.credit_timeouts
-        if stream.sent < one.answered:  # the robot was restarted
-            one.answered = 0
+        one.answered = min(one.answered, stream.sent)  # after a restart of the robot they begin again
         one.has_frames |= one.frames not in (_UNKNOWN, stream.sent)
         waits = not one.has_frames and now_us - one.part_us < NO_DRIVER_US
         answers = answered > one.answered + stream.window
@@ -246,10 +251,10 @@ class Sharing:
             one.tries, one.held = 0, sent
         one.frames, one.sent, one.status_us = stream.sent, sent, now_us
 
-    def needs_session(self, robot: str, *, is_mine: bool, now_us: int) -> bool:
+    def needs_session(self, robot: str, now_us: int) -> bool:
         """Return True if this service drives but the robot no longer accepts its session, at most once a second."""
         one = self.robots[robot]
-        stale = self._is_not_mine(one) or (not is_mine and one.sent - one.held >= FRESH_COMMANDS)
+        stale = one.is_not_mine or one.sent - one.held >= FRESH_COMMANDS
         if one.part is not SharingPart.DRIVE or not stale or self._changed_lately(one, now_us):
             return False
         one.begin_session(now_us)
@@ -314,15 +319,10 @@ class Sharing:
     def _must_leave(self, name: str, robot: SharedRobot) -> bool:
         """Return True if another driver has the better claim."""
         # A silent driver counts again if it has the lease.
-        is_not_mine = self._is_not_mine(robot)
-        others = robot.drivers if is_not_mine else robot.others
+        others = robot.drivers if robot.is_not_mine else robot.others
         if self._is_out or robot.is_busy:
-            return bool(others) and (self._is_out or is_not_mine)
+            return bool(others) and (self._is_out or robot.is_not_mine)
         return any(other.name in self._before(name) for other in others)
-
-    @staticmethod
-    def _is_not_mine(robot: SharedRobot) -> bool:
-        return robot.part is SharingPart.DRIVE and robot.status_us - robot.mine_us >= NOT_MINE_US
 
     def _before(self, robot: str) -> list[str]:
         """Return the services that may claim a robot before this one, in their order."""

@@ -4,6 +4,7 @@ import os
 import socket
 import struct
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
@@ -104,10 +105,10 @@ def test_each_open_socket_of_this_process_is_found_and_can_be_chosen():
 
 
 def test_a_number_that_is_no_socket_any_more_is_not_kept_open(tmp_path):
-    with (tmp_path / "file").open("w") as file:
-        assert list(own_sockets(str(tmp_path / "file").__eq__)) == []
-        kept = [link for link in os.listdir("/proc/self/fd") if os.path.exists(f"/proc/self/fd/{link}")
-                and os.path.samefile(f"/proc/self/fd/{link}", file.name)]
+    path = tmp_path / "file"
+    with path.open("w") as file:
+        assert list(own_sockets(str(path).__eq__)) == []
+        kept = [link.name for link in Path("/proc/self/fd").iterdir() if link.exists() and link.samefile(path)]
         assert kept == [str(file.fileno())]
 
 

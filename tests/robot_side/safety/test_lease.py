@@ -150,6 +150,8 @@ def test_token_is_of_the_driver_that_takes_the_lease_while_it_is_there():
     lease.add_token(first.token)
     lease.take(first.who, 10, first.later(1))
     assert lease.token == "", "it came later"
+    lease.take(first.who, 5_000, first.later(2))
+    assert lease.token == first.token, "it is there when the session takes the lease again"
 
 
 @pytest.mark.parametrize(("at_us", "ends"), [(0, True), (999, True), (1_000, False), (9_000, False)])
@@ -159,13 +161,13 @@ def test_lease_ends_with_its_token_while_it_lasts_and_its_session_never_drives_a
     lease.add_token(second.token)
     assert lease.end_token(first.token, at_us) is ends
     assert lease.is_fenced(first.who) and lease.holder is None and lease.token == ""
-    assert not lease.may_take(first.who, at_us + 1, first.later(1)), "a late command keeps no other session waiting"
+    assert lease.may_take(first.who, at_us + 1, first.later(1)) is False, "a late command keeps no other one waiting"
     assert lease.may_take(second.who, at_us + 1, second.proof)
 
 
 def test_empty_token_ends_no_lease():
     lease, first = held(token_first=False)
-    assert not lease.end_token("", 0)
+    assert lease.end_token("", 0) is False
     assert lease.live_holder(0) == first.who
 
 

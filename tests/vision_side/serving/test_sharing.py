@@ -89,7 +89,7 @@ class Service:
         status = robot.status(now_us)
         mine = name in self.tokens and bool(status.holder) and robot.holder == self.tokens[name].token[:8]
         self.sharing.on_status(name, status, is_mine=mine, sent=self.sent.get(name, 0), now_us=now_us)
-        if self.sharing.needs_session(name, is_mine=mine, now_us=now_us):
+        if self.sharing.needs_session(name, now_us):
             self.renew(name)
 
 

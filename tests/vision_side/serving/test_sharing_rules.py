@@ -2,6 +2,7 @@
 
 import pytest
 
+from sightline.protocol.errors import RejectReason
 from sightline.protocol.messages import LeaseHolder, State, Status, StreamStatus
 from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
 from sightline.vision_side.serving.assignment import assign, ranked
@@ -47,7 +48,7 @@ def see(sharing, at_us, commands=0, *, mine=False, state=State.ACTIVE, holder=No
                     stream=StreamStatus(**stream))
     (robot,) = sharing.robots
     sharing.on_status(robot, status, is_mine=mine, sent=commands, now_us=at_us)
-    return sharing.needs_session(robot, is_mine=mine, now_us=at_us)
+    return sharing.needs_session(robot, at_us)
 
 
 # --- the own link ----------------------------------------------------------------------------------------------------
@@ -309,7 +310,8 @@ def test_silence_from_the_time_as_driver_does_not_count_for_a_standby():
     robot = robot_whose("b", "a")
     sharing = service(robot)
     sharing.step(1_500 * MS)
-    see(sharing, 3_000 * MS, sent=1, accepted=1)
+    for ms in range(3_000, 3_600, 100):
+        see(sharing, ms * MS, sent=1, accepted=1)
     sharing.on_token(driver(robot), True, 3_600 * MS)
     assert sharing.step(3_600 * MS) == {robot: STANDBY}
     see(sharing, 3_650 * MS, sent=1, accepted=1)
@@ -424,11 +426,39 @@ def test_a_silent_driver_counts_again_when_it_has_the_lease():
 def test_time_without_statuses_shows_no_silence_of_a_driver(gap_ms):
     robot = robot_whose("b", "a")
     sharing = service(robot, driver(robot))
-    for ms in (1_900, 2_000, 2_000 + gap_ms, 2_100 + gap_ms, 2_200 + gap_ms, 2_229 + gap_ms):
+    for ms in (1_900, 2_000, 2_000 + gap_ms, 2_100 + gap_ms, 2_200 + gap_ms):
         see(sharing, ms * MS, accepted=5 + (ms >= 2_000))
         assert sharing.step(ms * MS) == {}
+    see(sharing, (2_230 + gap_ms) * MS - 1, accepted=6)
+    assert sharing.step((2_230 + gap_ms) * MS - 1) == {}
     see(sharing, (2_230 + gap_ms) * MS, accepted=6)
     assert sharing.step((2_230 + gap_ms) * MS) == {robot: DRIVE}, "150 ms of the gap count"
+
+
+@pytest.mark.parametrize("reason", RejectReason)
+def test_rejections_that_drivers_alone_cause_show_one_at_work(reason):
+    works = reason in ("STALE", "OUT_OF_ORDER", "OTHER_SESSION", "UNKNOWN_FRAME", "FROM_FUTURE", "DISARMED")
+    assert silent_after_ms(lambda ms: {"refused": {reason: ms}}) == (None if works else 380)
+
+
+def test_answers_are_more_than_the_frame_on_its_way_from_the_first_status_on():
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    for sent, ms in ((2, 2_000), (3, 2_100), (3, 2_200), (3, 2_300)):
+        see(sharing, ms * MS, sent=sent)
+    see(sharing, 2_380 * MS, sent=3)
+    assert sharing.step(2_380 * MS) == {robot: DRIVE}
+
+
+def test_commands_of_a_new_session_count_from_zero():
+    sharing = driven()
+    see(sharing, 1_000 * MS, 500, mine=True)
+    for commands, ms in ((501, 1_100), (502, 1_200)):
+        assert not see(sharing, ms * MS, commands)
+    assert see(sharing, 1_300 * MS, 503)
+    for ms in range(1_400, 3_300, 100):
+        assert not see(sharing, ms * MS, 47, holder=HUMAN)
+    assert see(sharing, 3_310 * MS, 48, holder=HUMAN)
 
 
 def test_answers_count_from_zero_after_a_restart_of_the_robot():
@@ -443,8 +473,8 @@ def test_answers_count_from_zero_after_a_restart_of_the_robot():
 def test_time_without_statuses_is_no_time_without_the_lease(gap_ms):
     sharing = driven()
     see(sharing, 2_000 * MS, 1, mine=True)
-    for commands, ms in enumerate((2_000, 2_100, 2_149), 2):
-        assert not see(sharing, (ms + gap_ms) * MS, commands)
+    for commands, us in enumerate((2_000 * MS, 2_100 * MS, 2_150 * MS - 1), 2):
+        assert not see(sharing, us + gap_ms * MS, commands)
     assert see(sharing, (2_150 + gap_ms) * MS, 9)
 
 
