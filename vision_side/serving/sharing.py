@@ -38,7 +38,7 @@ OF_DRIVERS: Final = (
     RejectReason.STALE, RejectReason.OUT_OF_ORDER, RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME,
     RejectReason.FROM_FUTURE, RejectReason.DISARMED,
 )
-"""Rejections that show a driver at work. Strangers, and drivers without the lease, cause the others."""
+"""Rejections that show a driver at work. Other programs, and drivers without the lease, cause the others."""
 ROBOT_RETURNS_US: Final = 2_000_000
 """Time from the return of the link of this service until the token of a robot that ended with it, and is not back,
 counts as ended. A robot tries to connect once a second, or more often."""
@@ -230,7 +230,7 @@ class Sharing:
         human = status.holder is not None and status.holder.source != "vision"
         needs_no_driver = human or status.state in (State.STOPPED, State.FAULT) or bool(status.stream.camera_fault)
         if one.status_us != _UNKNOWN:
-            # While no status came, the link was cut, also for the driver: that is no silence of it.
+            # While no status came, the link was cut, also for the driver: its silence does not count.
             gap_us = max(0, now_us - one.status_us - STATUS_GAP_US)
             one.active_us, one.mine_us = min(now_us, one.active_us + gap_us), min(now_us, one.mine_us + gap_us)
         # A driver that hangs neither sends commands nor gives credit back. Its rejected commands are work.

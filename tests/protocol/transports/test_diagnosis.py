@@ -104,7 +104,8 @@ def test_each_open_socket_of_this_process_is_found_and_can_be_chosen():
         assert {server.getsockname(), other.getsockname()} <= {one.getsockname() for one in own_sockets()}
 
 
-def test_a_number_that_is_no_socket_any_more_is_not_kept_open(tmp_path):
+@pytest.mark.own_process
+def test_a_number_that_became_a_file_does_not_stay_open(tmp_path):
     path = tmp_path / "file"
     with path.open("w") as file:
         assert list(own_sockets(str(path).__eq__)) == []

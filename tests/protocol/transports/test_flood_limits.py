@@ -158,7 +158,7 @@ def test_what_a_flooding_address_begins_is_dropped_and_all_others_go_on(family, 
 
 
 @pytest.mark.waits
-def test_a_listener_of_another_process_at_the_port_of_another_address_is_none_of_ours():
+def test_a_listener_of_another_process_at_the_port_of_another_address_does_not_count():
     port = free_port()
     code = f"import socket; one = socket.create_server(('127.0.0.2', {port})); print(1, flush=True); input()"
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:

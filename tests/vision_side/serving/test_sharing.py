@@ -26,7 +26,7 @@ class Robot:
     state: State = State.ACTIVE
     rejected: int = 0
     strange: int = 0
-    """Rejected commands of a program that is no driver."""
+    """Rejected commands of another program."""
     sent: int = 0
     unanswered: int = 0
     waits: bool = False
@@ -269,7 +269,7 @@ def test_a_link_that_stalls_changes_neither_drivers_nor_sessions(ms):
     assert site.drivers() == before and set(site.present) == tokens
 
 
-def test_rejected_commands_of_a_stranger_hide_no_driver_that_hangs():
+def test_rejected_commands_of_another_program_hide_no_driver_that_hangs():
     site = Site(robots(4), ("a", "b"))
     began_us, hanging = site.now_us, site.named("a")
     hanging.hangs = True

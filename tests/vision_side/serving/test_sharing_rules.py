@@ -470,7 +470,7 @@ def test_answers_count_from_zero_after_a_restart_of_the_robot():
 
 
 @pytest.mark.parametrize("gap_ms", [200, 500, 3_000])
-def test_time_without_statuses_is_no_time_without_the_lease(gap_ms):
+def test_time_without_statuses_does_not_count_as_time_without_the_lease(gap_ms):
     sharing = driven()
     see(sharing, 2_000 * MS, 1, mine=True)
     for commands, us in enumerate((2_000 * MS, 2_100 * MS, 2_150 * MS - 1), 2):
