@@ -1,0 +1,88 @@
+"""Tokens that end, at a fleet that shares robots, in virtual time and without a network."""
+
+import pytest
+
+from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.transports.tokens import RobotToken, VisionToken
+from sightline.vision_side.config import DetectorConfig, ShareConfig, VisionConfig
+from sightline.vision_side.serving import fleet as fleet_module
+from sightline.vision_side.serving.fleet import SharedFleet
+
+MS = 1_000
+
+
+class Site:
+    """A fleet and the robots whose tokens it sees."""
+
+    def __init__(self, monkeypatch, count):
+        self.now_us, self.connected, self.losses = 1_000_000, True, 0
+        self._network, self.declared = MemoryNetwork(seed=1), []
+        monkeypatch.setattr(fleet_module, "monotonic_us", lambda: self.now_us)
+        config = VisionConfig(robot="r*", connect=("tcp/127.0.0.1:1",), detector=DetectorConfig(kind="hsv"),
+                              share=ShareConfig(enabled=True, name="a"))
+        self.fleet = SharedFleet(config, self, lambda _line: None)
+        self.robots = [f"r{number}" for number in range(count)]
+        for robot in self.robots:
+            self.note(RobotToken(robot), True)
+        self.turn(count)
+
+    def on_new_robot(self, callback):
+        pass
+
+    def watch_tokens(self, callback):
+        self.note = callback
+
+    def declare_token(self, token):
+        self.declared.append(token)
+        return lambda: None
+
+    def link(self, robot):
+        return self._network.link(robot, role="vision")
+
+    def turn(self, times=1, ms=1):
+        for _ in range(times):
+            self.now_us += ms * MS
+            self.fleet.turn()
+
+
+def test_robots_whose_tokens_end_long_before_the_loss_of_the_own_link_is_known_keep_their_services(monkeypatch):
+    site = Site(monkeypatch, 40)
+    before = dict(site.fleet.services)
+    assert set(before) == set(site.robots)
+    for robot in site.robots:
+        site.note(RobotToken(robot), False)
+        site.turn(ms=5)
+    site.connected, site.losses = False, 1
+    site.turn(20, ms=100)
+    assert site.fleet.services == before
+    site.connected = True
+    site.turn()
+    for robot in site.robots:
+        site.note(RobotToken(robot), True)
+    site.turn(50, ms=100)
+    assert site.fleet.services == before
+
+
+@pytest.mark.parametrize(("away_ms", "stays"), [(1, True), (490, True), (510, False)])
+def test_robot_whose_own_link_was_cut_for_a_moment_gets_a_new_session_of_the_same_service(monkeypatch, away_ms, stays):
+    site = Site(monkeypatch, 1)
+    before, sender = site.fleet.services["r0"], site.fleet.services["r0"].sender
+    site.note(RobotToken("r0"), False)
+    site.turn(away_ms)
+    site.note(RobotToken("r0"), True)
+    site.turn()
+    assert (site.fleet.services["r0"] is before) is stays
+    assert site.fleet.services["r0"].sender is not sender and not site.fleet.services["r0"].is_standby
+
+
+def test_service_that_ends_counts_after_five_milliseconds(monkeypatch):
+    site = Site(monkeypatch, 2)
+    other = VisionToken("b", 1.0, "0000000b")
+    site.note(other, True)
+    site.turn()
+    assert set(site.fleet.sharing.services()) == {"a", "b"}
+    site.note(other, False)
+    site.turn(4)
+    assert set(site.fleet.sharing.services()) == {"a", "b"}
+    site.turn()
+    assert set(site.fleet.sharing.services()) == {"a"}
