@@ -57,8 +57,6 @@ def test_steps_of_the_own_robot_page_work_from_an_empty_folder(tmp_path):
     program = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
     with service([*program, *run[1:]], "robot r1: on", tmp_path, 20, cwd=folder, env=env):
         pass
-    for text in (None, changed):
-        if text is not None:
-            (folder / "my_robot.toml").write_text(text)
-        done = subprocess.run([*program, *check[1:]], cwd=folder, capture_output=True, text=True, check=False)
-        assert done.returncode == 0 and "valid" in done.stdout, done.stderr
+    (folder / "my_robot.toml").write_text(changed)
+    done = subprocess.run([*program, *check[1:]], cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "valid" in done.stdout, done.stderr
