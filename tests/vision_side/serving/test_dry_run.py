@@ -17,8 +17,8 @@ from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 MODEL = camera()
 COLOR = VisionConfig(detector=DetectorConfig(kind="hsv"))
-BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
-PICTURES = [BALL, BALL, b"no picture", BALL, jpeg_of(scene(MODEL, 3.0, -0.2)), BALL]
+BALL = jpeg_of(scene(MODEL, 1.0, 0.2, shaded=True))
+PICTURES = [BALL, BALL, b"no picture", BALL, jpeg_of(scene(MODEL, 3.0, -0.2, shaded=True)), BALL]
 
 
 class Scripted:
