@@ -64,6 +64,20 @@ def test_a_second_look_is_without_effect_elsewhere_for_other_labels_and_where_it
     assert found(once, model, jpeg, EXPECTED_PX) == ()
 
 
+@pytest.mark.parametrize(("options", "bonus"), [({}, 0.15), ({"address": "rooms"}, 0.1), ({"second_bonus": 0.3}, 0.3)])
+def test_a_weaker_sign_is_enough_where_the_target_is_expected(options, bonus):
+    detector = build_detector("onnx", options, VisionConfig(detector=DetectorConfig(device="cpu")))
+    looks, box = [], np.float32([[100.0, 80.0, 160.0, 140.0]])
+    detector._engine.run = lambda _pixels: {
+        "boxes": box, "scores": np.float32([looks.pop(0)]), "labels": np.float32([0])}
+    gray = jpeg_of(np.full((240, 320, 3), 110, np.uint8))
+    for first, second, score in ((0.49, 0.51 - bonus, 0.51), (0.49, 0.49 - bonus, None), (0.6, None, 0.6)):
+        looks += [first] if second is None else [first, second]
+        assert [round(one.score, 2) for one in found(detector, camera(320, 240), gray, (160.0, 120.0))] == (
+            [] if score is None else [score])
+        assert looks == []
+
+
 def test_a_target_that_the_first_look_finds_costs_no_second_look(shipped, monkeypatch):
     model = camera(320, 240)
     jpeg = jpeg_of(scene(model, 1.0, ASIDE_M, shaded=True))
@@ -113,4 +127,4 @@ def test_a_model_of_any_size_looks_once(tmp_path, monkeypatch, size, runs):
     seen, run = [], detector._engine.run
     monkeypatch.setattr(detector._engine, "run", lambda pixels: seen.append(1) or run(pixels))
     found(detector, camera(320, 240), jpeg_of(scene(camera(320, 240), 1.0, 0.0)), (160.0, 120.0), lambda _: False)
-    assert len(seen) == runs
+    assert len(seen) == runs and detector._second_bonus == 0.0
