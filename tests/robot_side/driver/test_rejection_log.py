@@ -50,7 +50,8 @@ def test_status_keeps_the_counts_of_an_earlier_network_process(tmp_path):
                 assert until(lambda count=count: refused() == count, 8)
             if count == 1:
                 robot.kill_network()
-                assert until(lambda: len(vision.headers) and refused() == 1, 10), "the old count, from the new process"
+                is_kept = until(lambda: len(vision.headers) and refused() == 1, 10)
+                assert is_kept, (refused(), vision.link.connected, robot.output()[-1_000:])
 
 
 def test_commands_before_arming_are_one_line_that_names_the_next_command(tmp_path):
