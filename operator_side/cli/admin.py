@@ -133,8 +133,8 @@ def init(folder: Folder, host: Hosts = None, days: Days = 825) -> None:
     for file in made.make(folder, host or [], days):
         print(f"wrote {file}")
     if not host:
-        print("the certificates are for programs of this machine only; name the machines that listen with --host and "
-              "another folder", file=sys.stderr)
+        print("these certificates are valid on this machine only; for others make another folder with --host NAME",
+              file=sys.stderr)
     print("copy ca.pem and the files of its role to each machine, every *.token to a robot that listens on wss://, and "
           "stop.secret to robots, routers and operators; "
           f"copy ca.key to no machine; then use --secure {folder}")

@@ -77,7 +77,7 @@ def _announced(connect: Sequence[str]) -> Iterator[None]:
     """Log the addresses once if they do not answer soon."""
     timer = threading.Timer(ANNOUNCED_AFTER_S, _log.info, ("connecting to %s ...", ", ".join(connect)))
     # It must not delay the end of a command.
-    timer.daemon = True
+    timer.name, timer.daemon = "connecting", True
     if connect:
         timer.start()
     try:

@@ -221,7 +221,7 @@ _TOKEN_ENDS_AFTER_US, _ROBOT_ENDS_AFTER_US = 5_000, 500_000
 """If the link ends, the tokens beyond it end before that is known: those of 200 robots for 0.1 s. A robot whose own
 link is cut for a moment is back so soon. The end of a driver or service must count at once."""
 _HANDS_OVER_WITHIN_S = 0.6
-_MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn
+_MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn, and ends that do not count yet
 
 
 class SharedFleet(Fleet):
@@ -235,7 +235,7 @@ class SharedFleet(Fleet):
         self._tokens: deque[tuple[Token, bool, int]] = deque(maxlen=_MAX_TOKENS)
         """Each with its presence and the time when that was noted."""
         self._ends_us: dict[Token, int] = {}
-        """When the ends of tokens count that may be back before."""
+        """Tokens that ended and may be back soon: when their end counts."""
         self._is_up, self._losses = True, fleet_link.losses
         self._statuses: dict[str, LatestSlot[Message]] = {}
         self._withdraw: dict[str, Callable[[], None]] = {}
@@ -292,9 +292,11 @@ class SharedFleet(Fleet):
                 if is_back and isinstance(token, RobotToken) and token.robot in self._withdraw:
                     self._attempt(token.robot, self._drive_again)
                 self.sharing.on_token(token, True, now_us)
-            else:
+            elif len(self._ends_us) < _MAX_TOKENS:
                 after_us = _ROBOT_ENDS_AFTER_US if isinstance(token, RobotToken) else _TOKEN_ENDS_AFTER_US
                 self._ends_us[token] = at_us + after_us
+            else:
+                self.sharing.on_token(token, False, now_us)
         for token in [one for one, end_us in self._ends_us.items() if end_us <= now_us or not self._is_up]:
             del self._ends_us[token]
             self.sharing.on_token(token, False, now_us)

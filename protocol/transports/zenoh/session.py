@@ -6,7 +6,6 @@ network therefore do not find it. It never connects to a peer that it found. Exp
 
 from __future__ import annotations
 
-import ctypes
 import json
 import logging
 import re
@@ -71,7 +70,9 @@ RETRY: Final = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_f
 
 
 def _keep(session: zenoh.Session) -> zenoh.Session:
-    """Return a session that listens, which stays in memory after its close, with 16 KiB."""
+    """Keep a session that listens in memory for ever. After its close it takes 16 KiB."""
+    import ctypes
+
     # To free it, Zenoh (1.10.2) waits for a task with Python's global lock held. The thread of that task may run a
     # callback of another session, which needs the lock: then all of Python stands for 10 s.
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(session))

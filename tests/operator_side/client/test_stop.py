@@ -132,7 +132,7 @@ def test_an_answered_datagram_needs_no_link(robot, link, port, busy):
 
 def test_an_answer_without_wheels_at_zero_opens_the_link_after_a_second(robot, link, port, busy):
     one = robot(turns_s=2.0)
-    assert stop(port) and 1.0 <= link.begun_s - one.stopped_s < 2.0
+    assert stop(port) and 1.0 <= link.begun_s - one.stopped_s <= 1.3
 
 
 def test_the_first_datagram_leaves_before_the_libraries_of_the_link_are_imported(port):

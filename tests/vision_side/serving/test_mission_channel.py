@@ -50,7 +50,7 @@ class Bench:
         self.network = MemoryNetwork(seed=3)
         self.robot, self.person = self.network.link("r1"), self.network.link("r1", role="operator")
         self.twists, self.reports, self.said, self.seq = self.robot.latest(TWIST), [], [], 0
-        self.applied = (0.0, 0.0)
+        self.applied, self.image = (0.0, 0.0), BALL
         self.person.subscribe(REPORT, self.reports.append)
         self.service = service(config or COLOR, self.network.link("r1", role="vision"), self.said.append)
         self.robot.publish(CAMERA, encode(Stamp(session=SESSION, seq=1, t_us=0)), encode(MODEL))
@@ -65,7 +65,7 @@ class Bench:
         for _ in range(count):
             self.seq += 1
             header = FrameHeader(session=session, seq=self.seq, t_us=self.seq * FRAME_US, applied=self.applied)
-            self.robot.publish(FRAME, encode(header), BALL)
+            self.robot.publish(FRAME, encode(header), self.image)
             self.turn()
         return self
 

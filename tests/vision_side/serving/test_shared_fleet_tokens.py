@@ -86,3 +86,14 @@ def test_service_that_ends_counts_after_five_milliseconds(monkeypatch):
     assert set(site.fleet.sharing.services()) == {"a", "b"}
     site.turn()
     assert set(site.fleet.sharing.services()) == {"a"}
+
+
+def test_ends_that_wait_are_bounded(monkeypatch):
+    monkeypatch.setattr(fleet_module, "_MAX_TOKENS", 50)
+    site = Site(monkeypatch, 2)
+    for number in range(200):
+        site.note(RobotToken(f"r{number + 100}"), False)
+        site.turn()
+    site.note(RobotToken("r1"), False)
+    site.turn()
+    assert len(site.fleet._ends_us) == 50 and set(site.fleet.services) == {"r0"}, "the end counts at once"
