@@ -443,8 +443,8 @@ def test_a_robot_may_send_an_image_with_its_answer_to_the_handshake():
                 protocol.send_response(protocol.accept(requests[0]))
                 protocol.send_text(TEXT.encode())
                 answered = b"".join(protocol.data_to_send())
-                connections[-1].sendall(answered)
                 images.append(answered[answered.index(b"\r\n\r\n") + 4:])
+                connections[-1].sendall(answered)
 
     with socket.create_server(("127.0.0.1", parse_websocket_endpoint(endpoint).port)) as server:
         threading.Thread(target=answer, args=(server,), daemon=True).start()
