@@ -307,7 +307,7 @@ class Teleop:
         self._seq = self._id = 0
         self._due_us = 0
         self._sent = STILL
-        self._leaving = self.has_left = False
+        self._leaving = self._has_released = False
         self._pending_request: Verb | None = None
         self._request_due_us = self._request_until_us = self._requested_from_id = 0
 
@@ -389,7 +389,7 @@ class Teleop:
         if reply.to != self._own.digest or reply.id < self._requested_from_id:
             return
         if self._leaving:
-            self.has_left |= reply.ok
+            self._has_released |= reply.ok
         elif self._pending_request is None:
             return
         elif reply.ok:
@@ -435,10 +435,20 @@ class Teleop:
         self._stick_waits |= self._stick is not None
         self._stick = None
 
+    @property
+    def has_left(self) -> bool:
+        """Return whether the operator may go: the lease is released, and no STOP is without proof."""
+        return self._has_released and not self.is_stopping
+
     def leave(self) -> Iterator[Message]:
-        """Yield the last messages: zero, then the release of the lease, until `has_left`; none for another driver."""
+        """Yield the last messages, until `has_left`: STOP while nothing proves it, zero, the release of the lease.
+
+        While another driver has the lease, only STOP.
+        """
+        if self.is_stopping:
+            yield self._request(Verb.STOP)
         if self.mode is Mode.WATCHING:
-            self.has_left = True
+            self._has_released = True
             return
         if self.mode is Mode.DRIVING and self._echo is not None:
             yield self._command(STILL, self._echo)

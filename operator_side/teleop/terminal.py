@@ -19,7 +19,7 @@ from sightline.operator_side.teleop.control import SOURCE, Mode, Teleop
 from sightline.operator_side.teleop.gamepad import Gamepad, PadKey
 from sightline.protocol.channels import FRAME, REPLY, STATUS, Channel
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.errors import ConfigError, HardwareError, LinkError
 from sightline.protocol.messages import LeaseHolder, Status
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 
@@ -75,6 +75,8 @@ _SHOW_US: Final = 100_000
 _ALL: Final = 4096  # the buffer of a terminal, so that many late keys are one read
 _LEAVE_S: Final = 0.25
 """The last messages are repeated for this time, unless the robot answers."""
+_PROVE_STOP_S: Final = 1.5
+"""A STOP that nothing has proven is repeated for this time after the end."""
 _LEAVE_PERIOD_S: Final = 0.03
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -124,7 +126,11 @@ class Cockpit:
         return slot
 
     def run(self) -> None:
-        """Drive until Q, Ctrl-C, a signal or the end of the terminal; then command zero and release the robot."""
+        """Drive until Q, Ctrl-C, a signal or the end of the terminal; then command zero and release the robot.
+
+        Raises:
+            LinkError: the operator sent STOP, and nothing proves it.
+        """
         with _signals(self._end), _cbreak(sys.stdin.fileno()):
             _print(self._teleop.layout.help)
             try:
@@ -135,6 +141,8 @@ class Cockpit:
                 if self._stop_sender is not None:
                     self._stop_sender.close()
                 _print("\n\n")
+                if self._teleop.is_stopping:  # this matters more than an error that ended the drive
+                    raise LinkError(f"robot '{self._link.robot}' did not confirm STOP; cut its power by hand")
 
     def _end(self, _number: int, _frame: FrameType | None) -> None:
         self._ended = True
@@ -202,13 +210,15 @@ class Cockpit:
             _print(f"\r\x1b[K{first}\n\x1b[K{second}\r\x1b[1A")  # and back up, to redraw both in place
 
     def _leave(self) -> None:
-        """Command zero and release the lease, until the robot confirms it or a short time is over."""
-        until_s = time.monotonic() + _LEAVE_S
+        """Command zero and release the lease, until the robot confirms it and STOP, or a short time is over."""
+        began_s = time.monotonic()
         while True:
             self._publish(self._teleop.leave())
             time.sleep(_LEAVE_PERIOD_S)
             self._take_messages()
-            if self._teleop.has_left or time.monotonic() > until_s:
+            self._stop_by_datagrams()
+            longest_s = _PROVE_STOP_S if self._teleop.is_stopping else _LEAVE_S
+            if self._teleop.has_left or time.monotonic() - began_s > longest_s:
                 return
 
 

@@ -3,7 +3,9 @@
 import pytest
 
 from sightline.operator_side.teleop.control import LEGACY, WASD, Mode
-from sightline.protocol.messages import STILL, State, Twist, Verb
+from sightline.protocol.channels import REQUEST, TWIST
+from sightline.protocol.codec import decode
+from sightline.protocol.messages import STILL, Request, State, Twist, Verb
 from tests.operator_side.teleop.fixture import OPERATOR, VISION, TeleopRig, vision_drives
 
 MOVING_MS, ZERO_MS = 120, 150
@@ -313,3 +315,26 @@ def test_an_answer_to_a_datagram_ends_the_repetition():
     rig.tap("\n")
     rig.teleop.on_stopped()
     assert not rig.teleop.is_stopping and rig.teleop.note == ""
+
+
+def test_leaving_repeats_a_stop_that_is_not_proven():
+    rig = TeleopRig()
+    rig.tap("\nq")
+    for _ in range(3):
+        messages = list(rig.teleop.leave())
+        assert [decode(Request, message.payload).verb for message in messages] == [Verb.STOP]
+        assert rig.teleop.wants_to_quit and not rig.teleop.has_left
+    rig.teleop.on_stopped()
+    assert list(rig.teleop.leave()) == [] and rig.teleop.has_left
+
+
+def test_leaving_while_driving_sends_stop_too_and_waits_for_its_proof():
+    rig = TeleopRig().armed()
+    rig.tap("\n")
+    rig.tap("i")
+    messages = list(rig.teleop.leave())
+    assert [message.channel for message in messages] == [REQUEST, TWIST, REQUEST]
+    for message in messages:
+        rig.send(message)
+    assert rig.until(lambda: rig.teleop.has_left, 1.0) is not None
+    assert rig.state is State.STOPPED and rig.applied == STILL

@@ -1,6 +1,7 @@
 """`sightline teleop` in a real pseudo-terminal, with a real robot over real Zenoh and fingers that repeat a key."""
 
 import os
+import pty
 import signal
 import statistics
 import threading
@@ -10,7 +11,15 @@ from contextlib import ExitStack, closing
 import pytest
 
 from sightline.operator_side.cli import app as cli
-from sightline.protocol.messages import State
+from sightline.operator_side.client.stop import StopSender
+from sightline.operator_side.teleop import terminal
+from sightline.operator_side.teleop.control import Speeds, Teleop
+from sightline.operator_side.teleop.terminal import Cockpit
+from sightline.protocol.channels import REQUEST
+from sightline.protocol.codec import decode
+from sightline.protocol.errors import LinkError
+from sightline.protocol.messages import Request, State, Verb
+from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.protocol.transports.zenoh.session import open_session
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
@@ -227,6 +236,23 @@ def test_terminal_shows_keys_and_robot(seat):
     seat.terminal.types("\x03")
     assert seat.terminal.process.wait(5) == 0
     assert "Traceback" not in seat.terminal.text()
+
+
+def test_quitting_without_proof_of_stop_repeats_it_and_is_an_error(monkeypatch):
+    monkeypatch.setattr(terminal, "_PROVE_STOP_S", 0.1)
+    network, teleop = MemoryNetwork(), Teleop("0000000a", Speeds(0.2, 1.0))
+    link, robot, requests = network.link("r1", role="teleop"), network.link("r1"), []
+    robot.subscribe(REQUEST, requests.append)
+    master, slave = pty.openpty()
+    with os.fdopen(master, "wb", 0) as fingers, os.fdopen(slave, "r+b", 0) as screen:
+        monkeypatch.setattr("sys.stdin", screen)
+        monkeypatch.setattr("sys.stdout", screen)
+        fingers.write(b"\nq")
+        with pytest.raises(LinkError, match="robot 'r1' did not confirm STOP; cut its power by hand"):
+            Cockpit(link, teleop, lambda: StopSender("r1", ["tcp/127.0.0.1:1"])).run()
+    network.advance(1)
+    assert {decode(Request, message.payload).verb for message in requests} == {Verb.STOP}
+    assert len(requests) >= 3
 
 
 def test_teleop_without_a_terminal_is_one_line(capsys):
