@@ -1,6 +1,7 @@
 """Options and exit codes that several command groups share. Shell (typer)."""
 
 import json
+import math
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, Final, TypeVar
 
@@ -87,9 +88,18 @@ def print_result(result: dict[str, Any], lines: Iterable[str], as_json: bool) ->
 
     A result whose `ok` is missing or None has nothing to fail.
     """
-    for line in (json.dumps(result),) if as_json else lines:
+    for line in (json.dumps(_finite(result), allow_nan=False),) if as_json else lines:
         typer.echo(line)
     return CHECK_FAILED if result.get("ok") is False else 0
+
+
+def _finite(value: Any) -> Any:
+    """Replace each number that JSON lacks, e.g. an infinite bound, by None."""
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:

@@ -3,21 +3,24 @@
 import ast
 import importlib.metadata
 import json
+import math
 import os
 import re
 import subprocess
 import sys
 import tomllib
 from contextlib import nullcontext
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
 import typer
 
+from sightline.evaluation.checks import at_most
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import commands as table
 from sightline.operator_side.cli import operate
-from sightline.operator_side.cli.options import CHECK_FAILED
+from sightline.operator_side.cli.options import CHECK_FAILED, print_result
 from sightline.operator_side.preflight import needs
 from sightline.protocol.errors import ConfigError, HardwareError, LinkError, SightlineError
 from tests.fixtures.commands import run
@@ -269,6 +272,14 @@ def test_error_that_ends_a_service_leaves_its_traceback_in_the_log(capsys, caplo
     (record,) = caplog.records
     assert (record.levelname, record.message) == ("ERROR", "program raised ZeroDivisionError: two lines")
     assert record.exc_info[2].tb_next
+
+
+@pytest.mark.parametrize("number", [math.inf, -math.inf, math.nan])
+def test_result_with_a_number_that_json_lacks_is_valid_json(capsys, number):
+    checks = [asdict(at_most("age", number, "ms", math.inf))]
+    print_result({"ok": True, "checks": checks, "ages_ms": (1.5, number)}, (), as_json=True)
+    result = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert result["checks"][0]["bound"] is None and result["ages_ms"] == [1.5, None]
 
 
 def test_config_commands_print_output_for_scripts(capsys, tmp_path):
