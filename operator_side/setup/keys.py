@@ -10,7 +10,8 @@ from __future__ import annotations
 import datetime
 import ipaddress
 import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,11 +62,7 @@ def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
     usage = dict.fromkeys(("digital_signature", "content_commitment", "key_encipherment", "data_encipherment",
                            "key_agreement", "encipher_only", "decipher_only"), False)
     builder = builder.add_extension(x509.KeyUsage(key_cert_sign=True, crl_sign=True, **usage), True)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        files = _write(folder, "ca", key, _signed(builder, key))
-    except OSError as error:
-        raise ConfigError(f"cannot write keys to {folder}: {error.strerror}; choose another folder") from None
+    files = _write(folder, _pair("ca", key, _signed(builder, key)))
     return files + [file for role in (*ROLES, STOP) for file in add(folder, role, hosts, days)]
 
 
@@ -75,7 +72,8 @@ def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> li
     `STOP` is not a role: it creates the STOP secret.
 
     Raises:
-        ConfigError: the role or a host is invalid, or the key of the authority is missing.
+        ConfigError: the role or a host is invalid, the key of the authority is missing, or the folder cannot be
+            written; nothing is changed.
     """
     if role == STOP:
         return _write_secret(folder)
@@ -95,7 +93,7 @@ def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> li
         .add_extension(x509.ExtendedKeyUsage([Usage.SERVER_AUTH, Usage.CLIENT_AUTH]), False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.public_key()), False)
     )
-    return _write(folder, role, key, _signed(builder, authority)) + _write_token(folder, role)
+    return _write(folder, {**_pair(role, key, _signed(builder, authority)), f"{role}.token": _random()})
 
 
 def look(folder: Path) -> list[Certificate]:
@@ -150,37 +148,43 @@ def _signed(builder: x509.CertificateBuilder, key: EllipticCurvePrivateKey) -> x
     return builder.sign(key, hashes.SHA256())
 
 
-def _write(folder: Path, name: str, key: EllipticCurvePrivateKey, certificate: x509.Certificate) -> list[Path]:
+def _pair(name: str, key: EllipticCurvePrivateKey, certificate: x509.Certificate) -> dict[str, bytes]:
     from cryptography.hazmat.primitives import serialization as forms
 
-    key_file, certificate_file = folder / f"{name}.key", folder / f"{name}.pem"
-    _private(key_file)
-    key_file.write_bytes(
-        key.private_bytes(forms.Encoding.PEM, forms.PrivateFormat.PKCS8, forms.NoEncryption())
-    )
-    certificate_file.write_bytes(certificate.public_bytes(forms.Encoding.PEM))
-    return [key_file, certificate_file]
-
-
-def _write_token(folder: Path, role: str) -> list[Path]:
-    return _write_random(folder / f"{role}.token")
+    return {
+        f"{name}.key": key.private_bytes(forms.Encoding.PEM, forms.PrivateFormat.PKCS8, forms.NoEncryption()),
+        f"{name}.pem": certificate.public_bytes(forms.Encoding.PEM),
+    }
 
 
 def _write_secret(folder: Path) -> list[Path]:
     if not (folder / "ca.pem").is_file():
         raise ConfigError(f"no keys in {folder}; create them with: sightline keys init {folder}")
-    return _write_random(folder / STOP_SECRET_FILE)
+    return _write(folder, {STOP_SECRET_FILE: _random()})
 
 
-def _write_random(file: Path) -> list[Path]:
-    _private(file)
-    file.write_text(secrets.token_urlsafe(_TOKEN_BYTES) + "\n")
-    return [file]
+def _random() -> bytes:
+    return secrets.token_urlsafe(_TOKEN_BYTES).encode() + b"\n"
 
 
-def _private(file: Path) -> None:
-    file.touch(mode=0o600)
-    file.chmod(0o600)
+def _write(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
+    """Write the files, of which all but certificates are private. On a full disk the earlier ones stay as they are."""
+    parts = {folder / name: folder / f".{name}.part" for name in files}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for file, part in parts.items():
+            part.unlink(missing_ok=True)
+            part.touch(mode=0o666 if file.suffix == ".pem" else 0o600)
+            part.write_bytes(files[file.name])
+        for file, part in parts.items():
+            part.replace(file)
+    except OSError as error:
+        raise ConfigError(f"cannot write keys to {folder}: {error.strerror}; choose another folder") from None
+    finally:
+        for part in parts.values():
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+    return list(parts)
 
 
 def _authority_key(folder: Path) -> EllipticCurvePrivateKey:

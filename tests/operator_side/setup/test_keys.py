@@ -1,4 +1,6 @@
-"""The STOP secret of `sightline keys`: a file of its own, which an older folder gets by one command."""
+"""The files of `sightline keys`: the STOP secret of its own, which an older folder gets by one command; whole files."""
+
+import errno
 
 import pytest
 
@@ -36,3 +38,30 @@ def test_an_invalid_host_is_rejected_before_anything_is_written(tmp_path, host):
     with pytest.raises(ConfigError, match=f"invalid host '{host}'"):
         keys.make(tmp_path / "keys", ["robot.local", host])
     assert not (tmp_path / "keys").exists()
+
+
+def test_key_that_cannot_be_written_is_reported_and_the_old_one_stays(tmp_path, monkeypatch):
+    keys.make(tmp_path, [])
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    write_bytes = type(tmp_path).write_bytes
+
+    def on_a_full_disk(path, data):
+        write_bytes(path, b"")
+        if "robot.pem" in path.name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(type(tmp_path), "write_bytes", on_a_full_disk)
+    with pytest.raises(ConfigError, match=f"cannot write keys to {tmp_path}: No space left on device; "):
+        keys.add(tmp_path, "robot", [])
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_new_keys_replace_the_old_ones_and_stay_private(tmp_path):
+    keys.make(tmp_path, [])
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    files = keys.add(tmp_path, "robot", []) + keys.add(tmp_path, "stop", [])
+    assert {file.name for file in files} == {"robot.key", "robot.pem", "robot.token", "stop.secret"}
+    assert {name for name, data in before.items() if (tmp_path / name).read_bytes() != data} == {
+        file.name for file in files}
+    assert all(file.stat().st_mode & 0o777 == 0o600 for file in files if file.suffix != ".pem")
+    assert (tmp_path / "robot.pem").stat().st_mode & 0o777 == (tmp_path / "ca.pem").stat().st_mode & 0o777
