@@ -1,6 +1,4 @@
-"""Checks before the work of a command: the extra that it needs is installed, its result can be written. Shell
-(files).
-"""
+"""Checks of what a command needs: its extra is installed, and its result can be written. Shell (files)."""
 
 import os
 import sys
@@ -49,3 +47,12 @@ def check_out_file(path: Path) -> None:
         may = False
     if not may:
         raise ConfigError(f"cannot write {path}: permission denied; name a file in a folder that you may write")
+
+
+@contextmanager
+def writes(path: Path, fix: str = "choose another file") -> Iterator[None]:
+    """Turn a failed write, e.g. on a full disk, into a ConfigError that names `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror or error}; {fix}") from None

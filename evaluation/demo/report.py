@@ -1,4 +1,4 @@
-"""Scores a demo and writes score.json, trajectory.png, run.mp4 and a summary. Shell (files)."""
+"""Scores a demo, summarizes it, and writes score.json, trajectory.png and run.mp4. Shell (files)."""
 
 import json
 import math
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sightline.evaluation.checks import Check, at_most, check_lines, to_dict
-from sightline.evaluation.demo.run import MOTOR_LOG, RECORDING, DemoRun
+from sightline.evaluation.demo.run import MOTOR_LOG, OTHER_FOLDER, RECORDING, DemoRun
 from sightline.evaluation.demo.shaped_vision import INJECTED
 from sightline.evaluation.faults.evidence import read_motors
 from sightline.evaluation.processes import last_line
@@ -24,11 +24,11 @@ from sightline.evaluation.score.figures import (
 )
 from sightline.evaluation.score.runs import MOST_NOTICES
 from sightline.operator_side.client.requests import StatusReport, read_report
-from sightline.operator_side.preflight import needs
+from sightline.operator_side.preflight import needs, writes
 from sightline.operator_side.recording.recorder import read_recording
 from sightline.operator_side.recording.replay import Replayed, replay
 from sightline.protocol.channels import STATUS
-from sightline.protocol.errors import SightlineError, WireError
+from sightline.protocol.errors import ConfigError, SightlineError, WireError
 
 if TYPE_CHECKING:
     from sightline.evaluation.plots import StatusAt
@@ -68,22 +68,33 @@ class DemoReport:
 
 
 def report(run: DemoRun) -> DemoReport:
-    """Score `run` and write its files. Raises SightlineError for a run that ended before its start."""
+    """Score `run`. Raises SightlineError for a run that ended before its start."""
     if not run.samples:
         raise SightlineError(f"ended before the robot drove; the logs are in {run.folder}")
     recording = run.folder / RECORDING
     said: list[AnsweredFrame] = []
-    # The same pipeline produces the same for the same frames.
-    replayed = replay(recording, lambda step: said.append(AnsweredFrame.of(step.frame.header.t_us, step.answer.seen)))
+    try:  # the same pipeline produces the same for the same frames
+        replayed = replay(
+            recording, lambda step: said.append(AnsweredFrame.of(step.frame.header.t_us, step.answer.seen)))
+    except ConfigError:
+        if not run.recorder_failed:
+            raise
+        why = f"recording {recording} ends too early to be scored: {run.recorder_failed}"
+        raise ConfigError(f"{why}; {OTHER_FOLDER}") from None
     during = [one for one in said if run.samples[0].t_us <= one.t_us <= run.samples[-1].t_us]
     record = RunRecord(run.samples, during, accepted_us(recording), _wheels(run))
     result = score(run.scenario, record)
     injected = _injected(run)
     checks = _checks(run, result) + _injection_checks(run, injected)
-    judged = DemoReport(run, result, checks, replayed, injected)
-    (run.folder / "score.json").write_text(json.dumps(judged.to_dict(), indent=2) + "\n", "utf-8")
-    _draw(run, recording)
-    return judged
+    return DemoReport(run, result, checks, replayed, injected)
+
+
+def write_files(judged: DemoReport) -> None:
+    """Write score.json, trajectory.png and run.mp4 to the run folder. Raises ConfigError if one cannot be written."""
+    folder = judged.run.folder
+    with writes(folder, OTHER_FOLDER):
+        (folder / "score.json").write_text(json.dumps(judged.to_dict(), indent=2) + "\n", "utf-8")
+        _draw(judged.run, folder / RECORDING)
 
 
 def accepted_us(recording: Path) -> int | None:

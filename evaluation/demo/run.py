@@ -17,6 +17,7 @@ from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import millis, twist_text
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.config.toml_text import toml_text
+from sightline.operator_side.preflight import writes
 from sightline.operator_side.recording.recorder import Recorder
 from sightline.operator_side.recording.replay import VISION_CONFIG
 from sightline.operator_side.terminal import LiveBlock
@@ -56,6 +57,7 @@ _SILENT_S: Final = 2.0
 """Without a word from the simulation: longer than a busy machine keeps it from its turn."""
 RECORDING: Final = "run.mcap"
 MOTOR_LOG: Final = "motors.csv"
+OTHER_FOLDER: Final = "free some space or pass another folder with --out"
 TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}", "legacy": "ws-legacy://127.0.0.1:{}"}
 """Endpoint of the vision service by transport. The operator and the recorder always use Zenoh."""
 
@@ -228,7 +230,9 @@ def _write_configuration(run: DemoRun, sockets: str) -> None:
     if options.detector is not None:
         files["vision"] = laid_over(files["vision"], {"detector": {"kind": options.detector}})
     for name, table in files.items():
-        (run.folder / f"{name}.toml").write_text(toml_text(table), "utf-8")
+        file = run.folder / f"{name}.toml"
+        with writes(file, OTHER_FOLDER):
+            file.write_text(toml_text(table), "utf-8")
 
 
 def _vision_arguments(run: DemoRun, endpoint: str) -> list[str]:

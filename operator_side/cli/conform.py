@@ -24,7 +24,7 @@ from sightline.conformance.report import from_lines, summary, to_dict, to_junit,
 from sightline.conformance.robot.fixture import Robot as RobotUnderTest
 from sightline.conformance.runner import Outcome, Result, chosen, run_cases
 from sightline.operator_side.cli.options import Json, Secure, command_group, print_result
-from sightline.operator_side.preflight import check_out_file
+from sightline.operator_side.preflight import check_out_file, writes
 from sightline.operator_side.table import print_table, table_lines
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.security import own_token
@@ -288,15 +288,18 @@ class RunOptions:
             raise ConfigError(f"{given[0]} is for one peer; leave out --jobs and --start")
 
     def report(self, results: Sequence[Result], side: str, peer: str) -> int:
-        """Print and write the results. Returns the exit code."""
+        """Print and write the results. Returns the exit code; raises ConfigError if a file cannot be written."""
         found = to_dict(results, side, self.name or peer)
-        if self.junit is not None:
-            self.junit.write_text(to_junit(results, side, self.name or peer), "utf-8")
-        if self.save is not None:
-            self.save.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
         if not self.as_json and not self.json_lines:
             print_results(results)
-        return print_result(found, (), self.as_json)
+        code = print_result(found, (), self.as_json)
+        if self.junit is not None:
+            with writes(self.junit):
+                self.junit.write_text(to_junit(results, side, self.name or peer), "utf-8")
+        if self.save is not None:
+            with writes(self.save):
+                self.save.write_text(json.dumps(found, indent=1) + "\n", "utf-8")
+        return code
 
 
 def _in_order(cases: Sequence[Case], *parts: Sequence[Result]) -> list[Result]:

@@ -68,7 +68,7 @@ def demo(
     """
     _check_installed("pybullet", "av", "matplotlib", "mcap")
     with needs("all"):
-        from sightline.evaluation.demo.report import report, summary
+        from sightline.evaluation.demo.report import report, summary, write_files
         from sightline.evaluation.demo.run import DemoOptions, run_demo
     show = _to_stderr if as_json else typer.echo
     if story:
@@ -79,6 +79,7 @@ def demo(
     show("all three processes ended; scoring, replaying and filming the run")
     scored = report(run)
     code = print_result(scored.to_dict(), summary(scored), as_json)
+    write_files(scored)  # after the results, which a full disk must not lose
     if open_it:
         webbrowser.open((scored.run.folder / "run.mp4").as_uri())
     return code

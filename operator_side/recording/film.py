@@ -17,7 +17,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from sightline.operator_side.client.pictures import Pictures, Shot
-from sightline.operator_side.preflight import check_out_file, needs
+from sightline.operator_side.preflight import check_out_file, needs, writes
 from sightline.protocol.channels import OVERLAY, Channel
 from sightline.protocol.errors import ConfigError, LinkError, RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
@@ -57,10 +57,8 @@ class Film:
         """Open the file; `fps` is a hint for the encoder. Raises ConfigError without PyAV or for a bad path."""
         with needs("report"):
             import av
-        try:
+        with writes(path):
             self._container = av.open(str(path), "w", options={"movflags": "+faststart"})
-        except OSError as error:
-            raise ConfigError(f"cannot write {path}: {error.strerror or error}; choose another file") from None
         self._av, self._fps = av, fps
         self._stream: Any = None
         self._first_us = self._last_ticks = -1
@@ -165,14 +163,15 @@ def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
 
 
 def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Captured:
-    """Write the images of `seconds`, or until Ctrl-C, to `path`. Raises LinkError if none arrives.
+    """Write the images of `seconds`, or until Ctrl-C, to `path`. Raises LinkError if none arrives, ConfigError for a
+    path that cannot be written.
 
     The capture times end it, so that a first image that comes late does not make the film longer.
     """
     unfinished = path.with_name(f".{path.name}.part.mp4")
     size = (0, 0)
     try:
-        with Film(unfinished, _FPS) as made, suppress(KeyboardInterrupt):
+        with writes(path), Film(unfinished, _FPS) as made, suppress(KeyboardInterrupt):
             ends_s = 0.0  # counted from the first image
             while (shot := _wanted(pictures, wanted, ends_s or time.monotonic() + PATIENCE_S)) is not None:
                 if made.since_first_s(shot.t_us) > seconds:
@@ -183,7 +182,8 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
                     made.add(jpeg_pixels(shot.jpeg), shot.t_us)
         if not made.frames:
             raise LinkError(_silence(pictures, wanted))
-        unfinished.replace(path)
+        with writes(path):
+            unfinished.replace(path)
         return Captured(path, made.frames, made.seconds, *size)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -210,8 +210,8 @@ def _silence(pictures: Pictures, wanted: Channel) -> str:
 def _write(path: Path, data: bytes) -> None:
     unfinished = path.with_name(f".{path.name}.part")
     try:
-        unfinished.write_bytes(data)
-        unfinished.replace(path)
-    except OSError as error:
+        with writes(path):
+            unfinished.write_bytes(data)
+            unfinished.replace(path)
+    finally:
         unfinished.unlink(missing_ok=True)
-        raise ConfigError(f"cannot write {path}: {error.strerror}; choose another file") from None

@@ -19,9 +19,10 @@ from sightline.conformance.runner import Outcome, Result, run_case
 from sightline.conformance.vision import cases as vision
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import conform
-from sightline.operator_side.cli.conform import access_for
+from sightline.operator_side.cli.conform import RunOptions, access_for
 from sightline.operator_side.setup import keys
 from sightline.protocol.channels import TWIST
+from sightline.protocol.errors import ConfigError
 from tests.conformance.robot.reference import virtual_robot
 from tests.conformance.robot.small_server import SmallServer
 from tests.fixtures.ports import free_endpoint
@@ -360,6 +361,13 @@ def test_json_has_the_shape_of_all_checking_commands():
     ]
     assert set(report["checks"][0]) >= {"name", "value", "unit", "bound", "ok"}
     assert report["ok"] == all(check["ok"] for check in report["checks"])
+
+
+def test_results_are_printed_before_files_that_cannot_be_written(capsys, tmp_path):
+    for option in ("junit", "save"):
+        with pytest.raises(ConfigError, match=f"cannot write {tmp_path}: Is a directory; choose another file"):
+            RunOptions(as_json=True, **{option: tmp_path}).report(RUN, "robot", "x")
+        assert json.loads(capsys.readouterr().out)["ok"] is False
 
 
 def test_junit_is_valid_for_any_text_of_a_peer():

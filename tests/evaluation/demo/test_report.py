@@ -1,11 +1,14 @@
 """The score of one demo and of many: also by the reports of the mission, and each figure by its own kind of bound."""
 
+import json
+import shutil
 from dataclasses import replace
 
 import pytest
 
 from sightline.benchmarks.real_time import Kinds, _figures
 from sightline.evaluation.demo import report as demo_report
+from sightline.evaluation.demo import run as demo_run
 from sightline.evaluation.demo.run import MOTOR_LOG, RECORDING, DemoOptions, DemoRun
 from sightline.evaluation.lockstep import Conditions, Lockstep
 from sightline.evaluation.scenario_config import robot_config, robot_of, vision_config
@@ -14,10 +17,13 @@ from sightline.operator_side.recording.recorder import Recorder
 from sightline.operator_side.recording.replay import VISION_CONFIG
 from sightline.protocol.channels import CAMERA, STATUS
 from sightline.protocol.codec import encode
+from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import Stamp, State, Status
 from sightline.protocol.transports.link import Message
 from sightline.sim.scenario import AT_LEAST, load_scenario
 from sightline.sim.world.world import World
+from sightline.vision_side.config import VisionConfig
+from tests.fixtures.commands import run
 
 RADIUS_M = robot_of(load_scenario("traffic-light")).wheels.radius_m
 
@@ -42,30 +48,27 @@ def lights(tmp_path_factory) -> DemoRun:
     return DemoRun(DemoOptions("traffic-light"), scenario, folder, lockstep.run.samples)
 
 
-def misread(run: DemoRun):
+def misread(driven: DemoRun):
     """(share of the frames that were read wrong, whether that is accepted)."""
-    judged = demo_report.report(run)
+    judged = demo_report.report(driven)
     return next((check.value, check.ok) for check in judged.checks if check.name == "wrong_states_percent")
 
 
-def test_color_of_the_light_is_scored_from_the_recording(lights, monkeypatch):
-    monkeypatch.setattr(demo_report, "_draw", lambda *_given: None)
+def test_color_of_the_light_is_scored_from_the_recording(lights):
     assert misread(lights) == (0.0, True)
     assert misread(replace(lights, samples=[replace(one, light="off") for one in lights.samples])) == (100.0, False)
     first, late = lights.samples[0], lights.samples[len(lights.samples) // 2 :]
     assert misread(replace(lights, samples=[replace(first, light="off"), *late])) == (0.0, True), "no report"
 
 
-def test_wheel_commands_are_scored_from_the_motor_log(lights, monkeypatch):
-    monkeypatch.setattr(demo_report, "_draw", lambda *_given: None)
+def test_wheel_commands_are_scored_from_the_motor_log(lights):
     still = replace(lights, options=replace(lights.options, latency_ms=400.0))
     (check,) = [check for check in demo_report.report(still).checks if check.name == "commanded_m"]
     assert check.value > 0.2 and not check.ok
     assert check.value == pytest.approx(lights.samples[-1].x_m - lights.samples[0].x_m, rel=0.2)
 
 
-def test_demo_of_a_scenario_without_bounds_is_not_evaluated(lights, monkeypatch):
-    monkeypatch.setattr(demo_report, "_draw", lambda *_given: None)
+def test_demo_of_a_scenario_without_bounds_is_not_evaluated(lights):
     bare = demo_report.report(replace(lights, scenario=lights.scenario.model_copy(update={"bounds": {}})))
     assert bare.ok is None and bare.to_dict()["ok"] is None and bare.checks == []
     assert any("not evaluated" in line for line in demo_report.summary(bare))
@@ -73,8 +76,7 @@ def test_demo_of_a_scenario_without_bounds_is_not_evaluated(lights, monkeypatch)
     assert demo_report.report(legacy).ok is None
 
 
-def test_summary_shows_what_the_detector_reported_each_line_once_and_the_first_three(lights, monkeypatch):
-    monkeypatch.setattr(demo_report, "_draw", lambda *_given: None)
+def test_summary_shows_what_the_detector_reported_each_line_once_and_the_first_three(lights):
     judged = demo_report.report(lights)
     before = demo_report.summary(judged)
     assert not any("detector: " in line for line in before)
@@ -88,6 +90,31 @@ def test_summary_shows_what_the_detector_reported_each_line_once_and_the_first_t
         log.write_text("")
     told = [f"detector: the color range marks {share} %" for share in (0, 1, 2)]
     assert after == [*before[:-2], *told, *before[-2:]]
+
+
+def test_results_are_printed_before_files_that_cannot_be_written(lights, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "run"
+    shutil.copytree(lights.folder, folder)
+    (folder / "score.json").mkdir()
+    monkeypatch.setattr(demo_run, "run_demo", lambda *_given: replace(lights, folder=folder))
+    code, out, err = run(capsys, "demo", "--scenario", "traffic-light", "--json")
+    assert code == 2 and json.loads(out)["checks"]
+    assert err.splitlines()[-1] == (
+        f"error: cannot write {folder}: Is a directory; free some space or pass another folder with --out")
+
+
+def test_recording_without_a_camera_model_names_the_error_of_the_disk(lights, tmp_path):
+    with Recorder(StatusLink(), tmp_path / RECORDING, {VISION_CONFIG: VisionConfig().model_dump_json()}):
+        pass
+    cut = replace(lights, folder=tmp_path, recorder_failed="No space left on device")
+    with pytest.raises(ConfigError, match="too early to be scored: No space left on device; free some space"):
+        demo_report.report(cut)
+
+
+def test_configuration_that_cannot_be_written_is_reported(lights, tmp_path):
+    (tmp_path / "robot.toml").mkdir()
+    with pytest.raises(ConfigError, match=f"cannot write {tmp_path}/robot.toml: Is a directory; free some space"):
+        demo_run._write_configuration(replace(lights, folder=tmp_path), "/tmp/sockets")
 
 
 class StatusLink:

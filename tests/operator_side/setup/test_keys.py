@@ -1,4 +1,4 @@
-"""The files of `sightline keys`: the STOP secret of its own, which an older folder gets by one command; whole files."""
+"""The files of `sightline keys`: whole or unchanged, private, and the STOP secret is a file of its own."""
 
 import errno
 
