@@ -42,6 +42,7 @@ def colored(text: str) -> str:
     return _COLORED.sub(lambda found: f"\x1b[{_COLORS[found[1]]}m{found[1]}\x1b[0m", text)
 
 
-def uses_color(stream: TextIO) -> bool:
+def uses_color(stream: TextIO | None) -> bool:
     """Return whether colors may be written: to a terminal, unless NO_COLOR is set (https://no-color.org)."""
-    return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
+    is_terminal = stream is not None and stream.isatty()  # None: the output is closed
+    return is_terminal and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"

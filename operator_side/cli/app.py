@@ -11,7 +11,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from sightline.operator_side.client.stop import stop_robot
 from sightline.operator_side.config.context import stop_secret_of, target_of
@@ -38,7 +38,7 @@ def run(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except BrokenPipeError:  # `sightline status --watch | head`: the reader has ended
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard(sys.stdout)
         return UNEXPECTED
     except Exception as error:
         return _unexpected(error)
@@ -99,18 +99,36 @@ def send_stop(robot: str | None, connect: list[str] | None, secure: str, as_json
     """Run `sightline stop` with its options as given. Returns 0; raises SightlineError if the robot may still move."""
 
     def on_slow() -> None:
-        print(f"STOP of {target.robot} is not confirmed, repeating; be ready to cut its power by hand", file=sys.stderr)
+        _warn(f"STOP of {target.robot} is not confirmed, repeating; be ready to cut its power by hand")
 
-    target = target_of(robot, connect, secure, announce=True)
-    is_stored = stop_robot(
-        target.robot, target.connect, target.secure, stop_secret_of(target), on_slow, thread_name=ABANDONED_THREAD
-    )
+    target = target_of(robot, connect, secure)
+    _warn(str(target))
+    is_stored = stop_robot(target.robot, target.connect, target.secure, stop_secret_of(target, _warn), on_slow,
+                           thread_name=ABANDONED_THREAD)
     if not is_stored:
-        print(f"STOP of {target.robot} is not on its disk, so that a restart ends it; is the disk full?",
-              file=sys.stderr)
+        _warn(f"STOP of {target.robot} is not on its disk, so that a restart ends it; is the disk full?")
     done = {"robot": target.robot, "ok": True, "state": "STOPPED", "detail": "wheels at zero"}
-    print(json.dumps(done) if as_json else f"{target.robot}: STOPPED (wheels at zero)", flush=True)
+    _print(json.dumps(done) if as_json else f"{target.robot}: STOPPED (wheels at zero)", sys.stdout)
     return 0
+
+
+def _warn(line: str) -> None:
+    _print(line, sys.stderr)
+
+
+def _print(line: str, stream: TextIO | None) -> None:
+    """Print a line. An output that is closed or on a full disk must neither prevent a STOP nor change its exit code."""
+    try:
+        if stream is not None:
+            print(line, file=stream, flush=True)
+    except OSError:
+        _discard(stream)
+
+
+def _discard(stream: TextIO | None) -> None:
+    """Send the rest of an output nowhere, so that the end of the process does not fail on it."""
+    if stream is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _unexpected(error: Exception) -> int:
@@ -146,7 +164,7 @@ def _usage_line(text: str, context: "typer.Context | None") -> str:
 def _print_error(line: str, code: int) -> int:
     from sightline.protocol.log import error_line
 
-    print(error_line(line), file=sys.stderr)
+    _warn(error_line(line))
     return code
 
 
@@ -158,7 +176,6 @@ def main() -> None:
     """Run the command of this process and exit with its code."""
     code = run(sys.argv[1:])
     if any(thread.name == ABANDONED_THREAD for thread in threading.enumerate()):
-        sys.stdout.flush()
         os._exit(code)
     sys.exit(code)
 

@@ -6,6 +6,7 @@ import secrets
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -361,7 +362,7 @@ def teleop(
         pad = Gamepad(gamepad) if gamepad else None
         if pad is not None:
             ending.callback(pad.close)
-        secret_file = stop_secret_of(target)
+        secret_file = stop_secret_of(target, partial(typer.echo, err=True))
         link = ending.enter_context(_link(target, ROLE))
         steered = Teleop(session, Speeds(linear, angular), layout)
         Cockpit(link, steered, lambda: StopSender(target.robot, target.connect, secret_file), pad).run()

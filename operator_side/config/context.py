@@ -6,7 +6,7 @@ Shell (files).
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -73,7 +73,7 @@ def target_of(robot: str | None, connect: list[str] | None, secure: str, *, anno
 
     Args:
         robot, connect, secure: values of the options, as given.
-        announce: whether to print address and origin on stderr, for commands that move or stop a robot.
+        announce: whether to print address and origin on stderr, for commands that move a robot.
     """
     target = find_address(os.environ, robot, connect, secure)
     check_robot_id(target.robot)
@@ -84,12 +84,12 @@ def target_of(robot: str | None, connect: list[str] | None, secure: str, *, anno
     return target
 
 
-def stop_secret_of(target: RobotAddress) -> str:
-    """Return the file of the STOP secret; print one line where the keys lack it."""
+def stop_secret_of(target: RobotAddress, warn: Callable[[str], None]) -> str:
+    """Return the file of the STOP secret; warn with one line where the keys lack it."""
     try:
         return stop_secret_file(target.secure) if target.secure else ""
     except ConfigError as error:
-        print(str(error), file=sys.stderr)
+        warn(str(error))
         return ""
 
 

@@ -83,7 +83,7 @@ _ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 def check_terminal() -> None:
     """Raise ConfigError unless stdin and stdout are a terminal."""
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+    if not all(stream is not None and stream.isatty() for stream in (sys.stdin, sys.stdout)):
         raise ConfigError("teleop needs a terminal to read keys; over ssh use `ssh -t`")
 
 

@@ -31,6 +31,7 @@ def test_colors_need_a_terminal_and_no_no_color(monkeypatch, environ, expected):
         monkeypatch.setenv(name, value)
     assert uses_color(Terminal()) is expected
     assert uses_color(io.StringIO()) is False
+    assert uses_color(None) is False, "the output is closed"
 
 
 def test_states_are_colored_and_other_words_are_not():

@@ -1,10 +1,13 @@
 """`sightline stop`: a plain command line is read as typer reads it, and every other one by typer."""
 
+import threading
+from pathlib import Path
 from random import Random
 
 import pytest
 
 from sightline.operator_side.cli import app as cli
+from sightline.protocol.errors import LinkError
 
 WORDS = ("r1", "r2", "--json", "--connect", "--connect=tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447", "--secure",
          "--secure=k", "--connect=", "--", "-h", "--jso", "-1", "", "=", "stop")  # fmt: skip
@@ -45,6 +48,31 @@ def test_every_line_has_the_result_that_typer_gives_it(stopped, monkeypatch, cap
         codes = [cli.run(["stop", *line]) for line in lines]
         results.append((codes, tuple(stopped), capsys.readouterr()))
     assert results[0] == results[1]
+
+
+@pytest.mark.parametrize("output", ["stdout", "stderr"])
+@pytest.mark.parametrize("is_closed", [True, False])
+def test_output_that_fails_neither_prevents_a_stop_nor_changes_its_exit_code(stopped, monkeypatch, output, is_closed):
+    def unanswered(*_given, **_options):
+        raise LinkError("no answer")
+
+    with Path("/dev/full").open("w", buffering=1) as full:
+        monkeypatch.setattr(f"sys.{output}", None if is_closed else full)
+        assert cli.run(["stop", "r7"]) == 0 and len(stopped) == 1
+        monkeypatch.setattr(cli, "stop_robot", unanswered)
+        assert cli.run(["stop", "r7"]) == 4
+
+
+def test_link_that_lingers_does_not_delay_the_exit_with_a_closed_output(stopped, monkeypatch):
+    ended, codes = threading.Event(), []
+    threading.Thread(target=ended.wait, name=cli.ABANDONED_THREAD, daemon=True).start()
+    monkeypatch.setattr("sys.stdout", None)
+    monkeypatch.setattr("sys.argv", ["sightline", "stop", "r7"])
+    monkeypatch.setattr("os._exit", codes.append)
+    with pytest.raises(SystemExit):
+        cli.main()
+    ended.set()
+    assert codes == [0] and len(stopped) == 1
 
 
 @pytest.mark.parametrize("words", [["-h"], ["--help"], ["r1", "r2"], ["--connect"], ["--secure", "--json"], ["--now"]])

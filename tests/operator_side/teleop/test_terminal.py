@@ -255,7 +255,10 @@ def test_quitting_without_proof_of_stop_repeats_it_and_is_an_error(monkeypatch):
     assert len(requests) >= 3
 
 
-def test_teleop_without_a_terminal_is_one_line(capsys):
+@pytest.mark.parametrize("closed", ["stdin", "stdout", ""])
+def test_teleop_without_a_terminal_is_one_line(capsys, monkeypatch, closed):
+    if closed:
+        monkeypatch.setattr(f"sys.{closed}", None)
     assert cli.run(["teleop", "r1", "--connect", "tcp/127.0.0.1:1"]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err == (
