@@ -149,16 +149,17 @@ def discover_all(connect: Sequence[str] | None, seconds: float, secure: str) -> 
         raise LinkError(f"no robot at {DEFAULT_ENDPOINT}, and no answer to a multicast after {SCOUT_S:g} s; "
                         "give the address: sightline robots --connect tcp/ROBOT:7447")
     with ThreadPoolExecutor(len(places), "discovery") as pool:
-        return DiscoveryReport(
-            dict(zip(places, pool.map(lambda place: _queried(place, seconds, secure), places), strict=True))
-        )
+        found = list(pool.map(lambda place: _queried(place, seconds, secure), places))
+    return _checked(DiscoveryReport(dict(zip(places, found, strict=True))), seconds)
 
 
 def _checked(report: DiscoveryReport, seconds: float) -> DiscoveryReport:
-    for place, found in report.places.items():
-        if isinstance(found, Discovered) and not found.statuses and not found.peers:
-            raise LinkError(f"no robot at {place} after {seconds:g} s; start one: sightline robot")
-    return report
+    if any(isinstance(found, Discovered) and (found.statuses or found.peers) for found in report.places.values()):
+        return report
+    errors = "; ".join(report.lines())  # without a robot or peer, only errors have a line
+    raise LinkError(
+        errors or f"no robot at {', '.join(report.places)} after {seconds:g} s; start one: sightline robot"
+    )
 
 
 def _of_zenoh(connect: Sequence[str]) -> Sequence[str]:
