@@ -22,7 +22,7 @@ from sightline.operator_side.doctor.finding import Finding, trouble
 from sightline.operator_side.preflight import needs
 from sightline.protocol import VERSION
 from sightline.protocol.errors import SightlineError
-from sightline.protocol.transports.diagnosis import port_owner
+from sightline.protocol.transports.diagnosis import listening_inodes, port_owner
 from sightline.protocol.transports.zenoh.session import MULTICAST_GROUP
 
 PORTS = {7447: "Zenoh", 9090: "sightline.v1", 9091: "the legacy protocol"}
@@ -77,6 +77,9 @@ def _collision() -> Finding:
 
 def _port(port: int, what: str) -> Finding:
     owner = port_owner(port)
+    if not owner and listening_inodes({port}):
+        fix = "run `sudo sightline doctor`, which names the process"
+        return Finding(f"port {port}", None, f"{what}: in use by a process of another user", fix)
     if not owner:
         return Finding(f"port {port}", None, f"{what}: free")
     number = owner.rpartition("(pid ")[2].rstrip(")")

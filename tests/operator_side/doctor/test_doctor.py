@@ -15,6 +15,7 @@ from sightline.operator_side.doctor import machine as cameras
 from sightline.operator_side.doctor import network as between
 from sightline.operator_side.doctor.finding import Finding, as_object, histogram
 from sightline.operator_side.setup import keys
+from sightline.protocol.transports import diagnosis
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from tests.fixtures.links import START_S, until
@@ -137,6 +138,15 @@ def test_busy_port_is_reported_with_its_owner(capsys, monkeypatch):
         check = _checks(capsys)[f"port {server.getsockname()[1]}"]
     assert "in use by" in check["value"] and f"(pid {os.getpid()})" in check["value"]
     assert f"kill {os.getpid()}," in check["fix"]
+
+
+def test_port_of_another_user_is_in_use(monkeypatch):
+    monkeypatch.setattr(diagnosis, "_descriptors", lambda _process: [])  # /proc/PID/fd of another user
+    with socket.create_server(("127.0.0.1", free_port())) as server:
+        port = server.getsockname()[1]
+        found = machine._port(port, "mine")
+    assert found.value == "mine: in use by a process of another user" and "sudo sightline doctor" in found.fix
+    assert machine._port(port, "mine").value == "mine: free"
 
 
 def test_package_of_the_same_name_is_reported(capsys, monkeypatch):
