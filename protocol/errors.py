@@ -37,6 +37,7 @@ CLAMPED = "CLAMPED"
 #  ├─ ConfigError   (2)     a bad option, file, environment variable or scenario
 #  ├─ HardwareError (3)     a device or the simulation is missing or broken
 #  ├─ LinkError     (4)     an endpoint cannot be opened or reached
+#  ├─ CheckError    (5)     an evaluated run did not get so far that it can be scored
 #  └─ WireError             invalid bytes from a peer; never ends a loop
 
 
@@ -62,6 +63,12 @@ class LinkError(SightlineError):
     """An endpoint cannot be opened or reached."""
 
     exit_code = 4
+
+
+class CheckError(SightlineError):
+    """An evaluated run failed before it could be scored."""
+
+    exit_code = 5
 
 
 class WireError(SightlineError):

@@ -28,7 +28,7 @@ from sightline.operator_side.preflight import needs, writes
 from sightline.operator_side.recording.recorder import read_recording
 from sightline.operator_side.recording.replay import Replayed, replay
 from sightline.protocol.channels import STATUS
-from sightline.protocol.errors import ConfigError, SightlineError, WireError
+from sightline.protocol.errors import CheckError, ConfigError, WireError
 
 if TYPE_CHECKING:
     from sightline.evaluation.plots import StatusAt
@@ -68,9 +68,9 @@ class DemoReport:
 
 
 def report(run: DemoRun) -> DemoReport:
-    """Score `run`. Raises SightlineError for a run that ended before its start."""
+    """Score `run`. Raises CheckError for a run that ended before its start."""
     if not run.samples:
-        raise SightlineError(f"ended before the robot drove; the logs are in {run.folder}")
+        raise CheckError(f"ended before the robot drove; the logs are in {run.folder}")
     recording = run.folder / RECORDING
     said: list[AnsweredFrame] = []
     try:  # the same pipeline produces the same for the same frames

@@ -21,7 +21,7 @@ from sightline.operator_side.preflight import writes
 from sightline.operator_side.recording.recorder import Recorder
 from sightline.operator_side.recording.replay import VISION_CONFIG
 from sightline.operator_side.terminal import LiveBlock
-from sightline.protocol.errors import ConfigError, HardwareError, SightlineError
+from sightline.protocol.errors import CheckError, ConfigError, HardwareError, SightlineError
 from sightline.protocol.messages import Status
 from sightline.protocol.transports.open import open_link
 from sightline.sim.bus import TruthReader
@@ -106,7 +106,10 @@ class DemoRun:
 
 
 def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
-    """Run it. Raises ConfigError, LinkError or the failure of a process; nothing is left running in any case."""
+    """Run it. Raises ConfigError, LinkError, CheckError, the failure of a process, or KeyboardInterrupt at the start.
+
+    Nothing is left running in any case.
+    """
     scenario = load_scenario(options.scenario)
     _check_vision(options, scenario)
     run = DemoRun(options, scenario, run_folder(options.out, f"{scenario.name}-{options.seed}"))
@@ -116,6 +119,8 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
         try:
             _drive(run, processes, processes.temporary_folder(), say)
         except KeyboardInterrupt:
+            if not run.samples:  # there is nothing to score
+                raise
             run.interrupted = True
         except SightlineError:
             processes.check(_DYING_S)  # who ended is the cause; what it broke here is not
@@ -178,7 +183,7 @@ def arm_robot(operator: Operator, processes: Processes) -> None:
         if reply.ok:
             return
         if time.monotonic() > deadline_s:
-            raise SightlineError(f"the robot would not be armed: {reply.detail}")
+            raise CheckError(f"the robot would not be armed: {reply.detail}")
 
 
 def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthReader, block: LiveBlock) -> None:

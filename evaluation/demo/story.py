@@ -12,7 +12,7 @@ from typing import Final, Literal, NamedTuple
 
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.evidence import DISTANCE_M, ZERO_MS, MotorRow, measure_stop, wheel_mps
-from sightline.protocol.errors import SightlineError
+from sightline.protocol.errors import CheckError
 from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.sim.truth import Truth
 
@@ -90,10 +90,10 @@ class StopFigure(NamedTuple):
 
 
 def stop_after(take: Take, event: Event, until: Event) -> StopFigure:
-    """Measure the stop after `event`. Raises SightlineError if the wheels were not at zero before `until`."""
+    """Measure the stop after `event`. Raises CheckError if the wheels were not at zero before `until`."""
     stop = measure_stop(take.motors, take.events[event], take.events[until])
     if stop.zero_ms is None:
-        raise SightlineError(f"{take.name}: the wheels were not at zero between {event!r} and {until!r}; run it again")
+        raise CheckError(f"{take.name}: the wheels were not at zero between {event!r} and {until!r}; run it again")
     return StopFigure(stop.zero_ms, stop.distance_m)
 
 
@@ -147,10 +147,10 @@ def has_fast_command(arrivals: Sequence[Arrival]) -> bool:
 
 
 def compose(safe: Take, naive: Take) -> Story:
-    """Compute the figures of both takes. Raises SightlineError where one of them did not end as the film shows."""
+    """Compute the figures of both takes. Raises CheckError where one of them did not end as the film shows."""
     lost_us = naive.events["wifi lost"]
     if "wall" not in naive.events:
-        raise SightlineError("the naive robot met no wall while the radio was gone, as its last command was slow; "
+        raise CheckError("the naive robot met no wall while the radio was gone, as its last command was slow; "
                              "run it again on a machine with less load")
     hit_us = naive.events["wall"]
     return Story(

@@ -45,7 +45,7 @@ from sightline.operator_side.preflight import check_out_file, needs
 from sightline.protocol.channels import FRAME, STATUS, TWIST
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
-from sightline.protocol.errors import ConfigError, HardwareError, SightlineError, WireError
+from sightline.protocol.errors import CheckError, ConfigError, HardwareError, WireError
 from sightline.protocol.messages import AnswerHeader, FrameHeader, Status
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import Link, Message
@@ -179,7 +179,7 @@ class TakeProcesses:
         self.until(lambda now: now.t_us >= ends_us, seconds + 5.0, "the end of a scene")
 
     def until(self, happened: Callable[[Truth], bool], seconds: float, what: str) -> None:
-        """Store truth until `happened`. Raises SightlineError naming `what` if it takes longer."""
+        """Store truth until `happened`. Raises CheckError naming `what` if it takes longer."""
         deadline_s = time.monotonic() + seconds
         while True:
             self.processes.check()
@@ -190,8 +190,8 @@ class TakeProcesses:
             if happened(now):
                 return
             if time.monotonic() > deadline_s:
-                raise SightlineError(f"{self.take.name}: no {what} within {seconds:g} s; the logs are in "
-                                     f"{self._folder}; run it again on a machine with less load")
+                raise CheckError(f"{self.take.name}: no {what} within {seconds:g} s; the logs are in "
+                                 f"{self._folder}; run it again on a machine with less load")
 
     def follows(self, since_us: int) -> Callable[[Truth], bool]:
         """Give a condition: the robot has followed the visible ball for a while, all of it after `since_us`."""

@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
@@ -17,8 +18,8 @@ from sightline.operator_side.recording.recorder import Recorder
 from sightline.operator_side.recording.replay import VISION_CONFIG
 from sightline.protocol.channels import CAMERA, STATUS
 from sightline.protocol.codec import encode
-from sightline.protocol.errors import ConfigError
-from sightline.protocol.messages import Stamp, State, Status
+from sightline.protocol.errors import CheckError, ConfigError
+from sightline.protocol.messages import Reply, Stamp, State, Status
 from sightline.protocol.transports.link import Message
 from sightline.sim.scenario import AT_LEAST, load_scenario
 from sightline.sim.world.world import World
@@ -115,6 +116,25 @@ def test_configuration_that_cannot_be_written_is_reported(lights, tmp_path):
     (tmp_path / "robot.toml").mkdir()
     with pytest.raises(ConfigError, match=f"cannot write {tmp_path}/robot.toml: Is a directory; free some space"):
         demo_run._write_configuration(replace(lights, folder=tmp_path), "/tmp/sockets")
+
+
+def test_interrupt_before_the_first_sample_ends_the_demo(tmp_path, monkeypatch):
+    def interrupted(*_given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo_run, "_drive", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        demo_run.run_demo(DemoOptions(out=tmp_path), print)
+
+
+def test_run_that_cannot_be_scored_is_a_failed_check(lights, monkeypatch):
+    with pytest.raises(CheckError, match="ended before the robot drove"):
+        demo_report.report(replace(lights, samples=[]))
+    monkeypatch.setattr(demo_run, "ARM_S", 0.0)
+    refused = Reply(to="0000000a", id=1, ok=False, state=State.STOPPED, detail="STOPPED: reset first")
+    operator = SimpleNamespace(wait_report=lambda: None, arm=lambda patience_s: refused)
+    with pytest.raises(CheckError, match="would not be armed: STOPPED"):
+        demo_run.arm_robot(operator, SimpleNamespace(check=lambda: None))
 
 
 class StatusLink:

@@ -33,7 +33,7 @@ from sightline.evaluation.faults.evidence import MotorRow
 from sightline.evaluation.scenario_config import robot_of
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.errors import ConfigError, SightlineError
+from sightline.protocol.errors import CheckError, ConfigError
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.ports import Picture, WheelAngles
@@ -101,14 +101,14 @@ def test_a_slow_stop_fails_the_check():
 
 
 def test_wheels_that_never_stop_are_an_error():
-    with pytest.raises(SightlineError, match="not at zero between 'wifi lost' and 'wifi back'"):
+    with pytest.raises(CheckError, match="not at zero between 'wifi lost' and 'wifi back'"):
         st.compose(safe_take(zero_s=15), naive_take())
 
 
 def test_naive_robot_without_wall_is_an_error():
     naive = naive_take()
     del naive.events["wall"]
-    with pytest.raises(SightlineError, match="met no wall"):
+    with pytest.raises(CheckError, match="met no wall"):
         st.compose(safe_take(), naive)
 
 

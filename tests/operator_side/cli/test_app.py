@@ -22,7 +22,7 @@ from sightline.operator_side.cli import commands as table
 from sightline.operator_side.cli import operate
 from sightline.operator_side.cli.options import CHECK_FAILED, print_result
 from sightline.operator_side.preflight import needs
-from sightline.protocol.errors import ConfigError, HardwareError, LinkError, SightlineError
+from sightline.protocol.errors import CheckError, ConfigError, HardwareError, LinkError, SightlineError
 from tests.fixtures.commands import run
 from tests.fixtures.ports import free_endpoint
 
@@ -116,7 +116,7 @@ def test_summary_in_the_program_help_is_that_of_the_command(name):
 
 def test_exit_codes_in_the_program_help_are_those_of_the_errors(capsys):
     _, out, _ = run(capsys, "--help")
-    errors = (SightlineError, ConfigError, HardwareError, LinkError)
+    errors = (SightlineError, ConfigError, HardwareError, LinkError, CheckError)
     for code in (0, *(error.exit_code for error in errors), CHECK_FAILED):
         assert re.search(rf"^  {code} +{table.EXIT_CODES[code]}", out, re.MULTILINE), code
 
