@@ -204,7 +204,7 @@ def _reading(path: Path) -> Iterator[Any]:
     try:
         with path.open("rb") as file:
             yield NonSeekingReader(file)
-    except EndOfFile:
+    except (EndOfFile, struct.error, UnicodeDecodeError):  # the cut is inside a number or a letter
         return
     except OSError as error:
         raise ConfigError(f"cannot read recording {path}: {error.strerror}") from None

@@ -1,5 +1,6 @@
 """Recording and replay: the messages of a link return, and the pipeline answers the same, byte for byte."""
 
+import os
 import subprocess
 import sys
 import threading
@@ -73,6 +74,23 @@ def test_a_recording_cut_short_reads_up_to_the_cut(tmp_path):
         assert read == messages[: len(read)]
         lengths.add(len(read))
     assert len(lengths) > 5, "the cut must have been in different places"
+
+
+def test_recording_cut_at_any_byte_reads_up_to_the_cut(tmp_path):
+    path = tmp_path / "run.mcap"
+    messages = [Message(FRAME, "", b"%d" % at, b"jpeg") for at in range(3)]
+    record(path, messages, scenario="Übung")
+    counts = set()
+    for length in reversed(range(path.stat().st_size)):
+        os.truncate(path, length)
+        read = [one.message for one in read_recording(path)]
+        assert read == messages[: len(read)]
+        counts.add(len(read))
+        try:
+            assert read_about(path) == {"scenario": "Übung"}
+        except ConfigError:
+            assert not read
+    assert counts == {0, 3}
 
 
 def test_a_slow_disk_drops_and_counts_and_never_blocks_the_link(tmp_path):
