@@ -87,20 +87,23 @@ class LiveGallery:
 
     live = True
 
-    def __init__(self, buffer: FrameBuffer) -> None:
-        self._buffer = buffer
-        self.route = buffer.route
+    def __init__(self, frames: int) -> None:
+        """`frames` is the number of images for the test of a range."""
+        # The next image may arrive before the pick in the image that the page shows.
+        self.buffer = FrameBuffer(max(2, frames))
+        self.route = self.buffer.route
+        self._frames = frames
 
     def pixels(self, number: int) -> Image:
         """Return an image of the buffer."""
-        shot = self._buffer.of(number)
+        shot = self.buffer.of(number)
         if shot is None:
             raise ConfigError("that image is gone; pick in a newer one")
         return _decoded(shot.jpeg)
 
     def recent(self) -> Sequence[Image]:
-        """Return all images of the buffer."""
-        return [_decoded(one.shot.jpeg) for one in self._buffer.shots]
+        """Return the newest images of the buffer."""
+        return [_decoded(one.shot.jpeg) for one in self.buffer.shots[-self._frames :]]
 
 
 def of_picture(path: Path) -> list[Image]:

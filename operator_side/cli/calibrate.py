@@ -422,7 +422,7 @@ class _Source:
     def gallery(self, frames: int) -> "Iterator[Gallery]":
         """Yield the images for a page."""
         from sightline.operator_side.calibrate.color_page import LiveGallery, StillGallery
-        from sightline.operator_side.cockpit.frame_buffer import FrameBuffer, fill
+        from sightline.operator_side.cockpit.frame_buffer import fill
 
         still = self._of_file(frames)
         if still is not None:
@@ -430,11 +430,12 @@ class _Source:
             return
         ending = threading.Event()
         with self._link() as (link, role):
-            pictures, buffer = Pictures(link, role, FRAME, self._target.secure), FrameBuffer(frames)
-            filling = threading.Thread(target=fill, args=(buffer, pictures, ending), name="pictures", daemon=True)
+            pictures, gallery = Pictures(link, role, FRAME, self._target.secure), LiveGallery(frames)
+            filling = threading.Thread(
+                target=fill, args=(gallery.buffer, pictures, ending), name="pictures", daemon=True)
             filling.start()
             try:
-                yield LiveGallery(buffer)
+                yield gallery
             finally:
                 ending.set()
                 filling.join(2.0)
