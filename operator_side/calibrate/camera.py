@@ -3,7 +3,6 @@
 OpenCV counts pixels from the center of the top-left one, `CameraModel` from its corner: half a pixel is added.
 """
 
-import itertools
 import math
 import statistics
 import time
@@ -242,11 +241,12 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, slots=True)
 class Collected(Generic[Found]):
-    """The results in `given` images of one size."""
+    """The results in `given` images of one size. Others of a live source were `skipped`."""
 
     size: JpegSize
     found: list[Found]
     given: int
+    skipped: int
 
 
 def folder_pictures(folder: Path) -> Iterator[bytes]:
@@ -300,24 +300,30 @@ def collect(
     is_new: Callable[[Found, Sequence[Found], JpegSize], bool],
     enough: int,
     report: Callable[[str], None],
+    *,
+    is_live: bool = False,
 ) -> Collected[Found]:
     """Search `pictures` until `enough` new results, or to their end; report each.
 
     Args:
         finder: makes, for a size, the function that searches one image.
+        is_live: skip damaged images, and those that flow control has scaled.
 
     Raises:
-        ConfigError: there is no image, or their sizes differ.
+        ConfigError: there is no image, or unless `is_live`, one is damaged or of another size.
     """
-    first = next(pictures, None)
-    if first is None:
-        raise ConfigError("no image from the camera; run `sightline doctor --camera v4l2`")
-    size = _size_of(first, None)
-    find = finder(size)
     found: list[Found] = []
-    given = 0
-    for jpeg in itertools.chain([first], pictures):
-        _size_of(jpeg, size)
+    size, given, skipped = None, 0, 0
+    for jpeg in pictures:
+        try:
+            own = _size_of(jpeg, size)
+        except ConfigError:
+            if not is_live:
+                raise
+            skipped += 1
+            continue
+        if size is None:
+            size, find = own, finder(own)
         given += 1
         one = find(jpeg)
         if one is not None and is_new(one, found, size):
@@ -325,7 +331,9 @@ def collect(
             report(f"{len(found)} of {enough}")
         if len(found) >= enough:
             break
-    return Collected(size, found, given)
+    if size is None:
+        raise ConfigError("no image from the camera; run `sightline doctor --camera v4l2`")
+    return Collected(size, found, given, skipped)
 
 
 def _size_of(jpeg: bytes, size: JpegSize | None) -> JpegSize:

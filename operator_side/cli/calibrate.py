@@ -34,9 +34,9 @@ from sightline.operator_side.client.pictures import Pictures, viewer_role
 from sightline.operator_side.config.context import RobotAddress, target_of
 from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.config.loading import load_service
-from sightline.operator_side.preflight import check_out_file, needs
+from sightline.operator_side.preflight import check_out_file, needs, writes
 from sightline.protocol.channels import FRAME
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, SightlineError
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.hardware.gpio import table_of, table_text
@@ -93,16 +93,17 @@ def drive(
     duties = _rising_duties(duty)
     check_confirmed(yes, sys.stdin.isatty(), "calibrate drive", "put the robot on the floor, free the way ahead")
     check_out_file(out)
-    rows = _measured_rows(robot, duties, seconds, confirmed=yes)
-    text = table_text(rows, f"measured by `sightline calibrate drive`, {seconds:g} s at each duty")
+    rows: list[tuple[float, float]] = []
     try:
+        _measure_rows(robot, duties, seconds, rows, confirmed=yes)
+        text = _table(rows, seconds)
         table_of(text, "these measurements")  # nothing is written that cannot be read again
-        out.write_text(text, "utf-8")
-    except (ConfigError, OSError) as error:
-        typer.echo(f"not written; the measured table is:\n{text}", err=True)
-        raise error if isinstance(error, ConfigError) else ConfigError(
-            f"cannot write {out}: {error.strerror}; choose another --out"
-        ) from None
+        with writes(out, "choose another --out"):
+            out.write_text(text, "utf-8")
+    except (SightlineError, typer.Abort, KeyboardInterrupt):  # Abort: also the end of stdin
+        if rows:
+            typer.echo(f"not written; the measured table is:\n{_table(rows, seconds)}", err=True)
+        raise
     typer.echo(f"wrote {out}; use it: sightline robot --set drive.options.table_file={out}")
 
 
@@ -113,10 +114,14 @@ def _rising_duties(text: str) -> list[float]:
     return duties
 
 
-def _measured_rows(
-    config: RobotConfig, duties: list[float], seconds: float, *, confirmed: bool
-) -> list[tuple[float, float]]:
-    rows: list[tuple[float, float]] = []
+def _table(rows: list[tuple[float, float]], seconds: float) -> str:
+    return table_text(rows, f"measured by `sightline calibrate drive`, {seconds:g} s at each duty")
+
+
+def _measure_rows(
+    config: RobotConfig, duties: list[float], seconds: float, rows: list[tuple[float, float]], *, confirmed: bool
+) -> None:
+    """Drive at each duty and append it to `rows` with its speed."""
     if not hasattr(DRIVES.load(config.motors)[0], "set_duty"):
         raise ConfigError(f"drive '{config.drive.kind}' has no duty to calibrate; use a gpio drive")
     with opened_drive(config, _guard) as (opened, guardian):
@@ -130,7 +135,6 @@ def _measured_rows(
                 rows.append((one, way_m / seconds))
     if not rows:
         raise ConfigError("the car did not move at any duty; check its wiring with `sightline robot test-wheels`")
-    return rows
 
 
 def _distance_m(question: str) -> float:
@@ -206,7 +210,7 @@ def camera(
         mounting = _mounting(mounted, given)
         report = _quiet if as_json else _print_board
         most = _MOST_IN_FOLDER if pictures is not None else views
-        made = _measure(source, wanted, mounting, views=most, config=config, report=report)
+        made = _measure(source, wanted, mounting, views=most, config=config, report=report, is_live=pictures is None)
     _write(out, made)
     typer.echo(json.dumps(_as_object(out, made)) if as_json else _summary(out, made))
 
@@ -268,16 +272,20 @@ def _measure(
     views: int,
     config: str | None,
     report: Callable[[str], None],
+    is_live: bool,
 ) -> "Calibration":
     from sightline.operator_side.calibrate import camera as calibrate
     from sightline.operator_side.calibrate.camera import collect
 
     if isinstance(wanted, calibrate.Board):
         boards = collect(pictures, lambda _: lambda jpeg: calibrate.find_board(jpeg, wanted), calibrate.is_new_view,
-                         views, report)
+                         views, report, is_live=is_live)
+        _print_skipped(boards.skipped)
         return calibrate.from_boards(boards.found, wanted, boards.size, boards.given, mounting)
     hsv = _vision_config(config).hsv
-    balls = collect(pictures, lambda size: calibrate.ball_finder(size, hsv), lambda *_: True, _BALL_PICTURES, _quiet)
+    balls = collect(pictures, lambda size: calibrate.ball_finder(size, hsv), lambda *_: True, _BALL_PICTURES, _quiet,
+                    is_live=is_live)
+    _print_skipped(balls.skipped)
     return calibrate.from_balls(balls.found, wanted, balls.size, balls.given, mounting)
 
 
@@ -291,10 +299,8 @@ def _write(path: Path, made: "Calibration") -> None:
     from sightline.operator_side.config.toml_text import toml_text
 
     head = f"# {made.used} of {made.given} images, {made.error:.2f} {made.error_unit}\n"
-    try:
+    with writes(path, "choose another --out"):
         path.write_text(head + toml_text(made.model.model_dump(mode="json")), "utf-8")
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}; choose another --out") from None
 
 
 def _hfov_deg(made: "Calibration") -> float:
@@ -319,6 +325,11 @@ def _as_object(path: Path, made: "Calibration") -> dict[str, Any]:
 
 def _print_board(line: str) -> None:
     typer.echo(f"board {line}; move and tilt it")
+
+
+def _print_skipped(count: int) -> None:
+    if count:
+        typer.echo(f"skipped {count} damaged images or images of another size", err=True)
 
 
 def _quiet(_line: str) -> None:

@@ -120,6 +120,19 @@ def test_the_same_view_is_taken_once():
     assert (len(got.found), got.given) == (2, 6)
 
 
+def test_damaged_and_scaled_images_of_a_live_source_are_skipped_and_counted():
+    small = jpeg_of(np.full((240, 320, 3), 120, np.uint8))
+    pictures = [b"\xff\xd8 no picture", tilted_view(0), small, tilted_view(1), b"", tilted_view(2)]
+    arguments = (lambda _: lambda jpeg: find_board(jpeg, BOARD), is_new_view, 99, lambda _: None)
+    got = collect(iter(pictures), *arguments, is_live=True)
+    assert (len(got.found), got.given, got.skipped) == (3, 3, 3)
+    assert (got.size.width_px, got.size.height_px) == (TRUTH.width_px, TRUTH.height_px)
+    with pytest.raises(ConfigError, match="are mixed"):
+        collect(iter(pictures[1:]), *arguments)
+    with pytest.raises(ConfigError, match="no image from the camera"):
+        collect(iter(pictures[:1]), *arguments, is_live=True)
+
+
 # --- ball --------------------------------------------------------------------------------------------------------
 
 

@@ -4,6 +4,8 @@ import io
 import signal
 import sys
 import tomllib
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,6 +20,13 @@ from tests.fixtures.links import until
 from tests.fixtures.terminal import Terminal
 
 GPIO = PluginChoice(kind="sightline.robot_side.hardware.gpio:GpioDrive", options={"wheel_radius_m": 0.0325})
+
+
+class DutyDrive:
+    """A drive with duties that moves nothing."""
+
+    def set_duty(self, left, right):
+        pass
 
 
 class Operator:
@@ -187,11 +196,25 @@ def test_a_drive_is_calibrated_at_a_terminal(tmp_path, opened, monkeypatch):
 
 def test_measurements_that_make_no_table_are_not_written(tmp_path, capsys, monkeypatch):
     out = tmp_path / "drive.toml"
-    monkeypatch.setattr(cli_robot_tools, "_measured_rows", lambda *_a, **_k: [(0.4, 0.2), (0.6, 0.1)])
+    rows = [(0.4, 0.2), (0.6, 0.1)]
+    monkeypatch.setattr(cli_robot_tools, "_measure_rows", lambda *given, **_k: given[3].extend(rows))
     assert cli.run(["calibrate", "drive", "--yes", "--out", str(out), "--duty", "0.4,0.6"]) == 2
     said = capsys.readouterr().err
     assert "both must rise" in said and not out.exists()
     assert "[0.4, 0.2]" in said, "what was measured is not lost"
+
+
+@pytest.mark.parametrize(("answers", "is_printed"), [("0.1\n0\n", True), ("", False)])
+def test_table_of_a_calibration_that_ends_early_is_printed(tmp_path, capsys, monkeypatch, answers, is_printed):
+    monkeypatch.setattr(sys, "stdin", io.StringIO(answers))
+    monkeypatch.setattr(cli_robot_tools, "opened_drive", lambda *_given: nullcontext((DutyDrive(), None)))
+    monkeypatch.setattr(cli_robot_tools, "DRIVES", SimpleNamespace(load=lambda _choice: (DutyDrive, None)))
+    monkeypatch.setattr(cli_robot_tools, "turn_for", lambda *_given: None)
+    out = tmp_path / "drive.toml"
+    assert cli.run(["calibrate", "drive", "--yes", "--out", str(out), "--duty", "0.4,0.6,0.8"]) == 130
+    said = capsys.readouterr().err
+    assert ("not written; the measured table is:" in said) is is_printed and ("[0.400, 0.0500]" in said) is is_printed
+    assert not out.exists()
 
 
 def test_wheels_turn_only_after_a_confirmation():
