@@ -204,8 +204,8 @@ def _check_service(given: Mapping[Key, Given], service: str, file: str | None) -
 def _check_names(given: Mapping[Key, Given], service: str) -> None:
     """Check robot id and endpoints here, for a clearer error than a pattern gives."""
     robot = given.get(("robot",)) if service != "sim" else None  # there it names the robot model
-    if robot is not None and isinstance(robot.text or robot.value, str):
-        robot_id = str(robot.text or robot.value)
+    robot_id = None if robot is None else robot.value if isinstance(robot.value, str) else robot.text
+    if robot_id is not None:
         # A vision service may name several by `*` and `?`.
         check_robot_id(robot_id.replace("*", "x").replace("?", "x") if service == "vision" else robot_id)
     for name in ("listen", "connect"):

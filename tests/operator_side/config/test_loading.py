@@ -181,6 +181,14 @@ def test_any_table_survives_as_toml(table):
     assert tomllib.loads(toml_text(table)) == table
 
 
+@pytest.mark.parametrize("text", ['"r2"', "'r2'", "r2"])
+def test_robot_id_may_be_quoted(text):
+    assert load("robot", sets=[f"robot={text}"], environ={}).config.robot == "r2"
+    assert load("robot", environ={"SIGHTLINE_ROBOT__ROBOT": text}).config.robot == "r2"
+    with pytest.raises(ConfigError, match="invalid robot id 'a/b'"):
+        load("robot", sets=['robot="a/b"'], environ={})
+
+
 def test_vision_accepts_several_robots_and_a_robot_only_one():
     assert load("vision", sets=("robot=r*",), environ={}).config.robot == "r*"
     with pytest.raises(ConfigError, match="invalid robot id 'r\\*'"):
