@@ -60,9 +60,12 @@ def plot_run(
     _plot_ways(figure.add_subplot(grid[:, 0]), samples, scenario)
     times_s = [(truth.t_us - samples[0].t_us) / 1e6 for truth in samples]
     upper, lower = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
-    if scenario.goals_m or scenario.light:
+    if scenario.light:
         _plot_speed(upper, times_s, samples)
-        (_plot_line if scenario.light else _plot_clearance)(lower, times_s, samples)
+        _plot_line(lower, times_s, samples)
+    elif scenario.goals_m:
+        _plot_speed(upper, times_s, samples)
+        _plot_clearance(lower, times_s, samples, scenario.bounds.get("least_clearance_m"))
     else:
         _plot_bearing(upper, times_s, samples)
         _plot_distance(lower, times_s, samples, scenario.stand_off_m)
@@ -134,8 +137,7 @@ def _plot_things(axes: "Axes", scenario: Scenario) -> None:
         light = _circle(scenario.light.at_m, LIGHT_DRAWN_M, "black")
         light.set_label("traffic light and stop line")
         axes.add_patch(light)
-        line_x_m, line_y_m = scenario.light.ahead(scenario.light.line_m)
-        axes.plot([line_x_m, line_x_m], [line_y_m - 0.1, line_y_m + 0.9], color="black")
+        axes.plot(*zip(*scenario.light.stop_line_m(), strict=True), color="black")
 
 
 def _circle(center: tuple[float, float], radius_m: float, color: str) -> "Circle":
@@ -183,11 +185,12 @@ def _plot_speed(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) ->
     axes.set(ylabel="speed (m/s)", title="speed")
 
 
-def _plot_clearance(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:
-    axes.axhline(0.10, color="0.7", linewidth=1, label="demanded")
+def _plot_clearance(axes: "Axes", times_s: list[float], samples: Sequence[Truth], bound_m: float | None) -> None:
     axes.plot(times_s, [truth.clearance_m or 0.0 for truth in samples], color=ROBOT_COLOR)
     axes.set(xlabel="time (s)", ylabel="clearance (m)", title="clearance, body to the nearest obstacle")
-    axes.legend(loc="best")
+    if bound_m is not None:
+        axes.axhline(bound_m, color="0.7", linewidth=1, label="demanded")
+        axes.legend(loc="best")
 
 
 def _plot_line(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:

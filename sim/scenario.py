@@ -229,6 +229,10 @@ LIT: dict[str, Color] = {"red": (0.95, 0.10, 0.08), "yellow": (0.98, 0.80, 0.06)
 UNLIT = 0.22  # of its lit colour: glass that nothing shines behind
 
 
+LINE_WIDE_M = 1.2
+"""Length of the stop line, across the lane."""
+
+
 class LightPhase(Config):
     """One colour for a time."""
 
@@ -298,6 +302,12 @@ class Light(Config):
         """The point `way_m` before the light."""
         faces_rad = math.radians(self.faces_deg)
         return self.at_m[0] + way_m * math.cos(faces_rad), self.at_m[1] + way_m * math.sin(faces_rad)
+
+    def stop_line_m(self) -> tuple[Point, Point]:
+        """Return both ends of the stop line."""
+        (x_m, y_m), faces_rad = self.ahead(self.line_m), math.radians(self.faces_deg)
+        aside_x_m, aside_y_m = -LINE_WIDE_M / 2 * math.sin(faces_rad), LINE_WIDE_M / 2 * math.cos(faces_rad)
+        return (x_m - aside_x_m, y_m - aside_y_m), (x_m + aside_x_m, y_m + aside_y_m)
 
     def past_line_m(self, x_m: float, y_m: float) -> float:
         """Return the distance of a point beyond the stop line, negative before it, in m."""

@@ -7,7 +7,20 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from sightline.sim.scenario import Color, Forced, Light, OnPath, Part, Place, Pushed, Rolling, Static, Thing, color_of
+from sightline.sim.scenario import (
+    LINE_WIDE_M,
+    Color,
+    Forced,
+    Light,
+    OnPath,
+    Part,
+    Place,
+    Pushed,
+    Rolling,
+    Static,
+    Thing,
+    color_of,
+)
 from sightline.sim.world.engine import pybullet
 from sightline.sim.world.physics import FLOOR, ROBOT, TARGET, WALL, Vector, group
 from sightline.sim.world.start import target_phase, thing_phase, thing_place
@@ -171,7 +184,6 @@ def round_mesh(rings: int = 24, sides: int = 48) -> tuple[list[Vector], list[int
 
 
 LINE_RGB = (0.92, 0.92, 0.92)
-LINE_WIDE_M = 1.2
 _LINE_DEEP_M = 0.05
 _LINE_HIGH_M = 0.002
 _NOTHING = -1

@@ -3,10 +3,12 @@
 import cv2
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from sightline.evaluation.demo.video import TopView, newest_status, status_text
-from sightline.evaluation.plots import AgeLimits, StatusAt, plot_run, scale_length_m
-from sightline.sim.scenario import load_scenario
+from sightline.evaluation.plots import AgeLimits, StatusAt, _plot_things, plot_run, scale_length_m
+from sightline.sim.scenario import Light, load_scenario
 from sightline.sim.truth import Truth
 
 LIMITS = AgeLimits(150, 400)
@@ -56,6 +58,29 @@ def test_plot_shows_the_state_behind_the_frame_age(samples, tmp_path):
     assert areas[0] == pytest.approx(areas[1], rel=0.35)
     plot_run(path, samples, scenario, "run")
     assert area_like(path, to_rgb("tab:green")) == 0
+
+
+@pytest.mark.parametrize("bound_m", [0.25, None])
+def test_demanded_clearance_is_the_bound_of_the_scenario(samples, monkeypatch, tmp_path, bound_m):
+    drawn = []
+    monkeypatch.setattr(FigureCanvasAgg, "draw", lambda _canvas: None)
+    monkeypatch.setattr(FigureCanvasAgg, "print_png", lambda canvas, _path: drawn.extend(canvas.figure.axes))
+    bounds = {} if bound_m is None else {"least_clearance_m": bound_m}
+    plot_run(tmp_path / "x.png", samples, load_scenario("thymio").model_copy(update={"bounds": bounds}), "run")
+    (axes,) = [axes for axes in drawn if axes.get_ylabel() == "clearance (m)"]
+    demanded = [line.get_ydata()[0] for line in axes.lines if line.get_label() == "demanded"]
+    assert demanded == ([] if bound_m is None else [bound_m])
+
+
+@pytest.mark.parametrize(("faces_deg", "ends_m"), [
+    (180.0, [(2.4, -1.05), (2.4, 0.15)]), (90.0, [(2.4, 0.15), (3.6, 0.15)]),
+])  # fmt: skip
+def test_stop_line_is_drawn_where_the_simulation_has_it(faces_deg, ends_m):
+    light = Light(at_m=(3.0, -0.45), faces_deg=faces_deg)
+    axes = Figure().add_subplot()
+    _plot_things(axes, load_scenario("traffic-light").model_copy(update={"light": light, "things": ()}))
+    (line,) = axes.lines
+    assert sorted(zip(*line.get_data(), strict=True)) == [pytest.approx(end_m) for end_m in ends_m]
 
 
 def test_film_shows_the_newest_state_and_its_frame_age():
