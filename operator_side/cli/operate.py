@@ -237,7 +237,8 @@ def mission(
     if label:
         options["label" if name == "legs" else "target.label"] = label
     if options and name is None:
-        raise ConfigError("--set needs a mission to start; name it, e.g. sightline mission r1 follow --set KEY=VALUE")
+        option, example = ("--set", "--set KEY=VALUE") if sets else ("--label", f"--label {label}")
+        raise ConfigError(f"{option} needs a mission to start; name it, e.g. sightline mission r1 follow {example}")
     if name is not None:
         request_of(0, name, (), options)  # reports what is invalid without a robot
     target = target_of(robot, connect, secure, announce=name is not None)

@@ -70,8 +70,9 @@ def _no_link(error: SightlineError, endpoint: str) -> Finding:
     if not found.value.startswith("no answer from"):
         return found
     transport, _, port = _address(endpoint)
-    form = f"ws://0.0.0.0:{port}" if transport == "ws" else f"{transport}/0.0.0.0:{port}"
-    fix = f"there: sightline robot --listen {form}"
+    scheme, is_web, _ = endpoint.partition("://")
+    there = f"{scheme}{is_web}" if is_web else f"{transport}/"
+    fix = f"there: sightline robot --listen {there}0.0.0.0:{port}"
     if transport not in _OVER_UDP:
         fix += "; what listens on the port now is something else"
     return Finding("link", False, found.value, fix)

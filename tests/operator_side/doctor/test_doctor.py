@@ -15,6 +15,7 @@ from sightline.operator_side.doctor import machine as cameras
 from sightline.operator_side.doctor import network as between
 from sightline.operator_side.doctor.finding import Finding, as_object, histogram
 from sightline.operator_side.setup import keys
+from sightline.protocol.errors import LinkError
 from sightline.protocol.transports import diagnosis
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.link import open_zenoh
@@ -203,6 +204,12 @@ def test_other_program_on_the_port_is_reported(capsys):
     assert checks["link"]["fix"] == (
         f"there: sightline robot --listen tcp/0.0.0.0:{port}; what listens on the port now is something else"
     )
+
+
+@pytest.mark.parametrize("scheme", ["tcp/", "ws/", "ws://", "wss://", "ws-legacy://"])
+def test_fix_of_a_link_without_an_answer_keeps_the_scheme(scheme):
+    found = between._no_link(LinkError("no answer from it after 5 s; start the robot"), f"{scheme}10.0.0.1:9090")
+    assert found.fix.startswith(f"there: sightline robot --listen {scheme}0.0.0.0:9090; ")
 
 
 def test_fix_of_a_link_is_separate_from_its_problem():
