@@ -369,9 +369,15 @@ def faults(
         print_table((row.id, f"{row.what}: {row.demanded}") for row in rows)
         return 0
     folder = Path(tempfile.mkdtemp(prefix="sightline-faults-"))
-    results = run_cases(
-        rows, repeat, folder, jobs, lambda one, progress: typer.echo(progress_line(one, *progress), err=as_json)
-    )
+    try:
+        results = run_cases(
+            rows, repeat, folder, jobs, lambda one, progress: typer.echo(progress_line(one, *progress), err=as_json)
+        )
+    except KeyboardInterrupt:
+        _remove_if_empty(folder)
+        if folder.exists():
+            typer.echo(f"logs of failed and interrupted rows are in {folder}", err=True)
+        raise
     _remove_if_empty(folder)
     return print_result(to_dict(results), [_summary(results, folder)], as_json)
 

@@ -229,6 +229,21 @@ def test_a_robot_may_be_given_by_its_address(capsys, monkeypatch):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("has_logs", [True, False])
+def test_interrupted_faults_name_the_folder_of_their_logs(capsys, monkeypatch, tmp_path, has_logs):
+    def interrupted(_rows, _repeat, folder, *_given):
+        if has_logs:
+            (folder / "vision.kill-1-1").mkdir()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr("sightline.evaluation.faults.runner.run_cases", interrupted)
+    code, _, err = run(capsys, "faults", "--only", "vision.kill")
+    left = [str(folder) for folder in tmp_path.iterdir()]
+    assert code == 130 and len(left) == has_logs and all(folder in err for folder in left)
+    assert ("logs of failed and interrupted rows are in" in err) is has_logs
+
+
 @pytest.mark.parametrize(("mission", "option"), [("follow", "target.label"), ("legs", "label")])
 def test_label_of_a_mission_is_its_option(capsys, monkeypatch, mission, option):
     requests = []
