@@ -32,7 +32,8 @@ async function showLive() {
     }
     try {
       const answer = await fetch(`picture?after=${last}`);
-      if (answer.status !== 200) continue;
+      if (!answer.ok) throw new Error(`picture: ${answer.status}`);
+      if (answer.status === 204) continue; // the server has waited for an image
       last = Number(answer.headers.get("X-Number"));
       await draw(answer);
     } catch {
