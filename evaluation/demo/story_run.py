@@ -279,11 +279,6 @@ def run_naive(folder: Path, seed: int) -> Take:
     return take
 
 
-def write_events(folder: Path, take: Take) -> None:
-    """Leave the events beside the motor log, in microseconds of the same clock."""
-    (folder / "events.json").write_text(json.dumps(take.events, indent=2) + "\n", "utf-8")
-
-
 def run_takes(folder: Path, seed: int, say: Callable[[str], None]) -> tuple[Take, Take]:
     """Run both takes in `folder`.
 

@@ -418,7 +418,6 @@ CLIENT_CASES: Final = (
 # Rows: the camera fails; STOP in every situation; wall clocks that are wrong. Shell.
 
 BAD_S: Final = 3.0
-STOP_ZERO_MS: Final = 700.0
 LOSSY_STOP_ZERO_MS: Final = 2000.0
 """A lost packet is sent again after 200 ms at the earliest, and the next loss doubles that."""
 COASTED_MS: Final = TrackConfig().coast_s * 1000 + 700.0

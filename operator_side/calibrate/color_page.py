@@ -31,7 +31,6 @@ from sightline.protocol.errors import ConfigError, LinkError, WireError
 MAX_FILE_BYTES: Final = 50_000_000
 MAX_PIXELS: Final = 25_000_000
 """Limit of an image file, a large photograph; the limits of the vision service bound a camera's frames."""
-MAX_FRAMES: Final = 200
 PATIENCE_S: Final = 5.0
 _PAGE_QUALITY: Final = 92
 
