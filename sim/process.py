@@ -80,7 +80,6 @@ class MotorPort:
         self.speeds_rad_s = (0.0, 0.0)
         self.angles_rad = (0.0, 0.0)
         """Total angle of each wheel, from the last physics step."""
-        self.refused = 0
         self._lock = threading.Lock()
         """Lines are in the order of their times."""
         self._logged_us, self._logged_rad = 0, (0.0, 0.0)
@@ -96,10 +95,9 @@ class MotorPort:
             self._write(LOG_HEADER)
 
     def take(self, data: bytes) -> None:
-        """Take one packet of a drive. A packet without two finite speeds is counted and changes nothing."""
+        """Take one packet of a drive. A packet without two finite speeds changes nothing."""
         speeds = MOTION_SET.unpack(data) if len(data) == MOTION_SET.size else (math.nan, math.nan)
         if not all(map(math.isfinite, speeds)):
-            self.refused += 1
             return
         with self._lock:
             try:
