@@ -235,7 +235,6 @@ def _away_m(detection: Detection, ball: Ball, size: JpegSize, mounting: Mounting
 ROLE = "calibrate"
 _WAIT_S = 0.2
 _SILENCE_S = 5.0
-_MAX_PIXELS = 4096 * 4096
 Found = TypeVar("Found")
 
 
@@ -338,7 +337,7 @@ def collect(
 
 def _size_of(jpeg: bytes, size: JpegSize | None) -> JpegSize:
     try:
-        own = read_jpeg_size(jpeg, _MAX_PIXELS)
+        own = read_jpeg_size(jpeg, MAX_PIXELS)
     except WireError as error:
         raise ConfigError(f"invalid JPEG: {error.detail}; remove or convert it") from None
     if size is not None and (own.width_px, own.height_px) != (size.width_px, size.height_px):
