@@ -7,10 +7,11 @@ from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.safety.limits import stop_bound
-from sightline.sim.robot import load_robot, outline, robot_names
+from sightline.sim.robot import load_robot, outline
 from sightline.sim.scenario import load_scenario, scenario_names
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.missions.registry import configured_mission
+from tests.fixtures.sim import robot_names
 
 
 @pytest.mark.parametrize("name", scenario_names())

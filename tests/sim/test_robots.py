@@ -16,10 +16,10 @@ from sightline.evaluation.scenario_config import robot_config
 from sightline.protocol.messages import Twist
 from sightline.robot_side.kinematics import Odometer, wheel_speeds
 from sightline.robot_side.safety.guard import RangeGuard
-from sightline.sim.robot import load_robot, robot_names
+from sightline.sim.robot import load_robot
 from sightline.sim.scenario import Start, Wall, load_scenario
 from sightline.sim.world.world import World
-from tests.fixtures.sim import empty
+from tests.fixtures.sim import empty, robot_names
 
 ROBOTS = [name for name in robot_names() if name != "chaser-small"]  # it differs in nothing that these tests look at
 

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from sightline.protocol.errors import ConfigError
 from sightline.sim.process import PeriodicTimer
-from sightline.sim.robot import load_robot, robot_names
+from sightline.sim.robot import load_robot
 from sightline.sim.scenario import ClosedPath, OnPath, PathLeg, Place, load_scenario, look_named, scenario_names
 from sightline.sim.world.world import Motor
+from tests.fixtures.sim import robot_names
 
 STEP_S = 0.004
 

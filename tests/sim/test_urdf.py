@@ -7,9 +7,10 @@ from xml.etree import ElementTree
 import pytest
 
 from sightline.protocol.errors import ConfigError
-from sightline.sim.robot import ROBOTS, load_robot, outline, robot_names, urdf_body, urdf_from_model
+from sightline.sim.robot import ROBOTS, load_robot, outline, urdf_body, urdf_from_model
 from sightline.sim.urdf import Urdf
 from tests.fixtures import demanded
+from tests.fixtures.sim import robot_names
 
 WHEELS = ("left_wheel_joint", "right_wheel_joint")
 

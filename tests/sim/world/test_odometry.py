@@ -9,9 +9,10 @@ import pytest
 
 from sightline.protocol.messages import Twist
 from sightline.robot_side.kinematics import DiffDriveConfig, Odometer, wheel_speeds
-from sightline.sim.robot import load_robot, robot_names
+from sightline.sim.robot import load_robot
 from sightline.sim.scenario import Start, load_scenario
 from sightline.sim.world.world import STEP_US, World
+from tests.fixtures.sim import robot_names
 
 TICK_STEPS = 5  # 50 Hz, as the driver reads its encoders
 SHARE = 2 / 3
