@@ -17,9 +17,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from docs.make.performance import CHECK_FAILED, processor
+from docs.make.performance import processor
 from sightline.evaluation.faults.cases import CASES
 from sightline.evaluation.faults.report import figure_text, value_text
+from sightline.operator_side.cli.options import CHECK_FAILED
 
 DOCS: Final = Path(__file__).parents[1]
 RESULTS: Final = Path("reference", "results")

@@ -18,6 +18,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
+from sightline.operator_side.cli.options import CHECK_FAILED
 from sightline.protocol.errors import ConfigError
 
 
@@ -177,7 +178,6 @@ SECTIONS: Final = (
 # its section names.
 
 
-CHECK_FAILED: Final = 5
 PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "performance.md"
 _HEADING: Final = "## "
 _HEAD: Final = (

@@ -17,6 +17,7 @@ import typer
 
 from sightline.operator_side.calibrate.wheels import check_confirmed, opened_drive, try_wheels, turn_for
 from sightline.operator_side.cli.options import (
+    CHECK_FAILED,
     CameraKind,
     CameraSets,
     ConfigFile,
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
 
 
 TASKS: Final = ("test-wheels",)
-_CHECK_FAILED: Final = 5
 _LONGEST_WAY_M: Final = 20.0
 
 
@@ -62,7 +62,7 @@ def run_task(task: str, config: RobotConfig, confirmed: bool) -> int:
         raise ConfigError(no_such_name("task", task, TASKS) + hint)
     check_confirmed(confirmed, sys.stdin.isatty(), task, "lift the robot")
     is_right = try_wheels(config, None if confirmed else _prompt, typer.echo, _guard)
-    return 0 if is_right else _CHECK_FAILED
+    return 0 if is_right else CHECK_FAILED
 
 
 def _guard(config: RobotConfig) -> "GuardianEnd":

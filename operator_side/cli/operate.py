@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from sightline.operator_side.cli.app import send_stop
-from sightline.operator_side.cli.options import REJECTED_EXIT, Connect, Json, Robot, Secure
+from sightline.operator_side.cli.options import CHECK_FAILED, Connect, Json, Robot, Secure
 from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import reply_line, short_lines, status_lines
 from sightline.operator_side.config.context import RobotAddress, stop_secret_of, target_of
@@ -188,7 +188,7 @@ def _print_reply(operator: Operator, verb: Verb, reply: Reply, as_json: bool) ->
         driver = operator.report.status.holder if operator.report else None
         line = reply_line(robot, verb, reply, driver.source if driver else "")
         typer.echo(line if reply.ok else f"error: {line}", err=not reply.ok)
-    return 0 if reply.ok else REJECTED_EXIT
+    return 0 if reply.ok else CHECK_FAILED
 
 
 @contextmanager
@@ -284,7 +284,7 @@ def goto(
             if not as_json and not report.done:
                 typer.echo(f"{target.robot}: {mission_line(report)}")
         code = _print_report(target.robot, report, as_json, is_answer=True)
-        return REJECTED_EXIT if cannot(report) else code
+        return CHECK_FAILED if cannot(report) else code
 
 
 def _waypoints(numbers: list[str], file: Path | None) -> "Waypoints":
@@ -322,7 +322,7 @@ def _print_report(robot: str, report: MissionReport, as_json: bool, *, is_answer
         typer.echo(f"{robot}: {mission_line(report)}")
         if not is_answer and report.detector:
             typer.echo(f"detector: {detector_line(report)}")
-    return REJECTED_EXIT if refused else 0
+    return CHECK_FAILED if refused else 0
 
 
 # --- `teleop` ----------------------------------------------------------------------------------------------------

@@ -7,11 +7,10 @@ from typing import Annotated, Any, Final, TypeVar
 
 import typer
 
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import CheckError, ConfigError
 
-REJECTED_EXIT: Final = 5
-
-CHECK_FAILED: Final = 5
+CHECK_FAILED: Final = CheckError.exit_code
+"""Exit code: a check failed, or the robot rejected the request."""
 
 Robot = Annotated[
     str | None, typer.Argument(metavar="ROBOT", help="Robot id [default: the one of `sightline use`, or r1].")
