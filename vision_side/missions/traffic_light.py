@@ -17,9 +17,8 @@ from sightline.vision_side.tracking.locate import locate_box
 from sightline.vision_side.tracking.prediction import MotionPredictor, PredictedMotion
 from sightline.vision_side.tracking.track import to_odometry
 
-_FRAMES = 2  # a color that lets go must be seen this often, one after the other; one that stops counts at once
-
-
+_FRAMES = 2  # green must be read this often, without another color or a hidden light between; others count at once
+_AT_REST_MPS = 0.01
 _CROSSED_M = 0.15  # a robot that stops for a line never ends so far beyond it: it has crossed, or started there
 
 
@@ -61,7 +60,7 @@ class StopLine:
         self._unseen_s = 0.0 if colour != UNKNOWN else self._unseen_s + dt_s
         if colour == UNKNOWN:
             if self._unseen_s > self._config.hidden_s:
-                self.colour = UNKNOWN
+                self.colour = self._candidate = UNKNOWN
             return
         self._count = self._count + 1 if colour == self._candidate else 1
         self._candidate = colour
@@ -84,6 +83,8 @@ class StopLine:
             self.clearing = left_m <= 0 and moving_mps > 0
         elif self._was_green and left_m < moving_mps**2 / (2 * self._config.hardest_mps2):
             self.clearing = True
+        elif left_m > 0 and moving_mps < _AT_REST_MPS:
+            self.clearing = False  # it was held before the line, where it can wait
         self._was_green = self.colour == "green"
 
 

@@ -116,6 +116,36 @@ def test_a_light_that_is_hidden_for_long_counts_as_red() -> None:
     assert stop.speed(0.05, 0.1, 0.3) == 0.0
 
 
+def test_one_green_frame_after_a_light_was_hidden_does_not_start() -> None:
+    for greens in (1, 5):
+        stop = StopLine(StopConfig(hidden_s=0.4))
+        for colour in ["green"] * greens + [UNKNOWN] * 90 + ["green"]:
+            stop.see(colour, 0.1)
+        assert stop.speed(0.03, 0.0, 0.3) == 0.0
+        stop.see("green", 0.1)
+        assert stop.speed(0.03, 0.0, 0.3) == 0.3
+
+
+def test_light_that_cannot_be_read_in_each_second_frame_turns_green() -> None:
+    stop = StopLine(StopConfig())
+    for colour in ("red", UNKNOWN, "green", UNKNOWN, "green", UNKNOWN):
+        stop.see(colour, 1 / 30)
+    assert stop.speed(0.03, 0.0, 0.3) == 0.3
+
+
+@pytest.mark.parametrize(("left_m", "moving_mps"), [(0.03, 0.3), (0.03, 0.0), (0.001, 0.009), (0.001, 0.02)])
+def test_robot_that_was_held_while_it_cleared_the_line_stays_before_it(left_m: float, moving_mps: float) -> None:
+    stop = StopLine(StopConfig())
+    for colour in ("green", "green", "yellow"):
+        stop.see(colour, 0.03)
+        speed_mps = stop.speed(left_m, 0.3, 0.3)
+    assert speed_mps == 0.3 and stop.clearing
+    for _ in range(200):
+        stop.see("red", 0.03)
+        speed_mps = stop.speed(left_m, moving_mps, 0.3)
+    assert speed_mps == (0.3 if moving_mps > 0.01 else 0.0)
+
+
 # --- the lane ----------------------------------------------------------------------------------------------------
 
 
