@@ -146,16 +146,12 @@ class Pipeline:
         self._scan = (stamp, scan)
 
     def set_camera(self, camera: CameraModel) -> None:
-        """Use another camera model from the next frame on. A requested mission continues."""
+        """Use another camera model from the next frame on. A running mission that needs it starts again."""
         self._camera = camera
         self._decoder = Decoder(camera.width_px, camera.height_px, self._config.max_pixels)
-        # Tracks of another camera model do not fit the new one, so the first mission starts again.
-        if self._request is None:
-            self._forget()
-            return
         self.restart_clock()
-        if self.mission.needs_camera:
-            self._mission_switch = MissionSwitch(self.mission, camera)
+        # Tracks of another camera model do not fit the new one.
+        self._mission_switch.set_camera(camera)
 
     def fits(self, jpeg: bytes) -> bool:
         """Return True if an image has the size of the camera model. Does not decode."""

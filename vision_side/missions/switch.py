@@ -34,6 +34,11 @@ class MissionSwitch:
         """Come to rest from the next frame on, then start `chosen`."""
         self.chosen, self._switching, self._waited_s = chosen, True, 0.0
 
+    def set_camera(self, camera: CameraModel) -> None:
+        """Start a running mission again if it needs the camera. One that is over stays over."""
+        if self._over is None and not self._switching and self.chosen.needs_camera:
+            self._begin(camera)
+
     def step(self, view: View) -> Plan:
         """Compute the plan for one frame."""
         if self._switching:

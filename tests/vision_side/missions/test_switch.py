@@ -1,5 +1,6 @@
 """From one mission to the next: at rest in between, whatever a mission does, and over when it is over."""
 
+import numpy as np
 import pytest
 
 from sightline.protocol.errors import ConfigError
@@ -120,6 +121,7 @@ def test_a_mission_that_cannot_even_begin_is_over():
 
 
 BALL = jpeg_of(scene(CAMERA, 1.0, 0.2))
+LARGE = jpeg_of(np.full((480, 640, 3), 140, np.uint8))
 
 
 def frame(seq, session="0000abcd"):
@@ -167,6 +169,25 @@ def test_requested_mission_continues_with_another_camera():
     assert int(before.split()[0]) > 2
     pipeline.set_camera(CAMERA)
     assert int(pipeline.step(frame(12)).seen.note.split()[0]) == int(before.split()[0]) + 1
+
+
+@pytest.mark.parametrize(("options", "phase"), [({"done_at": 2}, "driving"), ({"raises_at": 2}, "failed")])
+@pytest.mark.parametrize("requested", [False, True])
+def test_mission_that_is_over_does_not_start_again_with_another_camera(options, phase, requested):
+    pipeline = Pipeline(CONFIG, CAMERA, configured_detector(CONFIG), None if requested else scripted(**options))
+    if requested:
+        pipeline.switch(scripted(**options), ASKED, "0000abcd")
+    before = [pipeline.step(frame(seq)) for seq in range(1, 7)][-1]
+    pipeline.set_camera(CAMERA.model_copy(update={"width_px": 640, "height_px": 480}))
+    for answer in (before, pipeline.step(Frame(frame(7).header, LARGE))):
+        assert (answer.twist, answer.seen.done, answer.seen.phase) == (STILL, True, phase)
+
+
+def test_mission_that_waits_for_rest_waits_on_with_another_camera():
+    switch = MissionSwitch(scripted(), CAMERA)
+    switch.switch(scripted(speed=-0.2))
+    switch.set_camera(CAMERA)
+    assert switch.step(view(1, moving=(0.2, 0.0))).phase == "switching"
 
 
 def test_pipeline_with_an_unknown_mission_is_rejected():
