@@ -120,6 +120,11 @@ class Pipeline:
         """Return the newest mission."""
         return self._mission_switch.chosen
 
+    @property
+    def request(self) -> RequestId | None:
+        """Return the request for the newest mission, or None for the first mission."""
+        return self._request
+
     def switch(self, chosen: MissionSpec, request: RequestId, session: str) -> None:
         """Switch to another mission from the next frame on. The robot first comes to rest.
 

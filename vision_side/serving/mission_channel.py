@@ -205,11 +205,6 @@ class MissionChannel:
             self._apply(message, pipeline, frame)
         self._give_scan(pipeline, frame)
 
-    @property
-    def has_request(self) -> bool:
-        """Return True if the newest request was applied."""
-        return self._requests.newest is not None and not self._requests.rejection
-
     def report(
         self, now_s: float, answer: PipelineAnswer, frame: FrameHeader | None, camera: CameraModel | None = None
     ) -> None:

@@ -271,8 +271,8 @@ class Service:
 
     @property
     def has_request(self) -> bool:
-        """Return True if a mission was requested here."""
-        return self._mission_channel.has_request
+        """Return True if the mission of the robot was requested here, also after its end."""
+        return self._pipeline is not None and self._pipeline.request is not None
 
     def turn(self, wait_s: float) -> None:
         """Wait up to `wait_s` for a frame and answer it."""

@@ -152,6 +152,19 @@ def test_new_robot_session_ends_the_requested_mission_and_reports_it():
     assert (report.mission, report.asked.id) == ("follow", 3) and "a new session" in report.refused
 
 
+def test_robot_has_a_requested_mission_until_its_session_ends():
+    """Also after a request that was rejected, and after one that cannot be read."""
+    bench = Bench().frames(5)
+    assert not bench.service.has_request
+    assert bench.ask("band", 1).frames().service.has_request
+    assert bench.ask("folow", 2).frames().service.has_request
+    header = RequestHeader(source="operator", session=ASKER, seq=3)
+    bench.person.publish(MISSION, encode(header), b"{")
+    assert bench.frames().service.has_request
+    assert bench.service.skipped["MALFORMED"] == 1 and bench.report().mission == "band"
+    assert not bench.frames(session="0000beef").service.has_request
+
+
 def test_only_the_driving_vision_accepts_missions():
     bench = Bench(AckingService).frames(5).ask("band").frames(5)
     assert bench.reports == [] and bench.service._pipeline.mission.name == "follow"
