@@ -88,6 +88,17 @@ def test_a_new_session_and_another_camera_expect_no_target() -> None:
     assert noted.expected == [None, None, None, (120.0, 120.0)]
 
 
+def test_robot_does_not_drive_to_where_the_target_was_before_a_gap_of_eight_seconds() -> None:
+    one, far = pipeline(), jpeg_of(scene(MODEL, 1.9, 0.0, shaded=True))
+    for seq in range(1, 16):
+        tracked = one.step(Frame(header(seq), far))
+    assert tracked.seen.phase == "tracking" and tracked.twist is not None and tracked.twist.linear_mps > 0.3
+    for seq, jpeg in ((255, EMPTY), (256, EMPTY), (257, far)):
+        answer = one.step(Frame(header(seq), jpeg))
+        assert answer.seen.phase in ("searching", "lost" if jpeg is EMPTY else "tracking")
+        assert answer.twist is not None and answer.twist.linear_mps == 0.0
+
+
 def test_missing_image_is_acknowledged_and_starts_no_search() -> None:
     answers = phases([BALL] * 5 + [b"not a picture"] * 90)
     assert all(answer.twist is None and answer.seen.phase == "no image" for answer in answers[5:])

@@ -64,15 +64,24 @@ class Follow:
         self._steer = Steer(config.steer, config.target.stand_off_m)
         self._search = Search(config.search)
         self._motion_predictor = MotionPredictor(config.latency)
+        self._last_us: int | None = None
 
     def step(self, view: View) -> Plan:
         """Compute the plan for one frame."""
         places = self._places(view)
         self._hear(view)
-        seen = self._track.step(view.dt_s, view.header.pose, self._sightings(places, view))
+        seen = self._track.step(self._gap_s(view), view.header.pose, self._sightings(places, view))
         plan = self._act(view, seen)
         self._motion_predictor.sent(view.header.t_us, plan.twist)
         return plan
+
+    def _gap_s(self, view: View) -> float:
+        """Return the seconds since the last frame. By `dt_s`, which has an upper bound, an old track would not end."""
+        last_us, self._last_us = self._last_us, view.header.t_us
+        # With a `dt_s` of 0, the time of the last frame was not true.
+        if last_us is None or view.dt_s == 0:
+            return view.dt_s
+        return max(view.dt_s, (view.header.t_us - last_us) / 1e6)
 
     def _hear(self, view: View) -> None:
         """Let the delay estimate and the integrals know what the robot did."""

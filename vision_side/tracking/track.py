@@ -43,6 +43,8 @@ _LOOK_MISFIT = 12.0
 _ODDS = 4.0
 # Longest time in doubt.
 _DOUBT_US = 500_000
+# Time between two frames of the slowest stream. After a longer one, frames are missing.
+_GAP_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +158,8 @@ class Track:
         places = [_Place(*to_odometry(pose, one.x_m, one.y_m), self._noise(one), one) for one in sightings]
         for one in self._objects():
             one.advance(dt_s)
+        if dt_s > _GAP_S:
+            self._forget_hidden()
         fits = self._fits(places)
         in_doubt = self._in_doubt(self._followed, fits) if self._followed else set()
         for one, place in fits.items():
@@ -169,6 +173,12 @@ class Track:
             self._end(self._followed)
         self._update_others(places, fits, self._followed if seen else None)
         return seen.sighting if seen else None
+
+    def _forget_hidden(self) -> None:
+        """Forget what was hidden for too long. By now its gate would let in objects that are far away."""
+        if self._followed is not None:
+            self._end(self._followed)
+        self._others = [one for one in self._others if not one.is_forgotten]
 
     def _objects(self) -> list[_Object]:
         return [self._followed, *self._others] if self._followed else self._others

@@ -260,6 +260,21 @@ def test_coasting_ends_within_two_milliseconds_of_its_time():
     assert [step[3] for step in mission._steer.steps] == [True, True, True, True, False]
 
 
+@pytest.mark.parametrize(("gap_us", "dt_s", "phase", "may_drive"), [
+    (499_000, 0.5, "coasting", True), (501_000, 0.5, "coasting", False), (1_199_000, 0.5, "coasting", False),
+    (1_201_000, 0.5, "lost", None), (8_000_000, 0.5, "lost", None), (8_000_000, 0.0, "coasting", True),
+])  # fmt: skip
+def test_time_without_a_frame_is_time_without_the_target(gap_us, dt_s, phase, may_drive):
+    """Without `dt_s`, the time of the last frame was not true."""
+    mission = follow_of(search=SearchConfig(enabled=False))
+    for t_us in (1_000_000, 1_100_000, 1_200_000):
+        mission.step(view(at(1.0), t_us=t_us))
+    steps = mission._steer.steps
+    steps.clear()
+    assert mission.step(view(t_us=1_200_000 + gap_us, dt_s=dt_s)).phase == phase
+    assert [step[3] for step in steps] == ([] if may_drive is None else [may_drive])
+
+
 @pytest.mark.parametrize(("t_us", "applied", "unmet"), [
     (1_100_000, (0.0, 0.0), [(DT_S, -0.2, -0.3)]), (1_099_999, (0.0, 0.0), []), (1_100_000, (0.1, 0.0), []),
     (1_100_000, (0.0, 0.1), []), (1_100_000, (0.01, 0.0), []), (1_100_000, (0.0, -0.01), []),

@@ -203,6 +203,21 @@ def test_target_is_lost_within_two_milliseconds_of_its_time():
     assert track.target is None
 
 
+@pytest.mark.parametrize(("give_up_s", "gap_s", "sightings"), [
+    (0.4, 0.5, 3), (0.4, 0.503, 1), (1.2, 1.199, 3), (1.2, 1.201, 1), (1.2, 8.0, 1),
+])
+def test_target_is_lost_in_a_gap_between_frames_that_is_longer_than_its_time(give_up_s, gap_s, sightings):
+    """Its gate is wide then. A stream of two frames a second has no gaps."""
+    track = started((1.0, 0.0), (1.0, 0.0), give_up_s=give_up_s)
+    assert track.step(gap_s, HERE, [at(1.0)]) is not None
+    assert track.target.sightings == sightings
+
+
+def test_gap_before_the_first_target_changes_nothing():
+    track = Track(TrackConfig())
+    assert track.step(8.0, HERE, []) is None and track.target is None
+
+
 # --- beside other objects ----------------------------------------------------------------------------------------
 
 TARGET = (2.0, 0.0)
@@ -269,6 +284,13 @@ def test_object_beside_the_last_target_is_followed_three_seconds_after_its_loss(
     assert steps_until(track, lambda _: track.target is None, (2.0, 0.5)) == 5
     assert steps_until(track, lambda seen: seen, (2.0, 0.5)) == 31
     assert track.target.y_m == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("gap_s", "sightings"), [(2.99, None), (3.01, 1)])
+def test_object_beside_the_last_target_is_forgotten_in_a_gap_of_three_seconds(gap_s, sightings):
+    track = beside((2.0, 0.5))
+    track.step(gap_s, HERE, [at(2.0, 0.5)])
+    assert (track.target and track.target.sightings) == sightings
 
 
 def test_object_elsewhere_is_followed_at_once_also_while_the_others_are_hidden():
