@@ -23,6 +23,7 @@ from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import (
     LEAST_SIDE_PX,
+    MOST_SIDE_PX,
     STILL,
     CameraModel,
     DetectedBox,
@@ -57,7 +58,14 @@ def is_legacy(endpoint: str) -> bool:
 
 
 def assumed_camera(size: JpegSize) -> CameraModel:
-    """Return a camera model of 60 degrees for a robot that publishes none."""
+    """Return a camera model of 60 degrees for a robot that publishes none.
+
+    Raises:
+        WireError: MALFORMED for a size that no camera model has.
+    """
+    if not LEAST_SIDE_PX <= min(size.width_px, size.height_px) <= max(size.width_px, size.height_px) <= MOST_SIDE_PX:
+        raise WireError(RejectReason.MALFORMED, f"image is {size.width_px}x{size.height_px}, each side must have "
+                                                f"{LEAST_SIDE_PX} to {MOST_SIDE_PX} pixels")
     focal_px = round(size.width_px / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG / 2)), 1)
     return CameraModel(width_px=size.width_px, height_px=size.height_px, fx_px=focal_px, fy_px=focal_px,
                        cx_px=size.width_px / 2, cy_px=size.height_px / 2)

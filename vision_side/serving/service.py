@@ -5,7 +5,6 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
@@ -214,6 +213,7 @@ class Service:
         if not is_standby:
             self.listen()
         self._camera: CameraModel | None = None
+        self._assumed_camera: CameraModel | None = None
         self._pipeline: Pipeline | None = None
         self.sender = DriverSession()
         self._loss = FrameLoss()
@@ -330,12 +330,11 @@ class Service:
         if header.session != self._robot_session:
             self._robot_session = header.session
             self._log_change("link", f"frames from robot {self._config.robot}, session {_shown(header.session)}")
+        if self._pipeline is None or not self._pipeline.fits(message.payload):
+            self._find_camera(message.payload)
         if self._pipeline is None:
-            self._wait_for_camera(message.payload)
             self._publish(header, PipelineAnswer(None, Observation("no image", note="no camera model yet")), 0)
             return
-        if not self._pipeline.fits(message.payload):
-            self._look_at_camera()  # the robot publishes the model of a new size before its first image
         self._mission_channel.prepare(self._pipeline, header)
         deadline_us = monotonic_us() + round(self._config.detector.deadline_s * 1e6)
         answer = self._pipeline.step(Frame(header, message.payload, deadline_us))
@@ -374,17 +373,27 @@ class Service:
     def _acknowledge(self, seen: Observation) -> PipelineAnswer:
         return self._pipeline.acknowledge(seen) if self._pipeline else PipelineAnswer(None, seen)
 
-    def _wait_for_camera(self, jpeg: bytes) -> None:
-        """Assume a camera for a legacy robot. Log a missing model: it comes twice a second, so only a longer wait."""
-        if self._is_legacy:
-            with suppress(WireError):
-                camera = assumed_camera(read_jpeg_size(jpeg))
-                self._report(f"vision: {camera_line(camera)}")
-                self._use(camera)
+    def _find_camera(self, jpeg: bytes) -> None:
+        """Find the model of an image without one. It comes twice a second, so only a longer wait is logged."""
+        self._look_at_camera()  # the robot publishes the model of a new size before its first image
+        if self._is_legacy and self._camera is self._assumed_camera:
+            self._assume_camera(jpeg)
+        elif self._camera is None:
+            self._blind_since_s = self._blind_since_s or time.monotonic()
+            if time.monotonic() - self._blind_since_s > _CAMERA_PATIENCE_S:
+                self._log_change("camera", "frames come, but no camera model; is the robot of another version?")
+
+    def _assume_camera(self, jpeg: bytes) -> None:
+        """Assume a camera for the size of an image of a legacy robot, which publishes no model."""
+        try:
+            camera = assumed_camera(read_jpeg_size(jpeg, self._config.max_pixels))
+        except WireError as error:
+            self._log_change("camera", f"cannot assume a camera model: {error.detail}", "unknown")
             return
-        self._blind_since_s = self._blind_since_s or time.monotonic()
-        if time.monotonic() - self._blind_since_s > _CAMERA_PATIENCE_S:
-            self._log_change("camera", "frames come, but no camera model; is the robot of another version?")
+        if camera != self._camera:
+            self._assumed_camera = camera
+            self._report(f"vision: {camera_line(camera)}")
+            self._use(camera)
 
     def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
         """Publish the twist that cites the frame, or an acknowledgement.
@@ -519,8 +528,8 @@ class BoxesService(Service):
         self._log_change("link", f"frames from robot {self._config.robot}, session {_shown(header.session)}")
         self._publish(header, PipelineAnswer(None, Observation("no image", note="another service detects")), 0)
         self._viewing.keep(header, message.payload)
-        if self._pipeline is None:
-            self._wait_for_camera(message.payload)
+        if self._pipeline is None or (self._is_legacy and not self._pipeline.fits(message.payload)):
+            self._find_camera(message.payload)
         elif time.monotonic() - self._boxes_heard_s > _BOXES_SILENCE_S:
             self._mission_channel.report(time.monotonic(), self._acknowledge(_NO_BOXES), header)
             source = self._config.boxes.source

@@ -1,5 +1,6 @@
 """The stand-in of a legacy robot over a link in memory: STOP, disarm, arm, the assumed camera, the target's box."""
 
+import numpy as np
 import pytest
 
 from sightline.operator_side.config.loading import load_service
@@ -19,14 +20,15 @@ from sightline.protocol.messages import (
     Verb,
 )
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.serving.legacy_robot import LegacyRobotLink, assumed_camera, camera_line, target_box
-from sightline.vision_side.serving.service import Service
+from sightline.vision_side.serving.service import Service, open_service
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
 DRIVE = b"0.2000|-0.3500"
 ZERO = b"0.0000|0.0000"
+LEGACY = VisionConfig(connect=("ws-legacy://127.0.0.1:9091",), detector=DetectorConfig(kind="hsv"))
 
 
 class Bench:
@@ -140,6 +142,56 @@ def test_a_service_assumes_a_camera_for_a_legacy_robot_once_and_drives(bench):
     (box,) = decode(Detections, bench.boxes.take().payload).boxes
     assert box.x1_px < box.x2_px
     assert sum("publishes no camera model; assuming 60 degrees" in line for line in said) == 1
+
+
+def answered(bench, service, seq, image):
+    """Return what reaches the robot after one more image."""
+    header = FrameHeader(session="0000abcd", seq=seq, t_us=seq * 33_333)
+    bench.far.publish(FRAME, encode(header), image)
+    bench.advance()
+    service.turn(0.0)
+    bench.advance()
+    return bench.twists.take()
+
+
+@pytest.mark.parametrize("kind", ["hsv", "boxes"])
+def test_service_assumes_another_camera_for_another_image_size(bench, kind):
+    said = []
+    config = LEGACY.model_copy(update={"detector": DetectorConfig(kind=kind)})
+    service = open_service(config, bench.link, said.append)
+    sizes = (320, 240), (640, 480), (320, 240)
+    for seq in range(12):
+        shown = camera(*sizes[seq // 4])
+        twist = answered(bench, service, seq + 1, jpeg_of(scene(shown, 1.0, 0.2, shaded=True)))
+        assert kind == "boxes" or twist is not None
+    assumed = [line for line in said if "assuming 60 degrees" in line]
+    assert [line.split("width_px = ")[1].split(",")[0] for line in assumed] == ["320", "640", "320"]
+    assert not service.skipped
+
+
+def test_configured_camera_of_a_legacy_robot_stays_with_images_of_another_size(bench):
+    said = []
+    service = Service(LEGACY.model_copy(update={"camera": camera()}), bench.link, said.append)
+    large = jpeg_of(scene(camera(640, 480), 1.0, 0.2, shaded=True))
+    assert [answered(bench, service, seq, large) for seq in (1, 2)] == [None, None]
+    assert service.skipped == {"MALFORMED": 2} and "assuming" not in " ".join(said)
+
+
+@pytest.mark.parametrize("size_px", [(8, 8), (15, 240), (240, 15), (8193, 16), (16, 8193)])
+def test_image_of_a_size_that_no_camera_has_is_logged_once_and_ends_nothing(bench, size_px):
+    said = []
+    service = Service(LEGACY, bench.link, said.append)
+    image = jpeg_of(np.full((size_px[1], size_px[0], 3), 140, np.uint8))
+    assert [answered(bench, service, seq, image) for seq in (1, 2)] == [None, None]
+    words = f"cannot assume a camera model: image is {size_px[0]}x{size_px[1]}, each side must have 16 to 8192 pixels"
+    assert sum(words in line for line in said) == 1
+    assert answered(bench, service, 3, jpeg_of(scene(camera(), 1.0, 0.2, shaded=True))) is not None
+
+
+@pytest.mark.parametrize("size_px", [(16, 8192), (8192, 16)])
+def test_camera_is_assumed_up_to_the_limits_of_its_model(size_px):
+    shown = assumed_camera(JpegSize(*size_px, 3))
+    assert (shown.width_px, shown.height_px) == size_px
 
 
 def test_without_a_target_the_list_of_boxes_is_empty():
