@@ -170,7 +170,8 @@ class SessionSelector:
 _SILENCE_S = 3.0
 _NO_FRAMES_S = 1.0  # twice what the slowest stream takes between two frames
 _CAMERA_PATIENCE_S = 1.5
-_REPORTED_COUNTS = tuple(10**power for power in range(10))  # bad images are logged at 1, 10, 100 ...
+_REPORTED_COUNTS = tuple(10**power for power in range(10))
+_LONG_ROW = 30  # a second at 30 fps
 _REPORTED_PHASES = {"searching": "no target, searching", "lost": "target lost"}
 LogLine = Callable[[str], None]
 Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
@@ -182,6 +183,31 @@ def open_service(
     """Create the service for one robot that fits its detector (default: that of `config`)."""
     kind = BoxesService if config.detector.kind == "boxes" else Service
     return kind(config, link, report, detector, is_standby=is_standby)
+
+
+class SkipCounter:
+    """Counts what is skipped, and selects what to log of it: at 1, 10, 100 ..., and a reason that is new.
+
+    After a long row without a skip each reason is new again, so that one that comes and goes is not logged each time.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._used_in_a_row = 0
+        self._known: set[str] = set()
+
+    def use(self) -> None:
+        """Note one that is not skipped."""
+        self._used_in_a_row += 1
+        if self._used_in_a_row == _LONG_ROW:
+            self._known.clear()
+
+    def skip(self, reason: str) -> bool:
+        """Count one. Returns True if it should be logged."""
+        is_new = reason not in self._known
+        self._known.add(reason)
+        self.count, self._used_in_a_row = self.count + 1, 0
+        return is_new or self.count in _REPORTED_COUNTS
 
 
 class DriverSession:
@@ -228,6 +254,7 @@ class Service:
         self._newest: tuple[int, int | None] = (0, None)
         self.answered = self.steered = 0
         self.skipped: Counter[str] = Counter()
+        self._skipped_images = SkipCounter()
         self._mission_channel = MissionChannel(config, link, self._detector, self._log_change, self._reject)
         self._viewing = ViewPublisher(config, link, self._log_change)
 
@@ -434,10 +461,11 @@ class Service:
     def _report_phase(self, answer: PipelineAnswer) -> None:
         seen = answer.seen
         if answer.twist is None:
-            count = self.skipped.total()
-            if count in _REPORTED_COUNTS:
-                self._report(f"vision: skipped images: {count}; newest: {seen.note}")
-        elif seen.phase in _REPORTED_PHASES:
+            if self._skipped_images.skip(answer.skipped):
+                self._log_change("phase", f"skipped images: {self._skipped_images.count}; newest: {seen.note}")
+            return
+        self._skipped_images.use()
+        if seen.phase in _REPORTED_PHASES:
             self._log_change("phase", _REPORTED_PHASES[seen.phase])
         elif seen.phase == "tracking" and seen.distance_m is not None:
             self._log_change("phase", f"target seen at {seen.distance_m:.2f} m", "seen")

@@ -18,7 +18,7 @@ from sightline.protocol.transports.link import LatestSlot, Message
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.serving.process import serve
-from sightline.vision_side.serving.service import Service
+from sightline.vision_side.serving.service import Service, SkipCounter
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.vision.vision import camera, jpeg_of, scene
 
@@ -217,6 +217,44 @@ def test_lines_are_logged_per_change_and_never_per_frame(bench: Bench) -> None:
         *(f"skipped images: {count}; newest: image: not a JPEG, no SOI marker"
           for count in (1, 10, 100)),
     ]
+
+
+def skip_lines(bench: Bench) -> list[str]:
+    return [line.split(": ", 1)[1] for line in bench.said if "skipped images" in line]
+
+
+def test_outage_after_good_images_is_logged_and_its_end_too(bench: Bench) -> None:
+    bench.camera()
+    for seq in range(1, 12):
+        bench.frame(b"junk", seq)
+    bench.raw(b"{", BALL)  # not an image
+    for seq in range(12, 62):
+        bench.frame(BALL, seq)
+    before = skip_lines(bench)
+    assert [line.split(";")[0] for line in before] == ["skipped images: 1", "skipped images: 10"]
+    for _ in range(3):
+        bench.frame(BALL, 61)
+    assert skip_lines(bench)[2:] == ["skipped images: 12; newest: frame is not newer than the last"]
+    assert "skipped images" in bench.said[-1]
+    bench.frame(BALL, 62)
+    assert "target seen at" in bench.said[-1]
+
+
+@pytest.mark.parametrize(("used", "logged"), [(0, [1, 2, 10]), (29, [1, 2, 10]), (30, list(range(1, 13)))])
+def test_reason_is_logged_again_after_thirty_frames_that_were_used(used, logged):
+    counter, counts = SkipCounter(), []
+    for number in range(12):
+        counts += [counter.count] if counter.skip("MALFORMED" if number % 2 else "NO_ANSWER") else []
+        for _ in range(used):
+            counter.use()
+    assert counts == logged
+
+
+def test_images_that_are_skipped_now_and_then_are_not_logged_each_time(bench):
+    bench.camera()
+    for seq in range(1, 23):
+        bench.frame(EMPTY if seq % 2 else b"junk", seq)
+    assert [line.split(";")[0] for line in skip_lines(bench)] == ["skipped images: 1", "skipped images: 10"]
 
 
 @pytest.mark.alone
