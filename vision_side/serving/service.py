@@ -125,7 +125,7 @@ class SessionSelector:
     def __init__(self) -> None:
         self.current = ""
         self._heard_us = 0
-        self._proven = False
+        self._is_proven = False
         """True if the current session continued next to another one, which is then no sign of its end."""
         self._earlier: dict[str, _Earlier] = {}
         self.clock = RobotClock()
@@ -144,13 +144,18 @@ class SessionSelector:
             raise WireError(RejectReason.FROM_FUTURE, "frame disagrees with this clock")
         self._heard_us = now_us
 
+    @property
+    def proven(self) -> str:
+        """Return the current session if it continued next to another one, or empty."""
+        return self.current if self._is_proven else ""
+
     def _replaces(self, session: str, captured_us: int, now_us: int) -> bool:
-        if self._proven and now_us - self._heard_us <= SILENT_US:
+        if self._is_proven and now_us - self._heard_us <= SILENT_US:
             return False
         earlier = self._earlier.get(session)
         if earlier is not None and not earlier.goes_on(captured_us, now_us):
             return False
-        self._proven = earlier is not None
+        self._is_proven = earlier is not None
         return True
 
     def _follow(self, session: str) -> None:
@@ -375,7 +380,7 @@ class Service:
         self._viewing.show(header, answer, self._camera, started_ns=started_ns, jpeg=message.payload)
 
     def _is_of_robot(self, header: FrameHeader) -> bool:
-        """Return True for a frame of the steered robot. Another is counted, and logged once."""
+        """Return True for a frame of the steered robot. Others are counted, and logged once."""
         replaced = self._sessions.clock.replaced
         try:
             self._sessions.check(header, self._now_us())
@@ -384,7 +389,8 @@ class Service:
             if error.reason is RejectReason.OTHER_SESSION:
                 self._log_change("other", f"rejecting frames of session {_shown(header.session)}: robot "
                                           f"{self._config.robot} is steered in session "
-                                          f"{_shown(self._sessions.current)}; give each robot its own with --robot")
+                                          f"{_shown(self._sessions.current)}; give each robot its own with --robot",
+                                 self._sessions.proven or "unproven")
             else:
                 self._log_change("time", f"rejecting frames of robot {self._config.robot} whose time disagrees with "
                                          "this clock; does another client send frames?")

@@ -324,6 +324,17 @@ def test_frames_of_an_ended_session_are_skipped_and_logged_once(bench):
     assert bench.service.answered == 5
 
 
+def test_peer_with_a_new_session_for_each_frame_is_logged_once(bench, monkeypatch):
+    monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: bench.now_us)
+    bench.camera()
+    for seq in range(1, 60):
+        bench.frame(BALL, seq)
+        bench.frame(BALL, 1, session=f"{seq:08x}")
+    refused = [line for line in bench.said if "rejecting frames" in line]
+    assert len(refused) == 2, refused  # first the robot, for a moment, then the peer
+    assert f"is steered in session {SHOWN}" in refused[-1]
+
+
 @pytest.mark.parametrize("t_us", [600_000, 3_600_000_000, 2**53 - 1])
 def test_forged_frame_of_the_future_costs_no_answer(bench, monkeypatch, t_us):
     monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: bench.now_us)
