@@ -504,7 +504,7 @@ _NO_BOXES = Observation("no boxes")
 
 
 class BoxesInbox(LatestSlot[Message]):
-    """The newest frame and the newest boxes of one source; also the headers of replaced frames."""
+    """The newest frame and the newest boxes of one source; also the headers of replaced frames, which it counts."""
 
     def __init__(self, source: str) -> None:
         super().__init__()
@@ -521,7 +521,7 @@ class BoxesInbox(LatestSlot[Message]):
             replaced = self._newest.get(item.channel.name)
             if replaced is not None and item.channel is FRAME:
                 self.headers.append(replaced.header)
-            self.dropped += replaced is not None
+                self.dropped += 1
             self._newest[item.channel.name] = item
             self._arrived.notify()
 
@@ -544,6 +544,7 @@ class BoxesService(Service):
         self._inbox = BoxesInbox(config.boxes.source)
         self._reader = BoxReader(config.boxes)
         self._boxes_heard_s = time.monotonic()
+        self._rejected_boxes = SkipCounter()
         super().__init__(config, link, report, detector, is_standby=is_standby)
 
     def _arrivals(self) -> LatestSlot[Message]:
@@ -578,8 +579,10 @@ class BoxesService(Service):
             frame, found = self._reader.read(message.header, message.payload, self._camera)
         except WireError as error:
             self.skipped[error.reason] += 1
-            self._log_change("boxes", f"rejecting boxes: {error.detail}", f"rejected {error.reason}")
+            if self._rejected_boxes.skip(error.reason):
+                self._log_change("boxes", f"rejecting boxes: {error.detail} ({self._rejected_boxes.count} so far)")
             return
+        self._rejected_boxes.use()
         self._log_change("boxes", f"boxes from {self._config.boxes.source}")
         self._mission_channel.prepare(self._pipeline, frame)
         answer = self._pipeline.follow(frame, found)

@@ -134,6 +134,32 @@ def test_boxes_of_an_unknown_frame_are_counted_and_move_nothing():
     assert bench.twist() is not None
 
 
+def test_boxes_that_are_rejected_now_and_then_are_not_logged_each_time():
+    bench = Bench()
+    for seq in range(1, 12):
+        bench.frame(seq)
+        bench.boxes(seq, ball_at(1.0, 0.3))
+        bench.boxes(seq + 99, ball_at(1.0, 0.3))
+    assert bench.service.skipped == {"UNKNOWN_FRAME": 11}
+    lines = [line.rpartition("(")[2] for line in bench.said if "boxes" in line]
+    used = "vision: boxes from guest"
+    assert lines == [used, "1 so far)", used, "10 so far)", used]
+
+
+def test_replaced_boxes_are_not_replaced_frames():
+    bench = Bench()
+    bench.frame(1)
+    for number in (1, 2):
+        header = DetectionsHeader(source="guest", session="9999aaaa", seq=number)
+        bench.guest.publish(DETECTIONS, encode(header), encode(Detections(width_px=320, height_px=240)))
+    bench.turn()
+    assert bench.service.counts().overtaken == 0
+    for seq in (2, 3):
+        bench.robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=seq, t_us=seq * FRAME_US)), b"image")
+    bench.turn()
+    assert bench.service.counts().overtaken == 1
+
+
 def test_boxes_of_a_frame_that_is_not_newer_move_nothing():
     bench = Bench()
     for seq in range(1, 5):
