@@ -212,11 +212,6 @@ class DetectorService:
             raise self._failure
         self._report(f"detector: ended; {self.about()}")
 
-    def turn(self) -> bool:
-        """Look around, and serve one batch; False if nothing waited."""
-        self._look_around()
-        return self._serve_batch()
-
     def counters(self) -> dict[str, FrameCounters]:
         """Outcomes of each robot's frames."""
         with self._guard:

@@ -66,11 +66,16 @@ class Bench:
         robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=self.seq, t_us=self.seq)), jpeg)
         self.network.advance(self.network.now_us + 1)
 
+    def turn(self):
+        """Let the service look around, and serve one batch."""
+        self.service._look_around()
+        self.service._serve_batch()
+
     def look(self, jpeg=BALL_JPEG):
         """Return the service's answer to one more frame; None without an answer."""
-        self.service.turn()
+        self.turn()
         self.send(self.robot, jpeg)
-        self.service.turn()
+        self.turn()
         self.network.advance(self.network.now_us + 1)
         message = self.heard.take()
         return message and decode(Detections, message.payload, DETECTIONS.max_payload_bytes)
@@ -144,7 +149,7 @@ def test_notices_of_the_detector_are_logged_at_the_start_and_on_change():
     detector = Named(GOOD)
     detector.lines = ["m.onnx runs on cpu: no GPU runtime is installed"]
     bench = Bench(LabelFilter(detector, ("ball",)))
-    bench.service.turn()
+    bench.turn()
     assert bench.words[0] == "detector: m.onnx runs on cpu: no GPU runtime is installed"
     detector.lines = ["no answer: LATE"]
     bench.look()
@@ -202,10 +207,10 @@ def test_failure_on_the_frame_of_one_robot_costs_no_other_robot_its_answer():
     others = [bench.network.link(name) for name in ("r2", "r3")]
     heard = [link.latest(DETECTIONS) for link in (bench.robot, *others)]
     bench.present = ["r1", "r2", "r3"]
-    bench.service.turn()
+    bench.turn()
     for link in (bench.robot, *others):
         bench.send(link)
-    bench.service.turn()
+    bench.turn()
     bench.network.advance(bench.network.now_us + 1)
     assert [slot.take() is not None for slot in heard] == [False, True, True]
     assert [bench.service.counters()[name].rejected for name in ("r1", "r2", "r3")] == [1, 0, 0]
@@ -266,7 +271,7 @@ def test_two_batches_are_in_progress_and_a_slow_detector_gets_the_newest_frames(
 def test_batch_that_waited_too_long_is_counted_and_not_examined():
     detector = Partial()
     bench = Bench(detector, deadline_us=5_000)
-    bench.service.turn()
+    bench.turn()
     bench.send(bench.robot)
     batch = bench.service._prepare()
     time.sleep(0.006)
@@ -287,7 +292,7 @@ def test_failure_on_the_thread_that_prepares_ends_the_service_with_its_error(mon
     detector.slow.set()
     bench = Bench(detector)
     bench.present, other = ["r1", "r2"], bench.network.link("r2")
-    bench.service.turn()
+    bench.turn()
     prepare = bench.service._prepare
     monkeypatch.setattr(bench.service, "_prepare", fail)
     with pytest.raises(ZeroDivisionError):
