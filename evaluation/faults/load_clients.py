@@ -211,13 +211,14 @@ FLOOD_S: Final = 10.0
 
 
 def send_garbage(endpoint: str, ledger: EventLog) -> None:
-    """Send datagrams of every length, for another robot, and with a wrong HMAC for 10 s; print the rate."""
+    """Send datagrams of every length, for another robot, with a wrong HMAC, and an answer back; print the rate."""
     [place] = stop_addresses([endpoint])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.connect(place)
         one.send(pack_stop(StopDatagram(Kind.STOP, "r1", 1)))
-        challenge = unpack_stop(one.recv(LONGEST)).challenge
+        challenge = unpack_stop(answer := one.recv(LONGEST)).challenge
         others = [pack_stop(StopDatagram(Kind.STOP, robot, 7, challenge), b"foreign") for robot in ("r1", "r2")]
+        others.append(answer)
         invalid = [*(os.urandom(length) for length in range(LONGEST + 1)), *others * LONGEST]
         print(READY, flush=True)
         ledger.note(INJECTED)

@@ -116,6 +116,9 @@ class ReceiverCore:
         Raises:
             WireError: ignore it.
         """
+        # Answers have the challenge and an HMAC: one that comes back must not count as a STOP.
+        if one.kind is not Kind.STOP:
+            raise WireError(RejectReason.MALFORMED, "expected a STOP")
         if one.robot != self._robot:
             raise WireError(RejectReason.OTHER_ROBOT, "for another robot")
         if self._secret and one.challenge == NO_CHALLENGE:

@@ -129,6 +129,24 @@ def test_an_invalid_stop_is_ignored(fields, reason):
     assert error.value.reason is reason and number(core, 0) is None
 
 
+@pytest.mark.parametrize("secret", [b"", SECRET])
+@pytest.mark.parametrize("kind", [Kind.ANSWER, Kind.REGISTER])
+def test_signed_datagram_of_another_kind_stops_nothing(kind, secret):
+    core = receiver(secret)
+    with pytest.raises(WireError, match="MALFORMED"):
+        send(core, secret=secret, kind=kind, challenge=CHALLENGE)
+    assert number(core, 0) is None
+
+
+def test_answer_that_a_peer_without_keys_sends_back_stops_nothing():
+    core = receiver(SECRET)
+    query = StopDatagram(Kind.STOP, "r1", 7)
+    reply = core.on_stop(pack_stop(query), query, 0)
+    with pytest.raises(WireError, match="MALFORMED"):
+        core.on_stop(reply, unpack_stop(reply), 1)
+    assert core.packet(1) is None
+
+
 def test_without_keys_a_stop_for_another_robot_is_ignored_and_any_other_is_valid():
     core = receiver()
     with pytest.raises(WireError, match="OTHER_ROBOT"):

@@ -5,19 +5,28 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from sightline.protocol.transports import stop_port
-from sightline.protocol.transports.stop_datagram import DATAGRAM_BYTES, StopRequests, pack_stop, unpack_stop
-from sightline.protocol.transports.stop_port import now_us, read_packets, send_packet
+from sightline.protocol.transports.stop_datagram import (
+    DATAGRAM_BYTES,
+    Kind,
+    StopDatagram,
+    StopRequests,
+    pack_stop,
+    unpack_stop,
+)
+from sightline.protocol.transports.stop_port import StopPort, now_us, read_packets, send_packet
 from sightline.robot_side.guardian import stop_forwarder, stop_receiver
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_port
 
 MAX_RSS_KIB = 15_000
+SECRET = b"a secret of this site"
 FOREIGN = """
 import sys
 import sightline.robot_side.guardian.stop_receiver, sightline.robot_side.guardian.stop_forwarder
@@ -197,6 +206,23 @@ def test_behind_a_router_stop_is_forwarded_and_answered(started, operator, tmp_p
     started(stop_forwarder.start([router], name))
     robot = started(stop_receiver.start("r1", [], [router], name))
     assert stop(operator, router, Driver(robot), StopRequests("r1", secret, 7))
+
+
+def test_with_keys_an_answer_that_is_sent_back_stops_nothing(started, operator, tmp_path):
+    file = tmp_path / "stop.secret"
+    file.write_bytes(SECRET)
+    address = ("127.0.0.1", free_port())
+    driver = Driver(started(stop_receiver.start("r1", [address], [], str(file))))
+
+    def reflected():
+        operator.sendto(pack_stop(StopDatagram(Kind.STOP, "r1", 7)), address)
+        with suppress(OSError):
+            operator.sendto(operator.recv(2048), address)
+        driver.turn()
+        return driver.ignored or driver.applied
+
+    assert until(reflected, START_S)
+    assert driver.ignored.keys() == {"MALFORMED"} and driver.applied == 0
 
 
 def test_with_keys_datagrams_of_an_earlier_start_are_ignored(started, operator, tmp_path):
