@@ -28,7 +28,7 @@ from sightline.protocol.log import (
     start_log,
     start_log_thread,
 )
-from sightline.protocol.messages import LastRejection, State, StreamStatus
+from sightline.protocol.messages import State, StreamStatus
 from sightline.protocol.transports.endpoints import check_robot_id
 from sightline.protocol.transports.stop_port import read_packets, send_packet
 from sightline.robot_side import pipe as ipc
@@ -66,6 +66,8 @@ _MAX_CONFIG_BYTES = 1 << 20
 _STACK_BYTES, _PLUGIN_STACK_BYTES = 256 * 1024, 1024 * 1024
 _BATTERY_PERIOD_S = 1.0
 _STOP_REPORT_US = 100_000
+_INVALID: Final = (ValueError, KeyError, struct.error, WireError)
+"""Raised for a packet of a broken process, which is restarted."""
 
 
 def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
@@ -369,29 +371,30 @@ class Driver:
 
     def _drain(self) -> bool:
         """Handle what the network process and the STOP receiver sent; True if a command was among it."""
-        commanded = self._drain_receiver()
+        commanded = False
+        for packet in read_packets(self._stops) if self._stops else ():
+            with suppress(*_INVALID):
+                commanded |= self._on_receiver_packet(packet)
         for packet in self.driver_end.packets():
-            with suppress(ValueError, KeyError, struct.error, WireError):  # a broken process is restarted
+            with suppress(*_INVALID):
                 commanded |= self._on_packet(packet)
         return commanded
 
-    def _drain_receiver(self) -> bool:
-        """Handle what the STOP receiver sent; True if a STOP was among it. Next: `SafetyGate.stop`."""
-        stopped = False
-        for packet in read_packets(self._stops) if self._stops else ():
-            if packet.startswith(b"S"):
-                self._driver_core.gate.stop("STOP by a datagram")
-                self.latch_writer.want(True)
-                self._stop_applied, stopped = unpack_number(packet), True
-            elif packet.startswith(b"C"):
-                counts, address = unpack_ignored(packet)
-                self._driver_core.rejected_by_transport += Counter(counts)
-                for reason, count in counts.items():
-                    rejection = LastRejection(source=address, reason=reason, detail="a STOP datagram was ignored")
-                    self._log_rejection(rejection, count)
-            elif packet.startswith(b"L"):
-                self._log(packet[1:].decode())
-        return stopped
+    def _on_receiver_packet(self, packet: bytes) -> bool:
+        """Handle a packet of the STOP receiver; True for a STOP. Next: `SafetyGate.stop`."""
+        if packet.startswith(b"S"):
+            self._driver_core.gate.stop("STOP by a datagram")
+            self.latch_writer.want(True)
+            self._stop_applied = unpack_number(packet)
+            return True
+        if packet.startswith(b"C"):
+            counts, address = unpack_ignored(packet)
+            self._driver_core.rejected_by_transport += Counter(counts)
+            for reason, count in counts.items():
+                self._log_rejection(address, reason, "a STOP datagram was ignored", count)
+        elif packet.startswith(b"L"):
+            self._log(packet[1:].decode())
+        return False
 
     def _report_stop(self, now_us: int) -> None:
         """Send the STOP receiver the state, when it changes and ten times a second."""
@@ -428,8 +431,7 @@ class Driver:
         more, self._rejected_by_network = Counter(counts) - self._rejected_by_network, Counter(counts)
         self._driver_core.rejected_by_transport += more
         for reason, count in more.items():
-            rejection = LastRejection(source="the network", reason=reason, detail="rejected by the transport")
-            self._log_rejection(rejection, count)
+            self._log_rejection("the network", reason, "rejected by the transport", count)
 
     def _on_raw(self, packet: bytes) -> bool:
         message, rejection_before = ipc.unpack_message(packet), self._driver_core.gate.last_rejection
@@ -442,20 +444,19 @@ class Driver:
             self.latch_writer.want(self._driver_core.gate.state is State.STOPPED)  # the loop may end before its tick
         rejection = self._driver_core.gate.last_rejection
         if rejection is not None and rejection is not rejection_before:
-            self._log_rejection(rejection)
+            self._log_rejection(rejection.source, rejection.reason, rejection.detail)
         return True
 
-    def _log_rejection(self, rejection: LastRejection, times: int = 1) -> None:
+    def _log_rejection(self, source: str, reason: str, detail: str, times: int = 1) -> None:
         # A driver sends commands before it is armed: a normal state, and one line shows how it ends.
-        if rejection.reason == RejectReason.DISARMED:
+        if reason == RejectReason.DISARMED:
             if not self._is_waiting_logged:
                 self._is_waiting_logged, robot = True, self._driver_core.config.robot
-                self._log(f"receives commands from {rejection.source}; waiting for `sightline arm {robot}`")
+                self._log(f"receives commands from {source}; waiting for `sightline arm {robot}`")
             return
-        if count := self._rejection_limiter.due(rejection.reason, monotonic_us(), times):
+        if count := self._rejection_limiter.due(reason, monotonic_us(), times):
             often = f" ({count} times)" if count > 1 else ""
-            source = rejection.source or "an unknown source"
-            self._log(f"rejected {rejection.reason} from {source}{often}: {rejection.detail}")
+            self._log(f"rejected {reason} from {source or 'an unknown source'}{often}: {detail}")
 
 
 def main() -> None:

@@ -104,6 +104,22 @@ def test_ignored_datagrams_are_counted_in_the_status(driver):
     assert driver._driver_core.gate.state is State.DISARMED
 
 
+@pytest.mark.parametrize("address", ["2a02:8109:9340:5a2c:d4f1:9c3b:7e21:aa0b", "fe80::d4f1:9c3b:7e21:aa0b%wlp0s20f3"])
+def test_ignored_datagram_of_the_longest_address_is_counted_and_logged(driver, address, caplog):
+    caplog.set_level("INFO", "sightline")
+    driver.far.send(f"CMALFORMED 1 {address}".encode())
+    assert not driver._drain()
+    assert driver._driver_core.status(0).refused == {"MALFORMED": 1}
+    assert f"rejected MALFORMED from {address}: a STOP datagram was ignored" in caplog.text
+
+
+@pytest.mark.parametrize("packet", [b"S", b"S12", b"C", b"CMALFORMED", b"CMALFORMED x y", b"C\xff 1 y", b"L\xff", b"?"])
+def test_invalid_packet_of_the_receiver_never_ends_the_loop(driver, packet):
+    driver.far.send(packet)
+    assert not driver._drain()
+    assert (driver._driver_core.gate.state is State.STOPPED) == packet.startswith(b"S")
+
+
 def request(verb):
     header = RequestHeader(source="operator", session="0a1b2c3d", seq=1)
     return ipc.pack_message(
