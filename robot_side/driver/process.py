@@ -10,7 +10,9 @@ import struct
 import sys
 import threading
 from collections import Counter
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from functools import partial
 from types import FrameType
 from typing import Final
 
@@ -73,7 +75,8 @@ _INVALID: Final = (ValueError, KeyError, struct.error, WireError)
 def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
     """Run the robot until one of the ENDING signals or until the guardian is gone; the wheels are then at zero.
 
-    Raises ConfigError, HardwareError or LinkError before anything could move.
+    Raises ConfigError, HardwareError or LinkError before anything could move, and HardwareError if the drive failed to
+    set the motors to zero at the end.
     """
     check_robot_id(config.robot)
     limit_core_dump()
@@ -97,15 +100,9 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         if guardian is not None:
             ending.callback(guardian.ending)
             guardian.wait()
-        ending.callback(_zero, drive)  # last in, first to run: however the loop ends, the motors are set to zero
+        # Last in, first to run: however the loop ends, the motors are set to zero. An error makes the guardian do it.
+        ending.callback(_zero, config, partial(drive.set, 0.0, 0.0))
         return driver.loop()
-
-
-def _zero(drive: Drive) -> None:
-    try:
-        drive.set(0.0, 0.0)
-    except PLUGIN_ERRORS as error:  # nothing may keep what ends after it from ending
-        report_fault("drive", error)
 
 
 def zero_motors(config: RobotConfig) -> int:
@@ -114,15 +111,19 @@ def zero_motors(config: RobotConfig) -> int:
     Raises ConfigError for a drive without `zero`, HardwareError if the motors may still turn.
     """
     zero, options = zero_of(config)
+    _zero(config, partial(zero, options))
+    return 0
+
+
+def _zero(config: RobotConfig, set_to_zero: Callable[[], None]) -> None:
     try:
-        zero(options)
+        set_to_zero()
     except SightlineError:
         raise
     except PLUGIN_ERRORS as error:
         report_ending("drive", error)
         what = f"drive '{config.drive.kind}' raised {type(error).__name__}: {error_text(error)}"
         raise HardwareError(f"motors NOT set to zero: {what}; switch off their supply") from None
-    return 0
 
 
 class BatteryReader:

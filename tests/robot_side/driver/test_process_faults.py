@@ -9,12 +9,14 @@ import time
 import pytest
 
 from sightline.protocol.config import Config
+from sightline.protocol.errors import HardwareError
 from sightline.protocol.messages import Twist
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from sightline.robot_side.driver.process import Driver, run
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
+from sightline.robot_side.guardian.core import needs_zero
 from sightline.robot_side.ports import WheelAngles
 from sightline.robot_side.safety.limits import SafetyConfig
 from tests.fixtures.links import until
@@ -115,21 +117,41 @@ def test_a_packet_that_is_invalid_is_dropped(driver, packet):
     assert driver._drain() is False
 
 
-def test_motors_are_set_to_zero_after_every_end_of_the_loop(tmp_path, monkeypatch):
-    config = RobotConfig(
-        drive=PluginChoice(kind=f"{__name__}:BrokenDrive"), listen=(free_endpoint(),), state_dir=tmp_path
-    )
+@pytest.fixture
+def run_with(tmp_path, monkeypatch):
+    """Run a robot whose loop is another one."""
+    handlers = {number: signal.getsignal(number) for number in (*EXIT_SIGNALS, *IGNORED_SIGNALS)}
+    BrokenDrive.fails = BrokenDrive.reading = None
+    kind = PluginChoice(kind=f"{__name__}:BrokenDrive")
 
+    def run_with(loop):
+        monkeypatch.setattr(Driver, "loop", loop)
+        return run(RobotConfig(drive=kind, listen=(free_endpoint(),), state_dir=tmp_path))
+
+    yield run_with
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+def test_motors_are_set_to_zero_after_every_end_of_the_loop(run_with):
     def breaks(_self):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(Driver, "loop", breaks)
-    handlers = {number: signal.getsignal(number) for number in (*EXIT_SIGNALS, *IGNORED_SIGNALS)}
     with pytest.raises(ZeroDivisionError):
-        run(config)
+        run_with(breaks)
     assert BrokenDrive.told == (0.0, 0.0)
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
+
+
+def test_drive_that_still_fails_at_the_end_gives_the_exit_code_that_calls_zero(run_with):
+    """A guardian calls `zero` of the drive unless the code is 0."""
+
+    def fails(_self):
+        BrokenDrive.told, BrokenDrive.fails = (0.0, 0.0), OSError("unplugged")
+        return 0
+
+    with pytest.raises(HardwareError, match=r"motors NOT set to zero: .* OSError: unplugged; switch off") as error:
+        run_with(fails)
+    assert needs_zero(error.value.exit_code, was_ready=True)
 
 
 def test_a_latch_that_cannot_be_written_is_tried_again_and_does_not_block(tmp_path, caplog):

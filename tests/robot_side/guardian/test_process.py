@@ -126,6 +126,17 @@ def test_sixth_death_within_a_minute_ends_the_robot(tmp_path):
         assert robot.motor_rows()[-1][1:] == (0.0, 0.0)
 
 
+def test_drive_that_still_fails_at_the_end_is_set_to_zero_by_the_guardian(tmp_path):
+    kind = "tests.fixtures.dying:FailingLogDrive"
+    with RobotProcess(tmp_path, drive={"kind": kind, "options": {"path": str(tmp_path / "drive.csv")}}) as robot:
+        robot.wait_until_on()
+        assert not robot.motor_rows()
+        robot.process.terminate()
+        assert robot.process.wait(START_S) == 3
+        assert "the motors are set to zero" in robot.output()
+        assert [row[1:] for row in robot.motor_rows()] == [(0.0, 0.0)]
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_end_before_the_first_heartbeat_is_quick_and_quiet(tmp_path, number):
     with RobotProcess(tmp_path) as robot:
