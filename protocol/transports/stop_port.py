@@ -40,23 +40,25 @@ class StopPort:
         Args:
             pipe: `SOCK_SEQPACKET` end; `serve` returns when the other end is closed.
             addresses: to listen on.
-            outgoing: whether to open a socket for datagrams that begin here, on a free port.
+            outgoing: whether to open sockets for datagrams that begin here, on free ports.
         """
         self._pipe, self._missing = pipe, list(addresses)
         self._sockets: dict[int, socket.socket] = {}
         self._poll = select.poll()
         self._poll.register(pipe, select.POLLIN)
         self._retry_us = 0
-        self.outgoing = -1
-        if outgoing:
-            self.outgoing = self._add(_bound(("0.0.0.0", 0)))
+        self._outgoing: dict[int, socket.socket] = {}
+        for host in ("0.0.0.0", "::") if outgoing else ():
+            with suppress(OSError):  # a system without IPv6
+                one = self._add(_bound((host, 0)))
+                self._outgoing[one.family] = one
         self._bind_missing()
 
-    def _add(self, one: socket.socket) -> int:
+    def _add(self, one: socket.socket) -> socket.socket:
         one.setblocking(False)
         self._sockets[one.fileno()] = one
         self._poll.register(one, select.POLLIN)
-        return one.fileno()
+        return one
 
     def _bind_missing(self) -> None:
         # An address that is missing at start may come later: a Wi-Fi that is not up yet, or a receiver that still ends.
@@ -92,6 +94,22 @@ class StopPort:
         # Drop rather than wait: the sender of a STOP repeats it, and is answered then.
         with suppress(OSError, KeyError):
             self._sockets[origin[0]].sendto(data, origin[1])
+
+    def send_out(self, data: bytes, address: Address) -> str:
+        """Send a datagram that begins here. Returns why it could not be sent, or ""."""
+        problems = []
+        try:
+            found = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)
+        except (OSError, UnicodeError) as error:
+            return str(getattr(error, "strerror", error))
+        # A name may have addresses of both families while its host listens on one only, so the first of each gets it.
+        places = {family: place for family, _, _, _, place in reversed(found) if family in self._outgoing}
+        for family, place in places.items():
+            try:
+                self._outgoing[family].sendto(data, place)
+            except OSError as error:
+                problems.append(error.strerror)
+        return "" if len(problems) < len(places) else str(next(iter(problems), "no IPv6 on this machine"))
 
     def serve(
         self, on_datagram: Callable[[bytes, Origin], Replies], on_packet: Callable[[bytes], None],

@@ -46,6 +46,8 @@ class StopReceiver:
         self._core = ReceiverCore(robot, secret, os.urandom(CHALLENGE_BYTES), now_us())
         self._routers = [(address, Registration(robot, secret, _random())) for address in routers]
         self._ignored = IgnoredDatagrams()
+        self._unreachable: set[Address] = set()
+        """Routers that were logged because no datagram could be sent to them."""
         if routers:
             import threading  # for a robot that connects to a router only
 
@@ -54,9 +56,16 @@ class StopReceiver:
 
     def _register_all(self) -> None:
         while True:
-            for address, registration in self._routers:
-                self._port.send_to(registration.datagram(), (self._port.outgoing, address))
+            self._register()
             time.sleep(_REGISTER_S)
+
+    def _register(self) -> None:
+        for address, registration in self._routers:
+            problem = self._port.send_out(registration.datagram(), address)
+            if problem and address not in self._unreachable:
+                self._unreachable.add(address)
+                self._port.log(f"STOP port {address[0]}:{address[1]}/udp of the router: {problem}; trying again, until "
+                               "then STOP needs the link")
 
     def on_datagram(self, data: bytes, origin: Origin) -> Replies:
         """Answer a datagram, or ignore and count it."""

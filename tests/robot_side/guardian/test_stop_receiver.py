@@ -21,7 +21,13 @@ from sightline.protocol.transports.stop_datagram import (
 )
 from sightline.protocol.transports.stop_port import StopPort, now_us, read_packets, send_packet
 from sightline.robot_side.guardian import stop_forwarder, stop_receiver
-from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
+from sightline.robot_side.guardian.stop_core import (
+    DriverReport,
+    Registration,
+    pack_report,
+    unpack_ignored,
+    unpack_number,
+)
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_port
 
@@ -198,14 +204,44 @@ def test_a_port_in_use_is_reported_and_opened_later(started, operator):
     assert stop(operator, address, Driver(process), StopRequests("r1", b"", 7))
 
 
-@pytest.mark.parametrize("secret", [b"", b"a secret of this site"])
-def test_behind_a_router_stop_is_forwarded_and_answered(started, operator, tmp_path, secret):
+@pytest.mark.parametrize("secret", [b"", SECRET])
+@pytest.mark.parametrize(("operator", "host"), [(socket.AF_INET, "127.0.0.1"), (socket.AF_INET6, "::1")],
+                         indirect=["operator"])
+def test_behind_a_router_stop_is_forwarded_and_answered(started, operator, host, tmp_path, secret):
     file = tmp_path / "stop.secret"
-    file.write_bytes(secret)
-    name, router = str(file) if secret else "", ("127.0.0.1", free_port())
+    file.write_bytes(SECRET)
+    name, router = str(file) if secret else "", (host, free_port())
     started(stop_forwarder.start([router], name))
     robot = started(stop_receiver.start("r1", [], [router], name))
     assert stop(operator, router, Driver(robot), StopRequests("r1", secret, 7))
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_router_of_a_name_with_both_families_gets_a_registration_on_its_own(monkeypatch, host):
+    resolve, number = socket.getaddrinfo, free_port()
+    pipe, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    router, port = stop_port._bound((host, number)), StopPort(pipe, [], outgoing=True)
+    monkeypatch.setattr(socket, "getaddrinfo", lambda _name, *rest, **more: [
+        one for address in ("::1", "127.0.0.1") for one in resolve(address, *rest, **more)])
+    assert port.send_out(b"a registration", ("router.local", number)) == ""
+    assert router.recv(64) == b"a registration"
+    for one in (pipe, theirs, router, *port._sockets.values()):
+        one.close()
+
+
+def test_router_that_cannot_be_addressed_is_logged_once():
+    lines = []
+    pipe, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    port = StopPort(pipe, [], outgoing=True)
+    port.log = lines.append
+    receiver = stop_receiver.StopReceiver(port, "r1", b"", ())
+    receiver._routers = [(("255.255.255.255", 7448), Registration("r1", b"", 5))]  # a broadcast, which is not permitted
+    for _ in range(3):
+        receiver._register()
+    assert len(lines) == 1
+    assert lines[0].startswith("STOP port 255.255.255.255:7448/udp of the router: Permission denied; trying again, ")
+    for one in (pipe, theirs, *port._sockets.values()):
+        one.close()
 
 
 def test_with_keys_an_answer_that_is_sent_back_stops_nothing(started, operator, tmp_path):
