@@ -9,6 +9,7 @@ environment, so that both processes of a robot use the same.
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -128,11 +129,22 @@ def _write(line: str, stream: TextIO | None) -> None:
     try:
         encoding = getattr(stream, "encoding", None)
         print(line.encode(encoding, "backslashreplace").decode(encoding) if encoding else line, file=stream, flush=True)
-    except OSError:  # the reader has gone: what is still buffered must not spoil the exit either
-        with suppress(Exception):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    except OSError as error:
+        _discard(stream, has_reader=error.errno not in (errno.EPIPE, errno.EIO))
     except Exception:  # whatever a line does to a stream, the next one may be shown
         return
+
+
+def _discard(stream: TextIO, *, has_reader: bool) -> None:
+    """Discard what is buffered, which would spoil the exit. Without a reader, discard all that follows, too."""
+    with suppress(Exception), open(os.devnull, "wb") as nowhere:  # noqa: PTH123  the guardian has no pathlib
+        number = stream.fileno()
+        before = os.dup(number)
+        os.dup2(nowhere.fileno(), number)
+        if has_reader:  # a full disk, or a pipe without room at present
+            stream.flush()
+            os.dup2(before, number)
+        os.close(before)
 
 
 _HANDLER: Final = QueueHandler()

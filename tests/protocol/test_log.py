@@ -14,6 +14,7 @@ import threading
 import time
 from contextlib import suppress
 from datetime import UTC, datetime
+from pathlib import Path
 
 import pytest
 
@@ -199,6 +200,35 @@ def test_a_level_chooses_its_stream_and_a_stream_without_reader_costs_lines_only
     handler.handle(_record("known"))
     handler.flush()
     assert (sys.stdout.getvalue(), sys.stderr.getvalue()) == ("known\n", "kept\n")
+
+
+def test_full_disk_costs_only_the_lines_while_it_is_full(tmp_path, handler):
+    file = tmp_path / "log"
+    with file.open("w") as sys.stdout, Path("/dev/full").open("w") as full:
+        number = sys.stdout.fileno()
+        room = os.dup(number)
+        os.dup2(full.fileno(), number)
+        handler.handle(_record("lost"))
+        handler.flush()
+        os.dup2(room, number)
+        os.close(room)
+        handler.handle(_record("the next"))
+        handler.flush()
+    assert file.read_text() == "the next\n"
+
+
+def test_pipe_that_must_not_block_costs_only_the_lines_without_room(handler):
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with os.fdopen(reader, "rb", buffering=0) as read, os.fdopen(writer, "w") as sys.stdout:
+        size = fcntl.fcntl(writer, fcntl.F_GETPIPE_SZ)
+        assert os.write(writer, bytes(size)) == size
+        handler.handle(_record("lost"))
+        handler.flush()
+        assert read.read(size) == bytes(size)
+        handler.handle(_record("the next"))
+        handler.flush()
+        assert read.read(size) == b"the next\n"
 
 
 class Failing(io.StringIO):
