@@ -43,7 +43,9 @@ class SafetyConfig(BatteryLimits):
         default=400, description="the limit falls linearly to zero at this frame age; older is rejected as `STALE`"
     )
     silence_ms: Millis = Field(default=300, description="no accepted command for this long: HOLD")
-    lease_ms: Millis = Field(default=1_000, description="the driver loses the lease after this long without a command")
+    lease_ms: Millis = Field(
+        default=1_000, description="the driver loses the lease after this long without a command; at least `silence_ms`"
+    )
     disarm_after_hold_s: float = Field(default=10.0, ge=1, le=600, description="from HOLD to DISARMED")
     live_commands_to_arm: int = Field(
         default=5, ge=1, le=100, description="valid commands in a row that the driver needs before arming"
@@ -66,6 +68,8 @@ class SafetyConfig(BatteryLimits):
     def _stops_in_time(self) -> Self:
         if self.full_speed_age_ms >= self.zero_speed_age_ms:
             raise ValueError("full_speed_age_ms must be below zero_speed_age_ms")
+        if self.lease_ms < self.silence_ms:
+            raise ValueError("lease_ms must be at least silence_ms, so that no command is in force without its driver")
         # The bound follows from the values themselves, so that a robot that brakes slowly needs a lower top speed.
         bound = stop_bound(self)
         if bound.zero_us > STOP_TIME_BOUND_US or bound.distance_m > STOP_DISTANCE_BOUND_M:

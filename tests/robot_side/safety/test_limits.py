@@ -64,6 +64,16 @@ def test_the_limit_falls_over_a_time(full_ms, zero_ms, allowed):
         assert allowed
 
 
+@pytest.mark.parametrize(("lease_ms", "silence_ms", "allowed"), [(299, 300, False), (300, 300, True), (20, 20, True)])
+def test_no_command_outlives_the_lease_of_its_driver(lease_ms, silence_ms, allowed):
+    try:
+        SafetyConfig(lease_ms=lease_ms, silence_ms=silence_ms)
+    except ValidationError as error:
+        assert not allowed and "lease_ms must be at least silence_ms" in str(error)
+    else:
+        assert allowed
+
+
 def test_a_configuration_that_stops_late_is_rejected_with_its_bound():
     late = config(max_acceleration_mps2=0.5)
     bound = stop_bound(late)
