@@ -172,13 +172,15 @@ def read_arguments() -> tuple[socket.socket, dict[str, Any]]:
 
 STOP_SECRET_FILE: Final = "stop.secret"
 """The secret of STOP datagrams, which robots, routers and operators share."""
+_SECRET_BYTES: Final = 16
+"""Security limit: a shorter secret can be guessed from one recorded datagram. `sightline keys` writes 32 letters."""
 
 
 def stop_secret_file(folder: str) -> str:
     """Return the path of the STOP secret in a folder from `sightline keys`.
 
     Raises:
-        ConfigError: the folder has no such file, as folders of earlier releases.
+        ConfigError: the folder has no such file, as folders of earlier releases, or an invalid one.
     """
     from pathlib import Path  # which the receiver itself does without: it takes a megabyte
 
@@ -186,15 +188,28 @@ def stop_secret_file(folder: str) -> str:
     if not file.is_file():
         raise ConfigError(f"{file} is missing: STOP works on the link only; add it with `sightline keys add {folder} "
                           "stop`, and copy it to robots, routers and operators")
+    read_secret(str(file))
     return str(file)
 
 
 def read_secret(file: str) -> bytes:
-    """Return the STOP secret in `file`, b"" for no file."""
+    """Return the STOP secret in `file`, b"" for no file.
+
+    Raises:
+        ConfigError: the file is unreadable, or its secret too short. An empty one would permit every STOP.
+    """
     if not file:
         return b""
-    with open(file, "rb") as secret:  # noqa: PTH123  without pathlib
-        return secret.read().strip()
+    try:
+        with open(file, "rb") as opened:  # noqa: PTH123  without pathlib
+            secret = opened.read().strip()
+    except OSError as error:
+        raise ConfigError(f"{file}: {error.strerror}; STOP works on the link only; make it readable") from None
+    if len(secret) < _SECRET_BYTES:
+        raise ConfigError(f"{file} has {len(secret)} bytes, expected {_SECRET_BYTES} or more: STOP works on the link "
+                          f"only; replace it with `sightline keys add {file.rpartition('/')[0]} stop`, and copy it to "
+                          "robots, routers and operators")
+    return secret
 
 
 # The side that starts such a process.

@@ -183,21 +183,21 @@ def test_a_robot_that_goes_on_ends_in_an_error_and_a_warning(robot, link, port):
 
 
 def test_with_keys_the_secret_is_used(robot, link, port, tmp_path):
-    (tmp_path / "stop.secret").write_text("of this site\n")
-    one = robot(secret=b"of this site")
+    (tmp_path / "stop.secret").write_text("a secret of this site\n")
+    one = robot(secret=b"a secret of this site")
     assert stop(port, tmp_path / "stop.secret") and one.reasons == []
 
 
 def test_keys_of_another_deployment_stop_nothing(robot, link, port, tmp_path):
-    (tmp_path / "stop.secret").write_text("of another site\n")
-    one = robot(secret=b"of this site")
+    (tmp_path / "stop.secret").write_text("a secret of another site\n")
+    one = robot(secret=b"a secret of this site")
     with pytest.raises(LinkError, match="did not confirm"):
         stop(port, tmp_path / "stop.secret", timeout_s=0.4)
     assert not one.stopped_s
 
 
 def test_a_missing_secret_is_named(robot, link, port):
-    robot(secret=b"of this site")
+    robot(secret=b"a secret of this site")
     with pytest.raises(LinkError, match=r"copy stop\.secret"):
         stop(port, timeout_s=0.4)
 

@@ -8,10 +8,11 @@ import pytest
 
 from sightline.protocol.channels import REPLY, REQUEST
 from sightline.protocol.codec import decode, encode
+from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import Reply, Request, RequestHeader, State, Verb
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.stop_datagram import StopRequests
-from sightline.protocol.transports.stop_port import StopProcess
+from sightline.protocol.transports.stop_port import StopProcess, read_secret
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.persistence import StopLatch
@@ -160,10 +161,26 @@ def test_a_key_folder_without_the_secret_gets_one_line_with_the_command(tmp_path
     assert stop_receiver_of(RobotConfig(secure=str(tmp_path))) is None
     [record] = caplog.records
     assert f"`sightline keys add {tmp_path} stop`" in record.getMessage()
-    (tmp_path / "stop.secret").write_text("x")
+    (tmp_path / "stop.secret").write_text("a secret of this site")
     receiver = stop_receiver_of(RobotConfig(secure=str(tmp_path)))
     receiver.close()
     assert str(tmp_path / "stop.secret") in receiver.options["secret_file"]
+
+
+@pytest.mark.parametrize("text", ["", "\n", "15 letters long\n"])
+def test_empty_or_short_secret_closes_the_port_with_one_line(tmp_path, caplog, text):
+    file = tmp_path / "stop.secret"
+    file.write_text(text)
+    assert stop_receiver_of(RobotConfig(secure=str(tmp_path))) is None
+    [record] = caplog.records
+    assert str(file) in record.getMessage() and f"`sightline keys add {tmp_path} stop`" in record.getMessage()
+    with pytest.raises(ConfigError):  # as a receiver that starts again later reads it
+        read_secret(str(file))
+
+
+def test_unreadable_secret_is_one_line(tmp_path):
+    with pytest.raises(ConfigError, match=r"stop\.secret: Is a directory; STOP works on the link only"):
+        read_secret(str((tmp_path / "stop.secret").mkdir() or tmp_path / "stop.secret"))
 
 
 def test_robot_stops_and_latches_by_the_port_alone(tmp_path):

@@ -59,8 +59,8 @@ class Driver:
 
 
 @pytest.fixture
-def operator():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+def operator(request):
+    with socket.socket(getattr(request, "param", socket.AF_INET), socket.SOCK_DGRAM) as one:
         one.setblocking(False)
         yield one
 
@@ -96,7 +96,7 @@ def stop(operator, address, driver, requests):
     return until(proven, START_S)
 
 
-@pytest.mark.parametrize("secret", [b"", b"a secret of this site"])
+@pytest.mark.parametrize("secret", [b"", SECRET])
 def test_receiver_answers_stop_and_stays_below_15_mb(started, operator, tmp_path, secret):
     file = tmp_path / "stop.secret"
     file.write_bytes(secret + b"\n")
@@ -263,7 +263,7 @@ def test_with_keys_an_answer_that_is_sent_back_stops_nothing(started, operator, 
 
 def test_with_keys_datagrams_of_an_earlier_start_are_ignored(started, operator, tmp_path):
     file = tmp_path / "stop.secret"
-    file.write_bytes(b"secret")
+    file.write_bytes(SECRET)
     address, recorded = ("127.0.0.1", free_port()), []
 
     class Recorder:
@@ -274,7 +274,7 @@ def test_with_keys_datagrams_of_an_earlier_start_are_ignored(started, operator, 
         recv = operator.recv
 
     first = started(stop_receiver.start("r1", [address], [], str(file)))
-    assert stop(Recorder(), address, Driver(first), StopRequests("r1", b"secret", 7))
+    assert stop(Recorder(), address, Driver(first), StopRequests("r1", SECRET, 7))
     first.close()
     second = started(stop_receiver.start("r1", [address], [], str(file)))
     driver = Driver(second)
