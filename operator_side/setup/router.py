@@ -14,7 +14,7 @@ from typing import Final
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import RepeatLimiter
-from sightline.protocol.transports.endpoints import check_zenoh_endpoints, stop_addresses
+from sightline.protocol.transports.endpoints import check_zenoh_endpoints, own_stop_addresses
 from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.security import ROBOT_ROLE, load_role_keys
 from sightline.protocol.transports.stop_port import StopProcess, read_packets, stop_secret_file
@@ -68,7 +68,7 @@ def _raise_descriptor_limit() -> None:
 def _stop_forwarder(listen: Sequence[str], secure: str) -> StopProcess | None:
     """Prepare the forwarder of STOP datagrams; None where keys are used without a STOP secret."""
     try:
-        return stop_forwarder.start(stop_addresses(listen), stop_secret_file(secure) if secure else "")
+        return stop_forwarder.start(own_stop_addresses(listen), stop_secret_file(secure) if secure else "")
     except ConfigError as error:
         _log.warning("router: %s", error)
         return None

@@ -228,6 +228,23 @@ def stop_addresses(endpoints: Sequence[str]) -> list[tuple[str, int]]:
     return list(dict.fromkeys(places))
 
 
+# UDP port of discovery on each machine that listens beyond loopback: that of Zenoh plus three.
+MULTICAST_PORT: Final = 7449
+
+
+def own_stop_addresses(listen: Sequence[str]) -> list[tuple[str, int]]:
+    """Return the UDP addresses of the STOP port to open beside `listen`.
+
+    Raises:
+        ConfigError: one is that of discovery. Only one of the two could be opened.
+    """
+    addresses = stop_addresses(listen)
+    if any((host, MULTICAST_PORT) in addresses for host in ("0.0.0.0", "::")):
+        raise ConfigError(f"port {MULTICAST_PORT - 1} in {', '.join(listen)}: its STOP port would be {MULTICAST_PORT}/"
+                          f"udp, which is that of discovery; use another port, e.g. tcp/0.0.0.0:{MULTICAST_PORT}")
+    return addresses
+
+
 def _is_address(name: str) -> bool:
     try:
         ipaddress.ip_address(name)

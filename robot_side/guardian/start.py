@@ -18,7 +18,7 @@ from typing import Any, Final, NoReturn
 
 from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.errors import ConfigError, HardwareError
-from sightline.protocol.transports.endpoints import stop_addresses
+from sightline.protocol.transports.endpoints import own_stop_addresses, stop_addresses
 from sightline.protocol.transports.stop_datagram import STOP_PORT
 from sightline.protocol.transports.stop_port import StopProcess, stop_secret_file
 from sightline.robot_side.config import RobotConfig
@@ -129,13 +129,17 @@ def _execute(setup: dict[str, Any], ends: list[int]) -> NoReturn:
 
 
 def stop_receiver_of(config: RobotConfig) -> StopProcess | None:
-    """Prepare the STOP receiver beside the links of this robot; None where keys are used without a STOP secret."""
+    """Prepare the STOP receiver beside the links of this robot; None where keys are used without a STOP secret.
+
+    Raises:
+        ConfigError: the robot listens where it could not open its STOP port.
+    """
+    addresses, routers = own_stop_addresses(config.listen), stop_addresses(config.connect)
     try:
         secret_file = stop_secret_file(config.secure) if config.secure else ""
     except ConfigError as error:
         _log.warning("robot %s: %s", config.robot, error)
         return None
-    addresses, routers = stop_addresses(config.listen), stop_addresses(config.connect)
     if not addresses and not routers:
         addresses = [("127.0.0.1", STOP_PORT)]
     return stop_receiver.start(config.robot, addresses, routers, secret_file)

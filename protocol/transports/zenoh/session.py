@@ -18,15 +18,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError, install_command
 from sightline.protocol.transports.diagnosis import diagnose_tls, own_sockets, port_owner, unresolved_host
-from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
+from sightline.protocol.transports.endpoints import MULTICAST_PORT, parse_zenoh_endpoint, with_send_buffer
 from sightline.protocol.transports.security import RoleKeys, size_limit_section
 
 if TYPE_CHECKING:
     import zenoh
 
 
-# The group of Zenoh, with a port three above that of Zenoh.
-MULTICAST_GROUP: Final = ("224.0.0.224", 7449)
+# The group of Zenoh.
+MULTICAST_GROUP: Final = ("224.0.0.224", MULTICAST_PORT)
 MULTICAST_OFF: Final = {"enabled": False}
 LOOPBACK: Final = ("localhost", "127.", "::1")
 

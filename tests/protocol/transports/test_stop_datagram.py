@@ -4,8 +4,8 @@ import hmac
 
 import pytest
 
-from sightline.protocol.errors import RejectReason, WireError
-from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, stop_addresses
+from sightline.protocol.errors import ConfigError, RejectReason, WireError
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, own_stop_addresses, stop_addresses
 from sightline.protocol.transports.stop_datagram import (
     DATAGRAM_BYTES,
     NO_CHALLENGE,
@@ -67,6 +67,19 @@ def test_the_port_is_the_next_one_above_that_of_the_link():
     ends = ["tls/[::1]:7001#iface=lo", "ws://0.0.0.0:9090", "ws-legacy://0.0.0.0:9091", "tls/[::1]:7001"]
     assert stop_addresses(ends) == [("::1", 7002), ("0.0.0.0", 9091)]
     assert stop_addresses([]) == []
+
+
+@pytest.mark.parametrize(("listen", "is_free"), [
+    ("tcp/0.0.0.0:7448", False), ("tls/[::]:7448", False), ("wss://0.0.0.0:7448", False), ("tcp/0.0.0.0:7449", True),
+    ("tcp/127.0.0.1:7448", True), ("tcp/192.168.1.20:7448", True),
+])  # fmt: skip
+def test_stop_port_is_not_that_of_discovery(listen, is_free):
+    try:
+        assert own_stop_addresses([DEFAULT_ENDPOINT, listen]) == stop_addresses([DEFAULT_ENDPOINT, listen])
+    except ConfigError as error:
+        assert not is_free and "7449/udp, which is that of discovery; use another port, e.g. tcp/0.0" in str(error)
+    else:
+        assert is_free
 
 
 # --- the sender ----------------------------------------------------------------------------------------------------

@@ -157,6 +157,11 @@ def test_the_port_is_beside_the_links(changes, addresses, routers):
     assert options["addresses"] == addresses and options["routers"] == routers and options["secret_file"] == ""
 
 
+def test_robot_that_could_not_open_its_stop_port_does_not_start():
+    with pytest.raises(ConfigError, match=r"port 7448 in tcp/0\.0\.0\.0:7448: its STOP port would be 7449/udp"):
+        stop_receiver_of(RobotConfig(listen=("tcp/0.0.0.0:7448",)))
+
+
 def test_a_key_folder_without_the_secret_gets_one_line_with_the_command(tmp_path, caplog):
     assert stop_receiver_of(RobotConfig(secure=str(tmp_path))) is None
     [record] = caplog.records
