@@ -284,7 +284,8 @@ class Connection:
             self._readable.register(self._near, events)
             self._awaited = events
         # TLS decrypts whole records, so data can wait in this process while the socket has none for `poll`.
-        if isinstance(self._near, ssl.SSLSocket) and self._near.pending():
+        # While nothing is read they stay there, and only room for what waits ends the wait.
+        if events & select.POLLIN and isinstance(self._near, ssl.SSLSocket) and self._near.pending():
             return
         for descriptor, event in self._readable.poll(timeout_s * 1000):
             if descriptor == self._alarm.fileno():

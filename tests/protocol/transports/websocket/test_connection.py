@@ -1,6 +1,11 @@
 """Connections given up, by time and by send path: tables over `connection.py`, exact to the microsecond."""
 
 import random
+import select
+import socket
+import ssl
+import time
+from contextlib import suppress
 
 import pytest
 from hypothesis import example, given
@@ -13,11 +18,13 @@ from sightline.protocol.transports.websocket.connection import (
     PING_EVERY_US,
     SILENCE_US,
     STALLED_LIMIT_US,
+    Connection,
     Keepalive,
     MessageReader,
     SendPath,
     unmasked_head,
 )
+from tests.fixtures.ports import free_port
 
 CLEAR = SendPath(full=False, taken_bytes=7, lost=False)
 FULL = SendPath(full=True, taken_bytes=7, lost=False)
@@ -84,6 +91,31 @@ def test_send_path_that_is_full_at_times_counts_as_a_slow_reader():
 def test_machine_without_acknowledgments_is_closed_after_two_seconds(full):
     assert gives_up_at(lambda now_us: SendPath(full, 7, now_us >= 1_000_000)) == SILENCE_US
     assert gives_up_at(lambda now_us: SendPath(True, now_us, now_us >= 9_000_000)) == 9_000_000
+
+
+class Records(socket.socket):
+    """A socket with decrypted data, which `poll` does not see."""
+
+    def pending(self):
+        return 5
+
+
+def test_decrypted_data_that_may_not_be_read_yet_does_not_keep_the_thread_busy(monkeypatch):
+    """A peer that sends much and reads nothing: what is for it waits, and so does what it sent."""
+    monkeypatch.setattr(ssl, "SSLSocket", Records)
+    with socket.create_server(("127.0.0.1", free_port())) as server:
+        far = socket.create_connection(server.getsockname())
+        near = Records(fileno=server.accept()[0].detach())
+    connection = Connection(near, Protocol(SERVER))
+    while select.select([], [near], [], 0.05)[1]:
+        with suppress(BlockingIOError):
+            near.send(bytes(1 << 20))
+    connection._unsent.extend([b"waits"] * 12)
+    began_s = time.monotonic()
+    connection.wait(0.1)
+    assert time.monotonic() - began_s >= 0.1
+    connection.shut()
+    far.close()
 
 
 # Messages out of bytes: the short way gives what the library gives, however the bytes arrive, and nothing more.
