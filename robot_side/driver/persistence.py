@@ -26,8 +26,14 @@ class StopLatch:
             raise ConfigError(f"state_dir {directory}: {error.strerror}; choose a writable directory") from None
 
     def is_set(self) -> bool:
-        """Return True if the robot was STOPPED when it last ran."""
-        return self._path.exists()
+        """Return True if the robot was STOPPED when it last ran. Raises ConfigError where that is not known."""
+        try:
+            self._path.lstat()
+        except FileNotFoundError:
+            return False
+        except OSError as error:
+            raise ConfigError(f"cannot read the STOP mark {self._path}: {error.strerror}; make it readable") from None
+        return True
 
     def write(self, stopped: bool) -> None:
         """Write or remove the mark; once this returns not even a power cut changes it. May wait for the disk."""

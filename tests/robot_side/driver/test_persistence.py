@@ -7,6 +7,7 @@ import threading
 
 import pytest
 
+from sightline.protocol.errors import ConfigError
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from tests.fixtures.links import until
 
@@ -68,6 +69,21 @@ def test_folder_without_sync_still_stores_the_mark(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", only_files)
     latch.write(stopped=True)
     assert latch.is_set()
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.EACCES])
+def test_a_mark_that_cannot_be_read_is_an_error_and_not_a_robot_without_stop(tmp_path, monkeypatch, number):
+    latch = StopLatch(tmp_path, "r1")
+
+    def fails(*_arguments, **_options):
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as broken:
+        broken.setattr(os, "stat", fails)
+        broken.setattr(os, "lstat", fails)
+        with pytest.raises(ConfigError) as error:
+            latch.is_set()
+    assert str(error.value).startswith(f"cannot read the STOP mark {tmp_path}/r1.stopped: {os.strerror(number)}; ")
 
 
 # A terminal that is not read, and a write that fails, do not end the writing of the STOP mark.
