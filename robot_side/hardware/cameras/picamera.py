@@ -29,7 +29,7 @@ class PiCameraConfig(LensConfig):
     hfov_deg: Annotated[float, Field(gt=5, lt=175)] = 62.0
     delay_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
     """Age of an image when it is encoded, ms, if the sensor gives no usable time."""
-    frozen_after_s: Annotated[float, Field(ge=0.2, le=60)] = 2.0
+    frozen_after_s: Annotated[float, Field(ge=0.2, le=2)] = 2.0
 
 
 class PiCamera:

@@ -104,8 +104,8 @@ class V4l2CameraConfig(LensConfig):
     quality: Annotated[int, Field(ge=10, le=100)] = 80
     delay_ms: Annotated[float, Field(ge=0, le=1000)] = 30.0
     """Age of an image when it is read, ms, for drivers without a usable time."""
-    frozen_after_s: Annotated[float, Field(ge=0.2, le=60)] = 2.0
-    """Time without an image after which the camera counts as frozen."""
+    frozen_after_s: Annotated[float, Field(ge=0.2, le=2)] = 2.0
+    """Time without an image after which the camera counts as frozen; after 2 s another process opens it."""
 
 
 Capture = Any

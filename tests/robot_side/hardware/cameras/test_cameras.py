@@ -1,11 +1,13 @@
 """The camera contract over every camera that can run here: folder, still, video, V4L2 and Pi stand-ins, simulation."""
 
 import pytest
+from pydantic import ValidationError
 
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.hardware.cameras.picamera import PiCamera
 from sightline.robot_side.hardware.cameras.v4l2 import V4l2Camera
+from sightline.robot_side.pipe import NetworkSetup
 from sightline.robot_side.plugins import CAMERAS
 from tests.contracts.cameras import check_camera
 from tests.fixtures import demanded
@@ -71,6 +73,14 @@ def test_only_real_cameras_are_live(tmp_path):
         assert CAMERAS.build(PluginChoice(kind=kind, options={"path": str(path)})).live is False
     assert V4l2Camera.live is True
     assert PiCamera.live is True
+
+
+@pytest.mark.parametrize("camera", [V4l2Camera, PiCamera])
+def test_camera_is_frozen_before_another_process_opens_it(camera):
+    patience_us = NetworkSetup.model_fields["camera_patience_us"].default
+    assert camera.Config(frozen_after_s=2).frozen_after_s * 1e6 <= patience_us
+    with pytest.raises(ValidationError, match="less than or equal to 2"):
+        camera.Config(frozen_after_s=2.01)
 
 
 @pytest.mark.parametrize("kind", KINDS)
