@@ -254,7 +254,8 @@ class StopProcess:
             import subprocess
 
             if self._process is not None:
-                logging.getLogger(__name__).error("STOP receiver ended (%d); starting it again", self._process.poll())
+                logging.getLogger(__name__).error(
+                    "STOP %s ended (%d); starting it again", self.module.rpartition("_")[2], self._process.poll())
             root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))  # noqa: PTH100, PTH120
             number = self.far.fileno()
             command = [sys.executable, "-I", "-S", "-c", _CHILD.format(self.module), root, str(number)]
@@ -269,6 +270,10 @@ class StopProcess:
     def pid(self) -> int:
         """Return its process id, 0 before the first start."""
         return self._process.pid if self._process is not None else 0
+
+    def note_end(self, status: int) -> None:
+        """Take its wait status from a caller that waits for all its children, and so for this process too."""
+        self._process.returncode = os.waitstatus_to_exitcode(status)
 
     def close(self) -> None:
         """End it."""

@@ -259,6 +259,8 @@ class Guardian:
                     return
                 if pid == self._driver_pid:
                     self._status = status
+                elif self._receiver is not None and pid == self._receiver.pid:
+                    self._receiver.note_end(status)
 
     # --- the end -------------------------------------------------------------------------------------------------
 

@@ -115,6 +115,13 @@ def test_guardian_is_small_and_the_driver_dumps_no_core(tmp_path):
         assert "pydantic" not in maps and "zenoh" not in maps
 
 
+def test_killed_receiver_is_logged_with_its_signal(tmp_path):
+    with RobotProcess(tmp_path) as robot:
+        robot.wait_until_on()
+        os.kill(robot.receiver_pid(), signal.SIGKILL)
+        robot.wait_until_on("STOP receiver ended (-9); starting it again")
+
+
 def test_sixth_death_within_a_minute_ends_the_robot(tmp_path):
     with RobotProcess(tmp_path) as robot:
         robot.wait_until_on()

@@ -178,6 +178,14 @@ def test_a_killed_receiver_is_logged_and_started_again(started, operator, caplog
     assert caplog.messages == ["STOP receiver ended (-9); starting it again"]
 
 
+def test_killed_forwarder_is_logged_by_its_own_name(started, caplog):
+    process = started(stop_forwarder.start([], ""))
+    process._process.kill()
+    process._process.wait()
+    process.keep_alive(now_us() + 2_000_000)
+    assert caplog.messages == ["STOP forwarder ended (-9); starting it again"]
+
+
 @pytest.mark.parametrize("number", [
     signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP, signal.SIGTERM,
 ])
