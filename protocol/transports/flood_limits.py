@@ -164,6 +164,9 @@ def _line(flood: Flood) -> str:
     over = f"{flood.open} connections from {flood.host}, {flood.new_per_s:.0f} new ones a second"
     if flood.host in _OWN:
         return f"{over}, more than the total limit of {MAX_OPEN}; end the program on this machine"
+    if ":" in flood.host:
+        return (f"{over}, more than the total limit of {MAX_OPEN}; new ones go on, because an IPv6 host has many "
+                "addresses; block its network or end the program there")
     return (f"{over}, more than the total limit of {MAX_OPEN}; new ones are dropped for {BLOCKED_US / 1e6:.0f} s, open "
             "sessions go on; block that address or end the program there")
 

@@ -14,6 +14,7 @@ from sightline.protocol.transports.flood_limits import (
     MAX_OPEN,
     WINDOW_US,
     FloodDetector,
+    _line,
     limit_floods,
 )
 from sightline.protocol.transports.open import open_link
@@ -93,6 +94,16 @@ def test_this_machine_is_reported_and_not_blocked_and_the_list_is_bounded():
             for end, host in ends(f"10.0.2.{number}", range(MAX_OPEN + 1)).items()}
     detector.sample(many, 0)
     assert len(detector.blocked(0)) == MAX_BLOCKED
+
+
+@pytest.mark.parametrize(("host", "text"), [
+    ("10.0.0.9", "new ones are dropped for 10 s, open sessions go on; block that address or"),
+    ("2a02:8109:9340:5a2c:d4f1:9c3b:7e21:aa0b", "new ones go on, because an IPv6 host has many addresses; block its"),
+    ("::1", "end the program on this machine"),
+])  # fmt: skip
+def test_line_of_a_flood_states_what_is_dropped(host, text):
+    [flood] = FloodDetector().sample(ends(host, range(MAX_OPEN + 1)), 0)
+    assert f"65 connections from {host}, 22 new ones a second, more than the total limit of 64; {text}" in _line(flood)
 
 
 def test_the_memory_of_a_fast_flood_is_bounded():
