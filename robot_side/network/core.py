@@ -43,7 +43,7 @@ class NetworkCore:
         self._seq = first_seq
         self._max_frame_bytes = max_frame_bytes
         self._last_t_us = -1
-        self._camera_seq = 0
+        self._camera_seq: int | None = None
         self._camera_due_us = 0
         self._announced: CameraModel | None = None
         self._scale_percent = 100
@@ -134,8 +134,9 @@ class NetworkCore:
             return None
         self._announced = model
         self._camera_due_us = now_us + _CAMERA_PERIOD_US
+        # It begins above the numbers of an earlier process of this session, as the time does.
+        self._camera_seq = now_us if self._camera_seq is None else self._camera_seq + 1
         stamp = Stamp(session=self._session, seq=self._camera_seq, t_us=now_us)
-        self._camera_seq += 1
         return Message(CAMERA, "", encode(stamp), encode(model))
 
     def on_new_driver(self) -> None:

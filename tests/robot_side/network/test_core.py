@@ -208,6 +208,14 @@ def test_model_is_announced_at_once_and_then_each_half_second():
         assert announced[now_us] == Message(CAMERA, "", encode(stamp), encode(MODEL))
 
 
+def test_model_of_a_later_process_of_the_session_has_higher_numbers():
+    earlier, later = core_of(), core_of()
+    messages = [earlier.announce_camera(MODEL, now_us) for now_us in range(0, 10_000_000, 500_000)]
+    messages.append(later.announce_camera(MODEL, 10_000_000))
+    seqs = [decode(Stamp, message.header).seq for message in messages]
+    assert seqs == sorted(set(seqs))
+
+
 def test_model_of_another_image_size_is_announced_before_its_first_frame():
     core = core_of()
     core.announce_camera(MODEL, 0)
