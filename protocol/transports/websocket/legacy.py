@@ -271,7 +271,8 @@ class LegacyToRobot:
 
     def write(self, message: Message) -> tuple[bytes, ...]:
         if message.channel is DETECTIONS:
-            return (format_boxes(boxes_from_detections(decode(Detections, message.payload))),)
+            found = decode(Detections, message.payload, DETECTIONS.max_payload_bytes)
+            return (format_boxes(boxes_from_detections(found)),)
         return (as_text(self._options, message.payload),)
 
     def note_sent(self, message: Message) -> None:

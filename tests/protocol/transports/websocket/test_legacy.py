@@ -335,6 +335,16 @@ def test_boxes_go_out_in_place_of_twists():
         assert until(lambda: robot.said[1:] == ["", ""]), "an empty text stops it"
 
 
+@pytest.mark.parametrize("count", [5, 16, 64])
+def test_the_first_16_of_many_boxes_go_out(count):
+    boxes = tuple(DetectedBox(label="an empty bottle", score=0.9, x1_px=one, y1_px=30.125, x2_px=80.125, y2_px=60.5)
+                  for one in range(count))
+    found = Detections(width_px=160, height_px=120, boxes=boxes)
+    with old_robot_and_vision("?boxes") as (robot, vision):
+        vision.publish(DETECTIONS, b"{}", encode(found))
+        assert until(lambda: robot.said and robot.said[0].count("-") == min(count, 16) - 1)
+
+
 # --- a legacy robot is never left driving ----------------------------------------------------------------------------
 
 ZEROS = [("", "0.0000|0.0000"), ("?dashed", "0.0000-0.0000"), ("?dashed&swapped", "0.0000-0.0000")]
