@@ -210,20 +210,21 @@ class Driver:
     def loop(self) -> int:
         """Tick at absolute 20 ms deadlines, and for a command once MIN_TICK_US have passed since the last tick."""
         self._log_missing()
-        deadline_us = monotonic_us()
+        # Deadlines have the clock of heartbeats: a robot that slept is not late.
+        deadline_us = heartbeat_us()
         is_pending = False
         while not self._ended():
             self._wait(min(deadline_us, self._ticked_us + MIN_TICK_US) if is_pending else deadline_us)
             arrived = self._drain()
             is_pending |= arrived
-            now_us = monotonic_us()
+            now_us = heartbeat_us()
             if now_us >= deadline_us:
                 self._driver_core.tick_late_max_us = max(self._driver_core.tick_late_max_us, now_us - deadline_us)
                 deadline_us = max(deadline_us + TICK_US, now_us)
-                self._tick(now_us, punctual=True)
+                self._tick(monotonic_us(), punctual=True)
                 is_pending = False
             elif is_pending and now_us - self._ticked_us >= MIN_TICK_US:
-                self._tick(now_us, punctual=False)
+                self._tick(monotonic_us(), punctual=False)
                 is_pending = False
             elif arrived:
                 self._answer()
@@ -256,7 +257,7 @@ class Driver:
         return self._driver_core.at_rest and self._speeds_are_set
 
     def _wait(self, deadline_us: int) -> None:
-        timeout_s = max(0, deadline_us - monotonic_us()) / 1e6
+        timeout_s = max(0, deadline_us - heartbeat_us()) / 1e6
         readable = [self.driver_end.socket] if self.driver_end.socket else []
         if self._stops is not None:
             readable.append(self._stops)
@@ -269,7 +270,7 @@ class Driver:
             self._ending_since_us = self._ending_since_us or monotonic_us()
 
     def _tick(self, now_us: int, *, punctual: bool) -> None:
-        self._ticked_us = now_us
+        self._ticked_us = heartbeat_us()
         self._move()
         self._answer()
         if punctual:

@@ -22,6 +22,7 @@ class VirtualLoop:
 
     def __init__(self, late_us):
         self.now_us, self.late_us = 10_000_000, late_us
+        self.asleep_us = 0
         self.ticks_us = []
 
     def select(self, _readable, _writable, _broken, timeout_s):
@@ -52,19 +53,19 @@ def run(tmp_path, monkeypatch):
 
     def run(loop, seconds):
         """Run the loop for so long and return the times of its ticks, from its start on."""
-        monkeypatch.setattr(process, "monotonic_us", lambda: loop.now_us)
+        monkeypatch.setattr(process, "monotonic_us", lambda: loop.now_us + loop.asleep_us)
         monkeypatch.setattr(process, "heartbeat_us", lambda: loop.now_us)
         monkeypatch.setattr(process, "select", SimpleNamespace(select=loop.select))
         monkeypatch.setattr(process, "request_real_time", lambda _priority: ())
         driver = Driver(RobotConfig(state_dir=tmp_path), loop, None)
         made.append(driver)
-        driver.driver_end = loop
+        driver.driver_end, loop.core = loop, driver._driver_core
         monkeypatch.setattr(driver, "_on_packet", lambda _packet: True)
         started_us, tick = loop.now_us, driver._tick
 
         def counted(now_us, *, punctual):
             tick(now_us, punctual=punctual)
-            if now_us - started_us >= seconds * 1e6:
+            if loop.now_us - started_us >= seconds * 1e6:
                 driver._on_signal(signal.SIGTERM, None)
 
         monkeypatch.setattr(driver, "_tick", counted)
@@ -98,6 +99,19 @@ def test_deadlines_that_a_stall_has_passed_are_not_caught_up(run):
     gaps_us = [after - before for before, after in pairwise(ticks_us)]
     assert gaps_us[:4] == [20_000] * 4 and gaps_us[4] == 520_000
     assert sum(gap_us < 20_000 for gap_us in gaps_us[5:]) <= 1, "at most one tick follows at once"
+
+
+def test_robot_that_slept_for_an_hour_is_not_late(run):
+    loop = VirtualLoop(late_us=3_000)
+    select = loop.select
+
+    def sleep_once(*arguments):
+        select(*arguments)
+        loop.asleep_us = 3_600_000_000 if len(loop.ticks_us) >= 5 else 0
+
+    loop.select = sleep_once
+    assert len(run(loop, seconds=0.4)) == 21
+    assert loop.core.tick_late_max_us == 3_000
 
 
 @pytest.mark.parametrize("seed", range(3))
