@@ -37,7 +37,7 @@ from sightline.robot_side.safety.validation import (
 )
 
 _GUEST = Holder(source="guest", session="00000000")
-# A link that was cut delivers its messages later. An old `arm` must not arm (docs/decisions/0001).
+# A link that was cut delivers its messages later. An old `arm` must not arm (docs/explanation/decisions/0001).
 _MAX_REQUEST_AGE_US = 2_000_000
 # These verbs only take motion away, so they are safe at any age.
 _NEEDS_NO_ECHO = (Verb.STOP, Verb.DISARM, Verb.RELEASE)

@@ -3,7 +3,7 @@
 Each near point of a scan becomes one inequality on the twist. The robot approaches the point at
 `linear * forward + angular * turning`. This speed may be at most sqrt(2 brake (clearance - stop)), so that the robot
 still brakes in time. Motion along a wall or away from it is free. A stale sensor counts as an obstacle all around.
-docs/decisions/0003 compares this rule with a lane of free distance.
+docs/explanation/decisions/0003 compares this rule with a lane of free distance.
 """
 
 import math
