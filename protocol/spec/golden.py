@@ -26,7 +26,6 @@ from sightline.protocol.text import parse_twist
 INEXACT_KEY = "INEXACT_KEY"
 """The outcome of a key that is not exact. The receiver counts it and sends no reply."""
 Outcome = dict[str, Any]
-_SAID = ("purpose", "accept", "refuse")
 
 
 def outcome(key: str, header: bytes, payload: bytes) -> Outcome:
@@ -83,13 +82,6 @@ def _wire_vector(case: FramingCase) -> Outcome:
     if got.get("refuse") != case.refuse:
         raise ValueError(f"{case.folder}/{case.name}: stated {case.refuse or 'accept'}, decoded to {got}")
     return {"purpose": case.purpose, **case.given, **got}
-
-
-def read_again(folder: str, vector: Outcome) -> Outcome:
-    """Return the result at a receiver for the contents of a file alone."""
-    if "key" in vector:
-        return outcome(vector["key"], bytes.fromhex(vector["header_hex"]), bytes.fromhex(vector["payload_hex"]))
-    return framing_outcome(folder, {name: value for name, value in vector.items() if name not in _SAID})
 
 
 def files() -> dict[Path, str]:

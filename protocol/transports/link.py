@@ -385,7 +385,7 @@ NOT_A_PUT = "NOT_A_PUT"
 
 
 class LinkRules:
-    """The rules of one link to `robot` with role `role`. `rejected` and `callback_errors` never decrease."""
+    """The rules of one link to `robot` with role `role`. `rejected` never decreases."""
 
     def __init__(self, robot: str, role: str = "", max_frame_bytes: int = FRAME.max_payload_bytes) -> None:
         """Create the rules of one link.
@@ -403,7 +403,6 @@ class LinkRules:
         self.robot = check_robot_id(robot)
         self.role = role
         self.rejected: Counter[str] = Counter()
-        self.callback_errors = 0
         self._max_frame_bytes = max_frame_bytes
         self._counting = threading.Lock()
 
@@ -464,8 +463,6 @@ class LinkRules:
         # An error in a callback must not end the thread of the transport, which serves all channels.
         except Exception as error:
             report_fault("callback", error, message.channel.name)
-            with self._counting:
-                self.callback_errors += 1
 
 
 class BaseLink(Link):
@@ -480,11 +477,6 @@ class BaseLink(Link):
     def rejected(self) -> Counter[str]:
         """Return the rejected messages and peers, by reason."""
         return self._rules.rejected
-
-    @property
-    def callback_errors(self) -> int:
-        """Return the number of errors in callbacks."""
-        return self._rules.callback_errors
 
     @property
     @abstractmethod

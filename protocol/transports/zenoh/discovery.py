@@ -69,20 +69,6 @@ def _note(tokens: set[Token], token: AnyToken, is_present: bool) -> None:
         tokens.add(token)
 
 
-def list_robots(connect: Sequence[str], seconds: float, secure: str = "") -> dict[str, Message]:
-    """Return the newest `status` of every robot at `connect` within `seconds`. Raises the errors of `open_zenoh`."""
-    return discover(connect, seconds, secure).statuses
-
-
-def peers_at(connect: Sequence[str], seconds: float, secure: str = "") -> list[PeerInfo]:
-    """Return all peers at `connect`, with the shortest of a few round trips. Raises the errors of `open_zenoh`."""
-    check_zenoh_endpoints((), connect)
-    with ExitStack() as ending:
-        session = open_session((), connect, seconds, _own_keys(secure))
-        ending.callback(session.close)
-        return _query_rounds(session, time.monotonic() + seconds)
-
-
 def _own_keys(folder: str) -> RoleKeys | None:
     """Load the keys of an operator, or those of a viewer if the folder has no others. Viewing needs no more."""
     only_viewer = folder and not _has(folder, OPERATOR_ROLE) and _has(folder, VIEWER_ROLE)

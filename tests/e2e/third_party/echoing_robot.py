@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 from sightline.protocol.channels import ACK, DETECTIONS, REQUEST, STATUS, TWIST
+from sightline.protocol.log import faults
 from sightline.protocol.transports.websocket.link import open_websocket
 
 with open_websocket("r1", listen=sys.argv[1:3], role="robot") as link:
@@ -17,4 +18,4 @@ with open_websocket("r1", listen=sys.argv[1:3], role="robot") as link:
     print("up", flush=True)
     for _ in sys.stdin:
         kib = int(Path("/proc/self/statm").read_text().split()[1]) * 4
-        print(json.dumps({"refused": link.rejected, "raised": link.callback_errors, "kib": kib}), flush=True)
+        print(json.dumps({"refused": link.rejected, "raised": faults()["callback"], "kib": kib}), flush=True)

@@ -32,7 +32,7 @@ from sightline.protocol.transports.security import (
     may_subscribe,
     read_tokens,
 )
-from sightline.protocol.transports.zenoh.discovery import list_robots
+from sightline.protocol.transports.zenoh.discovery import discover
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.session import MAX_MESSAGE_BYTES, open_session
 from tests.fixtures.links import until
@@ -219,7 +219,7 @@ def test_robots_are_listed_over_a_secured_link(folder, endpoint, role, tmp_path)
         found = {}
         deadline_s = time.monotonic() + 5
         secure = str(tmp_path)
-        listing = threading.Thread(target=lambda: found.update(list_robots([endpoint], 0.6, secure)), daemon=True)
+        listing = threading.Thread(target=lambda: found.update(discover([endpoint], 0.6, secure).statuses), daemon=True)
         listing.start()
         while listing.is_alive() and time.monotonic() < deadline_s:
             robot.publish(STATUS, b"{}", b"{}")

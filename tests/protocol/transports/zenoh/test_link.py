@@ -1,4 +1,4 @@
-"""Zenoh in one process: errors in words, bounds, what a frame costs on the wire, `list_robots`."""
+"""Zenoh in one process: errors in words, bounds, what a frame costs on the wire, the newest statuses."""
 
 import gc
 import re
@@ -19,7 +19,7 @@ from sightline.protocol.messages import FrameHeader
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_send_buffer
 from sightline.protocol.transports.link import NOT_A_PUT
-from sightline.protocol.transports.zenoh.discovery import list_robots
+from sightline.protocol.transports.zenoh.discovery import discover
 from sightline.protocol.transports.zenoh.link import MAX_KEPT_PUBLISHERS, ZenohLink, open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
 from tests.fixtures.links import until
@@ -176,7 +176,7 @@ def test_invented_sources_are_forwarded_with_bounded_memory():
         assert len(robot._outlets) == MAX_KEPT_PUBLISHERS + 1
 
 
-def test_list_robots_gives_the_newest_status_of_each():
+def test_discovery_gives_the_newest_status_of_each_robot():
     endpoint = free_endpoint()
     with open_zenoh("r1", listen=[endpoint]) as first, open_zenoh("r2", connect=[endpoint]) as second:
         assert until(lambda: first.connected and second.connected)
@@ -184,7 +184,7 @@ def test_list_robots_gives_the_newest_status_of_each():
         publisher = _Publishing([first, second])
         publisher.start()
         try:
-            found = list_robots([endpoint], 0.6)
+            found = discover([endpoint], 0.6).statuses
         finally:
             publisher.stop()
         assert time.monotonic() - begin_s < 2.5
@@ -192,9 +192,9 @@ def test_list_robots_gives_the_newest_status_of_each():
     assert all(int(message.payload[2:]) > 5 for message in found.values())
 
 
-def test_list_robots_without_an_answer_raises():
+def test_discovery_without_an_answer_raises():
     with pytest.raises(LinkError, match="no answer from"):
-        list_robots([free_endpoint()], 0.3)
+        discover([free_endpoint()], 0.3)
 
 
 class _Publishing:

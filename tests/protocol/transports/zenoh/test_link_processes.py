@@ -189,12 +189,13 @@ def test_process_ends_after_with(start):
 def test_a_program_without_a_log_prints_the_traceback_of_its_callback_and_nothing_of_zenoh(start):
     code = """
     from sightline.protocol.errors import LinkError
+    from sightline.protocol.log import faults
     with open_zenoh("r1", listen=[endpoint]) as robot, open_zenoh("r1", connect=[endpoint]) as peer:
         peer.subscribe(FRAME, lambda message: 1 / 0)
         while not robot.has_listener(FRAME):
             time.sleep(0.01)
         robot.publish(FRAME, b"", b"x")
-        while not peer.callback_errors:
+        while not faults()["callback"]:
             time.sleep(0.01)
         for arguments in ({"listen": [endpoint]}, {"connect": ["tcp/127.0.0.1:1"], "timeout_s": 0.3}):
             try:

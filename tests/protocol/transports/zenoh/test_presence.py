@@ -14,7 +14,7 @@ from sightline.protocol.messages import Stamp, State, Status
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.security import certificate_role
 from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
-from sightline.protocol.transports.zenoh.discovery import Discovered, discover, peers_at
+from sightline.protocol.transports.zenoh.discovery import Discovered, discover
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.presence import (
     MAX_PEERS,
@@ -130,7 +130,7 @@ def test_every_peer_at_a_router_is_listed_within_two_seconds(router):
         open_zenoh("r1", connect=[router]),  # who has no role is not listed
     ):
         began_s = time.monotonic()
-        peers = peers_at([router], 1.0)
+        peers = discover([router], 1.0).peers
         took_s = time.monotonic() - began_s
         assert {peer.presence.host for peer in robot.peers()} == {peer.presence.host for peer in peers}
     assert [(peer.presence.role, peer.presence.robot) for peer in peers] == [
@@ -149,8 +149,8 @@ def test_a_role_that_is_invalid_is_rejected_and_nothing_stays_open(router, role)
 
 def test_closed_peer_is_not_listed(router):
     with open_zenoh("r1", connect=[router], role="robot"):
-        assert len(peers_at([router], 0.6)) == 1
-    assert peers_at([router], 0.6) == []
+        assert len(discover([router], 0.6).peers) == 1
+    assert discover([router], 0.6).peers == []
 
 
 def test_listening_robot_is_listed_by_a_connecting_client():
@@ -168,7 +168,7 @@ def test_second_robot_with_one_id_is_rejected_with_the_first(router):
     ):
         open_zenoh("r1", connect=[router], role="robot")
     with open_zenoh("r1", connect=[router], role="robot"):
-        assert len(peers_at([router], 0.6)) == 1
+        assert len(discover([router], 0.6).peers) == 1
 
 
 def test_other_id_and_restarted_robot_are_accepted(router):
@@ -177,7 +177,7 @@ def test_other_id_and_restarted_robot_are_accepted(router):
         open_zenoh("r2", connect=[router], role="robot"),
         open_zenoh("r1", connect=[router], role="robot", session="0000abcd"),
     ):
-        assert len(peers_at([router], 0.6)) == 2
+        assert len(discover([router], 0.6).peers) == 2
 
 
 def test_robot_that_ends_during_the_check_does_not_block_its_successor(router, monkeypatch):
@@ -195,7 +195,7 @@ def test_secured_peers_are_listed_by_their_certificate(tmp_path):
     with open_zenoh("r1", listen=[endpoint], role="robot", secure=str(folder)):
         links = [open_zenoh("r1", connect=[endpoint], role=role, secure=str(folder)) for role in roles]
         try:
-            listed = [peer.presence.role for peer in peers_at([endpoint], 1.0, str(folder))]
+            listed = [peer.presence.role for peer in discover([endpoint], 1.0, str(folder)).peers]
         finally:
             for link in links:
                 link.close()
@@ -214,7 +214,7 @@ def test_secured_peer_with_another_certificate_is_not_listed_as_robot(tmp_path):
         try:
             for key in (presence_key("robot", "0000abcd"), presence_key("viewer", "0000abcd")):
                 rogue.declare_queryable(key, lambda query, key=key: query.reply(key, encode(ROBOT)))
-            listed = [peer.presence.robot for peer in peers_at([endpoint], 1.0, str(folder))]
+            listed = [peer.presence.robot for peer in discover([endpoint], 1.0, str(folder)).peers]
         finally:
             rogue.close()
     assert listed == ["r2"]

@@ -22,7 +22,7 @@ from sightline.protocol.messages import (
     State,
     Status,
 )
-from sightline.protocol.transports.zenoh.discovery import Discovered, peers_at
+from sightline.protocol.transports.zenoh.discovery import Discovered, discover
 from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.vision_side.config import DetectorConfig, HsvConfig
 from sightline.vision_side.decode import Decoder
@@ -202,7 +202,7 @@ def test_presence_shows_model_device_and_health_of_a_service(bench):
     robot = bench.robot("r1")
     detector = bench.detector("r1")
     assert until(lambda: _result(robot, detector))
-    peers = peers_at([bench.endpoint], 2.0)
+    peers = discover([bench.endpoint], 1.0).peers
     said = next(line for line in lines(Discovered({}, peers)) if line.startswith("detector"))
     assert "of *" in said and "hsv on cpu: 1 robots" in said and "p95 age" in said
     whole = as_object(Discovered({}, peers))
