@@ -8,3 +8,7 @@ from typing import Final
 
 VERSION: Final = 1
 """Wire protocol version; the `v` of every header."""
+NAME_PATTERN: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}"
+"""Of a robot id, and of the name of a vision service."""
+ROLE_PATTERN: Final = r"[a-z][a-z0-9_]{0,15}"
+"""Of a `source`."""

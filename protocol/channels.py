@@ -9,6 +9,7 @@ from enum import Enum
 from functools import lru_cache
 from typing import Final
 
+from sightline.protocol import ROLE_PATTERN
 from sightline.protocol.messages import (
     AnswerHeader,
     CameraModel,
@@ -133,7 +134,7 @@ CHANNELS: dict[str, Channel] = {
                     OVERLAY, PREVIEW)
 }
 
-_SOURCE = re.compile(r"[a-z][a-z0-9_]{0,15}")
+_SOURCE = re.compile(ROLE_PATTERN)
 
 
 @lru_cache(maxsize=1024)  # used for each message; after an idle camera period the pattern alone costs 50 us

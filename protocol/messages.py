@@ -10,7 +10,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from sightline.protocol import VERSION
+from sightline.protocol import NAME_PATTERN, ROLE_PATTERN, VERSION
 from sightline.protocol.proof import session_digest
 
 MAX_INTEGER = 2**53 - 1  # the largest integer that every JSON reader holds exactly
@@ -24,8 +24,8 @@ Version = Annotated[int, Field(ge=VERSION, le=VERSION, description="version of t
 Element = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 """One element of a hash chain (`protocol/proof.py`)."""
 SessionId = Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")]
-Source = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,15}$")]
-RobotId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$")]
+Source = Annotated[str, Field(pattern=f"^{ROLE_PATTERN}$")]
+RobotId = Annotated[str, Field(pattern=f"^{NAME_PATTERN}$")]
 Counter = Annotated[int, Field(ge=0, le=MAX_INTEGER)]
 Percent = Annotated[int, Field(ge=0, le=100)]
 Microseconds = Annotated[int, Field(ge=0, le=MAX_INTEGER)]

@@ -5,11 +5,12 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from sightline.protocol import NAME_PATTERN
 from sightline.protocol.channels import FRAME
 from sightline.protocol.config import Config
 from sightline.protocol.messages import CameraModel, Source
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
-from sightline.protocol.transports.tokens import LEAST_WEIGHT, MOST_WEIGHT, NAME
+from sightline.protocol.transports.tokens import LEAST_WEIGHT, MOST_WEIGHT
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 HueDeg = Annotated[float, Field(ge=0, le=360)]
@@ -224,7 +225,7 @@ class ShareConfig(Config):
 
     enabled: bool = False
     """True to share: the service drives the robots that it owns, and stands by for others. It needs Zenoh."""
-    name: Annotated[str, Field(pattern=rf"^({NAME})?$")] = ""
+    name: Annotated[str, Field(pattern=f"^({NAME_PATTERN})?$")] = ""
     """Name among the services, each with its own; empty for a new one at each start."""
     weight: Annotated[float, Field(ge=LEAST_WEIGHT, le=MOST_WEIGHT)] = 1.0
     """Share of the robots, relative to the weights of the other services."""

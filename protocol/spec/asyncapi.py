@@ -2,14 +2,13 @@
 
 from typing import Any, Final
 
-from sightline.protocol import VERSION
+from sightline.protocol import NAME_PATTERN, VERSION
 from sightline.protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, REPLY, REQUEST, Channel, Direction
 from sightline.protocol.text import MAX_TWIST_BYTES
 from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL
 from sightline.protocol.transports.websocket.legacy_text import MAX_BOXES_BYTES
 
 Node = dict[str, Any]
-ROBOT_ID: Final = "^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"
 _SCHEMAS: Final = "#/components/schemas/"
 _OLDER: Final = {
     "picture": ("send", None, "base64 of a JPEG, a newline after every 76 characters and at the end"),
@@ -59,7 +58,7 @@ def _servers() -> Node:
 
 
 def _channel(one: Channel) -> Node:
-    robot = {"description": f"the robot's id, {ROBOT_ID}", "examples": ["r1"]}
+    robot = {"description": f"the robot's id, ^{NAME_PATTERN}$", "examples": ["r1"]}
     source = {"description": "the publisher's role", "examples": ["vision", "teleop", "guest"]}
     address = f"{KEY_PREFIX}/{{robot}}/{one.name}"
     return {

@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
+from sightline.protocol import NAME_PATTERN
 from sightline.protocol.errors import ConfigError
 
 # Endpoint of a robot and its peers when none is configured.
@@ -15,7 +16,7 @@ DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 # at p95 instead of 219 (`bench network --only rtt200`).
 SEND_BUFFER_BYTES: Final = 262_144
 
-ROBOT_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
+ROBOT_ID: Final = re.compile(NAME_PATTERN)
 _ZENOH_ENDPOINT = re.compile(
     r"(tcp|tls|quic|udp|ws)/(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]]+):([0-9]{1,5})(\?[^#\s]*)?(#\S*)?"
 )

@@ -12,19 +12,19 @@ driver (`protocol/proof.py`): only the driver can compute it before, so a robot 
 import re
 from typing import Final, NamedTuple
 
+from sightline.protocol import NAME_PATTERN
+
 PREFIX: Final = "sightline-token"
 ROBOT_KIND, VISION_KIND, DRIVER_KIND, DETECTOR_KIND = "robot", "vision", "driver", "detector"
 ALL_TOKENS: Final = f"{PREFIX}/**"
 LEAST_WEIGHT, MOST_WEIGHT = 0.01, 1000.0
 
-NAME: Final = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}"
-"""Pattern of the name of a vision service, as of a robot id."""
 _WEIGHT: Final = r"\d{1,4}(?:\.\d{1,3})?"
 # Exact: a peer may declare a token with a wildcard, which names no robot and no service.
 _KEYS: Final = re.compile(
-    rf"{PREFIX}/(?:robot/(?P<robot>{NAME})"
-    rf"|vision/(?P<name>{NAME})/(?P<weight>{_WEIGHT})/(?P<instance>[0-9a-f]{{8}})"
-    rf"|driver/(?P<driven>{NAME})/(?P<driver>{NAME})/(?P<token>[0-9a-f]{{32}})"
+    rf"{PREFIX}/(?:robot/(?P<robot>{NAME_PATTERN})"
+    rf"|vision/(?P<name>{NAME_PATTERN})/(?P<weight>{_WEIGHT})/(?P<instance>[0-9a-f]{{8}})"
+    rf"|driver/(?P<driven>{NAME_PATTERN})/(?P<driver>{NAME_PATTERN})/(?P<token>[0-9a-f]{{32}})"
     rf"|detector/(?P<group>[0-9a-f]{{8}})/(?P<share>{_WEIGHT})/(?P<session>[0-9a-f]{{8}})"
     r"/(?P<pattern>[A-Za-z0-9_.+=-]{1,32}))",
     re.ASCII,

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, NamedTuple, Protocol
 
 from pydantic import Field
 
-from sightline.protocol import VERSION
+from sightline.protocol import ROLE_PATTERN, VERSION
 from sightline.protocol.channels import CHANNELS, KEY_PREFIX, MAX_HEADER_BYTES, Channel
 from sightline.protocol.codec import decode
 from sightline.protocol.errors import RejectReason, WireError
@@ -39,7 +39,7 @@ class Hello(WireModel):
     robot: RobotId = Field(description="the robot's id; from a connecting peer the robot that it requests")
     role: str = Field(
         default="",
-        pattern=r"^([a-z][a-z0-9_]{0,15})?$",
+        pattern=f"^({ROLE_PATTERN})?$",
         description="`source` of the sender's messages toward the robot; empty or `robot` for a robot",
     )
     session: SessionId = Field(description="the sender's start: 8 hex digits drawn at random")
