@@ -12,8 +12,8 @@ from sightline.protocol.messages import Twist
 
 MAX_TWIST_BYTES = 64
 
-_NUMBER = rb"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
-_TWIST = re.compile(rb"(%b)\|(%b)" % (_NUMBER, _NUMBER))
+NUMBER = rb"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
+_TWIST = re.compile(rb"(%b)\|(%b)" % (NUMBER, NUMBER))
 _NON_FINITE = re.compile(rb"[+-]?(?:nan|inf|infinity)", re.IGNORECASE)
 
 

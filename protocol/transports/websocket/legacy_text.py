@@ -17,7 +17,7 @@ from typing import Final
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import DetectedBox, Detections, Twist
-from sightline.protocol.text import MAX_TWIST_BYTES, parse_twist
+from sightline.protocol.text import MAX_TWIST_BYTES, NUMBER, parse_twist
 
 LINE_CHARACTERS: Final = 76
 MAX_BOXES: Final = 16
@@ -25,8 +25,7 @@ MAX_BOXES_BYTES: Final = 1024
 BOX_LABEL: Final = "box"
 """Label of a box whose text contains no class."""
 
-_DASHED_NUMBER: Final = rb"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
-_DASHED: Final = re.compile(rb"(%b)-(%b)" % (_DASHED_NUMBER, _DASHED_NUMBER))
+_DASHED: Final = re.compile(rb"(%b)-(%b)" % (NUMBER, NUMBER))
 _FRACTION: Final = rb"(0(?:\.[0-9]{1,17})?|1(?:\.0{1,17})?)"
 _BOX: Final = re.compile(rb",".join([_FRACTION] * 4))
 _CLASSED_BOX: Final = re.compile(rb"([A-Za-z0-9_ ]{1,32})," + _BOX.pattern)
