@@ -216,6 +216,10 @@ class Holder(WireModel):
     session: SessionId
 
 
+GUEST: Final = Holder(source="guest", session="00000000")
+"""All clients without headers."""
+
+
 class LeaseHolder(WireModel):
     """The driver that holds the lease, as a robot shows it."""
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 from sightline.protocol.errors import CLAMPED, RejectReason, WireError
 from sightline.protocol.messages import (
+    GUEST,
     STILL,
     AnswerHeader,
     Holder,
@@ -36,7 +37,6 @@ from sightline.robot_side.safety.validation import (
     SequenceRecord,
 )
 
-_GUEST = Holder(source="guest", session="00000000")
 # A link that was cut delivers its messages later. An old `arm` must not arm (docs/explanation/decisions/0001).
 _MAX_REQUEST_AGE_US = 2_000_000
 # These verbs only take motion away, so they are safe at any age.
@@ -160,7 +160,7 @@ class SafetyGate:
         if header is None:
             if source != "guest":
                 raise WireError(RejectReason.MALFORMED, f"a twist from {source} needs a header that cites a frame")
-            return _GUEST, 0
+            return GUEST, 0
         if header.echo.channel == "status":
             raise WireError(RejectReason.UNKNOWN_FRAME, "a twist must cite a frame, not a status")
         self.issued.age_us(header.echo, now_us, self.config.max_age_us)

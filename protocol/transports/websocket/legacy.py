@@ -10,7 +10,7 @@ from sightline.protocol.channels import ACK, DETECTIONS, FRAME, KEY_PREFIX, TWIS
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.messages import AnswerHeader, Detections, DetectionsHeader, Echo, FrameHeader
+from sightline.protocol.messages import GUEST, AnswerHeader, Detections, DetectionsHeader, Echo, FrameHeader
 from sightline.protocol.text import format_twist, parse_twist
 from sightline.protocol.transports.endpoints import LegacyOptions
 from sightline.protocol.transports.link import Message
@@ -54,9 +54,6 @@ class DriverSlot:
 # The legacy protocol at both ends of a WebSocket. Its clients have no header, token or session. Pure.
 
 
-GUEST: Final = "guest"
-# The session of all clients without headers.
-GUEST_SESSION: Final = "00000000"
 # Security limit: a text toward a robot. A twist above 64 bytes is counted, and does not close the connection.
 MAX_COMMAND_TEXT_BYTES: Final = 256
 
@@ -124,11 +121,11 @@ class LegacyToVision:
         try:
             twist = parse_dashed(text, self._options.swapped) if self._options.dashed else parse_twist(text)
         except WireError:
-            return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", text)
+            return IncomingMessage(key_for(self._robot, TWIST, GUEST.source), b"", text)
         # Only a valid command claims the slot, so that a client with invalid text cannot stop the driver.
         self._claim_driver_slot()
         barred = format_twist(twist) if self._options.dashed else text
-        return IncomingMessage(key_for(self._robot, TWIST, GUEST), b"", barred)
+        return IncomingMessage(key_for(self._robot, TWIST, GUEST.source), b"", barred)
 
     def _claim_driver_slot(self) -> None:
         """Raise WireError if another client drives. Each new driver is logged once."""
@@ -146,8 +143,8 @@ class LegacyToVision:
         found = detections_from_boxes(parse_boxes(text), read_jpeg_size(looked_at[1]))
         self._answers += 1
         echo = _echo(looked_at[0])
-        header = DetectionsHeader(source=GUEST, session=GUEST_SESSION, seq=self._answers, echo=echo)
-        return IncomingMessage(key_for(self._robot, DETECTIONS, GUEST), encode(header), encode(found))
+        header = DetectionsHeader(source=GUEST.source, session=GUEST.session, seq=self._answers, echo=echo)
+        return IncomingMessage(key_for(self._robot, DETECTIONS, GUEST.source), encode(header), encode(found))
 
     def _acknowledgement(self) -> list[IncomingMessage]:
         sent, self._sent, self._looked_at = self._sent, None, None
@@ -159,8 +156,10 @@ class LegacyToVision:
         # The share of computing in the answer time is unknown. All of it counts as computing, so that the congestion
         # window does not widen for a slow peer.
         spent_us = max(0, self._now_us() - sent[1])
-        answer = AnswerHeader(source=GUEST, session=GUEST_SESSION, seq=self._answers, echo=echo, compute_us=spent_us)
-        return [IncomingMessage(key_for(self._robot, ACK, GUEST), encode(answer), b"")]
+        answer = AnswerHeader(
+            source=GUEST.source, session=GUEST.session, seq=self._answers, echo=echo, compute_us=spent_us
+        )
+        return [IncomingMessage(key_for(self._robot, ACK, GUEST.source), encode(answer), b"")]
 
 
 def _echo(header: bytes) -> Echo | None:

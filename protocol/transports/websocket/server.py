@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 from sightline.protocol.channels import FRAME, REQUEST, TWIST
 from sightline.protocol.errors import LinkError
+from sightline.protocol.messages import GUEST
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES, WebSocketEndpoint, host_problem, origin_problem
 from sightline.protocol.transports.flood_limits import note_accepted
@@ -154,8 +155,6 @@ TOO_MANY_CLIENTS: Final = "TOO_MANY_CLIENTS"
 # Counted for a client of wss:// whose TLS handshake fails.
 NO_TLS: Final = "NO_TLS"
 
-# Has the certificate of a viewer, and may drive without keys.
-_GUEST: Final = "guest"
 # After an accept that failed, e.g. without descriptors left. Without it the thread would use a whole core.
 _PAUSE_S: Final = 0.1
 
@@ -308,7 +307,8 @@ class Server:
         """Assign a client place. Raises PeerError without a free one."""
         # Without tokens, the role in the hello decides between the places of clients that control and that watch.
         granted = grants_of_role(certificate_role(role)) if wire.granted is None else wire.granted
-        claims = wire.granted is None and role == _GUEST
+        # A guest has the certificate of a viewer, and may drive without keys.
+        claims = wire.granted is None and role == GUEST.source
         acts = self._endpoint.legacy is not None or claims or may_control(granted)
         problem = self._connection_limits.promote(slot, acts)
         if problem:
