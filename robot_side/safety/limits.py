@@ -19,7 +19,6 @@ STOP_DISTANCE_BOUND_M = 0.25
 
 # Share of the top speed below which the robot counts as at rest.
 _AT_REST = 0.02
-_SLICE_US = 20_000
 _LONGEST_STEP_US = 1_000_000
 
 Millis = Annotated[int, Field(ge=20, le=5_000)]
@@ -174,7 +173,7 @@ class Ramp:
         # the time of one call bounded after a long pause.
         left_us = min(elapsed_us, _LONGEST_STEP_US)
         while left_us > 0:
-            slice_us = min(left_us, _SLICE_US)
+            slice_us = min(left_us, TICK_US)
             self._linear.step(goal.linear_mps, slice_us / 1e6)
             self._angular.step(goal.angular_rad_s, slice_us / 1e6)
             left_us -= slice_us
