@@ -30,7 +30,7 @@ ENDS_S: Final = 1.0
 JOINS_S: Final = 0.5
 """Longest time from the first image of a robot that joins to its first accepted command."""
 _SETTLE_S: Final = 4.0
-_PORTS: Final = (7447, 7448)
+_PORTS: Final = (7447, 7450)
 _FROZEN_S: Final = 3.0
 _HEALED_S: Final = 5.0
 _ROBOT_PROCESSES: Final = 5
