@@ -80,7 +80,9 @@ class Adaptive:
         return [self._look(frame) for frame in frames]
 
     def _look(self, frame: DetectFrame) -> DetectionResult | None:
-        tracker, t_us = self._trackers.of(frame.robot, frame.header.session), frame.header.t_us
+        # A track is in pixels. In an image of another size it would expect the target elsewhere.
+        tracker = self._trackers.of(frame.robot, (frame.header.session, frame.width_px, frame.height_px))
+        t_us = frame.header.t_us
         return timed(frame, self.maker, lambda picture: tracker.detect(picture, t_us))
 
 

@@ -4,11 +4,13 @@ import cv2
 import numpy as np
 import pytest
 
+from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.config import HsvConfig
-from sightline.vision_side.decode import DecodedImage
+from sightline.vision_side.decode import DecodedImage, Decoder
 from sightline.vision_side.detect.color.adaptive import AdaptiveConfig, AdaptiveTracker, ColorModel, PixelTrack
+from sightline.vision_side.detect.color.detectors import Adaptive
 from sightline.vision_side.detect.color.hsv import HsvDetector
-from sightline.vision_side.detect.port import Circle
+from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame
 from tests.fixtures.vision.vision import speckle
 
 YELLOW = (13, 199, 242)
@@ -90,6 +92,19 @@ def test_lost_target_is_found_again_elsewhere_after_a_while() -> None:
     found = [course.see(room((260, 120, 20), seed=seed)) for seed in range(30)]
     first = next(index for index, one in enumerate(found) if one is not None)
     assert 14 <= first <= 20, "half a second lost, then three pictures in a row"
+
+
+def test_change_of_the_image_size_costs_no_more_than_a_new_start() -> None:
+    config = AdaptiveConfig()
+    eye, found = Adaptive(config), []
+    for seq in range(1, 31):
+        width, height = (320, 240) if seq <= 10 else (240, 180)
+        picture = DecodedImage(cv2.resize(room((224, 120, 20), seed=seq).bgr, (width, height)), 1)
+        header = FrameHeader(session="0000abcd", seq=seq, t_us=seq * FRAME_US)
+        frame = DetectFrame("r1", header, b"", Decoder(width, height, 10**6), picture)
+        (result,) = eye.detect([frame], NO_DEADLINE)
+        found.append(bool(result and result.detections))
+    assert found[9] and found[10:].count(False) <= config.confirm - 1
 
 
 def test_detection_follows_the_fastest_turn() -> None:
