@@ -56,7 +56,9 @@ class DecoderPool:
 
     def again(self, frame: DetectFrame, place: int = 0) -> DetectFrame:
         """Return the frame with a decoder of this place. It is valid until the next one of its robot and `place`."""
-        return self.frame(frame.robot, frame.header, frame.jpeg, (frame.width_px, frame.height_px), place)
+        copy = self.frame(frame.robot, frame.header, frame.jpeg, (frame.width_px, frame.height_px), place)
+        copy.goes_by, copy.expected_px = frame.goes_by, frame.expected_px
+        return copy
 
     def frame(
         self, robot: str, header: FrameHeader, jpeg: bytes, size_px: tuple[int, int], place: int = 0

@@ -142,6 +142,17 @@ def test_shadow_compares_by_the_mission_of_the_frame_and_counts_again_with_anoth
     assert until(lambda: both.shadow_text("r1") == "shadow 100% agree"), "neither sees legs"
 
 
+def test_shadow_receives_what_the_mission_expects(pair, monkeypatch) -> None:
+    _, shadow, both = pair
+    received = []
+    monkeypatch.setattr(shadow, "detect", lambda frames, _deadline_us: received.extend(frames) or [None])
+    driving = frame(1)
+    driving.goes_by, driving.expected_px = configured_mission(MISSIONS["legs"]).goes_by, (12.0, 34.0)
+    both.detect([driving], NO_DEADLINE)
+    assert until(lambda: received)
+    assert (received[0].goes_by, received[0].expected_px) == (driving.goes_by, driving.expected_px)
+
+
 def test_shadow_and_detector_are_closed_if_one_close_fails(pair) -> None:
     driving, shadow, both = pair
     closed = []

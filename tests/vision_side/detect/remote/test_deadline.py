@@ -135,6 +135,16 @@ def test_pixels_of_an_abandoned_frame_do_not_reach_the_next():
     assert seen == [True]
 
 
+def test_detector_on_its_own_thread_receives_what_the_mission_expects(by_deadline, held, monkeypatch):
+    received = []
+    monkeypatch.setattr(held, "detect", lambda frames, _deadline_us: received.extend(frames) or [None])
+    asked = frame(1)
+    asked.goes_by, asked.expected_px = "legs".__eq__, (12.0, 34.0)
+    by_deadline.detect([asked], within(2))
+    (one,) = received
+    assert (one.goes_by, one.expected_px) == (asked.goes_by, asked.expected_px)
+
+
 def test_many_robots_need_a_bounded_number_of_decoders():
     decoders = DecoderPool(10**7)
     for number in range(2 * MAX_DECODERS):
