@@ -39,19 +39,24 @@ def configured_detector(config: VisionConfig) -> Detector:
         return NoDetector()
     check_device(config)
     _check_fallback(config)
-    detector = build_detector(one.kind, one.options, config)
-    _check_used_labels(one.kind, getattr(detector, "labels", ()), config)
+    detector = _built(one.kind, one.options, config)
     if one.fallback:
         from sightline.vision_side.detect.remote.fallback import Fallback
 
-        detector = Fallback(detector, build_detector(one.fallback, {}, config), max_pixels=config.max_pixels)
+        detector = Fallback(detector, _built(one.fallback, {}, config), max_pixels=config.max_pixels)
     detector = _narrowed(detector, config)
     if one.shadow:
         from sightline.vision_side.detect.shadow import ShadowDetector
 
-        second = build_detector(one.shadow, one.shadow_options, config)
-        _check_labels("detector.labels", one.shadow, one.labels, getattr(second, "labels", ()))
-        detector = ShadowDetector(detector, _narrowed(second, config), one.shadow, config.max_pixels)
+        second = _narrowed(_built(one.shadow, one.shadow_options, config), config)
+        detector = ShadowDetector(detector, second, one.shadow, config.max_pixels)
+    return detector
+
+
+def _built(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Detector:
+    """Create one of the configured detectors. Raises ConfigError, also for a label in use that it never gives."""
+    detector = build_detector(kind, options, config)
+    _check_used_labels(kind, getattr(detector, "labels", ()), config)
     return detector
 
 
@@ -166,9 +171,7 @@ def check_vision(config: VisionConfig) -> None:
     _check_fallback(config)
     for kind, options in ((one.kind, one.options), (one.fallback, {}), (one.shadow, one.shadow_options)):
         if kind:
-            known = check_choice(kind, options, config)
-            if kind == one.kind:
-                _check_used_labels(kind, known, config)
+            _check_used_labels(kind, check_choice(kind, options, config), config)
 
 
 def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Sequence[str]:

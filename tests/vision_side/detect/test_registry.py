@@ -176,6 +176,10 @@ def test_every_mistake_is_one_line(detector: dict, words: str) -> None:
         ({"mission": {"kind": "legs", "options": {"label": "person"}}}, "mission 'legs': onnx has no label 'person'"),
         ({"detector": {"kind": "onnx", "labels": ["bal"]}}, "detector.labels: onnx has no label 'bal'"),
         ({"detector": {"kind": "onnx", "labels": ["bal"], "fallback": "hsv"}}, "detector.labels: onnx has no label"),
+        ({"detector": {"kind": "hsv", "labels": ["target"], "shadow": "onnx"}}, "detector.labels: onnx has no label"),
+        ({"detector": {"kind": "hsv", "labels": ["person"], "fallback": "onnx"}}, "detector.labels: onnx has no label"),
+        ({"detector": {"kind": "hsv", "fallback": "onnx"}, "target": {"label": "person"}},
+         "mission 'follow': onnx has no label 'person'"),
     ],
 )
 def test_label_that_the_model_never_gives_is_rejected(settings: dict, words: str) -> None:
