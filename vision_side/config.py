@@ -114,11 +114,18 @@ class TargetConfig(Config):
     radius_m: Annotated[float, Field(gt=0.005, le=2)] = 0.1
     """Radius of the ball."""
     stand_off_m: Annotated[float, Field(gt=0.1, le=10)] = 0.8
-    """Distance to keep from the lens to the target's center, over the floor."""
+    """Distance to keep from the lens to the target's center, over the floor; less than `max_range_m`."""
     max_range_m: Annotated[float, Field(gt=0.2, le=50)] = 6.0
     """Detections further away do not count."""
     label: Annotated[str, Field(max_length=64)] = ""
     """Label of the target. Empty selects any detection except traffic lights and legs."""
+
+    @model_validator(mode="after")
+    def _must_see_at_the_stand_off(self) -> Self:
+        if self.stand_off_m >= self.max_range_m:
+            raise ValueError(f"stand_off_m of {self.stand_off_m:g} m must be less than max_range_m, "
+                             f"{self.max_range_m:g} m: the robot would back away until it loses the target")
+        return self
 
 
 class TrackConfig(Config):

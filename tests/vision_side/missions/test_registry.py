@@ -7,6 +7,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, CameraModel, FrameHeader, MissionRequest
@@ -89,6 +90,13 @@ def test_a_mission_begins_with_the_sections_of_vision_and_its_options_lie_over_t
     made = configured_mission(config).config
     assert (made.target.stand_off_m, made.target.radius_m, made.steer.bearing_kp) == (1.5, 0.07, 2.0)
     assert made.track == config.track
+
+
+def test_stand_off_beyond_the_range_is_rejected():
+    with pytest.raises(ValidationError, match="stand_off_m of 8 m must be less than max_range_m, 6 m"):
+        VisionConfig.model_validate({"target": {"stand_off_m": 8}})
+    with pytest.raises(ConfigError, match=r"stand_off_m of 0\.8 m must be less than max_range_m, 0\.8 m"):
+        requested_mission(MissionRequest(id=1, name="follow", options={"target.max_range_m": 0.8}), CONFIG)
 
 
 def test_requested_options_override_the_configured_ones():
