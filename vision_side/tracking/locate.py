@@ -4,6 +4,9 @@ A sphere projects to an ellipse, not to a circle about its center. Its outline r
 ray u, u . c = cos(alpha) with c toward the center, and the center is at radius / sin(alpha). So u . w = 1, or
 p . w = |p| for any point p of the ray, is linear in w = c / cos(alpha). The equation is exact at any angle off the
 axis, and holds for each part of the outline that is in view.
+
+The planes through the lens and the sides of a box touch the sphere. For the normal n of such a plane
+n . c = radius * |n|, which is linear in c. So three sides locate a sphere that the border of the image cuts.
 """
 
 import math
@@ -64,10 +67,12 @@ def locate_sphere(detection: Detection, camera: CameraModel, radius_m: float) ->
 
     Source: the outline rays of a sphere form a circular cone, see the module.
     """
-    outline = detection.outline_px if detection.outline_px is not None else _box_outline(detection, camera)
-    if len(outline) < _MIN_POINTS:
-        return None
-    center = _cone_center(points_ahead(outline, camera), radius_m)
+    whole = _whole_sides(detection, camera)
+    if detection.outline_px is None and sum(whole) == 3:
+        center = _tangent_center(detection, whole, camera, radius_m)
+    else:
+        outline = detection.outline_px if detection.outline_px is not None else _box_outline(detection, camera)
+        center = _cone_center(points_ahead(outline, camera), radius_m) if len(outline) >= _MIN_POINTS else None
     if center is None:
         return None
     right, down, ahead = center
@@ -146,6 +151,18 @@ def _solved(points: NDArray[np.float64]) -> tuple[float, float, float] | None:
         return None
     return ((aa * x + ab * y + ac * z) / determinant, (ab * x + bb * y + bc * z) / determinant,
             (ac * x + bc * y + cc * z) / determinant)
+
+
+def _tangent_center(
+    one: Detection, whole: list[bool], camera: CameraModel, radius_m: float
+) -> tuple[float, float, float] | None:
+    """Solve n . c = radius * |n| for the planes of the sides of a box that are `whole`."""
+    (left, _), (right, _), (_, top), (_, bottom) = _edges(one, camera)
+    if right <= left or bottom <= top:
+        return None
+    normals = np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])[whole]
+    w = _solved(np.vstack([normals.T, np.linalg.norm(normals, axis=1)]))
+    return None if w is None else (w[0] * radius_m, w[1] * radius_m, w[2] * radius_m)
 
 
 def _box_outline(detection: Detection, camera: CameraModel) -> NDArray[np.float64]:
@@ -258,10 +275,16 @@ def _edges(one: Detection, camera: CameraModel) -> list[list[float]]:
 
 def _range(width: float, height: float, one: Detection, camera: CameraModel, config: BoxesConfig) -> float | None:
     """Return the meters along the axis of the lens, by the configured height or else width, if it is fully in view."""
-    whole_height = one.y1_px >= _EDGE_PX and one.y2_px <= camera.height_px - _EDGE_PX
-    whole_width = one.x1_px >= _EDGE_PX and one.x2_px <= camera.width_px - _EDGE_PX
-    if config.height_m is not None and whole_height and height > 0:
+    left, right, top, bottom = _whole_sides(one, camera)
+    if config.height_m is not None and top and bottom and height > 0:
         return config.height_m / height
-    if config.width_m is not None and whole_width and width > 0:
+    if config.width_m is not None and left and right and width > 0:
         return config.width_m / width
     return None
+
+
+def _whole_sides(one: Detection, camera: CameraModel) -> list[bool]:
+    """Return False for each side (left, right, top, bottom) so near to the image border that it may cut the object."""
+    edges = ((one.x1_px, camera.width_px), (one.x2_px, camera.width_px), (one.y1_px, camera.height_px),
+             (one.y2_px, camera.height_px))
+    return [_EDGE_PX <= edge_px <= size_px - _EDGE_PX for edge_px, size_px in edges]

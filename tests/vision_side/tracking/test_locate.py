@@ -1,6 +1,7 @@
 """The places of detections: spheres from exact outlines and against another solver, boxes by size and bearing."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -18,7 +19,7 @@ from sightline.protocol.messages import (
     FrameHeader,
 )
 from sightline.vision_side.config import BoxesConfig
-from sightline.vision_side.detect.port import Circle, Detection
+from sightline.vision_side.detect.port import Circle, Detection, clipped
 from sightline.vision_side.tracking import locate as module
 from sightline.vision_side.tracking.locate import (
     REMEMBERED,
@@ -197,17 +198,48 @@ def test_sphere_without_an_outline_is_the_ellipse_in_its_box(box):
 
 
 @pytest.mark.parametrize(("box", "border"), [
-    ((-30.0, 200.0, 50.0, 290.0), lambda x, y: x > 1), ((600.0, 200.0, 680.0, 290.0), lambda x, y: x < 639),
-    ((300.0, -40.0, 380.0, 50.0), lambda x, y: y > 1), ((300.0, 430.0, 380.0, 520.0), lambda x, y: y < 479),
     ((1.0, 1.0, 81.0, 91.0), lambda x, y: (x > 1) & (y > 1)),
     ((559.0, 389.0, 639.0, 479.0), lambda x, y: (x < 639) & (y < 479)),
+    ((0.0, 0.0, 60.0, 70.0), lambda x, y: (x > 1) & (y > 1)),
+    ((590.0, 400.0, 640.0, 480.0), lambda x, y: (x < 639) & (y < 479)),
 ])  # fmt: skip
-def test_points_at_the_border_of_the_image_are_left_out(box, border):
+def test_points_in_a_corner_of_the_image_are_left_out(box, border):
     points = ellipse(*box)
     shown = points[border(*points.T)]
     assert len(shown) < 24
     expected = locate_sphere(outlined(shown), CAMERA, RADIUS_M)
     assert at(locate_sphere(boxed(*box), CAMERA, RADIUS_M)) == pytest.approx(at(expected))
+
+
+def ball_box(center, camera=CAMERA):
+    """Return the box of a ball as a detector delivers it, and whether the border of the image cuts it."""
+    edge = pixels(rays(center, 1440), camera)
+    box = boxed(*edge.min(axis=0), *edge.max(axis=0))
+    shown = clipped(box, camera.width_px, camera.height_px)
+    return shown, shown is not box
+
+
+@pytest.mark.parametrize("center", [
+    (0.75, 0.0, 1.0), (-0.8, 0.1, 1.0), (0.0, -0.55, 1.0), (0.1, 0.57, 1.0), (0.3, 0.33, 0.6), (-0.37, 0.0, 0.5),
+])  # fmt: skip
+def test_ball_at_the_border_is_located_by_the_three_sides_in_view(center):
+    """At most half of it is hidden."""
+    box, is_cut = ball_box(center)
+    assert is_cut and at(locate_sphere(box, CAMERA, RADIUS_M)) == pytest.approx(place(center), abs=1e-4)
+
+
+def test_outline_of_a_ball_at_the_border_counts_more_than_its_box():
+    box, _ = ball_box((0.75, 0.0, 1.0))
+    other = replace(box, outline_px=pixels(rays((0.3, 0.1, 0.8))))
+    assert at(locate_sphere(other, CAMERA, RADIUS_M)) == pytest.approx(place((0.3, 0.1, 0.8)), abs=1e-5)
+
+
+@pytest.mark.parametrize("box", [
+    (639.5, 200.0, 600.0, 290.0), (300.0, 479.5, 380.0, 400.0), (300.0, 0.0, 300.0, 90.0), (0.0, 200.0, 50.0, 200.0),
+    (0.0, 100.0, 1.00001, 100.00001),
+])  # fmt: skip
+def test_empty_box_of_a_ball_is_not_located(box):
+    assert locate_sphere(boxed(*box), CAMERA, RADIUS_M) is None
 
 
 def test_box_outside_the_image_is_not_located():
