@@ -81,11 +81,14 @@ def _between(one: Pose, other: Pose, share: float) -> Pose:
 
 
 def echoes(scan: RangeScan, sensor_x_m: float) -> Points:
-    """Return the points of `scan` relative to the robot. The sensor is `sensor_x_m` ahead of the axle."""
+    """Return the points of `scan` relative to the robot. The sensor is `sensor_x_m` ahead of the axle.
+
+    An obstacle too close to measure is one at `range_min_m`.
+    """
     ranges = scan.ranges_m.astype(np.float64)
-    met = np.flatnonzero((ranges >= scan.range_min_m) & (ranges <= scan.range_max_m))
-    angles = scan.angle_min_rad + met * scan.angle_increment_rad
-    return np.column_stack([sensor_x_m + ranges[met] * np.cos(angles), ranges[met] * np.sin(angles)])
+    met = np.flatnonzero((ranges > 0) & (ranges <= scan.range_max_m))
+    ranges, angles = np.maximum(ranges[met], scan.range_min_m), scan.angle_min_rad + met * scan.angle_increment_rad
+    return np.column_stack([sensor_x_m + ranges * np.cos(angles), ranges * np.sin(angles)])
 
 
 def in_odometry(points: Points, pose: Pose) -> Points:

@@ -54,9 +54,15 @@ def test_points_go_to_the_odometry_frame_and_back(x: float, y: float, yaw: float
 
 
 def test_echoes_exclude_rays_without_an_obstacle_or_out_of_range() -> None:
-    ranges = np.array([1.0, np.inf, 0.01, 2.0, 9.0], np.float32)
+    ranges = np.array([1.0, np.inf, 0.0, 2.0, 9.0], np.float32)
     found = echoes(RangeScan(0, -math.pi / 2, math.pi / 4, 0.05, 8.0, ranges), 0.1)
     assert found == pytest.approx(np.array([[0.1, -1.0], [0.1 + math.sqrt(2), math.sqrt(2)]]), abs=1e-6)
+
+
+def test_obstacle_too_close_to_measure_is_an_echo_at_the_smallest_range() -> None:
+    ranges = np.array([0.01, 0.0, 0.05], np.float32)
+    found = echoes(RangeScan(0, -math.pi / 2, math.pi / 2, 0.05, 8.0, ranges), 0.1)
+    assert found == pytest.approx(np.array([[0.1, -0.05], [0.1, 0.05]]), abs=1e-6)
 
 
 # --- the floor ---------------------------------------------------------------------------------------------------
