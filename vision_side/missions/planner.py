@@ -40,8 +40,8 @@ class Costmap:
         Only a ray with an echo shows that the floor before it is free: of several sensors merged into one scan, a
         number without an echo may stand for a ray that no sensor sends.
         """
-        filled = {(int(x), int(y)) for x, y in cells_of(echoes)}
-        for cell in _passed(np.array([sensor]), echoes) - filled:
+        filled = {(x, y) for x, y in cells_of(echoes).tolist()}
+        for cell in _passed(np.array([sensor]), echoes, self.cells()) - filled:
             self._doubt(cell)
         for cell in filled:
             self._fill(cell)
@@ -60,11 +60,8 @@ class Costmap:
             self.discoveries += 1
 
     def _doubt(self, cell: tuple[int, int]) -> None:
-        sure = self._sure.get(cell)
-        if sure is None:
-            return
-        if sure > 1:
-            self._sure[cell] = sure - 1
+        if self._sure[cell] > 1:
+            self._sure[cell] -= 1
         else:
             del self._sure[cell]
             self.version += 1
@@ -84,18 +81,22 @@ def cells_of(points: Points) -> Cells:
     return np.floor(points / CELL_M).astype(np.int64)
 
 
-def _passed(sensor: Points, ends: Points) -> set[tuple[int, int]]:
-    """Cells that the rays went through well before they ended."""
+def _passed(sensor: Points, ends: Points, cells: Cells) -> set[tuple[int, int]]:
+    """Return those of `cells` that the rays went through well before they ended, within the horizon."""
+    # Rays that end in one cell show the same floor.
+    ends = ends[np.unique(cells_of(ends), axis=0, return_index=True)[1]]
     along = ends - sensor
     length_m = np.hypot(along[:, 0], along[:, 1])
-    steps = int(max(length_m.max(initial=0.0) / CELL_M, 0.0))
-    if not steps:
-        return set()
-    way_m = np.arange(steps)[None] * CELL_M
-    sure = way_m < (length_m - _SHY_CELLS * CELL_M)[:, None]
+    clear_m = np.minimum(length_m - _SHY_CELLS * CELL_M, HORIZON_M)
+    steps = math.ceil(clear_m.max(initial=0.0) / CELL_M)
+    way_m = np.arange(steps) * CELL_M
     share = way_m / np.maximum(length_m, 1e-9)[:, None]
-    points = sensor[:, None] + share[..., None] * along[:, None]
-    return {(int(x), int(y)) for x, y in np.unique(cells_of(points[sure]), axis=0)}
+    points = (sensor[:, None] + share[..., None] * along[:, None])[way_m < clear_m[:, None]]
+    corner, size = cells_of(sensor) - steps - 1, 2 * steps + 3
+    seen = np.zeros((size, size), bool)
+    seen[tuple((cells_of(points) - corner).T)] = True
+    near = cells[((cells >= corner) & (cells < corner + size)).all(axis=1)]
+    return {(x, y) for x, y in near[seen[tuple((near - corner).T)]].tolist()}
 
 
 # The way to a goal over what is known of the floor; what is not known counts as free. Pure.  From the goal a wave

@@ -79,6 +79,16 @@ def test_one_echo_counts_immediately_and_rays_through_it_remove_it() -> None:
     assert cells_of(ground.points()).tolist() == [[30, 0]]
 
 
+def test_long_ray_clears_the_floor_within_the_horizon_only() -> None:
+    """Whatever its length: steps of 3 cm along all of this one would not fit into any memory."""
+    ground, near, far = Costmap(), (HORIZON_M - 0.3, 0.0), (HORIZON_M + 0.3, 0.0)
+    ground.see((0.0, 0.0), np.array([near, far]))
+    for _ in range(3):
+        ground.see((0.0, 0.0), np.array([(1e12, 0.0), (-1.0, 0.0)]))
+    left = {tuple(cell) for cell in ground.cells().tolist()}
+    assert tuple(cells_of(np.array(near)).tolist()) not in left and tuple(cells_of(np.array(far)).tolist()) in left
+
+
 def test_wall_at_a_grazing_angle_stays() -> None:
     ground = Costmap()
     wall = np.column_stack([np.linspace(0.05, 0.6, 40), np.full(40, 0.10)])
