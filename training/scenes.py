@@ -41,6 +41,7 @@ from sightline.sim.scenes.render import SceneRenderer
 from sightline.training.network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
 from sightline.training.schedule import SceneRange
 from sightline.vision_side.decode import DecodedImage
+from sightline.vision_side.detect.onnx.detector import digest_of
 from sightline.vision_side.detect.onnx.engine import open_engine
 from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.port import corners, overlap
@@ -73,8 +74,9 @@ class DrawnScenes:
         return len(self.truths) if self.simulated is None else self.simulated
 
     def digest(self) -> str:
-        """Hash the scenes: their number, their truths, the first image."""
-        content = json.dumps([len(self.truths), [[one.label, one.box] for row in self.truths for one in row]])
+        """Hash the scenes: their number, all boxes, the first image."""
+        truths = [[one.label, one.box] for row in self.truths for one in row]
+        content = json.dumps([len(self.truths), truths, self.unclear, self.others])
         return hashlib.sha256(content.encode() + self.pictures[0].tobytes()).hexdigest()[:16]
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -118,6 +120,15 @@ class SceneSource:
         scene = photo_scene(_photographs(self.photos), number - self.count)
         return scene if self.mined_with is None else with_false_balls(scene, open_miner(self.mined_with))
 
+    def note(self, scene: Scene | PhotoScene) -> dict[str, Any]:
+        """Return what is in a scene, and the model that found a part of it."""
+        truths = [[one.label, one.box, one.seen] for one in scene.truths]
+        note = {"truths": truths, "unclear": scene.unclear, "others": scene.others}
+        if self.mined_with is not None and isinstance(scene, PhotoScene):
+            note["miner"] = _miner_digest(self.mined_with)
+        # As it is read again: JSON has lists only.
+        return dict(json.loads(json.dumps(note)))
+
 
 @cache
 def _photographs(folder: Path) -> tuple[npt.NDArray[np.uint8], ...]:
@@ -142,6 +153,11 @@ def open_miner(model: Path) -> Miner:
         return [corners(one) for one in found if one.label == "ball"]
 
     return balls
+
+
+@cache
+def _miner_digest(model: Path) -> str:
+    return digest_of(model)
 
 
 def with_false_balls(scene: PhotoScene, miner: Miner) -> PhotoScene:
@@ -187,11 +203,17 @@ def _check_photographs(folder: Path) -> None:
 
 def _would_be_the_same(pictures: Path, notes: Path, source: SceneSource) -> bool:
     """Check that they were drawn whole, as many, and as they would be now: the first of each kind are compared."""
-    if not notes.exists() or not pictures.exists() or len(json.loads(notes.read_text("utf-8"))) != source.total:
+    rows = json.loads(notes.read_text("utf-8")) if notes.exists() and pictures.exists() else []
+    if len(rows) != source.total:
         return False
     drawn = np.load(pictures, mmap_mode="r")
+
+    def is_current(number: int) -> bool:
+        scene = source.drawn(renderer, number)
+        return np.array_equal(drawn[number], scene.rgb) and rows[number] == source.note(scene)
+
     with SceneRenderer() as renderer:
-        return all(np.array_equal(drawn[number], source.drawn(renderer, number).rgb)
+        return all(is_current(number)
                    for first in (0, LATER_FROM // source.every, HARDER_FROM // source.every, source.count,
                                  source.total - _TRIED)
                    for number in range(max(0, first), min(source.total, first + _TRIED)))
@@ -225,8 +247,7 @@ def _draw(pictures: Path, source: SceneSource, numbers: Sequence[int]) -> tuple[
         for number in numbers:
             scene = source.drawn(renderer, number)
             store[number] = scene.rgb
-            truths = [[one.label, one.box, one.seen] for one in scene.truths]
-            rows.append({"truths": truths, "unclear": scene.unclear, "others": scene.others})
+            rows.append(source.note(scene))
     store.flush()
     return numbers[0], rows
 

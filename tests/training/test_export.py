@@ -2,6 +2,9 @@
 
 import json
 import pickle
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.sim.scenes.model import HARDER, HEIGHT_PX, LABELS, WIDTH_PX, LabelledBox, PhotoScene
 from sightline.sim.scenes.photos import photo_scene
 from sightline.sim.scenes.render import SceneRenderer
+from sightline.training import scenes as module
 from sightline.training.network import GEOMETRY, OUTPUTS, SIZE_PX, STRIDE, network
 from sightline.training.scenes import (
     CUT_PX,
@@ -263,6 +267,38 @@ def test_a_photograph_that_scores_detectors_is_not_trained_on(tmp_path, photogra
         cv2.imwrite(str(photographs / f"mine-{one.stem}.png"), cv2.resize(cv2.imread(str(one)), (640, 480)))
     with pytest.raises(ConfigError, match=r"mine-\S+ shows the same as \S+, which is for scores only.* and 1 more"):
         drawn_scenes(tmp_path, SceneSource(2, 8, photographs), 1, lambda _: None)
+
+
+@pytest.fixture
+def no_simulator(monkeypatch):
+    """Gray images in place of the simulator's, drawn by a thread."""
+    gray = PhotoScene(np.full((HEIGHT_PX, WIDTH_PX, 3), 120, np.uint8), (), (), ())
+    monkeypatch.setattr(module, "SceneRenderer", lambda: nullcontext(SimpleNamespace(scene=lambda *_: gray)))
+    monkeypatch.setattr(module, "worker_pool", ThreadPoolExecutor)
+
+
+@pytest.mark.usefixtures("no_simulator")
+def test_scenes_are_drawn_again_for_other_notes_or_another_miner(tmp_path, photographs):
+    miners = [brightness_model(tmp_path / f"{word}.onnx", [[10.0, 20.0, 60.0, 90.0]], [0], words=(word,))
+              for word in ("cup", "hat")]  # neither finds a ball
+    sources = [SceneSource(1, 2, photographs, mined_with=one) for one in miners]
+    notes, drawn = tmp_path / "scenes.json", tmp_path / "scenes.npy"
+    first = drawn_scenes(tmp_path, sources[0], 1, lambda _: None)
+    stamps = [drawn.stat().st_mtime_ns]
+    rows = json.loads(notes.read_text())
+    rows[2]["others"] = [[1.0, 2.0, 3.0, 4.0]]
+    notes.write_text(json.dumps(rows))
+    for source in (sources[0], sources[1], sources[1]):
+        again = drawn_scenes(tmp_path, source, 1, lambda _: None)
+        stamps.append(drawn.stat().st_mtime_ns)
+        assert again.others == first.others
+    assert stamps[0] < stamps[1] < stamps[2] == stamps[3]
+
+
+def test_digest_of_scenes_covers_all_boxes():
+    boxes = [(40.0, 40.0, 80.0, 80.0)]
+    scenes = [one_scene(), one_scene((BALL,), boxes), one_scene((BALL,), (), boxes)]
+    assert len({one.digest() for one in scenes}) == 3
 
 
 @pytest.mark.slow
