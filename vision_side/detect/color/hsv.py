@@ -180,11 +180,6 @@ _STAIRS_PX = 1.5  # no pixel of a clean disk's outline is further from its circl
 _CLEAN = 0.25  # RMS, by the limit for a single point: so few points off it bend no circle, and none is looked for
 
 
-def fit_circle(points: Outline) -> Fit:
-    """Fit a circle by least squares (Kåsa's linear form). Radius 0 for a straight line or fewer than three points."""
-    return _fit(_terms(points))[0]
-
-
 def fit_round_part(outline: NDArray[Any], min_radius_px: float, max_roughness: float) -> tuple[Fit, Outline] | None:
     """Fit the circle of `outline` without the part that an object in front hides. Returns None if it is not round.
 
@@ -217,7 +212,8 @@ def _terms(points: NDArray[Any]) -> Terms:
 
 
 def _fit(terms: Terms) -> tuple[Fit, float]:
-    """Return the circle, and the RMS distance of the points from it, to first order.
+    """Fit a circle by least squares (Kåsa's linear form). Returns it, and the RMS distance of the points from it, to
+    first order. Radius 0 for a straight line or fewer than three points.
 
     One product of matrices holds every sum; the rest is plain numbers: normal equations about the points' middle.
     """
