@@ -37,7 +37,6 @@ class Fallback:
         """For each robot that the second drives: good answers of the first in a row."""
         self._beside: list[tuple[list[str], Pending]] = []
         """Robots and their frames that the first looks at beside; each robot is in one at most."""
-        self.switched = 0
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
         """See `Detector`."""
@@ -73,7 +72,6 @@ class Fallback:
         self._good[robot] = 0
         if len(self._good) > MAX_ROBOTS:  # the robot that was switched first has the first detector again
             self._good.popitem(last=False)
-        self.switched += 1
         self._news.add(f"the first detector is late or silent for {robot}: the fallback drives on")
 
     def _filled(self, results: Results, frames: Sequence[DetectFrame], deadline_us: int) -> Results:

@@ -218,7 +218,8 @@ def test_late_remote_answer_is_replaced_by_the_local_detector_in_the_same_frame(
     deadline_us = within(2)
     assert fallback.detect([frame(2)], deadline_us)[0].detector == "own"
     assert remote.deadlines[-1] == deadline_us - RESERVE_US and own.deadlines == [deadline_us]
-    assert "the fallback drives on" in fallback.notices()[0] and fallback.switched == 1
+    (line,) = fallback.notices()
+    assert "the fallback drives on" in line
 
 
 def test_shadow_of_a_remote_detector_has_the_same_deadline():
