@@ -6,9 +6,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from sightline.protocol.channels import SCAN
-from sightline.protocol.codec import check_sizes, decode
-from sightline.protocol.errors import RejectReason, WireError
+from sightline.protocol.codec import decode, decode_ranges
 from sightline.protocol.messages import FrameHeader, Pose, ScanHeader
 from sightline.vision_side.missions.port import RangeScan
 
@@ -18,13 +16,8 @@ def decode_scan(header: bytes, payload: bytes) -> tuple[ScanHeader, RangeScan]:
 
     Raises WireError: MALFORMED for broken headers and sizes, NOT_FINITE for a nan or a negative range.
     """
-    check_sizes(SCAN, header, payload)
     stamp = decode(ScanHeader, header)
-    if len(payload) % 4:
-        raise WireError(RejectReason.MALFORMED, f"scan payload of {len(payload)} bytes: not a multiple of 4")
-    ranges_m = np.frombuffer(payload, "<f4").astype(np.float32, copy=False)
-    if not (ranges_m >= 0).all():  # false for a nan too
-        raise WireError(RejectReason.NOT_FINITE, "scan holds a nan or negative range")
+    ranges_m = np.array(decode_ranges(payload), np.float32)
     scan = RangeScan(stamp.t_us, stamp.angle_min_rad, stamp.angle_increment_rad, stamp.range_min_m, stamp.range_max_m,
                      ranges_m)
     return stamp, scan
