@@ -1,6 +1,7 @@
 """The service manager's side: the unit file, the notifications, the motors zeroed by themselves."""
 
 import configparser
+import inspect
 import os
 import signal
 import socket
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.process import zero_motors
 from sightline.robot_side.driver.supervision import DRIVER_PRIORITY, GUARDIAN_PRIORITY, SystemdNotifier
@@ -20,17 +22,29 @@ from tests.fixtures.robot_process import RobotProcess
 UNIT = Path(__file__).parent.parent.parent.parent / "robot_side" / "systemd" / "sightline-robot.service"
 
 
-def test_the_unit_watches_restarts_and_zeroes():
+def unit_file():
     unit = configparser.ConfigParser(interpolation=None, strict=True)
     unit.optionxform = str
     unit.read(UNIT)
-    service = unit["Service"]
+    return unit
+
+
+def test_the_unit_watches_restarts_and_zeroes():
+    service = unit_file()["Service"]
     assert service["Type"] == "notify" and service["NotifyAccess"] == "main"
     assert 0 < float(service["WatchdogSec"]) <= 2 and service["Restart"] == "on-failure"
     assert service["ExecStopPost"].endswith("--zero-motors")
     assert service["ExecStart"].split(" --zero")[0] == service["ExecStopPost"].split(" --zero")[0]
     assert float(service["TimeoutStopSec"]) > ENDS_WITHIN_US / 1e6, "the guardian waits so long for the driver process"
     assert int(service["LimitRTPRIO"]) >= GUARDIAN_PRIORITY > DRIVER_PRIORITY
+
+
+def test_a_robot_that_waits_for_its_router_tries_for_ever_and_one_that_fails_at_once_stays_stopped():
+    unit = unit_file()
+    between_starts_s = int(unit["Unit"]["StartLimitIntervalSec"]) / int(unit["Unit"]["StartLimitBurst"])
+    pause_s = float(unit["Service"]["RestartSec"])
+    waits_s = inspect.signature(open_link).parameters["timeout_s"].default
+    assert pause_s < between_starts_s < pause_s + waits_s
 
 
 def test_the_guardian_feeds_the_watchdog_only_while_heartbeats_arrive(tmp_path, monkeypatch):
