@@ -148,7 +148,7 @@ def add(
 ) -> None:
     """Create the certificate of one role again
 
-    Use it for other addresses or after expiry. `stop` creates the secret of STOP datagrams.
+    Without --host it keeps its addresses. `stop` creates the secret of STOP datagrams.
     """
     made = _keys()
     for file in made.add(folder, role, host or [], days):

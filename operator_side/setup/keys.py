@@ -69,7 +69,7 @@ def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
 def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
     """Create a new certificate and WebSocket token of `role`, signed by the authority in `folder`.
 
-    `STOP` is not a role: it creates the STOP secret.
+    `STOP` is not a role: it creates the STOP secret. Without `hosts` a certificate keeps those of the present one.
 
     Raises:
         ConfigError: the role or a host is invalid, the key of the authority is missing, or the folder cannot be
@@ -83,7 +83,9 @@ def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> li
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID as Usage
 
-    authority = _authority_key(folder)
+    authority, present = _authority_key(folder), folder / f"{role}.pem"
+    if not hosts and present.exists():
+        hosts = _read(present).hosts
     key = ec.generate_private_key(ec.SECP256R1())
     names = [_general_name(host) for host in dict.fromkeys((*LOOPBACK, *hosts))]
     builder = (

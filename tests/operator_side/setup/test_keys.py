@@ -56,6 +56,15 @@ def test_key_that_cannot_be_written_is_reported_and_the_old_one_stays(tmp_path, 
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
+@pytest.mark.parametrize(("given", "hosts"), [([], ("robot.local", "10.0.0.7")), (["10.0.0.8"], ("10.0.0.8",))])
+def test_new_key_is_valid_for_the_addresses_of_the_old_one_unless_others_are_given(tmp_path, given, hosts):
+    keys.make(tmp_path, ["robot.local", "10.0.0.7"])
+    keys.add(tmp_path, "robot", given)
+    made = {one.role: one.hosts for one in keys.look(tmp_path)}
+    assert made["robot"] == (*keys.LOOPBACK, *hosts)
+    assert made["vision"] == (*keys.LOOPBACK, "robot.local", "10.0.0.7")
+
+
 def test_new_keys_replace_the_old_ones_and_stay_private(tmp_path):
     keys.make(tmp_path, [])
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
