@@ -122,6 +122,10 @@ class Processes:
         """Return the process id of the network process of robot `name`, or 0 without one."""
         return next(reversed(children_of(self.driver(name))), 0)
 
+    def stop(self, name: str) -> int:
+        """Return the process id of the STOP receiver of robot `name`, or the forwarder of a router; 0 without one."""
+        return next((pid for pid in children_of(self.pid(name)) if _is_stop(pid)), 0)
+
     @property
     def names(self) -> list[str]:
         """Those that were started and not ended here, the oldest first."""
@@ -218,9 +222,16 @@ def driver_of(guardian: int) -> int:
         own = _command(guardian)
         for pid in reversed(children_of(guardian)):
             command = _command(pid)  # ours while it is a fork; no line once it is dead
-            if command not in (b"", own) and b"stop_receiver" not in command:
+            if command not in (b"", own) and not _is_stop(pid):
                 return pid
     return 0
+
+
+def _is_stop(pid: int) -> bool:
+    """Return True for a STOP receiver or forwarder."""
+    with suppress(OSError):
+        return b"guardian.stop_" in _command(pid)
+    return False
 
 
 def is_running(pid: int) -> bool:

@@ -43,7 +43,7 @@ _RESIDENT: Final = "RssAnon:"
 
 def memory_kib(processes: Processes, names: Iterable[str]) -> dict[tuple[str, str], int]:
     """Return the private memory of each running process and of what it started. A restarted one counts as the same."""
-    which = {"itself": processes.pid, "driver": processes.driver, "network": processes.network}
+    which = {"itself": processes.pid, "driver": processes.driver, "network": processes.network, "stop": processes.stop}
     pids = {(name, role): pid_of(name) for name in names if name in processes.names for role, pid_of in which.items()}
     return {who: held for who, pid in pids.items() if pid and (held := _resident_kib(pid)) is not None}
 
@@ -463,7 +463,11 @@ class RobotFixture:
     @property
     def _judged(self) -> tuple[str, ...]:
         """Sightline's own processes; what a scripted driver needs to send 10 MB is its own affair."""
-        return ("sim", "robot", "peer") if self.setup.driver == "vision" else ("sim", "robot")
+        if self.setup.legacy is not None:  # its robot is a third-party server
+            return ("sim", "vision")
+        peer = ("peer",) if self.setup.driver == "vision" else ()
+        router = ("router",) if self.setup.routed else ()
+        return ("sim", "robot", *peer, *router)
 
     def status(self) -> dict[str, Any]:
         """Return what `sightline status --json` prints."""
