@@ -29,7 +29,8 @@ LOOP: Final = signal.SIGUSR2
 """To a driver process with a `FaultyDrive`: an endless loop begins."""
 HEAVY_BYTES: Final = 16_700
 """At 30 fps, 4 Mbit/s."""
-SPARE: Final = {"black": (320, 240), "resized": (160, 120), "bomb": (64, 64)}
+RESIZED_PERCENT: Final = 50
+SPARE: Final = {"black": (320, 240), "bomb": (64, 64)}
 """Images that `write_spares` leaves in the folder, so that the robot's process needs no encoder."""
 _SOF0: Final = b"\xff\xc0\x00\x11\x08"
 
@@ -54,6 +55,7 @@ class FaultyCamera:
     def read(self, timeout_s: float) -> Picture | None:
         """Return the next image after the effect of the mode, see `Camera`."""
         mode = self._mode.read_text("ascii") if self._mode.exists() else ""
+        self._camera.adjust(100, RESIZED_PERCENT if mode == "resized" else 100)
         picture = self._camera.read(timeout_s)
         if picture is None or mode not in (*FAULTS, *SPARE) or (mode == "gil" and self._held):
             self._last = picture or self._last
@@ -63,7 +65,8 @@ class FaultyCamera:
         while mode == "hangs" and self._mode.read_text("ascii") == mode:
             time.sleep(0.05)
         if mode in SPARE:
-            return replace(picture, jpeg=self._spares[mode])
+            # New bytes after its end, or the robot would take it for a frozen image.
+            return replace(picture, jpeg=self._spares[mode] + str(picture.t_us).encode())
         return FAULTS[mode](picture, self._last or picture)
 
     def close(self) -> None:
@@ -111,6 +114,10 @@ def _slow(now: Picture, _last: Picture) -> Picture:
     return now
 
 
+def _resized(now: Picture, _last: Picture) -> Picture:
+    return replace(now, scale_percent=100)  # the robot announces the full size still
+
+
 def _heavy(now: Picture, _last: Picture) -> Picture:
     return replace(now, jpeg=now.jpeg.ljust(HEAVY_BYTES, b"\0"))
 
@@ -121,7 +128,7 @@ def _nothing(_now: Picture, _last: Picture) -> None:
 
 FAULTS: Final[dict[str, Callable[[Picture, Picture], Picture | None]]] = {
     "gil": _hold_gil, "unplugged": _unplugged, "frozen": _frozen, "slow": _slow, "heavy": _heavy, "nothing": _nothing,
-    "hangs": lambda now, _last: now,
+    "resized": _resized, "hangs": lambda now, _last: now,
 }
 def _loop(_number: int, _frame: FrameType | None) -> None:
     while True:
