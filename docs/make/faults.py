@@ -40,7 +40,8 @@ _LEGEND: Final = (
     "*Falls*: the wheels leave their highest speed for good. *Zero*: their command is zero and they roll slower than",
     "0.01 m/s. *Injected*: the number of times that the fault occurred; a row that injected nothing fails. Two more",
     "rules apply to each row: no motion without a frame younger than 400 ms, and no process grows by 5 MB.",
-    "A row during which this machine stood still for over 20 ms runs again, three times at most.",
+    "A row runs again, three times at most, if this machine stood still for over 20 ms in the second after the fault.",
+    "After a failed check, this applies to the whole time from the first measurement to the end.",
 )
 
 Record = Mapping[str, Any]

@@ -355,7 +355,7 @@ def _load(rig: RobotFixture, kind: str, at_least_times: int) -> Injected:
     if kind == "viewers":
         checks.append(at_least("admitted", len(rig.noted("crowd", ADMITTED)), "times", MAX_CLIENTS))
         checks.append(at_least("pictures seen", len(rig.noted("crowd", SEEN)), "", MAX_CLIENTS))
-    return Injected(times, at_us, checks=tuple(checks))
+    return Injected(times, at_us, checks=tuple(checks), from_us=came_us)
 
 
 # --- punctuality -------------------------------------------------------------------------------------------------
@@ -481,7 +481,8 @@ def _fill_disk(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
     rig.processes.kill("peer")
     rig.watch(SETTLED_S)
-    return Injected(1, at_us, checks=(at_least("speed kept", slowest_mps, "m/s", KEPT_MPS),))
+    return Injected(
+        1, at_us, checks=(at_least("speed kept", slowest_mps, "m/s", KEPT_MPS),), from_us=since_us)
 
 
 def _kill_demo(rig: RobotFixture) -> Injected:
@@ -591,13 +592,14 @@ def _suspend(rig: RobotFixture) -> Injected:
 
 def _drive_on(rig: RobotFixture) -> Injected:
     """Drive with the wrong clock for a while, then let vision die."""
+    since_us = monotonic_us()
     rig.watch(BAD_S)
-    slowest_mps = min((wheel_mps(row) for row in rig.motors() if row.t_us > monotonic_us() - BAD_S * 1e6), default=0.0)
+    slowest_mps = min((wheel_mps(row) for row in rig.motors() if row.t_us > since_us), default=0.0)
     at_us = monotonic_us()
     rig.processes.kill("peer")
     rig.watch(SETTLED_S)
-    checks = (at_least("speed kept", slowest_mps, "m/s", 0.4),)
-    return Injected(len(rig.noted("clock", "injected")), at_us, checks=checks)
+    checks = (at_least("speed kept", slowest_mps, "m/s", KEPT_MPS),)
+    return Injected(len(rig.noted("clock", INJECTED)), at_us, checks=checks, from_us=since_us)
 _STAYS: Final = "and stays at zero"
 
 OPERATOR_CASES: Final = (

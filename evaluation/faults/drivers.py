@@ -68,7 +68,7 @@ def _two_visions(rig: RobotFixture) -> Injected:
         at_most("applied from the second", backwards, "lines", 0),
         at_least("speed kept", slowest_mps, "m/s", 0.4),
     )
-    return Injected(len(rig.sent("second")), at_us, checks=checks)
+    return Injected(len(rig.sent("second")), at_us, checks=checks, from_us=last[0].t_us)
 
 
 def _impersonate(rig: RobotFixture, fault: str = "copied", **attacker: Any) -> Injected:
@@ -92,7 +92,7 @@ def _impersonate(rig: RobotFixture, fault: str = "copied", **attacker: Any) -> I
         at_most("motor log lines of the attacker", backwards, "lines", 0),
         at_least("speed kept", min(map(wheel_mps, rows)), "m/s", 0.4),
     )
-    return Injected(rig.injected("attacker"), at_us, checks=(*checks, *stopped))
+    return Injected(rig.injected("attacker"), at_us, checks=(*checks, *stopped), from_us=began_us)
 
 
 def _replay_driver(rig: RobotFixture) -> Injected:
@@ -119,7 +119,7 @@ def _replay_driver(rig: RobotFixture) -> Injected:
         at_most("motor log lines of the replay", backwards, "lines", 0),
         at_least("speed kept", min(map(wheel_mps, rows)), "m/s", 0.4),
     )
-    return Injected(rig.injected("attacker"), at_us, checks=(*checks, *stopped))
+    return Injected(rig.injected("attacker"), at_us, checks=(*checks, *stopped), from_us=began_us)
 
 
 def _forge_frames(rig: RobotFixture) -> Injected:
@@ -149,7 +149,8 @@ def _take_over(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
     rig.processes.kill("person")
     rig.watch(SETTLED_S + 1.0)
-    return Injected(1, at_us, checks=(at_most("operator applied after", took_ms, "ms", 1000.0),))
+    applied = at_most("operator applied after", took_ms, "ms", 1000.0)
+    return Injected(1, at_us, checks=(applied,), from_us=rig.sent("person")[0].t_us)
 
 
 def _goes_back(rig: RobotFixture) -> bool:

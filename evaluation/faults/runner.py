@@ -47,6 +47,8 @@ class Injected:
     """Whether the robot drove again, where that is demanded."""
     checks: tuple[Check, ...] = ()
     """What only this row demands."""
+    from_us: int | None = None
+    """The time of the first measurement of `checks`, where that is before `at_us`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,15 +147,17 @@ def _run_once(row: FaultCase, place: Path) -> tuple[tuple[Check, ...], int]:
             at_most("memory", grown_mb, "MB", row.memory_mb),
             *injected.checks,
         )
-        return checks, rig.stalled_us(injected.at_us, injected.at_us + watched_us(checks))
+        return checks, rig.stalled_us(*watched_us(injected, checks))
 
 
-def watched_us(checks: Sequence[Check]) -> int:
-    """Return the time after the injection with exact stamps: the time of a stop, or the whole run after a failure.
+def watched_us(injected: Injected, checks: Sequence[Check]) -> tuple[int, int]:
+    """Return the begin and end of the time with exact stamps: that of a stop, or of all measurements after a failure.
 
     A motor's log is stamped by the simulation, which may have stood still between a command and its stamp.
     """
-    return _WATCHED_US if all(check.ok for check in checks) else _TO_THE_END_US
+    if all(check.ok for check in checks):
+        return injected.at_us, injected.at_us + _WATCHED_US
+    return min(injected.at_us, injected.from_us or injected.at_us), injected.at_us + _TO_THE_END_US
 
 
 def _motion_checks(row: FaultCase, rig: RobotFixture, injected: Injected) -> Iterable[Check]:

@@ -63,7 +63,7 @@ def _garbage(rig: RobotFixture) -> Injected:
     return Injected(1, at_us, checks=(
         *checks, at_least("speed kept before it", slowest_mps, "m/s", KEPT_MPS), at_least("sent", rate_hz, "1/s", 1000),
         at_least("reasons logged", counted, "", 3),
-    ))
+    ), from_us=came_us)
 
 
 def _replay(rig: RobotFixture) -> Injected:
@@ -86,7 +86,7 @@ def _replay(rig: RobotFixture) -> Injected:
     rig.prepare_operator()
     at_us, checks = rig.stop_by_operator()
     checks += at_least("speed kept", slowest_mps, "m/s", KEPT_MPS), at_least("reasons logged", counted, "", 2)
-    return Injected(len(rig.noted("crowd", INJECTED)), at_us, checks=checks)
+    return Injected(len(rig.noted("crowd", INJECTED)), at_us, checks=checks, from_us=since_us)
 
 
 TYPED_FALLS_MS: Final = 200.0

@@ -32,8 +32,8 @@ from sightline.evaluation.faults.evidence import (
 )
 from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED, read_recording
 from sightline.evaluation.faults.report import passed, run_line, to_dict
-from sightline.evaluation.faults.runner import FaultOutcome, run_case, watched_us
-from sightline.evaluation.faults.sampler import read_holes, stalled_us
+from sightline.evaluation.faults.runner import FaultOutcome, Injected, run_case, watched_us
+from sightline.evaluation.faults.sampler import STALL_US, Hole, read_holes, stalled_us
 from sightline.operator_side.cli import evaluate as cli_faults
 from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.errors import ConfigError, WireError
@@ -149,9 +149,14 @@ def test_image_in_flight_at_the_cut_may_be_answered():
     assert last_valid_us(sent, Blind(1_000_000)) <= 1_000_000
 
 
-def test_failed_check_extends_the_watched_time_to_the_whole_run():
+def test_failed_check_extends_the_watched_time_to_all_measurements():
     good, bad = at_most("zero", 1.0, "ms", 2.0), at_most("zero", 3.0, "ms", 2.0)
-    assert watched_us([good, bad]) > 60_000_000 > watched_us([good])
+    injected = Injected(1, 6_000_000, from_us=2_000_000)
+    assert watched_us(injected, [good]) == (6_000_000, 7_000_000)
+    from_us, to_us = watched_us(injected, [good, bad])
+    assert from_us == 2_000_000 and to_us > 66_000_000
+    assert stalled_us([Hole(3_000_000, 3_100_000)], from_us, to_us) > STALL_US
+    assert watched_us(Injected(1, 6_000_000), [bad])[0] == 6_000_000
 
 
 def test_without_any_command_no_motion_is_allowed():
