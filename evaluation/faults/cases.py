@@ -17,7 +17,7 @@ from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.devices import DRIVE_ERROR, LOOP
 from sightline.evaluation.faults.drivers import ATTACKED_S, COMMAND_CASES, SETTLED_S, VISION
 from sightline.evaluation.faults.evidence import INJECTED, REQUESTED, MotorRow, wheel_mps
-from sightline.evaluation.faults.fixture import AT_SPEED_S, ROBOT, RobotFixture, Setup
+from sightline.evaluation.faults.fixture import AT_SPEED_S, KEPT_MPS, ROBOT, RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import ADMITTED, HANDSHAKES, READY, SEEN, VIEWERS
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.evaluation.faults.sampler import Hole
@@ -331,7 +331,6 @@ NETWORK_CASES: Final = (
 # Rows: many viewers, some of them faulty, while a driver drives; and the timing of the driver process. Shell.
 
 LOADED_S: Final = 6.0
-KEPT_MPS: Final = 0.4
 TICK_MS: Final = 40.0
 STARVED_S: Final = 24.0
 TICKS: Final = 1000
@@ -586,7 +585,7 @@ def _suspend(rig: RobotFixture) -> Injected:
     rig.prepare_operator()
     at_us = rig.suspend()
     rig.watch(ATTACKED_S)
-    _, stopped = rig.stop_by_operator()
+    _, stopped = rig.stop_by_operator(moving=False)
     return Injected(1, at_us, checks=stopped)
 
 

@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from sightline.evaluation.checks import at_least, at_most
 from sightline.evaluation.faults.evidence import FLOOD_AT_LEAST, INJECTED, ZERO_MS, most_gain_mps2, wheel_mps
-from sightline.evaluation.faults.fixture import SESSION, RobotFixture, Setup
+from sightline.evaluation.faults.fixture import KEPT_MPS, SESSION, RobotFixture, Setup
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.protocol.clock import monotonic_us
 from sightline.robot_side.safety.limits import SafetyConfig
@@ -18,7 +18,8 @@ GAIN_MPS2: Final = SafetyConfig().max_acceleration_mps2 * 1.05
 """Five percent for rounding in the log."""
 ENOUGH: Final = 30
 PERSON: Final = "0e0e0e0e"
-_STOPS: Final = f"then STOP: zero <= {ZERO_MS:g} ms after the first packet, exit code 0"
+_STOPS: Final = "then STOP: exit code 0"
+_STOPS_MOVING: Final = f"then STOP: zero <= {ZERO_MS:g} ms after the first packet, exit code 0"
 
 
 def _attack(rig: RobotFixture, at_least_times: int = ENOUGH) -> Injected:
@@ -66,7 +67,7 @@ def _two_visions(rig: RobotFixture) -> Injected:
     rig.watch(SETTLED_S)
     checks = (
         at_most("applied from the second", backwards, "lines", 0),
-        at_least("speed kept", slowest_mps, "m/s", 0.4),
+        at_least("speed kept", slowest_mps, "m/s", KEPT_MPS),
     )
     return Injected(len(rig.sent("second")), at_us, checks=checks, from_us=last[0].t_us)
 
@@ -87,10 +88,10 @@ def _impersonate(rig: RobotFixture, fault: str = "copied", **attacker: Any) -> I
     rig.watch(LEASE_US / 2e6)
     rig.processes.kill("attacker")  # once the lease is over it may drive, in its own name
     rig.watch(SETTLED_S)
-    _, stopped = rig.stop_by_operator()
+    _, stopped = rig.stop_by_operator(moving=False)
     checks = (
         at_most("motor log lines of the attacker", backwards, "lines", 0),
-        at_least("speed kept", min(map(wheel_mps, rows)), "m/s", 0.4),
+        at_least("speed kept", min(map(wheel_mps, rows)), "m/s", KEPT_MPS),
     )
     return Injected(rig.injected("attacker"), at_us, checks=(*checks, *stopped), from_us=began_us)
 
@@ -113,11 +114,11 @@ def _replay_driver(rig: RobotFixture) -> Injected:
     at_us = monotonic_us()
     rig.processes.kill("person")
     rig.watch(ATTACKED_S)  # after the lease, an `arm` would let vision drive
-    _, stopped = rig.stop_by_operator()
+    _, stopped = rig.stop_by_operator(moving=False)
     rig.watch(SETTLED_S)
     checks = (
         at_most("motor log lines of the replay", backwards, "lines", 0),
-        at_least("speed kept", min(map(wheel_mps, rows)), "m/s", 0.4),
+        at_least("speed kept", min(map(wheel_mps, rows)), "m/s", KEPT_MPS),
     )
     return Injected(rig.injected("attacker"), at_us, checks=(*checks, *stopped), from_us=began_us)
 
@@ -136,7 +137,7 @@ def _forge_frames(rig: RobotFixture) -> Injected:
     rig.until(lambda: wheel_mps(rig.motors()[-1]) > 0 and rig.motors()[-1].t_us > at_us, 5.0, "vision driving again")
     again_ms = (next(row.t_us for row in rig.motors() if row.t_us > at_us and wheel_mps(row) > 0) - at_us) / 1000
     rig.wait_speed(rig.setup.at_speed_mps)
-    _, stopped = rig.stop_by_operator()
+    _, stopped = rig.stop_by_operator(moving=True)
     return Injected(times, at_us, checks=(at_most("drives again after", again_ms, "ms", 1000.0), *stopped))
 
 
@@ -209,7 +210,7 @@ COMMAND_CASES: Final = (
     FaultCase("identity.replayed", "drivers: an operator's twists, acquire, arm and reset, replayed (secured); it dies",
               _replay_driver, Setup(secure=True), blind=True, also=f"0 motor log lines of the replay; {_STOPS}"),
     FaultCase("frame.future", "vision: forged frames of the future for 3 s", _forge_frames, VISION, stops=False,
-              also=f"drives again <= 1000 ms after they end; {_STOPS}"),
+              also=f"drives again <= 1000 ms after they end; {_STOPS_MOVING}"),
     FaultCase(
         "driver.person", "drivers: an operator takes over at full speed, and is lost", _take_over, Setup(), blind=True,
         also="applied <= 1000 ms; vision does not resume by itself"

@@ -6,14 +6,14 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Final, Self
 
-from sightline.evaluation.checks import Check, at_most
+from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults import devices
 from sightline.evaluation.faults import evidence as judge
 from sightline.evaluation.faults.evidence import (
@@ -176,7 +176,9 @@ _TAIL_BYTES: Final = 8192
 """More than a second of the motors' log."""
 _PROBED_S: Final = 0.5
 _OPERATOR_READY_S: Final = 30.0
-_STOP_ENDS_S: Final = 20.0
+STOP_ENDS_S: Final = 20.0
+KEPT_MPS: Final = 0.4
+"""A scripted driver sends 0.5 m/s; a robot that is slower than this lost commands."""
 _CHASE: Final[dict[str, Any]] = {
     "summary": "a ball on a circle at 0.4 m/s", "stand_off_m": 0.8, "look": "plain",
     "target": {"kind": "path", "speed_mps": 0.4, "path": [{"length_m": 12.566371, "turn_deg": 360.0}]},
@@ -218,6 +220,18 @@ class Setup:
     def at_speed_mps(self) -> float:
         """Return the speed before a fault. A script sends 0.5 m/s, a guest 0.2; vision follows a ball at 0.4."""
         return {"vision": 0.3, "guest": 0.18}.get(self.driver, 0.48)
+
+    @property
+    def kept_mps(self) -> float:
+        """Return the speed that the wheels keep until a fault or STOP."""
+        return {"vision": 0.2, "guest": 0.15}.get(self.driver, KEPT_MPS)
+
+
+def _moving_stop(rows: Sequence[MotorRow], at_us: int, kept_mps: float) -> Iterable[Check]:
+    """Check that the wheels turned at the first packet of a STOP, and the time until they stood."""
+    speed_mps = next((wheel_mps(row) for row in reversed(rows) if row.t_us <= at_us), 0.0)
+    yield at_least("speed at the first packet", speed_mps, "m/s", kept_mps)
+    yield at_most("zero after the first packet", judge.measure_stop(rows, at_us).zero_ms, "ms", ZERO_MS)
 
 
 class RobotFixture:
@@ -342,17 +356,17 @@ class RobotFixture:
         self.start_peer("operator", "stop", **changes)
         self.processes.wait_line("operator", "stop ready", _OPERATOR_READY_S)
 
-    def stop_by_operator(self) -> tuple[int, tuple[Check, ...]]:
-        """Let the new operator send STOP. Returns the time of its first packet, and the checks of the stop."""
+    def stop_by_operator(self, *, moving: bool) -> tuple[int, tuple[Check, ...]]:
+        """Let the new operator send STOP. Returns the time of its first packet, and the checks of the stop.
+
+        Only a robot that is `moving` by then shows how soon its wheels reach zero.
+        """
         self.trigger("operator")
-        code = self.processes.exit_code("operator", _STOP_ENDS_S)
+        code = self.processes.exit_code("operator", STOP_ENDS_S)
         at_us = self.noted("operator", REQUESTED)[0].t_us
         self.watch(ZERO_MS / 1000)
-        zero_ms = judge.measure_stop(self.motors(), at_us).zero_ms
-        return at_us, (
-            at_most("zero after the first packet", zero_ms, "ms", ZERO_MS),
-            at_most("exit code of stop", code, "", 0),
-        )
+        ended = at_most("exit code of stop", code, "", 0)
+        return at_us, (*(_moving_stop(self.motors(), at_us, self.setup.kept_mps) if moving else ()), ended)
 
     def start_crowd(self, kind: str, endpoint: str = "") -> None:
         """Let many clients come, WebSocket ones by default; what they do is noted as by a peer called `crowd`."""

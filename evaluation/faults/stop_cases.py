@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
+from sightline.evaluation.faults.devices import MODE
 from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, ZERO_MS, measure_stop, wheel_mps
-from sightline.evaluation.faults.fixture import ROBOT, RobotFixture, Setup
+from sightline.evaluation.faults.fixture import KEPT_MPS, ROBOT, STOP_ENDS_S, RobotFixture, Setup
 from sightline.evaluation.faults.load_clients import FEW_HZ, HALF_OPEN, MANY_HZ, READY, SESSIONS, STOPS
 from sightline.evaluation.faults.peer import LEGACY_LIBRARIES
 from sightline.evaluation.faults.runner import FaultCase, Injected
@@ -21,9 +22,7 @@ from sightline.robot_side.safety.limits import SafetyConfig
 AT_WORK_S: Final = 3.0
 AFTER_S: Final = (2.0, 20.0, 80.0)
 """Times after the end of a flood at which STOP must work, too. The first one is in the short set."""
-STOP_ENDS_S: Final = 20.0
 READY_S: Final = 30.0
-KEPT_MPS: Final = 0.4
 _REPORTED: Final = ("connect_25", "half_open")
 """Floods that exceed the limits of one address. The others stay below, in number and in rate. Connections to plain TCP
 that end within a millisecond leave nothing to count, so `connect_500` is reported on WebSocket only."""
@@ -39,7 +38,7 @@ def _flood(rig: RobotFixture, kind: str, after_s: float | None = None) -> Inject
         rig.processes.kill("crowd")
         rig.watch(after_s)
     count = len(rig.noted("crowd", INJECTED))
-    at_us, checks = rig.stop_by_operator()
+    at_us, checks = rig.stop_by_operator(moving=True)
     if kind in _REPORTED or (kind == "connect_500" and rig.web_endpoint):
         log = rig.processes.log("router" if rig.setup.routed else "robot").read_text("utf-8")
         checks += at_least("reported", "connections from" in log, "", 1), at_most(
@@ -55,7 +54,7 @@ def _garbage(rig: RobotFixture) -> Injected:
     rig.processes.wait_line("crowd", READY, READY_S)
     rig.watch(AT_WORK_S)
     slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > came_us)
-    at_us, checks = rig.stop_by_operator()
+    at_us, checks = rig.stop_by_operator(moving=True)
     rig.processes.wait_line("crowd", "datagrams a second", READY_S)
     rate_hz = float(rig.processes.log("crowd").read_text("utf-8").rpartition(READY)[2].split()[0])
     log = rig.processes.log("robot").read_text("utf-8")
@@ -84,7 +83,7 @@ def _replay(rig: RobotFixture) -> Injected:
     counted = sum(reason in log for reason in ("OTHER_SESSION", "OTHER_ROBOT"))
     (rig.folder / "operator.ledger").unlink()
     rig.prepare_operator()
-    at_us, checks = rig.stop_by_operator()
+    at_us, checks = rig.stop_by_operator(moving=True)
     checks += at_least("speed kept", slowest_mps, "m/s", KEPT_MPS), at_least("reasons logged", counted, "", 2)
     return Injected(len(rig.noted("crowd", INJECTED)), at_us, checks=checks, from_us=since_us)
 
@@ -119,7 +118,7 @@ def _busy(rig: RobotFixture) -> Injected:
     busy = [subprocess.Popen([sys.executable, "-P", "-c", "while True: pass"]) for _ in range(BUSY)]
     try:
         rig.watch(AT_WORK_S)
-        at_us, checks = rig.stop_by_operator()
+        at_us, checks = rig.stop_by_operator(moving=True)
     finally:
         for process in busy:
             process.kill()
@@ -130,12 +129,13 @@ def _busy(rig: RobotFixture) -> Injected:
 def _no_descriptors(rig: RobotFixture) -> Injected:
     """Send STOP while no process of the robot may open a file or a socket."""
     rig.prepare_operator()
+    (rig.folder / MODE).unlink()  # or the camera of the bench would open a file for each image
     guardian = rig.processes.pid("robot")
     for pid in (guardian, *children_of(guardian), *children_of(rig.processes.driver("robot"))):
         held = max(int(link.name) for link in Path(f"/proc/{pid}/fd").iterdir()) + 1
         resource.prlimit(pid, resource.RLIMIT_NOFILE, (held, held))
-    # At once: the camera of the bench opens a file for each image, so that the robot would soon stop by itself.
-    at_us, checks = rig.stop_by_operator()
+    rig.watch(ZERO_MS / 1000)  # a robot that loses its images by this would stand by now
+    at_us, checks = rig.stop_by_operator(moving=True)
     return Injected(1, at_us, checks=checks)
 
 
@@ -166,7 +166,7 @@ def _guests(rig: RobotFixture) -> Injected:
     rig.prepare_operator()
     rig.start_peer("third", "guest", linear_mps=0.2, angular_rad_s=0.0)
     rig.wait_speed(rig.setup.at_speed_mps)
-    at_us, stopped = rig.stop_by_operator()
+    at_us, stopped = rig.stop_by_operator(moving=True)
     rig.watch(AT_WORK_S)
     return Injected(count, at_us, checks=(*checks, *stopped))
 
@@ -187,7 +187,7 @@ def _disarm_legacy(rig: RobotFixture) -> Injected:
     code, at_us = rig.processes.exit_code("disarm", STOP_ENDS_S), monotonic_us()
     rig.watch(0.5)
     left_mps = wheel_mps(rig.motors()[-1])
-    _, stopped = rig.stop_by_operator()
+    _, stopped = rig.stop_by_operator(moving=False)
     checks = at_most("exit code of disarm", code, "", 0), at_most("speed after disarm", left_mps, "m/s", 0.0)
     return Injected(1, at_us, checks=(*checks, *stopped))
 
@@ -195,7 +195,7 @@ def _disarm_legacy(rig: RobotFixture) -> Injected:
 def _stop_legacy(rig: RobotFixture) -> Injected:
     """Send STOP to a legacy robot."""
     rig.prepare_operator()
-    at_us, stopped = rig.stop_by_operator()
+    at_us, stopped = rig.stop_by_operator(moving=True)
     return Injected(1, at_us, checks=stopped)
 
 

@@ -1,4 +1,4 @@
-"""Which processes of a fault row are measured."""
+"""Which processes of a fault row are measured, and which STOP counts."""
 
 import subprocess
 import sys
@@ -6,8 +6,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from sightline.evaluation.faults.fixture import RobotFixture, Setup, memory_kib
+from sightline.evaluation.faults.evidence import MotorRow
+from sightline.evaluation.faults.fixture import RobotFixture, Setup, _moving_stop, memory_kib
 from sightline.evaluation.processes import Processes
+from sightline.robot_side.kinematics import DiffDriveConfig
+from sightline.robot_side.safety.limits import TICK_US
 
 _WAITS = [sys.executable, "-I", "-S", "-c", "print(1, flush=True); input()"]
 _GUARDIAN = "import subprocess, sys; subprocess.Popen(sys.argv[1:])"
@@ -30,3 +33,18 @@ def test_memory_of_stop_receiver_is_measured(tmp_path):
         measured = memory_kib(processes, ["robot"])
         guardian.stdin.close()
     assert set(measured) == {("robot", "itself"), ("robot", "stop")} and min(measured.values()) > 0
+
+
+def motors(mps_before, mps_after):
+    """A motor log: a second before STOP at 1 s, a second after it, the wheels at their set speed."""
+    rows, angle_rad = [], 0.0
+    for t_us in range(0, 2_000_000, TICK_US):
+        rad_s = (mps_before if t_us < 1_000_000 else mps_after) / DiffDriveConfig().wheel_radius_m
+        rows.append(MotorRow(t_us, rad_s, rad_s, angle_rad, angle_rad))
+        angle_rad += rad_s * TICK_US / 1e6
+    return rows
+
+
+@pytest.mark.parametrize(("before", "after", "ok"), [(0.5, 0.0, True), (0.0, 0.0, False), (0.5, 0.5, False)])
+def test_stop_of_a_standing_robot_passes_no_check(before, after, ok):
+    assert all(check.ok for check in _moving_stop(motors(before, after), 990_000, Setup().kept_mps)) is ok
