@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import median
 from typing import Final, NamedTuple
 
-from sightline.evaluation.checks import Check, at_most
+from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.protocol.errors import ConfigError
 
 OURS: Final = "sightline"
@@ -105,6 +105,10 @@ class Course:
     answered_percent: float
     ages_us: tuple[tuple[int, int], ...]
     validated_us: tuple[int, ...] = ()
+
+    def fps(self, seconds: float) -> float:
+        """Return the answered images per second."""
+        return self.captured * self.answered_percent / 100 / seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,6 +244,10 @@ CPU_MS: Final = 1.5
 """Per image: of all processes of the robot, and of vision."""
 CPU_OVER_FLOOR_MS: Final = 0.6
 ANSWERED_PERCENT: Final = 99.0
+"""Of the captured images, and of those that the camera offers while nothing is overloaded."""
+LOADED_FPS_SHARE: Final = 0.9
+"""Of the best rival that lets no image wait in a queue: a queue may answer all images, but late."""
+_QUEUES: Final = ("tcp", "callback")
 OVERLOADED_LIKE_MS: Final = 80.0
 """A detector overloaded by the rate is allowed the same ages as one with this delay."""
 TIMES_BEST: Final = 1.02
@@ -253,7 +261,8 @@ _PARTS: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class LoopFigures:
-    """One contestant. Times are from capture to the result, `validated_ms` (median) to the validation of the services;
+    """One contestant. `answered_percent` is of the images that the camera offers, `accepted_percent` of the captured
+    ones. Sightline captures only with credit, most rivals capture each image. Times are from capture to the result, `validated_ms` (median) to the validation of the services;
     `most_wait_ms` is the longest time between the two. None without an answer.
 
     `first_ms` and `last_ms` are medians of the first and the last ten seconds, or fifths of a shorter time; `cpu_ms` is
@@ -265,6 +274,7 @@ class LoopFigures:
     captured: int
     fps: float
     answered_percent: float
+    accepted_percent: float
     p50_ms: float | None
     p95_ms: float | None
     p99_ms: float | None
@@ -294,17 +304,18 @@ def percentile(values: Sequence[float], percent: float) -> float | None:
     return ordered[max(0, int(rank) - 1)]
 
 
-def figures_of(sample: LoopSample) -> LoopFigures:
-    """Compute the figures of a sample."""
-    course = sample.course
+def figures_of(sample: LoopSample, offered_fps: float) -> LoopFigures:
+    """Compute the figures of a sample. The camera offers so many images a second."""
+    course, fps = sample.course, sample.course.fps(sample.seconds)
     ages_ms = [age_us / 1000 for _, age_us in course.ages_us]
     parts = _parts(course.ages_us)
     judged = max(1, len(ages_ms))
     return LoopFigures(
         name=sample.name,
         captured=course.captured,
-        fps=course.captured * course.answered_percent / 100 / sample.seconds,
-        answered_percent=course.answered_percent,
+        fps=fps,
+        answered_percent=100 * fps / offered_fps,
+        accepted_percent=course.answered_percent,
         p50_ms=percentile(ages_ms, 50),
         p95_ms=percentile(ages_ms, 95),
         p99_ms=percentile(ages_ms, 99),
@@ -342,12 +353,21 @@ def loop_checks(figures: Mapping[str, LoopFigures], setting: LoopSetting) -> lis
     rivals = [figures[name] for name in PEERS if name in figures]
     like_ms = setting.detector_delay_ms or OVERLOADED_LIKE_MS
     checks = list(_loaded(ours, like_ms, rivals) if setting.is_loaded else _unloaded(ours, floor, rivals))
+    least_fps = _least_fps(setting, rivals)
+    if least_fps is not None:
+        checks.append(at_least("answered per second", ours.fps, "", least_fps))
     for rival in rivals:
         checks.append(at_most(f"p95 behind {rival.name}", _over(ours.p95_ms, rival.p95_ms), "ms", 0.0))
         if not setting.is_loaded:
             checks.append(at_most(f"p99 behind {rival.name}", _over(ours.p99_ms, rival.p99_ms), "ms", 0.0))
     disturbed = [one for one in figures.values() if one.is_disturbed]
     return [*checks, at_most("samples disturbed by others", len(disturbed), "", 0.0)]
+
+
+def _least_fps(setting: LoopSetting, rivals: Sequence[LoopFigures]) -> float | None:
+    if not setting.is_loaded:
+        return ANSWERED_PERCENT / 100 * setting.fps
+    return max((LOADED_FPS_SHARE * one.fps for one in rivals if one.name not in _QUEUES), default=None)
 
 
 def _unloaded(ours: LoopFigures, floor: LoopFigures, rivals: Sequence[LoopFigures]) -> Iterator[Check]:
@@ -358,7 +378,7 @@ def _unloaded(ours: LoopFigures, floor: LoopFigures, rivals: Sequence[LoopFigure
     if best_ms is not None:
         yield at_most("p50 behind the fastest over Zenoh", _over(ours.p50_ms, best_ms), "ms", BEHIND_ZENOH_MS)
     yield at_most("longest wait for the wheels", ours.most_wait_ms, "ms", MOST_WAIT_MS)
-    yield at_most("not accepted", 100 - ours.answered_percent, "%", 100 - ANSWERED_PERCENT)
+    yield at_most("not accepted", 100 - ours.accepted_percent, "%", 100 - ANSWERED_PERCENT)
     vision_ms = ours.cpu_ms["vision"]
     yield at_most("robot CPU", sum(ours.cpu_ms.values()) - vision_ms, "ms", CPU_MS)
     yield at_most("vision CPU", vision_ms, "ms", CPU_MS)
@@ -374,7 +394,7 @@ def _loaded(ours: LoopFigures, delay_ms: float, rivals: Sequence[LoopFigures]) -
     yield at_most("age p50", ours.p50_ms, "ms", delay_ms + LOADED_P50_OVER_DELAY_MS)
     yield at_most("age p99", ours.p99_ms, "ms", delay_ms + LOADED_P99_OVER_DELAY_MS)
     yield at_most("drift of age", drift_percent, "%", DRIFT_PERCENT)
-    yield at_most("not accepted", 100 - ours.answered_percent, "%", 100 - ANSWERED_PERCENT)
+    yield at_most("not accepted", 100 - ours.accepted_percent, "%", 100 - ANSWERED_PERCENT)
 
 
 def _times(value: float | None, other: float | None) -> float | None:

@@ -180,7 +180,7 @@ def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
         if setting.overload:
             ready = overloaded(ready, say)
         samples = _samples(ready, Path(name), say)
-    figures = {one: figures_of(sample) for one, sample in samples.items()}
+    figures = {one: figures_of(sample, ready.fps) for one, sample in samples.items()}
     return Race(ready, jpeg_bytes, samples, figures, loop_checks(figures, ready))
 
 

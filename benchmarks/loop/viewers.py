@@ -26,7 +26,7 @@ from sightline.benchmarks.loop.figures import (
 )
 from sightline.benchmarks.loop.ours import ROBOT, Ours, running_services
 from sightline.benchmarks.loop.pictures import write_pictures
-from sightline.evaluation.checks import Check, at_most
+from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.processes import Processes, terminated_like_interrupted
 from sightline.protocol.channels import FRAME
 from sightline.protocol.transports.link import Message
@@ -76,6 +76,7 @@ class Watch:
     """A stretch whose frames were looked at."""
 
     course: Course
+    fps: float
     memory_mb: float
     taken_percent: float
 
@@ -97,7 +98,7 @@ def measure_watchers(setting: LoopSetting, viewers: int, say: Callable[[str], No
             pairs.append(_measure(ready, viewers, folder, say))
             if not any(map(_is_disturbed, pairs[-1])):
                 break
-        return _checks(*min(pairs, key=lambda pair: max(one.taken_percent for one in pair)))
+        return _checks(ready.fps, *min(pairs, key=lambda pair: max(one.taken_percent for one in pair)))
 
 
 def _measure(setting: LoopSetting, viewers: int, folder: Path, say: Callable[[str], None]) -> tuple[Watch, Watch]:
@@ -135,14 +136,16 @@ def _stretch(ours: Ours, viewers: Mapping[str, int], seconds: float) -> ViewedSt
 
 
 def _watch(ours: Ours, stretch: ViewedStretch) -> Watch:
-    return Watch(ours.course(stretch.begin_us, stretch.end_us), stretch.memory_mb, stretch.taken_percent)
+    course = ours.course(stretch.begin_us, stretch.end_us)
+    fps = course.fps((stretch.end_us - stretch.begin_us) / 1e6)
+    return Watch(course, fps, stretch.memory_mb, stretch.taken_percent)
 
 
 def _is_disturbed(watch: Watch) -> bool:
     return watch.taken_percent > TAKEN_BOUND_PERCENT
 
 
-def _checks(alone: Watch, crowded: Watch) -> list[Check]:
+def _checks(offered_fps: float, alone: Watch, crowded: Watch) -> list[Check]:
     ages_ms = [[age_us / 1000 for _, age_us in one.course.ages_us] for one in (alone, crowded)]
     first_ms, then_ms = (percentile(one, 95) for one in ages_ms)
     later_ms = None if first_ms is None or then_ms is None else then_ms - first_ms
@@ -150,6 +153,7 @@ def _checks(alone: Watch, crowded: Watch) -> list[Check]:
     return [
         at_most("p95 of age, more", later_ms, "ms", P95_GROWTH_MS),
         at_most("not accepted", 100 - crowded.course.answered_percent, "%", 100 - ANSWERED_PERCENT),
+        at_least("answered per second", crowded.fps, "", ANSWERED_PERCENT / 100 * offered_fps),
         at_most("memory, more", crowded.memory_mb - alone.memory_mb, "MB", MEMORY_GROWTH_MB),
         at_most("samples disturbed by others", disturbed, "", 0.0),
     ]

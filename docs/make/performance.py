@@ -93,7 +93,8 @@ SECTIONS: Final = (
         "pipeline in one process at the same pace), plain TCP, three usual ways to receive Zenoh's images, the "
         "WebSocket request of openpi, the ZeroMQ of LeKiwi, and the legacy pipeline (`older`), on the same images in "
         "the same run. All but the legacy pipeline have Sightline's detector and steering, but no rival has credit, "
-        "an age limit or a safety gate. `benchmarks/peers/` names the sources.",
+        "an age limit or a safety gate. *Answered* is of the images that the camera offers. `benchmarks/peers/` names "
+        "the sources.",
         ("bench", "loop", "--seconds", "15"),
         "loop-zenoh.png",
     ),
@@ -269,11 +270,11 @@ def _section(section: Section, result: dict[str, Any]) -> str:
 
 def _race(contestants: Sequence[dict[str, Any]]) -> list[str]:
     """One row for each contestant of `bench loop`."""
-    heads = ("", "answered %", "p50 ms", "p95 ms", "p99 ms", "validated p50 ms", "bytes a picture", "CPU ms a picture",
+    heads = ("", "answered %", "fps", "p50 ms", "p95 ms", "p99 ms", "validated p50 ms", "bytes a picture", "CPU ms a picture",
              "memory MB")
     rows = [
         (one["name"], *(_number(one[key]) for key in (
-            "answered_percent", "p50_ms", "p95_ms", "p99_ms", "validated_ms")),
+            "answered_percent", "fps", "p50_ms", "p95_ms", "p99_ms", "validated_ms")),
          "none" if one["bytes_per_picture"] is None else f"{one['bytes_per_picture']:.0f}",
          *(_by_process(one[key]) for key in ("cpu_ms", "memory_mb")))
         for one in contestants

@@ -198,7 +198,7 @@ def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
 
 
 def _table(race: "Race") -> list[str]:
-    names = f"{'answered':>9} {'p50':>8} {'p95':>8} {'p99':>8} ms {'validated':>9} {'bytes':>8} {'others':>7}"
+    names = f"{'answered':>9} {'fps':>6} {'p50':>8} {'p95':>8} {'p99':>8} ms {'validated':>9} {'bytes':>8} {'others':>7}"
     head = f"{'':18} {names}  CPU ms per image; MB"
     return [head, *(_row(name, race) for name in race.figures)]
 
@@ -211,7 +211,7 @@ def _row(name: str, race: "Race") -> str:
     validated = "" if one.validated_ms is None else f"{one.validated_ms:.1f}"
     others = f"{one.taken_percent:5.1f} %{'!' if one.is_disturbed else ' '}"
     carried = f"{validated:>9} {one.bytes_per_picture or 0:8.0f} {others}"
-    return f"{name:18} {one.answered_percent:7.1f} % {ages}    {carried}  {cpu}; {memory}"
+    return f"{name:18} {one.answered_percent:7.1f} % {one.fps:6.1f} {ages}    {carried}  {cpu}; {memory}"
 
 
 # --- `bench network`: two machines and a bad network between them, on this one; needs root -----------------------

@@ -38,16 +38,17 @@ SMALL = LoopSetting(Path(), 160, 120, fps=30.0, seconds=2.0, tries=1)
 MS = 1000
 
 
-def sample(name, ages_ms, cpu_s=0.1, answered_percent=100.0, taken=0.0, waits_ms=(0.0,), robot_s=0.0):
+def sample(name, ages_ms, cpu_s=0.1, answered_percent=100.0, taken=0.0, waits_ms=(0.0,), robot_s=0.0,
+           seconds=0.0):
     ages_us = tuple((at * 33 * MS, round(age_ms * MS)) for at, age_ms in enumerate(ages_ms))
     validated_us = tuple(age_us - round(wait_ms * MS) for (_, age_us), wait_ms in zip(ages_us, cycle(waits_ms)))
     course = Course(len(ages_us), answered_percent, ages_us, validated_us)
     cpu = {"driver": robot_s, "network": robot_s, "vision": cpu_s}
-    return LoopSample(name, course, 10.0, cpu, {"vision": 60.0}, 1000, taken)
+    return LoopSample(name, course, seconds or len(ages_us) / SMALL.fps or 10.0, cpu, {"vision": 60.0}, 1000, taken)
 
 
 def judged(setting=SMALL, **samples):
-    figures = {name: figures_of(one) for name, one in samples.items()}
+    figures = {name: figures_of(one, setting.fps) for name, one in samples.items()}
     return {check.name: check.ok for check in loop_checks(figures, setting)}
 
 
@@ -131,7 +132,7 @@ def test_frames_that_the_vision_service_did_not_receive_are_unanswered():
 
 
 def test_without_an_answer_there_are_no_figures_and_no_check_holds():
-    silent = figures_of(sample(OURS, []))
+    silent = figures_of(sample(OURS, []), 30.0)
     assert (silent.p50_ms, silent.p95_ms, silent.first_ms, silent.most_wait_ms) == (None, None, None, None)
     found = judged(**{OURS: sample(OURS, [], answered_percent=0), FLOOR: sample(FLOOR, [1.0] * 100)})
     assert not found["p50, times the floor"]
@@ -154,6 +155,23 @@ def test_the_bounds_are_held_against_the_floor_of_the_same_run():
         assert not judged(**{FLOOR: floor, OURS: one})[bound], bound
 
 
+def test_few_images_fail_although_each_is_answered():
+    floor, ours = sample(FLOOR, [1.0] * 450), sample(OURS, [1.0] * 15, seconds=15.0)
+    assert not judged(**{FLOOR: floor, OURS: ours})["answered per second"]
+    figures = figures_of(ours, 30.0)
+    assert (figures.fps, figures.answered_percent, figures.accepted_percent) == (1.0, pytest.approx(100 / 30), 100.0)
+
+
+@pytest.mark.parametrize(("rival", "fps", "ok"), [
+    ("lekiwi", 11.0, True), ("lekiwi", 12.0, False), ("tcp", 30.0, True), ("callback", 30.0, True),
+])
+def test_overloaded_sightline_answers_nearly_as_many_images_as_a_rival_without_a_queue(rival, fps, ok):
+    slow = replace(SMALL, detector_delay_ms=80.0)
+    others = {rival: sample(rival, [90.0] * 600, seconds=600 / fps), "ring": sample("ring", [90.0] * 100, seconds=10.0)}
+    found = judged(slow, **{FLOOR: sample(FLOOR, [81.0] * 100), OURS: sample(OURS, [85.0] * 100, seconds=10.0)}, **others)
+    assert found["answered per second"] is ok
+
+
 @given(st.lists(st.lists(st.integers(1, 90), min_size=1, max_size=9), min_size=1, max_size=4), st.data())
 def test_turns_joined_are_as_one_sample_of_all_their_pictures(turns, data):
     parts = [replace(sample(OURS, ages_ms, data.draw(st.floats(0, 9)), data.draw(st.floats(0, 100)), at), tries=at + 1)
@@ -164,7 +182,8 @@ def test_turns_joined_are_as_one_sample_of_all_their_pictures(turns, data):
     assert whole.course.answered_percent == pytest.approx(answered / whole.course.captured)
     assert len(whole.course.validated_us) == len(whole.course.ages_us)
     assert whole.cpu_s["vision"] == pytest.approx(sum(part.cpu_s["vision"] for part in parts))
-    assert (whole.seconds, whole.carried_bytes) == (10.0 * len(parts), 1000 * len(parts))
+    assert (whole.seconds, whole.carried_bytes) == (
+        pytest.approx(sum(map(len, turns)) / SMALL.fps), 1000 * len(parts))
     assert whole.taken_percent == len(parts) - 1  # a turn that was disturbed is not hidden by the others
     assert whole.tries == sum(part.tries for part in parts)
 
@@ -187,9 +206,9 @@ def test_age_with_a_slow_detector_has_separate_bounds_and_does_not_grow():
 
 def test_drift_is_from_the_first_ten_seconds_to_the_last():
     late = [80.0] * 310 + [200.0] * 1400 + [84.0] * 310  # 33 ms each: a minute, bad in its middle
-    ours = figures_of(sample(OURS, late))
+    ours = figures_of(sample(OURS, late), 30.0)
     assert (ours.first_ms, ours.last_ms) == (80.0, 84.0)
-    short = figures_of(sample(OURS, [80.0] * 60 + [200.0] * 180 + [84.0] * 60))
+    short = figures_of(sample(OURS, [80.0] * 60 + [200.0] * 180 + [84.0] * 60), 30.0)
     assert (short.first_ms, short.last_ms) == (80.0, 84.0)
 
 
