@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from itertools import count
+from math import inf
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Final
@@ -16,6 +17,7 @@ from typing import Annotated, Final
 from pydantic import Field
 
 from sightline.benchmarks.loop.pictures import write_pictures
+from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.protocol.channels import DETECTIONS, FRAME, STATUS
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
@@ -121,7 +123,7 @@ FAIRNESS_PERCENT: Final = 10.0
 MEMORY_MB: Final = 5.0
 OVERLOAD: Final = 2.0
 ANSWERS_PER_FRAME: Final = 1.01
-KILL_GAP_MS: Final = 250.0
+LONGEST_GAP_MS: Final = 250.0
 LEAST_FPS: Final = 900.0
 BATCH_P95_MS: Final = 70.0
 """Bounds of a run with a detector that takes 5 ms for a batch, on two cores."""
@@ -166,14 +168,18 @@ class Load:
     """Answers to frames that were answered before."""
     ages_ms: list[float] = field(default_factory=list)
     answered_us: dict[str, int] = field(default_factory=dict)
-    """Time of the newest answer to a robot."""
+    """Time of the newest answer to a robot, at first the begin of the run."""
     gap_us: int = 0
-    """Longest time between two answers to a robot."""
+    """Longest time without an answer to a robot."""
     memory_mb: list[float] = field(default_factory=list)
     """Of the first service, once a second."""
     cpu_ms: float = 0.0
     """CPU time of all services for each answered frame, in the first half."""
     seconds: float = 0.0
+
+    def close_gap(self, robot: str, now_us: int) -> None:
+        """End the time without an answer to a robot, at an answer or at the end of the run."""
+        self.gap_us = max(self.gap_us, now_us - self.answered_us[robot])
 
     @property
     def p95_ms(self) -> float:
@@ -210,6 +216,32 @@ class Load:
         return (frames + self.repeated) / frames if frames else float("inf")
 
 
+def stream_checks(load: Load, plan: StreamPlan) -> list[Check]:
+    """Check the result of a run. With a time for a batch the rate counts, otherwise the overload."""
+    checks = [
+        at_most("furthest from an equal share", load.unfair_percent, "%", FAIRNESS_PERCENT),
+        at_most("robots without an answer", plan.streams - len(load.answered), "", 0),
+        at_most("memory of the service grew", load.growth_mb, "MB", MEMORY_MB),
+    ]
+    if plan.batch_us:
+        checks += [
+            at_least("answered per second", load.fps, "", LEAST_FPS),
+            at_most("age of boxes, p95", load.p95_ms, "ms", BATCH_P95_MS),
+            at_most("CPU time of the services for each answered frame", load.cpu_ms, "ms", inf),
+        ]
+    else:
+        checks += [
+            at_least("offered per answered frame, least", load.overload, "", 0.9 * OVERLOAD),
+            at_most("offered per answered frame", load.overload, "", 1.2 * OVERLOAD),
+            at_most("age of boxes, p95", load.p95_ms, "ms", DEADLINE_MS),
+        ]
+    return [
+        *checks,
+        at_most("answers per answered frame", load.answers_per_frame, "", ANSWERS_PER_FRAME),
+        at_most("longest time without an answer", load.gap_us / 1000, "ms", LONGEST_GAP_MS),
+    ]
+
+
 class _Streams:
     """The robots."""
 
@@ -236,7 +268,7 @@ class _Streams:
                 self.load.repeated += 1
                 return
             seen.append(echo.seq)
-            self.load.gap_us = max(self.load.gap_us, now_us - self.load.answered_us.get(robot, now_us))
+            self.load.close_gap(robot, now_us)
             self.load.answered_us[robot] = now_us
             self.load.answered[robot] += 1
             self.load.ages_ms.append((now_us - echo.t_us) / 1000)
@@ -274,6 +306,7 @@ def measure_streams(endpoint: str, folder: Path, plan: StreamPlan) -> Load:
         _wait_ready(robots, plan, services)
         _offer(robots, plan.streams, _WARM_S, services)
         robots.load.memory_mb.clear()
+        robots.load.answered_us = {link.robot: monotonic_us() for link in links}
         robots.counting = True
         before_s = sum(one.cpu_s() for one in services)
         began_s = time.monotonic()
@@ -284,6 +317,8 @@ def measure_streams(endpoint: str, folder: Path, plan: StreamPlan) -> Load:
             services[-1].kill()
         _offer(robots, plan.streams, plan.seconds / 2, services)
         robots.load.seconds = time.monotonic() - began_s
+        for link in links:
+            robots.load.close_gap(link.robot, monotonic_us())
     return robots.load
 
 

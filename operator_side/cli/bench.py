@@ -5,7 +5,6 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
-from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -351,35 +350,13 @@ def streams(
     """
     with needs("vision"):
         from sightline.benchmarks import detector as bench
-        from sightline.evaluation.checks import Check, at_most
         from sightline.evaluation.processes import free_port
 
     plan = bench.StreamPlan(streams, seconds, services, round(batch_ms * 1000),
                             ("--share",) if share and services > 1 else (), kill)
     with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
         load = bench.measure_streams(f"tcp/127.0.0.1:{free_port()}", Path(folder), plan)
-    checks = [
-        at_most("furthest from an equal share", load.unfair_percent, "%", bench.FAIRNESS_PERCENT),
-        at_most("robots without an answer", streams - len(load.answered), "", 0),
-        at_most("memory of the service grew", load.growth_mb, "MB", bench.MEMORY_MB),
-    ]
-    if batch_ms:
-        checks += [
-            Check("answered per second", load.fps, "", bench.LEAST_FPS, load.fps >= bench.LEAST_FPS),
-            at_most("age of boxes, p95", load.p95_ms, "ms", bench.BATCH_P95_MS),
-            at_most("CPU time of the services for each answered frame", load.cpu_ms, "ms", inf),
-        ]
-    else:
-        least = 0.9 * bench.OVERLOAD
-        checks += [
-            Check("offered per answered frame", load.overload, "", bench.OVERLOAD, load.overload >= least),
-            at_most("age of boxes, p95", load.p95_ms, "ms", bench.DEADLINE_MS),
-        ]
-    checks += [
-        at_most("answers per answered frame", load.answers_per_frame, "", bench.ANSWERS_PER_FRAME),
-        at_most("longest time between two answers", load.gap_us / 1000, "ms", bench.KILL_GAP_MS if kill else inf),
-    ]
-    return _print_checks(checks, as_json)
+    return _print_checks(bench.stream_checks(load, plan), as_json)
 
 
 @contextmanager
