@@ -19,6 +19,7 @@ from sightline.evaluation.score.figures import (
     RimSpeeds,
     RunRecord,
     Score,
+    bounds_of,
     checks_of,
     score,
 )
@@ -52,7 +53,7 @@ class DemoReport:
         """Return True if every check passes, None if the scenario has no bounds to check."""
         if not all(check.ok for check in self.checks):
             return False
-        return True if self.run.scenario.bounds else None
+        return True if bounds_of(self.run.scenario, self.run.options.latency_ms) else None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of `--json` and score.json."""
@@ -166,7 +167,7 @@ def _checks(run: DemoRun, result: Score) -> list[Check]:
     """Return the checks of the scenario. The legacy protocol, slow and without odometry, only has to follow."""
     if run.options.transport != "legacy":
         return checks_of(run.scenario, result, run.options.latency_ms, REAL_TIME_FACTOR)
-    if not run.scenario.bounds:
+    if not bounds_of(run.scenario, run.options.latency_ms):
         return []
     unseen = 100 * sum(not sample.visible for sample in run.samples) / len(run.samples)
     return [
@@ -179,7 +180,7 @@ def summary(judged: DemoReport) -> list[str]:
     """Format the closing lines: the score with its bounds, the files, and the next commands."""
     run, replayed = judged.run, judged.replayed
     lines = check_lines(judged.checks)
-    if not run.scenario.bounds:
+    if not bounds_of(run.scenario, run.options.latency_ms):
         lines.append(NOT_EVALUATED)
     lines.append(_replay_line(replayed))
     if run.dropped_by_recorder:

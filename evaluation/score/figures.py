@@ -9,6 +9,7 @@ from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
 from sightline.evaluation.checks import Check
+from sightline.robot_side.safety.limits import SafetyConfig
 from sightline.sim.scenario import AT_LEAST, FIGURES, OnPath, Scenario
 from sightline.sim.truth import Truth
 
@@ -329,12 +330,12 @@ def _is_new(t_us: int, changes: Sequence[int]) -> bool:
 
 
 # A score against the bounds of its scenario. Pure.
-#
-# The bounds apply to 0 to 200 ms added latency and 10 % loss on each leg.
 
 
-NOT_EVALUATED = "not evaluated: the scenario has no [bounds]"
-STANDS_STILL_FROM_MS = 350
+NOT_EVALUATED = "not evaluated: the scenario has no [bounds] for this latency"
+BOUNDS_UP_TO_MS = 200
+"""Added latency up to which the bounds of a scenario apply, with 10 % loss on each leg. Above it the robot is slow."""
+STANDS_STILL_FROM_MS = SafetyConfig().zero_speed_age_ms
 """Added latency from which every frame is too old. The robot must stand still, and the score checks it."""
 _STANDS_STILL = {"commanded_m": 0.05, "wall_contacts": 0.0}
 """Then the wheel commands are checked. A target that pushes a standing robot is not its doing."""
@@ -344,9 +345,9 @@ EXACT = tuple(name for name, figure in FIGURES.items() if figure.is_exact)
 
 def bounds_of(scenario: Scenario, latency_ms: float = 0.0) -> Mapping[str, float]:
     """Return the bounds of `scenario` with that latency; none if it is not evaluated."""
-    if not scenario.bounds:
-        return {}
-    return _STANDS_STILL if latency_ms >= STANDS_STILL_FROM_MS else scenario.bounds
+    if latency_ms <= BOUNDS_UP_TO_MS:
+        return scenario.bounds
+    return _STANDS_STILL if scenario.bounds and latency_ms >= STANDS_STILL_FROM_MS else {}
 
 
 def checks_of(scenario: Scenario, result: Score, latency_ms: float = 0.0, factor: float = 1.0) -> list[Check]:

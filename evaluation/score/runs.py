@@ -15,9 +15,9 @@ from sightline.evaluation.processes import worker_pool
 from sightline.evaluation.scenario_config import robot_of, vision_config
 from sightline.evaluation.score.figures import (
     NOT_EVALUATED,
-    STANDS_STILL_FROM_MS,
     Score,
     broken,
+    bounds_of,
     checks_of,
     median_and_worst,
     score,
@@ -164,8 +164,8 @@ def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCa
         for line in results[case][1]:
             news.setdefault(case.group, []).append(line)
     told = {group: list(dict.fromkeys(lines))[:MOST_NOTICES] for group, lines in news.items()}
-    unbounded = {name for name in {case.scenario for case in wanted} if not load_scenario(name).bounds}
-    unevaluated = list(dict.fromkeys(case.group for case in wanted if case.scenario in unbounded))
+    groups = {case.group: case for case in wanted}
+    unevaluated = [name for name, case in groups.items() if not bounds_of(load_scenario(case.scenario), case.latency_ms)]
     return ScoreReport(runs, scored_figures(runs), unevaluated, told)
 
 
@@ -237,7 +237,7 @@ class SabotagedPair:
     @property
     def ok(self) -> bool | None:
         """Return True if the score noticed the sabotage in each run, or nothing changed; None without bounds."""
-        if not load_scenario(self.scenario).bounds:
+        if not bounds_of(load_scenario(self.scenario), self.runs[0].case.latency_ms):
             return None
         return self.failed == len(self.runs) or self.is_unchanged
 
@@ -296,10 +296,10 @@ def run_sabotaged(case: ScoreCase) -> SabotagedRun:
     """Run until a bound is broken for good, or to the end. Compare a run that broke none with the healthy run."""
     scenario = load_scenario(case.scenario)
     seconds = case.seconds or scenario.seconds
-    is_still = case.latency_ms >= STANDS_STILL_FROM_MS  # then other bounds apply, to the end of the run
+    is_own = bounds_of(scenario, case.latency_ms) == scenario.bounds  # others apply to the end of the run
 
     def is_over(run: Run) -> bool:
-        return not is_still and bool(broken(scenario, score(scenario, run), seconds))
+        return is_own and bool(broken(scenario, score(scenario, run), seconds))
 
     _, run = run_of(case, is_over)
     checks = checks_of(scenario, score(scenario, run), case.latency_ms)

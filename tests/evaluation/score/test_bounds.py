@@ -506,14 +506,14 @@ def test_factor_raises_other_bounds_and_leaves_exact_ones():
 
 def test_scenario_without_bounds_has_no_checks():
     assert checks_of(scenario_of(), result_of()) == checks_of(scenario_of(), result_of(), 400) == []
-    assert NOT_EVALUATED == "not evaluated: the scenario has no [bounds]"
+    assert NOT_EVALUATED == "not evaluated: the scenario has no [bounds] for this latency"
 
 
 @pytest.mark.parametrize(("latency_ms", "names"), [
-    (0, {"acquired_s"}), (349.9, {"acquired_s"}), (350, {"commanded_m", "wall_contacts"}),
+    (0, {"acquired_s"}), (200, {"acquired_s"}), (200.1, set()), (360, set()), (399.9, set()),
     (400, {"commanded_m", "wall_contacts"}),
 ])  # fmt: skip
-def test_robot_must_stand_still_from_350_ms_of_added_latency(latency_ms, names):
+def test_robot_must_stand_still_from_the_age_at_which_its_limit_is_zero(latency_ms, names):
     scenario = scenario_of({"acquired_s": 1.5})
     assert {check.name for check in checks_of(scenario, result_of(), latency_ms)} == names
     assert set(bounds_of(scenario, latency_ms)) == names
