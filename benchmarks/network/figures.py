@@ -172,6 +172,21 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else 0.0
 
 
+_CAUSES: Final = {
+    "delayed": ("delay_ms", "jitter_ms", "rate_bit_s"), "lost": ("loss", "burst_start"), "cut": ("cut",),
+    "duplicated": ("duplicate",), "reordered": ("reorder",), "corrupted": ("corrupt",),
+}
+"""Counters of the wire, and the fields of a `LinkShape` that let them grow."""
+
+
+def injected_checks(row: NetworkCase, counts: Mapping[str, int]) -> Iterator[Check]:
+    """Check that each effect that the shapes of a row request harmed packets."""
+    legs = [leg for phase in row.phases for leg in (phase.shapes.ab, phase.shapes.ba)]
+    for kind, causes in _CAUSES.items():
+        if any(getattr(leg, cause) for leg in legs for cause in causes):
+            yield at_least(f"packets {kind}", float(counts.get(kind, 0)), "", 1.0)
+
+
 def network_checks(row: NetworkCase, figures: Sequence[NetworkFigures]) -> Iterator[Check]:
     """Hold the last phase of a row against its bounds; `figures` are those of all its phases."""
     last, first = figures[-1], figures[0]

@@ -20,6 +20,7 @@ from sightline.benchmarks.network.cases import NetworkCase, spans_s
 from sightline.benchmarks.network.figures import (
     Stretch,
     figures_of,
+    injected_checks,
     network_checks,
     on_old_sight,
 )
@@ -35,7 +36,7 @@ from sightline.benchmarks.network.stage import (
     start_robot,
     start_vision,
 )
-from sightline.evaluation.checks import Check, at_least, at_most
+from sightline.evaluation.checks import Check, at_most
 from sightline.evaluation.processes import Processes, terminated_like_interrupted
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError
@@ -109,7 +110,7 @@ def _course(row: NetworkCase, stage: Stage) -> NetworkRun:
     """One robot and one vision, the wire shaped phase by phase."""
     with stage.wire() as wire, stage.processes("processes") as processes:
         # From the first packet on: what TCP learned of a better wire would be what is measured.
-        before = wire.shape(stage.seeded(row.phases[0].shapes))
+        before, counts_before = wire.shape(stage.seeded(row.phases[0].shapes)), wire.counts
         _start(row, wire, processes, stage)
         stretches = []
         for phase, seconds in zip(row.phases, spans_s(row, stage.setting.seconds), strict=True):
@@ -120,14 +121,14 @@ def _course(row: NetworkCase, stage: Stage) -> NetworkRun:
             stretches.append(Stretch(begin_us, begin_us + round(settle_s * 1e6), monotonic_us()))
             processes.check()
         injected = wire.shape(LinkShapes()) - before
+        counts = wire.counts - counts_before
         processes.end()
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     rows = read_wheel_commands(stage.wheels.read_text("ascii"))
     figures = tuple(figures_of(notes, rows, stretch) for stretch in stretches)
-    harmed = at_least("injected", float(injected), "", 1.0)
-    return NetworkRun(
-        row, stage.seed, injected, figures, (harmed, *network_checks(row, figures), *_wheel_checks(rows, notes))
-    )
+    checks = (*injected_checks(row, counts), *network_checks(row, figures), *_wheel_checks(rows, notes))
+    lost = {"lost_percent": 100 * counts["lost"] / max(1, counts["taken"])} if row.draws else {}
+    return NetworkRun(row, stage.seed, injected, figures, checks, lost)
 
 
 def _wheel_checks(rows: Sequence[WheelCommand], notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[Check]:

@@ -1,6 +1,7 @@
 """Provide the rows of `bench network` with a setting, a folder, robots and vision services. Shell (files)."""
 
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -30,6 +31,7 @@ class ShapedWire(Protocol):
     robot_side: str
     far_side: str
     carried_bytes: dict[str, int]
+    counts: Counter[str]
 
     def shape(self, shapes: LinkShapes) -> int:
         """Put `shapes` in force; returns how many packets were harmed so far."""

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
@@ -83,6 +84,8 @@ class BenchWire:
         self._process: subprocess.Popen[str] | None = None
         self.carried_bytes = {"ab": 0, "ba": 0}
         """What came out at the far end of each direction, up to the last `shape`."""
+        self.counts: Counter[str] = Counter()
+        """The counters of both directions together, up to the last `shape`."""
 
     def __enter__(self) -> Self:
         with self._ending:
@@ -111,7 +114,8 @@ class BenchWire:
         stdin.flush()
         counts = json.loads(_file(self._process.stdout).readline())
         self.carried_bytes = {leg: count["delivered_bytes"] for leg, count in counts.items()}
-        return sum(count for leg in counts.values() for name, count in leg.items() if name not in _PLAIN)
+        self.counts = sum(map(Counter, counts.values()), Counter())
+        return sum(count for name, count in self.counts.items() if name not in _PLAIN)
 
     @staticmethod
     def _end(process: subprocess.Popen[str]) -> None:

@@ -11,6 +11,7 @@ from sightline.benchmarks.network.cases import CASES, NetworkCase, chosen, spans
 from sightline.benchmarks.network.figures import (
     Stretch,
     figures_of,
+    injected_checks,
     network_checks,
     sent_between,
     worst_of_seeds,
@@ -51,6 +52,16 @@ def test_every_row_harms_packets_and_demands_something():
         assert any(leg != LinkShape() for phase in row.phases for leg in (phase.shapes.ab, phase.shapes.ba)), row.name
         demanded = (row.least_fps, row.p50_ms, row.p95_ms, row.over_first_ms, row.flows_again_s)
         assert row.scene or any(bound is not None for bound in demanded), row.name
+
+
+@pytest.mark.parametrize(("name", "kinds"), [
+    ("cut", {"delayed", "cut"}), ("radio", {"delayed", "lost"}), ("bursts", {"delayed", "lost"}), ("thin", {"delayed"}),
+])
+def test_every_effect_that_a_row_requests_must_have_harmed_packets(name, kinds):
+    row = next(one for one in CASES if one.name == name)
+    assert [check.ok for check in injected_checks(row, dict.fromkeys(kinds, 1))] == [True] * len(kinds)
+    only_delayed = [check.name for check in injected_checks(row, {"delayed": 1000}) if not check.ok]
+    assert only_delayed == [f"packets {kind}" for kind in ("lost", "cut") if kind in kinds]
 
 
 def test_every_scene_that_a_row_names_is_there():
@@ -196,5 +207,5 @@ def test_short_network_row_runs_with_real_processes():
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     told = json.loads(done.stdout)
     names = [check["name"] for check in told["checks"]]
-    assert "near: injected" in names and told["rows"][0]["injected"] > 100
+    assert "near: packets delayed" in names and told["rows"][0]["injected"] > 100
     assert done.returncode == (0 if told["ok"] else 5), done.stderr

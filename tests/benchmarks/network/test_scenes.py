@@ -8,7 +8,14 @@ import pytest
 
 from sightline.benchmarks.loop.figures import read_wheel_commands
 from sightline.benchmarks.network.figures import moves_again_s, on_old_sight
-from sightline.benchmarks.network.scenes import ROBOTS, fleet_checks, reached_ms, reported_check, stop_checks_of
+from sightline.benchmarks.network.scenes import (
+    ROBOTS,
+    again_checks,
+    fleet_checks,
+    reached_ms,
+    reported_check,
+    stop_checks_of,
+)
 from sightline.evaluation.faults.evidence import MotorRow
 from sightline.sim.tun_emulator import why_impossible
 
@@ -40,6 +47,13 @@ def test_wheels_that_stay_still_do_not_move_again():
     assert moves_again_s(rows, 2 * SECOND_US, 60 * SECOND_US) is None
     assert moves_again_s(told((3, 2), (0, 1), (3, 1)), 1_900_000, 2_500_000) is None, "not by then"
     assert moves_again_s([], 0, 1) is None
+
+
+@pytest.mark.parametrize(("stands", "ok"), [(True, False), (False, True)])
+def test_harm_that_must_stop_the_wheels_did_not_happen_without_a_standstill(stands, ok):
+    never_stood_s = moves_again_s(told((3, 5)), 3 * SECOND_US, 60 * SECOND_US)
+    injected, again = again_checks([1.2, never_stood_s], 3.0, stands=stands)
+    assert injected.ok is ok and again.ok
 
 
 ANSWERS = [(at_us, at_us - 50_000) for at_us in range(0, SECOND_US, 50_000)]
