@@ -11,7 +11,7 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
 from sightline.protocol.text import format_twist, parse_twist
 from sightline.robot_side.safety.gate import SafetyGate
-from sightline.robot_side.safety.limits import SafetyConfig
+from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
 
 CODEC_BOUND_US: Final = 10.0
 _ROUNDS: Final = 200
@@ -66,7 +66,6 @@ def _median_us(call: Callable[[], None]) -> float:
 
 GATE_BOUND_US: Final = 20.0
 _SESSION: Final = "0000aaaa"
-_TICK_US: Final = 20_000
 
 
 def measure_gate(commands: int = 5_000) -> float:
@@ -74,7 +73,7 @@ def measure_gate(commands: int = 5_000) -> float:
     gate, took_us = SafetyGate(SafetyConfig(auto_arm=True), _SESSION), []
     twist = Twist(linear_mps=0.3, angular_rad_s=0.2)
     for number in range(commands):
-        now_us = (number + 1) * _TICK_US
+        now_us = (number + 1) * TICK_US
         gate.issued.add("frame", number, now_us - 5_000)
         echo = Echo(channel="frame", session=_SESSION, seq=number, t_us=now_us - 5_000)
         header = AnswerHeader(source="vision", session="0000bbbb", seq=number, echo=echo)

@@ -42,16 +42,7 @@ def taken_percent(before: Reading, after: Reading, seconds: float) -> float:
 
 def high_water_mb(pid: int) -> float:
     """Return the most memory that the process used so far, in MB of 2**20 bytes."""
-    return _status_mb(pid, "VmHWM")
-
-
-def resident_mb(pid: int) -> float:
-    """Return the memory that the process uses now, in MB of 2**20 bytes."""
-    return _status_mb(pid, "VmRSS")
-
-
-def _status_mb(pid: int, name: str) -> float:
-    return _field_kib(Path(f"/proc/{pid}/status").read_text().splitlines(), name) / 1024
+    return _field_kib(Path(f"/proc/{pid}/status").read_text().splitlines(), "VmHWM") / 1024
 
 
 def _field_kib(lines: Iterable[str], name: str) -> int:

@@ -7,8 +7,6 @@ from typing import Final
 from sightline.protocol.errors import ConfigError
 from sightline.sim.network_emulator import LinkShape, LinkShapes
 
-HOLD_AGE_MS: Final = 400.0
-"""A frame older than this is not driven on; the robot's default `safety.zero_speed_age_ms`."""
 CUT_S: Final = 5.0
 NOTHING_S: Final = 1.0
 STEP_SETTLES_S: Final = 2.0
@@ -25,7 +23,6 @@ class NetworkPhase:
     seconds: float | None = None
     settle_s: float = 0.0
     """How long after its beginning its bounds hold."""
-    judged: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +73,7 @@ _SITE: Final = (ZENOH,)
 CASES: Final = (
     NetworkCase("rtt40", "40 ms round trip", _steady(delay_ms=20), least_fps=28, p50_ms=40 + 15),
     NetworkCase(
-        "near", "no loss, 1 ms each way", (NetworkPhase(both(), judged=False), NetworkPhase(_NEAR)), over_first_ms=2 + 1
+        "near", "no loss, 1 ms each way", (NetworkPhase(both()), NetworkPhase(_NEAR)), over_first_ms=2 + 1
     ),
     NetworkCase(
         "radio",
@@ -106,7 +103,7 @@ CASES: Final = (
         "step",
         "10 Mbit/s, then 1 Mbit/s",
         (
-            NetworkPhase(both(delay_ms=5, rate_bit_s=1e7), judged=False),
+            NetworkPhase(both(delay_ms=5, rate_bit_s=1e7)),
             NetworkPhase(both(delay_ms=5, rate_bit_s=1e6), settle_s=STEP_SETTLES_S),
         ),
         p95_ms=250,
@@ -115,7 +112,7 @@ CASES: Final = (
         "rise",
         "1 Mbit/s, then 10 Mbit/s",
         (
-            NetworkPhase(both(delay_ms=5, rate_bit_s=1e6), judged=False),
+            NetworkPhase(both(delay_ms=5, rate_bit_s=1e6)),
             NetworkPhase(both(delay_ms=5, rate_bit_s=1e7), settle_s=STEP_SETTLES_S),
         ),
         least_fps=12,
@@ -126,8 +123,8 @@ CASES: Final = (
         "cut",
         "a partition of 5 s",
         (
-            NetworkPhase(_NEAR, judged=False),
-            NetworkPhase(both(cut=True), CUT_S, judged=False),
+            NetworkPhase(_NEAR),
+            NetworkPhase(both(cut=True), CUT_S),
             NetworkPhase(_NEAR, settle_s=HEALS_S),
         ),
         flows_again_s=HEALS_S,
@@ -136,8 +133,8 @@ CASES: Final = (
         "nothing",
         "20 Mbit/s, 10 ms round trip, a second of nothing",
         (
-            NetworkPhase(both(delay_ms=5, rate_bit_s=2e7), judged=False),
-            NetworkPhase(both(cut=True), NOTHING_S, judged=False),
+            NetworkPhase(both(delay_ms=5, rate_bit_s=2e7)),
+            NetworkPhase(both(cut=True), NOTHING_S),
             NetworkPhase(both(delay_ms=5, rate_bit_s=2e7), settle_s=HEALS_S),
         ),
         flows_again_s=HEALS_S,

@@ -6,15 +6,16 @@ from itertools import pairwise
 from typing import Any, Final
 
 from sightline.benchmarks.loop.figures import WheelCommand, percentile, wheel_ages
-from sightline.benchmarks.network.cases import HOLD_AGE_MS, NetworkCase
+from sightline.benchmarks.network.cases import NetworkCase
 from sightline.benchmarks.network.watch import NOTED
 from sightline.evaluation.checks import Check, at_least, at_most, worst_checks
-from sightline.robot_side.safety.limits import TICK_US, SafetyConfig, stop_bound
+from sightline.evaluation.faults.evidence import OLD_US, RAMPED_US
+from sightline.robot_side.safety.limits import TICK_US
 
 _LATE_US: Final = 2 * TICK_US
 """A decision holds for one tick. The recorder of a twist may receive it slightly after the robot."""
-_OLD_US: Final = SafetyConfig().zero_speed_age_ms * 1000 + _LATE_US
-_RAMPED_OUT_US: Final = (stop_bound(SafetyConfig()).ramped_us + 2 * _LATE_US) // TICK_US * TICK_US
+_OLD_US: Final = OLD_US + _LATE_US
+_RAMPED_OUT_US: Final = (RAMPED_US + 2 * _LATE_US) // TICK_US * TICK_US
 """Age of a frame, in whole ticks, at which even the ramp that it left behind is at its end; its answer and the zero may
 both be late."""
 _FASTER_RAD_S: Final = 0.15
@@ -68,8 +69,6 @@ def _stands(rows: Sequence[WheelCommand]) -> Iterator[tuple[int, int]]:
 
 
 DRIVING: Final = ("ACTIVE", "DEGRADED")
-_GAP_US: Final = 300_000
-"""Statuses come ten times a second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +204,7 @@ def network_checks(row: NetworkCase, figures: Sequence[NetworkFigures]) -> Itera
         yield at_most("longest hold", max(last.holds_s, default=0.0), "s", row.longest_hold_s)
     if row.flows_again_s is not None:
         yield at_most("flows again", last.flows_after_s, "s", row.flows_again_s)
-    yield at_most("oldest executed", max(one.executed_ms for one in figures), "ms", HOLD_AGE_MS)
+    yield at_most("oldest executed", max(one.executed_ms for one in figures), "ms", OLD_US / 1000)
 
 
 def worst_of_seeds(name: str, runs: Sequence[Sequence[Check]]) -> list[Check]:

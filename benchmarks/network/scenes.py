@@ -27,7 +27,14 @@ from sightline.benchmarks.network.stage import (
 )
 from sightline.benchmarks.network.stop_client import RESET, STOPPED
 from sightline.evaluation.checks import Check, at_least, at_most
-from sightline.evaluation.faults.evidence import REQUESTED, MotorRow, measure_stop, moved_on_old_sight, wheel_mps
+from sightline.evaluation.faults.evidence import (
+    REQUESTED,
+    ZERO_MS,
+    MotorRow,
+    measure_stop,
+    moved_on_old_sight,
+    wheel_mps,
+)
 from sightline.evaluation.faults.fixture import ROBOT, RobotFixture, Setup
 from sightline.evaluation.processes import Processes
 from sightline.protocol.clock import monotonic_us
@@ -309,8 +316,6 @@ def fleet_checks(
 REACHES_MS: Final = 300.0
 REPORTED_MS: Final = REACHES_MS + 100.0
 """By the robot's own status, ten times a second: as frames age, wheels slow down by themselves, before any STOP."""
-ZERO_MS: Final = 700.0
-"""Reached, and then the ramp from 0.5 m/s: as the fault bench demands of every STOP."""
 _BESIDE_S: Final = 60.0
 
 

@@ -13,12 +13,15 @@ from typing import Final
 from sightline.evaluation.checks import Check, at_most
 from sightline.protocol.clock import monotonic_us
 from sightline.robot_side.kinematics import DiffDriveConfig
-from sightline.robot_side.safety.limits import TICK_US, SafetyConfig, stop_bound
+from sightline.robot_side.safety.limits import TICK_US
 
 FALLS_MS: Final = 340.0
 ZERO_MS: Final = 700.0
 DISTANCE_M: Final = 0.25
-OLD_US: Final = SafetyConfig().zero_speed_age_ms * 1000
+OLD_US: Final = 400_000
+"""The promise: no motion on an older frame. A literal, so that a changed default of the robot fails the rows."""
+RAMPED_US: Final = 506_000
+"""The promised age of a frame at which the ramp that it left behind is at its end. A literal, too."""
 MEMORY_MB: Final = 5.0
 _LEAVES_MAXIMUM: Final = 0.99
 """Speed counts as falling from where it leaves 99 % of its maximum for good."""
@@ -27,8 +30,7 @@ _FASTER_MPS: Final = 0.005
 _AT_REST_MPS: Final = 0.01
 """A wheel is at zero when its motor is set to zero and its rim moves slower than this: 2 % of top speed, as in the
 bound that the robot computes."""
-_RAMPED_OUT_US: Final = stop_bound(SafetyConfig()).ramped_us + 2 * TICK_US
-"""Age of a frame at which even the ramp that it left behind is at its end, by the robot's own limits."""
+_RAMPED_OUT_US: Final = RAMPED_US + 2 * TICK_US
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,8 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -65,6 +65,18 @@ def raise_priority(pid: int) -> bool:
     except OSError:
         return False
     return True
+
+
+@contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Run processes that want all the processor they can get."""
+    busy = [subprocess.Popen([sys.executable, "-P", "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
 
 
 # The bench's end of `sim/tun_emulator.py`: two namespaces and the wire between them, shaped while it runs. Shell.

@@ -11,7 +11,7 @@ from typing import Final
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.devices import MODE
 from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, ZERO_MS, measure_stop, wheel_mps
-from sightline.evaluation.faults.fixture import KEPT_MPS, ROBOT, STOP_ENDS_S, RobotFixture, Setup
+from sightline.evaluation.faults.fixture import KEPT_MPS, ROBOT, STOP_ENDS_S, RobotFixture, Setup, busy_processes
 from sightline.evaluation.faults.load_clients import FEW_HZ, HALF_OPEN, MANY_HZ, READY, SESSIONS, STOPS
 from sightline.evaluation.faults.peer import LEGACY_LIBRARIES
 from sightline.evaluation.faults.runner import FaultCase, Injected
@@ -115,14 +115,9 @@ BUSY: Final = 8
 def _busy(rig: RobotFixture) -> Injected:
     """Send STOP while more processes than processors want all of them."""
     rig.prepare_operator()
-    busy = [subprocess.Popen([sys.executable, "-P", "-c", "while True: pass"]) for _ in range(BUSY)]
-    try:
+    with busy_processes(BUSY):
         rig.watch(AT_WORK_S)
         at_us, checks = rig.stop_by_operator(moving=True)
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
     return Injected(BUSY, at_us, checks=checks)
 
 

@@ -18,6 +18,8 @@ from sightline.evaluation.faults.cases import CASES, chosen
 from sightline.evaluation.faults.evidence import (
     GOOD,
     INJECTED,
+    OLD_US,
+    RAMPED_US,
     Blind,
     EventLog,
     MotorRow,
@@ -40,6 +42,7 @@ from sightline.protocol.errors import ConfigError, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.text import parse_twist
 from sightline.robot_side.kinematics import DiffDriveConfig
+from sightline.robot_side.safety.limits import SafetyConfig, stop_bound
 
 RADIUS_M = DiffDriveConfig().wheel_radius_m
 TICK_US = 20_000
@@ -116,6 +119,10 @@ def test_a_log_is_read_without_its_unfinished_line():
 
 
 # --- old frames --------------------------------------------------------------------------------------------------
+
+
+def test_promised_ages_are_those_of_the_robot():
+    assert SafetyConfig().zero_speed_age_ms * 1000 == OLD_US and stop_bound(SafetyConfig()).ramped_us == RAMPED_US
 
 
 def test_driving_on_young_frames_is_not_counted():
