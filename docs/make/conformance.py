@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -78,12 +79,17 @@ def started(*arguments: str, prints: str = "") -> Iterator[None]:
 
 
 def conform(name: str, *arguments: str) -> None:
-    """Run the kit once and store its result."""
+    """Run the kit once and store its result with the date. Raises RuntimeError if the kit left none."""
     KEPT.mkdir(parents=True, exist_ok=True)
     side, *rest = arguments
-    options = ["--save", str(file_of(name)), "--name", name]
+    file = file_of(name)
+    file.unlink(missing_ok=True)  # or the page would show an earlier run as this one
     print(f"--- {name}", flush=True)
-    subprocess.run([*SIGHTLINE, "conform", side, *options, *rest], stdout=subprocess.DEVNULL, check=False)
+    done = subprocess.run([*SIGHTLINE, "conform", side, "--save", str(file), "--name", name, *rest],
+                          stdout=subprocess.DEVNULL, check=False)
+    if not file.exists():
+        raise RuntimeError(f"{name}: the kit ended with {done.returncode} and without a result")
+    file.write_text(json.dumps({**json.loads(file.read_text()), "measured": f"{datetime.now(UTC):%Y-%m-%d}"}))
 
 
 def file_of(name: str) -> Path:
@@ -188,11 +194,13 @@ RUNS: dict[str, Callable[[str], None]] = {
 def to_page(runs: Sequence[Mapping[str, Any]]) -> str:
     """The Markdown page of several runs (their JSON): peers, what did not pass at once, every case of each side."""
     lines = ["# Conformance", "", PREFACE, ""]
-    lines += ["| peer | side | conforms | passed | failed | SHOULD failed | not applicable | cases |", "|" + "---|" * 8]
+    lines += ["| peer | side | conforms | passed | failed | SHOULD failed | not applicable | cases | measured |",
+              "|" + "---|" * 9]
     for run in runs:
         found = run["counts"]
         figures = (found.get(name, 0) for name in ("passed", "failed", "SHOULD failed", "not applicable"))
-        row = [run["peer"], run["side"], "yes" if run["ok"] else "no", *figures, len(run["checks"])]
+        row = [run["peer"], run["side"], "yes" if run["ok"] else "no", *figures, len(run["checks"]),
+               run.get("measured", "")]
         lines.append("| " + " | ".join(str(cell) for cell in row) + " |")
     lines += ["", UNSEEN]
     for run in runs:
