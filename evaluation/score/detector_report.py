@@ -271,7 +271,8 @@ def _percent(share: float) -> float:
 # The table of `sightline score detectors`, as text and as Markdown. Pure.
 
 
-_HEAD = ("column", "detector", "hits", "missed", "wrong object", "false alarms", "center p50 / p95 px", "ms p50")
+_HEAD = ("column", "detector", "hits", "missed", "wrong object", "false alarms", "nowhere", "center p50 / p95 px",
+         "ms p50")
 _MOST_LABELS = 3
 
 
@@ -281,7 +282,8 @@ def rows(report: DetectorReport) -> list[tuple[str, ...]]:
 
 
 def _cells(one: DetectorFigures) -> tuple[str, ...]:
-    shares = [f"{100 * share:.1f} %" for share in (one.hits, one.missed, one.wrong_object, one.false_alarms)]
+    counted = one.hits, one.missed, one.wrong_object, one.false_alarms, one.nowhere
+    shares = [f"{100 * share:.1f} %" for share in counted]
     centre = "-" if one.centre_p50_px is None else f"{one.centre_p50_px:.2f} / {one.centre_p95_px:.2f}"
     time = "-" if one.compute_p50_us is None else f"{one.compute_p50_us / 1000:.2f}"
     return (*shares, centre, time)

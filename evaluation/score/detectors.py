@@ -100,6 +100,8 @@ class DetectorFigures:
     """Of hits on balls that are wholly in view."""
     centre_p95_px: float | None
     compute_p50_us: float | None
+    nowhere: float
+    """Of the frames with a ball: those whose answer is neither on it nor on another object."""
 
 
 def figures(frames: Sequence[FrameResult]) -> DetectorFigures:
@@ -112,7 +114,7 @@ def figures(frames: Sequence[FrameResult]) -> DetectorFigures:
         len(frames), len(balls), _share(one.verdict == "hit" for one in balls),
         _share(one.verdict == "none" for one in balls), _share(one.verdict == "wrong object" for one in frames),
         _share(one.verdict != "none" for one in empty), _quantile(off, 0.5), _quantile(off, 0.95),
-        _quantile(times, 0.5),
+        _quantile(times, 0.5), _share(one.verdict == "nowhere" for one in balls),
     )
 
 

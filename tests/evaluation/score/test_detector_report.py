@@ -33,7 +33,7 @@ from sightline.sim.scenes.model import COLUMNS
 from sightline.vision_side.detect.port import Detection, Maker, result_of
 from tests.fixtures.vision.remote import frame
 
-GOOD = DetectorFigures(500, 400, 0.85, 0.1, 0.05, 0.05, 1.0, 3.0, 900.0)
+GOOD = DetectorFigures(500, 400, 0.85, 0.1, 0.05, 0.05, 1.0, 3.0, 900.0, 0.0)
 EVERY = dict.fromkeys(LABELLED, (300, 0.8))
 
 

@@ -11,7 +11,7 @@ from tests.fixtures import demanded
 demanded.module("pybullet", "sim")
 
 
-from sightline.evaluation.score.detector_report import markdown, score_scenes, subjects, text
+from sightline.evaluation.score.detector_report import DetectorReport, markdown, score_scenes, subjects, text
 from sightline.evaluation.score.detectors import FrameResult, LabelMatches, figures, frame_result, precisions
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import evaluate as cli_score_detectors
@@ -88,6 +88,14 @@ def test_figures_count_each_frame_where_it_belongs():
     assert (one.wrong_object, one.false_alarms) == (0.25, 0.5)
     assert (one.centre_p50_px, one.centre_p95_px, one.compute_p50_us) == (3.0, 3.0, 1100.0)
     assert figures([]).hits == 0.0
+
+
+def test_answer_on_nothing_while_a_ball_is_in_view_is_shown():
+    one = figures([FrameResult(True, "nowhere", 0.5), *[FrameResult(True, "hit", 0.9)] * 3, FrameResult(False, "nowhere")])
+    assert one.nowhere == 0.25
+    shown = DetectorReport(0, 5, {"nominal": {"hsv": one}}, {"hsv": {}}, {}, {}, {})
+    head, cells = (line.split("|")[1:-1] for line in markdown(shown).splitlines()[::2][:2])
+    assert cells[[cell.strip() for cell in head].index("nowhere")].strip() == "25.0 %"
 
 
 def test_average_precision_knows_the_simple_cases():
