@@ -7,6 +7,7 @@
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -26,7 +27,8 @@ from sightline.protocol.errors import ConfigError
 class Section:
     """One command of the page and why it is there; `name` is its argument of this script.
 
-    With a `picture` the command gets `--out`, and its loop.png is shown under that name.
+    With a `picture` the command gets `--out`, and its loop.png is shown under that name. `since` is the date of the last
+    change of its figures or bounds; the page marks an earlier measurement.
     """
 
     name: str
@@ -34,6 +36,7 @@ class Section:
     why: str
     arguments: tuple[str, ...]
     picture: str = ""
+    since: str = ""
 
 
 _SEEDS: Final = "201,202,203,204,205,206"
@@ -68,6 +71,7 @@ SECTIONS: Final = (
         "above. The recorded frames of each run, replayed through a fresh pipeline, must give the twists that were "
         "on the wire.",
         ("bench", "demo", "--scenario", _BALLS, "--seeds", _SEEDS, "--seconds", "12"),
+        since="2026-11-26",
     ),
     Section(
         "killed",
@@ -75,6 +79,7 @@ SECTIONS: Final = (
         "The vision service and the network process, killed with -9 while driving at 0.3 m/s or more, ten times "
         "each, scored from the log of the simulated motors. [Fault results](faults.md) has more faults.",
         ("faults", "--only", "vision.kill", "--only", "network.kill", "--only", "vision.restart", "--repeat", "10"),
+        since="2026-11-28",
     ),
     Section("gate", "Gate", "One command validated and one step decided.", ("bench", "gate")),
     Section("messages", "Messages", "Encode and decode, hot.", ("bench", "codec")),
@@ -97,6 +102,7 @@ SECTIONS: Final = (
         "the sources.",
         ("bench", "loop", "--seconds", "15"),
         "loop-zenoh.png",
+        since="2026-11-28",
     ),
     Section(
         "loop-websocket",
@@ -104,6 +110,7 @@ SECTIONS: Final = (
         "The same with `sightline.v1` between robot and vision.",
         ("bench", "loop", "--transport", "websocket", "--seconds", "15"),
         "loop-websocket.png",
+        since="2026-11-28",
     ),
     Section(
         "loop-slow",
@@ -112,6 +119,7 @@ SECTIONS: Final = (
         "stay flat.",
         ("bench", "loop", "--detector-delay-ms", "80", "--seconds", "60"),
         "loop-slow.png",
+        since="2026-11-28",
     ),
     Section(
         "loop-overload",
@@ -120,6 +128,7 @@ SECTIONS: Final = (
         "which the unchanged pipeline can process, so each detector repeats its own work instead.",
         ("bench", "loop", "--overload", "2", "--fps", "60", "--seconds", "60"),
         "loop-overload.png",
+        since="2026-11-28",
     ),
     Section(
         "watchers",
@@ -127,12 +136,14 @@ SECTIONS: Final = (
         "Ten viewers of the control stream itself, one that never reads and one that reads once a second, and what "
         "they cost the driver.",
         ("bench", "watchers", "--viewers", "10", "--seconds", "60"),
+        since="2026-11-28",
     ),
     Section(
         "watchers-websocket",
         "Viewers over WebSocket",
         "The same with `sightline.v1`.",
         ("bench", "watchers", "--transport", "websocket", "--viewers", "10", "--seconds", "60"),
+        since="2026-11-28",
     ),
     Section(
         "network",
@@ -141,12 +152,14 @@ SECTIONS: Final = (
         "loses and delays it. Ages count from capture to `drive.set`. Where packets are lost, five seeds "
         "run, and each bound applies to the worst.",
         _rows("radio", "bursts", "thin", "through", "step", "rise", extra=("--seeds", "1,2,3,4,5")),
+        since="2026-11-28",
     ),
     Section(
         "network-far",
         "Far and broken networks",
         "The same wire without loss: a round trip of 2, 40 and 200 ms, five seconds without a wire, and one.",
         _rows("near", "rtt40", "rtt200", "cut", "nothing", seconds=30),
+        since="2026-11-28",
     ),
     Section(
         "network-sites",
@@ -155,6 +168,7 @@ SECTIONS: Final = (
         "commands. In `fleet` one process plays the twenty robots, with sessions, headers and credit of their own: "
         "forty robot processes on two cores would measure themselves.",
         _rows("uplink", "standby", "router", "moved", "fleet"),
+        since="2026-11-28",
     ),
     Section(
         "network-stop",
@@ -169,6 +183,7 @@ SECTIONS: Final = (
         "The same networks over WebSocket",
         "With `sightline.v1` between robot and vision; rows with a router or a fleet need Zenoh.",
         ("bench", "network", "--transport", "websocket", "--seeds", "1,2,3,4,5", "--seconds", "60"),
+        since="2026-11-28",
     ),
 )
 
@@ -185,6 +200,8 @@ _HEAD: Final = (
     "# Performance\n\nWritten by `python -m docs.make.performance`, section by section. Each section states when and "
     "on which machine it was measured. Shared machines are noisy: read medians and ratios, not third digits."
 )
+_EARLIER: Final = "Measured with an earlier command, or with earlier figures and bounds."
+_MEASURED: Final = re.compile(r"^Measured (\d{4}-\d\d-\d\d)", re.MULTILINE)
 _PACKAGES: Final = ("eclipse-zenoh", "pydantic", "numpy", "opencv-python-headless", "simplejpeg", "onnxruntime",
                     "pybullet")
 
@@ -215,11 +232,30 @@ def write_report(path: Path, sections: Sequence[Section], say: Callable[[str], N
 
 def page_with(page: str, section: Section, text: str) -> str:
     """`page` with `text` as that section, all of them in the order of `SECTIONS`; sections of no name come last."""
+    return noted(f"{page}\n{text}")
+
+
+def noted(page: str) -> str:
+    """`page` in order, with what was never measured, and a note in each section of an earlier instrument.
+
+    The last section of a title counts.
+    """
     parts = {part.partition("\n")[0]: part.rstrip() for part in page.split(f"\n{_HEADING}")[1:]}
-    parts[section.title] = text.removeprefix(_HEADING).rstrip()
-    titles = [one.title for one in SECTIONS if one.title in parts]
+    known = {one.title: one for one in SECTIONS}
+    titles = [title for title in known if title in parts]
+    missing = [title for title in known if title not in parts]
+    head = [_HEAD, *([f"Not measured yet: {', '.join(missing)}."] if missing else [])]
     titles += [title for title in parts if title not in titles]
-    return "\n\n\n".join([_HEAD, *(_HEADING + parts[title] for title in titles)]) + "\n"
+    texts = [_HEADING + _marked(parts[title], known.get(title)) for title in titles]
+    return "\n\n\n".join(["\n\n".join(head), *texts]) + "\n"
+
+
+def _marked(text: str, section: Section | None) -> str:
+    """Add the note to a section whose command or instrument has changed since its date, or that no longer exists."""
+    text = text.replace(f"{_EARLIER}\n\n", "")
+    measured = _MEASURED.search(text)
+    is_new = section is not None and measured is not None and measured[1] >= section.since and _command(section) in text
+    return text if measured is None or is_new else text[:measured.start()] + f"{_EARLIER}\n\n" + text[measured.start():]
 
 
 def _measured(section: Section, pictures: Path) -> dict[str, Any]:
@@ -256,15 +292,18 @@ def processor() -> str:
     return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.machine())
 
 
+def _command(section: Section) -> str:
+    return f"`sightline {' '.join(section.arguments)}`"
+
+
 def _section(section: Section, result: dict[str, Any]) -> str:
     with_median = any("median" in check for check in result["checks"])
     head = "| figure | median | worst | bound | |" if with_median else "| figure | value | bound | |"
     rows = [_row(check, with_median) for check in result["checks"]]
     rule = "|---" * (head.count("|") - 1) + "|"
-    command = f"`sightline {' '.join(section.arguments)}`"
     shown = [f"![Age of the frames at the wheels](img/{section.picture})\n"] if section.picture else []
     race = [*_race(result["contestants"]), ""] if "contestants" in result else []
-    intro = [f"{_HEADING}{section.title}\n", f"{section.why}\n", f"{command}\n", f"Measured {_machine()}\n"]
+    intro = [f"{_HEADING}{section.title}\n", f"{section.why}\n", f"{_command(section)}\n", f"Measured {_machine()}\n"]
     return "\n".join([*intro, *race, *shown, head, rule, *rows])
 
 

@@ -1,12 +1,13 @@
 """The performance page: written section by section, the others left as they are; commands are not run here."""
 
 import json
+import re
 import subprocess
 
 import pytest
 
 from docs.make import performance as report
-from docs.make.performance import SECTIONS, page_with, sections_named, write_report
+from docs.make.performance import SECTIONS, noted, page_with, sections_named, write_report
 from sightline.operator_side.cli.commands import app
 from sightline.protocol.errors import ConfigError
 
@@ -73,6 +74,19 @@ def test_a_section_that_is_no_longer_known_is_kept_at_the_end():
     page = page_with("# Performance\n\nold\n\n## Once measured\n\nfigures\n", NAMED["gate"], "## Gate\n\nnew")
     assert page.index("## Gate") < page.index("## Once measured")
     assert page.endswith("figures\n")
+
+
+def test_section_of_an_earlier_instrument_is_marked_and_what_was_never_measured_is_listed(tmp_path, commands):
+    page = tmp_path / "performance.md"
+    write_report(page, sections_named(["gate", "loop"]), lambda _: None)
+    text = page.read_text()
+    assert report._EARLIER not in text and "Viewers, Viewers over WebSocket" in text.partition("\n## ")[0]
+    assert "Gate" not in text.partition("\n## ")[0]
+    old = re.sub("Measured 20..-..-..", "Measured 2026-11-22", text)
+    once = noted(old)
+    assert once.count(report._EARLIER) == 1 and once == noted(once)
+    assert once.index("## The whole loop") < once.index(report._EARLIER), "the gate is as it was"
+    assert noted(old.replace("`sightline bench gate`", "`sightline bench gates`")).count(report._EARLIER) == 2
 
 
 def test_a_race_shows_its_contestants_and_its_picture(tmp_path, commands):
