@@ -262,8 +262,9 @@ _PARTS: Final = 5
 @dataclass(frozen=True, slots=True)
 class LoopFigures:
     """One contestant. `answered_percent` is of the images that the camera offers, `accepted_percent` of the captured
-    ones. Sightline captures only with credit, most rivals capture each image. Times are from capture to the result, `validated_ms` (median) to the validation of the services;
-    `most_wait_ms` is the longest time between the two. None without an answer.
+    ones. Sightline captures only with credit, most rivals capture each image. Times are from capture to the result,
+    `validated_ms` (median) to the validation of the services; `most_wait_ms` is the longest time between the two. None
+    without an answer.
 
     `first_ms` and `last_ms` are medians of the first and the last ten seconds, or fifths of a shorter time; `cpu_ms` is
     per answered image and process, `memory_mb` the high-water mark, `bytes_per_picture` what went over the sockets,

@@ -27,8 +27,8 @@ from sightline.protocol.errors import ConfigError
 class Section:
     """One command of the page and why it is there; `name` is its argument of this script.
 
-    With a `picture` the command gets `--out`, and its loop.png is shown under that name. `since` is the date of the last
-    change of its figures or bounds; the page marks an earlier measurement.
+    With a `picture` the command gets `--out`, and its loop.png is shown under that name. `since` is the date of the
+    last change of its figures or bounds; the page marks an earlier measurement.
     """
 
     name: str
@@ -226,19 +226,14 @@ def write_report(path: Path, sections: Sequence[Section], say: Callable[[str], N
         result = _measured(section, path.parent / "img")
         ok &= bool(result["ok"])
         written = path.read_text("utf-8") if path.exists() else ""
-        path.write_text(page_with(written, section, _section(section, result)), "utf-8")
+        path.write_text(noted(f"{written}\n{_section(section, result)}"), "utf-8")
     return ok
 
 
-def page_with(page: str, section: Section, text: str) -> str:
-    """`page` with `text` as that section, all of them in the order of `SECTIONS`; sections of no name come last."""
-    return noted(f"{page}\n{text}")
-
-
 def noted(page: str) -> str:
-    """`page` in order, with what was never measured, and a note in each section of an earlier instrument.
+    """`page` in the order of `SECTIONS`, unknown sections last, with what was never measured and what is outdated.
 
-    The last section of a title counts.
+    Of two sections with one title the last one counts.
     """
     parts = {part.partition("\n")[0]: part.rstrip() for part in page.split(f"\n{_HEADING}")[1:]}
     known = {one.title: one for one in SECTIONS}
@@ -309,8 +304,8 @@ def _section(section: Section, result: dict[str, Any]) -> str:
 
 def _race(contestants: Sequence[dict[str, Any]]) -> list[str]:
     """One row for each contestant of `bench loop`."""
-    heads = ("", "answered %", "fps", "p50 ms", "p95 ms", "p99 ms", "validated p50 ms", "bytes a picture", "CPU ms a picture",
-             "memory MB")
+    heads = ("", "answered %", "fps", "p50 ms", "p95 ms", "p99 ms", "validated p50 ms", "bytes a picture",
+             "CPU ms a picture", "memory MB")
     rows = [
         (one["name"], *(_number(one[key]) for key in (
             "answered_percent", "fps", "p50_ms", "p95_ms", "p99_ms", "validated_ms")),

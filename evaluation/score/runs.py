@@ -16,8 +16,8 @@ from sightline.evaluation.scenario_config import robot_of, vision_config
 from sightline.evaluation.score.figures import (
     NOT_EVALUATED,
     Score,
-    broken,
     bounds_of,
+    broken,
     checks_of,
     median_and_worst,
     score,
@@ -165,7 +165,9 @@ def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCa
             news.setdefault(case.group, []).append(line)
     told = {group: list(dict.fromkeys(lines))[:MOST_NOTICES] for group, lines in news.items()}
     groups = {case.group: case for case in wanted}
-    unevaluated = [name for name, case in groups.items() if not bounds_of(load_scenario(case.scenario), case.latency_ms)]
+    unevaluated = [
+        name for name, case in groups.items() if not bounds_of(load_scenario(case.scenario), case.latency_ms)
+    ]
     return ScoreReport(runs, scored_figures(runs), unevaluated, told)
 
 

@@ -197,7 +197,8 @@ def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
 
 
 def _table(race: "Race") -> list[str]:
-    names = f"{'answered':>9} {'fps':>6} {'p50':>8} {'p95':>8} {'p99':>8} ms {'validated':>9} {'bytes':>8} {'others':>7}"
+    names = f"{'answered':>9} {'fps':>6} {'p50':>8} {'p95':>8} {'p99':>8} ms {'validated':>9} {'bytes':>8} "
+    names += f"{'others':>7}"
     head = f"{'':18} {names}  CPU ms per image; MB"
     return [head, *(_row(name, race) for name in race.figures)]
 

@@ -168,7 +168,8 @@ def test_few_images_fail_although_each_is_answered():
 def test_overloaded_sightline_answers_nearly_as_many_images_as_a_rival_without_a_queue(rival, fps, ok):
     slow = replace(SMALL, detector_delay_ms=80.0)
     others = {rival: sample(rival, [90.0] * 600, seconds=600 / fps), "ring": sample("ring", [90.0] * 100, seconds=10.0)}
-    found = judged(slow, **{FLOOR: sample(FLOOR, [81.0] * 100), OURS: sample(OURS, [85.0] * 100, seconds=10.0)}, **others)
+    ours = sample(OURS, [85.0] * 100, seconds=10.0)
+    found = judged(slow, **{FLOOR: sample(FLOOR, [81.0] * 100), OURS: ours}, **others)
     assert found["answered per second"] is ok
 
 

@@ -91,7 +91,8 @@ def test_figures_count_each_frame_where_it_belongs():
 
 
 def test_answer_on_nothing_while_a_ball_is_in_view_is_shown():
-    one = figures([FrameResult(True, "nowhere", 0.5), *[FrameResult(True, "hit", 0.9)] * 3, FrameResult(False, "nowhere")])
+    hits = [FrameResult(True, "hit", 0.9)] * 3
+    one = figures([FrameResult(True, "nowhere", 0.5), *hits, FrameResult(False, "nowhere")])
     assert one.nowhere == 0.25
     shown = DetectorReport(0, 5, {"nominal": {"hsv": one}}, {"hsv": {}}, {}, {}, {})
     head, cells = (line.split("|")[1:-1] for line in markdown(shown).splitlines()[::2][:2])
