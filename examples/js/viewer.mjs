@@ -103,19 +103,25 @@ export class Viewer {
     return this.eyes.ask(verb);
   }
 
-  /** STOP is a level: said every 50 ms until a status shows it. */
+  /** STOP is a level: repeated every 50 ms until a status that comes after the first one shows STOPPED and wheels at zero. */
   stop() {
     if (this.stopping) return;
     this.stopping = true;
     const since_ms = performance.now();
+    let before; // the status at hand when the first left: it may be from before a reset by another operator
     const again = () => {
-      if (this.vision.status?.payload.state === "STOPPED" || this.ended) {
-        this.stopping = false;
+      const { status } = this.vision;
+      const isLatched = before !== undefined && status !== before && status?.payload.state === "STOPPED";
+      this.stopping = !this.ended && !(isLatched && status.payload.applied.every((speed) => speed === 0));
+      if (this.ended) return;
+      if (!this.stopping) {
         this.show({ stop: "STOPPED" });
         return;
       }
+      if (this.isOpen && before === undefined) before = status;
       this.eyes.ask("stop");
-      this.show({ stop: performance.now() - since_ms > STOP_SLOW_MS ? "STOP is not confirmed; cut the power by hand" : "STOP ..." });
+      const isSlow = !isLatched && performance.now() - since_ms > STOP_SLOW_MS;
+      this.show({ stop: isSlow ? "STOP is not confirmed; cut the power by hand" : "STOP ..." });
       setTimeout(again, STOP_PERIOD_MS);
     };
     again();
