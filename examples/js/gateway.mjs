@@ -16,6 +16,7 @@ import { OPEN_MS, admissionProblem } from "./websocket.mjs";
 const USAGE = "node gateway.mjs --connect ws://HOST:PORT --robot ID [--port 8765]";
 const HOST = "127.0.0.1"; // beyond loopback whoever came through here would look like somebody of this machine
 const MOST_SOCKETS = 32; // security limit, that of a robot
+const KEEP_ALIVE_MS = 1000;
 
 class UsageError extends Error {}
 
@@ -41,6 +42,7 @@ function asSent({ method, url, rawHeaders }) {
 function join(near, far) {
   for (const [from, to] of [[near, far], [far, near]]) {
     from.setNoDelay(true);
+    from.setKeepAlive(true, KEEP_ALIVE_MS); // an end that loses its power closes nothing
     from.on("error", () => to.destroy());
     from.on("close", () => to.destroy());
     from.pipe(to);
@@ -53,9 +55,10 @@ function passOn(to) {
     const refuse = ([status, line]) => near.end(`HTTP/1.1 ${status} Refused\r\nConnection: close\r\n\r\n${line}\n`);
     near.on("error", () => near.destroy());
     if (problem !== null) return refuse(problem);
-    const far = connect(to);
+    const far = connect(to).setTimeout(OPEN_MS, () => far.destroy(new Error("no connection in time")));
     far.once("error", () => refuse([502, "the robot does not answer"]));
     far.once("connect", () => {
+      far.setTimeout(0);
       far.removeAllListeners("error");
       far.write(asSent(request));
       far.write(head);

@@ -10,6 +10,7 @@ import { Vision } from "./vision.mjs";
 
 const FIRST_PAUSE_MS = 200;
 const LONGEST_PAUSE_MS = 1000;
+const SILENT_MS = 2000; // a robot that loses its power closes nothing; a status comes ten times a second
 const STOP_PERIOD_MS = 50;
 const STOP_SLOW_MS = 300; // a STOP that is not seen to work within this is told to the person
 const MOST_BUFFERED_BYTES = 65_536; // a browser queues without end; beyond this, commands are dropped
@@ -43,10 +44,23 @@ export class Viewer {
     const socket = new this.WebSocket(this.url, this.subprotocols);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
-    socket.onopen = () => socket.send(this.hello());
-    socket.onmessage = ({ data }) => this.read(data);
+    socket.onopen = () => {
+      this.awaitMessage(socket);
+      socket.send(this.hello());
+    };
+    socket.onmessage = ({ data }) => socket === this.socket && this.read(data);
     socket.onclose = ({ code, reason }) => this.lost(socket, reason || `code ${code}`);
     socket.onerror = () => this.lost(socket, "nobody answers"); // not every platform closes what it never opened
+    this.awaitMessage(socket);
+  }
+
+  /** Leave the connection unless something comes in time. */
+  awaitMessage(socket) {
+    clearTimeout(this.silence);
+    this.silence = setTimeout(() => {
+      socket.close();
+      this.lost(socket, "silent for 2 s");
+    }, SILENT_MS);
   }
 
   hello() {
@@ -54,6 +68,7 @@ export class Viewer {
   }
 
   read(data) {
+    this.awaitMessage(this.socket);
     try {
       if (typeof data === "string") this.met(data);
       else this.receive(unpack(new Uint8Array(data), "", this.robot));
@@ -79,6 +94,7 @@ export class Viewer {
 
   lost(socket, why) {
     if (this.ended || socket !== this.socket) return;
+    clearTimeout(this.silence);
     this.isOpen = false;
     this.socket = null;
     this.show({ link: `no connection: ${why}` });
@@ -129,6 +145,7 @@ export class Viewer {
 
   close() {
     this.ended = true;
+    clearTimeout(this.silence);
     this.socket?.close(1000);
   }
 }

@@ -81,3 +81,33 @@ test("STOP is sent though the status at hand shows STOPPED: another operator may
   assert.equal(rig.stops.at(-1), "STOPPED");
   rig.viewer.close();
 });
+
+test("a robot that sends nothing for 2 s is left and connected to again", (t) => {
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  const rig = new Rig();
+  t.mock.timers.tick(1500);
+  rig.greet();
+  for (let count = 0; count < 5; count += 1) {
+    t.mock.timers.tick(1500);
+    rig.status("ACTIVE");
+  }
+  assert.equal(rig.sockets.length, 1);
+  t.mock.timers.tick(1999);
+  assert.equal(rig.socket.closed, false);
+  t.mock.timers.tick(1);
+  t.mock.timers.tick(200);
+  assert.deepEqual([rig.sockets.length, rig.sockets[0].closed], [2, true]);
+  rig.sockets[0].onmessage({ data: "no hello: it comes late, on the connection that was left" });
+  assert.equal(rig.socket.closed, false);
+  rig.viewer.close();
+});
+
+test("a robot that never says hello is left, too", (t) => {
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  const rig = new Rig();
+  rig.socket.onopen();
+  t.mock.timers.tick(2000);
+  t.mock.timers.tick(200);
+  assert.deepEqual([rig.sockets.length, rig.sockets[0].closed], [2, true]);
+  rig.viewer.close();
+});

@@ -16,6 +16,7 @@ from websockets.sync.client import connect
 
 from tests.fixtures.javascript import JsProcess, JsRobot, hello
 from tests.fixtures.links import until
+from tests.fixtures.ports import free_port
 
 
 @pytest.fixture(scope="module")
@@ -71,6 +72,19 @@ def test_seventeenth_client_is_rejected(tmp_path):
         with pytest.raises(InvalidStatus) as refused:
             connect(robot.endpoint, subprotocols=["sightline.v1"])
         assert refused.value.response.status_code == 503
+
+
+def test_gateway_to_a_robot_that_does_not_answer_reports_it(tmp_path):
+    with ExitStack() as ending, socket.socket() as full:  # its queue is full, so that no further client is connected
+        full.bind(("127.0.0.1", free_port()))
+        full.listen(0)
+        robot, page_port = full.getsockname(), free_port()
+        ending.enter_context(socket.create_connection(robot))
+        options = ("--connect", f"ws://127.0.0.1:{robot[1]}", "--robot", "r1", "--port", str(page_port))
+        assert ending.enter_context(JsProcess(tmp_path, "gateway.mjs", *options)).says("viewer of robot r1")
+        with pytest.raises(InvalidStatus) as refused:
+            connect(f"ws://127.0.0.1:{page_port}", subprotocols=["sightline.v1"], open_timeout=5)
+    assert refused.value.response.status_code == 502
 
 
 def test_robot_serves_only_the_viewers_page(quiet_robot):
