@@ -12,7 +12,9 @@ import { MAX_HELLO_BYTES, PeerError, SUBPROTOCOL } from "./framing.mjs";
 import { FrameReader, OPCODE, closePayload, encodeFrame } from "./rfc6455.mjs";
 
 const GUID = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"; // RFC 6455, 1.3
-const PING_MS = 1000;
+const PING_MS = 1000; // of silence of the other end
+const SILENT_MS = 2000;
+const CHECK_MS = 250;
 const CLOSE_MS = 1000;
 export const OPEN_MS = 2000; // security limit: for the HTTP handshake, and once more for the hello
 const MAX_CLIENTS = 16; // security limit, of the protocol
@@ -32,17 +34,20 @@ export class Connection {
     this.next = () => undefined; // gives the next message to send, when there is room
     this.onMessage = () => undefined;
     this.onEnd = () => undefined;
-    this.writing = this.closing = this.awaitsPong = false;
+    this.writing = this.closing = this.pinged = false;
+    this.heard_ms = performance.now();
     this.pong = null; // only the newest ping is answered: who pings without reading piles nothing up
     socket.setNoDelay(true);
     socket.on("data", (chunk) => this.read(chunk));
     socket.on("error", () => socket.destroy());
     socket.on("end", () => socket.destroy());
     socket.on("close", () => this.ended());
-    this.pings = setInterval(() => this.ping(), PING_MS);
+    this.checks = setInterval(() => this.check(), CHECK_MS);
   }
 
   read(chunk) {
+    this.heard_ms = performance.now();
+    this.pinged = false;
     try {
       for (const event of this.reader.feed(chunk)) this.onEvent(event);
     } catch (error) {
@@ -55,8 +60,7 @@ export class Connection {
 
   onEvent({ kind, data, code }) {
     if (kind === "close") this.onClose(code, data);
-    else if (this.closing) return;
-    else if (kind === "pong") this.awaitsPong = false;
+    else if (this.closing || kind === "pong") return;
     else if (kind === "ping") this.answerPing(data);
     else this.onMessage(data);
   }
@@ -64,8 +68,7 @@ export class Connection {
   onClose(code, reason) {
     this.reason ??= { code, reason };
     if (!this.closing) this.write(OPCODE.CLOSE, code === 1005 ? EMPTY : closePayload(code, ""));
-    this.closing = true;
-    this.socket.end();
+    this.end(CLOSE_MS);
   }
 
   answerPing(data) {
@@ -73,12 +76,12 @@ export class Connection {
     this.pump();
   }
 
-  ping() {
-    if (this.awaitsPong) {
-      this.close(1011, "silent for too long");
-      return;
-    }
-    this.awaitsPong = true;
+  /** Ping an end that is silent; whatever it sends shows that it is there. */
+  check() {
+    const silent_ms = performance.now() - this.heard_ms;
+    if (silent_ms >= SILENT_MS) this.close(1011, "silent for too long");
+    if (silent_ms < PING_MS || this.pinged) return;
+    this.pinged = true;
     this.write(OPCODE.PING, EMPTY);
   }
 
@@ -103,16 +106,21 @@ export class Connection {
   /** Say goodbye; the socket is gone within a second. */
   close(code, reason) {
     if (this.closing) return;
-    this.closing = true;
     this.reason = { code, reason };
     this.write(OPCODE.CLOSE, closePayload(code, reason));
     this.reader.feed = function* nothing() {}; // what follows a broken rule is not read
-    setTimeout(() => this.socket.destroy(), code === 1001 ? CLOSE_MS : CLOSE_MS / 2).unref();
+    this.end(code === 1001 ? CLOSE_MS : CLOSE_MS / 2);
+  }
+
+  /** What was written leaves in this time; then the socket is gone, whatever the other end does. */
+  end(within_ms) {
+    this.closing = true;
+    setTimeout(() => this.socket.destroy(), within_ms).unref();
     this.socket.end();
   }
 
   ended() {
-    clearInterval(this.pings);
+    clearInterval(this.checks);
     this.closing = true;
     this.onEnd(this.reason ?? { code: 1006, reason: "the connection broke" });
   }

@@ -1,0 +1,69 @@
+/** @file One open connection on a socket that is only made up: its end, and peers that are silent or late. */
+
+import assert from "node:assert/strict";
+import { EventEmitter } from "node:events";
+import test from "node:test";
+import { OPCODE, closePayload, encodeFrame } from "./rfc6455.mjs";
+import { Connection } from "./websocket.mjs";
+
+const MASK = Uint8Array.from([1, 2, 3, 4]);
+const fromClient = (opcode, payload = new Uint8Array(0)) => encodeFrame(opcode, payload, MASK);
+
+/** The listening end of one connection, on a clock of its own. */
+class Rig {
+  constructor({ mock }) {
+    mock.timers.enable({ apis: ["setTimeout", "setInterval"] });
+    mock.method(performance, "now", () => this.now_ms);
+    this.timers = mock.timers;
+    this.now_ms = 0;
+    this.written = [];
+    this.ends = [];
+    this.socket = Object.assign(new EventEmitter(), {
+      writable: true,
+      setNoDelay: () => undefined,
+      write: (frame) => this.written.push(frame[0] & 0x0f),
+      end: () => undefined, // the other end keeps its half open
+      destroy: () => this.socket.emit("close"),
+    });
+    this.connection = new Connection(this.socket, true);
+    this.connection.onEnd = (end) => this.ends.push(end.code);
+  }
+
+  pass(ms, each = () => undefined) {
+    for (let left = ms; left > 0; left -= 50) {
+      this.now_ms += 50;
+      this.timers.tick(50);
+      each(this.now_ms);
+    }
+  }
+
+  client(opcode, payload) {
+    this.socket.emit("data", fromClient(opcode, payload));
+  }
+}
+
+for (const payload of [new Uint8Array(0), closePayload(1000, "")]) {
+  test(`a peer that sends Close (${payload.length} bytes) and keeps TCP open takes no place for ever`, (t) => {
+    const rig = new Rig(t);
+    rig.client(OPCODE.CLOSE, payload);
+    rig.connection.close(1001, "the robot is shutting down");
+    rig.pass(1000);
+    assert.deepEqual(rig.ends, [payload.length === 0 ? 1005 : 1000]);
+  });
+}
+
+test("a peer that sends data stays, however late its pongs are", (t) => {
+  const rig = new Rig(t);
+  rig.pass(5000, (now_ms) => now_ms % 100 === 0 && rig.client(OPCODE.BINARY, Uint8Array.of(1)));
+  assert.deepEqual(rig.ends, []);
+});
+
+test("a peer whose only word is a late pong stays, a silent one is left after 2 s", (t) => {
+  const rig = new Rig(t);
+  rig.pass(5200, (now_ms) => now_ms % 1300 === 0 && rig.client(OPCODE.PONG));
+  assert.equal(rig.written.filter((opcode) => opcode === OPCODE.PING).length, 4);
+  rig.pass(1900);
+  assert.deepEqual(rig.ends, []);
+  rig.pass(900);
+  assert.deepEqual(rig.ends, [1011]);
+});
