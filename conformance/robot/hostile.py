@@ -1,6 +1,7 @@
 """Cases on guests, on what no peer should send, and on peers that come and go. Pure."""
 
-from itertools import cycle
+from dataclasses import dataclass
+from itertools import cycle, pairwise
 from typing import Final
 
 from sightline.conformance.case import Bench, Suite
@@ -17,11 +18,17 @@ from sightline.conformance.robot.fixture import (
     watcher,
 )
 from sightline.protocol.channels import FRAME, REQUEST, STATUS, TWIST, key_for
-from sightline.protocol.messages import LeaseHolder, Stamp, State
+from sightline.protocol.messages import LeaseHolder, Stamp, State, Status
 
 SUITE: Final = Suite("R")
 _GUEST_MPS: Final = 0.2
 _GUEST_RAD_S: Final = 1.0
+_GUEST_M: Final = 0.3
+"""By one twist, after the first status that shows it: 0.25 m, and the way of a stop from 0.2 m/s."""
+_GUEST_EVERY_US: Final = 50_000
+_HOLDS_US: Final = 600_000
+"""From a guest's last twist until a `status` shows HOLD, with room for a slow machine."""
+_BRAKES_US: Final = 400_000
 
 
 def _bare(bench: Bench, text: bytes = CRAWL) -> None:
@@ -83,15 +90,69 @@ def guests_with_header(bench: Bench) -> None:
     sender.expect("OTHER_SESSION", echo_session="fffffff0", what="one that cites another session")
 
 
-@SUITE.must("R-DIAL-05", "4.6 Guests", _guest)
-def guests_are_silent_soon(bench: Bench, watcher: Sender) -> None:
+@dataclass(slots=True)
+class _Guest:
+    """A guest that sends its twists in turn."""
+
+    watcher: Sender
+    twists: tuple[bytes, ...] = (CRAWL, b"0.1100|0.0000")
+    sent: int = 0
+
+    def send(self) -> None:
+        """Send the next twist, and go on every 50 ms."""
+        bench = self.watcher.bench
+        if self.twists:
+            _bare(bench, self.twists[self.sent % len(self.twists)])
+        self.sent += 1
+        bench.after(_GUEST_EVERY_US, self.send)
+
+    def expect_held(self, most_us: int, text: bytes) -> None:
+        """Fail the case unless a robot that receives only this twist holds, with its wheels at zero, in time."""
+        self.twists = (text,)
+        robot, bench = self.watcher.robot, self.watcher.bench
+        bench.rest(most_us + _BRAKES_US)
+        applied, what = robot.next_status(2).applied, f"after {most_us / 1e6:g} s of {text.decode()}"
+        bench.expect(applied == (0.0, 0.0), f"{what} it still drives, at {applied}")
+
+
+def _driving_guest(bench: Bench) -> _Guest:
+    """A guest that drives the robot, by twists that change."""
+    guest = _Guest(_guest(bench))
+    guest.send()
+    _arm_guest(guest.watcher)
+    drives = guest.watcher.robot.reaches(lambda status: status.applied[0] > 0.05, 1_000_000)
+    bench.need(drives, "guests do not drive here")
+    return guest
+
+
+@SUITE.must("R-DIAL-05", "4.6 Guests", _driving_guest)
+def guests_are_silent_soon(bench: Bench, guest: _Guest) -> None:
     """A guest's twist lives 250 ms."""
-    until_us = bench.now_us + 4_000_000
-    bench.on(FRAME, lambda _one: _bare(bench) if bench.now_us < until_us else None)
-    _arm_guest(watcher)
-    bench.need(watcher.robot.reaches(lambda status: status.applied[0] > 0.05, 1_000_000), "guests do not drive here")
-    held = watcher.robot.reaches(lambda status: status.state is State.HOLD, 6_000_000)
-    bench.expect(held, f"silence left it {watcher.robot.status().state}")
+    guest.twists = ()
+    held = guest.watcher.robot.reaches(lambda status: status.state is State.HOLD, _HOLDS_US)
+    bench.expect(held, f"{_HOLDS_US / 1e6:g} s of silence left it {guest.watcher.robot.status().state}")
+
+
+@SUITE.must("R-DIAL-07", "4.6 Guests", _driving_guest)
+def guests_repeat_briefly(bench: Bench, guest: _Guest) -> None:
+    """A robot that receives the same guest's twist for 2 s or 0.25 m holds, and drives on once the twist changes."""
+    guest.expect_held(2_000_000, b"0.0600|0.0000")
+    guest.twists = (b"0.2000|0.0000",)
+    again = guest.watcher.robot.reaches(lambda status: status.applied[0] > 0.05, 1_000_000)
+    bench.expect(again, "another twist does not drive it on")
+    mark, robot = bench.mark(), guest.watcher.robot
+    bench.rest(2_000_000)
+    read = ((one.at_us, one.payload(Status)) for one in bench.received(STATUS, mark))
+    reported = [(at_us, status.applied[0]) for at_us, status in read if status]
+    driven_m = sum((after[0] - before[0]) / 1e6 * before[1] for before, after in pairwise(reported))
+    bench.expect(driven_m <= _GUEST_M, f"by one twist it drove {driven_m:.2f} m, and is at {robot.status().applied}")
+
+
+@SUITE.must("R-DIAL-08", "4.6 Guests", _driving_guest)
+def guests_have_no_frame_age(bench: Bench, guest: _Guest) -> None:
+    """While a guest without header drives, `status` has no `frame_age_us`."""
+    age_us = guest.watcher.robot.next_status().frame_age_us
+    bench.expect(age_us is None, f"frame_age_us is {age_us}")
 
 
 @SUITE.must("R-DIAL-06", "4.6 Guests", _guest)

@@ -5,7 +5,7 @@
  */
 
 import { WireError } from "./codec.mjs";
-import { FreshnessRecord, IssuedRecord, Lease, RANKS, SequenceRecord, isHuman, proofOf, same, shown } from "./judging.mjs";
+import { FreshnessRecord, IssuedRecord, Lease, RANKS, RepeatRecord, SequenceRecord, isHuman, proofOf, same, shown } from "./judging.mjs";
 import { LIMITS, Ramp, STILL, ageFactor, clampTwist, isStill } from "./limits.mjs";
 
 const MAX_REQUEST_AGE_US = 2_000_000;
@@ -23,13 +23,14 @@ export class Gate {
     this.limits = { ...LIMITS, ...limits };
     this.issued = new IssuedRecord(session);
     this.pictures = new FreshnessRecord();
+    this.repeats = new RepeatRecord();
     this.sequence = new SequenceRecord();
     this.lease = new Lease(this.limits.lease_us);
     this.ramp = new Ramp(this.limits);
     this.state = stopped ? "STOPPED" : "DISARMED";
     this.reason = stopped ? "STOP was set before the restart" : "not armed";
     this.armsItself = this.limits.autoArm && !stopped;
-    this.command = null; // {twist, echo_us, arrival_us, life_us}
+    this.command = null; // {twist, echo_us, arrival_us, life_us, citesFrame}
     this.liveCommands = this.accepted = this.holdSince_us = 0;
     this.lastStep_us = null;
     this.refused = {};
@@ -117,7 +118,8 @@ export class Gate {
     const limited = clampTwist(twist, maxLinear_mps, maxAngular_rad_s);
     if (limited !== twist) this.count("CLAMPED");
     const life_us = guest ? limits.guestLife_us : limits.silence_us;
-    this.command = { twist: limited, echo_us: now_us - age_us, arrival_us: now_us, life_us };
+    if (header === null) this.repeats.add(twist, now_us);
+    this.command = { twist: limited, echo_us: now_us - age_us, arrival_us: now_us, life_us, citesFrame: header !== null };
     if (!guest) this.latency_us = age_us;
   }
 
@@ -132,6 +134,7 @@ export class Gate {
     const goal = this.armed ? this.goal(now_us) : STILL;
     const elapsed_us = Math.max(0, now_us - (this.lastStep_us ?? now_us));
     this.lastStep_us = now_us;
+    this.repeats.drive(this.applied.linear_mps, elapsed_us);
     return this.ramp.step(goal, elapsed_us);
   }
 
@@ -142,6 +145,7 @@ export class Gate {
     if (now_us - command.arrival_us > command.life_us) {
       return this.hold(`no accepted command for more than ${command.life_us / 1000} ms`, now_us);
     }
+    if (!command.citesFrame && this.repeats.isOver(limits, now_us)) return this.hold("the same command without a frame for too long", now_us);
     const factor = ageFactor(limits, now_us - command.echo_us);
     if (factor === 0) return this.hold("the frame behind the command is too old", now_us);
     this.state = factor === 1 ? "ACTIVE" : "DEGRADED";
@@ -227,6 +231,7 @@ export class Gate {
     const missing = this.missingToArm(now_us);
     if (missing !== "") throw new WireError("NOT_ALLOWED", missing);
     this.armsItself = this.limits.autoArm;
+    this.repeats = new RepeatRecord(); // who arms has looked at the robot
     this.begin(`armed by ${who.source}`, now_us);
     return "armed";
   }
@@ -252,7 +257,7 @@ export class Gate {
   }
 
   frameAge_us(now_us) {
-    return this.command && Math.max(0, now_us - this.command.echo_us);
+    return this.command?.citesFrame ? Math.max(0, now_us - this.command.echo_us) : null;
   }
 
   refuseBesideHuman(who, now_us) {

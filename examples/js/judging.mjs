@@ -7,6 +7,7 @@
  */
 
 import { WireError } from "./codec.mjs";
+import { STILL, isStill } from "./limits.mjs";
 import { continues, sessionDigest } from "./proof.mjs";
 
 const KEPT_PER_CHANNEL = 256; // 8 s of 30 fps frames; anything older is STALE long before
@@ -92,6 +93,32 @@ export class FreshnessRecord {
   /** Since when has been seen what a frame of `t_us` shows. */
   shownSince_us(t_us) {
     return this.jpeg === null ? t_us : Math.min(t_us, this.changed_us);
+  }
+}
+
+/** Since when, and how far, the robot drives by one twist without a header. Only another twist starts it again, no pause. */
+export class RepeatRecord {
+  constructor() {
+    this.twist = STILL;
+    this.since_us = this.driven_m = 0;
+  }
+
+  /** @param {import("./limits.mjs").Twist} twist as it arrived */
+  add(twist, now_us) {
+    if (twist.linear_mps === this.twist.linear_mps && twist.angular_rad_s === this.twist.angular_rad_s) return;
+    this.twist = twist;
+    this.since_us = now_us;
+    this.driven_m = 0;
+  }
+
+  drive(linear_mps, elapsed_us) {
+    this.driven_m += (Math.abs(linear_mps) * elapsed_us) / 1e6;
+  }
+
+  /** Only a changed twist shows that its sender sees a new picture. */
+  isOver({ guestUnchanged_us, guestUnchanged_m }, now_us) {
+    const isLong = now_us - this.since_us > guestUnchanged_us || this.driven_m > guestUnchanged_m;
+    return isLong && !isStill(this.twist);
   }
 }
 

@@ -27,6 +27,8 @@ export const LIMITS = Object.freeze({
   guestLife_us: 250_000,
   guestMaxLinear_mps: 0.2,
   guestMaxAngular_rad_s: 1,
+  guestUnchanged_us: 2_000_000,
+  guestUnchanged_m: 0.25,
   autoArm: false,
 });
 

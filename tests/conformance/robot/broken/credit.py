@@ -168,9 +168,25 @@ def guests_live_long(robot):
     def around(inner, source, twist, now_us, age_us):
         inner(source, twist, now_us, age_us)
         if source == "guest":
-            gate._command = AcceptedCommand(gate._command.twist, now_us + 60_000_000, now_us, 60_000_000, True)
+            gate._command = AcceptedCommand(gate._command.twist, now_us + 60_000_000, now_us, 60_000_000, False)
 
     wrap(gate, "_accept", around)
+
+
+@breaks("R-DIAL-07")
+def guests_repeat_one_twist_for_ever(robot):
+    robot.driving.gate._repeats_too_long = lambda _command, _now_us: False
+
+
+@breaks("R-DIAL-08")
+def guests_have_the_age_of_their_twist(robot):
+    gate = robot.driving.gate
+
+    def bend(_header, payload):
+        if gate._command is not None and not gate._command.cites_frame:
+            payload["frame_age_us"] = robot.now() - gate._command.arrival_us
+
+    bend_out(robot, "status", bend)
 
 
 # --- roles and keys --------------------------------------------------------------------------------------------------
