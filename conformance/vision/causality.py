@@ -2,16 +2,25 @@
 
 import itertools
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, Final
 
 from sightline.conformance.case import Bench, Level, Suite, itself
-from sightline.conformance.vision.fixture import ANSWER_US, FRAME_US, RobotPlayed, Sent, VisionAnswer, met
+from sightline.conformance.vision.fixture import ANSWER_US, ARMED, FRAME_US, RobotPlayed, Sent, VisionAnswer, met
 from sightline.conformance.vision.images import png
+from sightline.protocol.channels import SCAN, STATUS, Channel
+from sightline.protocol.codec import encode
 from sightline.protocol.messages import MAX_INTEGER
+from sightline.protocol.spec.message_cases import packed
 
 SUITE = Suite("V")
 _BURST = 20
 _RECOVERS_US = 1_000_000
+_HOUR_US: Final = 3_600_000_000
+_OTHER_SESSION: Final = "fffffff0"
+_RAYS: Final[dict[str, Any]] = {
+    "angle_min_rad": -1.0, "angle_increment_rad": 0.5, "range_min_m": 0.1, "range_max_m": 8.0,
+}  # fmt: skip
 
 
 def _cited(bench: Bench) -> list[tuple[Sent, VisionAnswer]]:
@@ -45,8 +54,10 @@ SUITE.must_all(itself, {
 @SUITE.must("V-CAUS-05", "4.5 Echo", RobotPlayed)
 def nothing_before_a_frame(bench: Bench, robot: RobotPlayed) -> None:
     """Before a frame came there is nothing to answer: camera and status alone drive nothing."""
+    bench.rest(ANSWER_US)  # the last answer to the start before may come late
+    mark = bench.mark()
     bench.rest(1_500_000)
-    bench.expect(not robot.answers(), "it answered before it was sent a frame")
+    bench.expect(not robot.answers(mark), "it answered before it was sent a frame")
 
 
 @SUITE.should("V-CAUS-06", "7.1 Answers", met)
@@ -135,22 +146,48 @@ def gaps_are_fine(_bench: Bench, robot: RobotPlayed) -> None:
         robot.answer_to(robot.frame(seq=fields["seq"] + leap, t_us=fields["t_us"]))
 
 
-def _forged_frame(robot: RobotPlayed, ahead_us: int) -> None:
-    """Fail the case if one frame whose time lies ahead keeps the robot's own frames from driving for a second."""
-    bench = robot.bench
+def _forged_frame(robot: RobotPlayed, **changes: Any) -> None:
+    """Send a frame that is the robot's next but for these fields; `ahead_us` is added to its time."""
     fields = robot.next_fields()
-    robot.frame("left", seq=fields["seq"], t_us=min(fields["t_us"] + ahead_us, MAX_INTEGER))
+    t_us = min(fields["t_us"] + changes.pop("ahead_us", 0), MAX_INTEGER)
+    robot.frame("left", **{"seq": fields["seq"], "t_us": t_us, **changes})
+
+
+def _forged_stamps(robot: RobotPlayed, channel: Channel, payload: bytes, **fields: Any) -> None:
+    """Send a message of the channel that is an hour ahead, and one of another session."""
+    stamp = robot.stamp().model_dump(mode="json") | fields
+    for changes in ({"t_us": stamp["t_us"] + _HOUR_US}, {"session": _OTHER_SESSION}):
+        robot.publish(channel, payload, packed(stamp | changes))
+
+
+def _drives_on(forge: Callable[[RobotPlayed], None], robot: RobotPlayed) -> None:
+    """Fail the case if what `forge` sends keeps the robot's own frames from driving for a second."""
+    bench = robot.bench
+    forge(robot)
     bench.rest(FRAME_US)
     began_us = bench.now_us
-    while not robot.twists_to(robot.film("left", 1)[0]):
-        bench.expect(bench.now_us - began_us < _RECOVERS_US, "no twist within a second after a frame of the future")
+    sent: list[Sent] = []
+    while not any(map(robot.twists_to, sent)):
+        bench.expect(bench.now_us - began_us < _RECOVERS_US, "no twist within a second after a forged message")
+        sent.append(robot.frame("left"))
+        bench.rest(FRAME_US)
 
 
+_FORGED: Final[dict[str, tuple[str, Callable[[RobotPlayed], None]]]] = {
+    "V-CAUS-14": ("A frame of an hour ahead", partial(_forged_frame, ahead_us=_HOUR_US)),
+    "V-CAUS-15": ("A frame of the largest time", partial(_forged_frame, ahead_us=MAX_INTEGER)),
+    "V-CAUS-16": ("A frame of the largest `seq`", partial(_forged_frame, seq=MAX_INTEGER)),
+    "V-CAUS-17": ("A frame of a session that is made up", partial(_forged_frame, session=_OTHER_SESSION)),
+    "V-CAUS-18": ("A `status` of another session or an hour ahead",
+                  partial(_forged_stamps, channel=STATUS, payload=encode(ARMED))),
+    "V-CAUS-19": ("A `scan` of another session or an hour ahead",
+                  partial(_forged_stamps, channel=SCAN, payload=bytes(16), **_RAYS)),
+}
+"""What must not blind it: title, how it is sent."""
 SUITE.must_all(met, {
-    "V-CAUS-14": ("2.6 Clock", "A frame of an hour ahead is forged: the robot's own drive within a second.",
-                  lambda it: _forged_frame(it, 3_600_000_000)),
-    "V-CAUS-15": ("2.6 Clock", "A frame of the largest time is forged: the robot's own drive within a second.",
-                  lambda it: _forged_frame(it, MAX_INTEGER)),
+    number: ("2.6 Clock", f"{title} is forged: the robot's own frames drive within a second.",
+             partial(_drives_on, forge))
+    for number, (title, forge) in _FORGED.items()
 })
 
 

@@ -5,6 +5,8 @@ from contextlib import suppress
 
 from sightline.conformance.vision.hostile import CAMERAS, DOUBTED, READ, REJECTED
 from sightline.conformance.vision.images import CAMERA, picture
+from sightline.protocol.channels import SCAN, STATUS
+from sightline.protocol.messages import Stamp
 from tests.conformance.vision.broken import STANDING, BrokenVision, breaks, frame_header, header_of
 
 
@@ -160,6 +162,58 @@ class Believing(Leaping):
 
 breaks("V-CAUS-14", "believes in an hour")(type("Believing", (Believing,), {"believed_us": (3_000_000_000, 10**14)}))
 breaks("V-CAUS-15", "believes in any time")(type("Believing", (Believing,), {"believed_us": (10**14, 2**63)}))
+
+
+@breaks("V-CAUS-16", "drops each frame that is not above the largest `seq`")
+class LargestSeq(BrokenVision):
+    newest = ("", 0)
+
+    def hears(self, header, jpeg):
+        with suppress(ValueError):
+            known = frame_header(header)
+            if known.session == self.newest[0] and known.seq <= self.newest[1]:
+                return None
+            self.newest = known.session, known.seq
+        return header, jpeg
+
+
+@breaks("V-CAUS-17", "bans each session that it left")
+class Bans(BrokenVision):
+    session, left = "", frozenset()
+
+    def hears(self, header, jpeg):
+        with suppress(ValueError):
+            known = frame_header(header).session
+            if known in self.left:
+                return None
+            self.left |= {self.session} - {known}
+            self.session = known
+        return header, jpeg
+
+
+class BelievesStamps(BrokenVision):
+    """Drops each frame from before the newest message of `believed`, of the same session."""
+
+    def __init__(self, network, robot="r1"):
+        super().__init__(network, robot)
+        self.newest_us = {}
+        self.link.subscribe(self.believed, self.on_stamp)
+
+    def on_stamp(self, message):
+        with suppress(ValueError):
+            stamp = Stamp.model_validate_json(message.header)
+            self.newest_us[stamp.session] = max(stamp.t_us, self.newest_us.get(stamp.session, 0))
+
+    def hears(self, header, jpeg):
+        with suppress(ValueError):
+            known = frame_header(header)
+            if known.t_us < self.newest_us.get(known.session, 0) - 1_000_000:
+                return None
+        return header, jpeg
+
+
+breaks("V-CAUS-18", "believes the time of a status")(type("BelievesStatus", (BelievesStamps,), {"believed": STATUS}))
+breaks("V-CAUS-19", "believes the time of a scan")(type("BelievesScan", (BelievesStamps,), {"believed": SCAN}))
 
 
 # --- pictures and cameras --------------------------------------------------------------------------------------------
