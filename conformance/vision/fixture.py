@@ -166,11 +166,12 @@ class RobotPlayed:
         return known.model_dump(mode="json", exclude_none=True)
 
     def film(self, name: str, frames: int, every_us: int = FRAME_US) -> list[Sent]:
-        """So many pictures at a steady rate."""
+        """Send so many pictures at a steady rate, or each when its credit is back (7.2), whichever is later."""
         sent = []
         for _ in range(frames):
             sent.append(self.frame(name))
             self.bench.rest(every_us)
+            self.is_answered(sent[-1], sent[-1].at_us + ANSWER_US - self.bench.now_us)
         return sent
 
     def _clock_us(self) -> int:

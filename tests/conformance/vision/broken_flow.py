@@ -97,7 +97,7 @@ class Tired(Gaps):
     steady = 0
 
     def likes(self, gap_us):
-        self.steady = self.steady + 1 if 29_000 < gap_us < 41_000 else 0
+        self.steady = self.steady + 1 if 29_000 < gap_us < 41_000 or self.steady > 45 else 0
         return self.steady < 46
 
 

@@ -55,6 +55,36 @@ class SendsTwice(VirtualVision):
         self.copies = [*self.copies, answer]
 
 
+class SlowVision(VirtualVision):
+    """Takes some time for each image, and then the newest frame."""
+
+    LOOK_US = 0
+    looked = None
+
+    def tick(self, now_us):
+        self.now_us = now_us
+        if self.looked is None:
+            super().tick(now_us)
+        elif now_us >= self.looked[0]:
+            super()._publish(*self.looked[1:])
+            self.looked = None
+
+    def _publish(self, *answer):
+        self.looked = (self.now_us + self.LOOK_US, *answer)
+
+
+PACED = [case for case in VIRTUAL if case.id in ("V-FLOW-05", "V-SEQ-05", "V-STAT-01", "V-STAT-06", "V-CAUS-14")]
+MUST = [case for case in VIRTUAL if case.level is Level.MUST]
+
+
+@pytest.mark.parametrize("look_us", [60_000, 150_000])
+@pytest.mark.parametrize("cases", [PACED, pytest.param(MUST, marks=pytest.mark.slow)], ids=["paced", "all"])
+def test_vision_service_with_a_slow_detector_fails_no_must_case(cases, look_us):
+    slow = type("Slow", (SlowVision,), {"LOOK_US": look_us})
+    results = [result_of(case, slow) for case in cases]
+    assert [(one.case.id, one.reason) for one in results if one.outcome is Outcome.FAILED] == []
+
+
 HOSTILE = [case for case in VIRTUAL if case.group == "hostile input"]
 
 
