@@ -10,6 +10,7 @@ import socket
 import ssl
 import time
 from base64 import b64encode
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from typing import Any, Final, NamedTuple, Self
@@ -23,6 +24,8 @@ from sightline.protocol.transports.zenoh.session import open_session
 
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 CONTINUED: Final = 0
+LATE_PONG_S: Final = 1.3
+"""Later than a ping interval, and within two seconds."""
 LOST: Final = (1006, "")
 """The end of a connection without a close frame: RFC 6455, 7.1.5."""
 _SIZES: Final = {126: 2, 127: 8}
@@ -80,6 +83,8 @@ class RawConnection:
     def __init__(self, connection: socket.socket, *, answers_pings: bool = True) -> None:
         self._socket = connection
         self.answers_pings = answers_pings
+        self.pongs_after_s = 0.0
+        self._pongs: deque[tuple[float, bytes]] = deque()
         self.pings = 0
         self._data = b""
         self._ended = False
@@ -113,6 +118,8 @@ class RawConnection:
         """Return the next frame except pings; None when none comes, or the connection has ended."""
         deadline_s = time.monotonic() + within_s
         while True:
+            while self._pongs and self._pongs[0][0] <= time.monotonic():
+                self.send(PONG, self._pongs.popleft()[1])
             taken = take_frame(self._data)
             if taken is None:
                 if not self._read(deadline_s - time.monotonic()):
@@ -123,7 +130,7 @@ class RawConnection:
                 return frame
             self.pings += 1
             if self.answers_pings:
-                self.send(PONG, frame.data)
+                self._pongs.append((time.monotonic() + self.pongs_after_s, frame.data))
 
     def frame_that(self, wanted: Callable[[RawFrame], bool], within_s: float) -> RawFrame | None:
         """Return the next frame for which `wanted` holds; None when none comes."""

@@ -9,7 +9,16 @@ from functools import partial
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, NotApplicableError, Suite, itself
-from sightline.conformance.raw_peers import BINARY, CONTINUED, PING, PONG, TEXT, RawWebSocket, split_url
+from sightline.conformance.raw_peers import (
+    BINARY,
+    CONTINUED,
+    LATE_PONG_S,
+    PING,
+    PONG,
+    TEXT,
+    RawWebSocket,
+    split_url,
+)
 from sightline.conformance.robot.fixture import GOOD, Robot, Sender, as_json
 from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, REPLY, STATUS
 from sightline.protocol.errors import WireError
@@ -345,6 +354,17 @@ def unanswered_pings_end(bench: Bench) -> None:
         end = raw.end(5.0)
         took_s = time.monotonic() - began_s
         bench.expect(end is not None and took_s < 4.0, f"after {took_s:.1f} s it is still connected")
+
+
+@SUITE.must("R-SOCK-49", "14.8 Liveness", real=True)
+def late_pongs_end_nothing(bench: Bench) -> None:
+    """A peer that sends data is not silent: it stays, though its pongs come 1.3 s late."""
+    with spoken(bench) as raw:
+        raw.pongs_after_s = LATE_PONG_S
+        for _ in range(20):
+            raw.send(TEXT, hello(bench))
+            end = raw.end(0.2)
+            bench.expect(end is None, f"after {raw.pings} pings the connection ended: {end}")
 
 
 @SUITE.must("R-SOCK-31", "13.2 Bounds", real=True)

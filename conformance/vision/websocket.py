@@ -16,7 +16,17 @@ from contextlib import contextmanager
 from typing import Any, Final, Self
 
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.raw_peers import BINARY, CLOSE, CONTINUED, PING, PONG, TEXT, RawConnection, RawFrame
+from sightline.conformance.raw_peers import (
+    BINARY,
+    CLOSE,
+    CONTINUED,
+    LATE_PONG_S,
+    PING,
+    PONG,
+    TEXT,
+    RawConnection,
+    RawFrame,
+)
 from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import CAMERA, FRAME, Channel
@@ -400,3 +410,15 @@ def leaves_the_silent(bench: Bench) -> None:
         client.answers_pings = False
         bench.expect(client.end(BACK_S), f"after {BACK_S:g} s without a word it is still connected")
         bench.expect(server.accept(BACK_S), f"it did not connect again within {BACK_S:g} s")
+
+
+@SUITE.must("V-SOCK-18", "14.8 Liveness", real=True)
+def late_pongs_end_nothing(bench: Bench) -> None:
+    """A robot that sends frames is not silent: it is not left, though its pongs come 1.3 s late."""
+    with server_of(bench) as server:
+        client = met(bench, server)
+        client.pongs_after_s = LATE_PONG_S
+        for seq in range(1, 41):
+            client.send(BINARY, _frame(client, seq))
+            end = client.end(0.1)
+            bench.expect(end is None, f"after {client.pings} pings it ended the connection: {end}")

@@ -159,6 +159,8 @@ class Client:
                 time.sleep(0.7)
             return self.drop()
         self.data += data
+        if not self.has("only a pong counts"):
+            self.unanswered_s = None
         try:
             while self.step():
                 pass

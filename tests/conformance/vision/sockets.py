@@ -33,9 +33,10 @@ SOCKETS = {
     "V-SOCK-15": "shows its token in the URL too",
     "V-SOCK-16": "comes from another site",
     "V-SOCK-17": "waits for the silent",
+    "V-SOCK-18": "leaves a robot whose pong is late",
 }
 
-SILENCE_S = 2.0
+SILENCE_S = 3.0
 """As long as pings and their patience take together."""
 
 
@@ -74,7 +75,7 @@ class SocketVision:
         url = self.endpoint + (f"/?token={self.token}" if self.broken == "V-SOCK-15" else "")
         origin = "http://elsewhere.example" if self.broken == "V-SOCK-16" else None
         pings = None if self.broken == "V-SOCK-09" else 1
-        patience = None if self.broken == "V-SOCK-17" else 1
+        patience = {"V-SOCK-17": None, "V-SOCK-18": 1}.get(self.broken, 2)
         with connect(url, subprotocols=protocols, compression=None, open_timeout=1, close_timeout=0.5,
                      additional_headers=twice, origin=origin, ping_interval=pings, ping_timeout=patience,
                      max_size=None if self.broken == "V-SOCK-11" else 1_100_000) as link:

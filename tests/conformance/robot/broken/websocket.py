@@ -49,6 +49,7 @@ DEFECTS = {
     "R-SOCK-46": "drops invalid JSON",
     "R-SOCK-47": "keeps missions",
     "R-SOCK-48": "rewrites missions",
+    "R-SOCK-49": "only a pong counts",
     "R-DIAL-11": "pictures are binary",
     "R-DIAL-12": "one line",
     "R-DIAL-13": "deaf to twists",
