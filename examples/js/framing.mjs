@@ -153,19 +153,22 @@ export function messageBound(wants) {
   return Math.max(MAX_HELLO_BYTES, 2 + MAX_BLOCK_BYTES + Math.max(0, ...payloads));
 }
 
-/** Slots of messages that have not left: one per channel and source, the newest; the most urgent leaves first. */
+/** Slots of messages that have not left: one per channel, source and verb, the newest; the most urgent leaves first. */
 export class Outbox {
   constructor() {
     this.slots = new Map();
     this.dropped = 0;
   }
 
-  /** @param {string} name channel, "" for a hello @param {string} source @param {string|Uint8Array} message */
-  put(name, source, message) {
-    const slot = `${name}/${source}`;
+  /**
+   * @param {string} name channel, "" for a hello @param {string} source @param {string|Uint8Array} message
+   * @param {string} [verb] of a request
+   */
+  put(name, source, message, verb = "") {
+    const slot = `${name}/${source}/${verb}`;
     const isCrowded = !this.slots.has(slot) && this.isCrowded(name, source);
     this.dropped += this.slots.has(slot) || isCrowded ? 1 : 0;
-    if (!isCrowded) this.slots.set(slot, { name, source, urgency: name === "" ? -1 : CHANNELS[name].urgency, message });
+    if (!isCrowded) this.slots.set(slot, { name, source, urgency: name === "" || verb === "stop" ? -1 : CHANNELS[name].urgency, message });
   }
 
   isCrowded(name, source) {

@@ -127,6 +127,15 @@ test("the outbox keeps the newest of each channel and source, the most urgent le
   assert.equal(outbox.dropped, 1);
 });
 
+test("a request waits for each verb, and STOP goes first", () => {
+  const outbox = new Outbox();
+  for (const verb of ["arm", "stop", "arm", "stop", "disarm"]) outbox.put("request", "operator", verb, verb);
+  assert.deepEqual([outbox.take(), outbox.take(), outbox.take(), outbox.take()], ["stop", "arm", "disarm", undefined]);
+  outbox.put("", "", "hello");
+  outbox.put("request", "operator", "stop", "stop");
+  assert.deepEqual([outbox.take(), outbox.take()], ["hello", "stop"]);
+});
+
 test("whoever makes up sources gets few places, and takes none of the roles'", () => {
   const outbox = new Outbox();
   for (let number = 0; number < 1000; number += 1) outbox.put("detections", `s${number}`, "old");

@@ -63,7 +63,8 @@ export class Peer {
    * @param {string} name channel @param {object} header @param {Uint8Array} payload
    */
   offer(name, header, payload) {
-    this.post(name, header.source ?? "", () => pack(name, header, payload));
+    const verb = name === "request" ? JSON.parse(new TextDecoder().decode(payload)).verb : "";
+    this.post(name, header.source ?? "", () => pack(name, header, payload), verb);
   }
 
   /** Pass a packet on as it came. */
@@ -71,9 +72,9 @@ export class Peer {
     this.post(channel.name, source, () => packRaw(channel.name, source, header, payload));
   }
 
-  post(name, source, write) {
+  post(name, source, write, verb = "") {
     if (!this.isOpen || !this.wants.has(name)) return;
-    this.outbox.put(name, source, write());
+    this.outbox.put(name, source, write(), verb);
     this.connection.pump();
   }
 }
