@@ -23,6 +23,8 @@ from sightline.protocol.messages import State, Status
 SUITE: Final = Suite("R")
 _WHEELS_STOP_US: Final = 700_000 + SETTLES_US
 """From STOP until the wheels are measured to be at rest."""
+_LOST_US: Final = 1_300_000
+"""Silence after which a human's lease has ended, while what it cites is younger than two seconds."""
 
 
 def _driven(bench: Bench, twists: int = 8) -> Sender:
@@ -94,6 +96,32 @@ def arming_after_disarm(bench: Bench, driver: Sender) -> None:
     before = driver.robot.stamp()
     bench.need(driver.granted("disarm"), "disarm is not granted (R-ARM-05)")
     driver.expect_rejected("arm", "STALE", "a request from before the disarm", cite=before)
+
+
+def _human(bench: Bench) -> Sender:
+    """A human that holds the lease of a robot that is not armed."""
+    human = teleop(bench)
+    human.need_good()
+    return human
+
+
+@SUITE.must("R-ARM-16", "8.3 Freshness", _human)
+def arming_after_a_human_let_go(bench: Bench, human: Sender) -> None:
+    """`arm` that cites a `status` from before a human let go is rejected as STALE."""
+    before = human.robot.stamp()
+    bench.need(human.granted("release"), "release is not granted (R-LEASE-15)")
+    human.fall_silent()
+    _driven(bench).expect_rejected("arm", "STALE", "a request from before the human let go", cite=before)
+
+
+@SUITE.must("R-ARM-17", "8.3 Freshness", _human)
+def reset_after_a_human_was_lost(bench: Bench, human: Sender) -> None:
+    """`reset` that cites a `status` from before a human was lost is rejected as STALE."""
+    before = human.robot.stamp()
+    human.fall_silent()
+    bench.rest(_LOST_US)
+    bench.need(human.robot.status().holder is None, "the lease does not end by silence (R-LEASE-04)")
+    operator(bench).expect_rejected("reset", "STALE", "a request from before the human was lost", cite=before)
 
 
 @SUITE.must("R-ARM-09", "8.2 Requests and replies", teleop)
@@ -221,6 +249,37 @@ def stops(bench: Bench, driver: Sender) -> None:
     bench.expect(reply is None or reply.ok, f"the reply reports {reply}")
     bench.rest(_WHEELS_STOP_US + WATCHED_AT_REST_US)
     driver.robot.expect_unmoved("a second after STOP", requested_us + _WHEELS_STOP_US)
+
+
+def _at_full_speed(bench: Bench) -> Sender:
+    """A driver of a robot that drives as fast as it may."""
+    limit = Robot(bench).status().max_linear_mps
+    bench.need(limit > 0, "the robot reports no limit (R-LIM-02)")
+    driver = armed(bench, text=f"{min(limit, 10.0):.4f}|0.0000".encode())
+    bench.rest(700_000)
+    return driver
+
+
+@SUITE.must("R-STOP-15", "8.2 Requests and replies", _at_full_speed)
+def reset_waits_for_the_wheels(bench: Bench, driver: Sender) -> None:
+    """`reset` while the wheels turn is rejected as NOT_ALLOWED."""
+    operator = Sender(driver.robot, "operator")
+    operator.send_request("stop")
+    bench.need(driver.robot.becomes(State.STOPPED), "STOP does not stop this robot (R-STOP-01)")
+    before, reply = driver.robot.status(), operator.reply("reset")
+    after = driver.robot.next_status()
+    bench.need(after.applied != (0.0, 0.0) or not reply.ok, "its wheels are at zero before a `status` shows STOPPED")
+    bench.expect(not reply.ok, "it was granted while the wheels turned")
+    counted = after.refused.get("NOT_ALLOWED", 0) > before.refused.get("NOT_ALLOWED", 0)
+    bench.expect(counted, f"rejected with {reply.detail!r}, expected NOT_ALLOWED")
+
+
+@SUITE.must("R-STOP-16", "8.2 Requests and replies", _human)
+def reset_beside_a_human(bench: Bench, human: Sender) -> None:
+    """While a human holds the lease, no other source may reset: NOT_ALLOWED."""
+    operator = _stopped(bench)
+    bench.need(human.robot.status().holder is not None, "the lease of the human has ended")
+    operator.expect_rejected("reset", "NOT_ALLOWED", "a request beside the human")
 
 
 @SUITE.must("R-STOP-02", "13.5 Security", teleop)

@@ -229,6 +229,8 @@ TAUGHT: Final = 14
 """Answers after which a robot expects slow ones."""
 _OF_QUICK: Final = 0.8
 """A share of the full rate that no credit leaves to the silent, and no credit at all exceeds."""
+_LEASE_LASTS_US: Final = 700_000
+"""Within the second that a lease lasts: afterwards a twist with another proof takes it."""
 QUICK_FPS: Final = 15
 """Below this, camera and credit cannot be distinguished."""
 
@@ -445,6 +447,22 @@ SUITE.must_all(taught, {
                   lambda it: _returns_nothing(it, "twists that are MALFORMED",
                                               lambda by, frame: by.twist(frame, b"x"))),
 })
+
+
+@SUITE.must("R-FLOW-17", "7.2 Credit", vision)
+def not_proven_returns_nothing(bench: Bench, driver: Sender) -> None:
+    """A twist that is NOT_PROVEN returns no credit, though its header cites a frame."""
+    driver.drive()
+    bench.rest(OWNED_US)
+    quick = _quick_fps(bench)
+    driver.delay_us = driver.compute_us = SLOW_US
+    bench.rest(1_300_000)
+    driver.fall_silent()
+    forger, before = again(driver), driver.robot.status().refused.get("NOT_PROVEN", 0)
+    driver.robot.each_frame(lambda frame: forger.twist(frame, proof="ab" * 16))
+    fps = fps_of(bench, _LEASE_LASTS_US)
+    bench.need(driver.robot.counts("NOT_PROVEN", before), "another proof is not NOT_PROVEN (R-PROOF-01)")
+    bench.expect(fps <= _OF_QUICK * quick, f"{fps:.0f} fps with twists that are NOT_PROVEN, {quick:.0f} with good ones")
 
 
 _ALONE_US: Final = 6_000_000

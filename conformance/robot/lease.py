@@ -250,6 +250,14 @@ def lost_commands_are_no_forgery(_bench: Bench, first: Sender) -> None:
     first.expect(GOOD)
 
 
+@SUITE.must("R-PROOF-09", "6.6 Proof", ready)
+def too_many_lost_commands(_bench: Bench, first: Sender) -> None:
+    """A proof that is 65 commands ahead does not continue: NOT_PROVEN."""
+    for _ in range(64):
+        first.proofs.next()
+    first.expect("NOT_PROVEN")
+
+
 @SUITE.must("R-PROOF-06", "6.6 Proof", ready)
 def chain_is_renewed(_bench: Bench, first: Sender) -> None:
     """A driver that announced its next chain continues in it."""

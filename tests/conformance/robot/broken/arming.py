@@ -1,7 +1,7 @@
 """Robots that arm, disarm, stop or reset wrongly. Pure."""
 
 from sightline.protocol.errors import RejectReason, WireError
-from sightline.protocol.messages import State, Twist, Verb
+from sightline.protocol.messages import STILL, State, Twist, Verb
 from sightline.robot_side.safety.lease import RANKS
 from sightline.robot_side.safety.validation import AcceptedCommand, CommandResult
 from tests.conformance.robot.broken.breaking import breaks, wrap
@@ -101,7 +101,7 @@ def arms_late(robot):
     forgives(robot, Verb.ARM, late)
 
 
-@breaks("R-ARM-08")
+@breaks("R-ARM-08", "R-ARM-16")
 def arms_from_before_the_disarm(robot):
     forgives(robot, Verb.ARM, denied(robot))
 
@@ -110,6 +110,30 @@ def arms_from_before_the_disarm(robot):
 def arms_beside_a_human(robot):
     gate = robot.driving.gate
     wrap(gate, "arm", lambda inner, who, now_us: inner(gate.holder(now_us) or who, now_us))
+
+
+def permits_earlier(robot, name):
+    """After the method `name` of the gate, a status from before still permits as much as it did."""
+    issued = robot.driving.gate.issued
+
+    def around(inner, *arguments):
+        denied = issued._denied_seq
+        try:
+            return inner(*arguments)
+        finally:
+            issued._denied_seq = denied
+
+    wrap(robot.driving.gate, name, around)
+
+
+@breaks("R-ARM-16")
+def arms_from_before_a_human_let_go(robot):
+    permits_earlier(robot, "release")
+
+
+@breaks("R-ARM-17")
+def resets_from_before_a_human_was_lost(robot):
+    permits_earlier(robot, "_notice_lost_human")
 
 
 @breaks("R-ARM-10")
@@ -233,7 +257,7 @@ def resets_without_echo(robot):
     forgives(robot, Verb.RESET, absent)
 
 
-@breaks("R-STOP-08")
+@breaks("R-STOP-08", "R-ARM-17")
 def resets_from_before_the_stop(robot):
     forgives(robot, Verb.RESET, denied(robot))
 
@@ -294,3 +318,23 @@ def never_arms_again(robot):
     gate, stopped = robot.driving.gate, []
     wrap(gate, "reset", lambda inner, who, now_us: stopped.append(who) or inner(who, now_us))
     wrap(gate, "_missing_to_arm", lambda inner, now_us: "it was stopped once" if stopped else inner(now_us))
+
+
+@breaks("R-STOP-15")
+def resets_turning_wheels(robot):
+    gate = robot.driving.gate
+
+    def around(inner, who, now_us):
+        applied, gate.applied = gate.applied, STILL
+        try:
+            return inner(who, now_us)
+        finally:
+            gate.applied = applied
+
+    wrap(gate, "reset", around)
+
+
+@breaks("R-STOP-16")
+def resets_beside_a_human(robot):
+    gate = robot.driving.gate
+    wrap(gate, "reset", lambda inner, who, now_us: inner(gate.holder(now_us) or who, now_us))

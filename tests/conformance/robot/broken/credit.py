@@ -22,7 +22,7 @@ def owns_too(robot, when):
     wrap(stream_of(robot), "_owns", lambda inner, who, now_us: when(now_us) or inner(who, now_us))
 
 
-@breaks("R-FLOW-01")
+@breaks("R-FLOW-01", "R-FLOW-17")
 def sends_without_credit(robot):
     wrap(robot, "film", lambda _inner, now_us: robot.capture(Picture(JPEG, now_us)) if robot.listening() else None)
 

@@ -231,15 +231,26 @@ def guests_are_many(robot):
 # --- credit ----------------------------------------------------------------------------------------------------------
 
 
-@breaks("R-FLOW-12")
-def malformed_twists_return_credit(robot):
+def returns_credit_for(robot, reason):
+    """Take a twist that is rejected for this reason as an ack."""
+
     def around(inner, message):
-        before = robot.driving.gate.counters["MALFORMED"]
+        before = robot.driving.gate.counters[reason]
         inner(message)
-        if robot.driving.gate.counters["MALFORMED"] > before and "echo" in (fields_of(message.header) or {}):
+        if robot.driving.gate.counters[reason] > before and "echo" in (fields_of(message.header) or {}):
             robot.on_ack(Message(ACK, message.source, message.header, b""))
 
     wrap(robot, "on_twist", around)
+
+
+@breaks("R-FLOW-12")
+def malformed_twists_return_credit(robot):
+    returns_credit_for(robot, "MALFORMED")
+
+
+@breaks("R-FLOW-17")
+def twists_that_are_not_proven_return_credit(robot):
+    returns_credit_for(robot, "NOT_PROVEN")
 
 
 @breaks("R-FLOW-13")
