@@ -1,12 +1,17 @@
 """The examples run as they stand."""
 
+import base64
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
 import textwrap
 from pathlib import Path
+
+import cv2
+import numpy as np
 
 from sightline.operator_side.config.loading import load_service
 from sightline.robot_side.plugins import DRIVES
@@ -40,6 +45,15 @@ def test_example_drive_keeps_the_contract(monkeypatch):
     assert isinstance(first, WheelAngles)
     assert until(lambda: drive.wheels().left_rad > first.left_rad + 0.1)
     drive.close()
+
+
+def test_legacy_client_changes_its_search_with_the_image():
+    steer = runpy.run_path(str(ROOT / "examples/compose/older_client.py"))["steer"]
+    images = [base64.b64encode(cv2.imencode(".jpg", np.full((48, 64, 3), shade, np.uint8))[1]).decode()
+              for shade in (90, 130)]
+    first, second = (steer(image) for image in images)
+    assert first != second and steer(images[0]) == first
+    assert all(re.fullmatch(r"0\.0\|0\.50?\d?", twist) for twist in (first, second))
 
 
 def test_steps_of_the_own_robot_page_work_from_an_empty_folder(tmp_path):
