@@ -232,9 +232,9 @@ def _ended(code: int) -> str:
     return f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
 
 
-# The questions to a codec: every golden vector, every accepted one cut short, and twists to write. Pure.  A vector's
-# outcome is in its file; what a cut message must come to is what our own decoders return. The files alone decide the
-# questions: a new vector is a new case.
+# The questions to a codec: every golden vector, every accepted one cut short and with bits flipped, and twists to
+# write. Pure.  A vector's outcome is in its file; what a cut or flipped message must come to is what our own decoders
+# return. The files alone decide the questions: a new vector is a new case.
 
 
 VECTORS: Final = Path(__file__).parent.parent / "protocol" / "vectors"
@@ -245,7 +245,7 @@ _MOST_CUTS: Final = 512
 """Of one payload: each cut sends its beginning again, 90 MB for one of 32 KB that is cut at every 8th byte."""
 _COMPONENT_BYTES: Final = 3
 """Of each component in a JPEG's frame header."""
-_VECTORS_FROM, _CUTS_FROM, _WRITES_FROM = 1001, 2001, 3001
+_VECTORS_FROM, _CUTS_FROM, _WRITES_FROM, _FLIPS_FROM = 1001, 2001, 3001, 4001
 
 _WRITTEN: Final = {
     "usual": ("four decimals", 0.2, -0.35, "0.2000|-0.3500"),
@@ -262,7 +262,7 @@ _WRITTEN: Final = {
 
 @dataclass(frozen=True, slots=True)
 class CodecCase:
-    """One line of the report: all of its questions must be answered rightly; `family` is vector, cut or write."""
+    """One line of the report: all of its questions must be answered rightly; `family` is vector, cut, write or flip."""
 
     number: int
     family: str
@@ -274,7 +274,7 @@ class CodecCase:
 
 
 def codec_cases(vectors: Path = VECTORS) -> list[CodecCase]:
-    """Every case: one per vector, one per vector that is accepted and can be cut, one per twist to write."""
+    """Every case: one per vector, two per accepted one that can be cut and flipped, one per twist to write."""
     read = [(path.relative_to(vectors).with_suffix("").as_posix(), json.loads(path.read_text("utf-8")))
             for path in sorted(vectors.rglob("*.json"))]
     able = [(name, vector) for name, vector in read if "accept" in vector and "key" in vector]
@@ -282,6 +282,7 @@ def codec_cases(vectors: Path = VECTORS) -> list[CodecCase]:
         *(_vector_case(_VECTORS_FROM + count, *one) for count, one in enumerate(read)),
         *(_cut_case(_CUTS_FROM + count, *one) for count, one in enumerate(able)),
         *(_write_case(_WRITES_FROM + count, *one) for count, one in enumerate(_WRITTEN.items())),
+        *(_flip_case(_FLIPS_FROM + count, *one) for count, one in enumerate(able) if one[1]["header_hex"]),
     ]
 
 
@@ -315,6 +316,20 @@ def _cut_case(number: int, name: str, vector: dict[str, Any]) -> CodecCase:
     apart = "" if payload_step == step else f", the payload at every {payload_step} bytes"
     purpose = f"`vectors/{name}.json`, header or payload cut short at {where}{apart}."
     return CodecCase(number, "cut", purpose, True, "17.2 Golden vectors", questions)
+
+
+def _flip_case(number: int, name: str, vector: dict[str, Any]) -> CodecCase:
+    key, header, payload = vector["key"], bytes.fromhex(vector["header_hex"]), bytes.fromhex(vector["payload_hex"])
+    step = 1 if name.endswith("/usual") else _CUT_EVERY
+
+    def questions() -> Iterator[Question]:
+        for at in range(0, len(header), step):
+            flipped = header[at] ^ 1 << at // step % 8
+            yield _message(key, header[:at] + bytes((flipped,)) + header[at + 1 :], payload)
+
+    where = "every byte" if step == 1 else f"every {step}th byte"
+    purpose = f"`vectors/{name}.json`, one bit of {where} of the header flipped, each alone."
+    return CodecCase(number, "flip", purpose, True, "17.2 Golden vectors", questions)
 
 
 def _components_at(payload: bytes) -> range:

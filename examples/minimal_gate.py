@@ -13,7 +13,7 @@ from typing import Any
 SESSION = secrets.token_hex(4)
 FULL_SPEED_US, MAX_AGE_US, SILENCE_US, LEASE_US, STATUS_US = 150_000, 400_000, 300_000, 1_000_000, 2_000_000
 MAX_LINEAR_MPS, MAX_ANGULAR_RAD_S = 0.3, 1.5
-MAX_JUMP = 2**32
+MAX_FIRST_SEQ, MAX_JUMP = 2**32, 2**20
 NOTHING = (0.0, 0.0, -MAX_AGE_US, -SILENCE_US)  # linear, angular, when the frame was captured, when it came
 NUMBER = rb"([+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)"
 TWIST = re.compile(NUMBER + rb"\|" + NUMBER)  # 4.1
@@ -50,6 +50,7 @@ class Gate:
         """The reason of 5.1 that stands against a twist, or "" with the command taken over."""
         match, echo, who = TWIST.fullmatch(text[:65]), header["echo"], (header["source"], header["session"])
         linear, angular = (float(match[1]), float(match[2])) if match else (math.nan, math.nan)
+        last = self.last_seq.get(who, -1)
         checks = {
             "UNSUPPORTED_VERSION": header.get("v", 1) == 1,
             "MALFORMED": match is not None and len(text) <= 64,
@@ -57,7 +58,7 @@ class Gate:
             "UNKNOWN_SOURCE": who[0] in ("vision", "teleop"),
             **self.young(echo, "frame", now, MAX_AGE_US),
             "NOT_PROVEN": self.proven(header, now),
-            "OUT_OF_ORDER": 0 < header["seq"] - self.last_seq.get(who, -1) <= MAX_JUMP,
+            "OUT_OF_ORDER": last < header["seq"] <= (MAX_FIRST_SEQ if last < 0 else last + MAX_JUMP),
         }
         wrong = next((reason for reason, holds in checks.items() if not holds), "")
         return wrong or self.take(who, header, (linear, angular, echo["t_us"], now))

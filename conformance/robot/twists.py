@@ -284,6 +284,12 @@ def _good(status: Status) -> int:
     return status.accepted + status.refused.get("DISARMED", 0)
 
 
+def _leaps(sender: Sender, numbers: Sequence[int], **changes: Any) -> None:
+    """Fail the case unless a twist with each of these `seq` is out of order."""
+    for seq in numbers:
+        sender.expect("OUT_OF_ORDER", seq=seq, what=f"seq {seq}", **changes)
+
+
 SUITE.must_all(vision, {
     "R-CAUS-01": ("5.2 Record", "A twist that answers the newest frame at once is accepted.",
                   lambda it: it.expect(GOOD)),
@@ -293,10 +299,10 @@ SUITE.must_all(ready, {
                  lambda it: it.expect("OUT_OF_ORDER", seq=it.seq)),
     "R-SEQ-08": ("2.5 Session and sequence", "A `seq` that jumps forward is taken.",
                  lambda it: it.expect(GOOD, seq=it.seq + 1001)),
-    "R-SEQ-13": ("5.1 Order", "A `seq` near the largest integer does not continue a session: it would bar its owner.",
-                 lambda it: it.expect("OUT_OF_ORDER", seq=1 << 52)),
-    "R-SEQ-14": ("5.1 Order", "A `seq` near the largest integer does not begin a session.",
-                 lambda it: it.expect("OUT_OF_ORDER", seq=1 << 52, session="fffffff1")),
+    "R-SEQ-13": ("5.1 Order", "A `seq` more than 2^20 above the last does not continue a session: it would bar its "
+                 "owner.", lambda it: _leaps(it, (1 << 52, it.seq + (1 << 20) + 1))),
+    "R-SEQ-14": ("5.1 Order", "A `seq` above 2^32 does not begin a session.",
+                 lambda it: _leaps(it, (1 << 52, (1 << 32) + 1), session="fffffff1")),
 })
 SUITE.must_all(_watcher, {
     "R-CAUS-12": ("5.1 Order", "The grammar is validated before the role: nonsense of a watcher is MALFORMED.",

@@ -47,6 +47,12 @@ def writes_minus_zero(question, right):
     return {"ok": written} if question["kind"] == "write_twist" else right
 
 
+@wrong("C-CODEC-4")
+def trips_over_a_flip(question, right):
+    """A header whose first brace has another bit is a fault of the program's own."""
+    return {"refusal": "CRASHED"} if base64.b64decode(question.get("header", "")).startswith(b"z") else right
+
+
 @wrong("C-CODEC-1")
 def takes_any_hello(question, right):
     """A hello for any robot at all."""
@@ -79,6 +85,13 @@ def dies(question, right):
     """In the middle."""
     if question["id"] == 3:
         print("out of luck", file=sys.stderr, flush=True)
+        sys.exit(7)
+    return right
+
+
+def dies_of_a_flip(question, right):
+    """When the first brace of a header has another bit."""
+    if base64.b64decode(question.get("header", "")).startswith(b"z"):
         sys.exit(7)
     return right
 

@@ -65,6 +65,8 @@ def test_every_vector_is_a_case_and_every_accepted_message_is_cut():
     cut = [one for one in asked if one.family == "cut"]
     assert len(cut) == sum("key" in vector and "accept" in vector for vector in vectors)
     assert all(any("refusal" in one.expected for one in case.questions()) for case in cut)
+    flipped = [one for one in asked if one.family == "flip"]
+    assert len(flipped) == sum("accept" in vector and bool(vector.get("header_hex")) for vector in vectors)
     assert {case.level for case in CASES} == set(Level)
 
 
@@ -81,6 +83,12 @@ def test_a_broken_codec_fails_its_family_and_no_other(name):
 
 def test_a_codec_that_rejects_a_cut_frame_header_passes_every_case():
     assert failed(run_codec([*BROKEN, "needs_whole_frame_headers"])) == {}
+
+
+def test_a_codec_that_dies_of_one_flipped_bit_fails():
+    (case,) = [one for one in CASES if "vectors/twist/usual.json`, one bit" in one.title]
+    (reason,) = failed(run_codec([*BROKEN, "dies_of_a_flip"], [case])).values()
+    assert reason == "it ended with 7 before it had answered"
 
 
 @pytest.mark.parametrize(("name", "line"), [
