@@ -11,7 +11,6 @@ import { JsonError, parseJson } from "./json.mjs";
 export const SUBPROTOCOL = "sightline.v1";
 export const MAX_HELLO_BYTES = 1024;
 export const MAX_BLOCK_BYTES = 576;
-export const MAX_REASON_BYTES = 123; // RFC 6455, 5.5
 const MAX_MADE_UP_SOURCES = 16; // security limit: of one channel, messages that wait and whose source is no role's
 const ROLE_SOURCES = new Set(["vision", "operator", "teleop", "detector"]);
 const PASSED_ON = new Set(["detections", "mission", "report", "overlay", "preview"]); // their sources others choose

@@ -100,7 +100,7 @@ export class Gate {
 
   /** Steps 7 to 9: the latch, the lease, the arming. */
   admit(who, header, now_us) {
-    if (this.state === "STOPPED" || this.state === "FAULT") throw new WireError(this.state, this.reason);
+    if (this.state === "STOPPED") throw new WireError(this.state, this.reason);
     this.noticeLostHuman(now_us);
     const holder = this.lease.liveHolder(now_us);
     if (!this.lease.mayTake(who, now_us)) throw new WireError("NOT_HOLDER", `${holder.source} ${shown(holder).digest} drives`);
@@ -202,13 +202,6 @@ export class Gate {
     return "STOPPED";
   }
 
-  /** The drive failed: wheels to zero until `reset`. */
-  fault(reason) {
-    if (this.state === "STOPPED" || this.state === "FAULT") return;
-    this.issued.denyEarlier();
-    this.leave("FAULT", reason);
-  }
-
   disarm(reason) {
     this.issued.denyEarlier();
     this.armsItself = false;
@@ -218,7 +211,7 @@ export class Gate {
 
   reset(who, now_us) {
     this.refuseBesideHuman(who, now_us);
-    if (this.state !== "STOPPED" && this.state !== "FAULT") return `nothing to reset: ${this.state}`;
+    if (this.state !== "STOPPED") return `nothing to reset: ${this.state}`;
     if (!isStill(this.applied)) throw new WireError("NOT_ALLOWED", "the wheels are not at zero yet; repeat the request");
     this.leave("DISARMED", `reset by ${who.source}; not armed`);
     return "reset; arm to drive";

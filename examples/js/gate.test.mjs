@@ -265,13 +265,6 @@ test("acquire and release", () => {
   assert.equal(rig.ask("release", { ...human, echo: null }), "not held");
 });
 
-test("a fault is left by reset", () => {
-  const rig = new Rig();
-  rig.gate.fault("the drive is gone");
-  assert.equal(rig.command(rig.frame()), "FAULT");
-  assert.match(rig.ask("reset"), /^reset/);
-});
-
 test("beyond the limits: one factor for both axes, counted", () => {
   assert.deepEqual(clampTwist({ linear_mps: 1, angular_rad_s: 1 }, 0.5, 2), { linear_mps: 0.5, angular_rad_s: 0.5 });
   const rig = new Rig();
