@@ -5,7 +5,9 @@ each).
 """
 
 import os
+import termios
 import time
+import tty
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TextIO
@@ -21,13 +23,29 @@ class MyDriveConfig(Config):
     port: Path
 
 
+BAUD = termios.B115200
+"""As the motor controller is set."""
+
+
 def opened(port: Path) -> TextIO:
     """Open the port to write lines."""
     try:
         # Without O_CREAT: where the port is missing, the user root would create a file and drive that.
-        return os.fdopen(os.open(port, os.O_WRONLY | os.O_NOCTTY), "w", buffering=1)
+        descriptor = os.open(port, os.O_WRONLY | os.O_NOCTTY)
     except OSError as error:
         raise HardwareError(f"motor controller {port}: {error.strerror}; is it plugged in?") from None
+    if os.isatty(descriptor):
+        set_up(descriptor)
+    return os.fdopen(descriptor, "w", buffering=1)
+
+
+def set_up(descriptor: int) -> None:
+    """Set the speed of a serial port, and send bytes as they are."""
+    # By default a port echoes what it receives: the controller would get its own answers back as commands.
+    tty.setraw(descriptor, termios.TCSANOW)
+    settings = termios.tcgetattr(descriptor)
+    settings[4] = settings[5] = BAUD  # both directions
+    termios.tcsetattr(descriptor, termios.TCSANOW, settings)
 
 
 class MyDrive:

@@ -7,12 +7,14 @@ import runpy
 import shlex
 import subprocess
 import sys
+import termios
 import textwrap
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from examples.my_drive import MyDrive
 from sightline.operator_side.config.loading import load_service
 from sightline.robot_side.plugins import DRIVES
 from sightline.robot_side.ports import WheelAngles
@@ -45,6 +47,18 @@ def test_example_drive_keeps_the_contract(monkeypatch):
     assert isinstance(first, WheelAngles)
     assert until(lambda: drive.wheels().left_rad > first.left_rad + 0.1)
     drive.close()
+
+
+def test_example_drive_sets_up_its_serial_port():
+    controller, port = os.openpty()
+    drive = MyDrive(MyDrive.Config(port=os.ttyname(port)))
+    assert termios.tcgetattr(port)[4:6] == [termios.B115200] * 2
+    os.write(controller, b"ready\n")
+    drive.set(1.0, -2.0)
+    assert os.read(controller, 100) == b"1.000 -2.000\n"
+    drive.close()
+    os.close(port)
+    os.close(controller)
 
 
 def test_legacy_client_changes_its_search_with_the_image():
