@@ -5,13 +5,14 @@ which both axes share one 2x2 covariance, because they have the same noise. The 
 
 The other objects in view are tracked too, so that the target does not become one of them where they cross or hide each
 other. Each sighting belongs to the object that it fits best, by the likelihood of its position and its look. Where two
-objects could be exchanged, neither is corrected: both go on as before, until they are apart. A target that stays in
-doubt is lost. For a while after its loss nothing is followed that looks like another object.
+objects could be exchanged, neither is corrected: both go on as before, until they are apart. Where one hides a part of
+the other, both are corrected less. A target that stays in doubt is lost. For a while after its loss nothing is followed
+that looks like another object.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sightline.protocol.messages import Pose
 from sightline.vision_side.config import TrackConfig
@@ -164,7 +165,7 @@ class Track:
         in_doubt = self._in_doubt(self._followed, fits) if self._followed else set()
         for one, place in fits.items():
             if one not in in_doubt:
-                one.correct(place)
+                one.correct(self._inexact(place) if self._is_in_line(one, pose) else place)
         if self._followed is None:
             seen = self._start(dt_s, places, fits)
         else:
@@ -199,6 +200,20 @@ class Track:
         gate_m = self._config.gate_m + self._config.gate_growth_mps * one.state.unseen_us / 1e6
         is_alike = one.state.unseen_us <= _BRIEFLY_US or difference(one.look, place.sighting.look) < OTHER
         return is_alike and one.away_m(place) < gate_m
+
+    def _is_in_line(self, one: _Object, pose: Pose) -> bool:
+        """Return True if an object hides a part of another one, or is hidden by it."""
+        here = from_odometry(pose, one.state.x_m, one.state.y_m)
+        return any(
+            other is not one and other.is_known
+            and _are_in_line(here, from_odometry(pose, other.state.x_m, other.state.y_m), self._config.apart_m)
+            for other in self._objects()
+        )
+
+    @staticmethod
+    def _inexact(place: _Place) -> _Place:
+        # The outline is of a part, or of both.
+        return replace(place, noise_m2=max(place.noise_m2, _MOST_NOISE_M2))
 
     def _in_doubt(self, target: _Object, fits: dict[_Object, _Place]) -> set[_Object]:
         """Return the target and the rivals that could as well have its sighting, and it theirs; empty if none could."""
@@ -257,6 +272,12 @@ class Track:
 
 def _apart_m(one: "Target | _Place", other: "Target | _Place") -> float:
     return math.hypot(one.x_m - other.x_m, one.y_m - other.y_m)
+
+
+def _are_in_line(one: tuple[float, float], other: tuple[float, float], apart_m: float) -> bool:
+    """Return True if the nearer of two points is less than `apart_m` from the ray to the further one."""
+    further_m = max(math.hypot(*one), math.hypot(*other))
+    return abs(one[0] * other[1] - one[1] * other[0]) < apart_m * further_m
 
 
 def to_odometry(pose: Pose, x_m: float, y_m: float) -> tuple[float, float]:

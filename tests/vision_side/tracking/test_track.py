@@ -373,6 +373,39 @@ def test_time_since_the_loss_counts_from_the_last_loss():
         assert track.step(DT_S, HERE, [at(*TARGET), at(2.0, 0.5)]) is not None
 
 
+def nearer(aside_m):
+    """Return a place so far from the ray to the target."""
+    return 1.0, aside_m
+
+
+def further(aside_m):
+    """Return a place to which the ray is so far from the target."""
+    angle = math.asin(aside_m / 2)
+    return 3 * math.cos(angle), 3 * math.sin(angle)
+
+
+@pytest.mark.parametrize(("aside_m", "frames", "range_noise", "is_inexact"), [
+    (0.149, 5, 0.008, True), (0.151, 5, 0.008, False), (0.149, 4, 0.008, False), (0.149, 5, 0.05, False),
+])  # fmt: skip
+@pytest.mark.parametrize("place", [nearer, further])
+@pytest.mark.parametrize("side", [1, -1])
+def test_sighting_in_line_with_a_known_object_is_less_exact(place, side, aside_m, frames, range_noise, is_inexact):
+    track = beside(place(side * aside_m), frames=frames, range_noise=range_noise, acceleration_mps2=0.35)
+    position, both, velocity = track._followed.variance
+    predicted = position + DT_S * (2 * both + DT_S * velocity) + 0.35**2 * DT_S**3 / 3
+    track.step(DT_S, HERE, [at(2.01, 0.0), at(*place(side * aside_m))])
+    noise_m2 = 0.15**2 if is_inexact else (range_noise * 2.01**2) ** 2
+    assert track.target.x_m == pytest.approx(2.0 + 0.01 * predicted / (predicted + noise_m2), rel=1e-9)
+
+
+def test_objects_are_in_line_as_seen_from_the_robot():
+    track, turned = beside((1.0, 0.0)), beside((1.0, 0.0))
+    track.step(DT_S, HERE, [at(2.01, 0.0), at(1.0, 0.0)])
+    # From here the target is 1 m ahead and the other object 1 m to the left.
+    turned.step(DT_S, (2.0, -1.0, math.pi / 2), [at(1.0, -0.01), at(1.0, 1.0)])
+    assert turned.target.x_m - 2.0 > 2 * (track.target.x_m - 2.0) > 0
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_target_stays_the_same_while_others_cross_and_hide_it(seed):
     """One crosses between robot and target, one behind the target; what is behind another one is hidden."""
