@@ -393,17 +393,27 @@ def test_sighting_in_line_with_a_known_object_is_less_exact(place, side, aside_m
     track = beside(place(side * aside_m), frames=frames, range_noise=range_noise, acceleration_mps2=0.35)
     position, both, velocity = track._followed.variance
     predicted = position + DT_S * (2 * both + DT_S * velocity) + 0.35**2 * DT_S**3 / 3
-    track.step(DT_S, HERE, [at(2.01, 0.0), at(*place(side * aside_m))])
+    turned = (0.0, 0.0, 0.5)
+    track.step(DT_S, turned, [at(*from_odometry(turned, *one)) for one in ((2.01, 0.0), place(side * aside_m))])
     noise_m2 = 0.15**2 if is_inexact else (range_noise * 2.01**2) ** 2
     assert track.target.x_m == pytest.approx(2.0 + 0.01 * predicted / (predicted + noise_m2), rel=1e-9)
 
 
 def test_objects_are_in_line_as_seen_from_the_robot():
-    track, turned = beside((1.0, 0.0)), beside((1.0, 0.0))
+    track, moved = beside((1.0, 0.0)), beside((1.0, 0.0))
     track.step(DT_S, HERE, [at(2.01, 0.0), at(1.0, 0.0)])
     # From here the target is 1 m ahead and the other object 1 m to the left.
-    turned.step(DT_S, (2.0, -1.0, math.pi / 2), [at(1.0, -0.01), at(1.0, 1.0)])
-    assert turned.target.x_m - 2.0 > 2 * (track.target.x_m - 2.0) > 0
+    moved.step(DT_S, (2.0, -1.0, math.pi / 2), [at(1.0, -0.01), at(1.0, 1.0)])
+    assert moved.target.x_m - 2.0 > 2 * (track.target.x_m - 2.0) > 0
+
+
+def test_objects_just_as_far_apart_as_objects_can_be_are_not_in_line():
+    moved = []
+    for apart_m in (0.25, 0.26):
+        track = beside((1.0, 0.25), apart_m=apart_m)
+        track.step(DT_S, HERE, [at(2.01, 0.0), at(1.0, 0.25)])
+        moved.append(track.target.x_m - 2.0)
+    assert moved[0] > 2 * moved[1] > 0
 
 
 @pytest.mark.parametrize("seed", range(12))
