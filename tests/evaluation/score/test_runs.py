@@ -142,7 +142,7 @@ def test_the_command_prints_one_object_and_exits_5_when_not_ok(capsys):
     assert cli.run(["score", *options, "4"]) == 0
     good = json.loads(capsys.readouterr().out)
     assert good["ok"] and good["checks"] and len(good["runs"]) == 1
-    assert cli.run(["score", *options, "1", "--latency-ms", "300"]) == 5, "no run acquires a target in this time"
+    assert cli.run(["score", *options, "1", "--latency-ms", "200"]) == 5, "no run acquires a target in this time"
     bad = json.loads(capsys.readouterr().out)
     assert not bad["ok"]
     assert "acquired_s" in next(check["name"] for check in bad["checks"] if not check["ok"])
