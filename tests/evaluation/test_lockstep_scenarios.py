@@ -16,8 +16,8 @@ BASICS = {"static", "circle", "eight", "pushed", "behind", "walls"}
 """Those that test_lockstep.py holds against all their bounds."""
 
 
-def drive(name: str, seed: int, seconds: float, mission: str | None = None) -> Run:
-    scenario = load_scenario(name)
+def drive(name: str, seed: int, seconds: float, mission: str | None = None, **changes: float) -> Run:
+    scenario = load_scenario(name).model_copy(update=changes)
     conditions = Conditions(latency_ms=50, loss=0.1)
     return run_lockstep(scenario, robot_of(scenario), seed, conditions, seconds, mission=mission)
 
@@ -42,6 +42,14 @@ def test_a_target_behind_a_wall_is_not_driven_at_through_it():
     run = drive("occluder", 804, 8.4)
     assert sum(not truth.visible for truth in run.samples) > 100
     assert run.samples[-1].wall_contacts * STEP_S < 0.1
+
+
+@pytest.mark.slow
+def test_ball_that_crosses_a_meter_ahead_is_not_followed():
+    """It hides the target for a second, and for some frames both have one outline."""
+    run = drive("three-balls", 7905, 12.0, stand_off_m=0.9)
+    assert sum(not truth.visible for truth in run.samples) > 10
+    assert all(abs(math.degrees(truth.bearing_rad)) < 2 for truth in last(run, 2.0))
 
 
 # --- the legacy laws, which must fail as they did ----------------------------------------------------------------
