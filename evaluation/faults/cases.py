@@ -250,12 +250,15 @@ def _cut(rig: RobotFixture, shapes: LinkShapes, seconds: float) -> Injected:
     return Injected(harmed, at_us, resumed_us, drives_again(rig))
 
 
-def _worsen(rig: RobotFixture, shapes: LinkShapes) -> Injected:
-    """Bad for a while, but not cut: frames that are still young may be driven on."""
-    before = shape(rig, shapes)
-    at_us = monotonic_us()
+def _worsen(rig: RobotFixture, both: LinkShape, harms: Sequence[str]) -> Injected:
+    """Bad for a while, but not cut: frames that are still young may be driven on. Each of the `harms` must occur."""
+    assert rig.wire is not None
+    shape(rig, LinkShapes(ab=both, ba=both))
+    at_us, before = monotonic_us(), rig.wire.counts
     rig.watch(DISTURBED_S)
-    return Injected(shape(rig, LinkShapes()) - before, at_us, again=drives_again(rig))
+    shape(rig, LinkShapes())
+    count = min(rig.wire.counts[harm] - before[harm] for harm in harms)
+    return Injected(count, at_us, again=drives_again(rig))
 
 
 def _flap(rig: RobotFixture) -> Injected:
@@ -293,20 +296,20 @@ NETWORK_CASES: Final = (
         seconds=3.0), _WIRED, blind=True, again=True
     ),
     FaultCase(
-        "wire.delay", "network: 300 ms each way", partial(_worsen, shapes=LinkShapes(ab=_SLOW, ba=_SLOW)), _WIRED,
+        "wire.delay", "network: 300 ms each way", partial(_worsen, both=_SLOW, harms=("delayed",)), _WIRED,
         stops=False, again=True
     ),
     FaultCase(
-        "wire.loss", "network: 20 % loss each way", partial(_worsen, shapes=LinkShapes(ab=LOSSY, ba=LOSSY)), _WIRED,
+        "wire.loss", "network: 20 % loss each way", partial(_worsen, both=LOSSY, harms=("lost",)), _WIRED,
         stops=False, again=True
     ),
     FaultCase(
-        "wire.mixed", "network: 10 % reordered, 10 % duplicated", partial(_worsen, shapes=LinkShapes(ab=_MIXED,
-        ba=_MIXED)), _WIRED, stops=False, again=True
+        "wire.mixed", "network: 10 % reordered, 10 % duplicated", partial(_worsen, both=_MIXED,
+        harms=("reordered", "duplicated")), _WIRED, stops=False, again=True
     ),
     FaultCase(
-        "wire.thin", "network: 1 Mbit/s under a camera of 4 Mbit/s", partial(_worsen, shapes=LinkShapes(ab=_THIN,
-        ba=_THIN)), _HEAVY, stops=False, again=True
+        "wire.thin", "network: 1 Mbit/s under a camera of 4 Mbit/s", partial(_worsen, both=_THIN,
+        harms=("delayed",)), _HEAVY, stops=False, again=True
     ),
     FaultCase("wire.flaps", "network: gone and back every 0.5 s", _flap, _WIRED, stops=False, again=True),
 )

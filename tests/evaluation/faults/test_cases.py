@@ -5,6 +5,8 @@ The short set is marked `slow`, the rest `long`.
 
 import json
 import math
+from collections import Counter
+from types import SimpleNamespace
 
 import pytest
 import typer
@@ -13,7 +15,7 @@ from hypothesis import strategies as st
 
 from docs.make.faults import describe_machine, report_page
 from sightline.evaluation.checks import Check, at_most, worst_checks
-from sightline.evaluation.faults import devices
+from sightline.evaluation.faults import cases, devices
 from sightline.evaluation.faults.cases import CASES, chosen
 from sightline.evaluation.faults.evidence import (
     GOOD,
@@ -235,6 +237,23 @@ def test_spare_images_have_the_defects_of_their_names(tmp_path):
 def outcome(row=CASES[0], value=1.0, bound=2.0, **changes):
     check = Check("zero", value, "ms", bound, value is not None and value <= bound)
     return FaultOutcome(row, **{"checks": (check,), **changes})
+
+
+@pytest.mark.parametrize(("row", "other"), [
+    ("wire.mixed", "delayed"), ("wire.mixed", "reordered"), ("wire.loss", "delayed"),
+])
+def test_other_harm_of_the_wire_is_not_the_fault(monkeypatch, row, other):
+    monkeypatch.setattr(cases, "drives_again", lambda rig: True)
+
+    class Wire:
+        def __init__(self):
+            self.counts = Counter()
+
+        def shape(self, shapes):
+            self.counts = self.counts + Counter({other: 5})
+
+    [case] = chosen([row], short=False)
+    assert case.inject(SimpleNamespace(wire=Wire(), watch=lambda seconds: None)).count == 0
 
 
 def test_rows_have_unique_names_and_state_their_bounds():
