@@ -243,11 +243,13 @@ class Setup:
         return {"vision": 0.2, "guest": 0.15}.get(self.driver, KEPT_MPS)
 
 
-def _moving_stop(rows: Sequence[MotorRow], at_us: int, kept_mps: float) -> Iterable[Check]:
+def moving_stop(
+    rows: Sequence[MotorRow], at_us: int, kept_mps: float, since: str = "the first packet", zero_ms: float = ZERO_MS,
+) -> Iterable[Check]:
     """Check that the wheels turned at the first packet of a STOP, and the time until they stood."""
     speed_mps = next((wheel_mps(row) for row in reversed(rows) if row.t_us <= at_us), 0.0)
-    yield at_least("speed at the first packet", speed_mps, "m/s", kept_mps)
-    yield at_most("zero after the first packet", judge.measure_stop(rows, at_us).zero_ms, "ms", ZERO_MS)
+    yield at_least(f"speed at {since}", speed_mps, "m/s", kept_mps)
+    yield at_most(f"zero after {since}", judge.measure_stop(rows, at_us).zero_ms, "ms", zero_ms)
 
 
 class RobotFixture:
@@ -382,7 +384,7 @@ class RobotFixture:
         at_us = self.noted("operator", REQUESTED)[0].t_us
         self.watch(ZERO_MS / 1000)
         ended = at_most("exit code of stop", code, "", 0)
-        return at_us, (*(_moving_stop(self.motors(), at_us, self.setup.kept_mps) if moving else ()), ended)
+        return at_us, (*(moving_stop(self.motors(), at_us, self.setup.kept_mps) if moving else ()), ended)
 
     def start_crowd(self, kind: str, endpoint: str = "") -> None:
         """Let many clients come, WebSocket ones by default; what they do is noted as by a peer called `crowd`."""

@@ -11,7 +11,15 @@ from typing import Final
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.devices import MODE
 from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, ZERO_MS, measure_stop, wheel_mps
-from sightline.evaluation.faults.fixture import KEPT_MPS, ROBOT, STOP_ENDS_S, RobotFixture, Setup, busy_processes
+from sightline.evaluation.faults.fixture import (
+    KEPT_MPS,
+    ROBOT,
+    STOP_ENDS_S,
+    RobotFixture,
+    Setup,
+    busy_processes,
+    moving_stop,
+)
 from sightline.evaluation.faults.load_clients import FEW_HZ, HALF_OPEN, MANY_HZ, READY, SESSIONS, STOPS
 from sightline.evaluation.faults.peer import LEGACY_LIBRARIES
 from sightline.evaluation.faults.runner import FaultCase, Injected
@@ -104,6 +112,7 @@ def _typed(rig: RobotFixture) -> Injected:
     rig.watch(ZERO_MS / 1000)
     falls_ms = measure_stop(rig.motors(), at_us).falls_ms
     return Injected(1, at_us, checks=(
+        *moving_stop(rig.motors(), at_us, rig.setup.kept_mps, "the start of the command"),
         at_most("speed falls after the start of the command", falls_ms, "ms", TYPED_FALLS_MS),
         at_most("CPU time of the command", cpu_s, "s", TYPED_CPU_S), at_most("exit code of stop", code, "", 0),
     ))
@@ -175,16 +184,23 @@ def _end_vision(rig: RobotFixture) -> Injected:
     return Injected(1, at_us, checks=(at_most("exit code of vision", code, "", 0),))
 
 
+DISARM_ZERO_MS: Final = 1000.0
+"""`disarm` starts first; the zero command comes at once then."""
+
+
 def _disarm_legacy(rig: RobotFixture) -> Injected:
     """Disarm a legacy robot, and then send STOP."""
     rig.prepare_operator()
+    began_us = monotonic_us()
     rig.processes.start("disarm", ["disarm", "--connect", rig.endpoint])
     code, at_us = rig.processes.exit_code("disarm", STOP_ENDS_S), monotonic_us()
     rig.watch(0.5)
-    left_mps = wheel_mps(rig.motors()[-1])
+    rows = rig.motors()
     _, stopped = rig.stop_by_operator(moving=False)
-    checks = at_most("exit code of disarm", code, "", 0), at_most("speed after disarm", left_mps, "m/s", 0.0)
-    return Injected(1, at_us, checks=(*checks, *stopped))
+    return Injected(1, at_us, checks=(
+        at_most("exit code of disarm", code, "", 0), at_most("speed after disarm", wheel_mps(rows[-1]), "m/s", 0.0),
+        *moving_stop(rows, began_us, rig.setup.kept_mps, "the start of disarm", DISARM_ZERO_MS), *stopped,
+    ), from_us=began_us)
 
 
 def _stop_legacy(rig: RobotFixture) -> Injected:
@@ -200,12 +216,13 @@ _FORMATS: Final = {
 }
 _LEGACY: Final = (
     ("ctrl_c", "Ctrl-C at vision", _end_vision, "exit code 0"),
-    ("disarm", "disarm; then STOP", _disarm_legacy, "exit codes 0"),
+    ("disarm", "disarm; then STOP", _disarm_legacy,
+     f"zero <= {DISARM_ZERO_MS:g} ms after the start of disarm; exit codes 0"),
     ("stop", "STOP by a new operator", _stop_legacy, "exit code 0"),
 )
 LEGACY_CASES: Final = tuple(
     FaultCase(f"legacy.{action}_{form}", f"legacy robot ({library}), texts {form}: {what}", inject,
-              Setup("vision", library, legacy=query), blind=True, also=demanded)
+              Setup("vision", library, legacy=query), blind=True, stops=action != "disarm", also=demanded)
     for row, (action, what, inject, demanded) in enumerate(_LEGACY)
     for column, (form, query) in enumerate(_FORMATS.items())
     for library in [tuple(LEGACY_LIBRARIES)[(row + column) % len(LEGACY_LIBRARIES)]]
@@ -250,7 +267,7 @@ STOP_CASES: Final = (
               f"{_GUEST.guest_unchanged_m:g} m, plus braking; {_DEMANDED}"),
     *LEGACY_CASES,
     FaultCase("stop.typed", "STOP: the command `sightline stop`, counted from its start", _typed, Setup(), blind=True,
-              alone=True, also=f"falls <= {TYPED_FALLS_MS:g} ms; CPU time <= {TYPED_CPU_S:g} s"),
+              alone=True, also=f"falls <= {TYPED_FALLS_MS:g} ms after its start; CPU time <= {TYPED_CPU_S:g} s"),
     FaultCase("stop.busy", f"STOP by a new operator: {BUSY} busy processes beside it", _busy, Setup(), blind=True,
               also=_DEMANDED, alone=True),
     FaultCase("stop.no_descriptors", "STOP by a new operator: the robot has no file descriptor left", _no_descriptors,

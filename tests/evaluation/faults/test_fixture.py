@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from sightline.evaluation.faults.evidence import MotorRow
-from sightline.evaluation.faults.fixture import RobotFixture, Setup, _moving_stop, memory_kib
+from sightline.evaluation.faults.fixture import RobotFixture, Setup, memory_kib, moving_stop
 from sightline.evaluation.processes import Processes
 from sightline.robot_side.kinematics import DiffDriveConfig
 from sightline.robot_side.safety.limits import TICK_US
@@ -47,4 +47,4 @@ def motors(mps_before, mps_after):
 
 @pytest.mark.parametrize(("before", "after", "ok"), [(0.5, 0.0, True), (0.0, 0.0, False), (0.5, 0.5, False)])
 def test_stop_of_a_standing_robot_passes_no_check(before, after, ok):
-    assert all(check.ok for check in _moving_stop(motors(before, after), 990_000, Setup().kept_mps)) is ok
+    assert all(check.ok for check in moving_stop(motors(before, after), 990_000, Setup().kept_mps)) is ok
