@@ -14,6 +14,7 @@ from sightline.sim.network_emulator import LinkShape, LinkShapes
 from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B, why_impossible
 from tests.fixtures.commands import service
 from tests.fixtures.links import until
+from tests.fixtures.robot_process import JPEG
 
 pytestmark = [
     pytest.mark.skipif(bool(why_impossible()), reason=f"{why_impossible()}; run the tests as root with /dev/net/tun"),
@@ -50,13 +51,16 @@ class Machines:
         """Run every command of a section in turn and return the output of the last command."""
         said = ""
         for machine, arguments in _commands(section):
-            command = self._command(machine, arguments)
             if arguments.split()[0] in READY:
-                ready = READY[arguments.split()[0]]
-                self._ending.enter_context(service(command, ready, self._folder, 20, cwd=self._folder, env=self._env))
+                self.start(machine, arguments)
             else:
-                said = self._once(command)
+                said = self._once(self._command(machine, arguments))
         return said
+
+    def start(self, machine, arguments):
+        """Start a service, which continues until the end."""
+        command, ready = self._command(machine, arguments), READY[arguments.split()[0]]
+        self._ending.enter_context(service(command, ready, self._folder, 20, cwd=self._folder, env=self._env))
 
     def again(self, section):
         """Run the last command of a section again and return its output."""
@@ -104,6 +108,42 @@ def test_commands_of_the_two_machines_page_work(section, wire, tmp_path):
         assert "r1" in said
         if section != "direct":  # which ends with STOP and reset; the others with a look at a robot that drives
             assert until(lambda: _drives(said) or _drives(machines.again(section)), 20), said
+
+
+def _listening(namespace):
+    """(protocol, address, port) of each socket that waits for peers in a namespace."""
+    table = subprocess.check_output(["ip", "netns", "exec", namespace, "ss", "-Hlntu"], text=True)
+    rows = [row.split() for row in table.splitlines()]
+    return {(row[0], *row[4].rsplit(":", 1)) for row in rows}
+
+
+# Prints the error of a TCP connection and of a datagram. An address without a listener answers both.
+_KNOCK = """
+import socket, sys
+for kind, port in ((socket.SOCK_STREAM, 7447), (socket.SOCK_DGRAM, 7448)):
+    with socket.socket(socket.AF_INET, kind) as door:
+        door.settimeout(5)
+        try:
+            door.connect((sys.argv[1], port))
+            door.send(b"x")
+            door.recv(1)
+        except OSError as error:
+            print(type(error).__name__)
+"""
+
+
+def test_without_listen_no_other_machine_reaches_the_robot(wire, tmp_path):
+    (tmp_path / "0.jpg").write_bytes(JPEG)
+    with ExitStack() as ending:
+        camera = f"--set camera.kind=folder --set camera.options.path={tmp_path}"
+        drive = f"--set drive.kind=log --set drive.options.path={tmp_path}/log.csv"
+        Machines(tmp_path, wire, ending).start("robot", f"robot {camera} {drive}")
+        listening = _listening(wire.robot_side)
+        assert {("tcp", "127.0.0.1", "7447"), ("udp", "127.0.0.1", "7448")} <= listening
+        assert {address for _, address, _ in listening} == {"127.0.0.1"}, listening
+        knock = ["ip", "netns", "exec", wire.far_side, sys.executable, "-c", _KNOCK, ADDRESS_A]
+        done = subprocess.run(knock, capture_output=True, text=True, timeout=20, check=True)
+        assert done.stdout.split() == ["ConnectionRefusedError"] * 2, "the machine answers, no program does"
 
 
 @pytest.mark.slow
