@@ -9,9 +9,9 @@ import sys
 
 import pytest
 
+from sightline.operator_side.client.stop import stop_robot
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.messages import LeaseHolder, State
-from sightline.robot_side.driver.persistence import StopLatch
 from tests.fixtures.links import until
 from tests.fixtures.ports import port_of
 from tests.fixtures.robot_process import RobotProcess, Vision, driving, stop_after
@@ -95,11 +95,14 @@ def test_shutdown_follows_zero_and_leaves_no_process(tmp_path, number):
 
 
 def test_the_stop_latch_survives_a_restart(tmp_path):
-    StopLatch(tmp_path / "state", "r1").write(stopped=True)
+    with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
+        assert driving(robot)
+        assert stop_robot("r1", [robot.endpoint], "", "", lambda: None)
+    since_us = monotonic_us()
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint) as vision:
-        assert until(lambda: vision.status().state is State.STOPPED)
         assert until(lambda: vision.status().refused.get("STOPPED", 0) > 5)
-        assert robot.speed() == 0.0
+        assert vision.status().state is State.STOPPED
+        assert not any(left or right for t_us, left, right in robot.motor_rows() if t_us > since_us)
 
 
 def test_rejected_twists_have_a_reason_and_move_nothing(tmp_path):
