@@ -1,6 +1,7 @@
 """`sightline robot test-wheels` and `sightline calibrate drive`: nothing turns unasked, every end is zero."""
 
 import io
+import os
 import signal
 import sys
 import tomllib
@@ -9,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from sightline.evaluation.processes import driver_of
 from sightline.operator_side.calibrate import wheels as wheel_test
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import calibrate as cli_robot_tools
@@ -171,6 +173,18 @@ def test_signal_during_a_turn_sets_zero_first(tmp_path, opened, number):
     assert terminal.process.wait(3) == 130
     assert commanded(log)[-1] == (0.0, 0.0)
     assert "not covered" not in terminal.text()
+
+
+def test_killed_during_a_turn_leaves_zero_and_restarts_nothing(tmp_path, opened):
+    log = tmp_path / "drive.csv"
+    terminal = opened("robot", "test-wheels", "--set", "drive.kind=log", "--set", f"drive.options.path={log}")
+    assert terminal.shows("off the ground? y/n")
+    terminal.types("y\n")
+    assert until(lambda: log.exists() and commanded(log) and commanded(log)[-1][0] > 0)
+    os.kill(driver_of(terminal.process.pid), signal.SIGKILL)
+    assert terminal.process.wait(3) == 3
+    assert commanded(log)[-1] == (0.0, 0.0)
+    assert "not started again: the motors are at zero" in terminal.text()
 
 
 def test_a_drive_is_calibrated_at_a_terminal(tmp_path, opened, monkeypatch):
