@@ -277,7 +277,8 @@ def _apart_m(one: "Target | _Place", other: "Target | _Place") -> float:
 def _are_in_line(one: tuple[float, float], other: tuple[float, float], apart_m: float) -> bool:
     """Return True if the nearer of two points is less than `apart_m` from the ray to the further one."""
     further_m = max(math.hypot(*one), math.hypot(*other))
-    return abs(one[0] * other[1] - one[1] * other[0]) < apart_m * further_m
+    is_ahead = one[0] * other[0] + one[1] * other[1] > 0
+    return is_ahead and abs(one[0] * other[1] - one[1] * other[0]) < apart_m * further_m
 
 
 def to_odometry(pose: Pose, x_m: float, y_m: float) -> tuple[float, float]:

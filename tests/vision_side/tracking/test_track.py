@@ -407,6 +407,13 @@ def test_objects_are_in_line_as_seen_from_the_robot():
     assert moved.target.x_m - 2.0 > 2 * (track.target.x_m - 2.0) > 0
 
 
+def test_object_behind_the_robot_is_not_in_line():
+    ahead, behind = beside((1.0, 0.0)), beside((-1.0, 0.0))
+    ahead.step(DT_S, HERE, [at(2.01, 0.0), at(1.0, 0.0)])
+    behind.step(DT_S, HERE, [at(2.01, 0.0)])
+    assert behind.target.x_m - 2.0 > 2 * (ahead.target.x_m - 2.0) > 0
+
+
 def test_objects_just_as_far_apart_as_objects_can_be_are_not_in_line():
     moved = []
     for apart_m in (0.25, 0.26):
