@@ -153,8 +153,9 @@ class Believing(Leaping):
 
     newest_us = 0
 
-    def drives_by(self, _seq, _t_us, _seq2, t_us2):
+    def drives_by(self, _seq, t_us, _seq2, t_us2):
         least_us, most_us = self.believed_us
+        self.newest_us = self.newest_us or t_us
         if least_us < t_us2 - self.newest_us < most_us:
             self.newest_us = t_us2
         return t_us2 < self.newest_us - 1_000_000
