@@ -40,6 +40,7 @@ from sightline.evaluation.faults.runner import FaultOutcome, Injected, run_case,
 from sightline.evaluation.faults.sampler import STALL_US, Hole, read_holes, stalled_us
 from sightline.operator_side.cli import evaluate as cli_faults
 from sightline.protocol.channels import REQUEST, TWIST
+from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.text import parse_twist
@@ -254,6 +255,22 @@ def test_other_harm_of_the_wire_is_not_the_fault(monkeypatch, row, other):
 
     [case] = chosen([row], short=False)
     assert case.inject(SimpleNamespace(wire=Wire(), watch=lambda seconds: None)).count == 0
+
+
+@pytest.mark.parametrize("row", ["network.kill", "network.pause"])
+def test_robot_may_drive_from_the_first_command_that_a_new_network_process_lets_arrive(monkeypatch, row):
+    began_us, pids, signaled = monotonic_us(), iter([7, 7, 0, 8]), []
+    after_us = [cases.LEFT_OVER_US // 2, 2_750_000, 2_800_000]
+    monkeypatch.setattr(cases, "drives_again", lambda rig: True)
+    monkeypatch.setattr(cases, "os", SimpleNamespace(kill=lambda *sent: signaled.append(sent)))
+    rig = SimpleNamespace(
+        processes=SimpleNamespace(network=lambda name: next(pids)), watch=lambda seconds: None,
+        sent=lambda: [SentCommand(began_us + later_us, began_us) for later_us in after_us],
+        until=lambda happened, *_: list(iter(happened, True)),
+        signal_network=lambda number: monotonic_us(),
+    )
+    [case] = chosen([row], short=False)
+    assert case.inject(rig).resumed_us == began_us + 2_750_000 and [pid for pid, _ in signaled] == [7]
 
 
 def test_rows_have_unique_names_and_state_their_bounds():
