@@ -222,7 +222,8 @@ _LEGACY: Final = (
 )
 LEGACY_CASES: Final = tuple(
     FaultCase(f"legacy.{action}_{form}", f"legacy robot ({library}), texts {form}: {what}", inject,
-              Setup("vision", library, legacy=query), blind=True, stops=action != "disarm", also=demanded)
+              Setup("vision", library, legacy=query), blind=True, stops=action != "disarm", also=demanded,
+              alone=action == "disarm")
     for row, (action, what, inject, demanded) in enumerate(_LEGACY)
     for column, (form, query) in enumerate(_FORMATS.items())
     for library in [tuple(LEGACY_LIBRARIES)[(row + column) % len(LEGACY_LIBRARIES)]]

@@ -280,6 +280,11 @@ def test_rows_have_unique_names_and_state_their_bounds():
     assert 6 <= sum(row.short for row in CASES) < len(CASES)
 
 
+def test_row_that_counts_from_the_start_of_a_process_runs_alone():
+    counted = [row for row in CASES if "start" in row.also]
+    assert len(counted) == 6 and all(row.alone for row in counted)
+
+
 def test_rows_are_chosen_by_id_group_and_length():
     assert [row.id for row in chosen(["vision.kill"], short=False)] == ["vision.kill"]
     assert {row.id.partition(".")[0] for row in chosen(["wire", "stop"], short=False)} == {"wire", "stop"}
