@@ -1,6 +1,6 @@
 """Compute the figures of a network case and of its wheel commands, with their bounds. Pure."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final
@@ -171,19 +171,22 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values) if values else 0.0
 
 
-_CAUSES: Final = {
-    "delayed": ("delay_ms", "jitter_ms", "rate_bit_s"), "lost": ("loss", "burst_start"), "cut": ("cut",),
-    "duplicated": ("duplicate",), "reordered": ("reorder",), "corrupted": ("corrupt",),
-}
-"""Counters of the wire, and the fields of a `LinkShape` that let them grow."""
+_CAUSES: Final[tuple[tuple[str, tuple[str, ...], Callable[[list[float]], float]], ...]] = (
+    ("delayed", ("delay_ms", "jitter_ms", "rate_bit_s"), min),
+    ("lost", ("loss",), min), ("lost", ("burst_start",), sum), ("cut", ("cut",), sum),
+    ("duplicated", ("duplicate",), min), ("reordered", ("reorder",), min), ("corrupted", ("corrupt",), min),
+)
+"""A counter of the wire, the fields of a `LinkShape` that let it grow, and how the directions with one count together.
+Bursts are rare, and a cut ends the answers: few packets go toward the robot, so these may harm none of them."""
 
 
-def injected_checks(row: NetworkCase, counts: Mapping[str, int]) -> Iterator[Check]:
-    """Check that each effect that the shapes of a row request harmed packets."""
-    legs = [leg for phase in row.phases for leg in (phase.shapes.ab, phase.shapes.ba)]
-    for kind, causes in _CAUSES.items():
-        if any(getattr(leg, cause) for leg in legs for cause in causes):
-            yield at_least(f"packets {kind}", float(counts.get(kind, 0)), "", 1.0)
+def injected_checks(row: NetworkCase, counts: Mapping[str, Mapping[str, int]]) -> Iterator[Check]:
+    """Check that each effect that the shapes of a row request harmed packets; `counts` has those of each direction."""
+    for kind, causes, together in _CAUSES:
+        harmed = [float(count.get(kind, 0)) for leg, count in counts.items()
+                  if any(getattr(getattr(phase.shapes, leg), cause) for phase in row.phases for cause in causes)]
+        if harmed:
+            yield at_least(f"packets {kind}", together(harmed), "", 1.0)
 
 
 def network_checks(row: NetworkCase, figures: Sequence[NetworkFigures]) -> Iterator[Check]:

@@ -6,6 +6,7 @@ The robot plays recorded images through a camera that can change their quality a
 import json
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -121,13 +122,14 @@ def _course(row: NetworkCase, stage: Stage) -> NetworkRun:
             stretches.append(Stretch(begin_us, begin_us + round(settle_s * 1e6), monotonic_us()))
             processes.check()
         injected = wire.shape(LinkShapes()) - before
-        counts = wire.counts - counts_before
+        counts = {leg: after - counts_before[leg] for leg, after in wire.counts.items()}
         processes.end()
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     rows = read_wheel_commands(stage.wheels.read_text("ascii"))
     figures = tuple(figures_of(notes, rows, stretch) for stretch in stretches)
     checks = (*injected_checks(row, counts), *network_checks(row, figures), *_wheel_checks(rows, notes))
-    lost = {"lost_percent": 100 * counts["lost"] / max(1, counts["taken"])} if row.draws else {}
+    total = sum(counts.values(), Counter[str]())
+    lost = {"lost_percent": 100 * total["lost"] / max(1, total["taken"])} if row.draws else {}
     return NetworkRun(row, stage.seed, injected, figures, checks, lost)
 
 

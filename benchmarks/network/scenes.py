@@ -230,10 +230,10 @@ def _stretch(wire: ShapedWire, shapes: LinkShapes, seconds: float) -> tuple[int,
     """(from, until, bytes that came from the robot in between)."""
     time.sleep(_UPLINK_SETTLE_S)
     wire.shape(shapes)
-    begin_us, begin_bytes = monotonic_us(), wire.carried_bytes["ab"]
+    begin_us, begin_bytes = monotonic_us(), wire.counts["ab"]["delivered_bytes"]
     time.sleep(seconds)
     wire.shape(shapes)
-    return begin_us, monotonic_us(), wire.carried_bytes["ab"] - begin_bytes
+    return begin_us, monotonic_us(), wire.counts["ab"]["delivered_bytes"] - begin_bytes
 
 
 def _stream_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: tuple[int, int, int]) -> tuple[float, float]:

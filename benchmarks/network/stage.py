@@ -30,8 +30,7 @@ class ShapedWire(Protocol):
 
     robot_side: str
     far_side: str
-    carried_bytes: dict[str, int]
-    counts: Counter[str]
+    counts: dict[str, Counter[str]]
 
     def shape(self, shapes: LinkShapes) -> int:
         """Put `shapes` in force; returns how many packets were harmed so far."""

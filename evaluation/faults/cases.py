@@ -248,13 +248,16 @@ def _cut(rig: RobotFixture, shapes: LinkShapes, seconds: float) -> Injected:
 
 
 def _worsen(rig: RobotFixture, both: LinkShape, harms: Sequence[str]) -> Injected:
-    """Bad for a while, but not cut: frames that are still young may be driven on. Each of the `harms` must occur."""
+    """Bad for a while, but not cut: frames that are still young may be driven on.
+
+    Each of the `harms` must occur in each direction.
+    """
     assert rig.wire is not None
     shape(rig, LinkShapes(ab=both, ba=both))
     at_us, before = monotonic_us(), rig.wire.counts
     rig.watch(DISTURBED_S)
     shape(rig, LinkShapes())
-    count = min(rig.wire.counts[harm] - before[harm] for harm in harms)
+    count = min(counts[harm] - before[leg][harm] for leg, counts in rig.wire.counts.items() for harm in harms)
     return Injected(count, at_us, again=drives_again(rig))
 
 

@@ -94,10 +94,8 @@ class BenchWire:
         self._log = log
         self._ending = ExitStack()
         self._process: subprocess.Popen[str] | None = None
-        self.carried_bytes = {"ab": 0, "ba": 0}
-        """What came out at the far end of each direction, up to the last `shape`."""
-        self.counts: Counter[str] = Counter()
-        """The counters of both directions together, up to the last `shape`."""
+        self.counts: dict[str, Counter[str]] = {"ab": Counter(), "ba": Counter()}
+        """The counters of each direction, up to the last `shape`."""
 
     def __enter__(self) -> Self:
         with self._ending:
@@ -124,10 +122,8 @@ class BenchWire:
         stdin = _file(self._process.stdin)
         stdin.write(shapes.model_dump_json() + "\n")
         stdin.flush()
-        counts = json.loads(_file(self._process.stdout).readline())
-        self.carried_bytes = {leg: count["delivered_bytes"] for leg, count in counts.items()}
-        self.counts = sum(map(Counter, counts.values()), Counter())
-        return sum(count for name, count in self.counts.items() if name not in _PLAIN)
+        self.counts = {leg: Counter(count) for leg, count in json.loads(_file(self._process.stdout).readline()).items()}
+        return sum(count for leg in self.counts.values() for name, count in leg.items() if name not in _PLAIN)
 
     @staticmethod
     def _end(process: subprocess.Popen[str]) -> None:

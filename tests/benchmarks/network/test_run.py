@@ -59,9 +59,22 @@ def test_every_row_harms_packets_and_demands_something():
 ])
 def test_every_effect_that_a_row_requests_must_have_harmed_packets(name, kinds):
     row = next(one for one in CASES if one.name == name)
-    assert [check.ok for check in injected_checks(row, dict.fromkeys(kinds, 1))] == [True] * len(kinds)
-    only_delayed = [check.name for check in injected_checks(row, {"delayed": 1000}) if not check.ok]
-    assert only_delayed == [f"packets {kind}" for kind in ("lost", "cut") if kind in kinds]
+    both_harmed = dict.fromkeys(("ab", "ba"), dict.fromkeys(kinds, 1))
+    assert [check.ok for check in injected_checks(row, both_harmed)] == [True] * len(kinds)
+    both_delayed = dict.fromkeys(("ab", "ba"), {"delayed": 1000})
+    failed = [check.name for check in injected_checks(row, both_delayed) if not check.ok]
+    assert failed == [f"packets {kind}" for kind in ("lost", "cut") if kind in kinds]
+
+
+@pytest.mark.parametrize(("name", "failed"), [
+    ("rtt40", ["delayed"]), ("radio", ["delayed", "lost"]), ("bursts", ["delayed"]), ("cut", ["delayed"]),
+])
+@pytest.mark.parametrize("harmed", ["ab", "ba"])
+def test_effect_each_way_must_harm_packets_in_both_directions(name, failed, harmed):
+    row = next(one for one in CASES if one.name == name)
+    counts = {"ab": {}, "ba": {}, harmed: {"delayed": 1000, "lost": 1000, "cut": 1000}}
+    found = [check.name for check in injected_checks(row, counts) if not check.ok]
+    assert found == [f"packets {kind}" for kind in failed]
 
 
 def test_every_scene_that_a_row_names_is_there():

@@ -244,17 +244,30 @@ def outcome(row=CASES[0], value=1.0, bound=2.0, **changes):
     ("wire.mixed", "delayed"), ("wire.mixed", "reordered"), ("wire.loss", "delayed"),
 ])
 def test_other_harm_of_the_wire_is_not_the_fault(monkeypatch, row, other):
+    assert harmed_count(monkeypatch, row, ab=[other], ba=[other]) == 0
+
+
+@pytest.mark.parametrize(("row", "harms"), [
+    ("wire.mixed", ["reordered", "duplicated"]), ("wire.loss", ["lost"]), ("wire.delay", ["delayed"]),
+])
+def test_harm_in_one_direction_only_is_not_the_fault(monkeypatch, row, harms):
+    assert harmed_count(monkeypatch, row, ab=harms, ba=[]) == harmed_count(monkeypatch, row, ab=[], ba=harms) == 0
+    assert harmed_count(monkeypatch, row, ab=harms, ba=harms) == 5
+
+
+def harmed_count(monkeypatch, row, **harms):
+    """The count of a row whose wire harms five packets in each direction in the ways of `harms`."""
     monkeypatch.setattr(cases, "drives_again", lambda rig: True)
 
     class Wire:
         def __init__(self):
-            self.counts = Counter()
+            self.counts = {"ab": Counter(), "ba": Counter()}
 
         def shape(self, shapes):
-            self.counts = self.counts + Counter({other: 5})
+            self.counts = {leg: count + Counter(dict.fromkeys(harms[leg], 5)) for leg, count in self.counts.items()}
 
     [case] = chosen([row], short=False)
-    assert case.inject(SimpleNamespace(wire=Wire(), watch=lambda seconds: None)).count == 0
+    return case.inject(SimpleNamespace(wire=Wire(), watch=lambda seconds: None)).count
 
 
 @pytest.mark.parametrize("row", ["network.kill", "network.pause"])
