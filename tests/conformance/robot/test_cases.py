@@ -1,5 +1,7 @@
 """The kit against our own robot in virtual time, and its own parts. tests/conformance/mutants runs the broken ones."""
 
+import itertools
+
 import pytest
 
 from sightline.conformance.case import GROUPS, KEPT_MESSAGES, Case, Level, Suite
@@ -12,6 +14,7 @@ from tests.conformance.robot.reference import virtual_robot
 
 VIRTUAL = [case for case in CASES if not case.real]
 NAMES = [case.id for case in VIRTUAL]
+CASES_BY_ID = dict(zip(NAMES, VIRTUAL, strict=True))
 
 
 def result_of(case, break_it=None):
@@ -47,6 +50,24 @@ def test_robot_slower_than_the_usual_twist_of_the_kit_passes():
     bench, _robot = virtual_robot(max_linear_mps=0.08)
     results = run_cases([case for case in VIRTUAL if case.id in ("R-LIM-01", "R-LIM-08")], bench, prepare)
     assert [one.reason for one in results if one.outcome is not Outcome.PASSED] == []
+
+
+def one_frame_in(count, break_it=None):
+    """The robot films only one of `count` pictures of its camera, which takes 30 a second."""
+
+    def film_rarely(robot):
+        film, ticks = robot.film, itertools.count()
+        robot.film = lambda now_us: None if next(ticks) % count else film(now_us)
+        if break_it is not None:
+            break_it(robot)
+
+    return film_rarely
+
+
+@pytest.mark.parametrize("name", ["R-ARM-03", "R-ARM-16"])
+def test_robot_below_ten_frames_a_second_passes(name):
+    result = result_of(CASES_BY_ID[name], one_frame_in(4))
+    assert result.outcome is Outcome.PASSED, result.reason
 
 
 @pytest.mark.parametrize("break_it", broken_motion.LIARS, ids=lambda break_it: break_it.__name__)
