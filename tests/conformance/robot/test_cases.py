@@ -9,6 +9,7 @@ from sightline.conformance.robot.cases import CASES, prepare
 from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases
 from sightline.protocol.errors import ConfigError
 from tests.conformance.clauses import clauses
+from tests.conformance.robot.broken import arming as broken_arming
 from tests.conformance.robot.broken import motion as broken_motion
 from tests.conformance.robot.reference import virtual_robot
 
@@ -68,6 +69,12 @@ def one_frame_in(count, break_it=None):
 def test_robot_below_ten_frames_a_second_passes(name):
     result = result_of(CASES_BY_ID[name], one_frame_in(4))
     assert result.outcome is Outcome.PASSED, result.reason
+
+
+@pytest.mark.parametrize(("count", "found"), [(4, Outcome.FAILED), (8, Outcome.SKIPPED)])
+def test_robot_of_few_frames_that_arms_from_before_a_human_let_go_does_not_pass(count, found):
+    break_it = one_frame_in(count, broken_arming.arms_from_before_a_human_let_go)
+    assert result_of(CASES_BY_ID["R-ARM-16"], break_it).outcome is found
 
 
 @pytest.mark.parametrize("break_it", broken_motion.LIARS, ids=lambda break_it: break_it.__name__)
