@@ -7,6 +7,7 @@ import pytest
 from sightline.conformance.case import GROUPS, KEPT_MESSAGES, Case, Level, Suite
 from sightline.conformance.robot.cases import CASES, prepare
 from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases
+from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import ConfigError
 from tests.conformance.clauses import clauses
 from tests.conformance.robot.broken import arming as broken_arming
@@ -75,6 +76,23 @@ def test_robot_below_ten_frames_a_second_passes(name):
 def test_robot_of_few_frames_that_arms_from_before_a_human_let_go_does_not_pass(count, found):
     break_it = one_frame_in(count, broken_arming.arms_from_before_a_human_let_go)
     assert result_of(CASES_BY_ID["R-ARM-16"], break_it).outcome is found
+
+
+def test_rejected_reset_may_be_counted_in_a_later_status():
+    def reports_late(robot):
+        emit, waiting = robot.emit, []
+
+        def one_status_late(message):
+            if message.channel is STATUS:
+                waiting.append(message)
+                message = waiting.pop(0) if len(waiting) > 1 else None
+            if message is not None:
+                emit(message)
+
+        robot.emit = one_status_late
+
+    result = result_of(CASES_BY_ID["R-STOP-15"], reports_late)
+    assert result.outcome is Outcome.PASSED, result.reason
 
 
 @pytest.mark.parametrize("break_it", broken_motion.LIARS, ids=lambda break_it: break_it.__name__)
