@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from itertools import count
@@ -177,8 +177,24 @@ class Load:
     """CPU time of all services for each answered frame, in the first half."""
     seconds: float = 0.0
 
-    def close_gap(self, robot: str, now_us: int) -> None:
-        """End the time without an answer to a robot, at an answer or at the end of the run."""
+    def begin(self, robots: Iterable[str], now_us: int) -> None:
+        """Forget the memory of the time before, and wait for the first answer to each robot."""
+        self.memory_mb.clear()
+        self.answered_us = dict.fromkeys(robots, now_us)
+
+    def answer(self, robot: str, frame_us: int, now_us: int) -> None:
+        """Count the first answer to a frame."""
+        self._close_gap(robot, now_us)
+        self.answered_us[robot] = now_us
+        self.answered[robot] += 1
+        self.ages_ms.append((now_us - frame_us) / 1000)
+
+    def end(self, now_us: int) -> None:
+        """Count the time since the newest answer to each robot, too."""
+        for robot in self.answered_us:
+            self._close_gap(robot, now_us)
+
+    def _close_gap(self, robot: str, now_us: int) -> None:
         self.gap_us = max(self.gap_us, now_us - self.answered_us[robot])
 
     @property
@@ -268,10 +284,7 @@ class _Streams:
                 self.load.repeated += 1
                 return
             seen.append(echo.seq)
-            self.load.close_gap(robot, now_us)
-            self.load.answered_us[robot] = now_us
-            self.load.answered[robot] += 1
-            self.load.ages_ms.append((now_us - echo.t_us) / 1000)
+            self.load.answer(robot, echo.t_us, now_us)
 
         return note
 
@@ -305,8 +318,7 @@ def measure_streams(endpoint: str, folder: Path, plan: StreamPlan) -> Load:
         robots = _Streams(links, jpeg)
         _wait_ready(robots, plan, services)
         _offer(robots, plan.streams, _WARM_S, services)
-        robots.load.memory_mb.clear()
-        robots.load.answered_us = {link.robot: monotonic_us() for link in links}
+        robots.load.begin((link.robot for link in links), monotonic_us())
         robots.counting = True
         before_s = sum(one.cpu_s() for one in services)
         began_s = time.monotonic()
@@ -317,8 +329,7 @@ def measure_streams(endpoint: str, folder: Path, plan: StreamPlan) -> Load:
             services[-1].kill()
         _offer(robots, plan.streams, plan.seconds / 2, services)
         robots.load.seconds = time.monotonic() - began_s
-        for link in links:
-            robots.load.close_gap(link.robot, monotonic_us())
+        robots.load.end(monotonic_us())
     return robots.load
 
 
