@@ -12,11 +12,12 @@ from pathlib import Path
 import pytest
 import typer
 
+from sightline.benchmarks.loop import viewers
 from sightline.benchmarks.loop.counters import carried_between, carried_bytes
-from sightline.benchmarks.loop.figures import FLOOR, OURS, PEERS, LoopSetting
+from sightline.benchmarks.loop.figures import FLOOR, OURS, PEERS, Course, LoopSetting
 from sightline.benchmarks.loop.pictures import COUNT, camera_of, write_pictures
 from sightline.benchmarks.loop.race import run_race
-from sightline.benchmarks.loop.viewers import measure_watchers
+from sightline.benchmarks.loop.viewers import Watch, measure_watchers
 from sightline.benchmarks.loop.vision import PipelineVision
 from sightline.benchmarks.peers.classic_detector import ClassicVision
 from sightline.evaluation.processes import children_of
@@ -111,6 +112,14 @@ def test_loop_continues_while_viewers_stall():
     checks = {check.name: check for check in measure_watchers(replace(SMALL, tries=1), 3, lambda _: None)}
     assert checks["not accepted"].value < 50
     assert checks["memory, more"].value < 50
+
+
+@pytest.mark.parametrize(("fps", "failed"), [(30.0, set()), (1.0, {"answered per second"})])
+def test_loop_that_films_few_images_beside_viewers_fails(fps, failed):
+    ages_us = tuple((number * 33_333, 20_000) for number in range(60))
+    alone = Watch(Course(60, 100.0, ages_us), 30.0, 50.0, 0.0)
+    checks = viewers._checks(30.0, alone, replace(alone, fps=fps))
+    assert {check.name for check in checks if not check.ok} == failed
 
 
 @pytest.mark.slow
