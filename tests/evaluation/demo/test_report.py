@@ -77,6 +77,14 @@ def test_demo_of_a_scenario_without_bounds_is_not_evaluated(lights):
     assert demo_report.report(legacy).ok is None
 
 
+@pytest.mark.parametrize("transport", ["zenoh", "legacy"])
+def test_demo_with_a_latency_without_bounds_is_not_evaluated(lights, transport):
+    options = DemoOptions("traffic-light", transport=transport, latency_ms=300.0)
+    late = demo_report.report(replace(lights, options=options))
+    assert late.ok is None and late.to_dict()["ok"] is None and late.checks == []
+    assert any("not evaluated" in line for line in demo_report.summary(late))
+
+
 def test_summary_shows_what_the_detector_reported_each_line_once_and_the_first_three(lights):
     judged = demo_report.report(lights)
     before = demo_report.summary(judged)

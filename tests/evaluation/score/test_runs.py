@@ -118,6 +118,13 @@ def test_scenario_without_bounds_has_a_null_in_its_json_and_exit_code_0(bare_opt
     assert result["runs"][0]["score"]["unseen_percent"] > 60
 
 
+def test_scenario_without_bounds_at_this_latency_is_not_evaluated(capsys):
+    options = ["--scenario", "static", "--seeds", "1", "--jobs", "1", "--seconds", "1", "--latency-ms", "300"]
+    assert cli.run(["score", *options, "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert result["ok"] is None and result["checks"] == [] and len(result["not_evaluated"]) == 1
+
+
 def test_scenario_that_extends_another_is_scored_by_its_bounds(tmp_path, capsys):
     mine = tmp_path / "mine.toml"
     mine.write_text(OPEN_VIEW.replace("bounds = {}", ""))

@@ -113,8 +113,8 @@ def test_listed_pairs_exist():
 # --- the result --------------------------------------------------------------------------------------------------
 
 
-def pair(*results, scenario="static", name="range-blind"):
-    made = tuple(SabotagedRun(case(scenario, name, seed), broken, 1.0, unchanged)
+def pair(*results, scenario="static", name="range-blind", **changes):
+    made = tuple(SabotagedRun(case(scenario, name, seed, **changes), broken, 1.0, unchanged)
                  for seed, (broken, unchanged) in enumerate(results))
     return SabotagedPair(f"{scenario} {name}", scenario, name, made)
 
@@ -138,6 +138,11 @@ def test_scenario_without_bounds_cannot_notice_a_sabotage(tmp_path):
     mine = tmp_path / "mine.toml"
     mine.write_text('extends = "static"\nbounds = {}\n')
     report = SabotageReport([pair(PASSES, scenario=str(mine))])
+    assert report.ok is None and report.to_dict()["checks"] == [] and "not evaluated" in report.lines()[0]
+
+
+def test_latency_without_bounds_cannot_notice_a_sabotage():
+    report = SabotageReport([pair(PASSES, latency_ms=300)])
     assert report.ok is None and report.to_dict()["checks"] == [] and "not evaluated" in report.lines()[0]
 
 
@@ -169,6 +174,13 @@ def test_run_that_broke_no_bound_is_compared_with_the_healthy_one(monkeypatch):
     monkeypatch.setattr(runs, "broken", lambda *_given: [])
     assert run_sabotaged(case("static", "nothing", seconds=0.6)).unchanged
     assert not run_sabotaged(case("static", "wheels-dead", seconds=0.6)).unchanged
+
+
+@pytest.mark.parametrize(("latency_ms", "ends_early"), [(50, True), (400, False)])
+def test_run_ends_early_only_by_the_bounds_of_its_scenario(monkeypatch, latency_ms, ends_early):
+    monkeypatch.setattr(runs, "broken", lambda *_given: ["acquired_s"])
+    result = run_sabotaged(case("static", "wheels-dead", seconds=0.4, latency_ms=latency_ms))
+    assert (result.seconds < 0.3) is ends_early
 
 
 def test_sabotage_shows_in_the_exit_code_and_the_json(capsys):
