@@ -130,7 +130,7 @@ def test_every_peer_at_a_router_is_listed_within_two_seconds(router):
         open_zenoh("r1", connect=[router]),  # who has no role is not listed
     ):
         began_s = time.monotonic()
-        peers = discover([router], 1.0).peers
+        peers = discover([router], 0.6).peers
         took_s = time.monotonic() - began_s
         assert {peer.presence.host for peer in robot.peers()} == {peer.presence.host for peer in peers}
     assert [(peer.presence.role, peer.presence.robot) for peer in peers] == [
