@@ -28,6 +28,7 @@ from sightline.robot_side.guardian.stop_core import (
     unpack_ignored,
     unpack_number,
 )
+from tests.fixtures import demanded
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_port
 
@@ -58,9 +59,20 @@ class Driver:
         send_packet(self.near, pack_report(DriverReport(self.applied, state, bool(self.applied), True)))
 
 
+def need_ipv6():
+    try:
+        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+            probe.bind(("::1", 0))
+    except OSError as error:
+        demanded.do_without("ipv6", f"no IPv6 ({error.strerror}); run: sysctl net.ipv6.conf.lo.disable_ipv6=0")
+
+
 @pytest.fixture
 def operator(request):
-    with socket.socket(getattr(request, "param", socket.AF_INET), socket.SOCK_DGRAM) as one:
+    family = getattr(request, "param", socket.AF_INET)
+    if family is socket.AF_INET6:
+        need_ipv6()
+    with socket.socket(family, socket.SOCK_DGRAM) as one:
         one.setblocking(False)
         yield one
 
@@ -226,6 +238,8 @@ def test_behind_a_router_stop_is_forwarded_and_answered(started, operator, host,
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 def test_router_of_a_name_with_both_families_gets_a_registration_on_its_own(monkeypatch, host):
+    if host == "::1":
+        need_ipv6()
     resolve, number = socket.getaddrinfo, free_port()
     pipe, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     router, port = stop_port._bound((host, number)), StopPort(pipe, [], outgoing=True)
