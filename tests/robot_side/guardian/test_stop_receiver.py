@@ -1,5 +1,6 @@
 """The STOP receiver as a process: small, only the standard library, deaf to anything but a valid STOP."""
 
+import errno
 import signal
 import socket
 import subprocess
@@ -7,6 +8,7 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -252,16 +254,20 @@ def test_router_of_a_name_with_both_families_gets_a_registration_on_its_own(monk
 
 
 def test_router_that_cannot_be_addressed_is_logged_once():
+    def denied(_data, _place):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
     lines = []
     pipe, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     port = StopPort(pipe, [], outgoing=True)
     port.log = lines.append
     receiver = stop_receiver.StopReceiver(port, "r1", b"", ())
-    receiver._routers = [(("255.255.255.255", 7448), Registration("r1", b"", 5))]  # a broadcast, which is not permitted
+    receiver._routers = [(("127.0.0.1", 7448), Registration("r1", b"", 5))]
+    port._outgoing = {socket.AF_INET: SimpleNamespace(sendto=denied)}
     for _ in range(3):
         receiver._register()
     assert len(lines) == 1
-    assert lines[0].startswith("STOP port 255.255.255.255:7448/udp of the router: Permission denied; trying again, ")
+    assert lines[0].startswith("STOP port 127.0.0.1:7448/udp of the router: Permission denied; trying again, ")
     for one in (pipe, theirs, *port._sockets.values()):
         one.close()
 
