@@ -4,6 +4,7 @@ import base64
 import os
 import re
 import runpy
+import select
 import shlex
 import subprocess
 import sys
@@ -55,6 +56,7 @@ def test_example_drive_sets_up_its_serial_port():
     assert termios.tcgetattr(port)[4:6] == [termios.B115200] * 2
     os.write(controller, b"ready\n")
     drive.set(1.0, -2.0)
+    assert select.select([controller], [], [], 5)[0]
     assert os.read(controller, 100) == b"1.000 -2.000\n"
     drive.close()
     os.close(port)

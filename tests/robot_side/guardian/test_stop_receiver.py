@@ -248,6 +248,7 @@ def test_router_of_a_name_with_both_families_gets_a_registration_on_its_own(monk
     monkeypatch.setattr(socket, "getaddrinfo", lambda _name, *rest, **more: [
         one for address in ("::1", "127.0.0.1") for one in resolve(address, *rest, **more)])
     assert port.send_out(b"a registration", ("router.local", number)) == ""
+    router.settimeout(5)
     assert router.recv(64) == b"a registration"
     for one in (pipe, theirs, router, *port._sockets.values()):
         one.close()
