@@ -240,6 +240,7 @@ def test_terminal_shows_keys_and_robot(seat):
 
 def test_quitting_without_proof_of_stop_repeats_it_and_is_an_error(monkeypatch):
     monkeypatch.setattr(terminal, "_PROVE_STOP_S", 0.1)
+    monkeypatch.setattr(terminal, "_LEAVE_PERIOD_S", 0.005)
     network, teleop = MemoryNetwork(), Teleop("0000000a", Speeds(0.2, 1.0))
     link, robot, requests = network.link("r1", role="teleop"), network.link("r1"), []
     robot.subscribe(REQUEST, requests.append)
