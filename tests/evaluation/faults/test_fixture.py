@@ -12,8 +12,14 @@ from sightline.evaluation.processes import Processes
 from sightline.robot_side.kinematics import DiffDriveConfig
 from sightline.robot_side.safety.limits import TICK_US
 
-_WAITS = [sys.executable, "-I", "-S", "-c", "print(1, flush=True); input()"]
-_GUARDIAN = "import subprocess, sys; subprocess.Popen(sys.argv[1:])"
+_GUARDIAN = """
+from sightline.robot_side.guardian import stop_receiver
+receiver = stop_receiver.start("r1", [], [], "")
+receiver.keep_alive(0)
+print(1, flush=True)
+input()
+receiver.close()
+"""
 
 
 @pytest.mark.parametrize(("setup", "measured"), [
@@ -26,12 +32,12 @@ def test_every_process_of_sightline_is_measured(tmp_path, setup, measured):
 
 def test_memory_of_stop_receiver_is_measured(tmp_path):
     processes = Processes(tmp_path)
-    command = [*_WAITS[:3], "-c", f"{_GUARDIAN}; input()", *_WAITS, "robot_side.guardian.stop_receiver"]
+    command = [sys.executable, "-P", "-c", _GUARDIAN]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as guardian:
         assert guardian.stdout.readline()
         processes._running["robot"] = SimpleNamespace(pid=guardian.pid)
         measured = memory_kib(processes, ["robot"])
-        guardian.stdin.close()
+        guardian.stdin.write(b"\n")
     assert set(measured) == {("robot", "itself"), ("robot", "stop")} and min(measured.values()) > 0
 
 
