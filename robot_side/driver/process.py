@@ -44,7 +44,7 @@ from sightline.robot_side.driver.supervision import (
     limit_core_dump,
     request_real_time,
 )
-from sightline.robot_side.guardian.core import AT_REST, MOVING
+from sightline.robot_side.guardian.core import AT_REST, ENDING, FAILED, MOVING
 from sightline.robot_side.guardian.start import GuardianEnd, zero_of
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
@@ -98,10 +98,9 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         ending.callback(driver.driver_end.close)
         ending.callback(driver.finish)
         if guardian is not None:
-            ending.callback(guardian.ending)
             guardian.wait()
         # Last in, first to run: however the loop ends, the motors are set to zero. An error makes the guardian do it.
-        ending.callback(_zero, config, partial(drive.set, 0.0, 0.0))
+        ending.callback(_end, config, drive, guardian)
         return driver.loop()
 
 
@@ -113,6 +112,17 @@ def zero_motors(config: RobotConfig) -> int:
     zero, options = zero_of(config)
     _zero(config, partial(zero, options))
     return 0
+
+
+def _end(config: RobotConfig, drive: Drive, guardian: GuardianEnd | None) -> None:
+    """Set the motors to zero, and send the guardian whether this process may take its time to end."""
+    last_beat = FAILED
+    try:
+        _zero(config, partial(drive.set, 0.0, 0.0))
+        last_beat = ENDING
+    finally:
+        if guardian is not None:
+            guardian.beat(last_beat)
 
 
 def _zero(config: RobotConfig, set_to_zero: Callable[[], None]) -> None:

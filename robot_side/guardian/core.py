@@ -17,6 +17,8 @@ WATCHED: Final = b"w"
 """What a guardian sends to a driver process once it watches it."""
 ENDING: Final = b"e"
 """The last heartbeat: the wheels are at zero, and files and devices are being closed."""
+FAILED: Final = b"f"
+"""The last heartbeat: the drive did not take zero at the end, so only the guardian can stop the wheels."""
 
 PERIOD_US: Final = 100_000
 """Between two looks at a driver: each wakes the guardian, and the end of a driver wakes it without a look."""
@@ -61,6 +63,11 @@ class HeartbeatMonitor:
         return bool(self._last)
 
     @property
+    def drive_failed(self) -> bool:
+        """Return True if the driver ends without having set the wheels to zero."""
+        return self._last == FAILED
+
+    @property
     def is_late(self) -> bool:
         """Return True if a heartbeat is missing, so that `look` needs the processor time of the driver."""
         return self._silence_us >= LATE_US and self._last not in (b"", IDLE)
@@ -84,7 +91,7 @@ class HeartbeatMonitor:
             self._own_us += step_us
         else:
             self._own_us += min(step_us, run_us - before_us)
-        return self._reason()
+        return "its drive did not take zero at the end" if self.drive_failed else self._reason()
 
     def _reason(self) -> str:
         if self._last == IDLE:

@@ -112,6 +112,8 @@ class Guardian:
         self._send_ready()
         while True:
             code = os.waitstatus_to_exitcode(self._watch())
+            if self._monitor.drive_failed:  # the same whether the driver process was killed or quicker
+                code = _HARDWARE_EXIT
             error = self._set_to_zero() if needs_zero(code, was_ready=self._monitor.is_ready) else None
             self._log_end(code, error)  # after zero: the thread that writes the log has no real-time priority
             self._kill_orphans()

@@ -24,7 +24,7 @@ from sightline.protocol.transports.stop_port import StopProcess, stop_secret_fil
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, GUARDIAN_PRIORITY, schedule_real_time
 from sightline.robot_side.guardian import stop_receiver
-from sightline.robot_side.guardian.core import ENDING, STARTS_WITHIN_US, pack_beat
+from sightline.robot_side.guardian.core import STARTS_WITHIN_US, pack_beat
 from sightline.robot_side.plugins import DRIVES
 
 _log: Final = logging.getLogger(__name__)
@@ -70,10 +70,6 @@ class GuardianEnd:
             return False
         except OSError:
             return True
-
-    def ending(self) -> None:
-        """Send that the wheels are at zero and this process ends."""
-        self.beat(ENDING)
 
 
 def become_guardian(config: RobotConfig, *, restarts: bool) -> GuardianEnd:

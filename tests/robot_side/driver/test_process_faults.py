@@ -3,8 +3,10 @@
 import math
 import os
 import signal
+import socket
 import subprocess
 import time
+from contextlib import suppress
 
 import pytest
 
@@ -16,7 +18,8 @@ from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from sightline.robot_side.driver.process import Driver, run
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
-from sightline.robot_side.guardian.core import needs_zero
+from sightline.robot_side.guardian.core import ENDING, FAILED, WATCHED, needs_zero, unpack_beat
+from sightline.robot_side.guardian.start import GuardianEnd
 from sightline.robot_side.ports import WheelAngles
 from sightline.robot_side.safety.limits import SafetyConfig
 from tests.fixtures.links import until
@@ -124,13 +127,19 @@ def run_with(tmp_path, monkeypatch):
     BrokenDrive.fails = BrokenDrive.reading = None
     kind = PluginChoice(kind=f"{__name__}:BrokenDrive")
 
-    def run_with(loop):
+    def run_with(loop, guardian=None):
         monkeypatch.setattr(Driver, "loop", loop)
-        return run(RobotConfig(drive=kind, listen=(free_endpoint(),), state_dir=tmp_path))
+        return run(RobotConfig(drive=kind, listen=(free_endpoint(),), state_dir=tmp_path), guardian)
 
     yield run_with
     for number, handler in handlers.items():
         signal.signal(number, handler)
+
+
+def unplug(_driver):
+    """End the loop with a drive that takes no more speeds."""
+    BrokenDrive.told, BrokenDrive.fails = (0.0, 0.0), OSError("unplugged")
+    return 0
 
 
 def test_motors_are_set_to_zero_after_every_end_of_the_loop(run_with):
@@ -144,14 +153,22 @@ def test_motors_are_set_to_zero_after_every_end_of_the_loop(run_with):
 
 def test_drive_that_still_fails_at_the_end_gives_the_exit_code_that_calls_zero(run_with):
     """A guardian calls `zero` of the drive unless the code is 0."""
-
-    def fails(_self):
-        BrokenDrive.told, BrokenDrive.fails = (0.0, 0.0), OSError("unplugged")
-        return 0
-
     with pytest.raises(HardwareError, match=r"motors NOT set to zero: .* OSError: unplugged; switch off") as error:
-        run_with(fails)
+        run_with(unplug)
     assert needs_zero(error.value.exit_code, was_ready=True)
+
+
+@pytest.mark.parametrize(("loop", "beat"), [(lambda _driver: 0, ENDING), (unplug, FAILED)])
+def test_last_heartbeat_permits_a_long_end_only_after_zero(run_with, loop, beat):
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        ours.send(WATCHED)
+        with suppress(HardwareError):
+            run_with(loop, GuardianEnd(theirs))
+        ours.setblocking(False)
+        assert unpack_beat(ours.recv(16))[0] == beat
+        with pytest.raises(BlockingIOError):
+            ours.recv(16)
 
 
 def test_a_latch_that_cannot_be_written_is_tried_again_and_does_not_block(tmp_path, caplog):

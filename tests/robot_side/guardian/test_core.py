@@ -6,6 +6,7 @@ from sightline.robot_side.guardian.core import (
     AT_REST,
     ENDING,
     ENDS_WITHIN_US,
+    FAILED,
     HUNG_US,
     IDLE,
     LATE_US,
@@ -92,6 +93,11 @@ def test_start_and_end_have_limits_of_their_own():
     assert silence_us(monitor, 1_000_000) == (ENDS_WITHIN_US, "did not end within 7 s")
 
 
+def test_driver_whose_drive_did_not_take_zero_is_killed_at_once():
+    assert beaten(FAILED).look(1_000_000) == "its drive did not take zero at the end"
+    assert beaten(FAILED).drive_failed and not beaten(ENDING).drive_failed
+
+
 def test_limits_are_exact():
     for monitor, limit_us in ((HeartbeatMonitor(0), STARTS_WITHIN_US), (beaten(MOVING, 0), HUNG_US)):
         assert silence_us(monitor, 0, limit_us=limit_us - LATE_US)[0] is None
@@ -106,7 +112,7 @@ def test_driver_that_falls_asleep_while_it_waits_for_a_processor_is_hung():
 
 
 def test_heartbeats_are_bytes_that_differ():
-    assert (AT_REST, MOVING, IDLE, ENDING, WATCHED) == (b"0", b"1", b"i", b"e", b"w")
+    assert (AT_REST, MOVING, IDLE, ENDING, FAILED, WATCHED) == (b"0", b"1", b"i", b"e", b"f", b"w")
     assert RESTART_WINDOW_US == 60_000_000
     assert pack_beat(MOVING, 1) == b"1\x01" + bytes(7)
     assert unpack_beat(pack_beat(MOVING, 2**40 + 3)) == (MOVING, 2**40 + 3)

@@ -13,10 +13,12 @@ from pathlib import Path
 import pytest
 
 from sightline.operator_side.client.requests import Operator
+from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import Verb
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver.process import _SHUTDOWN_US
 from sightline.robot_side.driver.supervision import schedule_real_time
 from sightline.robot_side.guardian.process import hurry
 from sightline.robot_side.guardian.start import zero_of
@@ -138,10 +140,13 @@ def test_drive_that_still_fails_at_the_end_is_set_to_zero_by_the_guardian(tmp_pa
     with RobotProcess(tmp_path, drive={"kind": kind, "options": {"path": str(tmp_path / "drive.csv")}}) as robot:
         robot.wait_until_on()
         assert not robot.motor_rows()
+        terminated_us = heartbeat_us()
         robot.process.terminate()
         assert robot.process.wait(START_S) == 3
         assert "the motors are set to zero" in robot.output()
+        assert "a new driver process starts" not in robot.output()
         assert [row[1:] for row in robot.motor_rows()] == [(0.0, 0.0)]
+        assert robot.motor_rows()[0][0] - terminated_us <= _SHUTDOWN_US + BOUND_S * 1e6, "not after the devices"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
