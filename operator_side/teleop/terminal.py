@@ -19,7 +19,7 @@ from sightline.operator_side.teleop.control import SOURCE, Mode, Teleop
 from sightline.operator_side.teleop.gamepad import Gamepad, PadKey
 from sightline.protocol.channels import FRAME, REPLY, STATUS, Channel
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.errors import ConfigError, HardwareError, LinkError
+from sightline.protocol.errors import ConfigError, HardwareError, LinkError, SightlineError
 from sightline.protocol.messages import LeaseHolder, Status
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 
@@ -166,7 +166,10 @@ class Cockpit:
         if self._stop_sender is not None and self._stop_sender.is_stopped:
             self._teleop.on_stopped()
         if self._teleop.is_stopping and self._stop_sender is None:
-            self._stop_sender = self._send_stop()
+            try:
+                self._stop_sender = self._send_stop()
+            except (SightlineError, OSError, RuntimeError) as error:  # the link sends STOP without it
+                self._teleop.note = f"STOP is not confirmed, repeating; {error}"
         elif not self._teleop.is_stopping and self._stop_sender is not None:
             self._stop_sender.close()
             self._stop_sender = None

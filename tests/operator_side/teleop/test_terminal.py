@@ -238,7 +238,10 @@ def test_terminal_shows_keys_and_robot(seat):
     assert "Traceback" not in seat.terminal.text()
 
 
-def test_quitting_without_proof_of_stop_repeats_it_and_is_an_error(monkeypatch):
+@pytest.mark.parametrize("secret_file", ["", "missing.secret"])
+def test_quitting_without_proof_of_stop_repeats_it_and_is_an_error(monkeypatch, tmp_path, secret_file):
+    """Also where no datagram can be sent, since the STOP secret was removed after the start."""
+    secret_file = secret_file and str(tmp_path / secret_file)
     monkeypatch.setattr(terminal, "_PROVE_STOP_S", 0.1)
     monkeypatch.setattr(terminal, "_LEAVE_PERIOD_S", 0.005)
     network, teleop = MemoryNetwork(), Teleop("0000000a", Speeds(0.2, 1.0))
@@ -250,10 +253,11 @@ def test_quitting_without_proof_of_stop_repeats_it_and_is_an_error(monkeypatch):
         monkeypatch.setattr("sys.stdout", screen)
         fingers.write(b"\nq")
         with pytest.raises(LinkError, match="robot 'r1' did not confirm STOP; cut its power by hand"):
-            Cockpit(link, teleop, lambda: StopSender("r1", ["tcp/127.0.0.1:1"])).run()
+            Cockpit(link, teleop, lambda: StopSender("r1", ["tcp/127.0.0.1:1"], secret_file)).run()
     network.advance(1)
     assert {decode(Request, message.payload).verb for message in requests} == {Verb.STOP}
     assert len(requests) >= 3
+    assert teleop.note == "STOP is not confirmed, repeating" or (secret_file and secret_file in teleop.note)
 
 
 @pytest.mark.parametrize("closed", ["stdin", "stdout", ""])
