@@ -23,7 +23,6 @@ from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.protocol.transports.zenoh.discovery import find_listeners
 from sightline.protocol.transports.zenoh.presence import QUERY_ROUNDS, PeerInfo, best_round_trips, software_version
-from sightline.protocol.transports.zenoh.session import LOOPBACK
 
 ROLE = "doctor"
 ARP_TABLE = Path("/proc/net/arp")
@@ -51,7 +50,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
             yield Finding("reach", False, f"{host}:{port} does not answer", why)
             return
         yield from _round_trip(knocks_ms, "handshakes")
-    if not host.startswith(LOOPBACK):
+    if not host.startswith(endpoints.LOOPBACK):
         yield _found_by_multicast(host)
     try:
         role = viewer_role(secure) if secure else ROLE  # an operator's keys may acknowledge frames

@@ -231,6 +231,12 @@ def stop_addresses(endpoints: Sequence[str]) -> list[tuple[str, int]]:
 
 # UDP port of discovery on each machine that listens beyond loopback: that of Zenoh plus three.
 MULTICAST_PORT: Final = 7449
+LOOPBACK: Final = ("localhost", "127.", "::1")
+
+
+def uses_discovery(listen: Sequence[str]) -> bool:
+    """Return True if a Zenoh endpoint of `listen` is beyond loopback, so that its owner answers discovery."""
+    return any("://" not in one and not parse_zenoh_endpoint(one)[1].startswith(LOOPBACK) for one in listen)
 
 
 def own_stop_addresses(listen: Sequence[str]) -> list[tuple[str, int]]:
@@ -239,11 +245,12 @@ def own_stop_addresses(listen: Sequence[str]) -> list[tuple[str, int]]:
     Raises:
         ConfigError: one is that of discovery. Only one of the two could be opened.
     """
-    addresses = stop_addresses(listen)
-    if any((host, MULTICAST_PORT) in addresses for host in ("0.0.0.0", "::")):
-        raise ConfigError(f"port {MULTICAST_PORT - 1} in {', '.join(listen)}: its STOP port would be {MULTICAST_PORT}/"
-                          f"udp, which is that of discovery; use another port, e.g. tcp/0.0.0.0:{MULTICAST_PORT}")
-    return addresses
+    for endpoint in listen if uses_discovery(listen) else ():
+        if any((host, MULTICAST_PORT) in stop_addresses([endpoint]) for host in ("0.0.0.0", "::")):
+            other = endpoint.replace(f":{MULTICAST_PORT - 1}", f":{MULTICAST_PORT}")
+            raise ConfigError(f"port {MULTICAST_PORT - 1} in {endpoint}: its STOP port would be {MULTICAST_PORT}/udp, "
+                              f"which is that of discovery; use another port, e.g. {other}")
+    return stop_addresses(listen)
 
 
 def _is_address(name: str) -> bool:

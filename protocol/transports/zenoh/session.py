@@ -18,7 +18,12 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError, install_command
 from sightline.protocol.transports.diagnosis import diagnose_tls, own_sockets, port_owner, unresolved_host
-from sightline.protocol.transports.endpoints import MULTICAST_PORT, parse_zenoh_endpoint, with_send_buffer
+from sightline.protocol.transports.endpoints import (
+    MULTICAST_PORT,
+    parse_zenoh_endpoint,
+    uses_discovery,
+    with_send_buffer,
+)
 from sightline.protocol.transports.security import RoleKeys, size_limit_section
 
 if TYPE_CHECKING:
@@ -28,12 +33,11 @@ if TYPE_CHECKING:
 # The group of Zenoh.
 MULTICAST_GROUP: Final = ("224.0.0.224", MULTICAST_PORT)
 MULTICAST_OFF: Final = {"enabled": False}
-LOOPBACK: Final = ("localhost", "127.", "::1")
 
 
 def multicast_section(listen: Sequence[str]) -> dict[str, Any]:
     """Return Zenoh's `scouting/multicast`. It is on only if the owner listens beyond loopback."""
-    if all(parse_zenoh_endpoint(endpoint)[1].startswith(LOOPBACK) for endpoint in listen):
+    if not uses_discovery(listen):
         return MULTICAST_OFF
     never: dict[str, list[str]] = {"router": [], "peer": [], "client": []}
     return {"enabled": True, "listen": True, "address": multicast_address(), "autoconnect": never}

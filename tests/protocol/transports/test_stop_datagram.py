@@ -69,17 +69,27 @@ def test_the_port_is_the_next_one_above_that_of_the_link():
     assert stop_addresses([]) == []
 
 
-@pytest.mark.parametrize(("listen", "is_free"), [
-    ("tcp/0.0.0.0:7448", False), ("tls/[::]:7448", False), ("wss://0.0.0.0:7448", False), ("tcp/0.0.0.0:7449", True),
-    ("tcp/127.0.0.1:7448", True), ("tcp/192.168.1.20:7448", True),
+WIDE = "tcp/0.0.0.0:7447"
+
+
+@pytest.mark.parametrize(("first", "second", "example"), [
+    (DEFAULT_ENDPOINT, "tcp/0.0.0.0:7448", "tcp/0.0.0.0:7449"), (DEFAULT_ENDPOINT, "tls/[::]:7448", "tls/[::]:7449"),
+    (WIDE, "wss://0.0.0.0:7448", "wss://0.0.0.0:7449"), (WIDE, "ws://[::]:7448/", "ws://[::]:7449/"),
 ])  # fmt: skip
-def test_stop_port_is_not_that_of_discovery(listen, is_free):
-    try:
-        assert own_stop_addresses([DEFAULT_ENDPOINT, listen]) == stop_addresses([DEFAULT_ENDPOINT, listen])
-    except ConfigError as error:
-        assert not is_free and "7449/udp, which is that of discovery; use another port, e.g. tcp/0.0" in str(error)
-    else:
-        assert is_free
+def test_stop_port_is_not_that_of_discovery(first, second, example):
+    with pytest.raises(ConfigError) as error:
+        own_stop_addresses([first, second])
+    assert str(error.value) == (f"port 7448 in {second}: its STOP port would be 7449/udp, which is that of discovery; "
+                                f"use another port, e.g. {example}")
+
+
+@pytest.mark.parametrize("listen", [
+    [WIDE, "tcp/0.0.0.0:7449"], [WIDE, "tcp/127.0.0.1:7448"], [DEFAULT_ENDPOINT, "tcp/192.168.1.20:7448"],
+    ["ws://0.0.0.0:7448"], [DEFAULT_ENDPOINT, "ws://0.0.0.0:7448"], ["tcp/[::1]:7447", "wss://[::]:7448"], [],
+])  # fmt: skip
+def test_stop_port_may_be_7449_where_discovery_does_not_use_it(listen):
+    """A WebSocket endpoint, or one on loopback, switches no discovery on."""
+    assert own_stop_addresses(listen) == stop_addresses(listen)
 
 
 # --- the sender ----------------------------------------------------------------------------------------------------
