@@ -33,6 +33,7 @@ _limiter: Final = RepeatLimiter()
 def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
     """Serve until SIGTERM or SIGINT. Raises ConfigError and LinkError as `open_session` does."""
     check_zenoh_endpoints(listen, connect)
+    stop_addresses = own_stop_addresses(listen)
     secured = load_role_keys(secure, ROBOT_ROLE)
     _raise_descriptor_limit()
     ending = threading.Event()
@@ -44,7 +45,7 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, lambda _number, _frame: ending.set())
         rules = f"keys of {secure}, access rules on" if secure else "no keys, every client that reaches it may connect"
-        forwarder = _stop_forwarder(listen, secure)
+        forwarder = _stop_forwarder(stop_addresses, secure)
         if forwarder is not None:
             closing_all.callback(forwarder.close)
             forwarder.keep_alive(monotonic_us())
@@ -65,10 +66,10 @@ def _raise_descriptor_limit() -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
-def _stop_forwarder(listen: Sequence[str], secure: str) -> StopProcess | None:
+def _stop_forwarder(addresses: Sequence[tuple[str, int]], secure: str) -> StopProcess | None:
     """Prepare the forwarder of STOP datagrams; None where keys are used without a STOP secret."""
     try:
-        return stop_forwarder.start(own_stop_addresses(listen), stop_secret_file(secure) if secure else "")
+        return stop_forwarder.start(addresses, stop_secret_file(secure) if secure else "")
     except ConfigError as error:
         _log.warning("router: %s", error)
         return None

@@ -11,7 +11,7 @@ import pytest
 
 from sightline.operator_side.setup import keys, router
 from sightline.protocol.channels import FRAME, TWIST
-from sightline.protocol.errors import LinkError
+from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.protocol.transports.zenoh.session import MAX_ROUTER_SESSIONS, MAX_SESSIONS, open_session
 from tests.fixtures.links import until
@@ -61,6 +61,12 @@ def test_router_without_its_keys_reports_the_missing_file(tmp_path):
     with _router("--listen", "tls/127.0.0.1:7450", "--secure", str(tmp_path)) as router:
         assert router.wait(10) == 2
         assert router.stderr.read().startswith("error: ca.pem is missing in")
+
+
+def test_router_does_not_start_where_its_stop_port_would_be_that_of_discovery(monkeypatch):
+    monkeypatch.setattr(router, "open_session", lambda *_: pytest.fail("it opened its session"))
+    with pytest.raises(ConfigError, match=r"its STOP port would be 7449/udp, .* e\.g\. tcp/0\.0\.0\.0:7449"):
+        router.run(["tcp/0.0.0.0:7448"], [], "")
 
 
 @pytest.mark.slow
