@@ -210,7 +210,10 @@ def _read(file: Path) -> Certificate:
     try:
         read = x509.load_pem_x509_certificate(file.read_bytes())
     except (OSError, ValueError):
-        raise ConfigError(f"invalid certificate {file}; create new ones with: sightline keys init") from None
+        # The present addresses are not known, and new keys of all roles are not needed for one of them.
+        repair = (f"replace it with: sightline keys add {file.parent} {file.stem} --host HOST" if file.stem in ROLES
+                  else f"create new ones with: sightline keys init {file.parent}-new")
+        raise ConfigError(f"invalid certificate {file}; {repair}") from None
     names = read.extensions
     try:
         alternative = names.get_extension_for_class(x509.SubjectAlternativeName).value

@@ -74,3 +74,23 @@ def test_new_keys_replace_the_old_ones_and_stay_private(tmp_path):
         file.name for file in files}
     assert all(file.stat().st_mode & 0o777 == 0o600 for file in files if file.suffix != ".pem")
     assert (tmp_path / "robot.pem").stat().st_mode & 0o777 == (tmp_path / "ca.pem").stat().st_mode & 0o777
+
+
+def test_damaged_certificate_of_a_role_is_replaced_without_a_new_authority(tmp_path):
+    keys.make(tmp_path, [])
+    (tmp_path / "robot.pem").write_text("damaged")
+    expected = (f"invalid certificate {tmp_path}/robot.pem; replace it with: sightline keys add {tmp_path} robot "
+                "--host HOST")
+    for read in (keys.look, lambda folder: keys.add(folder, "robot", [])):
+        with pytest.raises(ConfigError) as error:
+            read(tmp_path)
+        assert str(error.value) == expected
+    keys.add(tmp_path, "robot", ["10.0.0.7"])
+    assert {one.role: one.hosts for one in keys.look(tmp_path)}["robot"] == (*keys.LOOPBACK, "10.0.0.7")
+
+
+def test_damaged_certificate_of_the_authority_needs_a_new_folder(tmp_path):
+    keys.make(tmp_path, [])
+    (tmp_path / "ca.pem").write_text("damaged")
+    with pytest.raises(ConfigError, match=f"ca.pem; create new ones with: sightline keys init {tmp_path}-new$"):
+        keys.look(tmp_path)
