@@ -306,7 +306,7 @@ def collect(
 
     Args:
         finder: makes, for a size, the function that searches one image.
-        is_live: skip damaged images, and those that flow control has scaled.
+        is_live: skip damaged images, and those that flow control has scaled; begin again with the first larger one.
 
     Raises:
         ConfigError: there is no image, or unless `is_live`, one is damaged or of another size.
@@ -315,14 +315,15 @@ def collect(
     size, given, skipped = None, 0, 0
     for jpeg in pictures:
         try:
-            own = _size_of(jpeg, size)
+            own = _size_of(jpeg, size, may_grow=is_live)
         except ConfigError:
             if not is_live:
                 raise
             skipped += 1
             continue
-        if size is None:
-            size, find = own, finder(own)
+        if size is None or own.width_px > size.width_px:
+            size, find, given, skipped = own, finder(own), 0, skipped + given
+            found.clear()
         given += 1
         one = find(jpeg)
         if one is not None and is_new(one, found, size):
@@ -335,12 +336,14 @@ def collect(
     return Collected(size, found, given, skipped)
 
 
-def _size_of(jpeg: bytes, size: JpegSize | None) -> JpegSize:
+def _size_of(jpeg: bytes, size: JpegSize | None, *, may_grow: bool) -> JpegSize:
     try:
         own = read_jpeg_size(jpeg, MAX_PIXELS)
     except WireError as error:
         raise ConfigError(f"invalid JPEG: {error.detail}; remove or convert it") from None
-    if size is not None and (own.width_px, own.height_px) != (size.width_px, size.height_px):
+    if size is None or (may_grow and own.width_px > size.width_px):
+        return own
+    if (own.width_px, own.height_px) != (size.width_px, size.height_px):
         raise ConfigError(f"images of {own.width_px}x{own.height_px} and {size.width_px}x{size.height_px} are mixed; "
                           "use images of one size")
     return own

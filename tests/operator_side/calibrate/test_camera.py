@@ -133,6 +133,17 @@ def test_damaged_and_scaled_images_of_a_live_source_are_skipped_and_counted():
         collect(iter(pictures[:1]), *arguments, is_live=True)
 
 
+def test_live_source_whose_first_images_are_scaled_begins_again_at_full_size():
+    """Flow control may have scaled the images before, and never makes one larger than the camera does."""
+    sizes = [JpegSize(160, 120, 3), JpegSize(160, 120, 3), JpegSize(640, 480, 3), JpegSize(320, 240, 3)]
+    pictures = [jpeg_of(np.full((size.height_px, size.width_px, 3), 120, np.uint8)) for size in sizes]
+    reports = []
+    got = collect(iter([*pictures, pictures[2], pictures[0]]), lambda size: lambda _: size.width_px, lambda *_: True, 3,
+                  reports.append, is_live=True)
+    assert (got.size.width_px, got.found, got.given, got.skipped) == (640, [640, 640], 2, 4)
+    assert reports == ["1 of 3", "2 of 3", "1 of 3", "2 of 3"]
+
+
 # --- ball --------------------------------------------------------------------------------------------------------
 
 
