@@ -13,6 +13,7 @@ from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.messages import CameraModel, FrameHeader, Stamp
 from sightline.protocol.proof import NO_PROOF, ProofChain, session_digest
 from sightline.protocol.text import format_twist
@@ -194,12 +195,14 @@ class SkipCounter:
     """Counts what is skipped, and selects what to log of it: at 1, 10, 100 ..., and a reason that is new.
 
     After a long row without a skip each reason is new again, so that one that comes and goes is not logged each time.
+    One that comes and goes for long is logged after 1, 2, 4 ... 60 s.
     """
 
     def __init__(self) -> None:
         self.count = 0
         self._used_in_a_row = 0
         self._known: set[str] = set()
+        self._limiter = RepeatLimiter()
 
     def use(self) -> None:
         """Note one that is not skipped."""
@@ -207,10 +210,11 @@ class SkipCounter:
         if self._used_in_a_row == _LONG_ROW:
             self._known.clear()
 
-    def skip(self, reason: str) -> bool:
+    def skip(self, reason: str, now_us: int) -> bool:
         """Count one. Returns True if it should be logged."""
-        is_new = reason not in self._known
-        self._known.add(reason)
+        is_new = reason not in self._known and self._limiter.due(reason, now_us) > 0
+        if is_new:
+            self._known.add(reason)
         self.count, self._used_in_a_row = self.count + 1, 0
         return is_new or self.count in _REPORTED_COUNTS
 
@@ -467,7 +471,7 @@ class Service:
     def _report_phase(self, answer: PipelineAnswer) -> None:
         seen = answer.seen
         if answer.twist is None:
-            if self._skipped_images.skip(answer.skipped):
+            if self._skipped_images.skip(answer.skipped, monotonic_us()):
                 self._log_change("phase", f"skipped images: {self._skipped_images.count}; newest: {seen.note}")
             return
         self._skipped_images.use()
@@ -579,7 +583,7 @@ class BoxesService(Service):
             frame, found = self._reader.read(message.header, message.payload, self._camera)
         except WireError as error:
             self.skipped[error.reason] += 1
-            if self._rejected_boxes.skip(error.reason):
+            if self._rejected_boxes.skip(error.reason, monotonic_us()):
                 self._log_change("boxes", f"rejecting boxes: {error.detail} ({self._rejected_boxes.count} so far)")
             return
         self._rejected_boxes.use()

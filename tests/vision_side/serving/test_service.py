@@ -244,10 +244,22 @@ def test_outage_after_good_images_is_logged_and_its_end_too(bench: Bench) -> Non
 def test_reason_is_logged_again_after_thirty_frames_that_were_used(used, logged):
     counter, counts = SkipCounter(), []
     for number in range(12):
-        counts += [counter.count] if counter.skip("MALFORMED" if number % 2 else "NO_ANSWER") else []
+        is_logged = counter.skip("MALFORMED" if number % 2 else "NO_ANSWER", number * 10_000_000)
+        counts += [counter.count] if is_logged else []
         for _ in range(used):
             counter.use()
     assert counts == logged
+
+
+def test_reason_that_comes_and_goes_every_second_is_logged_ever_less_often():
+    counter, logged_s = SkipCounter(), []
+    for number in range(1, 2771):  # an hour
+        if counter.skip("MALFORMED", number * 1_300_000):
+            logged_s.append(number * 1.3)
+        for _ in range(30):
+            counter.use()
+    assert 60 <= len(logged_s) <= 70
+    assert any(counter.skip("MALFORMED", 3_601_000_000 + tick * 33_333) for tick in range(1810)), "an outage, in 60 s"
 
 
 def test_images_that_are_skipped_now_and_then_are_not_logged_each_time(bench):
