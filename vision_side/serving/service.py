@@ -360,7 +360,7 @@ class Service:
         header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
         if header is None:
             return
-        if not self._is_of_robot(header):
+        if not self._is_of_robot(header, self._frames.dropped):
             return
         self._heard_s = time.monotonic()
         if header.session != self._robot_session:
@@ -383,8 +383,13 @@ class Service:
             self._viewing.publish_detections(header, answer, started_ns)
         self._viewing.show(header, answer, self._camera, started_ns=started_ns, jpeg=message.payload)
 
-    def _is_of_robot(self, header: FrameHeader) -> bool:
-        """Return True for a frame of the steered robot. Others are counted, and logged once."""
+    def _is_of_robot(self, header: FrameHeader, replaced_frames: int = 0) -> bool:
+        """Return True for a frame of the steered robot. Others are counted, and logged once.
+
+        Args:
+            header: header of the frame.
+            replaced_frames: number of frames so far that came, and whose headers are not given to this method.
+        """
         replaced = self._sessions.clock.replaced
         try:
             self._sessions.check(header, self._now_us())
@@ -399,7 +404,7 @@ class Service:
                 self._log_change("time", f"rejecting frames of robot {self._config.robot} whose time disagrees with "
                                          "this clock; does another client send frames?")
             return False
-        self._loss.update(header, self._frames.dropped)
+        self._loss.update(header, replaced_frames)
         if self._pipeline is not None and self._sessions.clock.replaced != replaced:
             self._pipeline.restart_clock()
         return True

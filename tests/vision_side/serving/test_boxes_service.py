@@ -160,6 +160,19 @@ def test_replaced_boxes_are_not_replaced_frames():
     assert bench.service.counts().overtaken == 1
 
 
+def test_lost_frames_count_also_next_to_replaced_ones():
+    """The header of each replaced frame is noted, so that it leaves no gap. Three of 25 frames do not arrive."""
+    bench = Bench()
+    for seq in range(1, 21):
+        bench.frame(seq)
+    for seq in (24, 25):
+        bench.robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=seq, t_us=seq * FRAME_US)), b"image")
+    bench.turn()
+    assert bench.service.counts().overtaken == 1
+    share = 1 - (63 / 64) ** 3
+    assert bench.service._loss._share == pytest.approx(share * (63 / 64) ** 2)
+
+
 def test_boxes_of_a_frame_that_is_not_newer_move_nothing():
     bench = Bench()
     for seq in range(1, 5):
