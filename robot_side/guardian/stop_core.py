@@ -173,14 +173,16 @@ class Registration:
         self._counter += 1
         return pack_stop(StopDatagram(Kind.REGISTER, self._robot, self._counter, self._challenge), self._secret)
 
+    def awaits(self, one: StopDatagram) -> bool:
+        """Return True for an answer to this registration."""
+        return one.kind is Kind.ANSWER and self._first < one.counter <= self._counter
+
     def on_answer(self, data: bytes, one: StopDatagram) -> bytes | None:
-        """Take an answer. Returns the next datagram if it must be sent immediately.
+        """Take an answer that it awaits. Returns the next datagram if it must be sent immediately.
 
         Raises:
             WireError: it has no valid HMAC.
         """
-        if not self._first < one.counter <= self._counter:
-            return None
         if self._secret:
             check_hmac(data, self._secret)
         self._unanswered = 0

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from sightline.protocol.errors import WireError
-from sightline.protocol.transports.stop_datagram import CHALLENGE_BYTES, Kind, unpack_stop
+from sightline.protocol.transports.stop_datagram import CHALLENGE_BYTES, unpack_stop
 from sightline.protocol.transports.stop_port import (
     Address,
     Origin,
@@ -71,8 +71,8 @@ class StopReceiver:
         """Answer a datagram, or ignore and count it."""
         try:
             one = unpack_stop(data)
-            if one.kind is Kind.ANSWER and self._routers:
-                answers = (registration.on_answer(data, one) for _, registration in self._routers)
+            if awaiting := [registration for _, registration in self._routers if registration.awaits(one)]:
+                answers = (registration.on_answer(data, one) for registration in awaiting)
                 return [(answer, origin) for answer in answers if answer is not None]
             return [(self._core.on_stop(data, one, now_us()), origin)]
         except WireError as error:

@@ -300,6 +300,6 @@ def test_a_router_that_starts_again_gives_its_new_challenge():
 def test_an_answer_to_another_registration_is_ignored():
     registration = Registration("r1", b"", 5)
     registration.datagram()
-    forged = pack_stop(StopDatagram(Kind.ANSWER, "r1", 5, b"x" * 16))
-    assert registration.on_answer(forged, unpack_stop(forged)) is None
-    assert unpack_stop(registration.datagram()).challenge == NO_CHALLENGE
+    assert [registration.awaits(StopDatagram(Kind.ANSWER, "r1", counter)) for counter in (5, 6, 7)] == [
+        False, True, False]
+    assert not registration.awaits(StopDatagram(Kind.STOP, "r1", 6))

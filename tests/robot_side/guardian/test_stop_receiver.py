@@ -273,6 +273,23 @@ def test_router_that_cannot_be_addressed_is_logged_once():
         one.close()
 
 
+def test_answers_that_no_registration_awaits_are_counted():
+    """Also at a robot that connects to routers, which awaits others."""
+    pipe, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    theirs.setblocking(False)
+    port = StopPort(pipe, [], outgoing=True)
+    receiver = stop_receiver.StopReceiver(port, "r1", b"", ())
+    receiver._routers = [(("127.0.0.1", 7448), Registration("r1", b"", first)) for first in (5, 50)]
+    assert [unpack_stop(one.datagram()).counter for _, one in receiver._routers] == [6, 51]
+    for counter in (5, 6, 51, 52):
+        answer = pack_stop(StopDatagram(Kind.ANSWER, "r1", counter, b"x" * 16))
+        assert receiver.on_datagram(answer, (0, ("127.0.0.1", 7448))) in ((), [])
+    receiver.on_turn()
+    assert [unpack_ignored(packet)[0] for packet in read_packets(theirs)] == [{"MALFORMED": 2}]
+    for one in (pipe, theirs, *port._sockets.values()):
+        one.close()
+
+
 def test_with_keys_an_answer_that_is_sent_back_stops_nothing(started, operator, tmp_path):
     file = tmp_path / "stop.secret"
     file.write_bytes(SECRET)
