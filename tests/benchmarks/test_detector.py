@@ -10,7 +10,7 @@ ANSWERED_HZ = 30 / OVERLOAD
 
 def load(answered_s=SECONDS):
     """A run whose services answer each robot evenly, for so long; an answer takes 50 ms."""
-    one = Load(offered=30 * SECONDS * len(ROBOTS), memory_mb=[0.0], seconds=SECONDS)
+    one = Load(offered=30 * SECONDS * len(ROBOTS), memory_mb=[0.0] * SECONDS, seconds=SECONDS)
     one.begin(ROBOTS, BEGIN_US)
     one.memory_mb += [80.0] * SECONDS
     for number in range(round(answered_s * ANSWERED_HZ)):

@@ -11,6 +11,7 @@ from sightline.evaluation.faults.fixture import RobotFixture, Setup, memory_kib,
 from sightline.evaluation.processes import Processes
 from sightline.robot_side.kinematics import DiffDriveConfig
 from sightline.robot_side.safety.limits import TICK_US
+from tests.fixtures.links import START_S, until
 
 _GUARDIAN = """
 from sightline.robot_side.guardian import stop_receiver
@@ -36,6 +37,7 @@ def test_memory_of_stop_receiver_is_measured(tmp_path):
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as guardian:
         assert guardian.stdout.readline()
         processes._running["robot"] = SimpleNamespace(pid=guardian.pid)
+        assert until(lambda: memory_kib(processes, ["robot"]).get(("robot", "stop")), START_S)
         measured = memory_kib(processes, ["robot"])
         guardian.stdin.write(b"\n")
     assert set(measured) == {("robot", "itself"), ("robot", "stop")} and min(measured.values()) > 0
