@@ -95,6 +95,17 @@ def unpack_stop(data: bytes) -> StopDatagram:
                         bool(flags & _STORED), bool(flags & _KEYED), received, applied)
 
 
+def challenge_of(seed: bytes, host: str, port: int) -> bytes:
+    """Return the challenge for one address, which needs no memory.
+
+    Args:
+        seed: random bytes of this start.
+        host: address of the peer, as the kernel writes it.
+        port: its UDP port.
+    """
+    return _hmac(f"{host} {port}".encode(), seed)[:CHALLENGE_BYTES]
+
+
 def check_hmac(data: bytes, secret: bytes) -> None:
     """Raise WireError WRONG_KEY unless `data` ends in the HMAC of `secret`. Takes constant time."""
     # In constant time: otherwise the time of the answer reveals the correct part of a guess.

@@ -19,6 +19,7 @@ from sightline.protocol.transports.stop_datagram import (
     STATES,
     Kind,
     StopDatagram,
+    challenge_of,
     check_hmac,
     pack_stop,
     unpack_stop,
@@ -156,38 +157,40 @@ class ReceiverCore:
 
 
 class Registration:
-    """Registers a robot at one router, so that the router forwards STOPs to it."""
+    """Registers a robot at one router, so that the router forwards STOPs to it.
+
+    With a secret it answers each challenge at the address that the challenge came from: a router has one per address
+    of the robot, and a robot may reach it from two families, or with another port of a NAT.
+    """
 
     def __init__(self, robot: str, secret: bytes, counter: int) -> None:
         """Begin. `counter` is a random start, below 2^63."""
         self._robot, self._secret = robot, secret
         self._first = self._counter = counter
-        self._challenge = NO_CHALLENGE
-        self._unanswered = 0
 
     def datagram(self) -> bytes:
-        """Return the datagram to send now, about once a second."""
-        self._unanswered += 1
-        if self._unanswered > 2:  # the router may have started again
-            self._challenge = NO_CHALLENGE
-        self._counter += 1
-        return pack_stop(StopDatagram(Kind.REGISTER, self._robot, self._counter, self._challenge), self._secret)
+        """Return the datagram to send now, about once a second. With a secret it requests the challenge."""
+        self._counter += 2
+        return self._pack(self._counter, NO_CHALLENGE)
+
+    def _pack(self, counter: int, challenge: bytes) -> bytes:
+        return pack_stop(StopDatagram(Kind.REGISTER, self._robot, counter, challenge), self._secret)
 
     def awaits(self, one: StopDatagram) -> bool:
         """Return True for an answer to this registration."""
-        return one.kind is Kind.ANSWER and self._first < one.counter <= self._counter
+        return one.kind is Kind.ANSWER and self._first < one.counter <= self._counter + bool(self._secret)
 
     def on_answer(self, data: bytes, one: StopDatagram) -> bytes | None:
-        """Take an answer that it awaits. Returns the next datagram if it must be sent immediately.
+        """Take an answer that it awaits. Returns the datagram to send back immediately, or None.
 
         Raises:
             WireError: it has no valid HMAC.
         """
-        if self._secret:
-            check_hmac(data, self._secret)
-        self._unanswered = 0
-        is_new, self._challenge = one.challenge != self._challenge, one.challenge
-        return self.datagram() if is_new and self._secret else None
+        if not self._secret:
+            return None
+        check_hmac(data, self._secret)
+        # An odd number is that of a datagram with a challenge. Its answer needs none, or the two would never end.
+        return None if (one.counter - self._first) % 2 else self._pack(one.counter + 1, one.challenge)
 
 
 # The forwarder beside a router.
@@ -207,9 +210,14 @@ Origin = tuple[int, tuple[str, int]]
 class ForwarderCore:
     """Forwards STOPs to the robots that registered, and the answers back."""
 
-    def __init__(self, secret: bytes, challenge: bytes) -> None:
-        """Begin without robots. With a secret, only robots that know it may register."""
-        self._secret, self._challenge = secret, challenge
+    def __init__(self, secret: bytes, seed: bytes) -> None:
+        """Begin without robots. With a secret, only robots that know it may register.
+
+        Args:
+            secret: STOP secret, or b"".
+            seed: random bytes of this start.
+        """
+        self._secret, self._seed = secret, seed
         self._robots: dict[str, dict[str, tuple[Origin, int]]] = {}
         """Robot id -> host -> address and time of the last registration."""
         self._waiting: OrderedDict[Hashable, Origin] = OrderedDict()
@@ -238,13 +246,15 @@ class ForwarderCore:
     def _register(
         self, data: bytes, one: StopDatagram, origin: Origin, now_us: int
     ) -> list[tuple[bytes, Origin]]:
+        # Of the address: otherwise a recorded registration would send STOPs to any address.
+        challenge = challenge_of(self._seed, *origin[1][:2])
         if self._secret and one.challenge != NO_CHALLENGE:
-            if one.challenge != self._challenge:
-                raise WireError(RejectReason.OTHER_SESSION, "of an earlier start of the router")
+            if one.challenge != challenge:
+                raise WireError(RejectReason.OTHER_SESSION, "of an earlier start of the router, or of another address")
             check_hmac(data, self._secret)
         if not self._secret or one.challenge != NO_CHALLENGE:
             self._place(one.robot, origin, now_us)
-        answer = StopDatagram(Kind.ANSWER, one.robot, one.counter, self._challenge, keyed=bool(self._secret))
+        answer = StopDatagram(Kind.ANSWER, one.robot, one.counter, challenge, keyed=bool(self._secret))
         return [(pack_stop(answer, self._secret), origin)]
 
     def _place(self, robot: str, origin: Origin, now_us: int) -> None:

@@ -9,6 +9,7 @@ from sightline.protocol.transports.stop_datagram import (
     STOPPED,
     Kind,
     StopDatagram,
+    challenge_of,
     check_hmac,
     pack_stop,
     unpack_stop,
@@ -275,7 +276,9 @@ def test_with_keys_a_robot_registers_by_the_challenge_of_the_router():
 
 
 @pytest.mark.parametrize(("secret", "challenge", "reason"), [
-    (SECRET, b"x" * 16, "OTHER_SESSION"), (b"another", CHALLENGE, "WRONG_KEY"), (b"", CHALLENGE, "WRONG_KEY"),
+    (SECRET, b"x" * 16, "OTHER_SESSION"), (SECRET, CHALLENGE, "OTHER_SESSION"),
+    (b"another", challenge_of(CHALLENGE, *OPERATOR[1]), "WRONG_KEY"),
+    (b"", challenge_of(CHALLENGE, *OPERATOR[1]), "WRONG_KEY"),
 ])  # fmt: skip
 def test_with_keys_no_third_party_registers(secret, challenge, reason):
     core = ForwarderCore(SECRET, CHALLENGE)
@@ -284,6 +287,39 @@ def test_with_keys_no_third_party_registers(secret, challenge, reason):
         core.on_datagram(data, OPERATOR, 0)
     with pytest.raises(WireError, match="OTHER_ROBOT"):
         core.on_datagram(stop_of(), OPERATOR, 0)
+
+
+def registered(core, registration, *origins):
+    """Register as a robot does whose datagram arrives from each of `origins`. Returns its last datagram."""
+    sent = [(registration.datagram(), origin) for origin in origins]
+    for data, origin in sent:
+        [(reply, back)] = core.on_datagram(data, origin, 0)
+        assert back == origin
+        if second := registration.on_answer(reply, unpack_stop(reply)):
+            sent.append((second, origin))
+        assert len(sent) <= 2 * len(origins), "an answer to an answer"
+    return sent[-1][0]
+
+
+@pytest.mark.parametrize("origin", [
+    (3, ("10.0.0.1", 9)), (3, ("10.0.0.2", 50000)), (4, ("2001:db8::1", 50000, 0, 0)), OPERATOR,
+])  # fmt: skip
+def test_with_keys_a_recorded_registration_counts_only_from_its_own_address_and_port(origin):
+    core = ForwarderCore(SECRET, CHALLENGE)
+    recorded = registered(core, Registration("r1", SECRET, 5), ROBOT)
+    assert unpack_stop(recorded).challenge != NO_CHALLENGE
+    with pytest.raises(WireError, match="OTHER_SESSION"):
+        core.on_datagram(recorded, origin, 4_000_000)
+    assert core.on_datagram(stop_of(), OPERATOR, 4_000_000) == [(stop_of(), ROBOT)]
+
+
+def test_with_keys_a_robot_registers_from_both_families_and_from_a_new_port_of_its_nat():
+    core, registration = ForwarderCore(SECRET, CHALLENGE), Registration("r1", SECRET, 5)
+    second, moved = (4, ("2001:db8::1", 50001, 0, 0)), (3, ("10.0.0.1", 50007))
+    registered(core, registration, ROBOT, second)
+    assert [place for _, place in core.on_datagram(stop_of(), OPERATOR, 0)] == [ROBOT, second]
+    registered(core, registration, moved, second)
+    assert [place for _, place in core.on_datagram(stop_of(), OPERATOR, 0)] == [moved, second]
 
 
 def test_a_router_that_starts_again_gives_its_new_challenge():
