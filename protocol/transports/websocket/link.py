@@ -319,7 +319,8 @@ class WebSocketLink(BaseLink):
     def _leave(self, peer: Peer) -> None:
         with self._joining:
             self._peers = tuple(other for other in self._peers if other is not peer)
-            self._dropped += peer.queue.dropped
+            # Replaced and never changed, as other threads read it without the lock.
+            self._dropped = self._dropped + peer.queue.dropped
             self._announce()
 
     def _on_change(self) -> None:

@@ -43,6 +43,16 @@ def test_late_vision_receives_the_existing_subscriptions(site):
     assert until(lambda: vision.has_listener(PREVIEW)) and not vision.has_listener(OVERLAY)
 
 
+def test_drops_of_a_peer_that_leaves_change_no_counter_that_another_thread_reads(site):
+    robot, opened, _ = site
+    before, vision = robot.dropped, opened("vision")
+    assert until(lambda: robot.connected)
+    robot._peers[0].queue.dropped[OVERLAY.name] = 3
+    vision.close()
+    assert until(lambda: not robot.connected and robot.dropped == {OVERLAY.name: 3})
+    assert before == {}
+
+
 def test_vision_that_subscribes_to_itself_receives_nothing(site):
     _, opened, _ = site
     vision = opened("vision")
