@@ -63,7 +63,7 @@ export class Robot {
 
   onTwist(source, { header, payload }, now_us) {
     const reason = this.gate.offer(source, header, payload, now_us);
-    if (header === null || header.source !== source || reason === "NOT_PROVEN") return;
+    if (header === null || reason === "UNKNOWN_SOURCE" || reason === "NOT_PROVEN") return;
     this.stream.onHolder(this.gate.lease.liveHolder(now_us), now_us);
     this.returnCredit(header, now_us);
   }

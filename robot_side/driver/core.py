@@ -35,7 +35,8 @@ from sightline.robot_side.safety.guard import RangeGuard
 
 _PERIODS_US = {STATUS.name: 100_000, ODOMETRY.name: 50_000}
 _RETURNS_NO_CREDIT = (
-    RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME, RejectReason.FROM_FUTURE, RejectReason.NOT_PROVEN,
+    RejectReason.UNKNOWN_SOURCE, RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME, RejectReason.FROM_FUTURE,
+    RejectReason.NOT_PROVEN,
 )  # fmt: skip
 
 

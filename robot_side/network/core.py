@@ -9,6 +9,7 @@ from sightline.protocol.messages import (
     MAX_CHANNELS_SHOWN,
     AnswerHeader,
     CameraModel,
+    Echo,
     FrameHeader,
     Holder,
     Planar,
@@ -23,6 +24,7 @@ from sightline.robot_side.pipe import CommandAck, RobotMotion
 from sightline.robot_side.ports import Adjustable, Camera, Picture, scaled_model
 
 _CAMERA_PERIOD_US = 500_000
+_KEPT_FRAMES = 256  # that an ack may cite, as many as the gate records
 
 
 class NetworkCore:
@@ -43,6 +45,8 @@ class NetworkCore:
         self._seq = first_seq
         self._max_frame_bytes = max_frame_bytes
         self._last_t_us = -1
+        self._frame_times: dict[int, int] = {}
+        """Number of a sent frame -> its capture time."""
         self._camera_seq: int | None = None
         self._camera_due_us = 0
         self._announced: CameraModel | None = None
@@ -76,6 +80,8 @@ class NetworkCore:
         self._scale_percent = picture.scale_percent
         header = self._header(picture.t_us)
         self._stream.on_sent(self._seq, picture.t_us, now_us, len(picture.jpeg))
+        self._frame_times[self._seq] = picture.t_us
+        self._frame_times.pop(self._seq - _KEPT_FRAMES, None)
         self._seq += 1
         return header, Message(FRAME, "", encode(header), picture.jpeg)
 
@@ -94,19 +100,20 @@ class NetworkCore:
     def on_command_ack(self, ack: CommandAck, now_us: int) -> None:
         """Return the credit of a validated twist to the holder of the lease."""
         self._stream.on_holder(ack.holder, now_us)
-        self._answer(ack.sender, ack.seq, ack.compute_us, now_us)
+        # An answer to a frame that does not exist yet must not return credit.
+        if ack.seq < self._seq:
+            self._stream.on_answer(ack.sender, ack.seq, ack.compute_us, now_us)
 
     def on_ack(self, message: Message, now_us: int) -> None:
         """Return the credit of an acknowledgment. Raises WireError for an invalid one."""
         header = decode(AnswerHeader, message.header)
-        if header.source == message.source and header.echo.session == self._session:
+        if header.source == message.source and self._was_sent(header.echo):
             who = Holder(source=header.source, session=header.session)
-            self._answer(who, header.echo.seq, header.compute_us, now_us)
+            self._stream.on_answer(who, header.echo.seq, header.compute_us, now_us)
 
-    def _answer(self, who: Holder, seq: int, compute_us: int, now_us: int) -> None:
-        # An answer to a frame that does not exist yet must not return credit.
-        if seq < self._seq:
-            self._stream.on_answer(who, seq, compute_us, now_us)
+    def _was_sent(self, echo: Echo) -> bool:
+        is_frame = echo.channel == FRAME.name and echo.session == self._session
+        return is_frame and self._frame_times.get(echo.seq) == echo.t_us
 
     def adapt(self, camera: Camera) -> None:
         """Pass a new encoding target to a camera that can follow it. Repeat it while the camera is gone."""

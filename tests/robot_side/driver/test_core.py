@@ -111,6 +111,14 @@ def test_command_that_cites_nothing_of_this_robot_returns_no_credit(changes, rea
     assert core.gate.counters[reason] == 1
 
 
+@pytest.mark.parametrize("key", ["teleop", "viewer"])
+def test_command_under_the_key_of_another_source_returns_no_credit(key):
+    core = core_of()
+    core.on_issued(7, NOW_US, 0)
+    assert core.on_twist(Message(TWIST, key, twist().header, b"0|0"), NOW_US) is None
+    assert core.gate.last_rejection.reason == "UNKNOWN_SOURCE"
+
+
 def test_command_for_a_frame_of_the_future_returns_no_credit_and_for_a_stale_one_does():
     core = core_of()
     core.on_issued(7, NOW_US, 0)

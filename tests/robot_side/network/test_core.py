@@ -80,8 +80,8 @@ def test_size_of_a_frame_and_the_times_of_both_clocks_reach_the_stream():
 # --- answers -----------------------------------------------------------------------------------------------------
 
 
-def ack(*, key="vision", source="vision", session=ROBOT, seq=0, compute_us=0):
-    echo = Echo(channel="frame", session=session, seq=seq, t_us=1)
+def ack(*, key="vision", source="vision", channel="frame", session=ROBOT, seq=0, t_us=1, compute_us=0):
+    echo = Echo(channel=channel, session=session, seq=seq, t_us=t_us)
     header = AnswerHeader(source=source, session=VISION, seq=5, echo=echo, compute_us=compute_us)
     return Message(ACK, key, encode(header), b"")
 
@@ -97,11 +97,20 @@ def test_ack_under_the_key_of_another_source_returns_no_credit(key, source):
 
 @pytest.mark.parametrize(("changes", "returns"), [
     ({}, True), ({"session": "0000cccc"}, False), ({"seq": 6}, False), ({"seq": 8}, False), ({"seq": 9}, False),
+    ({"channel": "status"}, False), ({"t_us": 0}, False), ({"t_us": 2}, False),
 ])  # fmt: skip
 def test_ack_of_a_frame_of_this_session_returns_credit(changes, returns):
     core = core_with_a_frame_in_flight(seq=7)
     core.on_ack(ack(**{"seq": 7, **changes}), 20_000)
     assert core.may_capture(LATER_US, True) == returns
+    assert (core._stream._owner == HOLDER) == returns
+
+
+def test_newest_frames_are_those_that_an_ack_may_cite():
+    core = core_of(seq=7)
+    for count in range(300):
+        core.on_camera(Picture(b"", count + 1), count)
+    assert core._frame_times == {7 + count: count + 1 for count in range(300 - 256, 300)}
 
 
 def test_invalid_ack_raises_and_returns_no_credit():
@@ -132,7 +141,7 @@ def test_validated_command_passes_the_credit_to_the_holder_of_the_lease():
 
 
 @pytest.mark.parametrize("answer", [
-    lambda core, seq, now_us: core.on_ack(ack(seq=seq, compute_us=99_000), now_us),
+    lambda core, seq, now_us: core.on_ack(ack(seq=seq, t_us=now_us - 99_999, compute_us=99_000), now_us),
     lambda core, seq, now_us: core.on_command_ack(CommandAck(HOLDER, seq, 99_000, HOLDER), now_us),
 ])  # fmt: skip
 def test_computing_time_of_a_peer_does_not_count_for_the_link(answer):
@@ -268,7 +277,7 @@ def test_status_shows_every_counter():
     core = core_of()
     for seq in range(3):
         core.on_camera(Picture(b"", seq + 1), seq)
-    core.on_ack(ack(seq=1), 10_000)
+    core.on_ack(ack(seq=1, t_us=2), 10_000)
     assert core.may_capture(500_000, True), "the third has timed out"
     assert core.status(500_000) == StreamStatus(sent=3, fps=3.0, overtaken=1, credit_timeouts=1)
     shown = core.status(500_000, 4, {"status": 1, "scan": 0, "odometry": 5, "camera": 3}, 6)

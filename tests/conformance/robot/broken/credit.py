@@ -98,7 +98,7 @@ def acks_of_frames_to_come(robot):
     def bend(fields, _message):
         echo = fields.get("echo")
         if isinstance(echo, dict) and echo["seq"] >= robot.sending._seq:
-            echo["seq"] = robot.sending._seq - 1
+            echo["seq"], echo["t_us"] = next(reversed(robot.sending._frame_times.items()))
 
     bend_acks(robot, bend)
 
