@@ -162,9 +162,17 @@ def pattern_for(robot: str, channel: Channel) -> str:
     return f"{KEY_PREFIX}/{check_robot_id(robot)}/{channel.name}{tail}"
 
 
-@lru_cache(maxsize=1024)
+_MAX_KEY_CHARS: Final = len(KEY_PREFIX) + 32 + max(map(len, CHANNELS)) + 16 + len("///")
+
+
 def parse_key(key: str) -> tuple[str, Channel, str] | None:
     """Split an exact key into (robot, channel, source). Return None for any other text, also with wildcards."""
+    # A transport may deliver a key of 64 KB, and the cache would store many of them.
+    return _parse_key(key) if len(key) <= _MAX_KEY_CHARS else None
+
+
+@lru_cache(maxsize=1024)
+def _parse_key(key: str) -> tuple[str, Channel, str] | None:
     parts = key.split("/")
     channel = CHANNELS.get(parts[2]) if len(parts) in (3, 4) and parts[0] == KEY_PREFIX else None
     if channel is None or channel.has_source != (len(parts) == 4) or not ROBOT_ID.fullmatch(parts[1]):

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from sightline.protocol import channels
 from sightline.protocol.channels import (
     CHANNELS,
     FRAME,
@@ -191,6 +192,15 @@ def test_a_key_is_exact_or_none(key):
         assert key_for(*parsed) == key
         assert "*" not in key
         assert "$" not in key
+
+
+def test_longest_key_is_read_and_a_longer_one_is_not_stored():
+    longest = max((one for one in CHANNELS.values() if one.has_source), key=lambda one: len(one.name))
+    key = key_for("a" * 32, longest, "b" * 16)
+    assert parse_key(key) == ("a" * 32, longest, "b" * 16)
+    stored = channels._parse_key.cache_info().misses
+    assert parse_key(key + "b") is None and parse_key("x" * 65_536) is None
+    assert channels._parse_key.cache_info().misses == stored
 
 
 @pytest.mark.parametrize("robot", ["", "r1/r2", "*", "r*", "-r1", ".", "a" * 33, "r 1", "r1\n", "é", "r1$"])
