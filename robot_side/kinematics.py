@@ -59,7 +59,13 @@ class Odometer:
         return self._moving.linear_mps, self._moving.angular_rad_s
 
     def update(self, wheels: WheelAngles) -> None:
-        """Take one reading. Readings not newer than the last are ignored."""
+        """Take one reading. Readings not newer than the last are ignored.
+
+        Raises:
+            ValueError: an angle is not finite.
+        """
+        if not (math.isfinite(wheels.left_rad) and math.isfinite(wheels.right_rad)):
+            raise ValueError(f"invalid wheel angles ({wheels.left_rad}, {wheels.right_rad}): not finite")
         if self._last is None or self._rate_from is None:
             self._last = self._rate_from = wheels
             return

@@ -55,6 +55,20 @@ def test_readings_that_are_not_newer_are_ignored_and_the_rate_is_measured():
     assert odometer.pose[0] == pytest.approx(1.9 * DRIVE.wheel_radius_m)
 
 
+@pytest.mark.parametrize("broken", [(math.nan, 0.0), (0.0, math.inf), (math.inf, -math.inf)])
+@pytest.mark.parametrize("before", [0, 1, 2])
+def test_angle_that_is_not_finite_is_rejected_and_not_stored(broken, before):
+    odometer = Odometer(DRIVE)
+    for step in range(before):
+        odometer.update(WheelAngles(0.1 * step, 0.1 * step, step * 20_000))
+    with pytest.raises(ValueError, match="not finite"):
+        odometer.update(WheelAngles(*broken, before * 20_000))
+    for step in range(before, 6):
+        odometer.update(WheelAngles(0.1 * step, 0.1 * step, step * 20_000))
+    assert odometer.pose[0] == pytest.approx(DRIVE.wheel_radius_m * 0.1 * 5)
+    assert odometer.moving[0] == pytest.approx(5 * DRIVE.wheel_radius_m)
+
+
 # Every number of the wheels' arithmetic, worked out by hand.
 
 
