@@ -20,6 +20,8 @@ STOP_DISTANCE_BOUND_M = 0.25
 # Share of the top speed below which the robot counts as at rest.
 _AT_REST = 0.02
 _LONGEST_STEP_US = 1_000_000
+# No larger twist is scaled, m/s or rad/s. The excess of a huge one would be infinite, and the result zero.
+_LARGEST = 1e6
 
 Millis = Annotated[int, Field(ge=20, le=5_000)]
 
@@ -104,10 +106,11 @@ def clamp_twist(twist: Twist, max_linear_mps: float, max_angular_rad_s: float) -
     """Scale both axes by one factor until both limits hold, so that the curve stays the same."""
     if max_linear_mps <= 0 or max_angular_rad_s <= 0:
         return STILL
-    excess = max(1.0, abs(twist.linear_mps) / max_linear_mps, abs(twist.angular_rad_s) / max_angular_rad_s)
+    linear, angular = (max(-_LARGEST, min(_LARGEST, speed)) for speed in (twist.linear_mps, twist.angular_rad_s))
+    excess = max(1.0, abs(linear) / max_linear_mps, abs(angular) / max_angular_rad_s)
     if excess == 1.0:
         return twist
-    return Twist(linear_mps=twist.linear_mps / excess, angular_rad_s=twist.angular_rad_s / excess)
+    return Twist(linear_mps=linear / excess, angular_rad_s=angular / excess)
 
 
 class AxisRamp:

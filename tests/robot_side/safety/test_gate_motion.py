@@ -136,6 +136,12 @@ def test_speed_acceleration_and_its_sign_stay_within_limits(goals, ticks_ms):
         before = twist
 
 
+def test_twist_as_large_as_a_float_drives_at_the_limit():
+    rig = Rig().armed().drive(1_000, 1e308)
+    assert rig.gate.applied == Twist(linear_mps=rig.gate.config.max_linear_mps, angular_rad_s=0.0)
+    assert rig.gate.counters["CLAMPED"] == 50
+
+
 def test_late_step_moves_as_far_as_several_punctual_steps():
     goal = Twist(linear_mps=0.5, angular_rad_s=0.0)
     late, punctual = Ramp(SafetyConfig()), Ramp(SafetyConfig())

@@ -135,6 +135,10 @@ def test_the_limit_falls_linearly_with_age(age_us, factor):
         ((1.0, 10.0), (0.25, 2.5)),
         ((2.0, 5.0), (0.5, 1.25)),
         ((0.0, 0.0), (0.0, 0.0)),
+        ((1e308, 0.0), (0.5, 0.0)),
+        ((0.0, -1e308), (0.0, -2.5)),
+        ((-1e308, 1e308), (-0.5, 0.5)),
+        ((1e308, 1.0), (0.5, 5e-7)),
     ],
 )
 def test_both_axes_are_cut_by_one_factor(asked, given):
