@@ -39,6 +39,8 @@ class _Timeline:
     def __init__(self, seq: int, t_us: int, now_us: int) -> None:
         self.offset_us = now_us - t_us
         self.heard_us = self._begun_us = now_us
+        self._undrifted_us = 0
+        """Time without its drift yet: between two messages the drift may be less than 1 us."""
         self._begun_t_us = self._t_us = t_us
         self._seq = seq
 
@@ -48,7 +50,7 @@ class _Timeline:
         return self._t_us - AHEAD_US <= t_us <= now_us - self.offset_us + AHEAD_US and seq <= most
 
     def extend(self, seq: int, t_us: int, now_us: int) -> None:
-        drift_us = (now_us - self.heard_us) // _DRIFT
+        drift_us, self._undrifted_us = divmod(self._undrifted_us + now_us - self.heard_us, _DRIFT)
         self.offset_us = min(self.offset_us + drift_us, now_us - t_us)
         self.heard_us = now_us
         self._t_us, self._seq = max(self._t_us, t_us), max(self._seq, seq)

@@ -20,6 +20,16 @@ def test_an_age_is_short_by_no_more_than_the_quickest_delay(seed):
         assert age_us == max(0, true_us - 4_000)
 
 
+@pytest.mark.parametrize("fps", [30, 240, 1_000])
+def test_clock_of_a_slow_robot_is_followed_at_any_rate(fps):
+    """50 us/s slower: without the drift its newest message would be 3 ms old after a minute."""
+    clock = RobotClock()
+    for now_us in range(0, 60_000_000, 1_000_000 // fps):
+        t_us = now_us - now_us // 20_000
+        assert clock.update("0a0b0c0d", t_us, now_us)
+    assert clock.age_us("0a0b0c0d", t_us, now_us) <= 1
+
+
 def test_another_session_is_another_clock():
     clock = RobotClock()
     assert clock.age_us("", 0, 5) is None and clock.age_us("0a0b0c0d", 0, 5) is None
