@@ -87,6 +87,8 @@ def _hurt(rig: RobotFixture, part: str, number: signal.Signals) -> Injected:
     os.kill(before, number)
     rig.until(lambda: pid() not in (0, before), AGAIN_S, f"a new {part} process")
     rig.watch(SETTLED_S)
+    if part == "driver":  # a new one never arms itself
+        rig.processes.start("arm", ["arm", "--connect", rig.endpoint, "--wait", str(AGAIN_S)])
     again = drives_again(rig)
     first_us = min((one.t_us for one in rig.sent() if one.t_us > at_us + LEFT_OVER_US), default=None)
     return Injected(1, at_us, first_us, again)

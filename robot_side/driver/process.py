@@ -192,6 +192,8 @@ class Driver:
         self._battery_reader = battery_reader
         self._logged_level = BatteryLevel.SILENT
         self._driver_core = DriverCore(config, secrets.token_hex(4), stopped=latch.is_set())
+        # The process before may have been disarmed, or have lost a human: only an operator arms again.
+        self._driver_core.gate.arms_itself &= guardian is None or not guardian.is_restart
         self._logged_state = self._driver_core.gate.state
         self._is_waiting_logged = False
         self._ending_since_us: int | None = None
@@ -477,7 +479,7 @@ def main() -> None:
     try:
         start_log(None, "robot")
         config = RobotConfig.model_validate_json(heartbeats.recv(_MAX_CONFIG_BYTES))
-        sys.exit(run(config, GuardianEnd(heartbeats, *stops)))
+        sys.exit(run(config, GuardianEnd(heartbeats, *stops, is_restart=True)))
     except SightlineError as error:
         _log.error("%s", error)
         sys.exit(error.exit_code)

@@ -40,13 +40,17 @@ _GUARDIAN: Final = (
 class GuardianEnd:
     """The guardian as the process with the motors sees it."""
 
-    def __init__(self, heartbeats: socket.socket, stops: socket.socket | None = None) -> None:
+    def __init__(
+        self, heartbeats: socket.socket, stops: socket.socket | None = None, *, is_restart: bool = False
+    ) -> None:
         for end in filter(None, (heartbeats, stops)):
             end.setblocking(False)
         self.heartbeats = heartbeats
         """To wait on: readable when the guardian is gone."""
         self.stops = stops
         """To wait on: STOPs of the STOP receiver, also those of before this process; None without a receiver."""
+        self.is_restart = is_restart
+        """True if the guardian started this process after another one."""
 
     def wait(self) -> None:
         """Wait until the guardian watches this process. Nothing may move before.

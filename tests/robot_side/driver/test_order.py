@@ -19,6 +19,7 @@ from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.persistence import StopLatch
 from sightline.robot_side.driver.process import BatteryReader, Driver
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
+from sightline.robot_side.guardian.start import GuardianEnd
 from sightline.robot_side.pipe import DriverEnd, NetworkEnd
 from sightline.robot_side.safety.limits import SafetyConfig
 from tests.fixtures.links import until
@@ -62,6 +63,15 @@ def driver(tmp_path, ends):
     made.latch_writer.close()
     for number, handler in handlers.items():
         signal.signal(number, handler)
+
+
+@pytest.mark.parametrize("is_restart", [False, True])
+def test_only_the_first_driver_process_arms_itself(driver, is_restart):
+    with socket.socket() as heartbeats:
+        end = GuardianEnd(heartbeats, is_restart=is_restart)
+        made = Driver(driver._driver_core.config, StillDrive(), None, None, end)
+        made.latch_writer.close()
+    assert made._driver_core.gate.arms_itself is not is_restart
 
 
 def answer(session, seq=SEQ, t_us=T_US):

@@ -79,10 +79,14 @@ def test_dead_or_stopped_driver_leaves_the_wheels_at_zero_and_a_new_one_starts(d
     assert robot.speed() == 0.0
 
 
-def test_endless_loop_in_the_driver_is_ended(dying):
-    robot, _, fault = dying("loop")
+def test_endless_loop_in_the_driver_is_ended_and_the_new_one_waits_for_an_operator(dying):
+    robot, vision, fault = dying("loop")
     robot.wait_until_on("a new driver process starts")
     check_stop(robot, fault)
+    assert until(lambda: vision.status().refused.get("DISARMED", 0) >= 10, START_S), "five arm a robot by itself"
+    assert (vision.status().state, vision.status().auto_arm) == ("DISARMED", False)
+    arm(robot.endpoint)
+    assert driving(robot)
 
 
 def test_driver_ramps_to_zero_and_ends_without_its_guardian(dying):
