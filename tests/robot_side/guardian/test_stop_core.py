@@ -334,8 +334,10 @@ def test_a_router_that_starts_again_gives_its_new_challenge():
 
 
 def test_an_answer_to_another_registration_is_ignored():
-    registration = Registration("r1", b"", 5)
-    registration.datagram()
-    assert [registration.awaits(StopDatagram(Kind.ANSWER, "r1", counter)) for counter in (5, 6, 7)] == [
-        False, True, False]
-    assert not registration.awaits(StopDatagram(Kind.STOP, "r1", 6))
+    for secret, newest in ((b"", 7), (SECRET, 8)):  # with a secret it may have answered a challenge, too
+        registration = Registration("r1", secret, 5)
+        assert unpack_stop(registration.datagram()).counter == 7
+        counters = (5, 7, newest, newest + 1)
+        awaited = [registration.awaits(StopDatagram(Kind.ANSWER, "r1", counter)) for counter in counters]
+        assert awaited == [False, True, True, False]
+        assert not registration.awaits(StopDatagram(Kind.STOP, "r1", 7))

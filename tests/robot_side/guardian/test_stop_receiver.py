@@ -280,8 +280,8 @@ def test_answers_that_no_registration_awaits_are_counted():
     port = StopPort(pipe, [], outgoing=True)
     receiver = stop_receiver.StopReceiver(port, "r1", b"", ())
     receiver._routers = [(("127.0.0.1", 7448), Registration("r1", b"", first)) for first in (5, 50)]
-    assert [unpack_stop(one.datagram()).counter for _, one in receiver._routers] == [6, 51]
-    for counter in (5, 6, 51, 52):
+    assert [unpack_stop(one.datagram()).counter for _, one in receiver._routers] == [7, 52]
+    for counter in (5, 7, 52, 53):
         answer = pack_stop(StopDatagram(Kind.ANSWER, "r1", counter, b"x" * 16))
         assert receiver.on_datagram(answer, (0, ("127.0.0.1", 7448))) in ((), [])
     receiver.on_turn()
