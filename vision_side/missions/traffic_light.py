@@ -188,12 +188,15 @@ class TrafficLight:
         pose = view.header.pose
         if self._light and self._left_m(line, self._light, pose) < -self._config.stop.cleared_m:
             self._light, self._stop = None, StopLine(self._config.stop)
+        known_m = self._left_m(line, self._light, pose) if self._light else math.inf
         next_m, shown = math.inf, UNKNOWN
         for one in lights:
             place = self._light_place(one, pose)
-            if place is None or (one.colour == UNKNOWN and not self._is_known(place, pose)):
-                continue  # a dark shape that shows no color may be anything
+            if place is None:
+                continue
             left_m = self._left_m(line, place, pose)
+            if not self._is_known(place, pose) and (one.colour == UNKNOWN or left_m >= known_m):
+                continue  # a dark shape may be anything, and the known light counts as red while it is hidden
             if -self._config.stop.cleared_m <= left_m < next_m:
                 next_m, shown = left_m, one.colour
                 self._meet(place, pose, self._is_cut(one.box) or shown == UNKNOWN)

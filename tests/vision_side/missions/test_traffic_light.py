@@ -9,10 +9,18 @@ import pytest
 from sightline.protocol.messages import FrameHeader
 from sightline.sim.scenario import look_named
 from sightline.vision_side.decode import DecodedImage
+from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.goto import Footprint
 from sightline.vision_side.missions.lane import Lane, LaneConfig
-from sightline.vision_side.missions.lights import COLOURS, UNKNOWN, BoxLightReader, HousingLightReader, LampConfig
-from sightline.vision_side.missions.port import View
+from sightline.vision_side.missions.lights import (
+    COLOURS,
+    UNKNOWN,
+    BoxLightReader,
+    DetectedLight,
+    HousingLightReader,
+    LampConfig,
+)
+from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.traffic_light import StopConfig, StopLine, TrafficLight, TrafficLightBoxes
 from tests.fixtures.vision.course import Course, Drive, Row
 from tests.fixtures.vision.lane import BLOCK_M, LENS, LaneWorld
@@ -172,6 +180,55 @@ def test_blocks_are_remembered_once_and_without_end_they_are_bounded() -> None:
     for step in range(3000):
         lane.see((0.3 * step, 0.0, 0.0), [(0.3 * step + 1.0, 0.5), (0.3 * step + 1.01, 0.49)])
     assert len(lane._blocks) <= 64
+
+
+# --- two lights on one lane ----------------------------------------------------------------------------------------
+
+BLANK = DecodedImage(np.full((LENS.height_px, LENS.width_px, 3), 120, np.uint8), 1)
+
+
+def box_at(x_m: float, y_m: float, height_m: float, width_m: float) -> Detection:
+    """Return the box of something at a place in front of the lens, with its lower edge at half of the image."""
+    ahead_m = x_m - LENS.x_m
+    x, half = LENS.cx_px - LENS.fx_px * y_m / ahead_m, LENS.fx_px * width_m / ahead_m / 2
+    return Detection(x - half, LENS.cy_px - LENS.fy_px * height_m / ahead_m, x + half, LENS.cy_px, 1.0, "target")
+
+
+def light_at(x_m: float, colour: str) -> DetectedLight:
+    lamp = LampConfig()
+    return DetectedLight(colour, box_at(x_m, -0.1, lamp.housing_height_m, lamp.housing_width_m))
+
+
+def plans_at_lights(*frames: list[DetectedLight]) -> list[Plan]:
+    """Return the plan for each frame, given the lights in it. The robot does not move."""
+    mission, plans = TrafficLight(TrafficLight.Config(block_height_m=BLOCK_M), LENS), []
+    blocks = tuple(box_at(x, 0.5, BLOCK_M, 0.1) for x in (1.5, 2.0, 2.5))
+    for seq, lights in enumerate(frames):
+        mission._reader.read = lambda *_, lights=lights: lights
+        header = FrameHeader(session="0000abcd", seq=seq + 1, t_us=seq * 33_000)
+        plans.append(mission.step(View(header, 0.033, 0.05, LENS, blocks, BLANK)))
+    return plans
+
+
+NEAR_M, FAR_M = 0.75, 2.4
+
+
+@pytest.mark.parametrize("first", [[light_at(NEAR_M, "red")], [light_at(FAR_M, "green"), light_at(NEAR_M, "red")]])
+@pytest.mark.parametrize("then", [[], [light_at(NEAR_M, UNKNOWN)]], ids=["hidden", "unreadable"])
+def test_green_light_further_on_does_not_replace_a_hidden_red_one(first, then) -> None:
+    plans = plans_at_lights(*[first] * 5, *[[light_at(FAR_M, "green"), *then]] * 30)
+    assert all(plan.twist.linear_mps < 0.15 for plan in plans)
+    assert plans[4].note.startswith("light red") and plans[-1].note.startswith("light unknown")
+    assert plans[-1].distance_m == pytest.approx(plans[4].distance_m)
+
+
+@pytest.mark.parametrize("unreadable", [[], [light_at(NEAR_M, UNKNOWN)]])
+def test_nearer_light_replaces_a_known_one_as_soon_as_it_is_readable(unreadable) -> None:
+    far = light_at(FAR_M, "green")
+    plans = plans_at_lights(*[[far, *unreadable]] * 5, [far, light_at(NEAR_M, "red")])
+    assert plans[4].note.startswith("light green") and plans[4].twist.linear_mps == 0.3
+    assert plans[5].note.startswith("light red") and plans[5].twist.linear_mps < 0.15
+    assert plans[4].distance_m - plans[5].distance_m == pytest.approx(FAR_M - NEAR_M, abs=0.1)
 
 
 # --- driving -----------------------------------------------------------------------------------------------------
