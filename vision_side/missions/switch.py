@@ -4,11 +4,14 @@ A mission can be a third-party plug-in. One that raises, or returns an impossibl
 """
 
 from dataclasses import replace
+from numbers import Real
+from types import UnionType
 from typing import Final
 
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.log import report_fault
-from sightline.protocol.messages import STILL, CameraModel
+from sightline.protocol.messages import STILL, CameraModel, Twist
+from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.registry import MissionSpec
 
@@ -18,6 +21,10 @@ STILL_MPS: Final = 0.01
 STILL_RAD_S: Final = 0.03
 MAX_COMMAND: Final = 1000.0
 """m/s and rad/s; beyond it a mission computes nonsense, and its text might not fit a twist's 64 bytes."""
+_TYPES: Final[dict[str, type | UnionType]] = {
+    "twist": Twist, "phase": str, "note": str, "target": Detection | None,
+    "bearing_rad": Real | None, "distance_m": Real | None,
+}  # fmt: skip
 
 
 class MissionSwitch:
@@ -72,11 +79,20 @@ class MissionSwitch:
             plan = self._mission.step(view)
             if max(abs(plan.twist.linear_mps), abs(plan.twist.angular_rad_s)) > MAX_COMMAND:
                 raise ValueError(f"returned {plan.twist.linear_mps:g} m/s, {plan.twist.angular_rad_s:g} rad/s")
+            plan = _typed(plan)
         except PLUGIN_ERRORS as error:  # vision goes on, the robot stands still
             plan = _failed(error)
         if plan.done:
             self._over = plan = replace(plan, twist=STILL, target=None)
         return plan
+
+
+def _typed(plan: Plan) -> Plan:
+    """Return a plan whose `done` is a bool. Raises TypeError for a field that the service cannot use."""
+    for name, kind in _TYPES.items():
+        if not isinstance(getattr(plan, name), kind):
+            raise TypeError(f"returned a {name} of type {type(getattr(plan, name)).__name__}")
+    return replace(plan, done=bool(plan.done))
 
 
 def _failed(error: BaseException) -> Plan:

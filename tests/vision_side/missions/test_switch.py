@@ -1,5 +1,8 @@
 """From one mission to the next: at rest in between, whatever a mission does, and over when it is over."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -244,6 +247,27 @@ def test_command_beyond_a_thousand_ends_the_mission(linear_mps, angular_rad_s, p
     plan = switch.step(looked())
     assert (plan.phase, plan.twist) == (phase, twist if phase == "driving" else STILL)
     assert switch.step(looked()).phase == phase
+
+
+@pytest.mark.parametrize(("field", "value"), [
+    ("twist", SimpleNamespace(linear_mps=0.1, angular_rad_s=0.0)), ("phase", None), ("note", None), ("note", b"along"),
+    ("target", "ball"), ("target", (1.0, 2.0)), ("done", np.array([True, False])),
+    ("bearing_rad", "left"), ("distance_m", "1 m"), ("distance_m", np.zeros(2)),
+])  # fmt: skip
+def test_plan_with_a_field_of_another_type_ends_the_mission(field, value):
+    switch = MissionSwitch(scripted(), CAMERA)
+    switch._mission.step = lambda _view: replace(Plan(STILL, "driving"), **{field: value})
+    plan = switch.step(looked())
+    assert (plan.phase, plan.done) == ("failed", True)
+    assert switch.step(looked()) is plan
+
+
+def test_mission_may_return_values_of_numpy():
+    switch = MissionSwitch(scripted(), CAMERA)
+    for done in (False, True):
+        plan = Plan(STILL, "driving", done=np.bool_(done), bearing_rad=np.float32(0.5), distance_m=np.float64(1.0))
+        switch._mission.step = lambda _view, plan=plan: plan
+        assert switch.step(looked()) == plan and switch.step(looked()).done is done
 
 
 def test_note_of_a_failed_mission_has_at_most_200_characters():
