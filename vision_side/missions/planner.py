@@ -136,6 +136,7 @@ class Planner:
         self._next: dict[Cell, Cell | None] = {}
         away_m = _away(filled - low, size)
         self._blocked, self._tight = away_m < keep_m, away_m < roomy_m
+        self._beyond_m = 0.0
         self._steps = _flooded(self._blocked, self._tight, self._seeds(size))
 
     def _seeds(self, size: NDArray[np.int64]) -> list[tuple[int, Cell]]:
@@ -147,6 +148,7 @@ class Planner:
         border += [(a, b) for a in (0, int(size[0]) - 1) for b in range(int(size[1]))]
         away = {one: round(math.hypot(one[0] - i, one[1] - j)) for one in border if not self._blocked[one]}
         nearest = min(away.values(), default=0)
+        self._beyond_m = nearest * CELL_M
         return [(steps - nearest, one) for one, steps in away.items()]
 
     def _cell(self, point: Point) -> Cell:
@@ -177,8 +179,8 @@ class Planner:
         return (int(cells[nearest, 0]), int(cells[nearest, 1])) if away[nearest] <= reach else None
 
     def left_m(self, entry: Cell) -> float:
-        """Length of the way from `entry`, about 6 % off; to the plan's border where the goal is beyond it."""
-        return float(self._steps[entry]) * CELL_M
+        """Length of the way from `entry`, about 6 % off; beyond the plan's border it is straight."""
+        return float(self._steps[entry]) * CELL_M + self._beyond_m
 
     def carrot(self, robot: Point, entry: Cell) -> Point:
         """Return the farthest point of the way in direct line of sight from the robot."""
@@ -195,7 +197,7 @@ class Planner:
     def left_from(self, point: Point) -> float:
         """Length of the way from `point`; inf where none leads from there."""
         steps = self._steps[self._cell(point)] if self.covers(point) else _UNREACHED
-        return float(steps) * CELL_M if steps < _UNREACHED else math.inf
+        return float(steps) * CELL_M + self._beyond_m if steps < _UNREACHED else math.inf
 
     def _way(self, entry: Cell) -> list[Cell]:
         way = [entry]

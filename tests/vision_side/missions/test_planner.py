@@ -169,7 +169,22 @@ def test_a_goal_beyond_the_horizon_is_aimed_at(goal: tuple[float, float]) -> Non
     carrot = route.carrot((0.0, 0.0), entry)
     aside = math.remainder(math.atan2(carrot[1], carrot[0]) - math.atan2(goal[1], goal[0]), math.tau)
     assert abs(aside) < (1.2 if goal[0] > 0 else 0.15)
-    assert route.left_m(entry) < 2 * HORIZON_M
+    assert route.left_m(entry) == pytest.approx(math.hypot(*goal), rel=0.02)
+
+
+@pytest.mark.parametrize("goal", [(70.0, 0.0), (50.0, 50.0), (-40.0, 15.0)])
+def test_way_left_to_a_goal_beyond_the_horizon_falls_from_plan_to_plan(goal: tuple[float, float]) -> None:
+    filled, left_m = np.empty((0, 2), np.int64), []
+    share = HORIZON_M / math.hypot(*goal)
+    for step in (0.0, 0.5, 0.99, 1.5):
+        robot = (step * share * goal[0], step * share * goal[1])
+        route = Planner(filled, robot, goal, 0.2, 0.2)
+        entry = route.entry(robot, 0.1)
+        assert entry is not None
+        left_m.append(route.left_m(entry))
+        assert left_m[-1] == pytest.approx(math.dist(robot, goal), rel=0.02)
+        assert route.left_from(robot) == left_m[-1]
+    assert left_m == sorted(left_m, reverse=True)
 
 
 # --- brakes ------------------------------------------------------------------------------------------------------
