@@ -32,6 +32,8 @@ _MIN_POINTS = 6
 _TRIMS = 3
 # Times the median error. The stair-step of a pixel is always nearer, the edge of an occluder is not.
 _OUTLIER = 4.0
+# Two borders of the image hide the true size of a box. The range may be 80 % too large, the bearing is still useful.
+_CUT_TWICE_EXACTNESS = 0.3
 _BOX_ANGLES = np.linspace(0.0, 2 * math.pi, 24, endpoint=False)
 
 
@@ -63,7 +65,8 @@ def locate_sphere(detection: Detection, camera: CameraModel, radius_m: float) ->
         radius_m: radius of the sphere, m.
 
     Returns:
-        Its center over the floor, or None if the outline does not fit a sphere in front of the camera.
+        Its center over the floor, or None if the outline does not fit a sphere in front of the camera. The range is
+        inexact for a box without an outline that two borders of the image cut.
 
     Source: the outline rays of a sphere form a circular cone, see the module.
     """
@@ -78,7 +81,8 @@ def locate_sphere(detection: Detection, camera: CameraModel, radius_m: float) ->
     right, down, ahead = center
     tilt_cos, tilt_sin = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)
     x_m = camera.x_m + ahead * tilt_cos + down * tilt_sin
-    return Sighting(x_m, camera.y_m - right, detection)
+    is_cut_twice = detection.outline_px is None and sum(whole) < 3
+    return Sighting(x_m, camera.y_m - right, detection, _CUT_TWICE_EXACTNESS if is_cut_twice else 1.0)
 
 
 def points_ahead(outline_px: NDArray[np.float64], camera: CameraModel) -> NDArray[np.float64]:

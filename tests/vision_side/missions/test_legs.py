@@ -131,6 +131,20 @@ def test_legs_are_distinguished_by_the_gap_between_them() -> None:
     assert nearest_legs(points, np.hypot(*points.T), 0.6) == pytest.approx([1.006, 1.090], abs=0.01)
 
 
+@pytest.mark.parametrize("first_deg", [-180, 0, 3, 8])
+def test_scan_may_begin_in_the_middle_of_a_leg(first_deg: int) -> None:
+    angles_deg = np.remainder(first_deg + np.arange(360) + 180, 360) - 180
+    legs_m = np.where(abs(angles_deg) < 3, 1.0, np.where(abs(angles_deg - 8) < 3, 1.3, np.inf)).astype(np.float32)
+    scan = RangeScan(0, math.radians(first_deg), math.radians(1), 0.05, 8.0, legs_m)
+    box = box_of(((1.0, 0.0, 0.06), (1.29, 0.18, 0.06)), (0.0, 0.0, 0.0))
+    mission = Legs(Legs.Config(sensor_x_m=0.0), LENS)
+    assert mission.step(view(box, scan)).distance_m == pytest.approx(1.15 - LENS.x_m + LEG_M, abs=0.01)
+
+
+def test_single_echo_is_one_leg() -> None:
+    assert nearest_legs(np.array([[1.0, 0.0]]), np.array([1.0]), 0.6) == [1.0]
+
+
 @pytest.mark.parametrize(("expected_m", "found_m"), [
     (None, [1.2, 1.35, 1.7]), (1.95, [1.7, 2.0, 2.1]), (1.3, [1.2, 1.35]), (3.0, [1.2, 1.35, 1.7]),
 ])

@@ -225,7 +225,18 @@ def ball_box(center, camera=CAMERA):
 def test_ball_at_the_border_is_located_by_the_three_sides_in_view(center):
     """At most half of it is hidden."""
     box, is_cut = ball_box(center)
-    assert is_cut and at(locate_sphere(box, CAMERA, RADIUS_M)) == pytest.approx(place(center), abs=1e-4)
+    found = locate_sphere(box, CAMERA, RADIUS_M)
+    assert is_cut and at(found) == pytest.approx(place(center), abs=1e-4) and found.exactness == 1.0
+
+
+@pytest.mark.parametrize("center", [(-0.4, 0.28, 0.5), (0.36, 0.27, 0.5), (0.4, -0.33, 0.5), (-0.8, -0.6, 1.0)])
+def test_ball_in_a_corner_of_the_image_has_a_bearing_and_an_inexact_range(center):
+    box, is_cut = ball_box(center, LEVEL)
+    found, (x_m, y_m) = locate_sphere(box, LEVEL, RADIUS_M), place(center, LEVEL)
+    assert is_cut and found is not None and found.exactness == 0.3
+    assert math.atan2(found.y_m, found.x_m) == pytest.approx(math.atan2(y_m, x_m), abs=0.15)
+    outlined_box = replace(box, outline_px=pixels(rays(center), LEVEL))
+    assert locate_sphere(outlined_box, LEVEL, RADIUS_M).exactness == 1.0
 
 
 def test_outline_of_a_ball_at_the_border_counts_more_than_its_box():
