@@ -127,8 +127,10 @@ def nearest_legs(
     `points` come in the order of the scan; a gap between two of them parts one leg from the next. Legs within half a
     stride of `expected_m` come before all others: who walks in between is nearer, but is not the one to follow.
     """
-    parts = np.split(np.arange(len(points)), np.flatnonzero(np.hypot(*np.diff(points, axis=0).T) > _GAP_M) + 1)
-    all_m = sorted(float(away_m[part].min()) for part in parts)
+    is_first = np.hypot(*(points - np.roll(points, 1, axis=0)).T) > _GAP_M
+    # Modulo, because a leg straight ahead is at both ends of a scan that begins there.
+    legs = np.cumsum(is_first) % max(1, np.count_nonzero(is_first))
+    all_m = sorted(float(away_m[legs == leg].min()) for leg in np.unique(legs))
     expected = [one for one in all_m if expected_m is not None and abs(one - expected_m) <= stride_m / 2]
     nearest = expected or all_m
     return [one for one in nearest if one <= nearest[0] + stride_m]
