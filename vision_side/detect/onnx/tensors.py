@@ -391,8 +391,9 @@ class ImageTile:
 
     def in_image(self, one: Detection) -> Detection:
         """Return a detection in this tile in px of the whole image."""
+        circle = one.circle and _moved(one.circle, np.array([-self.left_px, -self.top_px]), 1.0)
         return replace(one, x1_px=one.x1_px + self.left_px, y1_px=one.y1_px + self.top_px,
-                       x2_px=one.x2_px + self.left_px, y2_px=one.y2_px + self.top_px)
+                       x2_px=one.x2_px + self.left_px, y2_px=one.y2_px + self.top_px, circle=circle)
 
 
 def tile_about(picture: DecodedImage, place_px: tuple[float, float]) -> ImageTile:

@@ -1,5 +1,7 @@
 """The second look: an enlarged part of the image where the target is expected, and what counts of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import DecodedImage, Decoder
 from sightline.vision_side.detect.onnx.tensors import ImageTile, tile_about
-from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection
+from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection
 from sightline.vision_side.detect.registry import build_detector
 from tests.fixtures.vision.onnx import brightness_model
 from tests.fixtures.vision.vision import BALL_RADIUS_M, camera, jpeg_of, scene
@@ -112,6 +114,8 @@ def test_a_detection_in_a_tile_has_its_place_in_the_image_and_is_left_out_at_the
     tile = ImageTile(DecodedImage(np.zeros((72, 96, 3), np.uint8), 2), 40, 60)
     inside = Detection(10.0, 20.0, 30.0, 50.0, 0.7, "ball")
     assert tile.in_image(inside) == Detection(50.0, 80.0, 70.0, 110.0, 0.7, "ball")
+    round_ = replace(inside, circle=Circle(20.0, 35.0, 10.0))
+    assert tile.in_image(round_).circle == Circle(60.0, 95.0, 10.0)
     assert tile.shows_all(inside)
     for box in ((0.5, 20.0, 30.0, 50.0), (10.0, 0.0, 30.0, 50.0), (10.0, 20.0, 191.5, 50.0), (10.0, 20.0, 30.0, 144.0)):
         assert not tile.shows_all(Detection(*box, 0.7, "ball"))
