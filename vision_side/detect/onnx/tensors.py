@@ -306,8 +306,9 @@ def _circles(
     if not form.masks or form.size is None:
         return [None] * len(rows)
     prototypes = next(one[0] for one in outputs.values() if one.ndim == 4)
-    table = _of_boxes(outputs)[0]
-    numbers = (table.T if form.kind == "yolo" else table)[rows, -form.masks :]
+    table = _of_boxes(outputs)
+    table = table[0].T if form.kind == "yolo" else table.reshape(-1, table.shape[-1])
+    numbers = table[rows, -form.masks :]
     scale = form.size[0] / prototypes.shape[1]
     return [_of_prototypes(np.tensordot(one, prototypes, 1) > 0, box / scale, scale)
             for one, box in zip(numbers, boxes, strict=True)]

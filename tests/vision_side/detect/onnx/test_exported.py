@@ -114,6 +114,18 @@ def test_round_mask_of_yolo_becomes_a_circle(by_row: bool) -> None:
     assert (circle.cx_px, circle.cy_px, circle.radius_px) == pytest.approx((160, 120, 20), abs=0.3)
 
 
+@pytest.mark.parametrize("shape", [(2, 8), (1, 2, 8)])
+def test_round_mask_beside_a_row_becomes_a_circle(shape: tuple[int, ...]) -> None:
+    prototypes = np.where(np.stack([disk(160, 160, 80, 80, 10), disk(160, 160, 40, 60, 30)]), 1.0, -1.0)[None]
+    rows = np.array([[280, 280, 360, 360, 0.9, 0, 3, 0], [120, 200, 160, 280, 0.8, 1, 0, 3]], np.float32)
+    form = form_of(shape, (1, 2, 160, 160), names=CUP_NAMES)
+    first, second = read({"output0": rows.reshape(shape), "output1": prototypes}, form)
+    assert (form.kind, first.label, second.circle) == ("rows", "cup", None)
+    circle = first.circle
+    assert circle is not None
+    assert (circle.cx_px, circle.cy_px, circle.radius_px) == pytest.approx((160, 120, 20), abs=0.3)
+
+
 def test_masks_beside_boxes_become_circles() -> None:
     form = ModelFormat(True, True, (240, 320), "triple", ("ball", "box"), "float32")
     square = np.zeros((240, 320))
