@@ -64,7 +64,7 @@ class Driver:
 def need_ipv6():
     try:
         with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
-            probe.bind(("::1", 0))
+            probe.bind(("::1", free_port()))
     except OSError as error:
         demanded.do_without("ipv6", f"no IPv6 ({error.strerror}); run: sysctl net.ipv6.conf.lo.disable_ipv6=0")
 
