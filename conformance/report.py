@@ -4,7 +4,7 @@ import json
 import xml.etree.ElementTree as ET
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 from sightline.conformance.case import Case, Level
 from sightline.conformance.runner import Outcome, Result, passed, printable
@@ -63,6 +63,10 @@ def from_lines(text: str, cases: Sequence[Case], side: str, peer: str, file: str
         if case is not None:
             results.append(Result(case, outcome, reason, took_us))
     return results
+
+
+LINE_START: Final = '{"name": '
+"""Each line of `to_line` begins with it."""
 
 
 def to_line(one: Result, side: str, peer: str) -> str:

@@ -20,7 +20,7 @@ from sightline.conformance.benches import LiveBench
 from sightline.conformance.case import Access, Case
 from sightline.conformance.jobs import Jobs
 from sightline.conformance.measured import WheelRow, check_motor_log, read_motor_log
-from sightline.conformance.report import from_lines, summary, to_dict, to_junit, to_line
+from sightline.conformance.report import LINE_START, from_lines, summary, to_dict, to_junit, to_line
 from sightline.conformance.robot.fixture import Robot as RobotUnderTest
 from sightline.conformance.runner import Outcome, Result, chosen, run_cases
 from sightline.operator_side.cli.options import Json, Secure, command_group, print_result
@@ -246,9 +246,12 @@ class RunOptions:
             why = getattr(error, "strerror", None) or "not a text file"
             raise ConfigError(f"cannot read --resume {self.resume}: {why}; name another file") from None
         whole = text[: text.rfind("\n") + 1]
+        results = from_lines(whole, cases, side, self.name or peer, str(self.resume))
         if whole != text:  # a killed run may have left half a line, to which nothing can be appended
+            if not whole and not text.startswith(LINE_START):
+                raise ConfigError(f"--resume {self.resume} has no results; name another file")
             self.resume.write_text(whole, "utf-8")
-        return from_lines(whole, cases, side, self.name or peer, str(self.resume))
+        return results
 
     @contextmanager
     def shown(self, total: int, side: str, peer: str) -> Iterator[Callable[[Result], None]]:

@@ -13,7 +13,7 @@ import pytest
 
 from docs.make.conformance import to_page
 from sightline.conformance.case import Access, Case, Level
-from sightline.conformance.report import summary, to_dict, to_junit
+from sightline.conformance.report import summary, to_dict, to_junit, to_line
 from sightline.conformance.robot.cases import CASES
 from sightline.conformance.runner import Outcome, Result, run_case
 from sightline.conformance.vision import cases as vision
@@ -293,6 +293,26 @@ def test_each_case_is_one_line_and_a_second_run_skips_what_the_file_has(capsys, 
         assert code == 5, "the failure that the file has counts"
         code, out, err = run(capsys, "robot", server.endpoint, *options, "--name", "another")
         assert (code, out) == (2, "") and "not of robot another" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["my notes", "line\nmy notes", "{}"])
+def test_resume_leaves_a_file_of_another_kind_as_it_is(capsys, tmp_path, text):
+    (tmp_path / "notes").write_text(text)
+    code, out, err = run(capsys, "robot", "ws://127.0.0.1:1", "--resume", tmp_path / "notes")
+    assert (code, out) == (2, "") and "--resume" in err and err.count("\n") == 1
+    assert (tmp_path / "notes").read_text() == text
+
+
+def test_resume_of_another_peer_keeps_the_cut_line(tmp_path):
+    store = tmp_path / "r.jsonl"
+    text = to_line(Result(CASES[0], Outcome.PASSED, "", 1), "robot", "a") + '\n{"name": "R-'
+    store.write_text(text)
+    with pytest.raises(ConfigError, match="not of robot b"):
+        RunOptions(resume=store).earlier(CASES, "robot", "b")
+    assert store.read_text() == text
+    assert len(RunOptions(resume=store).earlier(CASES, "robot", "a")) == 1
+    store.write_text('{"name": "R-')
+    assert RunOptions(resume=store).earlier(CASES, "robot", "a") == [] and store.read_text() == ""
 
 
 @pytest.mark.slow
