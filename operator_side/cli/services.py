@@ -329,10 +329,14 @@ def _files(name: str, seed: int) -> dict[str, dict[str, Any]]:
 def _write(out: Path, name: str, files: dict[str, dict[str, Any]]) -> None:
     from sightline.sim.scenario import load_scenario
 
+    texts = {out / f"{service}.toml": toml_text(table) for service, table in files.items()}
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for service, table in files.items():
-            (out / f"{service}.toml").write_text(toml_text(table), "utf-8")
+        for file, text in texts.items():
+            if file.exists() and file.read_bytes() != text.encode():
+                raise ConfigError(f"{file} exists with other content; choose another --out")
+        for file, text in texts.items():
+            file.write_text(text, "utf-8")
     except OSError as error:
         raise ConfigError(f"cannot write --out {out}: {error.strerror}; choose a folder that you may write") from None
     typer.echo(f"sightline sim --config {out}/sim.toml\nsightline robot --profile sim --config {out}/robot.toml\n"

@@ -23,10 +23,19 @@ def test_every_scenario_configures_a_vision_service_with_its_mission(name):
 
 
 def test_all_required_services_are_listed(tmp_path, capsys):
-    assert cli.run(["scenarios", "circle", "--out", str(tmp_path)]) == 0
+    assert cli.run(["scenarios", "circle", "--out", str(tmp_path / "circle")]) == 0
     assert "labels" not in capsys.readouterr().out
-    assert cli.run(["scenarios", "legs", "--out", str(tmp_path)]) == 0
+    assert cli.run(["scenarios", "legs", "--out", str(tmp_path / "legs")]) == 0
     assert capsys.readouterr().out.endswith("sightline labels r1\n")
+
+
+def test_written_scenario_replaces_no_other_configuration(tmp_path, capsys):
+    assert [cli.run(["scenarios", "circle", "--out", str(tmp_path)]) for _ in range(2)] == [0, 0]
+    (tmp_path / "robot.toml").write_text("robot = 'mine'\n")
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    assert cli.run(["scenarios", "legs", "--out", str(tmp_path)]) == 2
+    assert "exists with other content; choose another --out" in capsys.readouterr().err
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
 def test_plain_scenarios_use_the_plain_detector():
