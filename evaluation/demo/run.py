@@ -57,6 +57,8 @@ _SILENT_S: Final = 2.0
 """Without a word from the simulation: longer than a busy machine keeps it from its turn."""
 RECORDING: Final = "run.mcap"
 MOTOR_LOG: Final = "motors.csv"
+_MARKS: Final = ("sim.log", "sightline/sim.log")
+"""Files of an earlier run and of an earlier story, which the next one in the same folder replaces."""
 OTHER_FOLDER: Final = "free some space or pass another folder with --out"
 TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}", "legacy": "ws-legacy://127.0.0.1:{}"}
 """Endpoint of the vision service by transport. The operator and the recorder always use Zenoh."""
@@ -254,12 +256,17 @@ def _about(run: DemoRun) -> dict[str, str]:
 
 
 def run_folder(out: Path | None, name: str) -> Path:
-    """Make the folder of a run: `out`, or a new one below `runs`. Raises ConfigError if it cannot be made."""
+    """Make the folder of a run: `out`, or a new one below `runs`.
+
+    Raises ConfigError if it cannot be made, or has files and none of them is of a run.
+    """
     dated = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
     folder = (out or Path("runs") / dated).expanduser().absolute()
     while True:
         try:
             folder.mkdir(parents=True, exist_ok=out is not None)
+            if any(folder.iterdir()) and not any((folder / mark).exists() for mark in _MARKS):
+                raise ConfigError(f"run folder {folder} has other files; choose a new one with --out")
             return folder
         except OSError as error:
             if out is not None or not isinstance(error, FileExistsError):

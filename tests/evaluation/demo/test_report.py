@@ -135,6 +135,17 @@ def test_interrupt_before_the_first_sample_ends_the_demo(tmp_path, monkeypatch):
         demo_run.run_demo(DemoOptions(out=tmp_path), print)
 
 
+def test_run_folder_is_new_or_of_an_earlier_run(tmp_path):
+    (tmp_path / "run/sightline").mkdir(parents=True)
+    (tmp_path / "run/robot.toml").touch()
+    with pytest.raises(ConfigError, match=f"run folder {tmp_path}/run has other files; choose a new one with --out"):
+        demo_run.run_folder(tmp_path / "run", "")
+    for mark in ("run/sim.log", "run/sightline/sim.log"):
+        (tmp_path / mark).touch()
+        assert demo_run.run_folder(tmp_path / "run", "") == tmp_path / "run"
+        (tmp_path / mark).unlink()
+
+
 def test_run_that_cannot_be_scored_is_a_failed_check(lights, monkeypatch):
     with pytest.raises(CheckError, match="ended before the robot drove"):
         demo_report.report(replace(lights, samples=[]))
