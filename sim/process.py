@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from io import FileIO
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Final
@@ -87,7 +88,7 @@ class MotorPort:
         self.lines_lost = 0
         """Commands that were applied and could not be logged, e.g. on a full disk."""
         try:
-            self._log = Path(log_path).open("wb", buffering=0) if log_path else None  # noqa: SIM115  closed by close()
+            self._log = _opened_log(Path(log_path)) if log_path else None
         except OSError as error:
             raise ConfigError(f"motor_log {log_path}: {error.strerror}; name a file in a folder that exists") from None
         self._is_cut = False
@@ -140,6 +141,15 @@ class MotorPort:
             _log.warning("motor log: %d commands have no line", self.lines_lost)
         if self._log:
             self._log.close()
+
+
+def _opened_log(path: Path) -> FileIO:
+    """Open a new log in place of an earlier one. Raises OSError, and ConfigError for a file that is not a log."""
+    if path.is_file() and path.stat().st_size:  # not a device or a pipe
+        with path.open("rb") as earlier:
+            if earlier.read(len(LOG_HEADER)) != LOG_HEADER:
+                raise ConfigError(f"motor_log {path}: exists and is not a motor log; name another file")
+    return path.open("wb", buffering=0)
 
 
 # The simulation's end of the bus: its clients and their messages. Shell (sockets, one thread).

@@ -3,6 +3,7 @@
 import pytest
 
 from sightline.evaluation.faults.evidence import measure_stop, read_motors
+from sightline.protocol.errors import ConfigError
 from sightline.sim import process
 from sightline.sim.bus import MOTION_SET
 from sightline.sim.process import LOG_HEADER, MotorPort
@@ -32,6 +33,17 @@ def test_lines_are_whole_again_when_the_disk_has_room(tmp_path, monkeypatch):
     assert header.encode() + b"\n" == LOG_HEADER
     assert [line.split(",")[1:3] for line in (first, last)] == [["1.00000", "1.00000"], ["3.00000", "3.00000"]]
     assert len(cut) == 4
+
+
+def test_log_replaces_an_earlier_log_and_no_other_file(tmp_path):
+    (tmp_path / "empty.csv").touch()
+    (tmp_path / "notes.txt").write_text("t_us, my notes\n")
+    for name in ("new.csv", "new.csv", "empty.csv"):
+        MotorPort(str(tmp_path / name)).close()
+        assert (tmp_path / name).read_bytes() == LOG_HEADER
+    with pytest.raises(ConfigError, match="notes.txt: exists and is not a motor log; name another file"):
+        MotorPort(str(tmp_path / "notes.txt"))
+    assert (tmp_path / "notes.txt").read_text() == "t_us, my notes\n"
 
 
 class Short:
