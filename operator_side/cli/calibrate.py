@@ -7,7 +7,7 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -382,11 +382,22 @@ def pick_color(
     config = config.expanduser() if config else None
     if config is not None:
         check_config(config)
+    mask = mask or _MASK
+    _check_mask(mask, {"--picture": picture, "--video": video, "--config": config})
     source = _Source(target_of(robot, connect, secure), picture, video)
     if place is None:
         _on_page(source, frames, config, port)
     else:
-        _at_once(source.pictures(frames), place, config, mask or _MASK, as_json)
+        _at_once(source.pictures(frames), place, config, mask, as_json)
+
+
+def _check_mask(mask: Path, others: Mapping[str, Path | None]) -> None:
+    """Raise ConfigError for a mask that would replace another file of the command, and for one that is not a PNG."""
+    if mask.suffix.lower() != ".png":
+        raise ConfigError(f"invalid --mask {mask}: expected a .png file, e.g. --mask mask.png")
+    for option, path in others.items():
+        if path is not None and mask.expanduser().resolve() == path.expanduser().resolve():
+            raise ConfigError(f"--mask {mask} is also the file of {option}; name another .png file")
 
 
 def place_of(at: str | None, box: str | None) -> "Box | None":

@@ -138,6 +138,8 @@ def test_range_is_tested_over_the_whole_video(there, capsys):
     ("--picture ball.png --json", "add --at X,Y"),
     ("--picture ball.png --at 110,112 --config bad.toml", "bad.toml"),
     ("--picture ball.png --at 110,112 --mask none/mask.png", "cannot write none/mask.png"),
+    ("--picture ball.png --at 110,112 --mask ./ball.png", "--mask ball.png is also the file of --picture"),
+    ("--picture ball.png --at 110,112 --mask mask.jpg", "invalid --mask mask.jpg: expected a .png file"),
     ("--at 1,1 --connect nowhere", "nowhere"),
 ])
 def test_failed_pick_is_one_line_and_writes_nothing(there, capsys, arguments, words):
