@@ -1,8 +1,12 @@
-"""Reasons for rejecting a message, and every exception that Sightline raises on purpose. Pure but for
-`install_command`, which reads what is installed.
+"""Reasons for rejecting a message, and every exception that Sightline raises on purpose. Pure but for `home_path`
+and `install_command`, which read where homes are and what is installed.
 """
 
 from enum import StrEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 
 class RejectReason(StrEnum):
@@ -83,6 +87,17 @@ class WireError(SightlineError):
         super().__init__(f"{reason}: {detail}")
         self.reason = reason
         self.detail = detail
+
+
+def home_path(path: "str | Path") -> "Path":
+    """Return `path` with the home folder in place of a first `~` or `~USER`. Raises ConfigError without such a folder.
+    """
+    from pathlib import Path  # imports delay STOP
+
+    try:
+        return Path(path).expanduser()
+    except RuntimeError:
+        raise ConfigError(f"no home folder for '{Path(path).parts[0]}' in {path}; write the whole path") from None
 
 
 def install_command(extra: str) -> str:

@@ -24,7 +24,7 @@ from pydantic import Field
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
-from sightline.protocol.errors import ConfigError, HardwareError, install_command
+from sightline.protocol.errors import ConfigError, HardwareError, home_path, install_command
 from sightline.sim.bus import (
     CAMERA,
     MOTION_ANGLES,
@@ -88,7 +88,7 @@ class MotorPort:
         self.lines_lost = 0
         """Commands that were applied and could not be logged, e.g. on a full disk."""
         try:
-            self._log = _opened_log(Path(log_path)) if log_path else None
+            self._log = _opened_log(home_path(log_path)) if log_path else None
         except OSError as error:
             raise ConfigError(f"motor_log {log_path}: {error.strerror}; name a file in a folder that exists") from None
         self._is_cut = False

@@ -21,7 +21,7 @@ from sightline.operator_side.preflight import writes
 from sightline.operator_side.recording.recorder import Recorder
 from sightline.operator_side.recording.replay import VISION_CONFIG
 from sightline.operator_side.terminal import LiveBlock
-from sightline.protocol.errors import CheckError, ConfigError, HardwareError, SightlineError
+from sightline.protocol.errors import CheckError, ConfigError, HardwareError, SightlineError, home_path
 from sightline.protocol.messages import Status
 from sightline.protocol.transports.open import open_link
 from sightline.sim.bus import TruthReader
@@ -261,7 +261,7 @@ def run_folder(out: Path | None, name: str) -> Path:
     Raises ConfigError if it cannot be made, or has files and none of them is of a run.
     """
     dated = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
-    folder = (out or Path("runs") / dated).expanduser().absolute()
+    folder = home_path(out or Path("runs") / dated).absolute()
     while True:
         try:
             folder.mkdir(parents=True, exist_ok=out is not None)

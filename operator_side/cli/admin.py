@@ -21,7 +21,7 @@ from sightline.operator_side.doctor.finding import Finding, as_object
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.setup import install as units
 from sightline.operator_side.table import print_table
-from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.errors import ConfigError, LinkError, home_path
 from sightline.protocol.transports.endpoints import check_endpoint, check_robot_id
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import RobotConfig
@@ -98,7 +98,7 @@ def _print_use(values: Mapping[str, object], line: str, as_json: bool) -> None:
 
 def _folder(secure: str) -> str:
     """Return the absolute path, since a command may start in another folder."""
-    return str(Path(secure).expanduser().absolute()) if secure else ""
+    return str(home_path(secure).absolute()) if secure else ""
 
 
 def _answer(context: contexts.Context) -> str:
@@ -130,7 +130,7 @@ def init(folder: Folder, host: Hosts = None, days: Days = 825) -> None:
     The roles are robot, vision, operator, detector and viewer.
     """
     made = _keys()
-    for file in made.make(folder, host or [], days):
+    for file in made.make(home_path(folder), host or [], days):
         print(f"wrote {file}")
     if not host:
         print("these certificates are valid on this machine only; for others make another folder with --host NAME",
@@ -151,14 +151,14 @@ def add(
     Without --host it keeps its addresses. `stop` creates the secret of STOP datagrams.
     """
     made = _keys()
-    for file in made.add(folder, role, host or [], days):
+    for file in made.add(home_path(folder), role, host or [], days):
         print(f"wrote {file}")
 
 
 def show(folder: Folder, as_json: Json = False) -> None:
     """Show role, hosts and expiry of each certificate"""
     made = _keys()
-    found = made.look(folder)
+    found = made.look(home_path(folder))
     if as_json:
         print(json.dumps([{"file": str(one.file), "role": one.role, "hosts": one.hosts,
                            "ends": one.ends.isoformat()} for one in found]))
@@ -188,7 +188,7 @@ def install(
     Without --yes it only prints the files. For a `gpio` drive, a second file sets the pins low after each end.
     """
     program = Path(sys.executable).with_name("sightline")
-    file = (config or Path(f"/etc/sightline/{service}.toml")).expanduser().absolute()  # systemd changes the folder
+    file = home_path(config or Path(f"/etc/sightline/{service}.toml")).absolute()  # systemd changes the folder
     runs_it = user or os.environ.get("SUDO_USER") or getpass.getuser()
     planned = units.plan(service, program, file, runs_it, units.UNIT_DIR, instances=instances)
     if not yes:

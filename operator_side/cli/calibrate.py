@@ -37,7 +37,7 @@ from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import check_out_file, needs, writes
 from sightline.protocol.channels import FRAME
-from sightline.protocol.errors import ConfigError, SightlineError
+from sightline.protocol.errors import ConfigError, SightlineError, home_path
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.hardware.gpio import table_of, table_text
@@ -379,7 +379,7 @@ def pick_color(
         raise ConfigError("--json works without a browser; add --at X,Y or --box X,Y,W,H")
     with needs("vision"):
         from sightline.operator_side.calibrate.color_file import check_config
-    config = config.expanduser() if config else None
+    config = home_path(config) if config else None
     if config is not None:
         check_config(config)
     mask = mask or _MASK
@@ -396,7 +396,7 @@ def _check_mask(mask: Path, others: Mapping[str, Path | None]) -> None:
     if mask.suffix.lower() != ".png":
         raise ConfigError(f"invalid --mask {mask}: expected a .png file, e.g. --mask mask.png")
     for option, path in others.items():
-        if path is not None and mask.expanduser().resolve() == path.expanduser().resolve():
+        if path is not None and home_path(mask).resolve() == home_path(path).resolve():
             raise ConfigError(f"--mask {mask} is also the file of {option}; name another .png file")
 
 
@@ -471,8 +471,8 @@ class _Source:
         from sightline.operator_side.calibrate.color_page import of_picture, of_video
 
         if self._picture is not None:
-            return of_picture(self._picture.expanduser())
-        return of_video(self._video.expanduser(), frames) if self._video is not None else None
+            return of_picture(home_path(self._picture))
+        return of_video(home_path(self._video), frames) if self._video is not None else None
 
 
 def _at_once(pictures: "list[Image]", place: "Box", config: Path | None, mask: Path, as_json: bool) -> None:
@@ -481,7 +481,7 @@ def _at_once(pictures: "list[Image]", place: "Box", config: Path | None, mask: P
 
     ranges = pick(pictures[-1], place)
     trial = try_out(ranges, pictures)
-    write_mask(mask.expanduser(), ranges, pictures[-1])
+    write_mask(home_path(mask), ranges, pictures[-1])
     check_trial(trial)
     note = _use(ranges, config)
     if as_json:

@@ -26,7 +26,7 @@ from sightline.conformance.runner import Outcome, Result, chosen, run_cases
 from sightline.operator_side.cli.options import Json, Secure, command_group, print_result
 from sightline.operator_side.preflight import check_out_file, writes
 from sightline.operator_side.table import print_table, table_lines
-from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.errors import ConfigError, LinkError, home_path
 from sightline.protocol.transports.security import own_token
 
 _EXAMPLE = "e.g. --token vision=keys/vision.token"
@@ -37,7 +37,7 @@ def access_for(secure: str, tokens: Iterable[str], roles: Sequence[str], ending:
 
     A named token replaces the one in the folder. Raises ConfigError for an unusable token.
     """
-    if secure and not Path(secure).expanduser().is_dir():
+    if secure and not home_path(secure).is_dir():
         raise ConfigError(f"--secure {secure}: folder not found; create keys with `sightline keys init {secure}`")
     given = _by_role(tokens, roles)
     if given:
@@ -52,7 +52,7 @@ def _by_role(tokens: Iterable[str], roles: Sequence[str]) -> dict[str, Path]:
         role, equals, file = named.rpartition("=")
         if equals and role not in roles:
             raise ConfigError(f"--token {named}: unknown role '{role}', expected {', '.join(roles)}; {_EXAMPLE}")
-        found.update(dict.fromkeys([role] if role else roles, Path(file).expanduser()))
+        found.update(dict.fromkeys([role] if role else roles, home_path(file)))
     return found
 
 
@@ -67,7 +67,7 @@ def _token_in(file: Path) -> str:
 def _joined(secure: str, tokens: dict[str, Path], ending: ExitStack) -> str:
     """Make a temporary folder with the files of `secure` and these tokens in place of its own."""
     folder = Path(ending.enter_context(tempfile.TemporaryDirectory(prefix="sightline-conform-")))
-    for file in Path(secure).expanduser().iterdir() if secure else _trusted_here():
+    for file in home_path(secure).iterdir() if secure else _trusted_here():
         (folder / (file.name if secure else "ca.pem")).symlink_to(file.absolute())
     for role, given in tokens.items():
         own = folder / f"{role}.token"

@@ -18,7 +18,7 @@ from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import reply_line, short_lines, status_lines
 from sightline.operator_side.config.context import RobotAddress, stop_secret_of, target_of
 from sightline.operator_side.table import print_block
-from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.errors import ConfigError, LinkError, home_path
 from sightline.protocol.messages import MissionReport, Reply, State, Status, Verb
 from sightline.protocol.transports.open import open_link
 
@@ -295,7 +295,7 @@ def _waypoints(numbers: list[str], file: Path | None) -> "Waypoints":
     if numbers:
         raise ConfigError("waypoints on the command line and --file exclude each other; remove one")
     try:
-        return waypoints_of_file(file.expanduser().read_text("utf-8"), str(file))
+        return waypoints_of_file(home_path(file).read_text("utf-8"), str(file))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"cannot read {file}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
 

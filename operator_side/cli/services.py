@@ -35,7 +35,7 @@ from sightline.operator_side.config.loading import load_service, model_of
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import print_table
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, home_path
 from sightline.protocol.log import start_log
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 from sightline.protocol.transports.open import open_link
@@ -286,7 +286,7 @@ def scenarios(
         return
     files = _files(name, seed)
     if out is not None:
-        _write(out, name, files)
+        _write(home_path(out), name, files)
     elif as_json:
         typer.echo(json.dumps(files))
     else:

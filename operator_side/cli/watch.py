@@ -28,7 +28,7 @@ from sightline.operator_side.config.context import target_of
 from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.preflight import needs
 from sightline.protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, REPORT, Channel, Direction
-from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.errors import ConfigError, LinkError, home_path
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
 
@@ -179,7 +179,7 @@ def capture(
     target = target_of(robot, connect, secure)
     robot, secure = target.robot, target.secure
     kind = "mp4" if seconds is not None else "png"
-    path = (out or Path(f"{robot}-{time.strftime('%Y%m%d-%H%M%S')}.{kind}")).expanduser()
+    path = home_path(out or Path(f"{robot}-{time.strftime('%Y%m%d-%H%M%S')}.{kind}"))
     check_target(path, seconds)
     wanted, role = OVERLAY if overlay else FRAME, viewer_role(secure)
     with open_link(robot, connect=target.connect, role=role, secure=secure) as link:

@@ -4,14 +4,13 @@ import secrets
 import threading
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
 from sightline.operator_side.client.requests import SOURCE as OPERATOR
 from sightline.protocol.channels import ACK, FRAME, OVERLAY, SOURCES_OF_ROLE, STATUS, Channel
 from sightline.protocol.clock import RobotClock, monotonic_us
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.errors import WireError
+from sightline.protocol.errors import WireError, home_path
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import AnswerHeader, DetectionsHeader, Echo, FrameHeader, Stamp
 from sightline.protocol.transports.link import Link, Message
@@ -76,7 +75,7 @@ class Shot:
 
 def viewer_role(secure: str) -> str:
     """Return the role of a viewer: operator if `secure` has its keys, since a viewer may not even acknowledge."""
-    folder = Path(secure).expanduser()
+    folder = home_path(secure)
     is_operator = secure and any((folder / f"operator.{kind}").is_file() for kind in ("key", "token"))
     return OPERATOR if is_operator else VIEWER
 

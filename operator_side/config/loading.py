@@ -19,7 +19,7 @@ from sightline.operator_side.config.context import CONNECT_VARIABLE
 from sightline.operator_side.config.errors import explain, is_known, known_keys, no_such_name
 from sightline.operator_side.config.toml_text import key_and_text, toml_value
 from sightline.protocol.config import Config
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, home_path
 from sightline.protocol.log import LOG_FORMAT_VARIABLE
 from sightline.protocol.transports.endpoints import check_endpoint, check_robot_id
 
@@ -130,7 +130,7 @@ def _from_profile(service: str, profile: str | None) -> Iterable[Given]:
 
 def _from_file(file: str, origin: str) -> Iterable[Given]:
     try:
-        table = tomllib.loads(Path(file).expanduser().read_text("utf-8"))
+        table = tomllib.loads(home_path(file).read_text("utf-8"))
     except OSError as error:
         raise ConfigError(f"cannot read {file}: {error.strerror}; check --config") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -141,7 +141,7 @@ def _from_file(file: str, origin: str) -> Iterable[Given]:
 def _decimal_hint(file: str, error: Exception) -> str:
     """Return the fix of a number with a decimal comma in the line of the error, or an empty text."""
     place = re.search(r"at line (\d+)", str(error))
-    lines = Path(file).expanduser().read_text("utf-8").splitlines() if place else []
+    lines = home_path(file).read_text("utf-8").splitlines() if place else []
     found = re.search(r"=\s*(-?\d+),(\d+)\s*(#|$)", lines[int(place[1]) - 1]) if place and lines else None
     return f"; write {found[1]}.{found[2]} with a point" if found else ""
 

@@ -23,7 +23,7 @@ from sightline.protocol.channels import (
     Channel,
     Direction,
 )
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, home_path
 from sightline.protocol.transports.endpoints import WebSocketEndpoint, parse_zenoh_endpoint, with_allowed
 from sightline.protocol.transports.tokens import ALL_TOKENS, DETECTOR_KIND, DRIVER_KIND, ROBOT_KIND, VISION_KIND
 from sightline.protocol.transports.tokens import PREFIX as TOKEN_PREFIX
@@ -104,7 +104,7 @@ def load_role_keys(folder: str, source: str) -> RoleKeys | None:
     """
     if not folder:
         return None
-    role, folder = certificate_role(source), str(Path(folder).expanduser())
+    role, folder = certificate_role(source), str(home_path(folder))
     missing = [name for name in ("ca.pem", f"{role}.pem", f"{role}.key") if not (Path(folder) / name).is_file()]
     if missing:
         raise ConfigError(f"{missing[0]} is missing in {folder}: create keys with `sightline keys init`, and copy "
@@ -192,7 +192,7 @@ def read_tokens(folder: str) -> Mapping[str, str]:
     """Read every token file in `folder` as token -> role. Raises ConfigError for an invalid file."""
     if not folder:
         return {}
-    files = {role: Path(folder).expanduser() / f"{role}.token" for role in ROLES}
+    files = {role: home_path(folder) / f"{role}.token" for role in ROLES}
     tokens = {_read(file): role for role, file in files.items() if file.is_file()}
     if len(tokens) < sum(file.is_file() for file in files.values()):
         raise ConfigError(f"{folder} contains the same token for two roles; create a token for each role")
@@ -201,7 +201,7 @@ def read_tokens(folder: str) -> Mapping[str, str]:
 
 def own_token(folder: str, source: str) -> str:
     """Return the token that a link of role `source` shows when it connects, or "" without one."""
-    file = Path(folder).expanduser() / f"{certificate_role(source)}.token"
+    file = home_path(folder) / f"{certificate_role(source)}.token"
     return _read(file) if folder and file.is_file() else ""
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, home_path
 
 Address = tuple[str, int]
 Origin = tuple[int, Address]
@@ -182,9 +182,7 @@ def stop_secret_file(folder: str) -> str:
     Raises:
         ConfigError: the folder has no such file, as folders of earlier releases, or an invalid one.
     """
-    from pathlib import Path  # which the receiver itself does without: it takes a megabyte
-
-    file = Path(folder).expanduser() / STOP_SECRET_FILE
+    file = home_path(folder) / STOP_SECRET_FILE
     if not file.is_file():
         raise ConfigError(f"{file} is missing: STOP works on the link only; add it with `sightline keys add {folder} "
                           "stop`, and copy it to robots, routers and operators")

@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import Final
 
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, home_path
 from sightline.protocol.log import count_fault
 
 _log: Final = logging.getLogger(__name__)
@@ -19,7 +19,7 @@ class StopLatch:
     """A mark per robot: there while it is STOPPED."""
 
     def __init__(self, directory: Path, robot: str) -> None:
-        self._path = directory.expanduser() / f"{robot}.stopped"
+        self._path = home_path(directory) / f"{robot}.stopped"
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:

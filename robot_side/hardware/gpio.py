@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config, first_problem
-from sightline.protocol.errors import ConfigError, HardwareError, install_command
+from sightline.protocol.errors import ConfigError, HardwareError, home_path, install_command
 from sightline.robot_side.hardware.gpio_low import import_lgpio, leave_low, zero
 from sightline.robot_side.ports import WheelAngles
 
@@ -455,7 +455,7 @@ def _rows(config: GpioDriveConfig) -> tuple[tuple[float, float], ...]:
     if path is None:
         return config.table
     try:
-        return table_of(path.expanduser().read_text("utf-8"), str(path))
+        return table_of(home_path(path).read_text("utf-8"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         cause = error.strerror if isinstance(error, OSError) else "not text"
         raise ConfigError(f"{path}: cannot be read: {cause}; write one with `sightline calibrate drive`") from None

@@ -1,4 +1,4 @@
-"""The command that an error proposes for a missing extra."""
+"""The command that an error proposes for a missing extra, and home folders in paths."""
 
 import json
 from importlib import metadata
@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sightline.protocol.errors import install_command
+from sightline.protocol.errors import ConfigError, home_path, install_command
 
 INSTALLED_FROM = {
     "clone, here": ("file://{here}", "pip install '.[zenoh]'"),
@@ -33,3 +33,11 @@ def test_install_command_of_an_unknown_distribution_names_the_clone(monkeypatch)
 
     monkeypatch.setattr(metadata, "distribution", distribution)
     assert install_command("zenoh") == "pip install '.[zenoh]'"
+
+
+def test_home_path_replaces_the_home_folder(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    assert [home_path(one) for one in ("~/a", Path("~"), "b/~", "")] == [
+        Path("/home/me/a"), Path("/home/me"), Path("b/~"), Path()]  # fmt: skip
+    with pytest.raises(ConfigError, match="no home folder for '~nobody-here' in ~nobody-here/a; write the whole path"):
+        home_path("~nobody-here/a")

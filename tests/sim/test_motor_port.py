@@ -35,7 +35,10 @@ def test_lines_are_whole_again_when_the_disk_has_room(tmp_path, monkeypatch):
     assert len(cut) == 4
 
 
-def test_log_replaces_an_earlier_log_and_no_other_file(tmp_path):
+def test_log_replaces_an_earlier_log_and_no_other_file(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    MotorPort("~/home.csv").close()
+    assert (tmp_path / "home.csv").read_bytes() == LOG_HEADER
     (tmp_path / "empty.csv").touch()
     (tmp_path / "notes.txt").write_text("t_us, my notes\n")
     for name in ("new.csv", "new.csv", "empty.csv"):

@@ -10,16 +10,15 @@ import select
 import socket
 import ssl
 import time
-from pathlib import Path
 
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, home_path
 from sightline.protocol.transports.security import certificate_role
 
 
 def server_tls_context(folder: str, source: str) -> ssl.SSLContext:
     """Create the TLS context of a listening end. Raises ConfigError for a missing or invalid certificate or key."""
     role = certificate_role(source)
-    certificate, key = (Path(folder).expanduser() / f"{role}.{kind}" for kind in ("pem", "key"))
+    certificate, key = (home_path(folder) / f"{role}.{kind}" for kind in ("pem", "key"))
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_cert_chain(certificate, key)
@@ -32,7 +31,7 @@ def server_tls_context(folder: str, source: str) -> ssl.SSLContext:
 
 def client_tls_context(folder: str) -> ssl.SSLContext:
     """Create the TLS context of a connecting end. It trusts `ca.pem`, or without a folder the system's authorities."""
-    authority = Path(folder).expanduser() / "ca.pem"
+    authority = home_path(folder) / "ca.pem"
     try:
         return ssl.create_default_context(cafile=str(authority) if folder else None)
     except (OSError, ssl.SSLError) as error:

@@ -8,11 +8,10 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from sightline.protocol.channels import KEY_PREFIX, STATUS, parse_key
-from sightline.protocol.errors import ConfigError, install_command
+from sightline.protocol.errors import ConfigError, home_path, install_command
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_zenoh_endpoint
 from sightline.protocol.transports.link import LinkRules, Message
 from sightline.protocol.transports.security import RoleKeys, load_role_keys
@@ -76,7 +75,7 @@ def _own_keys(folder: str) -> RoleKeys | None:
 
 
 def _has(folder: str, role: str) -> bool:
-    return (Path(folder).expanduser() / f"{role}.key").is_file()
+    return (home_path(folder) / f"{role}.key").is_file()
 
 
 def _listen(session: zenoh.Session, seconds: float) -> list[PeerInfo]:

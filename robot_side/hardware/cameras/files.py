@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from sightline.protocol.clock import monotonic_us
-from sightline.protocol.errors import ConfigError, HardwareError, WireError, install_command
+from sightline.protocol.errors import ConfigError, HardwareError, WireError, home_path, install_command
 from sightline.protocol.jpeg import JpegSize, read_jpeg_size
 from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
 from sightline.robot_side.hardware.cameras.timing import FrameTimer
@@ -52,7 +52,7 @@ class FolderCamera:
 
 def jpegs_in(folder: Path) -> list[Path]:
     """Return the .jpg and .jpeg files of `folder` in name order. Raises HardwareError for an empty result."""
-    paths = sorted(path for path in folder.expanduser().glob("*") if path.suffix.lower() in (".jpg", ".jpeg"))
+    paths = sorted(path for path in home_path(folder).glob("*") if path.suffix.lower() in (".jpg", ".jpeg"))
     if not paths:
         raise HardwareError(f"no .jpg images in {folder}; name a folder that has some")
     return paths
@@ -84,7 +84,7 @@ class StillCamera:
 
     def __init__(self, config: StillCameraConfig) -> None:
         try:
-            self._jpeg = config.path.expanduser().read_bytes()
+            self._jpeg = home_path(config.path).read_bytes()
         except OSError as error:
             raise HardwareError(
                 f"image {config.path} cannot be read: {error.strerror}; set camera.options.path to a .jpg"
@@ -171,7 +171,7 @@ class VideoCamera:
     # --- the file ------------------------------------------------------------------------------------------------
 
     def _open(self) -> None:
-        path = self._config.path.expanduser()
+        path = home_path(self._config.path)
         if not path.is_file():
             raise HardwareError(f"video {self._config.path} is not there; set camera.options.path to a video file")
         self._capture: Any = self._cv2.VideoCapture(str(path), self._cv2.CAP_FFMPEG)

@@ -50,6 +50,11 @@ def test_every_line_has_the_result_that_typer_gives_it(stopped, monkeypatch, cap
     assert results[0] == results[1]
 
 
+def test_keys_in_an_unknown_home_do_not_prevent_a_stop(stopped, capsys):
+    assert cli.run(["stop", "--secure", "~no-user/x"]) == 0 and len(stopped) == 1
+    assert "no home folder for '~no-user' in ~no-user/x; write the whole path" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("output", ["stdout", "stderr"])
 @pytest.mark.parametrize("is_closed", [True, False])
 def test_output_that_fails_neither_prevents_a_stop_nor_changes_its_exit_code(stopped, monkeypatch, output, is_closed):

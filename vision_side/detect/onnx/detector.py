@@ -17,7 +17,7 @@ from pydantic import Field
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config as Settings
-from sightline.protocol.errors import ConfigError, HardwareError, install_command
+from sightline.protocol.errors import ConfigError, HardwareError, home_path, install_command
 from sightline.protocol.log import report_fault
 from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.config import Device, HsvConfig
@@ -247,7 +247,7 @@ def read_onnx_model(config: OnnxDetector.Config) -> LoadedModel:
         HardwareError: for a device that is not there.
     """
     named = {"": SHIPPED, "nanodet": NANODET, "rooms": ROOMS}
-    path = named.get(config.address) or Path(config.address).expanduser()
+    path = named.get(config.address) or home_path(config.address)
     digest = digest_of(path)
     engine = open_engine(path, config.device, config.threads)
     try:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from sightline.protocol.config import PluginRegistry
-from sightline.protocol.errors import ConfigError, HardwareError, SightlineError
+from sightline.protocol.errors import ConfigError, HardwareError, SightlineError, home_path
 from sightline.vision_side.detect.onnx.detector import DEFAULT_MIN_SCORE, LoadedModel, OnnxDetector, digest_of
 from sightline.vision_side.detect.onnx.engine import Arrays, OnnxHeader, Tensor
 from sightline.vision_side.detect.onnx.tensors import ModelFormat, model_format, named_labels, own_labels
@@ -151,10 +151,10 @@ class TorchDetector(FrameworkDetector):
         framework.set_num_threads(config.threads)
         if _IS_CLASS.fullmatch(config.address):
             path, metadata = Path(config.address), dict[str, Any]()
-            digest = digest_of(Path(config.weights).expanduser()) if config.weights else ""
+            digest = digest_of(home_path(config.weights)) if config.weights else ""
             module, note = _of_class(framework, config)
         else:
-            path = Path(config.address).expanduser()
+            path = home_path(config.address)
             digest = digest_of(path)
             module, metadata, note = _of_file(framework, path, config)
         rows, columns = config.size or metadata.get("imgsz") or (_SIDE_PX, _SIDE_PX)
@@ -169,7 +169,7 @@ def _of_class(torch: Any, config: Any) -> tuple[Any, str]:
     if not isinstance(module, torch.nn.Module):
         raise ConfigError(f"model {config.address} is not a torch.nn.Module; name a class of one")
     if config.weights:
-        path = Path(config.weights).expanduser()
+        path = home_path(config.weights)
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
         except pickle.UnpicklingError:  # it has more than tensors
@@ -290,7 +290,7 @@ class UltralyticsDetector(FrameworkDetector):
     @classmethod
     def opened(cls, framework: Any, config: Any) -> LoadedModel:
         """Open the file without downloads."""
-        path = Path(config.address).expanduser()
+        path = home_path(config.address)
         digest = digest_of(path)
         note = _allowed_pickle(path, config) if path.suffix in (".pt", ".pth") else ""
         device = _device(importlib.import_module("torch"), config.device)
@@ -325,7 +325,7 @@ class TransformersDetector(FrameworkDetector):
     @classmethod
     def opened(cls, framework: Any, config: Any) -> LoadedModel:
         """Open the folder without downloads and without code in it."""
-        folder = Path(config.address).expanduser()
+        folder = home_path(config.address)
         files = sorted([*folder.glob("*.safetensors"), *folder.glob("*.bin")]) if folder.is_dir() else []
         digest = digest_of(folder / "config.json", *files)
         if not files:
