@@ -101,7 +101,7 @@ def send_stop(robot: str | None, connect: list[str] | None, secure: str, as_json
     def on_slow() -> None:
         _warn(f"STOP of {target.robot} is not confirmed, repeating; be ready to cut its power by hand")
 
-    target = target_of(robot, connect, secure)
+    target = target_of(robot or None, connect, secure)  # a script's unset variable must not prevent a STOP
     _warn(str(target))
     is_stored = stop_robot(target.robot, target.connect, target.secure, stop_secret_of(target, _warn), on_slow,
                            thread_name=ABANDONED_THREAD)

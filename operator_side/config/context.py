@@ -56,16 +56,18 @@ def find_address(
     Raises:
         ConfigError: SIGHTLINE_CONNECT or the context file is invalid.
     """
+    robot_id = DEFAULT_ROBOT if robot is None else robot  # "" is an unset variable of a script, and invalid
     if connect:
-        return RobotAddress(robot or DEFAULT_ROBOT, tuple(connect), secure, "--connect")
+        return RobotAddress(robot_id, tuple(connect), secure, "--connect")
     if environ.get(CONNECT_VARIABLE):
-        return RobotAddress(robot or DEFAULT_ROBOT, _from_variable(environ[CONNECT_VARIABLE]), secure, CONNECT_VARIABLE)
+        return RobotAddress(robot_id, _from_variable(environ[CONNECT_VARIABLE]), secure, CONNECT_VARIABLE)
     path = context_path(environ)
     saved = read_context(path) if path else None
     if saved is not None:
-        return RobotAddress(robot or saved.robot, (saved.connect,), secure or saved.secure, shown(path))
+        robot_id = saved.robot if robot is None else robot
+        return RobotAddress(robot_id, (saved.connect,), secure or saved.secure, shown(path))
     default = DEFAULT_ENDPOINT.replace("tcp/", "tls/") if secure else DEFAULT_ENDPOINT
-    return RobotAddress(robot or DEFAULT_ROBOT, (default,), secure, "default")
+    return RobotAddress(robot_id, (default,), secure, "default")
 
 
 def target_of(robot: str | None, connect: list[str] | None, secure: str, *, announce: bool = False) -> RobotAddress:

@@ -206,6 +206,8 @@ def test_completion_of_the_shell_offers_commands_and_options():
         (["score", "--detector", "hvs"], 2, "'hsv'"),
         (["status", "--connect", "here"], 2, "tcp/127.0.0.1:7447"),
         (["arm", "a b"], 2, "'a b'"),
+        (["arm", ""], 2, "invalid robot id ''"),
+        (["arm", "", "--connect", "tcp/127.0.0.1:9"], 2, "invalid robot id ''"),
         *((words, 2, "no home folder for '~no-user' in ~no-user/x; write the whole path") for words in (
             ["status", "--secure", "~no-user/x"],
             ["config", "check", "robot", "~no-user/x"],

@@ -50,6 +50,11 @@ def test_every_line_has_the_result_that_typer_gives_it(stopped, monkeypatch, cap
     assert results[0] == results[1]
 
 
+def test_empty_robot_id_stops_the_default_robot(stopped):
+    assert cli.run(["stop", ""]) == 0
+    assert stopped == [("r1", ("tcp/127.0.0.1:7447",), "")]
+
+
 def test_keys_in_an_unknown_home_do_not_prevent_a_stop(stopped, capsys):
     assert cli.run(["stop", "--secure", "~no-user/x"]) == 0 and len(stopped) == 1
     assert "no home folder for '~no-user' in ~no-user/x; write the whole path" in capsys.readouterr().err
