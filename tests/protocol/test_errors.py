@@ -39,5 +39,5 @@ def test_home_path_replaces_the_home_folder(monkeypatch):
     monkeypatch.setenv("HOME", "/home/me")
     assert [home_path(one) for one in ("~/a", Path("~"), "b/~", "")] == [
         Path("/home/me/a"), Path("/home/me"), Path("b/~"), Path()]  # fmt: skip
-    with pytest.raises(ConfigError, match="no home folder for '~nobody-here' in ~nobody-here/a; write the whole path"):
-        home_path("~nobody-here/a")
+    with pytest.raises(ConfigError, match="no home folder for '~nosuchuser' in ~nosuchuser/a; write the whole path"):
+        home_path("~nosuchuser/a")

@@ -44,7 +44,7 @@ def test_log_replaces_an_earlier_log_and_no_other_file(tmp_path, monkeypatch):
     for name in ("new.csv", "new.csv", "empty.csv"):
         MotorPort(str(tmp_path / name)).close()
         assert (tmp_path / name).read_bytes() == LOG_HEADER
-    with pytest.raises(ConfigError, match="notes.txt: exists and is not a motor log; name another file"):
+    with pytest.raises(ConfigError, match=r"notes\.txt: exists and is not a motor log; name another file"):
         MotorPort(str(tmp_path / "notes.txt"))
     assert (tmp_path / "notes.txt").read_text() == "t_us, my notes\n"
 
