@@ -249,9 +249,20 @@ class Collected(Generic[Found]):
 
 
 def folder_pictures(folder: Path) -> Iterator[bytes]:
-    """Yield the JPEGs of `folder` in name order. Raises HardwareError without one."""
+    """Yield the JPEGs of `folder` in name order.
+
+    Raises HardwareError without one, and ConfigError for an unreadable or damaged one, or one of another size.
+    """
+    first: JpegSize | None = None
     for path in jpegs_in(folder):
-        yield path.read_bytes()
+        try:
+            jpeg = path.read_bytes()
+            first = _size_of(jpeg, first, may_grow=False)
+        except OSError as error:
+            raise ConfigError(f"cannot read {path}: {error.strerror}; remove it or make it readable") from None
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
+        yield jpeg
 
 
 def camera_pictures(camera: Camera, seconds: float) -> Iterator[bytes]:

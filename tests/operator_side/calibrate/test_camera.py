@@ -250,8 +250,19 @@ def test_bad_usage_is_one_line(arguments, said):
 
 def test_images_of_two_sizes_are_rejected(tmp_path):
     small = jpeg_of(np.full((240, 320, 3), 120, np.uint8))
-    with pytest.raises(ConfigError, match="are mixed"):
-        run("--pictures", folder(tmp_path, [EMPTY, small]))
+    pictures = folder(tmp_path, [EMPTY, small])
+    with pytest.raises(ConfigError, match=f"{pictures}/01.jpg: images of .* are mixed"):
+        run("--pictures", pictures)
+
+
+def test_image_that_cannot_be_used_is_named(tmp_path):
+    pictures = folder(tmp_path, [EMPTY, b"no JPEG"])
+    with pytest.raises(ConfigError, match=f"{pictures}/01.jpg: invalid JPEG: .*; remove or convert it"):
+        run("--pictures", pictures)
+    (pictures / "01.jpg").unlink()
+    (pictures / "01.jpg").mkdir()
+    with pytest.raises(ConfigError, match=f"cannot read {pictures}/01.jpg: Is a directory; remove it or make it"):
+        run("--pictures", pictures)
 
 
 def test_the_board_is_counted_in_inner_corners():
