@@ -9,6 +9,7 @@ Environment names are SIGHTLINE_<SERVICE>__<KEY>, `__` for each dot: SIGHTLINE_R
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -207,12 +208,23 @@ def _check_names(given: Mapping[Key, Given], service: str) -> None:
     robot_id = None if robot is None else robot.value if isinstance(robot.value, str) else robot.text
     if robot_id is not None:
         # A vision service may name several by `*` and `?`.
-        check_robot_id(robot_id.replace("*", "x").replace("?", "x") if service == "vision" else robot_id)
-    for name in ("listen", "connect"):
-        one = given.get((name,))
-        for endpoint in _as_list(one.value) if one else ():
+        plain_id = robot_id.replace("*", "x").replace("?", "x") if service == "vision" else robot_id
+        with _labeled(given, ("robot",)):
+            check_robot_id(plain_id)
+    for key in (("listen",), ("connect",)):
+        for endpoint in _as_list(given[key].value) if key in given else ():
             if isinstance(endpoint, str):
-                check_endpoint(endpoint)
+                with _labeled(given, key):
+                    check_endpoint(endpoint)
+
+
+@contextmanager
+def _labeled(given: Mapping[Key, Given], key: Key) -> Iterator[None]:
+    """Add the place of `key` to the ConfigError of its value."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{_label(given, key)}: {error}") from None
 
 
 def _as_list(value: Any) -> list[Any]:

@@ -181,6 +181,17 @@ def test_any_table_survives_as_toml(table):
     assert tomllib.loads(toml_text(table)) == table
 
 
+@pytest.mark.parametrize("line", ["robot = 'a b'", "listen = ['tcp:7447']", "connect = ['tcp/robot']"])
+def test_bad_id_or_endpoint_names_its_file_and_key(tmp_path, line):
+    file = tmp_path / "robot.toml"
+    file.write_text(line)
+    key = line.partition(" ")[0]
+    with pytest.raises(ConfigError, match=f"^{file}: {key}: invalid "):
+        load("robot", file=str(file), environ={})
+    with pytest.raises(ConfigError, match=f"^--{key}: invalid "):
+        load("robot", options={key: "a/b"}, environ={})
+
+
 @pytest.mark.parametrize("text", ['"r2"', "'r2'", "r2"])
 def test_robot_id_may_be_quoted(text):
     assert load("robot", sets=[f"robot={text}"], environ={}).config.robot == "r2"
