@@ -4,6 +4,7 @@ A plain `sightline stop` imports only what a STOP datagram needs. All other comm
 longer to import than a STOP takes.
 """
 
+import errno
 import json
 import os
 import re
@@ -11,6 +12,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from sightline.operator_side.client.stop import stop_robot
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     import typer
 
 INTERRUPTED: Final = 130
+CLOSED: Final = 141  # as a shell reports SIGPIPE
 UNEXPECTED: Final = 1
 USAGE: Final = 2
 
@@ -32,16 +35,17 @@ def run(arguments: Sequence[str]) -> int:
     try:
         options = plain_options(arguments[1:]) if arguments[:1] == ["stop"] else None
         code = _typed(arguments) if options is None else send_stop(**options)
+        if sys.stdout is not None:
+            sys.stdout.flush()  # here, where its failure can be reported
         return code if isinstance(code, int) else 0
     except SightlineError as error:
         return _print_error(str(error), error.exit_code)
     except KeyboardInterrupt:
         return INTERRUPTED
-    except BrokenPipeError:  # `sightline status --watch | head`: the reader has ended
-        _discard(sys.stdout)
-        return UNEXPECTED
+    except OSError as error:
+        return _of_system(error, arguments)
     except Exception as error:
-        return _unexpected(error)
+        return _unexpected(error, arguments)
 
 
 def _typed(arguments: Sequence[str]) -> Any:
@@ -57,6 +61,10 @@ def _typed(arguments: Sequence[str]) -> Any:
             return app(list(arguments), standalone_mode=False, prog_name="sightline")
     except typer.Abort:
         return INTERRUPTED
+    except SystemExit as ending:
+        if isinstance(ending.__context__, BrokenPipeError):  # which typer takes for an unexpected error
+            raise ending.__context__ from None
+        raise
 
 
 @contextmanager
@@ -131,11 +139,25 @@ def _discard(stream: TextIO | None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-def _unexpected(error: Exception) -> int:
+def _of_system(error: OSError, arguments: Sequence[str]) -> int:
+    """Report an output that cannot be written, and a current folder that is gone; others are unexpected."""
+    if error.filename is None and error.errno in (errno.EPIPE, errno.ENOSPC):
+        _discard(sys.stdout)
+        if error.errno == errno.EPIPE:
+            return CLOSED
+        return _print_error(f"cannot write the output: {error.strerror}; free the disk", USAGE)
+    try:
+        Path.cwd()
+    except FileNotFoundError:
+        return _print_error("the current folder no longer exists; change to another", USAGE)
+    return _unexpected(error, arguments)
+
+
+def _unexpected(error: Exception, arguments: Sequence[str]) -> int:
     """Print a usage error of the command line, or a fault of the program, as one line."""
     usage = getattr(error, "format_message", None)
     if usage is not None:
-        line = _usage_line(" ".join(usage().split()), getattr(error, "ctx", None))
+        line = _usage_line(" ".join(usage().split()), getattr(error, "ctx", None), arguments)
         return _print_error(line, getattr(error, "exit_code", USAGE))
     if os.environ.get("SIGHTLINE_DEBUG") == "1":
         raise error
@@ -146,10 +168,10 @@ def _unexpected(error: Exception) -> int:
     return _print_error(f"unexpected {where}; SIGHTLINE_DEBUG=1 shows where, please report it", UNEXPECTED)
 
 
-def _usage_line(text: str, context: "typer.Context | None") -> str:
+def _usage_line(text: str, context: "typer.Context | None", arguments: Sequence[str]) -> str:
     """Add the nearest command of the same group to a usage error that is about a command."""
     unknown = _UNKNOWN_COMMAND.match(text)
-    path = context.command_path if context else "sightline"
+    path = context.command_path if context else _command_path(arguments)
     if unknown is None:
         return f"{text.rstrip('.')}; see {path} --help"
     from sightline.operator_side.cli.commands import COMMANDS
@@ -159,6 +181,21 @@ def _usage_line(text: str, context: "typer.Context | None") -> str:
     if path != "sightline" and unknown[1] in COMMANDS:
         return f"unknown command '{unknown[1]}' in {path}; did you mean 'sightline {unknown[1]}'?; see {path} --help"
     return no_such_name("command", unknown[1], here) + f"; see {path} --help"
+
+
+def _command_path(arguments: Sequence[str]) -> str:
+    """Return the words of the command, for an error that does not have them: an option without its value."""
+    from typer.main import get_command
+
+    from sightline.operator_side.cli.commands import app
+
+    command, path = get_command(app), "sightline"
+    for word in arguments:
+        command = getattr(command, "commands", {}).get(word)
+        if command is None:
+            break
+        path += f" {word}"
+    return path
 
 
 def _print_error(line: str, code: int) -> int:

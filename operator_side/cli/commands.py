@@ -19,6 +19,7 @@ EXIT_CODES: Final = {
     4: "no connection, or no answer",
     5: "a check failed, or the robot rejected the request",
     130: "interrupted by Ctrl-C",
+    141: "the program that reads the output has ended",
 }
 """Each exit code of every command."""
 

@@ -157,6 +157,8 @@ def test_completion_of_the_shell_offers_commands_and_options():
         (["bench", "pipline"], 2, "unknown command 'pipline'; did you mean 'pipeline'?; see sightline bench --help"),
         (["bench", "vision"], 2, "unknown command 'vision' in sightline bench; did you mean 'sightline vision'?"),
         (["config", "check"], 2, "SERVICE"),
+        (["arm", "r1", "--connect"], 2, "see sightline arm --help"),
+        (["config", "show", "robot", "--profile"], 2, "see sightline config show --help"),
         (["config", "check", "robto"], 2, "did you mean 'robot'"),
         (["config", "check", "robot", "no such file.toml"], 2, "no such file.toml"),
         (["config", "check", "vision", "--set", "targt.radius_m=1"], 2, "did you mean 'target.radius_m'"),
@@ -300,6 +302,30 @@ def test_error_that_ends_a_service_leaves_its_traceback_in_the_log(capsys, caplo
     (record,) = caplog.records
     assert (record.levelname, record.message) == ("ERROR", "program raised ZeroDivisionError: two lines")
     assert record.exc_info[2].tb_next
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["keys", "show", "keys"]])  # by typer.echo, and by print
+@pytest.mark.parametrize("is_full", [True, False])
+def test_output_that_cannot_be_written_is_not_an_unexpected_error(capsys, monkeypatch, arguments, is_full):
+    monkeypatch.setattr("sightline.operator_side.setup.keys.look", lambda _folder: [])
+    monkeypatch.setattr("sightline.operator_side.cli.admin.print_table", lambda _rows: print("no keys"))
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w") as closed, Path("/dev/full").open("w") as full:
+        monkeypatch.setattr("sys.stdout", full if is_full else closed)
+        assert cli.run(arguments) == (2 if is_full else 141)
+    line = "error: cannot write the output: No space left on device; free the disk\n"
+    assert capsys.readouterr().err == (line if is_full else "")
+
+
+@pytest.mark.parametrize("arguments", [
+    ["use", "tcp/127.0.0.1:1", "--secure", "keys"], ["install", "robot", "--config", "r.toml"],
+])
+def test_current_folder_that_is_gone_is_one_line(capsys, monkeypatch, tmp_path, arguments):
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert run(capsys, *arguments) == (2, "", "error: the current folder no longer exists; change to another\n")
 
 
 @pytest.mark.parametrize("number", [math.inf, -math.inf, math.nan])
