@@ -11,7 +11,7 @@ from sightline.vision_side.config import TrackConfig
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.tracking.appearance import OTHER
 from sightline.vision_side.tracking.locate import Sighting
-from sightline.vision_side.tracking.track import Target, Track, from_odometry, to_odometry
+from sightline.vision_side.tracking.track import Target, Track, _are_in_line, from_odometry, to_odometry
 
 HERE = (0.0, 0.0, 0.0)
 DT_S = 0.1
@@ -412,6 +412,14 @@ def test_object_behind_the_robot_is_not_in_line():
     ahead.step(DT_S, HERE, [at(2.01, 0.0), at(1.0, 0.0)])
     behind.step(DT_S, HERE, [at(2.01, 0.0)])
     assert behind.target.x_m - 2.0 > 2 * (ahead.target.x_m - 2.0) > 0
+
+
+@pytest.mark.parametrize(("one", "other", "apart_m", "is_in_line"), [
+    ((2.0, 0.0), (0.0, 0.1), 0.15, False), ((0.8, 0.0), (0.5, 0.0), 0.15, True), ((0.8, 0.0), (-0.5, 0.0), 0.15, False),
+    ((1.0, 1.0), (2.0, 2.0), 0.15, True), ((1.0, -2.0), (2.0, -4.0), 0.15, True), ((0.1, -0.5), (2.0, 0.2), 0.6, True),
+])
+def test_only_objects_on_the_same_side_of_the_robot_are_in_line(one, other, apart_m, is_in_line):
+    assert _are_in_line(one, other, apart_m) is _are_in_line(other, one, apart_m) is is_in_line
 
 
 def test_objects_just_as_far_apart_as_objects_can_be_are_not_in_line():
