@@ -189,12 +189,11 @@ def _command_path(arguments: Sequence[str]) -> str:
 
     from sightline.operator_side.cli.commands import app
 
-    command, path = get_command(app), "sightline"
+    commands, path = getattr(get_command(app), "commands", {}), "sightline"
     for word in arguments:
-        command = getattr(command, "commands", {}).get(word)
-        if command is None:
+        if word not in commands:
             break
-        path += f" {word}"
+        commands, path = getattr(commands[word], "commands", {}), f"{path} {word}"
     return path
 
 
