@@ -42,7 +42,9 @@ def read_table(path: Path, folder: Path | None = None) -> dict[str, Any]:
     """
     try:
         table = tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}; name a TOML file that you may read") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read as TOML: {error}") from None
     return _extended(table, path, folder) if folder and "extends" in table else table
 

@@ -218,7 +218,7 @@ def own_options(texts: Sequence[str]) -> dict[str, Any]:
     """Read `--set KEY=VALUE` for a detector's own `Config`; a dot separates sections. Raises ConfigError."""
     from sightline.operator_side.config.toml_text import options_of
 
-    return _nested(options_of(texts))
+    return _nested(options_of(texts, example="min_score=0.5"))
 
 
 def _nested(options: dict[str, Any]) -> dict[str, Any]:

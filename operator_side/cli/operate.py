@@ -297,7 +297,8 @@ def _waypoints(numbers: list[str], file: Path | None) -> "Waypoints":
     try:
         return waypoints_of_file(home_path(file).read_text("utf-8"), str(file))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot read {file}: {getattr(error, 'strerror', None) or 'not a text file'}") from None
+        why = getattr(error, "strerror", None) or "not a text file"
+        raise ConfigError(f"cannot read {file}: {why}; name a file with one waypoint X Y per line") from None
 
 
 @contextmanager

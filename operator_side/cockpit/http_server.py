@@ -78,8 +78,8 @@ def served(routes: Mapping[str, Route], port: int, host: str = HOST, *, names: S
     except (OSError, OverflowError) as error:
         owner = port_owner(port)
         busy = f"port {port} is in use by {owner}; choose another"
-        cause = busy if owner else getattr(error, "strerror", None) or str(error)
-        raise LinkError(f"cannot serve on {host}:{port}: {cause}") from None
+        other = f"{getattr(error, 'strerror', None) or error}; choose another port, or an address of this machine"
+        raise LinkError(f"cannot serve on {host}:{port}: {busy if owner else other}") from None
     threading.Thread(target=server.serve_forever, args=(0.05,), name="http", daemon=True).start()
     try:
         yield f"http://{host}:{server.server_port}/"

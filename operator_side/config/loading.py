@@ -133,7 +133,7 @@ def _from_file(file: str, origin: str) -> Iterable[Given]:
     try:
         table = tomllib.loads(home_path(file).read_text("utf-8"))
     except OSError as error:
-        raise ConfigError(f"cannot read {file}: {error.strerror}; check --config") from None
+        raise ConfigError(f"cannot read {file}: {error.strerror}; name a TOML file that you may read") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{file}: invalid TOML: {error}{_decimal_hint(file, error)}") from None
     return [Given(key, value, origin) for key, value in _leaves(table)]

@@ -11,6 +11,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.sim.process import PeriodicTimer
 from sightline.sim.robot import load_robot
 from sightline.sim.scenario import ClosedPath, OnPath, PathLeg, Place, load_scenario, look_named, scenario_names
+from sightline.sim.toml_file import read_table
 from sightline.sim.world.world import Motor
 from tests.fixtures.sim import robot_names
 
@@ -64,6 +65,11 @@ def test_bad_scenario_file_is_one_line_that_names_the_key(tmp_path, old, new, ex
         load_scenario(str(file))
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_file_that_cannot_be_read_is_not_invalid_toml(tmp_path):
+    with pytest.raises(ConfigError, match=f"cannot read {tmp_path}: Is a directory; name a TOML file that you may"):
+        read_table(tmp_path)
 
 
 def write(folder, text):

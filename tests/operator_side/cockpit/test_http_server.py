@@ -140,6 +140,12 @@ def test_port_in_use_is_one_line(port):
     assert "\n" not in str(why.value)
 
 
+def test_address_of_another_machine_is_reported_with_a_fix():
+    with pytest.raises(LinkError, match=r"cannot serve on 192\.0\.2\.1:0: .*; choose another port"), \
+            served(ROUTES, 0, "192.0.2.1"):
+        pass
+
+
 def test_a_route_that_raises_is_logged_once_with_its_traceback_and_counted(port, caplog):
     for _ in range(2):
         with pytest.raises(http.client.RemoteDisconnected), asked(port, "GET", "/broken"):
