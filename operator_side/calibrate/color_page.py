@@ -27,6 +27,7 @@ from sightline.operator_side.cockpit.frame_buffer import FrameBuffer
 from sightline.operator_side.cockpit.http_server import HttpAnswer, PageRequest, Route, as_json, page
 from sightline.operator_side.recording.film import jpeg_pixels
 from sightline.protocol.errors import ConfigError, LinkError, WireError
+from sightline.robot_side.hardware.cameras.files import quiet_videos
 
 MAX_FILE_BYTES: Final = 50_000_000
 MAX_PIXELS: Final = 25_000_000
@@ -129,6 +130,7 @@ def of_video(path: Path, frames: int) -> list[Image]:
     """Read `frames` images spread evenly over a video, or all of fewer. Raises ConfigError for an invalid one."""
     if not path.is_file():
         raise ConfigError(f"{path} is not a file; name a video")
+    quiet_videos(cv2)
     capture = cv2.VideoCapture(str(path))
     try:
         count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))

@@ -1,6 +1,7 @@
 """Cameras that play one JPEG, a folder of JPEGs, or a video file. Shell."""
 
 import math
+import os
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -224,10 +225,18 @@ class VideoCamera:
                              "record it again")
 
 
+def quiet_videos(cv2: Any) -> None:
+    """Let OpenCV and FFmpeg print nothing of their own about a video, unless the environment sets their levels."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read at the first video
+    if "OPENCV_LOG_LEVEL" not in os.environ:
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+
+
 def _packages() -> tuple[Any, Any]:
     try:
         import cv2
         import simplejpeg
     except ImportError:
         raise ConfigError(f"camera video needs OpenCV and simplejpeg: {install_command('camera')}") from None
+    quiet_videos(cv2)  # the errors here name the file
     return simplejpeg.encode_jpeg, cv2

@@ -3,6 +3,7 @@
 import json
 import stat
 import tomllib
+from pathlib import Path
 
 import av
 import cv2
@@ -15,6 +16,7 @@ from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.recording.film import Film
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import HsvRange
+from tests.fixtures.commands import sightline
 from tests.operator_side.calibrate.test_color import ball_picture
 
 YELLOW = (HsvRange(hue_low_deg=41, hue_high_deg=57, saturation_low=0.42, value_low=0.4),)
@@ -117,6 +119,13 @@ def test_range_is_tested_over_the_whole_video(there, capsys):
     assert run(["pick-color", "--video", "run.mp4", "--box", "140,90,40,40", "--frames", "5", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
     assert said["trial"]["pictures"] == 5 and said["trial"]["with_any"] == 5 and said["written"] is None
+
+
+@pytest.mark.usefixtures("there")
+def test_libraries_print_nothing_about_an_invalid_video():
+    Path("film.mp4").write_bytes(b"no film at all" * 100)
+    done = sightline("pick-color", "--video", "film.mp4", "--at", "1,1")
+    assert (done.returncode, done.stderr) == (2, "error: invalid video film.mp4; use another file\n")
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

@@ -1,5 +1,7 @@
 """Cameras that play files, and the lens model that every camera takes."""
 
+import subprocess
+import sys
 import time
 from itertools import pairwise
 
@@ -75,6 +77,15 @@ def test_invalid_video_is_reported(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(HardwareError, match="cannot be played"):
         VideoCamera(VideoCamera.Config(path=tmp_path / name))
+
+
+def test_libraries_print_nothing_about_an_invalid_video(tmp_path):
+    (tmp_path / "film.mp4").write_bytes(b"no film at all" * 100)
+    code = ("import sys; from sightline.robot_side.hardware.cameras.files import HardwareError, VideoCamera\n"
+            "try: VideoCamera(VideoCamera.Config(path=sys.argv[1]))\nexcept HardwareError as error: print(error)")
+    done = subprocess.run([sys.executable, "-P", "-c", code, tmp_path / "film.mp4"], capture_output=True, text=True,
+                          check=True)
+    assert "cannot be played" in done.stdout and done.stderr == ""
 
 
 def test_a_video_that_is_not_there_is_reported(tmp_path):
