@@ -12,7 +12,16 @@ from typing import Annotated
 
 import typer
 
-from sightline.operator_side.cli.options import CameraKind, CameraSets, Json, Secure, command_group, print_result
+from sightline.operator_side.cli.options import (
+    CameraKind,
+    CameraSets,
+    Json,
+    RobotName,
+    Secure,
+    check_camera_sets,
+    command_group,
+    print_result,
+)
 from sightline.operator_side.client.pictures import viewer_role
 from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.config import context as contexts
@@ -53,7 +62,7 @@ def use(
     address: Annotated[
         str | None, typer.Argument(metavar="ADDRESS", help="Address of the robot or router, e.g. tcp/ROBOT:7447.")
     ] = None,
-    robot: Annotated[str, typer.Option("--robot", metavar="ID", help="Robot id.")] = contexts.DEFAULT_ROBOT,
+    robot: RobotName = None,
     *,
     secure: Secure = "",
     clear: Annotated[bool, typer.Option("--clear", help="Remove the saved address.")] = False,
@@ -64,6 +73,8 @@ def use(
 
     Client commands use --connect, else SIGHTLINE_CONNECT, else this address. Services ignore it.
     """
+    if address is None:
+        _check_alone({f"--robot {robot}": robot is not None, f"--secure {secure}": secure, "--no-check": no_check})
     path = contexts.context_path(os.environ)
     if path is None:
         raise ConfigError("this user has no home folder; set XDG_CONFIG_HOME to a folder that you may write")
@@ -77,11 +88,19 @@ def use(
         _show_target(as_json)
         return
     check_endpoint(address)
+    robot = contexts.DEFAULT_ROBOT if robot is None else robot
     context = contexts.Context(address, check_robot_id(robot), _folder(secure))
     note = "" if no_check else _answer(context)
     contexts.write_context(path, context)
     saved = f"saved robot {robot} at {address} to {contexts.shown(path)}{note}"
     _print_use({"connect": address, "robot": robot, "secure": context.secure, "file": str(path)}, saved, as_json)
+
+
+def _check_alone(given: Mapping[str, object]) -> None:
+    """Raise ConfigError for the first option that is given, without ADDRESS."""
+    option = next((option for option, is_given in given.items() if is_given), "")
+    if option:
+        raise ConfigError(f"{option.split()[0]} needs ADDRESS; write sightline use ADDRESS {option}")
 
 
 def _show_target(as_json: bool) -> None:
@@ -244,6 +263,7 @@ def doctor(
     if "/" in robot:
         raise ConfigError(f"robot '{robot}' is an address; run `sightline doctor --peer {robot}`")
     check_robot_id(robot)
+    check_camera_sets(camera, camera_sets)
     if peer is not None:
         check_endpoint(peer)
     found: list[Finding] = []

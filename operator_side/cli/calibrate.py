@@ -28,6 +28,7 @@ from sightline.operator_side.cli.options import (
     Secure,
     ServiceConnect,
     Sets,
+    check_camera_sets,
     command_group,
     numbers,
 )
@@ -203,6 +204,7 @@ def camera(
     Use a chessboard, or a ball of known size and distance. Images come from --pictures, --camera or a running robot.
     """
     check_out_file(out)
+    check_camera_sets(camera, camera_sets)
     wanted = _subject(board, square_m, ball_radius_m, distance_m)
     given = {"x_m": x_m, "y_m": y_m, "z_m": z_m, "pitch_rad": pitch_rad}
     with needs("vision"), ExitStack() as ending:

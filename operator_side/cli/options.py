@@ -101,6 +101,12 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+def check_camera_sets(camera: str | None, camera_sets: list[str] | None) -> None:
+    """Raise ConfigError for options of no camera."""
+    if camera_sets and camera is None:
+        raise ConfigError("--camera-set needs --camera; name a camera, e.g. --camera v4l2")
+
+
 def numbers(option: str, text: str, kind: Callable[[str], Number]) -> list[Number]:
     """Read the numbers of an option, separated by commas. Raises ConfigError with an example."""
     try:

@@ -28,6 +28,7 @@ from sightline.operator_side.cli.options import (
     ServiceConnect,
     Sets,
     SocketDir,
+    check_camera_sets,
     command_group,
 )
 from sightline.operator_side.config.context import target_of
@@ -218,8 +219,7 @@ def vision(
 def _check_vision_options(camera: str | None, camera_sets: list[str] | None, *, dry_run: bool, share: bool) -> None:
     if camera is not None and not dry_run:
         raise ConfigError("--camera has no robot to steer; add --dry-run")
-    if camera_sets and camera is None:
-        raise ConfigError("--camera-set needs --camera; name a camera, e.g. --camera v4l2")
+    check_camera_sets(camera, camera_sets)
     if share and dry_run:
         raise ConfigError("--share has no robot to steer with --dry-run; leave one of them out")
 
@@ -233,7 +233,15 @@ def _measured(run: Any, config: Any, where: str) -> int:
         return int(run(config, observe))
 
 
-def router(listen: Listen = None, connect: ServiceConnect = None, secure: Secure = "", log: LogForm = None) -> int:
+def router(
+    listen: Annotated[
+        list[str] | None,
+        typer.Option("--listen", metavar="ENDPOINT", help="Listen here, e.g. tcp/0.0.0.0:7447 or tls/0.0.0.0:7447."),
+    ] = None,
+    connect: ServiceConnect = None,
+    secure: Secure = "",
+    log: LogForm = None,
+) -> int:
     """Run a router to which all machines of a site connect
 
     It runs until Ctrl-C. Robots, vision services and clients reach each other through it.

@@ -32,6 +32,9 @@ _limiter: Final = RepeatLimiter()
 
 def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
     """Serve until SIGTERM or SIGINT. Raises ConfigError and LinkError as `open_session` does."""
+    web = next((endpoint for endpoint in (*listen, *connect) if "://" in endpoint), "")
+    if web:
+        raise ConfigError(f"a router takes no WebSocket endpoint ({web}); let the robot listen on ws://")
     check_zenoh_endpoints(listen, connect)
     stop_addresses = own_stop_addresses(listen)
     secured = load_role_keys(secure, ROBOT_ROLE)

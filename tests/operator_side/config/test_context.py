@@ -186,6 +186,10 @@ def test_use_saves_shows_and_clears_an_address(capsys, home):
     (("here",), 2, "'here'"),
     ((ADDRESS, "--robot", "a/b"), 2, "'a/b'"),
     ((ADDRESS, "--clear"), 2, "--clear"),
+    (("--robot", "r2"), 2, "--robot needs ADDRESS; write sightline use ADDRESS --robot r2"),
+    (("--secure", "keys"), 2, "--secure needs ADDRESS; write sightline use ADDRESS --secure keys"),
+    (("--no-check",), 2, "--no-check needs ADDRESS; write sightline use ADDRESS --no-check"),
+    (("--clear", "--robot", "r2"), 2, "--robot needs ADDRESS"),
     (("tls/127.0.0.1:1", "--secure", "no-such-folder"), 2, "no-such-folder"),
 ])
 def test_invalid_use_is_one_line_and_saves_nothing(capsys, home, arguments, code, expected):
