@@ -90,8 +90,7 @@ class WireError(SightlineError):
 
 
 def home_path(path: "str | Path") -> "Path":
-    """Return `path` with the home folder in place of a first `~` or `~USER`. Raises ConfigError without such a folder.
-    """
+    """Return `path` with the home folder in place of a first `~` or `~USER`. Raises ConfigError for an unknown user."""
     from pathlib import Path  # imports delay STOP
 
     try:
