@@ -245,6 +245,7 @@ class SharedFleet(Fleet):
         own = VisionToken(config.share.name or f"vision-{instance}", round(config.share.weight, 3), instance)
         named = () if set("*?") & set(config.robot) else (config.robot,)
         self.sharing = Sharing(own, named)
+        self.sharing.on_link(True, monotonic_us())
         self._twin_reported = False
         fleet_link.watch_tokens(self._note)
         self._leave_services = fleet_link.declare_token(own)

@@ -44,7 +44,7 @@ ROBOT_RETURNS_US: Final = 2_000_000
 counts as ended. A robot tries to connect once a second, or more often."""
 SERVICE_RETURNS_US: Final = 300_000
 """The same for tokens of services and drivers. A service may have died with its router, and its robots stand. One that
-returns later gets its robots back."""
+returns later gets its robots back. As long, nothing is claimed: the token of a driver may follow that of its robot."""
 MAX_ROBOTS, MAX_SERVICES, MAX_DRIVERS = 10_000, 256, 16
 """Security limits: robots, services, and drivers of one robot. Further tokens do not count."""
 MAX_OWN: Final = 2 * MAX_ROBOTS
@@ -140,7 +140,7 @@ class Sharing:
         self._services: set[VisionToken] = set()
         self._choices: dict[str, tuple[str, str]] = {}
         self._is_changed = True
-        self._is_up, self._up_us = True, 0
+        self._is_up, self._up_us = True, -SERVICE_RETURNS_US
         self._ended: set[Token] = set()
         """Tokens that ended with the link of this service, so that nothing is known of what they stand for."""
 
@@ -166,7 +166,7 @@ class Sharing:
         return {one.name: one.weight for one in present if not (self._is_leaving and one == self.own)}
 
     def on_link(self, is_up: bool, now_us: int) -> None:
-        """Note the end or the return of the link of this service. Until it is back, nothing changes."""
+        """Note the end or the begin of the link of this service. Until it is back, nothing changes."""
         self._is_up, self._up_us = is_up, now_us
         for robot in self.robots.values():
             robot.begin_part(now_us)
@@ -309,7 +309,8 @@ class Sharing:
         beside = SharingPart.STANDBY if is_choice else SharingPart.NONE
         if robot.part in (SharingPart.CLAIM, SharingPart.DRIVE):
             return beside if self._must_leave(name, robot) else robot.part
-        may_claim = not self._is_out and not self._changed_lately(robot, now_us) and self._is_next(name, robot, now_us)
+        may_claim = (not self._is_out and now_us - self._up_us >= SERVICE_RETURNS_US
+                     and not self._changed_lately(robot, now_us) and self._is_next(name, robot, now_us))
         return SharingPart.CLAIM if may_claim else beside
 
     @property
@@ -320,6 +321,8 @@ class Sharing:
         """Return True if another driver has the better claim."""
         # A silent driver counts again if it has the lease.
         others = robot.drivers if robot.is_not_mine else robot.others
+        if robot.is_not_mine and robot.tries > MAX_DOUBLINGS and robot.others:
+            return True  # it stays with a driver that has reasons to keep it, e.g. a mission
         if self._is_out or robot.is_busy:
             return bool(others) and (self._is_out or robot.is_not_mine)
         return any(other.name in self._before(name) for other in others)

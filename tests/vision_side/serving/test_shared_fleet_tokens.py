@@ -25,6 +25,7 @@ class Site:
         for robot in self.robots:
             self.note(RobotToken(robot), True)
         self.turn(count)
+        self.turn(ms=300)
 
     def on_new_robot(self, callback):
         pass

@@ -158,6 +158,32 @@ def test_an_owner_of_a_robot_without_driver_drives_in_one_step():
     assert sharing.step(0) == {"r1": DRIVE} and sharing.step(1) == {}
 
 
+@pytest.mark.parametrize("later_ms", [0, 20, 290])
+def test_a_service_that_starts_does_not_drive_beside_a_driver_whose_token_comes_after_that_of_the_robot(later_ms):
+    sharing = Sharing(OWN)
+    sharing.on_link(True, 5_000 * MS)
+    sharing.on_token(RobotToken("r1"), True, 5_001 * MS)
+    assert sharing.step(5_001 * MS) == {"r1": STANDBY}
+    sharing.on_token(driver("r1"), True, (5_001 + later_ms) * MS)
+    assert sharing.step(5_300 * MS - 1) == {}
+    assert sharing.step(5_300 * MS) == {"r1": CLAIM}
+
+
+@pytest.mark.parametrize("is_beside", [False, True])
+def test_an_owner_without_the_lease_leaves_the_robot_to_a_driver_that_keeps_it(is_beside):
+    """A driver with a mission stays, and two that answer share the credit of the robot."""
+    robot = robot_whose("a", "b")
+    sharing, parts = service(robot), []
+    sharing.on_token(driver(robot), is_beside, 10 * MS)
+    for ms in range(0, 30_000, 100):
+        see(sharing, ms * MS, ms * (part(sharing) is DRIVE), accepted=ms)
+        sharing.step(ms * MS)
+        parts.append(part(sharing))
+    assert parts[:30] == [DRIVE] * 30
+    assert set(parts[35:70]) == {STANDBY if is_beside else DRIVE}
+    assert set(parts[75:]) == {CLAIM if is_beside else DRIVE}
+
+
 @pytest.mark.parametrize(("order", "after_ms"), [("ba", 1_500), ("bca", 2_500), ("bcda", 3_500), ("bcdea", 3_500)])
 @pytest.mark.parametrize("begin_ms", [0, 7_000])
 def test_choice_claims_a_robot_without_a_driver_after_its_turn(order, after_ms, begin_ms):
