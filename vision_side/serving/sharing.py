@@ -75,6 +75,7 @@ class SharedRobot:
     driverless_us: int = 0
     """When the token of a driver ended last, or this robot became known."""
     changed_us: int = -BETWEEN_CHANGES_US << MAX_DOUBLINGS
+    renewed_us: int = -BETWEEN_CHANGES_US << MAX_DOUBLINGS
     tries: int = 0
     """Claims and new sessions since this service last held the lease. Each one waits twice as long."""
     arrived: int = _UNKNOWN
@@ -255,10 +256,13 @@ class Sharing:
         """Return True if this service drives but the robot no longer accepts its session, at most once a second."""
         one = self.robots[robot]
         stale = one.is_not_mine or one.sent - one.held >= FRESH_COMMANDS
-        if one.part is not SharingPart.DRIVE or not stale or self._changed_lately(one, now_us):
+        # Without another driver its claim does not count: a robot that lost a router ends sessions of any age.
+        before_us = one.changed_us if one.drivers else one.renewed_us
+        if one.part is not SharingPart.DRIVE or not stale or _is_within_wait(before_us, one.tries, now_us):
             return False
         one.begin_session(now_us)
-        one.changed_us, one.tries = now_us, one.tries + 1
+        one.changed_us = one.renewed_us = now_us
+        one.tries += 1
         return True
 
     def is_about_to_drive(self, robot: str, now_us: int) -> bool:
@@ -266,10 +270,6 @@ class Sharing:
         one = self.robots.get(robot)
         return (one is not None and one.part is SharingPart.CLAIM
                 and now_us - one.changed_us < BETWEEN_CHANGES_US)
-
-    @staticmethod
-    def _changed_lately(robot: SharedRobot, now_us: int) -> bool:
-        return now_us - robot.changed_us < BETWEEN_CHANGES_US << min(max(0, robot.tries - 1), MAX_DOUBLINGS)
 
     def step(self, now_us: int) -> dict[str, SharingPart]:
         """Decide the part in each robot from now on. Returns the robots whose part changed."""
@@ -309,8 +309,8 @@ class Sharing:
         beside = SharingPart.STANDBY if is_choice else SharingPart.NONE
         if robot.part in (SharingPart.CLAIM, SharingPart.DRIVE):
             return beside if self._must_leave(name, robot) else robot.part
-        may_claim = (not self._is_out and now_us - self._up_us >= SERVICE_RETURNS_US
-                     and not self._changed_lately(robot, now_us) and self._is_next(name, robot, now_us))
+        waits = now_us - self._up_us < SERVICE_RETURNS_US or _is_within_wait(robot.changed_us, robot.tries, now_us)
+        may_claim = not self._is_out and not waits and self._is_next(name, robot, now_us)
         return SharingPart.CLAIM if may_claim else beside
 
     @property
@@ -342,3 +342,7 @@ class Sharing:
             return self.own.name == owner or has_no_driver or robot.is_silent
         # The third choice after 2.5 s, all others a second later.
         return has_no_driver and waited_us // BETWEEN_CHANGES_US >= min(2, len(self._before(name)) - 1)
+
+
+def _is_within_wait(changed_us: int, tries: int, now_us: int) -> bool:
+    return now_us - changed_us < BETWEEN_CHANGES_US << min(max(0, tries - 1), MAX_DOUBLINGS)

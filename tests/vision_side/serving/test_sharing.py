@@ -245,6 +245,21 @@ def test_a_join_and_an_orderly_end_leave_no_gap_and_no_two_drivers(seed):
     assert site.worst_gap_ms(began_us) <= 150 and site.doubled == doubled
 
 
+@pytest.mark.parametrize("after_ms", [30, 250, 600, 1_200])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_session_that_a_robot_ended_soon_after_a_change_is_followed_within_half_a_second(seed, after_ms):
+    """A robot that loses one of its routers sees the end of tokens that are declared again behind the other one."""
+    site = Site(robots(12), SERVICES, seed)
+    site.join("d")
+    site.run(after_ms)
+    began_us = site.now_us
+    for robot in site.robots.values():
+        robot.fenced.add(robot.holder)
+        robot.holder = ""
+    site.run(2_500).assert_owners_drive()
+    assert site.worst_gap_ms(began_us) <= 500
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_a_service_that_hangs_is_succeeded_and_drives_its_robots_again_later(seed):
     site = Site(robots(12), SERVICES, seed)

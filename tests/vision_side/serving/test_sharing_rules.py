@@ -649,11 +649,20 @@ def test_time_without_the_lease_counts_from_the_last_reason_to_have_none(changed
     assert see(sharing, 1_300 * MS, 4)
 
 
-def test_no_new_session_while_no_command_leaves_or_within_a_second_of_the_claim():
+def beside(is_beside):
+    """Return a service that drives, perhaps beside another driver, which may have the lease."""
     sharing = driven()
+    (robot,) = sharing.robots
+    sharing.on_token(driver(robot), is_beside, 0)
+    return sharing
+
+
+@pytest.mark.parametrize(("is_beside", "after_ms"), [(True, 1_000), (False, 300)])
+def test_no_new_session_while_no_command_leaves_or_soon_after_the_claim(is_beside, after_ms):
+    sharing = beside(is_beside)
     assert not any(see(sharing, ms * MS, 7) for ms in range(0, 5_000, 100))
-    sharing = driven()
-    assert next(us for us in range(0, 9_000 * MS, 50 * MS) if see(sharing, us, us)) == 1_000 * MS
+    sharing = beside(is_beside)
+    assert next(ms for ms in range(0, 9_000, 50) if see(sharing, ms * MS, ms // 30)) == after_ms
 
 
 @pytest.mark.parametrize(("count", "needed"), [(47, False), (48, True)])
@@ -668,11 +677,12 @@ def test_a_new_session_after_48_commands_without_the_lease(count, needed):
     assert not see(driven(), 1_010 * MS, 90, mine=True), "it has the lease"
 
 
-def test_waits_for_new_sessions_double_to_4_s_and_end_with_the_lease():
-    sharing, begun_ms = driven(), []
+@pytest.mark.parametrize(("is_beside", "first_ms"), [(True, 1_000), (False, 300)])
+def test_waits_for_new_sessions_double_to_4_s_and_end_with_the_lease(is_beside, first_ms):
+    sharing, begun_ms = beside(is_beside), []
     for ms in range(0, 20_000, 50):
-        begun_ms += [ms] if see(sharing, ms * MS, ms) else []
-    assert begun_ms == [1_000, 3_000, 7_000, 11_000, 15_000, 19_000]
+        begun_ms += [ms] if see(sharing, ms * MS, ms // 30) else []
+    assert begun_ms == [first_ms + wait_ms for wait_ms in (0, 2_000, 6_000, 10_000, 14_000, 18_000)]
     assert not see(sharing, 20_000 * MS, 1, mine=True)
     begun_ms = [ms for ms in range(23_000, 28_000, 50) if see(sharing, ms * MS, ms)]
     assert begun_ms == [23_000, 24_000, 26_000]
@@ -688,8 +698,7 @@ def test_commands_count_from_the_begin_of_a_session():
         see(sharing, 2_940 * MS, count + 1)
         assert see(sharing, 3_050 * MS, 5) is needed, "the first status of a new session showed no command of it"
         sharing = driven()
-        see(sharing, 900 * MS, count)
-        assert see(sharing, 1_000 * MS, 5) is needed
+        assert (see(sharing, 900 * MS, count) or see(sharing, 1_000 * MS, 5)) is needed
 
 
 def test_standby_needs_no_session():
