@@ -12,8 +12,9 @@ from sightline.protocol.proof import NO_PROOF, Proof, continues, tokens_of
 RANKS = {"guest": 0, "vision": 1, "teleop": 2}
 # After the loss of one of these drivers, the robot stops and must be armed again.
 HUMANS = frozenset({"teleop"})
-# Security limits: tokens of drivers, and sessions that drive no more. The token of the holder leaves last.
-_MAX_TOKENS, _MAX_FENCED = 64, 64
+# Security limits: tokens of drivers, sessions that drive no more, and sessions whose token is known. The token of the
+# holder leaves last.
+_MAX_TOKENS, _MAX_FENCED, _MAX_KNOWN = 64, 64, 64
 
 
 @dataclass(slots=True)
@@ -36,6 +37,8 @@ class Lease:
     _tokens: OrderedDict[str, None] = field(default_factory=OrderedDict)
     _fenced: OrderedDict[Holder, None] = field(default_factory=OrderedDict)
     """Sessions whose token ended while they held the lease, or that were succeeded. A late command never drives."""
+    _known: OrderedDict[Holder, str] = field(default_factory=OrderedDict)
+    """Tokens of the sessions that held the lease: later proofs no longer show them."""
 
     def live_holder(self, now_us: int) -> Holder | None:
         """Return the driver that holds the lease now."""
@@ -74,9 +77,8 @@ class Lease:
         if holder != who:
             if holder is not None and holder.source == who.source:
                 self._fence(holder)
-            # The same session keeps its token after a silence: its first proofs are long ago.
-            if who != self.holder or not self.token:
-                self.token = "" if who.source in HUMANS else self._token_of(proof)
+            self.token = "" if who.source in HUMANS else self._known_token(who) or self._token_of(proof)
+            self._remember(who)
         self.holder, self.expires_us, self.proof = who, now_us + self.life_us, proof
 
     def advance(self, who: Holder, proof: Proof, now_us: int) -> None:
@@ -107,6 +109,18 @@ class Lease:
     def _token_of(self, proof: Proof) -> str:
         """Return the token whose driver revealed `proof`, or "" without one."""
         return next((token for token in tokens_of(proof.proof) if token in self._tokens), "")
+
+    def _known_token(self, who: Holder) -> str:
+        """Return the token with which a session held the lease before, also if a human drove since, or ""."""
+        token = self._known.get(who, "")
+        return token if token in self._tokens else ""
+
+    def _remember(self, who: Holder) -> None:
+        if self.token:
+            self._known[who] = self.token
+            self._known.move_to_end(who)
+            if len(self._known) > _MAX_KNOWN:
+                self._known.popitem(last=False)
 
     def _fence(self, who: Holder) -> None:
         self._fenced[who] = None

@@ -238,6 +238,33 @@ def test_holder_that_takes_the_lease_again_keeps_its_token(gap_us):
     assert lease.token == first.token
 
 
+def test_driver_keeps_its_token_over_a_human_and_over_a_stop():
+    human = Holder(source="teleop", session="0000000f")
+    for between in (lambda lease: lease.take(human, 1_000), lambda lease: None):
+        lease, first = held()
+        between(lease)
+        lease.drop()
+        lease.take(first.who, 9_000, first.later(500))
+        assert lease.token == first.token
+        lease.drop()
+        lease.end_token(first.token, 9_500)
+        lease.take(first.who, 10_000, first.later(501))
+        assert lease.token == "", "a token that ended is of nobody"
+
+
+@pytest.mark.parametrize(("others", "known"), [(63, True), (64, False)])
+def test_tokens_of_sixty_four_former_drivers_are_known(others, known):
+    lease, first = held()
+    for number in range(others):
+        lease.drop()
+        other = Vision(number + 2)
+        lease.add_token(other.token)
+        lease.take(other.who, 0, other.proof)
+        lease.end_token(other.token, 0)
+    lease.take(first.who, 0, first.later(500))
+    assert (lease.token == first.token) is known
+
+
 def test_succeeded_driver_is_fenced_and_one_whose_lease_ended_or_that_a_human_displaced_is_not():
     lease, first = held()
     second = Vision(2)
