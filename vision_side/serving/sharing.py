@@ -28,6 +28,9 @@ NO_DRIVER_US: Final = 1_500_000
 BETWEEN_CHANGES_US: Final = 1_000_000
 """Shortest time between two claims of one robot by one service. It doubles while they have no effect."""
 MAX_DOUBLINGS: Final = 2
+NO_FRAMES_US: Final = 2_500_000
+"""Time without a frame of the robot after which a driver without a command is silent. A camera that fails is named in
+`status` by then. A driver that does not subscribe to frames gets none either."""
 NOT_MINE_US: Final = 300_000
 """Time without the lease, although commands leave, after which a driver needs a new session."""
 FRESH_COMMANDS: Final = 48
@@ -86,11 +89,10 @@ class SharedRobot:
     """Time of the newest status."""
     active_us: int = _UNKNOWN
     """Last time at which the driver worked, or had no reason to."""
-    part_us: int = _UNKNOWN
+    worked_us: int = _UNKNOWN
+    """Last time at which the driver worked, or the begin of the part."""
     frames: int = _UNKNOWN
-    """Frames that the robot sent, as its newest status shows them."""
-    has_frames: bool = False
-    """True once it sent a frame since the part began. Before that, a driver has nothing to answer."""
+    """Frames that the robot had sent then, as its status showed them. Without a later one there is nothing to answer."""
     sent: int = _UNKNOWN
     """Commands of the session of this service."""
     held: int = _UNKNOWN
@@ -119,8 +121,8 @@ class SharedRobot:
 
     def begin_part(self, now_us: int) -> None:
         """Forget what the statuses showed before."""
-        self.active_us = self.part_us = now_us
-        self.has_frames, self.frames, self.status_us = False, _UNKNOWN, _UNKNOWN
+        self.active_us = self.worked_us = now_us
+        self.frames = self.status_us = _UNKNOWN
 
 
 class Sharing:
@@ -239,18 +241,18 @@ class Sharing:
         stream, arrived = status.stream, status.accepted + refused
         answered = stream.sent - stream.credit_timeouts
         one.answered = min(one.answered, stream.sent)  # after a restart of the robot they begin again
-        one.has_frames |= one.frames not in (_UNKNOWN, stream.sent)
-        waits = not one.has_frames and now_us - one.part_us < NO_DRIVER_US
         answers = answered > one.answered + stream.window
         one.answered = answered if answers else one.answered
-        if needs_no_driver or waits or answers or arrived != one.arrived:
+        if needs_no_driver or answers or arrived != one.arrived or one.frames == _UNKNOWN:
+            one.worked_us, one.frames = now_us, stream.sent
+        if stream.sent == one.frames and now_us - one.worked_us < NO_FRAMES_US:
             one.active_us = now_us
         one.arrived = arrived
         if is_mine or needs_no_driver or sent == one.sent:
             one.mine_us = now_us
         if is_mine:
             one.tries, one.held = 0, sent
-        one.frames, one.sent, one.status_us = stream.sent, sent, now_us
+        one.sent, one.status_us = sent, now_us
 
     def needs_session(self, robot: str, now_us: int) -> bool:
         """Return True if this service drives but the robot no longer accepts its session, at most once a second."""
