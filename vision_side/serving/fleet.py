@@ -217,9 +217,11 @@ class Fleet:
 
 
 _LONGEST_SHARED_WAIT_S = 0.02
-_TOKEN_ENDS_AFTER_US, _ROBOT_ENDS_AFTER_US = 5_000, 500_000
+_TOKEN_ENDS_AFTER_US, _ROBOT_ENDS_AFTER_US, _MISSION_ENDS_AFTER_US = 5_000, 500_000, 10_000_000
 """If the link ends, the tokens beyond it end before that is known: those of 200 robots for 0.1 s. A robot whose own
-link is cut for a moment is back so soon. The end of a driver or service must count at once."""
+link is cut for a moment is back so soon. Its requested mission goes on after a longer cut too, as without other
+services. The end of a driver or service must count at once."""
+_NEVER_US = 1 << 62
 _HANDS_OVER_WITHIN_S = 0.6
 _MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn, and ends that do not count yet
 
@@ -282,7 +284,11 @@ class SharedFleet(Fleet):
     def _drive_again(self, robot: str) -> None:
         self._renew(robot)
         if not self.services[robot].is_standby:
-            self.services[robot].begin()
+            self._begin(self.services[robot])
+
+    def _begin(self, service: Service) -> None:
+        service.begin()
+        self._bell.set()  # its first frame may wait there already
 
     def _take_tokens(self, now_us: int) -> None:
         """Note the tokens that came, and those whose end counts by now. Without a link each end counts at once."""
@@ -294,13 +300,21 @@ class SharedFleet(Fleet):
                     self._attempt(token.robot, self._drive_again)
                 self.sharing.on_token(token, True, now_us)
             elif len(self._ends_us) < _MAX_TOKENS:
-                after_us = _ROBOT_ENDS_AFTER_US if isinstance(token, RobotToken) else _TOKEN_ENDS_AFTER_US
-                self._ends_us[token] = at_us + after_us
+                self._ends_us[token] = at_us + self._ends_after_us(token)
             else:
                 self.sharing.on_token(token, False, now_us)
         for token in [one for one, end_us in self._ends_us.items() if end_us <= now_us or not self._is_up]:
             del self._ends_us[token]
             self.sharing.on_token(token, False, now_us)
+
+    def _ends_after_us(self, token: Token) -> int:
+        """Return the time from the end of a token until it counts."""
+        if not isinstance(token, RobotToken):
+            return _TOKEN_ENDS_AFTER_US
+        if self.sharing.is_named(token.robot):
+            return _NEVER_US
+        service = self.services.get(token.robot)
+        return _MISSION_ENDS_AFTER_US if service is not None and service.has_request else _ROBOT_ENDS_AFTER_US
 
     def _turn_of(self, robot: str) -> None:
         super()._turn_of(robot)
@@ -329,7 +343,8 @@ class SharedFleet(Fleet):
             self._bell.set()
 
     def _wait(self) -> None:
-        self._bell.wait(_TOKEN_ENDS_AFTER_US / 1e6 if self._ends_us else _LONGEST_SHARED_WAIT_S)
+        next_end_s = (min(self._ends_us.values(), default=_NEVER_US) - monotonic_us()) / 1e6
+        self._bell.wait(min(max(0.001, next_end_s), _LONGEST_SHARED_WAIT_S))
         self._bell.clear()
 
     def _present(self) -> list[str]:
@@ -366,14 +381,15 @@ class SharedFleet(Fleet):
     def _carry_out(self, robot: str, service: Service, now_us: int) -> None:
         shared = self.sharing.robots.get(robot)
         part = shared.part if shared else SharingPart.NONE
-        if self.sharing.is_about_to_drive(robot, now_us):
-            service.listen()  # before the token, so that the former driver leaves when this one has frames
-        elif part is not SharingPart.DRIVE:
+        is_about_to_drive = self.sharing.is_about_to_drive(robot, now_us)
+        if part is not SharingPart.DRIVE and not (is_about_to_drive and service.is_standby):
             service.rest()
+        if is_about_to_drive:
+            service.listen()  # before the token, so that the former driver leaves when this one has frames
         if part in (SharingPart.CLAIM, SharingPart.DRIVE) and robot not in self._withdraw:
             self._renew(robot)
         if part is SharingPart.DRIVE and service.is_standby:
-            service.begin()
+            self._begin(service)
         if part in (SharingPart.NONE, SharingPart.STANDBY):
             self._withdraw_token(robot)
 

@@ -4,7 +4,7 @@
     part      subscribes to           its token of a driver   left when
     STANDBY   camera model, status    no                      the robot gets another owner or standby
     CLAIM     frames too              yes                     no other driver is left, or it is silent
-    DRIVE     the same                yes                     a better choice claims the robot
+    DRIVE     the same                yes                     a better choice claims it, or another one keeps the lease
 
 The owner claims; the former driver sees the token and leaves; then the owner drives, first by the newest frame. A claim
 that has no effect for a second, e.g. because a mission goes on, receives no more frames. So two services never look at
@@ -92,11 +92,13 @@ class SharedRobot:
     worked_us: int = _UNKNOWN
     """Last time at which the driver worked, or the begin of the part."""
     frames: int = _UNKNOWN
-    """Frames that the robot had sent then, as its status showed them. Without a later one there is nothing to answer."""
+    """Frames that the robot had sent then, as a status showed them. Without a later one there is nothing to answer."""
     sent: int = _UNKNOWN
     """Commands of the session of this service."""
     held: int = _UNKNOWN
     """Those when it last held the lease."""
+    has_held: bool = False
+    """True if this service held the lease since it drives."""
     mine_us: int = _UNKNOWN
     """Last time at which this service held the lease, or had no reason to."""
 
@@ -109,6 +111,11 @@ class SharedRobot:
     def is_silent(self) -> bool:
         """Return True if its statuses show no driver at work."""
         return self.status_us - self.active_us >= SILENT_US
+
+    @property
+    def is_kept(self) -> bool:
+        """Return True if this service drives beside a driver that has the lease, e.g. for a mission, and keeps it."""
+        return self.part is SharingPart.DRIVE and not self.has_held and self.is_not_mine and bool(self.others)
 
     @property
     def is_not_mine(self) -> bool:
@@ -158,6 +165,10 @@ class Sharing:
         self._own_drivers[token] = None
         if len(self._own_drivers) > MAX_OWN:
             del self._own_drivers[next(iter(self._own_drivers))]
+
+    def is_named(self, robot: str) -> bool:
+        """Return True if this service serves a robot also without a token of it."""
+        return robot in self._named
 
     def leave(self) -> None:
         """End the part of this service: each robot goes to the first other service that claims it."""
@@ -251,7 +262,7 @@ class Sharing:
         if is_mine or needs_no_driver or sent == one.sent:
             one.mine_us = now_us
         if is_mine:
-            one.tries, one.held = 0, sent
+            one.tries, one.held, one.has_held = 0, sent, True
         one.sent, one.status_us = sent, now_us
 
     def needs_session(self, robot: str, now_us: int) -> bool:
@@ -298,6 +309,7 @@ class Sharing:
             robot.changed_us, robot.tries = now_us, robot.tries + 1
         if part is SharingPart.DRIVE:
             robot.ignored |= robot.drivers
+            robot.has_held = False
             robot.begin_session(now_us)
         # Without a part, no status came: what it showed before is over. A standby knows that the driver is silent.
         if part is not SharingPart.CLAIM or robot.part is SharingPart.NONE:
@@ -310,7 +322,9 @@ class Sharing:
         is_choice = not self._is_out and self.own.name in self._choices[name]
         beside = SharingPart.STANDBY if is_choice else SharingPart.NONE
         if robot.part in (SharingPart.CLAIM, SharingPart.DRIVE):
-            return beside if self._must_leave(name, robot) else robot.part
+            if self._must_leave(name, robot):
+                return beside
+            return SharingPart.CLAIM if robot.is_kept else robot.part
         waits = now_us - self._up_us < SERVICE_RETURNS_US or _is_within_wait(robot.changed_us, robot.tries, now_us)
         may_claim = not self._is_out and not waits and self._is_next(name, robot, now_us)
         return SharingPart.CLAIM if may_claim else beside
@@ -323,8 +337,6 @@ class Sharing:
         """Return True if another driver has the better claim."""
         # A silent driver counts again if it has the lease.
         others = robot.drivers if robot.is_not_mine else robot.others
-        if robot.is_not_mine and robot.tries > MAX_DOUBLINGS and robot.others:
-            return True  # it stays with a driver that has reasons to keep it, e.g. a mission
         if self._is_out or robot.is_busy:
             return bool(others) and (self._is_out or robot.is_not_mine)
         return any(other.name in self._before(name) for other in others)

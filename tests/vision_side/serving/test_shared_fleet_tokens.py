@@ -3,10 +3,12 @@
 import pytest
 
 from sightline.protocol.transports.memory import MemoryNetwork
-from sightline.protocol.transports.tokens import RobotToken, VisionToken
+from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
 from sightline.vision_side.config import DetectorConfig, ShareConfig, VisionConfig
 from sightline.vision_side.serving import fleet as fleet_module
 from sightline.vision_side.serving.fleet import SharedFleet
+from sightline.vision_side.serving.service import Service
+from sightline.vision_side.serving.sharing import SharingPart
 
 MS = 1_000
 
@@ -14,11 +16,11 @@ MS = 1_000
 class Site:
     """A fleet and the robots whose tokens it sees."""
 
-    def __init__(self, monkeypatch, count):
+    def __init__(self, monkeypatch, count, pattern="r*"):
         self.now_us, self.connected, self.losses = 1_000_000, True, 0
         self._network, self.declared = MemoryNetwork(seed=1), []
         monkeypatch.setattr(fleet_module, "monotonic_us", lambda: self.now_us)
-        config = VisionConfig(robot="r*", connect=("tcp/127.0.0.1:1",), detector=DetectorConfig(kind="hsv"),
+        config = VisionConfig(robot=pattern, connect=("tcp/127.0.0.1:1",), detector=DetectorConfig(kind="hsv"),
                               share=ShareConfig(enabled=True, name="a"))
         self.fleet = SharedFleet(config, self, lambda _line: None)
         self.robots = [f"r{number}" for number in range(count)]
@@ -74,6 +76,45 @@ def test_robot_whose_own_link_was_cut_for_a_moment_gets_a_new_session_of_the_sam
     site.turn()
     assert (site.fleet.services["r0"] is before) is stays
     assert site.fleet.services["r0"].sender is not sender and not site.fleet.services["r0"].is_standby
+
+
+@pytest.mark.parametrize(("away_ms", "stays"), [(600, True), (9_900, True), (10_100, False)])
+def test_robot_with_a_requested_mission_keeps_it_for_ten_seconds(monkeypatch, away_ms, stays):
+    monkeypatch.setattr(Service, "has_request", True)
+    site = Site(monkeypatch, 1)
+    before = site.fleet.services["r0"]
+    site.note(RobotToken("r0"), False)
+    site.turn(away_ms // 10, ms=10)
+    site.note(RobotToken("r0"), True)
+    site.turn()
+    assert (site.fleet.services["r0"] is before) is stays
+
+
+@pytest.mark.parametrize("away_ms", [100, 600, 60_000])
+def test_robot_that_is_named_gets_a_new_session_of_the_same_service(monkeypatch, away_ms):
+    site = Site(monkeypatch, 1, pattern="r0")
+    before, sender = site.fleet.services["r0"], site.fleet.services["r0"].sender
+    site.note(RobotToken("r0"), False)
+    site.turn(away_ms // 20, ms=20)
+    site.note(RobotToken("r0"), True)
+    site.turn()
+    assert site.fleet.services["r0"] is before and before.sender is not sender and not before.is_standby
+
+
+def test_a_driver_that_gives_up_receives_frames_for_its_claim_and_answers_none(monkeypatch):
+    site = Site(monkeypatch, 1)
+    service, robot = site.fleet.services["r0"], site.fleet.sharing.robots["r0"]
+    assert not service.is_standby
+    site.note(DriverToken("r0", "b", "0" * 32), True)
+    robot.mine_us, robot.status_us, robot.active_us, robot.has_held = 0, site.now_us, site.now_us, False
+    site.turn()
+    assert robot.part is SharingPart.CLAIM and service.is_standby and service._is_subscribed
+    site.turn(120, ms=10)
+    assert robot.part is SharingPart.CLAIM and not service._is_subscribed
+    site.note(DriverToken("r0", "b", "0" * 32), False)
+    site.fleet._bell.clear()
+    site.turn(6)
+    assert not service.is_standby and site.fleet._bell.is_set(), "a frame may wait"
 
 
 def test_service_that_ends_counts_after_five_milliseconds(monkeypatch):
