@@ -10,7 +10,7 @@ from sightline.vision_side.detect.port import DetectFrame
 
 Memory = TypeVar("Memory")
 
-MAX_ROBOTS: Final = 256
+MAX_ROBOTS: Final = 1_000
 """Of which something is remembered, as many as a site meets: with fewer, robots that take turns would each be forgotten
 just before theirs. The robot that was not seen for the longest is forgotten first."""
 

@@ -8,6 +8,7 @@ A session that is not closed prevents the exit of the interpreter. Always use a 
 
 from __future__ import annotations
 
+import logging
 import secrets
 import threading
 import time
@@ -39,6 +40,7 @@ from sightline.protocol.transports.zenoh.session import close_without_waiting, o
 if TYPE_CHECKING:
     import zenoh
 
+_log: Final = logging.getLogger(__name__)
 
 # A close that takes longer is left to a daemon thread, so that no process hangs on a dead peer.
 CLOSE_S: Final = 1.5
@@ -352,8 +354,8 @@ class _ConnectedPeers:
 #     link = fleet_link.link("r1")
 
 
-# Security limit: robots of one fleet that are present at a time.
-MAX_ROBOTS: Final = 256
+# Security limit: robots of one fleet that are present at a time, as many as a router has sessions for.
+MAX_ROBOTS: Final = 1_000
 # A robot publishes ten statuses a second. One that is silent for longer has left. Its next status adds it again.
 LEFT_AFTER_S: Final = 10.0
 
@@ -411,6 +413,7 @@ class ZenohFleet(FleetLink):
         self._ending = ExitStack()
         self._ending.callback(session.close)
         self._heard_s: dict[str, float] = {}
+        self._is_full_logged = False
         self._on_new_robot: Callable[[], None] = lambda: None
         self._peers = _ConnectedPeers(session, self._ending)
 
@@ -492,7 +495,14 @@ class ZenohFleet(FleetLink):
             return
         is_new = parsed[0] not in self._heard_s
         if is_new and len(self._heard_s) >= MAX_ROBOTS:
+            self._log_full(parsed[0])
             return
         self._heard_s[parsed[0]] = time.monotonic()
         if is_new:
             self._on_new_robot()
+
+    def _log_full(self, robot: str) -> None:
+        if not self._is_full_logged:
+            self._is_full_logged = True
+            _log.warning("%s is not served: %d robots are present, the limit of one service; give each service a part "
+                         "of the robots with --robot", robot, MAX_ROBOTS)

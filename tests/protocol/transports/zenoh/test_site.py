@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from contextlib import ExitStack, contextmanager
+from types import SimpleNamespace
 
 import pytest
 import zenoh
@@ -14,7 +15,7 @@ import zenoh
 from sightline.operator_side.setup import keys
 from sightline.protocol.channels import ACK, FRAME, REQUEST, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
-from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
+from sightline.protocol.transports.zenoh.link import MAX_ROBOTS, open_fleet, open_zenoh
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
@@ -61,6 +62,16 @@ def test_missing_peer_raises_in_time_with_the_endpoint(transport, folder):
 def test_with_keys_no_other_transport_is_taken(transport, folder):
     with pytest.raises(ConfigError, match="has no TLS"):
         open_zenoh("r1", connect=[free_endpoint(f"{transport}/")], role="vision", secure=folder)
+
+
+def test_robots_beyond_the_limit_of_a_service_are_logged_once(caplog):
+    with open_fleet("r*", listen=[free_endpoint()], role="vision") as fleet:
+        for number in range(MAX_ROBOTS + 3):
+            fleet._note(SimpleNamespace(key_expr=f"sightline/r{number}/status"))
+        assert len(fleet.robots()) == MAX_ROBOTS
+    assert [one.getMessage() for one in caplog.records] == [
+        "r1000 is not served: 1000 robots are present, the limit of one service; give each service a part of the "
+        "robots with --robot"]
 
 
 def test_several_robots_and_vision_services_at_one_router_never_cross(tmp_path):
