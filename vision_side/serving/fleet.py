@@ -17,7 +17,7 @@ from fnmatch import fnmatchcase
 from sightline.protocol.channels import STATUS, Channel
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode
-from sightline.protocol.errors import ConfigError, WireError
+from sightline.protocol.errors import ConfigError, LinkError, WireError
 from sightline.protocol.log import report_fault
 from sightline.protocol.messages import LeaseHolder, Stamp, Status
 from sightline.protocol.transports.link import FleetLink, LatestSlot, Link, LinkWrapper, Message
@@ -183,12 +183,19 @@ class Fleet:
             notifying = _NotifyingLink(link, self._bell)
             self.services[robot] = self._open(config, notifying, self._detector)
             return
-        own = configured_detector(config) if self.services else None
+        own = self._another_detector(config) if self.services else None
         service = self.services[robot] = self._open(config, link, own or self._detector)
         arguments = (robot, service, own)
         thread = threading.Thread(target=self._serve_one, args=arguments, name=f"vision {robot}", daemon=True)
         self._threads[robot] = thread
         thread.start()
+
+    def _another_detector(self, config: VisionConfig) -> Detector:
+        """Open the detector of one more robot. If it does not open, that robot alone has failed: the first did."""
+        try:
+            return configured_detector(config)
+        except ConfigError as error:
+            raise LinkError(str(error)) from error
 
     def _serve_one(self, robot: str, service: Service, own: Detector | None) -> None:
         """Run a robot's thread until its service is dropped, and close its `own` detector at the end."""

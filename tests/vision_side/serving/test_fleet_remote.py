@@ -184,6 +184,25 @@ def test_an_error_in_one_robots_service_ends_it_alone_and_a_new_one_starts(monke
     assert caplog.text.count("RuntimeError: out of luck") == 2, "the line and its traceback, once"
 
 
+def test_a_detector_that_does_not_open_for_one_more_robot_costs_that_robot_alone(monkeypatch):
+    opened = []
+
+    def opens(config):
+        if config.robot == "r1":
+            raise ConfigError("no memory left on this GPU")
+        opened.append(config.robot)
+        return Hanging(config)
+
+    monkeypatch.setattr(fleet_module, "configured_detector", opens)
+    said = []
+    fleet = Fleet(VisionConfig(robot="r*", detector=DetectorConfig(kind="zenoh")), Quiet(3), said.append)
+    while len(fleet.services) < 2:  # on a busy machine a turn adds one
+        fleet.turn()
+    assert set(fleet.services) == {"r0", "r2"} and opened == ["r*", "r2"]
+    assert said == ["vision: r1: its service failed; a new one starts in 1 s"]
+    fleet._end()
+
+
 @pytest.mark.parametrize("error", [RuntimeError("a"), WireError("MALFORMED", "b"), OSError("c")])
 def test_a_service_that_fails_for_days_is_started_again_each_half_minute(monkeypatch, error):
     def fail(_service, _wait_s):
