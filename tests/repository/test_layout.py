@@ -73,7 +73,6 @@ SMALL_FILES = {  # with one importer, in their own folder: the reason why each i
     "robot_side/guardian/stop_receiver.py": "a process of its own",
     "robot_side/hardware/log_zero.py": "all that the guardian imports of the drive log",
     "robot_side/driver/persistence.py": "the STOP latch on disk: the one place that a restart depends on",
-    "robot_side/safety/lease.py": "a rule set of its own in the safety core, under strict limits",
 }
 
 

@@ -249,7 +249,7 @@ def test_driver_keeps_its_token_over_a_human_and_over_a_stop():
         lease.drop()
         lease.end_token(first.token, 9_500)
         lease.take(first.who, 10_000, first.later(501))
-        assert lease.token == "", "a token that ended is of nobody"
+        assert lease.token == "", "a token that ended has no driver"
 
 
 @pytest.mark.parametrize(("others", "known"), [(63, True), (64, False)])

@@ -228,7 +228,7 @@ def test_a_later_choice_takes_no_part_before_it_claims():
 def silent_after_ms(changed):
     """Pass `changed(ms)` to a standby after the statuses of a driver at work; return when it drives, None if never.
 
-    The robot sends one more frame, which nobody answers.
+    The robot sends one more frame, which has no answer.
     """
     robot = robot_whose("b", "a")
     sharing = service(robot, driver(robot))
