@@ -90,7 +90,7 @@ class SharedRobot:
     active_us: int = _UNKNOWN
     """Last time at which the driver worked, or had no reason to."""
     worked_us: int = _UNKNOWN
-    """Last time at which the driver worked, or the begin of the part."""
+    """Last time at which the driver worked, or the first status of this part."""
     frames: int = _UNKNOWN
     """Frames that the robot had sent then, as a status showed them. Without a later one there is nothing to answer."""
     sent: int = _UNKNOWN
@@ -115,7 +115,7 @@ class SharedRobot:
     @property
     def is_kept(self) -> bool:
         """Return True if this service drives beside a driver that has the lease, e.g. for a mission, and keeps it."""
-        return self.part is SharingPart.DRIVE and not self.has_held and self.is_not_mine and bool(self.others)
+        return not self.has_held and self.is_not_mine and bool(self.others)
 
     @property
     def is_not_mine(self) -> bool:
@@ -126,9 +126,8 @@ class SharedRobot:
         """Forget the commands of the session before."""
         self.mine_us, self.sent, self.held = now_us, 0, 0
 
-    def begin_part(self, now_us: int) -> None:
+    def begin_part(self) -> None:
         """Forget what the statuses showed before."""
-        self.active_us = self.worked_us = now_us
         self.frames = self.status_us = _UNKNOWN
 
 
@@ -183,7 +182,7 @@ class Sharing:
         """Note the end or the begin of the link of this service. Until it is back, nothing changes."""
         self._is_up, self._up_us = is_up, now_us
         for robot in self.robots.values():
-            robot.begin_part(now_us)
+            robot.begin_part()
             robot.driverless_us = now_us
             robot.begin_session(now_us)
 
@@ -313,7 +312,7 @@ class Sharing:
             robot.begin_session(now_us)
         # Without a part, no status came: what it showed before is over. A standby knows that the driver is silent.
         if part is not SharingPart.CLAIM or robot.part is SharingPart.NONE:
-            robot.begin_part(now_us)
+            robot.begin_part()
         robot.part = part
 
     def _next_part(self, name: str, robot: SharedRobot, now_us: int) -> SharingPart:
@@ -322,9 +321,8 @@ class Sharing:
         is_choice = not self._is_out and self.own.name in self._choices[name]
         beside = SharingPart.STANDBY if is_choice else SharingPart.NONE
         if robot.part in (SharingPart.CLAIM, SharingPart.DRIVE):
-            if self._must_leave(name, robot):
-                return beside
-            return SharingPart.CLAIM if robot.is_kept else robot.part
+            kept = SharingPart.CLAIM if robot.is_kept else robot.part
+            return beside if self._must_leave(name, robot) else kept
         waits = now_us - self._up_us < SERVICE_RETURNS_US or _is_within_wait(robot.changed_us, robot.tries, now_us)
         may_claim = not self._is_out and not waits and self._is_next(name, robot, now_us)
         return SharingPart.CLAIM if may_claim else beside

@@ -265,6 +265,18 @@ def test_tokens_of_sixty_four_former_drivers_are_known(others, known):
     assert (lease.token == first.token) is known
 
 
+def test_the_driver_that_held_the_lease_longest_ago_is_forgotten_first():
+    lease, first = held()
+    for number in range(100):
+        lease.drop()
+        other = Vision(number + 2)
+        lease.add_token(other.token)
+        lease.take(other.who, 0, other.proof)
+        lease.end_token(other.token, 0)
+        lease.take(first.who, 0, first.later(500))
+        assert lease.token == first.token
+
+
 def test_succeeded_driver_is_fenced_and_one_whose_lease_ended_or_that_a_human_displaced_is_not():
     lease, first = held()
     second = Vision(2)

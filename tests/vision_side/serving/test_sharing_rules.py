@@ -181,9 +181,51 @@ def test_an_owner_without_the_lease_leaves_the_robot_to_a_driver_that_keeps_it(i
         parts.append(part(sharing))
     assert parts[:3] == [DRIVE] * 3
     assert set(parts[3:]) == {CLAIM if is_beside else DRIVE}
+    assert sharing.robots[robot].tries == (2 if is_beside else 9)
     sharing.on_token(driver(robot), False, 30_000 * MS)
     sharing.step(30_000 * MS)
     assert part(sharing) is DRIVE, "at once"
+
+
+def test_an_owner_that_had_the_lease_stays_beside_another_driver_and_gives_up_only_after_its_next_begin():
+    robot = robot_whose("a", "b")
+    sharing, parts = service(robot), []
+    see(sharing, 100 * MS, 1, mine=True)
+    sharing.on_token(driver(robot), True, 110 * MS)
+    for ms in range(200, 3_000, 100):
+        see(sharing, ms * MS, ms // 30, accepted=ms)
+        sharing.step(ms * MS)
+        parts.append(part(sharing))
+    assert set(parts) == {DRIVE}
+    sharing.robots[robot].is_busy = True  # a mission ends here, so that another one may drive
+    sharing.step(3_000 * MS)
+    assert part(sharing) is STANDBY
+    sharing.on_token(driver(robot), False, 9_000 * MS)
+    sharing.robots[robot].is_busy = False
+    sharing.step(9_000 * MS)
+    assert part(sharing) is DRIVE
+    sharing.on_token(driver(robot, 2), True, 9_010 * MS)
+    for ms in range(9_100, 9_500, 100):
+        see(sharing, ms * MS, ms // 30, accepted=ms)
+        sharing.step(ms * MS)
+    assert part(sharing) is CLAIM
+
+
+@pytest.mark.parametrize(("at_us", "waits"), [(2_499_999, True), (2_500_000, False)])
+def test_time_without_frames_ends_after_2_5_s(at_us, waits):
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    for us in (0, at_us):
+        see(sharing, us, sent=1)
+    assert (sharing.robots[robot].active_us == at_us) is waits
+
+
+def test_one_frame_without_an_answer_is_no_sign_of_the_driver():
+    robot = robot_whose("b", "a")
+    sharing = service(robot, driver(robot))
+    for ms in (0, 100):
+        see(sharing, ms * MS, sent=1 + ms // 100, credit_timeouts=ms // 100)
+    assert sharing.robots[robot].active_us == 0
 
 
 @pytest.mark.parametrize(("order", "after_ms"), [("ba", 1_500), ("bca", 2_500), ("bcda", 3_500), ("bcdea", 3_500)])
@@ -343,11 +385,11 @@ def test_silence_from_the_time_as_driver_does_not_count_for_a_standby():
     robot = robot_whose("b", "a")
     sharing = service(robot)
     sharing.step(1_500 * MS)
-    for ms in range(3_000, 3_600, 100):
-        see(sharing, ms * MS, sent=1, accepted=1)
+    for count, ms in enumerate(range(3_000, 3_600, 100)):
+        see(sharing, ms * MS, sent=1 + count, credit_timeouts=count, accepted=1)
     sharing.on_token(driver(robot), True, 3_600 * MS)
     assert sharing.step(3_600 * MS) == {robot: STANDBY}
-    see(sharing, 3_650 * MS, sent=1, accepted=1)
+    see(sharing, 3_650 * MS, sent=7, credit_timeouts=6, accepted=1)
     assert sharing.step(3_650 * MS) == {}
 
 
@@ -599,6 +641,7 @@ def test_a_robot_that_joins_later_is_driven():
 
 def test_a_named_robot_needs_no_token_and_stays():
     assert Sharing(OWN, named=("old",)).step(0) == {"old": DRIVE}
+    assert [Sharing(OWN, named=("old",)).is_named(robot) for robot in ("old", "new")] == [True, False]
     robot = robot_whose("b", "a")
     sharing = Sharing(OWN, named=(robot,))
     for token in OTHERS:
