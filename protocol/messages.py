@@ -399,6 +399,7 @@ class MissionRequest(WireModel):
         default={},
         max_length=MAX_OPTIONS,
         description="from the configuration of the mission; a dot selects an entry of a table",
+        json_schema_extra={"additionalProperties": False},
     )
 
 

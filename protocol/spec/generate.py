@@ -135,10 +135,16 @@ def _type_of(schema: Schema) -> str:
     if schema.get("type") == "array":
         return _array(schema)
     if schema.get("type") == "object":
-        values = schema.get("additionalProperties") or next(iter(schema["patternProperties"].values()))
-        most = f" (at most {schema['maxProperties']})" if "maxProperties" in schema else ""
-        return f"object of {_type_of(values)}{most}"
+        return _object(schema)
     return " ".join([schema["type"], *_bounds(schema)])
+
+
+def _object(schema: Schema) -> str:
+    most = f" (at most {schema['maxProperties']})" if "maxProperties" in schema else ""
+    if "patternProperties" not in schema:
+        return f"object of {_type_of(schema['additionalProperties'])}{most}"
+    [(pattern, values)] = schema["patternProperties"].items()
+    return f"object of {_type_of(values)}{most}, names `{pattern}`"
 
 
 def _named(name: str) -> str:

@@ -97,6 +97,16 @@ def test_every_field_has_a_meaning_and_its_unit():
     assert schema.unit_of("seq") == schema.unit_of("session") == ""
 
 
+def test_schema_and_field_table_bound_the_names_of_mission_options():
+    """The vector `mission/option_name_upper` rejects another name."""
+    options = schema.json_schema()["$defs"]["MissionRequest"]["properties"]["options"]
+    (pattern,) = options["patternProperties"]
+    assert options["additionalProperties"] is False and not re.match(pattern, "A")
+    assert f"names `{pattern}`" in schema.field_tables()
+    clause = README.partition("**18.1")[2].partition("**18.2")[0]
+    assert f"`{pattern}`" in clause
+
+
 def test_every_clause_has_its_number_once():
     headings = re.findall(r"^## (\d+)\. ", README, re.MULTILINE)
     clauses = re.findall(r"\*\*(\d+\.\d+)\b", README)
