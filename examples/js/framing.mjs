@@ -18,7 +18,7 @@ const PASSED_ON = new Set(["detections", "mission", "report", "overlay", "previe
 const UTF8 = new TextDecoder("utf-8", { fatal: true, ignoreBOM: true });
 const LATIN1 = new TextDecoder("latin1");
 const ALONE = /^\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{0,64})")?\}/;
-const FIRST = /^\{"channel":"([^"\\]{1,64})",(?=")/;
+const FIRST = /^\{"channel":"([^"\\]{1,64})",/;
 
 /** The connection must end with this close code; the message is the reason, one line for a person. */
 export class PeerError extends Error {

@@ -137,6 +137,9 @@ def _messages() -> list[FramingCase]:
         _message("no_header_role", "the hello's role is the source", framed(b'{"channel":"twist"}'), role="guest"),
         _message("header_after_it", "what follows is the header as it is", framed(alone + packed(ANSWER)), role=""),
         _message("header_broken", "the header is rejected later", framed(b'{"channel":"twist","v":1,')),
+        _message("header_empty", "nothing follows the channel", framed(b'{"channel":"twist",}')),
+        _message("header_junk", "no quote follows the channel", framed(b'{"channel":"twist",junk')),
+        _message("header_blank", "a blank follows the channel", framed(b'{"channel":"twist", "v":1,,}')),
         _message("source_of_header", "a header's source is before the role's", framed(TWIST_BLOCK), role="teleop"),
         _message("source_of_role", "no source in the header", framed(b'{"channel":"twist",' + packed(
             without(ANSWER, "source"))[1:])),

@@ -28,7 +28,7 @@ MAX_HELLO_BYTES: Final = 1024
 
 _LENGTH_BYTES: Final = 2
 _WITHOUT_SOURCE: Final = frozenset(name.encode("ascii") for name, row in CHANNELS.items() if not row.has_source)
-_FIRST: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})",(?=")')
+_FIRST: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})",')
 _ALONE: Final = re.compile(rb'\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{0,64})")?\}')
 
 

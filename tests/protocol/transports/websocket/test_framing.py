@@ -57,9 +57,10 @@ def test_source_in_a_header_from_a_robot_is_ignored():
     assert unpack(framed(b'{"channel":"frame","v":1,"source":"vision"}'), "r1", "").key == "sightline/r1/frame"
 
 
-def test_unreadable_header_is_passed_to_the_receiver():
-    packet = unpack(framed(b'{"channel":"twist","v":1,'), "r1", "vision")
-    assert packet == IncomingMessage("sightline/r1/twist/vision", b'{"v":1,', b"0|0")
+@pytest.mark.parametrize("rest", [b'"v":1,', b"}", b"junk", b' "v":1,,}', b""])
+def test_unreadable_header_is_passed_to_the_receiver(rest):
+    packet = unpack(framed(b'{"channel":"twist",' + rest), "r1", "vision")
+    assert packet == IncomingMessage("sightline/r1/twist/vision", b"{" + rest, b"0|0")
 
 
 @pytest.mark.parametrize(
