@@ -14,6 +14,7 @@ import { FrameReader, OPCODE, closePayload, encodeFrame } from "./rfc6455.mjs";
 const GUID = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"; // RFC 6455, 1.3
 const PING_MS = 1000; // of silence of the other end
 const SILENT_MS = 2000;
+const STALLED_MS = 30_000; // for the end of a message whose bytes the other machine takes slowly, or not at all
 const CHECK_MS = 250;
 const CLOSE_MS = 1000;
 export const OPEN_MS = 2000; // security limit: for the HTTP handshake, and once more for the hello
@@ -34,8 +35,9 @@ export class Connection {
     this.next = () => undefined; // gives the next message to send, when there is room
     this.onMessage = () => undefined;
     this.onEnd = () => undefined;
-    this.writing = this.closing = this.pinged = false;
+    this.writing = this.closing = this.pinged = this.pingDue = false;
     this.heard_ms = performance.now();
+    this.began_ms = this.waited_ms = -Infinity; // the newest write, and the newest one that had to wait for room
     this.pong = null; // only the newest ping is answered: who pings without reading piles nothing up
     socket.setNoDelay(true);
     socket.on("data", (chunk) => this.read(chunk));
@@ -47,6 +49,7 @@ export class Connection {
 
   read(chunk) {
     this.heard_ms = performance.now();
+    this.waited_ms = -Infinity;
     this.pinged = false;
     try {
       for (const event of this.reader.feed(chunk)) this.onEvent(event);
@@ -76,27 +79,41 @@ export class Connection {
     this.pump();
   }
 
-  /** Ping an end that is silent; whatever it sends shows that it is there. */
+  /**
+   * Ping an end that is silent; whatever it sends shows that it is there. An end for which a write waits is slow, not
+   * gone, and so is one that still has to read what waited: it gets the ping only after that.
+   */
   check() {
-    const silent_ms = performance.now() - this.heard_ms;
-    if (silent_ms >= SILENT_MS) this.close(1011, "silent for too long");
-    if (silent_ms < PING_MS || this.pinged) return;
-    this.pinged = true;
-    this.write(OPCODE.PING, EMPTY);
+    const now_ms = performance.now();
+    if (this.writing) this.waited_ms = this.began_ms;
+    const isSlow = now_ms - this.waited_ms < STALLED_MS;
+    if (now_ms - this.heard_ms >= SILENT_MS && !isSlow) this.close(1011, "silent for too long");
+    if (now_ms - this.heard_ms < PING_MS || this.pinged) return;
+    this.pinged = this.pingDue = true;
+    this.pump();
   }
 
   /** Send what waits, one message at a time, each only once the one before has left for the kernel. */
   pump() {
     if (this.writing || this.closing) return;
-    const message = this.pong ?? this.next();
-    if (message === undefined) return;
-    const opcode = this.pong !== null ? OPCODE.PONG : typeof message === "string" ? OPCODE.TEXT : OPCODE.BINARY;
-    this.pong = null;
+    const [opcode, payload] = this.nextFrame();
+    if (payload === undefined) return;
     this.writing = true;
-    this.write(opcode, typeof message === "string" ? Buffer.from(message) : message, () => {
+    this.began_ms = performance.now();
+    this.write(opcode, payload, () => {
       this.writing = false;
       this.pump();
     });
+  }
+
+  nextFrame() {
+    const { pong, pingDue } = this;
+    this.pong = null;
+    if (pong !== null) return [OPCODE.PONG, pong];
+    this.pingDue = false;
+    if (pingDue) return [OPCODE.PING, EMPTY];
+    const message = this.next();
+    return typeof message === "string" ? [OPCODE.TEXT, Buffer.from(message)] : [OPCODE.BINARY, message];
   }
 
   write(opcode, payload, done) {

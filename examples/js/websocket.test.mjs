@@ -18,10 +18,15 @@ class Rig {
     this.now_ms = 0;
     this.written = [];
     this.ends = [];
+    this.isFull = false; // whether the kernel takes nothing at once
     this.socket = Object.assign(new EventEmitter(), {
       writable: true,
       setNoDelay: () => undefined,
-      write: (frame) => this.written.push(frame[0] & 0x0f),
+      write: (frame, taken) => {
+        this.written.push(frame[0] & 0x0f);
+        if (this.isFull) this.taken = taken;
+        else taken?.();
+      },
       end: () => undefined, // the other end keeps its half open
       destroy: () => this.socket.emit("close"),
     });
@@ -65,5 +70,41 @@ test("a peer whose only word is a late pong stays, a silent one is left after 2 
   rig.pass(1900);
   assert.deepEqual(rig.ends, []);
   rig.pass(900);
+  assert.deepEqual(rig.ends, [1011]);
+});
+
+test("a peer that takes data slowly and answers no ping stays; it is pinged between messages", (t) => {
+  const rig = new Rig(t);
+  rig.isFull = true;
+  rig.connection.next = () => Uint8Array.of(1);
+  rig.connection.pump();
+  rig.pass(100_000, (now_ms) => now_ms % 5000 === 0 && rig.taken());
+  assert.deepEqual(rig.ends, []);
+  assert.deepEqual(rig.written.slice(0, 4), [OPCODE.BINARY, OPCODE.PING, OPCODE.BINARY, OPCODE.BINARY]);
+});
+
+test("a peer that takes nothing for 30 s is left", (t) => {
+  const rig = new Rig(t);
+  rig.isFull = true;
+  rig.connection.next = () => Uint8Array.of(1);
+  rig.connection.pump();
+  rig.pass(29_900);
+  assert.deepEqual(rig.ends, []);
+  rig.pass(900);
+  assert.deepEqual(rig.ends, [1011]);
+});
+
+test("a peer that took what waited may read it first; after that it is silent", (t) => {
+  const rig = new Rig(t);
+  rig.isFull = true;
+  rig.connection.next = () => (rig.isFull ? Uint8Array.of(1) : undefined);
+  rig.connection.pump();
+  rig.pass(3000);
+  rig.isFull = false;
+  rig.taken();
+  rig.pass(20_000);
+  assert.deepEqual([rig.ends, rig.written.at(-1)], [[], OPCODE.PING]);
+  rig.client(OPCODE.PONG);
+  rig.pass(2900);
   assert.deepEqual(rig.ends, [1011]);
 });
