@@ -10,6 +10,26 @@ import { findTarget } from "./vision.mjs";
 const NOTHING = new Uint8Array(0);
 /** Channels that these eyes want of a robot. */
 export const EYES_WANT = Object.freeze(["frame", "camera", "status", "reply"]);
+const DRIFT = 5000; // two quartz clocks differ by less than 1 in this
+
+/** How late a robot's messages come, without synchronized clocks: at least by what they lose on the fastest of the session. */
+export class RobotClock {
+  constructor() {
+    this.session = "";
+  }
+
+  /**
+   * Learn from a message at its arrival.
+   * @param {{session: string, t_us: number}} stamp @param {number} now_us
+   * @returns {number} its least possible age, in us
+   */
+  age_us({ session, t_us }, now_us) {
+    const drift_us = (now_us - this.heard_us) / DRIFT;
+    const learned_us = session === this.session ? this.offset_us + drift_us : Infinity;
+    Object.assign(this, { session, heard_us: now_us, offset_us: Math.min(learned_us, now_us - t_us) });
+    return now_us - t_us - this.offset_us;
+  }
+}
 
 export class Eyes {
   /**
@@ -19,12 +39,13 @@ export class Eyes {
    * @param {(name: string, header: object, payload: Uint8Array) => void} world.send
    * @param {() => number} world.now_us
    * @param {() => Promise<void>} [world.pause] lets what has arrived be read first, so that the newest frame wins
-   * @param {(what: object) => void} [world.onSeen] told of each answer: {target, twist}
+   * @param {(what: object) => void} [world.onSeen] told of each answer: {target, twist, age_us}, the least age of its frame
    * @param {(reply: object) => void} [world.onReply]
    */
   constructor(vision, { look, send, now_us, pause = async () => undefined, onSeen = () => undefined, onReply = () => undefined }) {
     Object.assign(this, { vision, look, send, now_us, pause, onSeen, onReply });
     this.drives = true; // otherwise frames are acknowledged only
+    this.clock = new RobotClock();
     this.newest = null;
     this.busy = false;
     this.skipped = {}; // reason -> count
@@ -48,7 +69,10 @@ export class Eyes {
   onNews({ channel, source, header, payload }) {
     const read = readMessage(channel, source, header, payload);
     if (channel.name === "camera") this.vision.onCamera(read.header, read.payload);
-    if (channel.name === "status") this.vision.onStatus(read.header, read.payload);
+    if (channel.name === "status") {
+      this.clock.age_us(read.header, this.now_us());
+      this.vision.onStatus(read.header, read.payload);
+    }
     if (channel.name === "reply" && read.payload.to === this.vision.digest) this.onReply(read.payload);
   }
 
@@ -56,8 +80,9 @@ export class Eyes {
   onFrame({ channel, header, payload }) {
     checkSizes(channel, header, payload);
     const stamp = decode(channel.header, header);
-    if (!this.vision.isNew(stamp, this.now_us())) throw new WireError("OUT_OF_ORDER", `frame ${stamp.seq} is not newer than the last`);
-    this.newest = { stamp, jpeg: payload, arrival_us: this.now_us() };
+    const arrival_us = this.now_us();
+    if (!this.vision.isNew(stamp, arrival_us)) throw new WireError("OUT_OF_ORDER", `frame ${stamp.seq} is not newer than the last`);
+    this.newest = { stamp, jpeg: payload, arrival_us, age_us: this.clock.age_us(stamp, arrival_us) };
     return this.busy ? undefined : this.work();
   }
 
@@ -73,13 +98,13 @@ export class Eyes {
   }
 
   /** The twist for a frame; null where it is only acknowledged: a bad picture, or nobody drives from here. */
-  async decide({ stamp, jpeg }) {
+  async decide({ stamp, jpeg, arrival_us, age_us }) {
     try {
       if (!this.vision.advances(stamp)) throw new WireError("OUT_OF_ORDER", "the robot's clock stands still");
       this.checkPicture(jpeg);
       const target = findTarget(await this.look(jpeg));
       const twist = this.drives ? this.vision.twistFor(target) : null;
-      this.onSeen({ target, twist });
+      this.onSeen({ target, twist, age_us: age_us + this.now_us() - arrival_us });
       return twist;
     } catch (error) {
       this.skip(error);

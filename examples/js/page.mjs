@@ -9,9 +9,10 @@ const write = (id, text) => {
   part(id).textContent = text;
 };
 const drawnAt_ms = []; // of the last second
+let newest_ms = 0; // least age of the newest image when it was drawn
 
 /** @param {object} what one thing that changed */
-function show({ link, status, reply, stop, target }) {
+function show({ link, status, reply, stop, target, age_us }) {
   if (link !== undefined) {
     write("link", link);
     part("link").className = link === "connected" ? "" : "lost";
@@ -21,6 +22,7 @@ function show({ link, status, reply, stop, target }) {
   if (stop !== undefined) write("news", stop);
   if (target !== undefined) {
     drawnAt_ms.push(performance.now());
+    newest_ms = age_us / 1000;
     markTarget(part("picture"), target);
   }
 }
@@ -37,15 +39,16 @@ function showStatus({ state, reason, holder, applied, frame_age_us, latency_us, 
   write("pictures", `${stream.sent} sent, ${viewer.eyes.answered} answered here, ${stream.credit_timeouts} unanswered in time`);
 }
 
-/** What stands still must be seen to stand still: the age grows while nothing comes. */
+/** What stands still, or comes late, must be seen to: the age grows while nothing comes. */
 function showAge() {
   const now_ms = performance.now();
   while (drawnAt_ms.length > 1 && drawnAt_ms[0] < now_ms - 1000) drawnAt_ms.shift();
   if (drawnAt_ms.length === 0) return;
-  const age_ms = now_ms - drawnAt_ms.at(-1);
-  const old = age_ms > OLD_MS;
-  part("figure").className = old ? "old" : "";
-  write("age", old ? `no image for ${(age_ms / 1000).toFixed(1)} s` : `${drawnAt_ms.length} images/s, the newest ${Math.round(age_ms)} ms ago`);
+  const since_ms = now_ms - drawnAt_ms.at(-1);
+  const age_ms = since_ms + newest_ms;
+  part("figure").className = age_ms > OLD_MS ? "old" : "";
+  const images = `${drawnAt_ms.length} images/s, at least ${Math.round(age_ms)} ms old`;
+  write("age", since_ms > OLD_MS ? `no image for ${(since_ms / 1000).toFixed(1)} s` : images);
 }
 
 const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/`;

@@ -15,7 +15,7 @@ const STOP_PERIOD_MS = 50;
 const STOP_SLOW_MS = 300; // a STOP that is not seen to work within this is told to the person
 const MOST_BUFFERED_BYTES = 65_536; // a browser queues without end; beyond this, commands are dropped
 
-/** One robot and one page. Told by `show(what)`: {link}, {status}, {reply}, {target, twist}, {stop}. */
+/** One robot and one page. Told by `show(what)`: {link}, {status}, {reply}, {target, twist, age_us}, {stop}. */
 export class Viewer {
   /**
    * @param {{url: string, robot: string, look: (jpeg: Uint8Array) => Promise<object>, show: (what: object) => void,

@@ -26,6 +26,12 @@ def test_javascript_unit_tests_pass():
     assert int(re.findall(r"^# pass (\d+)", run.stdout, re.MULTILINE)[0]) >= 90
 
 
+def test_page_shows_nothing_old_as_new():
+    run = subprocess.run([node(), "--test", str(Path(__file__).parent / "page.test.mjs")],
+                         check=False, capture_output=True, text=True, timeout=30)
+    assert run.returncode == 0, run.stdout[-4000:]
+
+
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: path.name)
 def test_files_are_short_and_state_their_purpose(path):
     source = path.read_text("utf-8")

@@ -1,0 +1,80 @@
+/** @file The viewer's page on elements, a socket and pictures that are only made up: what is old does not look new. */
+
+import assert from "node:assert/strict";
+import { beforeEach, mock, test } from "node:test";
+import { encode } from "../../../examples/js/codec.mjs";
+import { drawPicture } from "../../../examples/js/drawing.mjs";
+import { helloText, pack } from "../../../examples/js/framing.mjs";
+
+const SESSION = "0a1b2c3d";
+const JPEG = drawPicture({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
+const parts = {};
+const sockets = [];
+let now_ms = 10_000;
+let seq = 0;
+
+class FakeElement {
+  textContent = "";
+  className = "";
+
+  getContext() {
+    return { drawImage: () => undefined, getImageData: (x, y, width, height) => ({ data: new Uint8Array(4 * width * height) }) };
+  }
+}
+
+class FakeSocket {
+  bufferedAmount = 0;
+
+  constructor() {
+    sockets.push(this);
+  }
+
+  send() {}
+
+  close() {}
+}
+
+mock.timers.enable({ apis: ["setTimeout", "setInterval"] });
+mock.method(performance, "now", () => now_ms);
+Object.assign(globalThis, {
+  document: { getElementById: (id) => (parts[id] ??= new FakeElement()), addEventListener: () => undefined, body: { dataset: { robot: "r1" } } },
+  location: { protocol: "http:", host: "r1", hash: "" },
+  WebSocket: FakeSocket,
+  createImageBitmap: async () => ({ width: 8, height: 8, close: () => undefined }),
+});
+await import("../../../examples/js/page.mjs");
+
+function pass(ms) {
+  for (let left = ms; left > 0; left -= 50) {
+    now_ms += 50;
+    mock.timers.tick(50);
+  }
+}
+
+/** A message that the robot stamped `late_ms` ago by this clock. */
+async function receive(channel, payload, late_ms = 0) {
+  const header = { v: 1, session: SESSION, seq: (seq += 1), t_us: (now_ms - late_ms) * 1000 };
+  sockets.at(-1).onmessage({ data: pack(channel, header, payload).buffer });
+  await new Promise(setImmediate); // the picture is drawn
+}
+
+const receiveStatus = () => receive("status", encode({ state: "ACTIVE", reason: "drives", applied: [0.4, 0] }));
+
+beforeEach(() => {
+  sockets.at(-1).onopen();
+  sockets.at(-1).onmessage({ data: helloText("r1", SESSION, []) });
+});
+
+test("an image that comes late is dimmed, and its age begins with its delay", async () => {
+  await receiveStatus();
+  await receive("frame", JPEG, 20);
+  pass(100);
+  assert.deepEqual([parts.age.textContent, parts.figure.className], ["1 images/s, at least 120 ms old", ""]);
+  await receive("frame", JPEG, 0);
+  await receiveStatus();
+  pass(1200);
+  assert.deepEqual([parts.age.textContent, parts.figure.className], ["no image for 1.2 s", "old"]);
+  await receive("frame", JPEG, 1150);
+  pass(100);
+  assert.deepEqual([parts.age.textContent, parts.figure.className], ["1 images/s, at least 1250 ms old", "old"]);
+});
