@@ -4,11 +4,13 @@ import { Viewer, canvasLook, markTarget } from "./viewer.mjs";
 
 const REFRESH_MS = 100;
 const OLD_MS = 500; // what is older than this must not look like the present
+const STATUS_MS = 1000; // ten times the period of a status
 const part = (id) => document.getElementById(id);
 const write = (id, text) => {
   part(id).textContent = text;
 };
 const drawnAt_ms = []; // of the last second
+let statusAt_ms = Infinity; // of the state on the page; Infinity: it shows none
 let newest_ms = 0; // least age of the newest image when it was drawn
 
 /** @param {object} what one thing that changed */
@@ -16,6 +18,7 @@ function show({ link, status, reply, stop, target, age_us }) {
   if (link !== undefined) {
     write("link", link);
     part("link").className = link === "connected" ? "" : "lost";
+    if (link !== "connected") forgetStatus("");
   }
   if (status !== undefined) showStatus(status);
   if (reply !== undefined) write("news", reply.detail);
@@ -28,6 +31,7 @@ function show({ link, status, reply, stop, target, age_us }) {
 }
 
 function showStatus({ state, reason, holder, applied, frame_age_us, latency_us, stream }) {
+  statusAt_ms = performance.now();
   write("state", state);
   part("state").className = state;
   write("reason", reason);
@@ -37,6 +41,19 @@ function showStatus({ state, reason, holder, applied, frame_age_us, latency_us, 
   const ages = [["now", frame_age_us], ["when the last command came", latency_us]].filter(([, age_us]) => age_us !== null);
   write("sight", ages.map(([what, age_us]) => `${Math.round(age_us / 1000)} ms old ${what}`).join(", ") || "none");
   write("pictures", `${stream.sent} sent, ${viewer.eyes.answered} answered here, ${stream.credit_timeouts} unanswered in time`);
+}
+
+/** What is no longer known must not look like the present. */
+function forgetStatus(reason) {
+  statusAt_ms = Infinity;
+  for (const id of ["state", "wheels", "driver", "sight", "pictures"]) write(id, "?");
+  part("state").className = "";
+  write("reason", reason);
+}
+
+function refresh() {
+  showAge();
+  if (performance.now() - statusAt_ms > STATUS_MS) forgetStatus("no status for more than 1 s");
 }
 
 /** What stands still, or comes late, must be seen to: the age grows while nothing comes. */
@@ -55,7 +72,7 @@ const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}
 const token = location.hash.slice(1); // what stands behind the # is never sent with a request
 const viewer = new Viewer({ url, robot: document.body.dataset.robot, token, look: canvasLook(part("picture")), show });
 viewer.open();
-setInterval(showAge, REFRESH_MS);
+setInterval(refresh, REFRESH_MS);
 
 part("stop").onclick = () => viewer.stop();
 document.addEventListener("keydown", (event) => {

@@ -43,8 +43,8 @@ def watch_page(link: Link, role: str, first: Channel, port: int, secure: str) ->
 
 
 def state_of(robot: str, missions: MissionClient, is_online: bool) -> dict[str, Any]:
-    """Return the text next to the image; `is_online` is False for a silent robot."""
-    report = missions.operator.report
+    """Return the text next to the image. A silent robot, `is_online` is False, has none: its last state is over."""
+    report = missions.operator.report if is_online else None
     lines = _robot_lines(report.status) if report is not None else []
     mission = missions.newest(0.0)
     if mission is not None:

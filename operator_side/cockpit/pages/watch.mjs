@@ -65,6 +65,7 @@ async function showStates() {
     try {
       showState(await (await fetch("state")).json());
     } catch {
+      showState({ state: "", reason: "", lines: [] }); // the last state is over
       report("`sightline watch` has ended");
     }
     await pause(STATE_MS);

@@ -78,3 +78,29 @@ test("an image that comes late is dimmed, and its age begins with its delay", as
   pass(100);
   assert.deepEqual([parts.age.textContent, parts.figure.className], ["1 images/s, at least 1250 ms old", "old"]);
 });
+
+const stateShown = () => ["state", "reason", "wheels", "driver", "sight", "pictures"].map((id) => parts[id].textContent);
+const UNKNOWN = ["?", "", "?", "?", "?", "?"];
+
+test("a robot that sends frames but no status shows no state after 1 s", async () => {
+  await receiveStatus();
+  assert.deepEqual([...stateShown().slice(0, 2), parts.state.className], ["ACTIVE", "drives", "ACTIVE"]);
+  for (let count = 0; count < 9; count += 1) {
+    pass(100);
+    await receive("frame", JPEG);
+  }
+  assert.equal(parts.state.textContent, "ACTIVE");
+  pass(200);
+  assert.deepEqual([stateShown(), parts.state.className], [UNKNOWN.with(1, "no status for more than 1 s"), ""]);
+  assert.equal(parts.link.textContent, "connected");
+  await receiveStatus();
+  assert.equal(parts.state.textContent, "ACTIVE");
+});
+
+test("a lost link leaves no state", async () => {
+  await receiveStatus();
+  sockets.at(-1).onclose({ code: 1006 });
+  assert.deepEqual([stateShown(), parts.state.className, parts.link.className], [UNKNOWN, "", "lost"]);
+  pass(1500);
+  assert.deepEqual(stateShown(), UNKNOWN);
+});

@@ -127,6 +127,7 @@ def test_page_reports_a_lost_robot_and_finds_it_again(tmp_path: Path) -> None:
         assert until(lambda: page.text("age").startswith("no image for"), 5.0), page.text("age")
         assert until(lambda: page.text("link").startswith("no connection"), 5.0), page.text("link")
         assert page.run("document.getElementById('figure').className") == "old"
+        assert page.text("state") == page.text("wheels") == "?"
         with JsRobot(tmp_path, port=port):
             assert until(lambda: page.text("link") == "connected", 8.0), page.text("link")
             assert until(lambda: page.text("age").endswith("ms old"), 8.0), page.text("age")

@@ -1,5 +1,6 @@
 """The scripts of the pages of `watch` and `pick-color`, in Node without a browser."""
 
+import json
 import subprocess
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from tests.fixtures.javascript import node
 PAGES = Path(http_server.__file__).parent / "pages"
 SCRIPT = """
 let requests = 0;
-globalThis.document = { getElementById: () => ({ style: {} }), body: { dataset: { live: "true" } } };
+const element = { style: {}, replaceChildren() {} };
+globalThis.document = { getElementById: () => element, body: { dataset: { live: "true" } } };
 globalThis.setInterval = globalThis.setTimeout = () => 0; // no pause ends
 globalThis.fetch = async (path) => {
   if (path.startsWith("picture") && (requests += 1) > 20) process.exit(7);
@@ -27,3 +29,32 @@ def test_page_pauses_after_a_rejected_request(name):
     command = [node(), "--input-type=module", "-e", SCRIPT, (PAGES / name).as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
     assert done.returncode == 0, done.stderr
+
+
+ENDING_SCRIPT = """
+const parts = {};
+const element = () => ({ style: {}, replaceChildren(...children) { this.children = children; } });
+globalThis.document = { getElementById: (id) => (parts[id] ??= element()), createElement: element };
+globalThis.setInterval = () => 0;
+globalThis.setTimeout = (next) => setImmediate(next);
+const state = { robot: "r1", online: true, state: "ACTIVE", reason: "drives", lines: [["wheels", "+0.40 m/s"]] };
+let states = 0;
+globalThis.fetch = async (path) => {
+  if (path !== "state") return new Promise(() => undefined);
+  if ((states += 1) > 2) {
+    const { link, state, reason, lines } = parts;
+    const texts = [link.textContent, state.textContent, state.className, reason.textContent];
+    console.log(JSON.stringify([...texts, lines.children]));
+    process.exit(0);
+  }
+  if (states === 2) throw new TypeError("the server has ended");
+  return { json: async () => state };
+};
+await import(process.argv[1]);
+"""
+
+
+def test_page_shows_no_state_after_the_command_ended():
+    command = [node(), "--input-type=module", "-e", ENDING_SCRIPT, (PAGES / "watch.mjs").as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    assert json.loads(done.stdout) == ["`sightline watch` has ended", "", "", "", []], done.stderr

@@ -1,0 +1,26 @@
+"""The text next to the image of `sightline watch`."""
+
+import pytest
+
+from sightline.operator_side.client.missions import MissionClient
+from sightline.operator_side.cockpit.watch_page import state_of
+from sightline.protocol.channels import STATUS
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import Stamp, State, Status
+from sightline.protocol.transports.memory import MemoryNetwork
+
+
+@pytest.mark.parametrize("is_online", [True, False])
+def test_state_of_an_offline_robot_is_empty(is_online):
+    network = MemoryNetwork()
+    missions = MissionClient(network.link("r1", role="operator"))
+    status = Status(state=State.ACTIVE, reason="drives", applied=(0.4, 0.0))
+    network.link("r1").publish(STATUS, encode(Stamp(session="0000000a", seq=1, t_us=1)), encode(status))
+    network.advance(1)
+    shown = state_of("r1", missions, is_online)
+    assert (shown["online"], shown["state"], shown["reason"]) == (
+        (True, "ACTIVE", "drives") if is_online else (False, "", "")
+    )
+    assert [name for name, _text in shown["lines"]] == (
+        ["driver", "wheels", "frame age", "stream", "dropped", "commands"] if is_online else []
+    )
