@@ -20,7 +20,6 @@ from sightline.vision_side.serving import sharing
 from sightline.vision_side.serving.assignment import assign
 from sightline.vision_side.serving.fleet import SharedFleet
 from sightline.vision_side.serving.service import Service
-from sightline.vision_side.serving.sharing import Sharing
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 
@@ -156,7 +155,7 @@ def test_a_service_that_comes_takes_robots_and_withdraws_no_command(site):
 
 def may_claim_again(visions):
     """Return True when no service has claimed a robot within the last second: none changes more than once a second."""
-    return until(lambda: not any(Sharing._changed_lately(one, monotonic_us())
+    return until(lambda: not any(sharing._is_within_wait(one.changed_us, one.tries, monotonic_us())
                                  for vision in visions for one in vision.fleet.sharing.robots.copy().values()))
 
 
