@@ -5,6 +5,7 @@ The Makefile calls it before each goal. It returns at once where the environment
 
 import argparse
 import hashlib
+import json
 import math
 import os
 import platform
@@ -80,7 +81,7 @@ class Setup:
         """Bring the environment up to date, or raise SetupError. Writes the stamp only after the last step."""
         self.check_python()
         digest = self.digest()
-        if self.stamp.is_file() and self.stamp.read_text() == digest:
+        if self.stamp.is_file() and self.stamp.read_text() == digest and self.is_editable():
             return
         compiles = not has_pybullet_wheel()
         wheel = stored_wheel(self.lock)
@@ -121,6 +122,11 @@ class Setup:
         for path in (self.lock, ROOT / "pyproject.toml", ROOT / "setup.py"):
             facts.update(path.read_bytes())
         return facts.hexdigest()
+
+    def is_editable(self) -> bool:
+        """Return True if Sightline runs from this folder. `pip install '.[extra]'` puts a copy in its place."""
+        records = self.venv.glob("lib/python*/site-packages/sightline_robot-*.dist-info/direct_url.json")
+        return any(json.loads(one.read_text()).get("dir_info", {}).get("editable") for one in records)
 
     def check_space(self, build_mb: int) -> None:
         """Raise SetupError where a disk has less space than the set-up takes."""

@@ -117,4 +117,6 @@ def install_command(extra: str) -> str:
     if "vcs_info" in record:
         return f"pip install 'sightline-robot[{extra}] @ {record['vcs_info']['vcs']}+{record['url']}'"
     place = unquote(urlsplit(record["url"]).path) if record else "."
-    return f"pip install '{'.' if place == str(Path.cwd()) else place}[{extra}]'"
+    # Without the option pip puts a copy in the place of an editable installation.
+    editable = "--editable " if record.get("dir_info", {}).get("editable") else ""
+    return f"pip install {editable}'{'.' if place == str(Path.cwd()) else place}[{extra}]'"

@@ -209,13 +209,18 @@ def install(
     program = Path(sys.executable).with_name("sightline")
     file = home_path(config or Path(f"/etc/sightline/{service}.toml")).absolute()  # systemd changes the folder
     runs_it = user or os.environ.get("SUDO_USER") or getpass.getuser()
-    planned = units.plan(service, program, file, runs_it, units.UNIT_DIR, instances=instances)
+    planned, beside = units.plan(service, program, file, runs_it, units.UNIT_DIR, instances=instances), None
+    # A service that cannot start is not installed.
+    loaded = load_service(service, file=str(file), environ={}).config if yes or file.exists() else None
+    if isinstance(loaded, RobotConfig):
+        beside = units.drop_in(loaded, program, file, units.UNIT_DIR)
+        if loaded.state_dir != RobotConfig().state_dir:
+            planned = units.with_state_in(planned, loaded.state_dir)
     if not yes:
-        _show(planned, _beside(service, program, file) if file.exists() else None)
+        _show(planned, beside)
         if service == "robot" and not file.exists():
             typer.echo(f"{file} does not exist yet; with a gpio drive in it, a second file sets the pins low", err=True)
         return
-    beside = _beside(service, program, file)  # a service that cannot start is not installed
     stale = units.drop_in_path(planned.path.parent)
     if service == "robot" and beside is None and units.take_away(stale):
         typer.echo(f"removed {stale}: the drive of this robot is not gpio")
@@ -225,12 +230,6 @@ def install(
         typer.echo(f"wrote {beside.path}: the pins are set low first whenever the robot ends")
     started = planned.path.stem if instances is None else f"'{planned.path.stem}*'"
     typer.echo(f"wrote and started {planned.path}; check it with: systemctl status {started}")
-
-
-def _beside(service: str, program: Path, file: Path) -> units.InstallPlan | None:
-    """Plan the second file. Raises ConfigError if the service cannot start with this configuration."""
-    loaded = load_service(service, file=str(file), environ={}).config
-    return units.drop_in(loaded, program, file, units.UNIT_DIR) if isinstance(loaded, RobotConfig) else None
 
 
 def _show(planned: units.InstallPlan, beside: units.InstallPlan | None) -> None:

@@ -3,13 +3,15 @@
 The units are readable files (`robot_side/systemd`, `vision_side/systemd`); only paths, user and pins change.
 """
 
+import grp
 import os
 import re
 import subprocess
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 
+from sightline.protocol import NAME_PATTERN
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.plugins import DRIVES
@@ -26,6 +28,11 @@ _DROP_INS_PINS = "gpio_low 10 9 8 7 17"
 """The pins in the file of `robot_side/systemd`: those of the example car."""
 
 
+_GROUPS = "SupplementaryGroups=video gpio"
+_STATE_DIR = "Environment=SIGHTLINE_ROBOT__STATE_DIR=/var/lib/sightline"
+_NAME = " --name %l-%i"
+
+
 @dataclass(frozen=True)
 class InstallPlan:
     """One systemd file: its path and text, and the units to start, which are several for a template."""
@@ -39,7 +46,7 @@ class InstallPlan:
 def plan(
     service: str, program: Path, config: Path, user: str, unit_dir: Path = UNIT_DIR, *, instances: int | None = None
 ) -> InstallPlan:
-    """Make the unit of `service` for this machine's paths.
+    """Make the unit of `service` for this machine: its paths, groups and name.
 
     Args:
         instances: number of vision services that share the robots; None for one that shares with no other.
@@ -59,8 +66,22 @@ def plan(
     name = f"sightline-{service}{'' if instances is None else '@'}.service"
     units = (name,) if instances is None else tuple(name.replace("@", f"@{k}") for k in range(1, instances + 1))
     unit = files(f"sightline.{service}_side").joinpath("systemd", name).read_text()
-    unit = unit.replace("User=sightline", f"User={user}")
+    unit = unit.replace("User=sightline", f"User={user}").replace(_GROUPS, _present(_GROUPS))
+    if not re.fullmatch(NAME_PATTERN, f"{os.uname().nodename.partition('.')[0]}-{MAX_INSTANCES}"):
+        unit = unit.replace(_NAME, "")  # the service makes one
     return InstallPlan(service, unit_dir / name, _fitted(unit, service, program, config), units)
+
+
+def with_state_in(planned: InstallPlan, folder: Path) -> InstallPlan:
+    """Let the service store the STOP latch where its configuration says, not in the folder of the unit.
+
+    Raises:
+        ConfigError: systemd cannot read the path, or it depends on the user.
+    """
+    if not folder.is_absolute() or any(letter.isspace() or letter in "%\"'\\" for letter in str(folder)):
+        raise ConfigError(f"invalid state_dir '{folder}' for a unit; write a whole path, e.g. /var/lib/sightline, "
+                          "without spaces, quotes and %")
+    return replace(planned, text=planned.text.replace(_STATE_DIR, f"ReadWritePaths={folder}"))
 
 
 def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UNIT_DIR) -> InstallPlan | None:
@@ -85,6 +106,13 @@ def drop_in(robot: RobotConfig, program: Path, config: Path, unit_dir: Path = UN
 def drop_in_path(unit_dir: Path = UNIT_DIR) -> Path:
     """Return the path of the second file."""
     return unit_dir / "sightline-robot.service.d" / _DROP_IN
+
+
+def _present(groups: str) -> str:
+    """Leave out the groups that this machine lacks: systemd starts no service with an unknown group."""
+    there = {one.gr_name for one in grp.getgrall()}
+    key, _, names = groups.partition("=")
+    return f"{key}={' '.join(name for name in names.split() if name in there)}"
 
 
 def _fitted(unit: str, service: str, program: Path, config: Path) -> str:
@@ -130,8 +158,11 @@ def _put(planned: InstallPlan) -> None:
     try:
         if planned.path.name == _DROP_IN:
             planned.path.parent.mkdir(exist_ok=True)
-        planned.path.write_text(planned.text)
+        part = planned.path.with_suffix(".part")  # a disk that is full must not leave half a unit
+        part.write_text(planned.text)
+        part.replace(planned.path)
     except OSError as error:
+        part.unlink(missing_ok=True)
         raise ConfigError(f"cannot write {planned.path}: {error.strerror}; run it with sudo") from None
 
 

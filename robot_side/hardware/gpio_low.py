@@ -26,7 +26,8 @@ def import_lgpio() -> Any:
     import tempfile  # the guardian has no memory for it without a GPIO drive
 
     here = Path.cwd()  # lgpio leaves it, and what is relative must stay so
-    with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # the disk may be full
+    with tempfile.TemporaryDirectory(prefix="sightline-", dir=memory) as folder:
         os.environ["LG_WD"] = folder
         try:
             return importlib.import_module("lgpio")

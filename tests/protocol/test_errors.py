@@ -27,6 +27,12 @@ def test_install_command_names_what_was_installed(monkeypatch, url, command):
     assert install_command("zenoh") == command
 
 
+def test_install_command_keeps_an_editable_clone_editable(monkeypatch):
+    record = json.dumps({"url": "file:///srv/sightline", "dir_info": {"editable": True}})
+    monkeypatch.setattr(metadata, "distribution", lambda _name: SimpleNamespace(read_text=lambda _file: record))
+    assert install_command("zenoh") == "pip install --editable '/srv/sightline[zenoh]'"
+
+
 def test_install_command_of_an_unknown_distribution_names_the_clone(monkeypatch):
     def distribution(name):
         raise metadata.PackageNotFoundError(name)

@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import importlib.util
+import json
 import os
 import re
 import signal
@@ -60,6 +61,7 @@ def venv(tmp_path, calls) -> Path:
     (folder / "bin").mkdir(parents=True)
     (folder / "pyvenv.cfg").touch()
     executable(folder / "bin/python", FAKE_PYTHON)
+    installed_as(folder, editable=True)
     return folder
 
 
@@ -69,6 +71,13 @@ def stored(environment, calls) -> None:
     wheel = environment.stored_wheel(DEMO)
     wheel.parent.mkdir(parents=True)
     wheel.touch()
+
+
+def installed_as(venv: Path, *, editable: bool) -> None:
+    """Let an environment have Sightline as pip records it."""
+    record = venv / "lib/python3/site-packages/sightline_robot-1.dist-info/direct_url.json"
+    record.parent.mkdir(parents=True, exist_ok=True)
+    record.write_text(json.dumps({"url": ROOT.as_uri(), "dir_info": {"editable": True} if editable else {}}))
 
 
 def executable(path: Path, text: str) -> Path:
@@ -142,6 +151,14 @@ def test_environment_is_set_up_once(stored, venv, calls):
     installs = [line for line in calls.read_text().splitlines() if " install " in line]
     assert len(installs) >= 2 and "--require-hashes" in installs[0] and str(ROOT) in installs[-1]
     assert set_up("test", venv).returncode == 0 and (venv / ".test").exists()
+
+
+def test_a_copy_of_sightline_is_replaced_by_the_folder_itself(stored, venv, calls):
+    """`pip install '.[metrics]'` in this environment makes a copy, which changes no stamp."""
+    assert set_up("demo", venv).returncode == 0
+    installed_as(venv, editable=False)
+    calls.write_text("")
+    assert "setting up" in set_up("demo", venv).stdout and f"--editable {ROOT}" in calls.read_text()
 
 
 def test_interrupted_set_up_leaves_no_stamp_and_no_process(stored, venv, calls, monkeypatch):

@@ -128,7 +128,7 @@ def test_xacro_file_without_the_extra_prints_the_install_command(tmp_path, monke
     monkeypatch.setitem(__import__("sys").modules, "xacrodoc", None)
     (tmp_path / "mine.urdf.xacro").write_text("<robot/>")
     path = thymio_with(tmp_path, words=('urdf = "thymio.urdf"', 'urdf = "mine.urdf.xacro"'))
-    with pytest.raises(ConfigError, match=r"pip install '\.\[xacro\]'"):
+    with pytest.raises(ConfigError, match=r"pip install --editable '\.\[xacro\]'"):
         load_robot(path)
 
 

@@ -316,7 +316,7 @@ def test_training_without_pytorch_prints_the_install_command(monkeypatch, capsys
     monkeypatch.setitem(__import__("sys").modules, "torch", None)
     assert cli.run(["train", "--out", str(tmp_path)]) == 2
     error = capsys.readouterr().err.strip()
-    assert "pip install '.[train]'" in error and "torch" in error and "\n" not in error
+    assert "pip install --editable '.[train]'" in error and "torch" in error and "\n" not in error
 
 
 @pytest.mark.parametrize("arguments", [["--steps", "0"], ["--device", "tpu"], ["--scenes", "3"], ["--batch", "1"]])

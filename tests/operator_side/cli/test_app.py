@@ -454,8 +454,8 @@ def test_every_python_that_the_product_starts_ignores_the_current_folder():
 @pytest.mark.parametrize(
     ("package", "version", "expected"),
     [
-        ("av.video", (3, 11), "av is not installed: pip install '.[sim]'"),
-        ("pybullet", (3, 11), "pip install '.[sim]'"),
+        ("av.video", (3, 11), "av is not installed: pip install --editable '.[sim]'"),
+        ("pybullet", (3, 11), "pip install --editable '.[sim]'"),
         ("pybullet", (3, 13), "Python 3.13: use Python 3.11, or `docker compose up`"),
     ],
 )

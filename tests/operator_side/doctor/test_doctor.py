@@ -171,7 +171,7 @@ def test_unreadable_certificates_are_reported_with_the_extra(capsys, tmp_path, m
     for name in [one for one in sys.modules if one.partition(".")[0] == "cryptography"]:
         monkeypatch.setitem(sys.modules, name, None)
     check = _checks(capsys, "--secure", str(tmp_path / "k"))["certificates"]
-    assert not check["ok"] and "pip install '.[secure]'" in str(check)
+    assert not check["ok"] and "pip install --editable '.[secure]'" in str(check)
 
 
 def test_closed_port_and_unknown_host_have_different_fixes(capsys, monkeypatch):

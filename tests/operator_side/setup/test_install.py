@@ -1,7 +1,9 @@
 """`sightline install`: units that systemd's own parser takes, with this machine's paths; nothing written unasked."""
 
 import configparser
+import errno
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from typer.main import get_command
@@ -57,6 +59,52 @@ def test_unit_zeroes_the_motors_after_every_end(tmp_path):
 def test_value_that_changes_the_unit_is_rejected(service, config, user, tmp_path):
     with pytest.raises(ConfigError):
         install.plan(service, PROGRAM, config, user, tmp_path)
+
+
+@pytest.mark.parametrize(("present", "line"), [
+    (("video", "gpio"), "video gpio"), (("video", "root"), "video"), ((), "")])
+def test_unit_names_only_groups_of_this_machine(present, line, monkeypatch, tmp_path):
+    monkeypatch.setattr(install.grp, "getgrall", lambda: [SimpleNamespace(gr_name=name) for name in present])
+    unit = _parsed(install.plan("robot", PROGRAM, CONFIG, "pi", tmp_path).text)
+    assert unit["Service"]["SupplementaryGroups"] == line
+
+
+def test_folder_of_the_configuration_holds_the_stop_latch(capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(install, "UNIT_DIR", tmp_path)
+    shown = []
+    for line in ("", 'state_dir = "/data/state"\n'):
+        (tmp_path / "robot.toml").write_text(line)
+        assert cli.run(["install", "robot", "--config", str(tmp_path / "robot.toml"), "--user", "pi"]) == 0
+        shown.append(_parsed(capsys.readouterr().out)["Service"])
+    assert shown[0]["Environment"] == "SIGHTLINE_ROBOT__STATE_DIR=/var/lib/sightline"
+    assert "Environment" not in shown[1] and shown[1]["ReadWritePaths"] == "/data/state"
+
+
+@pytest.mark.parametrize("folder", ["~/state", "state", "/a b", "/a%i"])
+def test_folder_of_the_stop_latch_that_systemd_cannot_use_is_rejected(folder, tmp_path):
+    with pytest.raises(ConfigError, match="write a whole path"):
+        install.with_state_in(install.plan("robot", PROGRAM, CONFIG, "pi", tmp_path), Path(folder))
+
+
+@pytest.mark.parametrize(("host", "name"), [
+    ("pi", " --name %l-%i"), ("h" * 29 + ".local", " --name %l-%i"), ("h" * 30, "")])
+def test_instances_on_a_host_with_a_long_name_make_their_names(host, name, monkeypatch, tmp_path):
+    monkeypatch.setattr(install.os, "uname", lambda: SimpleNamespace(nodename=host))
+    unit = _parsed(install.plan("vision", PROGRAM, CONFIG, "pi", tmp_path, instances=2).text)
+    assert unit["Service"]["ExecStart"] == f"{PROGRAM} vision --config {CONFIG} --share{name}"
+
+
+def test_a_full_disk_leaves_the_unit_as_it_was(monkeypatch, tmp_path):
+    def fill(path, text):
+        path.touch()
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    planned = install.plan("vision", PROGRAM, CONFIG, "pi", tmp_path)
+    planned.path.write_text("before")
+    monkeypatch.setattr(Path, "write_text", fill)
+    with pytest.raises(ConfigError, match="No space left on device"):
+        install.write(planned)
+    assert planned.path.read_text() == "before" and list(tmp_path.iterdir()) == [planned.path]
 
 
 def test_install_without_yes_writes_nothing(capsys, monkeypatch, tmp_path):

@@ -89,7 +89,7 @@ def test_missing_gamepad_is_one_line(plugged, path, says):
 
 def test_missing_evdev_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "evdev", None)
-    with pytest.raises(ConfigError, match=r"evdev is not installed: pip install '\.\[gamepad\]'"):
+    with pytest.raises(ConfigError, match=r"evdev is not installed: pip install --editable '\.\[gamepad\]'"):
         Gamepad("auto")
 
 

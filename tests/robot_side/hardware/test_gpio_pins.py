@@ -30,7 +30,7 @@ def test_a_missing_package_names_its_extra(monkeypatch, module):
     monkeypatch.setattr(Device, "pin_factory", None)
     monkeypatch.setitem(sys.modules, module, None)
     monkeypatch.delitem(sys.modules, "gpiozero.pins.lgpio", raising=False)
-    with pytest.raises(ConfigError, match=rf"needs {module}: pip install '\.\[robot-pi\]'"):
+    with pytest.raises(ConfigError, match=rf"needs {module}: pip install --editable '\.\[robot-pi\]'"):
         GpioDrive(config())
 
 

@@ -52,7 +52,7 @@ def test_bad_arguments_are_rejected_before_anything_is_opened(arguments, said):
 
 def test_websockets_that_is_not_installed_is_one_line_with_the_fix(monkeypatch):
     monkeypatch.setitem(sys.modules, "websockets", None)
-    with pytest.raises(ConfigError, match=re.escape("pip install '.[websocket]'")):
+    with pytest.raises(ConfigError, match=re.escape("pip install --editable '.[websocket]'")):
         open_websocket("r1", connect="ws://127.0.0.1:9090")
 
 

@@ -95,7 +95,7 @@ def test_bad_arguments_are_rejected_before_anything_is_opened(arguments, said):
 
 def test_zenoh_that_is_not_installed_is_one_line_with_the_fix(monkeypatch):
     monkeypatch.setitem(sys.modules, "zenoh", None)
-    with pytest.raises(ConfigError, match=re.escape("pip install '.[zenoh]'")):
+    with pytest.raises(ConfigError, match=re.escape("pip install --editable '.[zenoh]'")):
         open_zenoh("r1", connect=["tcp/127.0.0.1:7447"])
 
 

@@ -242,7 +242,7 @@ def test_truncated_model_and_model_of_2_gb_are_one_line(tmp_path: Path) -> None:
 
 def test_without_the_runtime_one_line_names_what_to_install(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ConfigError, match=r"pip install '\.\[vision\]'") as missing:
+    with pytest.raises(ConfigError, match=r"pip install --editable '\.\[vision\]'") as missing:
         detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))
     assert "\n" not in str(missing.value)
 
