@@ -4,7 +4,7 @@ from typing import Final
 
 from sightline.conformance.case import Bench, Case
 from sightline.conformance.vision import answers, causality, flow, hostile, websocket
-from sightline.conformance.vision.fixture import RobotPlayed
+from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed
 
 _FIRST_US: Final = 20_000_000
 """A vision service may still be starting, or be started now."""
@@ -25,13 +25,15 @@ def is_there(bench: Bench) -> bool:
 def prepare(bench: Bench) -> None:
     """Wait until the vision receives the kit's robot: some answer, even one that this end turns away.
 
-    The robot names no camera: a case is about what happens then.
+    The robot names no camera: a case is about what happens then. A slow vision service may still compute for the last
+    frame; the answer to it is awaited, so that the first frame of the case is the next that it takes.
     """
     robot = RobotPlayed(bench, camera=None)
     before = bench.dropped_here.total()
     deadline_us = bench.now_us + (_AGAIN_US if bench.mark() else _FIRST_US)
     while bench.now_us < deadline_us:
-        robot.frame("absent")
+        sent = robot.frame("absent")
         if bench.wait(lambda: robot.answers() or bench.dropped_here.total() > before, _EVERY_US):
+            robot.is_answered(sent, sent.at_us + ANSWER_US - bench.now_us)
             break
     robot.stop()
