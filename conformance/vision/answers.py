@@ -21,6 +21,8 @@ from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE
 SUITE = Suite("V")
 _SESSION: Final = re.compile(r"[0-9a-f]{8}")
 _ECHO: Final = {"channel", "session", "seq", "t_us"}
+_LAST_US: Final = 200_000
+"""So far ahead of a robot's other messages a frame may be: from 500 ms on it is forged (2.6)."""
 _FOUR_DECIMALS: Final = re.compile(rb"[+-]?[0-9]+\.[0-9]{4}\|[+-]?[0-9]+\.[0-9]{4}")
 
 
@@ -138,7 +140,8 @@ SUITE.must_all(met, {
 @SUITE.must("V-FRAM-19", "2.2 Numbers")
 def largest_integers(bench: Bench) -> None:
     """`seq` and `t_us` up to 2^53 - 1 come back as they were."""
-    robot = RobotPlayed(bench, first_seq=MAX_INTEGER - 40, first_t_us=MAX_INTEGER - 60_000_000)
+    robot = RobotPlayed(bench, first_seq=MAX_INTEGER - 40, first_t_us=MAX_INTEGER - _LAST_US)
+    robot.stop()  # its clock is about to end
     answer = robot.answer_to(robot.frame(seq=MAX_INTEGER, t_us=MAX_INTEGER))
     got = (answer.echo.get("seq"), answer.echo.get("t_us"))
     bench.expect(got == (MAX_INTEGER, MAX_INTEGER), f"it cites seq {got[0]} and t_us {got[1]}")

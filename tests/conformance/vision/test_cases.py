@@ -9,7 +9,9 @@ from sightline.conformance.codec import CASES as CODEC_CASES
 from sightline.conformance.robot.cases import CASES as ROBOT_CASES
 from sightline.conformance.runner import Outcome, passed, run_case
 from sightline.conformance.vision.cases import CASES, prepare
-from sightline.protocol.channels import FRAME
+from sightline.protocol.channels import FRAME, STATUS
+from sightline.protocol.codec import decode
+from sightline.protocol.messages import FrameHeader, Stamp
 from sightline.protocol.transports.websocket.framing import pack
 from tests.conformance.clauses import UNTESTED, clauses
 from tests.conformance.vision import broken_answers as vision_broken_answers  # noqa: F401
@@ -86,6 +88,33 @@ def test_vision_service_with_a_slow_detector_fails_no_must_case(cases, look_us):
     slow = type("Slow", (SlowVision,), {"LOOK_US": look_us})
     results = [result_of(case, slow) for case in cases]
     assert [(one.case.id, one.reason) for one in results if one.outcome is Outcome.FAILED] == []
+
+
+class StrictClock(VirtualVision):
+    """Rejects a frame that runs over 500 ms ahead of what the fastest frame or status of its session allows (2.6)."""
+
+    def __init__(self, network, robot="r1"):
+        super().__init__(network, robot)
+        self.behind_us = {}
+        self.link.subscribe(STATUS, lambda message: self.is_possible(decode(Stamp, message.header)))
+
+    def is_possible(self, stamp):
+        behind_us = self.now_us - stamp.t_us
+        least_us = self.behind_us.get(stamp.session, behind_us)
+        possible = behind_us >= least_us - 500_000
+        if possible:
+            self.behind_us[stamp.session] = min(least_us, behind_us)
+        return possible
+
+    def _frame(self, message, started_ns):
+        if self.is_possible(decode(FrameHeader, message.header)):
+            super()._frame(message, started_ns)
+
+
+@pytest.mark.parametrize(("name", "vision"), [("V-FRAM-19", StrictClock)])
+def test_case_demands_no_more_than_the_specification(name, vision):
+    result = result_of(next(case for case in VIRTUAL if case.id == name), vision)
+    assert (result.outcome, result.reason) == (Outcome.PASSED, "")
 
 
 HOSTILE = [case for case in VIRTUAL if case.group == "hostile input"]
