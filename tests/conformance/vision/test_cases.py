@@ -13,6 +13,7 @@ from sightline.protocol.channels import FRAME, STATUS
 from sightline.protocol.codec import decode
 from sightline.protocol.messages import FrameHeader, Stamp
 from sightline.protocol.transports.websocket.framing import pack
+from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from tests.conformance.clauses import UNTESTED, clauses
 from tests.conformance.vision import broken_answers as vision_broken_answers  # noqa: F401
 from tests.conformance.vision import broken_flow as vision_broken_flow  # noqa: F401
@@ -111,7 +112,19 @@ class StrictClock(VirtualVision):
             super()._frame(message, started_ns)
 
 
-@pytest.mark.parametrize(("name", "vision"), [("V-FRAM-19", StrictClock)])
+class LearnsFirst(VirtualVision):
+    """Acknowledges the first frames of each session: it has not yet taken in the camera model (10.1)."""
+
+    session, left = "", 0
+
+    def _publish(self, header, answer, compute_us):
+        if header.session != self.session:
+            self.session, self.left = header.session, 3
+        self.left = max(0, self.left - 1)
+        super()._publish(header, PipelineAnswer(None, Observation("learns")) if self.left else answer, compute_us)
+
+
+@pytest.mark.parametrize(("name", "vision"), [("V-FRAM-19", StrictClock), ("V-SEQ-05", LearnsFirst)])
 def test_case_demands_no_more_than_the_specification(name, vision):
     result = result_of(next(case for case in VIRTUAL if case.id == name), vision)
     assert (result.outcome, result.reason) == (Outcome.PASSED, "")
