@@ -60,6 +60,10 @@ GROUPS: Final = {
 """Code in an id -> the group's name, as `--group` takes it."""
 
 
+NOT_DRIVING: Final = "it does not answer plain frames with twists"
+"""Why a case is not applicable that builds on twists of a vision service. `passed` counts it as untested."""
+
+
 class Level(StrEnum):
     """The level of a case, in the words of RFC 2119."""
 

@@ -30,8 +30,7 @@ def _sample(bench: Bench, junk: int = 0) -> list[VisionAnswer]:
     """Answers to six views, of a target beside and ahead and of none, and to so many that are not pictures."""
     robot = RobotPlayed(bench)
     for name in ("left", "left", "centre", "centre", "right", "absent"):
-        sent = robot.frame(name)
-        robot.is_answered(sent)
+        robot.is_driven(robot.frame(name))
     for _ in range(junk):
         robot.frame(jpeg=png())
         bench.rest(100_000)
@@ -314,7 +313,7 @@ def _steering(bench: Bench) -> _Steering:
 def _toward(bench: Bench, name: str) -> Planar:
     """Return (m/s, rad/s) of its last answer to a robot that starts, and shows one image only."""
     robot = RobotPlayed(bench)
-    robot.film(name, _LOOKS, _EVERY_US)
+    robot.is_driven(robot.film(name, _LOOKS, _EVERY_US)[-1])
     robot.stop()
     twists = robot.twists()
     bench.need(twists, "it sends no twists")
@@ -344,7 +343,7 @@ def steers_by_the_target(bench: Bench) -> None:
 def _last_twist(bench: Bench, robot: RobotPlayed, name: str, frames: int = _SECOND) -> VisionAnswer:
     """Return its answer after a number of images of one kind."""
     mark = bench.mark()
-    robot.film(name, frames, _EVERY_US)
+    robot.is_driven(robot.film(name, frames, _EVERY_US)[-1])
     twists = robot.twists(mark)
     bench.need(twists, "it sends no twists")
     return twists[-1]
@@ -392,7 +391,7 @@ def _replayed(bench: Bench, every_us: int) -> list[bytes]:
     texts = []
     for number, name in enumerate(names):
         sent = robot.frame(name, seq=number + 1, t_us=5_000_000 + number * 40_000)
-        robot.is_answered(sent)
+        robot.is_driven(sent)
         texts.append(next((one.text for one in robot.answers_to(sent) if one.is_twist), b""))
         bench.rest(every_us)
     robot.stop()
@@ -405,7 +404,7 @@ def new_start_new_memory(bench: Bench, robot: RobotPlayed) -> None:
     robot.film("centre", _SECOND // 2, _EVERY_US)
     robot.stop()
     robot = RobotPlayed(bench)
-    mark = bench.mark()
-    robot.film("absent", 4, _EVERY_US)
-    fastest = max((abs(one.speeds[0]) for one in robot.twists(mark)), default=0.0)
+    sent = robot.film("absent", 4, _EVERY_US)
+    robot.is_driven(sent[-1])
+    fastest = max((abs(one.speeds[0]) for frame in sent for one in robot.twists_to(frame)), default=0.0)
     bench.expect(fastest < _STILL_MPS, f"it drives at {fastest:g} m/s by nothing that this start has shown")

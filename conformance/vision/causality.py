@@ -75,12 +75,14 @@ def no_frame_twice(bench: Bench, robot: RobotPlayed) -> None:
 def newest_wins(bench: Bench, robot: RobotPlayed) -> None:
     """In a burst of 20 frames no older frame is answered after a newer one."""
     mark = bench.mark()
-    for _ in range(_BURST):
-        robot.frame("left")
+    burst = [robot.frame("left").seq for _ in range(_BURST)]
     bench.rest(1_000_000)
-    echoed = [one.echo.get("seq") for one in robot.answers(mark)]
-    cited = [seq for seq in echoed if isinstance(seq, int)]
-    bench.expect(cited == sorted(cited), f"it answered in the order {cited}")
+    answers = [one for one in robot.answers(mark) if one.echo.get("seq") in burst]
+    twists, acks = ([one.echo["seq"] for one in answers if one.is_twist is kind] for kind in (True, False))
+    # A twist may cite a frame again that was acknowledged before (7.1), so only its first answer counts among all.
+    firsts = [*dict.fromkeys(one.echo["seq"] for one in answers)]
+    for cited in (twists, acks, firsts):
+        bench.expect(cited == sorted(cited), f"it answered in the order {cited}")
 
 
 def _no_twist_for(bench: Bench, robot: RobotPlayed, sent: Sent, what: str) -> None:
@@ -104,6 +106,7 @@ def repeated_frame(bench: Bench, robot: RobotPlayed) -> None:
     """A frame that arrives a second time gets no second twist."""
     sent = robot.frame()
     robot.answer_to(sent)
+    robot.is_driven(sent)
     before = len(robot.twists_to(sent))
     for _ in range(3):
         robot.frame(seq=sent.seq, t_us=sent.t_us)

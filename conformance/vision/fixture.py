@@ -15,7 +15,7 @@ import zlib
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
-from sightline.conformance.case import Bench, Received
+from sightline.conformance.case import NOT_DRIVING, Bench, Received
 from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import ACK, CAMERA, FRAME, STATUS, TWIST, Channel
@@ -228,15 +228,18 @@ class RobotPlayed:
             self.bench.expect(False, f"no answer to frame {sent.seq} within {within_us / 1e6:g} s")
         return self.answers_to(sent)[0]
 
+    def is_driven(self, *sent: Sent, within_us: int = ANSWER_US) -> bool:
+        """Return True if a twist cites one of `sent` in time. It may come later than an ack of the same frame (7.1)."""
+        return self.bench.wait(lambda: any(map(self.twists_to, sent)), within_us)
+
     def expect_twist(self, sent: Sent) -> None:
-        """Fail the case unless the answer to `sent` is a twist."""
+        """Fail the case unless a twist answers `sent`."""
         answer = self.answer_to(sent)
-        self.bench.expect(answer.is_twist, f"it came to {answer.words()}, not to a twist")
+        self.bench.expect(self.is_driven(sent), f"it came to {answer.words()}, not to a twist")
 
     def expect_any_twist(self, sent: list[Sent]) -> None:
         """Fail the case unless a twist cites one of `sent`."""
-        twist = any(one.is_twist for frame in sent for one in self.answers_to(frame))
-        self.bench.expect(twist, "no twist came")
+        self.bench.expect(self.is_driven(*sent), "no twist came")
 
     def twists_to(self, sent: Sent) -> list[VisionAnswer]:
         """Whatever cites `sent` and drives."""
@@ -250,28 +253,20 @@ class RobotPlayed:
 
     def met(self) -> Self:
         """Go on once the vision drives by these pictures; a case that builds on that is not applicable otherwise."""
-        for _ in range(_MEETING_FRAMES):
-            sent = self.frame()
-            if self.is_answered(sent) and self._drives(sent):
-                return self
-        self.bench.need(False, "it does not answer plain frames with twists")
+        self.bench.need(self._drives(_MEETING_FRAMES), NOT_DRIVING)
         return self
 
-    def _drives(self, sent: Sent) -> bool:
-        """Return True after a twist. After an ack, the next frame is not due yet."""
-        if self.twists_to(sent):
-            return True
-        self.bench.rest(FRAME_US)
-        return False
+    def _drives(self, frames: int) -> bool:
+        """Return True once a twist cites one of so many plain frames."""
+        sent: list[Sent] = []
+        for _ in range(frames):
+            sent.append(self.frame())
+            if self.is_answered(sent[-1]) and self.is_driven(*sent, within_us=FRAME_US):
+                return True
+        return self.is_driven(*sent)
 
-    def expect_driven(self, after: str) -> VisionAnswer:
+    def expect_driven(self, after: str) -> None:
         """One of three plain frames is answered by a twist; the case fails otherwise."""
-        for _ in range(3):
-            sent = self.frame()
-            self.is_answered(sent)
-            if twists := self.twists_to(sent):
-                return twists[0]
-            self.bench.rest(FRAME_US)
-        self.need_nothing_dropped()
-        self.bench.expect(False, f"after {after}, plain frames get no twist any more")
-        raise AssertionError("unreachable: expect raised")
+        if not self._drives(3):
+            self.need_nothing_dropped()
+            self.bench.expect(False, f"after {after}, plain frames get no twist any more")

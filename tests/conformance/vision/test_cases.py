@@ -130,6 +130,54 @@ def test_case_demands_no_more_than_the_specification(name, vision):
     assert (result.outcome, result.reason) == (Outcome.PASSED, "")
 
 
+class SteersLater(VirtualVision):
+    """Acknowledges each frame at once, and cites it again when it has looked at it (7.1); then it takes the newest."""
+
+    LOOK_US = 0
+    newest = looked = None
+
+    def tick(self, now_us):
+        self.now_us = now_us
+        if self.looked is not None and now_us >= self.looked[0]:
+            super()._publish(*self.looked[1:])
+            self.looked = None
+        super().tick(now_us)
+        if self.looked is None and self.newest is not None:
+            self.looked, self.newest = (now_us + self.LOOK_US, *self.newest), None
+
+    def _publish(self, header, answer, compute_us):
+        super()._publish(header, PipelineAnswer(None, Observation("takes it up")), compute_us)
+        if answer.twist is not None:
+            self.newest = (header, answer, compute_us)
+
+
+LATER = [case for case in VIRTUAL
+         if case.id in ("V-FRAM-14", "V-GRAM-01", "V-CAUS-09", "V-STAT-01", "V-STEER-01", "V-HOST-33", "V-LIM-41")]
+
+
+@pytest.mark.parametrize("look_us", [60_000, 150_000])
+@pytest.mark.parametrize("cases", [LATER, pytest.param(MUST, marks=pytest.mark.slow)], ids=["some", "all"])
+def test_vision_service_that_steers_after_its_acknowledgement_passes(cases, look_us):
+    later = type("Later", (SteersLater,), {"LOOK_US": look_us})
+    results = [result_of(case, later) for case in cases]
+    assert [(one.case.id, one.reason) for one in results if one.outcome is not Outcome.PASSED] == []
+
+
+class NeverDrives(VirtualVision):
+    """Only acknowledges."""
+
+    def _publish(self, header, answer, compute_us):
+        super()._publish(header, PipelineAnswer(None, Observation("watches")), compute_us)
+
+
+def test_vision_service_that_never_drives_does_not_conform():
+    cases = [case for case in VIRTUAL if case.id in ("V-FRAM-01", "V-CAUS-08", "V-LIM-14")]
+    results = [result_of(case, NeverDrives) for case in cases]
+    assert [one.outcome for one in results] == [Outcome.PASSED, Outcome.SKIPPED, Outcome.SKIPPED]
+    assert not passed(results)
+    assert passed(results[:1])
+
+
 HOSTILE = [case for case in VIRTUAL if case.group == "hostile input"]
 
 
