@@ -143,9 +143,10 @@ class VirtualBench(Bench):
     """See the module."""
 
     def __init__(
-        self, network: MemoryNetwork, peers: Sequence[Ticking], channels: Sequence[Channel], robot: str = "r1"
+        self, network: MemoryNetwork, peers: Sequence[Ticking], channels: Sequence[Channel], robot: str = "r1",
+        access: Access | None = None,
     ) -> None:
-        super().__init__(robot)
+        super().__init__(robot, access=access)
         self._network, self._peers, self._channels = network, peers, channels
         self._link: MemoryLink | None = None
         self._dropped: Counter[str] = Counter()

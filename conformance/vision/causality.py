@@ -1,16 +1,27 @@
-"""Cases about what an answer cites, in which order, and when: causality and sequence. Pure."""
+"""Cases about what an answer cites, in which order, and whose it is: causality, sequence, proof. Pure."""
 
 import itertools
+import re
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
-from sightline.conformance.case import Bench, Level, Suite, itself
-from sightline.conformance.vision.fixture import ANSWER_US, ARMED, FRAME_US, RobotPlayed, Sent, VisionAnswer, met
+from sightline.conformance.case import Bench, Level, Received, Suite, itself
+from sightline.conformance.vision.fixture import (
+    ANSWER_US,
+    ARMED,
+    FRAME_US,
+    RobotPlayed,
+    Sent,
+    VisionAnswer,
+    met,
+    read_answer,
+)
 from sightline.conformance.vision.images import png
-from sightline.protocol.channels import SCAN, STATUS, Channel
+from sightline.protocol.channels import SCAN, STATUS, TWIST, Channel
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import MAX_INTEGER
+from sightline.protocol.proof import MAX_LOST, Proof, continues
 from sightline.protocol.spec.message_cases import packed
 
 SUITE = Suite("V")
@@ -269,3 +280,86 @@ def old_session_is_over(bench: Bench) -> None:
     sent = new.frame("left", **{name: late[name] for name in ("session", "seq", "t_us")})
     _no_twist_for(bench, new, sent, "a frame of a session that is over")
     new.expect_driven("a frame of a session that is over")
+
+
+# --- proof of identity -----------------------------------------------------------------------------------------------
+
+
+_ELEMENT: Final = re.compile(r"[0-9a-f]{32}")
+_MOST_TWISTS: Final = 1_100
+_MOST_US: Final = 60_000_000
+_FEW: Final = 20
+
+
+class _Chain:
+    """Validates the proof of each twist from now on, as a robot does whose lease this driver holds."""
+
+    def __init__(self, robot: RobotPlayed) -> None:
+        self.fault = ""
+        """What is wrong with the first proof that does not continue those before it."""
+        self.twists = 0
+        self.announcing: int | None = None
+        """How many twists announced the chain that the last one ended in; None before a chain ended."""
+        self._robot, self._bench, self._announced = robot, robot.bench, 0
+        self._session: Any = None
+        self._last, self._next = Proof(None), Proof(None)
+        self._bench.on(TWIST, self._read)
+
+    def _read(self, received: Received) -> None:
+        """Read a twist. Nothing is raised here: a link would log it."""
+        self.twists += 1
+        fields = read_answer(received).fields
+        proof, following = (self._element(fields.get(name)) for name in ("proof", "next_proof"))
+        if self._last.proof is not None and fields.get("session") == self._session and not continues(proof, self._last):
+            if not continues(proof, self._next):
+                self.fault = self.fault or (f"the proof of twist {self.twists}, {proof}, hashed 1 to {MAX_LOST} times, "
+                                            "gives neither the last one nor the announced one")
+            self.announcing, self._announced, self._next = self._announced, 0, Proof(None)
+        if following is not None and following != self._next.proof:
+            # An element that the first twist announces may have been announced before.
+            self._next, self._announced = Proof(following), MAX_LOST if self.twists == 1 else 0
+        self._announced += following is not None
+        self._last, self._session = Proof(proof), fields.get("session")
+
+    def _element(self, value: Any) -> str | None:
+        if value is None or (isinstance(value, str) and _ELEMENT.fullmatch(value)):
+            return value
+        self.fault = self.fault or f"a proof is 32 lower-case hex digits, not {value!r}"
+        return None
+
+    def follow(self, frames: int) -> None:
+        """Show so many frames, each when a twist answers the last, until a proof is wrong or the chain has ended."""
+        deadline_us = self._bench.now_us + _MOST_US
+        for _ in range(frames):
+            self._robot.is_driven(self._robot.frame("left"))
+            if self.fault or self.announcing is not None or self._bench.now_us > deadline_us:
+                break
+        self._bench.need(self.fault or self._last.proof, "its twists have no proof, which a link without keys permits")
+
+
+@SUITE.must("V-PROOF-01", "6.6 Proof", met)
+def proofs_continue(bench: Bench, robot: RobotPlayed) -> None:
+    """The proof of each twist, hashed 1 to 64 times, gives that of the last one: else a robot rejects it."""
+    chain = _Chain(robot)
+    chain.follow(_FEW)
+    bench.expect(not chain.fault, chain.fault)
+
+
+@SUITE.must("V-PROOF-02", "6.6 Proof", met)
+def next_chain_is_announced(bench: Bench, robot: RobotPlayed) -> None:
+    """A chain of proofs that ends continues in the next one, which at least 64 twists have announced."""
+    chain = _Chain(robot)
+    chain.follow(_FEW)
+    bench.need(not chain.fault, "its proofs do not continue (V-PROOF-01)")
+    chain.follow(_MOST_TWISTS)
+    bench.expect(not chain.fault, chain.fault)
+    bench.need(chain.announcing is not None, f"its chain did not end in {chain.twists} twists")
+    bench.expect((chain.announcing or 0) >= MAX_LOST, f"only {chain.announcing} twists announced the next chain")
+
+
+@SUITE.must("V-PROOF-03", "6.6 Proof", met)
+def proof_behind_keys(bench: Bench, robot: RobotPlayed) -> None:
+    """Where peers show keys, each twist has a proof."""
+    bench.need(bench.access.is_guarded, "no keys were named (--secure, --token)")
+    robot.film("left", _FEW)
+    bench.expect(all(one.fields.get("proof") for one in robot.twists() if one.fields), "a twist has no proof")

@@ -14,6 +14,7 @@ from sightline.protocol.channels import ACK, CHANNELS, FRAME, REQUEST, TWIST, ke
 from sightline.protocol.codec import encode
 from sightline.protocol.transports.memory import MemoryNetwork
 from tests.conformance.robot.reference import MODEL
+from tests.conformance.vision.fixture import KEYS
 from tests.fixtures.javascript import EXAMPLES, node
 from tests.fixtures.robot_process import JPEG
 
@@ -101,7 +102,9 @@ def virtual_js(peers, side, folder=EXAMPLES):
     network = MemoryNetwork()
     network.advance(1_000_000)
     peer = JsPeer(peers, network, side, folder)
-    return VirtualBench(network, [peer], FROM_ROBOT if side == "robot" else TO_ROBOT), peer
+    if side == "robot":
+        return VirtualBench(network, [peer], FROM_ROBOT), peer
+    return VirtualBench(network, [peer], TO_ROBOT, access=KEYS), peer
 
 
 def changed_copy(folder, file, old, new):

@@ -43,7 +43,7 @@ from tests.conformance.vision import (  # noqa: F401  (they fill BROKEN)
     broken_steering,
 )
 from tests.conformance.vision.broken import BROKEN as BROKEN_VISIONS
-from tests.conformance.vision.fixture import VirtualVision
+from tests.conformance.vision.fixture import KEYS, VirtualVision
 from tests.conformance.vision.sockets import SOCKETS
 from tests.fixtures.javascript import EXAMPLES, ROOT, node
 
@@ -156,7 +156,7 @@ class Stage:
             kind = BROKEN_VISIONS[written.caught_by[0]][1] if written else VirtualVision
             network = MemoryNetwork()
             one = kind(network)
-            bench = VirtualBench(network, [one], TO_ROBOT)
+            bench = VirtualBench(network, [one], TO_ROBOT, access=KEYS)
         elif peer == "robot":
             bench, one = virtual_robot(BROKEN_ROBOTS[written.caught_by[0]] if written else None)
         else:

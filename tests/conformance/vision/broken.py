@@ -109,6 +109,8 @@ class BrokenVision(VirtualVision):
 
     def puts(self, fields, text, *, source="vision", payload=None, before=b"", after=b""):
         channel = ACK if text is None else TWIST
+        if text is not None:
+            fields = fields | self.sender.proofs.next()._asdict()
         self.network.put(key_for("r1", channel, source), before + packed(fields) + after,
                          (text or b"") if payload is None else payload, self.link)
 

@@ -1,8 +1,11 @@
 """Broken vision services: wrong headers, wrong twists, wrong echoes, wrong counts. Pure."""
 
+import secrets
+
 from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import REQUEST, key_for
 from sightline.protocol.messages import Stamp
+from sightline.protocol.proof import NO_PROOF, Proof
 from sightline.protocol.spec.message_cases import packed
 from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from tests.conformance.vision.broken import STANDING, BrokenVision, breaks, frame_header
@@ -231,3 +234,33 @@ class Nostalgic(BrokenVision):
         if known.session not in self.sessions:
             self.sessions = (*self.sessions, known.session)
         return header, jpeg
+
+
+# --- proofs ----------------------------------------------------------------------------------------------------------
+
+
+class OwnProofs(BrokenVision):
+    """Gets its proofs from `next`."""
+
+    def __init__(self, network, robot="r1"):
+        super().__init__(network, robot)
+        self.chain, self.sender.proofs = self.sender.proofs, self
+
+
+@breaks("V-PROOF-01", "proof is random")
+class RandomProof(OwnProofs):
+    def next(self):
+        return Proof(secrets.token_hex(16))
+
+
+@breaks("V-PROOF-02", "continues in another chain than the one that it announced")
+class OtherChain(OwnProofs):
+    def next(self):
+        proof = self.chain.next()
+        return proof._replace(next_proof=proof.next_proof and proof.next_proof[::-1])
+
+
+@breaks("V-PROOF-03", "has no proof")
+class NoProof(OwnProofs):
+    def next(self):
+        return NO_PROOF

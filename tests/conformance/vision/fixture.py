@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from sightline.conformance.benches import TO_ROBOT, VirtualBench
-from sightline.conformance.case import Bench
+from sightline.conformance.case import Access, Bench
 from sightline.protocol.errors import WireError
 from sightline.protocol.messages import CameraModel, FrameHeader
 from sightline.protocol.transports.memory import MemoryLink, MemoryNetwork
@@ -21,6 +21,8 @@ from sightline.vision_side.serving.service import Service
 COMPUTE_US = 2_000
 """Compute time that the reference reports for a frame; virtual answers take a step of 5 ms."""
 CONFIG = VisionConfig()
+KEYS = Access({"vision": "0123456789abcdefABCDEF_-"})
+"""A vision service behind keys must prove its twists; a network in memory checks no token."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,4 +95,4 @@ class VirtualVision(Service):
 def virtual_bench(vision=VirtualVision) -> Bench:
     """A bench of its own with one vision."""
     network = MemoryNetwork()
-    return VirtualBench(network, [vision(network)], TO_ROBOT)
+    return VirtualBench(network, [vision(network)], TO_ROBOT, access=KEYS)

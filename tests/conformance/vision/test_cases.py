@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from sightline.conformance.case import Level
+from sightline.conformance.case import Access, Level
 from sightline.conformance.codec import CASES as CODEC_CASES
 from sightline.conformance.robot.cases import CASES as ROBOT_CASES
 from sightline.conformance.runner import Outcome, passed, run_case
@@ -176,6 +176,13 @@ def test_vision_service_that_never_drives_does_not_conform():
     assert [one.outcome for one in results] == [Outcome.PASSED, Outcome.SKIPPED, Outcome.SKIPPED]
     assert not passed(results)
     assert passed(results[:1])
+
+
+def test_vision_service_without_proofs_fails_no_case_on_a_link_without_keys():
+    for case in (case for case in VIRTUAL if case.id.startswith("V-PROOF")):
+        bench = virtual_bench(BROKEN["V-PROOF-03"][1])
+        bench.access = Access()
+        assert run_case(case, bench, prepare).outcome is Outcome.SKIPPED
 
 
 HOSTILE = [case for case in VIRTUAL if case.group == "hostile input"]
