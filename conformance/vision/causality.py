@@ -359,7 +359,7 @@ def next_chain_is_announced(bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.must("V-PROOF-03", "6.6 Proof", met)
 def proof_behind_keys(bench: Bench, robot: RobotPlayed) -> None:
-    """Where peers show keys, each twist has a proof."""
+    """Each twist has a proof where peers show keys."""
     bench.need(bench.access.is_guarded, "no keys were named (--secure, --token)")
     robot.film("left", _FEW)
     bench.expect(all(one.fields.get("proof") for one in robot.twists() if one.fields), "a twist has no proof")

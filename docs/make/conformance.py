@@ -35,8 +35,9 @@ TOKEN = "conformance-0123456789abcdef"
 
 PREFACE = """`python -m docs.make.conformance` runs the kit over these peers and writes this page. A case that a peer's
 choices leave nothing to test in (no guests, no scan, no port of the legacy protocol, no token, another transport)
-counts as not applicable. The minimal peers are the examples of
-[Implement a peer](../../tutorials/implement-a-peer.md): they leave out clauses on purpose and therefore do not conform.
+counts as not applicable. Most cases of a vision service need its twists, so one that never drives does not conform.
+The minimal peers are the examples of [Implement a peer](../../tutorials/implement-a-peer.md): they leave out clauses on
+purpose and therefore do not conform.
 Clauses are those of [protocol/README.md](https://github.com/sightline-robot/sightline/blob/main/protocol/README.md)."""
 
 UNSEEN = """## Not visible over the wire
