@@ -266,9 +266,13 @@ def rejected_seq_bars_no_driver(bench: Bench, sender: Sender) -> None:
 
 _REMEMBERED_FRAMES: Final = 256
 _APART_US: Final = 8_000
-"""Twists on one frame: apart enough for none to replace another, and all before the next frame."""
+"""Twists on one frame: apart enough for none to replace another, and all before the frame is too old."""
 _OTHERS: Final = 80
 """Rejected senders between a twist and its replay; they must not displace the one that held the lease."""
+_OF_ONE_FRAME: Final = 16
+"""Senders that cite one frame, so that all have sent before the memory of the driver may end."""
+_REMEMBERED_US: Final = 9_000_000
+"""Within the ten seconds for which a robot remembers a driver."""
 
 
 def _watcher(bench: Bench) -> Sender:
@@ -359,9 +363,14 @@ def remembers_senders(bench: Bench, sender: Sender) -> None:
     """A robot remembers the senders that drove: a replay is OUT_OF_ORDER after eighty others were rejected."""
     replayed = sender.twist_result(seq=sender.seq)
     bench.need(replayed == "OUT_OF_ORDER", f"a replay is {replayed} (R-SEQ-06)")
+    began_us = bench.now_us
     sender.need_good()
-    for number in range(_OTHERS):
-        header = {**sender.header(sender.robot.frame()), "session": f"{0xA0000000 + number:08x}", "seq": 1 << 20}
-        bench.publish(TWIST, as_json(header), CRAWL, sender.source)
+    for _ in range(_OTHERS // _OF_ONE_FRAME):
+        frame = sender.robot.frame()
+        for _ in range(_OF_ONE_FRAME):
+            Sender(sender.robot, sender.source, acks=False).twist(frame, seq=1 << 20)
+            bench.rest(_APART_US)
     sender.robot.next_status(2)
-    sender.expect("OUT_OF_ORDER", seq=sender.seq)
+    result = sender.twist_result(seq=sender.seq)
+    bench.need(bench.now_us - began_us < _REMEMBERED_US, "too few frames: a robot may have forgotten the driver")
+    bench.expect(result == "OUT_OF_ORDER", f"after {_OTHERS} others a replay is {result}")

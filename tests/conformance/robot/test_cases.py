@@ -10,6 +10,7 @@ from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import ConfigError
 from tests.conformance.clauses import clauses
+from tests.conformance.robot import reference
 from tests.conformance.robot.broken import arming as broken_arming
 from tests.conformance.robot.broken import motion as broken_motion
 from tests.conformance.robot.reference import virtual_robot
@@ -76,6 +77,19 @@ def test_robot_below_ten_frames_a_second_passes(name):
 def test_robot_of_few_frames_that_arms_from_before_a_human_let_go_does_not_pass(count, found):
     break_it = one_frame_in(count, broken_arming.arms_from_before_a_human_let_go)
     assert result_of(CASES_BY_ID["R-ARM-16"], break_it).outcome is found
+
+
+RATES = {
+    "R-SEQ-12": {1: Outcome.PASSED, 5: Outcome.PASSED, 12: Outcome.PASSED},
+}
+"""Case -> camera rate in 1/s -> the outcome at our robot, where a case needs frames at some rate."""
+
+
+@pytest.mark.parametrize(("name", "fps"), [(name, fps) for name, rates in RATES.items() for fps in rates])
+def test_robot_with_a_slow_camera_passes_or_is_left(monkeypatch, name, fps):
+    monkeypatch.setattr(reference, "CAMERA_US", 1e6 / fps)
+    result = result_of(CASES_BY_ID[name])
+    assert result.outcome is RATES[name][fps], result.reason
 
 
 def test_rejected_reset_may_be_counted_in_a_later_status():

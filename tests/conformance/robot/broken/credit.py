@@ -33,7 +33,7 @@ def computing_widens_the_window(robot):
     wrap(stream, "on_answer", lambda inner, who, seq, compute_us, now_us: inner(who, seq, 0, now_us))
 
 
-@breaks("R-FLOW-03", "R-SEQ-12")
+@breaks("R-FLOW-03")
 def acks_are_not_heard(robot):
     def around(inner, message):
         if "echo" not in (fields_of(message.header) or {}):
@@ -55,7 +55,7 @@ def refused_twists_return_nothing(robot):
     wrap(robot, "on_twist", around)
 
 
-@breaks("R-FLOW-05", "R-SEQ-12")
+@breaks("R-FLOW-05")
 def credit_is_out_for_long(robot):
     stream_of(robot)._timeout_us = lambda _now_us: 800_000
 
