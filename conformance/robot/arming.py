@@ -70,6 +70,7 @@ def arms(bench: Bench, driver: Sender) -> None:
 def unarmed_does_not_move(bench: Bench, driver: Sender) -> None:
     """A robot that is not armed counts good twists as DISARMED, accepts none and does not move."""
     before = driver.robot.status()
+    _send_more(driver, 2)
     after = driver.robot.next_status(3)
     bench.expect(after.accepted == before.accepted, f"{after.accepted - before.accepted} twists were accepted")
     grew = after.refused.get("DISARMED", 0) > before.refused.get("DISARMED", 0)
@@ -385,6 +386,7 @@ def arms_after_reset(bench: Bench, first: Sender) -> None:
     driver = Sender(operator.robot)
     bench.need(driver.twist_result(CRAWL) == GOOD, "twists are not accepted after reset (R-STOP-06)")
     driver.drive()
-    bench.rest(500_000)
+    _send_more(driver, 8)
+    driver.robot.next_status()
     bench.expect(driver.granted("arm"), "arm is not granted after reset")
     arm(driver)

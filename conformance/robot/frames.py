@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import pairwise
+from statistics import median
 from typing import Final
 
 from sightline.conformance.case import Bench, Received, Suite
@@ -339,12 +340,15 @@ def rejected_twists_return_credit(bench: Bench, watcher: Sender) -> None:
 @SUITE.must("R-FLOW-05", "7.5 Timeout")
 def lost_credit_times_out(bench: Bench) -> None:
     """Credit that is not returned times out: frames go on within 500 ms."""
-    taught(bench)
     mark = bench.mark()
+    taught(bench)
+    usual_us, mark = median(_gaps_us(bench, mark)), bench.mark()
     bench.rest(2_500_000)
     gaps_us = _gaps_us(bench, mark)
     bench.expect(len(gaps_us) >= 2, "without an answer no frames came any more")
-    bench.expect(max(gaps_us) <= 650_000, f"without an answer {max(gaps_us) / 1e3:.0f} ms passed between two frames")
+    # A slow camera delivers its next picture up to an interval after the timeout.
+    most_us = max(650_000, 550_000 + usual_us)
+    bench.expect(max(gaps_us) <= most_us, f"without an answer {max(gaps_us) / 1e3:.0f} ms passed between two frames")
 
 
 @SUITE.must("R-FLOW-06", "7.3 Owner", Robot)
