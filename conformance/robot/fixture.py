@@ -195,6 +195,8 @@ class Sender:
         self.request_id = 0
         self.acks = acks
         self.driving: bytes | None = None
+        self.sent_us = 0
+        """When it sent its last twist."""
         self.delay_us = self.compute_us = 0
         robot.each_frame(self._on_frame)
 
@@ -219,6 +221,7 @@ class Sender:
     def twist(self, frame: FrameHeader, text: bytes = CRAWL, **changes: Any) -> None:
         """Send a twist that cites `frame`; its `seq` is the next unless `changes` send otherwise."""
         self.seq += 1
+        self.sent_us = self.bench.now_us
         self.bench.publish(TWIST, as_json(self.header(frame, **changes)), text, self.source)
 
     def ack(self, frame: FrameHeader, **changes: Any) -> None:

@@ -1,12 +1,12 @@
 """Cases on the lease: who drives, by rank, for how long, and what happens when the driver is gone. Pure."""
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.robot.fixture import GOOD, Sender, moving, operator, ready, teleop, vision
+from sightline.conformance.robot.fixture import GOOD, NOT_COUNTED, Sender, moving, operator, ready, teleop, vision
 from sightline.protocol.channels import STATUS
-from sightline.protocol.messages import FrameHeader, LeaseHolder, State
+from sightline.protocol.messages import LeaseHolder, State
 from sightline.protocol.proof import ProofChain
 
 SUITE: Final = Suite("R")
@@ -17,11 +17,27 @@ _SUCCESSION_US: Final = 450_000
 """Silence after which a robot with the default limits accepts a successor, from 400 ms on."""
 
 
+def _result_while_held(first: Sender, second: Sender, **changes: Any) -> str:
+    """The result of the next twist of `second`, in the second that the lease lasts after the last of `first`."""
+    held_us = first.sent_us
+    result = second.twist_result(**changes)
+    in_time = second.sent_us - held_us < _LEASE_US * 9 // 10
+    first.bench.need(in_time or result == NOT_COUNTED, "no frame came while the lease lasted")
+    return result
+
+
+def _expect_while_held(expected: str, first: Sender, second: Sender, what: str = "the twist", **changes: Any) -> None:
+    """Fail the case unless the next twist of `second`, while `first` holds the lease, gets the result `expected`."""
+    result = _result_while_held(first, second, **changes)
+    first.bench.expect(result == expected, f"{what}: {result}, expected {expected}")
+
+
 def _held_alone(bench: Bench) -> tuple[Sender, Sender]:
     """The source that holds the lease, and a second driver that is rejected."""
     first = ready(bench)
     second = Sender(first.robot)
     bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
+    first.need_good()
     return first, second
 
 
@@ -81,7 +97,7 @@ def lease_lasts(bench: Bench) -> None:
     first, second = _held_alone(bench)
     first.twist(first.robot.frame())
     bench.rest(_LEASE_US // 2)
-    second.expect("NOT_HOLDER", what="a second driver")
+    _expect_while_held("NOT_HOLDER", first, second, "a second driver")
 
 
 @SUITE.must("R-LEASE-06", "6.1 Lease", _held_for_a_while)
@@ -120,7 +136,7 @@ def human_keeps(bench: Bench) -> None:
     """`vision` does not take the lease from `teleop`."""
     human = teleop(bench)
     human.need_good()
-    Sender(human.robot).expect("NOT_HOLDER", what="a twist of vision")
+    _expect_while_held("NOT_HOLDER", human, Sender(human.robot), "a twist of vision")
 
 
 @SUITE.must("R-LEASE-11", "6.2 Losing the human")
@@ -178,21 +194,22 @@ def release(bench: Bench, first: Sender) -> None:
     Sender(first.robot).expect(GOOD, what="then a second driver")
 
 
-def _frees_nothing(second: Sender) -> None:
+def _frees_nothing(first: Sender, second: Sender) -> None:
     second.request("release")
-    second.expect("NOT_HOLDER", what="after its release a twist of the second driver")
+    _expect_while_held("NOT_HOLDER", first, second, "after its release a twist of the second driver")
 
 
 SUITE.must_all(ready, {
     "R-LEASE-02": ("6.1 Lease", "A second driver of the same rank is rejected as NOT_HOLDER.",
-                   lambda it: Sender(it.robot).expect("NOT_HOLDER")),
+                   lambda it: _expect_while_held("NOT_HOLDER", it, Sender(it.robot))),
     "R-LEASE-09": ("6.1 Lease", "`teleop` takes the lease from `vision`.",
                    lambda it: Sender(it.robot, "teleop").expect(GOOD, what="a twist of teleop")),
 })
-SUITE.must_all(lambda bench: _held_alone(bench)[1], {
-    "R-LEASE-16": ("8.2 Requests and replies", "`release` by another source frees nothing.", _frees_nothing),
+SUITE.must_all(_held_alone, {
+    "R-LEASE-16": ("8.2 Requests and replies", "`release` by another source frees nothing.",
+                   lambda held: _frees_nothing(*held)),
     "R-LEASE-17": ("8.2 Requests and replies", "`acquire` is rejected while an equal or higher rank drives.",
-                   lambda it: it.expect_rejected("acquire", "", "a second vision service")),
+                   lambda held: held[1].expect_rejected("acquire", "", "a second vision service")),
 })
 SUITE.must_all(operator, {
     "R-LEASE-18": ("8.2 Requests and replies", "`acquire` is rejected to a role that may not drive.",
@@ -211,19 +228,19 @@ SUITE.must_all(teleop, {
 _FORGED: Final = "ab" * 16
 
 
-def _copied(bench: Bench) -> Sender:
-    """A second peer that has read the driver's session and its last number, and has a chain of its own."""
+def _copied(bench: Bench) -> tuple[Sender, Sender]:
+    """The driver, and a peer that has read its session and its last number, and has a chain of its own."""
     first = ready(bench)
     copy = Sender(first.robot, first.source, acks=False)
     copy.session, copy.seq = first.session, first.seq + 100
-    return copy
+    return first, copy
 
 
 SUITE.must_all(_copied, {
     "R-PROOF-01": ("6.6 Proof", "A twist that states the driver's session with another proof is NOT_PROVEN.",
-                   lambda it: it.expect("NOT_PROVEN")),
+                   lambda held: _expect_while_held("NOT_PROVEN", *held)),
     "R-PROOF-02": ("6.6 Proof", "A twist that states the driver's session without a proof is NOT_PROVEN.",
-                   lambda it: it.expect("NOT_PROVEN", proof=None)),
+                   lambda held: _expect_while_held("NOT_PROVEN", *held, proof=None)),
 })
 
 
@@ -232,13 +249,13 @@ def read_proof_is_over(_bench: Bench, first: Sender) -> None:
     """A proof that was accepted once proves nothing: a copy with a higher `seq` is NOT_PROVEN."""
     proof = first.proofs.next().proof
     first.expect(GOOD, proof=proof)
-    first.expect("NOT_PROVEN", proof=proof)
+    _expect_while_held("NOT_PROVEN", first, first, proof=proof)
 
 
 @SUITE.must("R-PROOF-04", "6.6 Proof", ready)
 def copied_identity_bars_no_driver(_bench: Bench, first: Sender) -> None:
     """The `seq` of a twist that is NOT_PROVEN is not used up: the driver's next one is good."""
-    first.expect("NOT_PROVEN", proof=_FORGED, seq=first.seq + 1000)
+    _expect_while_held("NOT_PROVEN", first, first, proof=_FORGED, seq=first.seq + 1000)
     first.expect(GOOD)
 
 
@@ -255,7 +272,7 @@ def too_many_lost_commands(_bench: Bench, first: Sender) -> None:
     """A proof that is 65 commands ahead does not continue: NOT_PROVEN."""
     for _ in range(64):
         first.proofs.next()
-    first.expect("NOT_PROVEN")
+    _expect_while_held("NOT_PROVEN", first, first)
 
 
 @SUITE.must("R-PROOF-06", "6.6 Proof", ready)
@@ -325,23 +342,16 @@ def other_tokens_end_nothing(bench: Bench, held: tuple[Sender, Callable[[], None
     first.need_good()
     withdraw()
     bench.rest(_TOKEN_US)
-    Sender(first.robot).expect("NOT_HOLDER", what="after the end of a token that is not of the holder, a third driver")
+    what = "after the end of a token that is not of the holder, a third driver"
+    _expect_while_held("NOT_HOLDER", first, Sender(first.robot), what)
 
 
-def _result_while_held(bench: Bench, first: Sender, second: Sender) -> str:
+def _result_after_silence(first: Sender, second: Sender) -> str:
     """The result of a twist of `second` after the holder was silent for 0.45 s, in the second that its lease lasts."""
-    sent_us: list[int] = []
-
-    def send(frame: FrameHeader) -> None:
-        sent_us.append(bench.now_us)
-        second.twist(frame)
-
+    first.twist(first.robot.frame())
     first.fall_silent()
-    began_us = bench.now_us
-    bench.rest(_SUCCESSION_US)
-    result = second.result_on_next(send)
-    bench.need(sent_us[-1] - began_us < _LEASE_US * 9 // 10, "no frame came while the silent driver held the lease")
-    return result
+    first.bench.rest(_SUCCESSION_US)
+    return _result_while_held(first, second)
 
 
 @SUITE.must("R-LEASE-24", "6.8 Tokens", _with_token)
@@ -350,7 +360,7 @@ def silent_holder_is_succeeded(bench: Bench, held: tuple[Sender, Callable[[], No
     first, _ = held
     second = Sender(first.robot)
     second.declare()
-    result = _result_while_held(bench, first, second)
+    result = _result_after_silence(first, second)
     bench.expect(result == GOOD, f"after 0.45 s of silence of the holder, a driver with a token: {result}")
 
 
@@ -358,5 +368,5 @@ def silent_holder_is_succeeded(bench: Bench, held: tuple[Sender, Callable[[], No
 def only_a_token_succeeds(bench: Bench, held: tuple[Sender, Callable[[], None]]) -> None:
     """A holder with a token that is silent for 0.45 s does not yield to a driver without one."""
     first, _ = held
-    result = _result_while_held(bench, first, Sender(first.robot))
+    result = _result_after_silence(first, Sender(first.robot))
     bench.expect(result == "NOT_HOLDER", f"after 0.45 s of silence, a driver without a token: {result}")

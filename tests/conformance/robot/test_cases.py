@@ -13,6 +13,7 @@ from tests.conformance.clauses import clauses
 from tests.conformance.robot import reference
 from tests.conformance.robot.broken import arming as broken_arming
 from tests.conformance.robot.broken import motion as broken_motion
+from tests.conformance.robot.broken.breaking import fields_of
 from tests.conformance.robot.reference import virtual_robot
 
 VIRTUAL = [case for case in CASES if not case.real]
@@ -85,6 +86,12 @@ RATES = {
     "R-FLOW-05": {3: Outcome.PASSED},
     "R-ARM-04": {3: Outcome.PASSED},
     "R-STOP-14": {2: Outcome.SKIPPED, 3: Outcome.PASSED, 7: Outcome.PASSED},
+    "R-LEASE-02": {1: Outcome.SKIPPED, 2: Outcome.PASSED},
+    "R-LEASE-05": {2: Outcome.SKIPPED, 3: Outcome.PASSED},
+    "R-LEASE-10": {1: Outcome.SKIPPED},
+    "R-LEASE-16": {2: Outcome.PASSED},
+    "R-LEASE-23": {1: Outcome.SKIPPED},
+    **{f"R-PROOF-0{number}": {1: Outcome.SKIPPED, 2: Outcome.PASSED} for number in (1, 2, 3, 4, 9)},
 }
 """Case -> camera rate in 1/s -> the outcome at our robot, where a case needs frames at some rate."""
 
@@ -94,6 +101,21 @@ def test_robot_with_a_slow_camera_passes_or_is_left(monkeypatch, name, fps):
     monkeypatch.setattr(reference, "CAMERA_US", 1e6 / fps)
     result = result_of(CASES_BY_ID[name])
     assert result.outcome is RATES[name][fps], result.reason
+
+
+def test_robot_that_counts_no_twist_of_a_second_driver_fails():
+    def drops_others(robot):
+        on_twist, sessions = robot.on_twist, set()
+
+        def of_the_first(message):
+            sessions.add(fields_of(message.header)["session"])
+            if len(sessions) == 1:
+                on_twist(message)
+
+        robot.on_twist = of_the_first
+
+    result = result_of(CASES_BY_ID["R-LEASE-02"], drops_others)
+    assert result.outcome is Outcome.FAILED, result.reason
 
 
 def test_rejected_reset_may_be_counted_in_a_later_status():
