@@ -108,6 +108,14 @@ def test_robot_with_a_slow_camera_passes_or_is_left(monkeypatch, name, fps):
     assert result.outcome is RATES[name][fps], result.reason
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("fps", [1, 2, 3, 5, 7, 9, 10, 12, 14, 15, 18, 24, 60, 120, 240])
+def test_robot_with_any_camera_fails_no_case(monkeypatch, fps):
+    monkeypatch.setattr(reference, "CAMERA_US", 1e6 / fps)
+    results = {case.id: result_of(case) for case in VIRTUAL}
+    assert {name: one.reason for name, one in results.items() if one.outcome is Outcome.FAILED} == {}
+
+
 def test_robot_that_counts_no_twist_of_a_second_driver_fails():
     def drops_others(robot):
         on_twist, sessions = robot.on_twist, set()
