@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from hashlib import sha256
+from itertools import pairwise
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, Received
@@ -34,6 +35,8 @@ SETTLES_US: Final = 200_000
 """From a command of zero until a motor and its measurement are at rest."""
 WATCHED_AT_REST_US: Final = 500_000
 """Long enough for several poses that are apart (measured.py)."""
+_STEADY_US: Final = 225_000
+"""Between two frames, so that the speed of a robot hardly falls by their age (5.3) and not by silence (5.4)."""
 _STAMPED: Final = (STATUS, ODOMETRY, FRAME)
 _SENT_AGAIN: Final = 2
 
@@ -126,6 +129,13 @@ class Robot:
         rests_us = self.clock_us() + SETTLES_US
         self.bench.rest(SETTLES_US + WATCHED_AT_REST_US)
         self.expect_unmoved(what, rests_us)
+
+    def expect_at_speed(self, holds: bool, reason: str) -> None:
+        """Fail the case unless `holds`; leave it where frames are so far apart that a robot slows down before each."""
+        times_us = [one.at_us for one, _ in self.frames()[-5:]]
+        steady = all(then - was <= _STEADY_US for was, then in pairwise(times_us))
+        self.bench.need(holds or steady, "too few frames for a steady speed")
+        self.bench.expect(holds, reason)
 
     def _first_t_us(self) -> int:
         """The robot's clock at the first message of the case: a motor log reaches back further."""

@@ -145,8 +145,8 @@ def applied_in_frames(bench: Bench, driver: Sender) -> None:
     bench.rest(300_000)
     reported = [header.applied[0] for _, header in driver.robot.frames(mark)]
     bench.need(reported, "no frame while driving")
-    bench.need(driver.robot.status().applied[0] > 0.05, "the robot does not drive on between two frames")
-    bench.expect(max(reported) > 0.05, f"status reports {driver.robot.status().applied}, the frames {reported[-1]}")
+    reason = f"status reports {driver.robot.status().applied}, the frames {reported[-1]}"
+    driver.robot.expect_at_speed(max(reported) > 0.05, reason)
 
 
 def _grows(robot: Robot, channel: Channel, what: str, values: Iterable[int], least_step: int = 1) -> None:
@@ -233,8 +233,8 @@ _OF_QUICK: Final = 0.8
 """A share of the full rate that no credit leaves to the silent, and no credit at all exceeds."""
 _LEASE_LASTS_US: Final = 700_000
 """Within the second that a lease lasts: afterwards a twist with another proof takes it."""
-_OFTEN_US: Final = 250_000
-"""Between two frames; with a slower camera they come as often without credit, by its timeouts."""
+_COUNTED_US: Final = 600_000
+"""Within the second for which credit is its owner's."""
 QUICK_FPS: Final = 15
 """Below this, camera and credit cannot be distinguished."""
 
@@ -439,13 +439,13 @@ def _second_hastens_nothing(first: Sender) -> None:
 def _returns_nothing(watcher: Sender, what: str, forge: Callable[[Sender, FrameHeader], None]) -> None:
     """Fail the case if what `forge` sends about each frame returns credit to a peer that has been slow."""
     bench = watcher.bench
-    bench.need(median(_gaps_us(bench, 0)) <= _OFTEN_US, "too few frames")
-    silent = fps_of(bench, 600_000)
+    silent = fps_of(bench, _COUNTED_US)
     bench.need(silent < QUICK_FPS, f"{silent:.0f} fps without any answer (R-FLOW-01)")
     forger = again(watcher)
     watcher.robot.each_frame(partial(forge, forger))
-    fps = fps_of(bench, 600_000)
-    bench.expect(fps < 1.5 * silent, f"{fps:.0f} fps with {what}, {silent:.0f} without")
+    fps = fps_of(bench, _COUNTED_US)
+    most = max(1.5 * silent, silent + 2e6 / _COUNTED_US)  # one frame more or less is chance
+    bench.expect(fps < most, f"{fps:.0f} fps with {what}, {silent:.0f} without")
 
 
 SUITE.must_all(taught, {

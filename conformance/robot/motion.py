@@ -4,7 +4,6 @@ The duration of a stop is the time between two arrivals at the kit, so that the 
 """
 
 import math
-from itertools import pairwise
 from typing import Final
 
 from sightline.conformance.case import Bench, Suite
@@ -25,8 +24,6 @@ _OFF_RAD_S: Final = 0.15
 """How far measured motion may be off, besides a share: a wheel slips, an encoder has steps."""
 _OVERSHOOT: Final = 1.15
 _MEASURED_US: Final = 600_000
-_STEADY_US: Final = 225_000
-"""Between two frames, so that the speed of a robot hardly falls by their age (5.3) and not by silence (5.4)."""
 
 
 def _settled(robot: Robot) -> Planar:
@@ -40,14 +37,6 @@ def _driven(bench: Bench, text: bytes) -> tuple[Status, Planar]:
     robot = armed(bench, text=text).robot
     applied = _settled(robot)
     return robot.status(), applied
-
-
-def _expect_steady(robot: Robot, holds: bool, reason: str) -> None:
-    """Fail the case unless `holds`; leave it where frames are so far apart that a robot slows down before each."""
-    times_us = [one.at_us for one, _ in robot.frames()[-5:]]
-    steady = all(then - was <= _STEADY_US for was, then in pairwise(times_us))
-    robot.bench.need(holds or steady, "too few frames for a steady speed")
-    robot.bench.expect(holds, reason)
 
 
 def _within_limits(status: Status, most: Planar) -> tuple[bytes, Planar]:
@@ -64,7 +53,7 @@ def reaches_the_command(bench: Bench) -> None:
         text, wanted = _within_limits(Robot(bench).status(), most)
         _status, applied = _driven(bench, text)
         near = math.isclose(applied[0], wanted[0], abs_tol=0.005) and math.isclose(applied[1], wanted[1], abs_tol=0.02)
-        _expect_steady(Robot(bench), near, f"{text.decode()} is applied as {applied}")
+        Robot(bench).expect_at_speed(near, f"{text.decode()} is applied as {applied}")
         bench.rest(1_000_000 if Sender(Robot(bench), "operator").granted("disarm") else 0)
         bench.forget()
 
@@ -153,7 +142,7 @@ def the_curve_stays(bench: Bench, robot: Robot) -> None:
     bench.need(applied[0] > 0, "it does not drive (R-LIM-01)")
     wanted, seen = requested[1] / requested[0], applied[1] / applied[0]
     reason = f"curvature {seen:.2f} instead of {wanted:.2f} 1/m"
-    _expect_steady(robot, math.isclose(wanted, seen, rel_tol=0.1), reason)
+    robot.expect_at_speed(math.isclose(wanted, seen, rel_tol=0.1), reason)
 
 
 @SUITE.should("R-LIM-07", "6.4 Arming", Robot)

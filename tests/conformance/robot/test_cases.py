@@ -86,7 +86,7 @@ RATES = {
     "R-FLOW-05": {3: Outcome.PASSED},
     "R-ARM-04": {3: Outcome.PASSED},
     "R-STOP-14": {2: Outcome.SKIPPED, 3: Outcome.PASSED, 7: Outcome.PASSED},
-    **{f"R-FLOW-{number}": {2.6: Outcome.SKIPPED, 5: Outcome.PASSED} for number in ("09", "10", "12")},
+    **{f"R-FLOW-{number}": {2.6: Outcome.PASSED} for number in ("09", "10", "12")},
     "R-FRAM-12": {2.6: Outcome.SKIPPED, 3: Outcome.PASSED},
     "R-LIM-01": {2.7: Outcome.SKIPPED, 3: Outcome.PASSED},
     "R-LIM-06": {3: Outcome.SKIPPED, 5: Outcome.PASSED},
