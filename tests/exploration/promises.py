@@ -56,6 +56,7 @@ class Promises:
         self.seen = (False,) * THIEF
         self.holder, self.left, self.live = NOBODY, 0, 0
         self.tokens = self.fenced = self.bound = 0  # bits of drivers: present, never again; the holder has a token
+        self.former = NOBODY  # had the lease last, with a token, until its end
         self.command = (NOBODY, NOBODY, NOBODY)  # age of the image, age of the arrival, driver
         self.auto = auto and not stopped
         self.stored = stopped  # STOP is on the disk
@@ -69,7 +70,7 @@ class Promises:
         return (
             _STATES[self.state], *self.images, self.last, self.previous, self.since_new, self.frozen, self.started,
             self.ended, *self.seen, self.holder, self.left, self.live, *self.command, self.tokens, self.fenced,
-            self.bound, self.auto,
+            self.bound, self.former, self.auto,
             self.stored, self.held, self.idle, self.quiet, self.speed_mps, self.way_m,
         )
 
@@ -80,8 +81,8 @@ class Promises:
         self.seen = saved[13:16]
         self.holder, self.left, self.live = saved[16:19]
         self.command = saved[19:22]
-        self.tokens, self.fenced, self.bound = saved[22:25]
-        self.auto, self.stored, self.held, self.idle, self.quiet, self.speed_mps, self.way_m = saved[25:]
+        self.tokens, self.fenced, self.bound, self.former = saved[22:26]
+        self.auto, self.stored, self.held, self.idle, self.quiet, self.speed_mps, self.way_m = saved[26:]
 
     # --- what happens ----------------------------------------------------------------------------------------------
 
@@ -121,7 +122,7 @@ class Promises:
             if self.holder != NOBODY and RANK[DRIVERS[self.holder].source] == RANK[DRIVERS[driver].source]:
                 self.fenced |= 1 << self.holder
             self.bound = self.tokens >> driver & 1
-        self.holder, self.left = driver, LEASE
+        self.holder, self.left, self.former = driver, LEASE, NOBODY
         demand((reason == "") <= (self.state in ARMED), "2: only an armed robot applies commands")
         demand((reason == "") >= (self.state in ARMED), "an honest command is applied")
         if not reason:
@@ -152,6 +153,7 @@ class Promises:
             may = cited and self._may_take(driver)
             if may and self.holder != driver:
                 self.holder, self.left, self.live, self.command = driver, LEASE, 0, (NOBODY,) * 3
+                self.former = NOBODY
         elif self._is_beside_human(driver):
             demand(not granted, "2: while a human drives no other operator arms or resets")
             return
@@ -181,6 +183,9 @@ class Promises:
                 self.fenced |= 1 << driver
                 self.left = 0
                 self._lose_holder()
+            elif self.former == driver:
+                self.fenced |= 1 << driver
+                self.former = NOBODY
 
     def on_restart(self, auto: bool) -> None:
         """The driver process started again."""
@@ -213,7 +218,9 @@ class Promises:
             self.command = _OLDER[shown], min(arrival + 1, SILENCE + 1), driver
         self.left = max(0, self.left - 1)
         if self.left == 0 and self.holder != NOBODY:
+            former = self.holder if self.bound else NOBODY
             self._lose_holder()
+            self.former = former
         may_arm = self.state is State.DISARMED and self.holder != NOBODY and self.live >= LIVE
         if self.auto and may_arm and self.speed_mps == 0.0:
             self._arm()
