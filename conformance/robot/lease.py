@@ -370,3 +370,20 @@ def only_a_token_succeeds(bench: Bench, held: tuple[Sender, Callable[[], None]])
     first, _ = held
     result = _result_after_silence(first, Sender(first.robot))
     bench.expect(result == "NOT_HOLDER", f"after 0.45 s of silence, a driver without a token: {result}")
+
+
+@SUITE.must("R-LEASE-26", "6.8 Tokens", _with_token)
+def token_is_kept_over_another_driver(bench: Bench, held: tuple[Sender, Callable[[], None]]) -> None:
+    """The lease of a session that drives again after another driver ends with its token, also after many commands."""
+    first, withdraw = held
+    for _ in range(2):  # its first 64 proofs are over
+        for _ in range(40):
+            first.proofs.next()
+        first.need_good()
+    for sender in (Sender(first.robot), first):
+        bench.rest(_LEASE_US * 3 // 2)
+        sender.need_good()
+    withdraw()
+    bench.rest(_TOKEN_US)
+    third = Sender(first.robot)
+    _expect_while_held(GOOD, first, third, "after the end of the token a third driver")

@@ -198,7 +198,7 @@ def acquire_of_an_equal(robot):
     wrap(gate, "acquire", around)
 
 
-@breaks("R-LEASE-21")
+@breaks("R-LEASE-21", "R-LEASE-26")
 def tokens_end_no_lease(robot):
     robot.driving.gate.end_token = lambda token, now_us: False
 
@@ -225,6 +225,11 @@ def silent_holders_yield_to_all(robot):
         return Lease.may_take(self, who, now_us, proof) or (bool(self.token) and silent_us > 400_000)
 
     lease_of(robot, may_take=may_take)
+
+
+@breaks("R-LEASE-26")
+def later_proofs_have_no_token(robot):
+    lease_of(robot, _known_token=lambda self, who: "")
 
 
 @breaks("R-LEASE-18")
