@@ -306,7 +306,7 @@ def test_text_becomes_frames_with_a_header_of_their_own_and_twists_become_text()
         assert not vision.has_listener(ACK)
         vision.publish(ACK, b"{}", b"")
         vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
-        assert until(lambda: robot.said == ["0.2000|-0.3500"])
+        assert until(lambda: robot.said[:1] == ["0.2000|-0.3500"])
         assert vision.latest(CAMERA).take() is None
 
 
@@ -314,7 +314,7 @@ def test_text_becomes_frames_with_a_header_of_their_own_and_twists_become_text()
 def test_dashed_twists_go_out_dashed(options, said):
     with old_robot_and_vision(options) as (robot, vision):
         vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
-        assert until(lambda: robot.said == [said])
+        assert until(lambda: robot.said[:1] == [said])
 
 
 def test_nonnegative_text_has_zero_for_each_negative_number():
@@ -331,7 +331,7 @@ def test_boxes_go_out_in_place_of_twists():
         assert vision.has_listener(DETECTIONS)
         assert not vision.has_listener(TWIST)
         vision.publish(DETECTIONS, b"{}", encode(found))
-        assert until(lambda: robot.said == ["0.2500,0.0000,0.5000,0.5000"])
+        assert until(lambda: robot.said[:1] == ["0.2500,0.0000,0.5000,0.5000"])
         assert until(lambda: robot.said[1:] == ["", ""]), "an empty text stops it"
 
 
@@ -375,8 +375,8 @@ def test_a_link_that_never_drove_sends_nothing():
 
 def test_silence_after_a_motion_brings_two_zeros():
     with old_robot_and_vision() as (robot, vision):
-        vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
         sent_s = time.monotonic()
+        vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
         assert until(lambda: len(robot.said) > 1)
         assert time.monotonic() - sent_s >= 0.3
         assert until(lambda: robot.said[1:] == ["0.0000|0.0000"] * 2)
@@ -389,7 +389,7 @@ def test_a_robot_whose_connection_was_lost_while_driving_is_stopped_at_the_next(
         vision.publish(TWIST, b"{}", b"0.2000|-0.3500")
         assert until(lambda: robot.said)
         robot.clients[0].socket.shutdown(socket.SHUT_RDWR)
-        assert until(lambda: robot.said[1:] == ["closed 0", "0.0000|0.0000", "0.0000|0.0000"])
+        assert until(lambda: sorted(robot.said[1:]) == ["0.0000|0.0000", "0.0000|0.0000", "closed 0"]), "by two threads"
 
 
 OPTIONS = {one: parse_websocket_endpoint(f"ws-legacy://robot:9091{one}").legacy
