@@ -1,6 +1,7 @@
 """The hosts connected to a port: the system's table of TCP sockets, and reports of a host with too many connections."""
 
 import os
+import re
 import socket
 import struct
 from contextlib import ExitStack
@@ -65,13 +66,15 @@ def test_the_table_is_read_only_after_a_new_connection(monkeypatch):
     monkeypatch.setattr(flood_limits, "opened_connections", lambda: opened[0])
     monkeypatch.setattr(flood_limits, "connection_ends", lambda _ports: reads.append(1) or {})
     monkeypatch.setattr(flood_limits, "_CHECK_S", 0.01)
-    monkeypatch.setattr(flood_limits, "_QUIET_US", 500_000)
+    monkeypatch.setattr(flood_limits, "_QUIET_US", 3_600_000_000)
     with limit_floods([f"ws://127.0.0.1:{free_port()}"], lambda _line: None):
         for count in (1, 2, 3):
             assert until(lambda count=count: len(reads) == count)
             assert not until(lambda count=count: len(reads) > count, 0.1)
             opened[0] += 1
-        assert until(lambda: len(reads) == 5, 2.0), "and from time to time"
+        assert until(lambda: len(reads) == 4)
+        monkeypatch.setattr(flood_limits, "_QUIET_US", 500_000)
+        assert until(lambda: len(reads) >= 5), "and from time to time"
 
 
 def test_a_flood_of_connections_is_reported_once_with_its_address():
@@ -85,10 +88,11 @@ def test_a_flood_of_connections_is_reported_once_with_its_address():
         for _ in range(3):
             ending.enter_context(socket.create_connection(address))
         assert until(lambda: reported, 3.0)
-        assert reported == [
-            "67 connections from 127.0.0.1, 22 new ones a second, more than the total limit of 64; "
-            "end the program on this machine"
-        ]
+        (line,) = reported
+        assert re.fullmatch(  # the table may be read before the last one is in it
+            r"6[567] connections from 127\.0\.0\.1, 22 new ones a second, more than the total limit of 64; "
+            r"end the program on this machine", line
+        )
 
 
 def linger(one):
