@@ -20,7 +20,7 @@ from sightline.operator_side.config.loading import load_service
 from sightline.robot_side.plugins import DRIVES
 from sightline.robot_side.ports import WheelAngles
 from tests.fixtures.commands import service
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision
 
@@ -35,7 +35,7 @@ def test_example_robot_drives(tmp_path, monkeypatch):
     drive = {"kind": config.drive.kind, "options": {"port": str(serial)}}
     changes = {"drive": drive, "camera": config.camera.model_dump(), "endpoint": free_endpoint()}
     with RobotProcess(tmp_path, **changes) as robot, Vision(robot.endpoint):
-        assert until(lambda: any(float(line.split()[0]) > 5 for line in serial.read_text().splitlines()[:-1]), 8)
+        assert until(lambda: any(float(line.split()[0]) > 5 for line in serial.read_text().splitlines()[:-1]), START_S)
     assert serial.read_text().splitlines()[-1] == "0.000 0.000"
 
 

@@ -18,7 +18,7 @@ import websocket
 from sightline.benchmarks.loop.pictures import camera_of, write_pictures
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.text import parse_twist
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint, free_port
 from tests.fixtures.robot_process import RobotProcess, driving, stop_after
 
@@ -77,7 +77,7 @@ def old_vision_drives(folder: Path, pictures: Path):
         _once_up(robot),
         running(STRANGERS / "old_vision.py", url, log) as vision,
     ):
-        assert until(lambda: len(rows_of(log)) > FPS, 10)
+        assert until(lambda: len(rows_of(log)) > FPS, START_S)
         assert driving(robot, 1.0)
         yield robot, vision, log, url
 

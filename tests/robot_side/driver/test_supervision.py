@@ -16,7 +16,7 @@ from sightline.robot_side.driver.process import zero_motors
 from sightline.robot_side.driver.supervision import DRIVER_PRIORITY, GUARDIAN_PRIORITY, SystemdNotifier
 from sightline.robot_side.guardian.core import ENDS_WITHIN_US
 from sightline.robot_side.hardware.log_drive import LogDrive
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.robot_process import RobotProcess
 
 UNIT = Path(__file__).parent.parent.parent.parent / "robot_side" / "systemd" / "sightline-robot.service"
@@ -51,7 +51,7 @@ def test_the_guardian_feeds_the_watchdog_only_while_heartbeats_arrive(tmp_path, 
     address = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(address)
-        manager.settimeout(5)
+        manager.settimeout(START_S)
         monkeypatch.setenv("NOTIFY_SOCKET", address)
         monkeypatch.setenv("WATCHDOG_USEC", "1000000")
         with RobotProcess(tmp_path) as robot:

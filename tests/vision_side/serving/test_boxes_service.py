@@ -27,7 +27,7 @@ from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.serving.process import serve
 from sightline.vision_side.serving.service import BoxesService
 from sightline.vision_side.tracking.locate import REMEMBERED, locate_box
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.robot_process import RobotProcess
 from tests.fixtures.vision.vision import Rig, acquired_at, ball_about_lens, camera, circle, errors_after, still
 
@@ -308,8 +308,9 @@ def test_over_a_real_link_the_robot_validates_boxes_by_the_frame_they_answer(tmp
     """A real robot process, our service, and a detector that answers fresh frames first and then old ones."""
     config = VisionConfig.model_validate({"detector": {"kind": "boxes"}, "boxes": {"width_m": 1.0}})
     ending, said = threading.Event(), []
-    with (RobotProcess(tmp_path) as robot, open_zenoh("r1", connect=[robot.endpoint], role="guest") as far,
-          open_zenoh("r1", connect=[robot.endpoint], role="vision") as link):
+    with (RobotProcess(tmp_path) as robot,
+          open_zenoh("r1", connect=[robot.endpoint], role="guest", timeout_s=START_S) as far,
+          open_zenoh("r1", connect=[robot.endpoint], role="vision", timeout_s=START_S) as link):
         statuses, eyes = far.latest(STATUS), Eyes(far)
         serving = threading.Thread(target=serve, args=(config, link, ending, said.append), daemon=True)
         serving.start()
@@ -319,7 +320,7 @@ def test_over_a_real_link_the_robot_validates_boxes_by_the_frame_they_answer(tmp
             return decode(Status, statuses.take(2.0).payload, STATUS.max_payload_bytes)
 
         try:
-            assert until(lambda: robot.speed() > 3, 10)
+            assert until(lambda: robot.speed() > 3, START_S)
             assert status().holder.source == "vision"
             eyes.late_by = 20
             assert until(lambda: status().refused.get("STALE", 0) > 3)
