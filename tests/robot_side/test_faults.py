@@ -306,6 +306,7 @@ def test_what_ends_a_first_network_process_is_the_last_line_of_the_program_and_l
     assert (capsys.readouterr().err, caplog.messages) == ("", ["robot r1: no camera"])
 
 
+@pytest.mark.own_process
 def test_a_camera_that_hangs_at_the_first_start_ends_the_robot_with_its_name(monkeypatch, capsys):
     ended, going_on = [], threading.Event()
 

@@ -138,6 +138,7 @@ def _count(what: str) -> int:
     return len(list(Path("/proc/self", what).iterdir()))
 
 
+@pytest.mark.own_process
 def test_no_thread_or_descriptor_is_left_behind():
     endpoint = free_endpoint("ws://")
 

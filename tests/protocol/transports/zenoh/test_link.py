@@ -223,6 +223,7 @@ def _count(what: str) -> int:
     return len(list(Path("/proc/self", what).iterdir()))
 
 
+@pytest.mark.own_process
 def test_no_thread_or_descriptor_is_left_behind():
     endpoint = free_endpoint()
 
@@ -239,6 +240,7 @@ def test_no_thread_or_descriptor_is_left_behind():
     assert until(lambda: _count("task") <= before[1] + 2, 3)
 
 
+@pytest.mark.own_process
 def test_a_close_while_others_publish_is_silent(monkeypatch):
     """A publisher in use cannot be undeclared; this prints no traceback on the terminal."""
     raised, over = [], threading.Event()
