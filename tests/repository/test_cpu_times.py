@@ -16,6 +16,7 @@ from tests.fixtures import cpu_times
 
 def pytest_configure(config):
     cpu_times.NOTED_S = 0.02
+    cpu_times.slowness = lambda: 1.0  # the tests compute for a time, not for a piece of work
     config.addinivalue_line("markers", "slow: second tier")
     config.pluginmanager.register(cpu_times.CpuTimes(bound_s=0.05))
 """
