@@ -113,6 +113,7 @@ def stop(port, secret_file="", timeout_s=5.0, on_slow=lambda: None):
 STOPPED = Status(state=State.STOPPED, reason="STOP by operator")
 
 
+@pytest.mark.alone
 def test_stop_returns_when_the_wheels_are_at_zero(robot, link, port):
     one = robot(turns_s=0.3)
     assert stop(port, on_slow=lambda: pytest.fail("slow"))
@@ -130,6 +131,7 @@ def test_an_answered_datagram_needs_no_link(robot, link, port, busy):
     assert stop(port) and not link.begun_s
 
 
+@pytest.mark.alone
 def test_an_answer_without_wheels_at_zero_opens_the_link_after_a_second(robot, link, port, busy):
     one = robot(turns_s=2.0)
     assert stop(port) and 1.0 <= link.begun_s - one.stopped_s <= 1.3
