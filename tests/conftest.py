@@ -24,6 +24,10 @@ settings.load_profile("tests")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+# No proxy of the machine stands between a test and its own servers.
+os.environ["no_proxy"] = os.environ["NO_PROXY"] = "127.0.0.1,localhost"
+
+
 def pytest_configure(config):
     """Measure the CPU time of each test; give some tests a process of their own."""
     config.pluginmanager.register(CpuTimes())
