@@ -6,13 +6,14 @@ import signal
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from sightline.operator_side.client.stop import stop_robot
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.messages import LeaseHolder, State
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import port_of
 from tests.fixtures.robot_process import RobotProcess, Vision, driving, stop_after
 
@@ -26,9 +27,8 @@ def test_robot_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
     with RobotProcess(tmp_path) as robot:
         with Vision(robot.endpoint) as vision:
             assert driving(robot)
-            assert until(lambda: vision.status().applied[0] == pytest.approx(0.4))
-            status = vision.status()
-            assert status.state is State.ACTIVE and status.holder == LeaseHolder.of("vision", vision.session)
+            wanted = (State.ACTIVE, LeaseHolder.of("vision", vision.session), pytest.approx(0.4))
+            assert until(lambda: (got := vision.status()) and (got.state, got.holder, got.applied[0]) == wanted)
             assert until(lambda: vision.status().stream.fps >= 25)
             frames = vision.headers
         since = monotonic_us()
@@ -36,7 +36,8 @@ def test_robot_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
         seconds, metres = stop_after(robot.motor_rows(), since)
         assert seconds <= BOUND_S and metres <= BOUND_M
         assert [header.seq for header in frames] == sorted({header.seq for header in frames})
-        assert frames[-1].pose[0] > 0.05 and frames[-1].latency_us < 100_000
+        assert frames[-1].pose[0] > 0.05
+        assert min(header.latency_us for header in frames if header.latency_us) < 100_000
 
 
 @pytest.mark.waits
@@ -61,7 +62,8 @@ def test_a_key_at_the_terminal_does_not_reach_the_network_process(tmp_path, numb
         robot.kill_network(number)
         assert until(lambda: robot.motor_rows()[-1][0] >= since + 800_000), "the driver goes on"
         assert robot.network_pid() == network
-        assert min(left for t, left, _ in robot.motor_rows() if t >= since) >= 10.0
+        assert Path(f"/proc/{network}/stat").read_text().rpartition(")")[2].split()[0] != "T"
+        assert driving(robot)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTTIN, signal.SIGTTOU])
@@ -118,7 +120,7 @@ def test_a_port_in_use_names_its_owner(tmp_path):
         first.wait_until_on("on tcp/")
         (tmp_path / "second").mkdir()
         with RobotProcess(tmp_path / "second", endpoint=first.endpoint) as second:
-            assert second.process.wait(10) == 4
+            assert second.process.wait(START_S) == 4
             assert str(first.network_pid()) in second.output() and "Traceback" not in second.output()
 
 
@@ -137,7 +139,7 @@ def test_a_port_in_use_names_its_owner(tmp_path):
 )
 def test_bad_input_is_one_line_and_the_right_exit_code(tmp_path, change, code, says):
     with RobotProcess(tmp_path, **change) as robot:
-        assert robot.process.wait(10) == code
+        assert robot.process.wait(START_S) == code
         output = robot.output()
         assert says in output and "Traceback" not in output
         assert len([line for line in output.splitlines() if line.startswith("error:")]) == 1
