@@ -68,7 +68,8 @@ def test_rejected_client_receives_the_reason_by_http(quiet_robot, options, statu
 def test_seventeenth_client_is_rejected(tmp_path):
     with JsRobot(tmp_path) as robot, ExitStack() as clients:
         for _ in range(16):
-            clients.enter_context(connect(robot.endpoint, subprotocols=["sightline.v1"]))
+            client = clients.enter_context(connect(robot.endpoint, subprotocols=["sightline.v1"]))
+            client.send(hello("js1"))  # without it the client is dropped after two seconds
         with pytest.raises(InvalidStatus) as refused:
             connect(robot.endpoint, subprotocols=["sightline.v1"])
         assert refused.value.response.status_code == 503

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import time
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from websockets.sync.client import connect
 
 from tests.fixtures.javascript import ROOT, JsProcess, JsRobot, JsVision, hello, json_payload
-from tests.fixtures.links import until
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_port
 from tests.fixtures.robot_process import RobotProcess, driving
 
@@ -57,9 +58,13 @@ def test_our_vision_and_operator_drive_and_stop_the_javascript_robot(tmp_path, o
         armed = sightline("arm", "js1", "--connect", robot.endpoint)
         assert "armed" in armed
         assert robot.says(r"ACTIVE \(driving\)")
-        assert until(lambda: any(applied(robot)), 10)
-        told = status(robot)
-        assert told["state"] == "ACTIVE" and told["holder"]["source"] == "vision"
+        told: dict[str, Any] = {}
+
+        def drives() -> bool:
+            told.update(status(robot))
+            return told["state"] == "ACTIVE" and told["holder"]["source"] == "vision" and any(told["applied"])
+
+        assert until(drives, START_S), told
         assert set(told["refused"]) <= {"DISARMED", "CLAMPED", "NOT_ALLOWED"}  # armed as soon as it was allowed
         assert told["stream"]["credit_timeouts"] < told["stream"]["sent"] / 4
         assert "STOPPED" in sightline("stop", "js1", "--connect", robot.endpoint)
@@ -120,7 +125,7 @@ def test_the_javascript_vision_drives_our_robot(tmp_path):
         assert vision.says("target seen"), vision.output() + robot.output()
         assert driving(robot, 2.0), robot.output()
         told = json.loads(sightline("status", "r1", "--connect", endpoint, "--json"))
-        assert told["accepted"] > 5 and set(told["refused"]) <= {"DISARMED", "CLAMPED"}
+        assert told["accepted"] > 5 and set(told["refused"]) <= {"DISARMED", "CLAMPED", "STALE"}  # on a busy machine
         assert told["applied"][0] > 0 > told["applied"][1]  # the ball is on the right
         vision.kill()
         assert until(lambda: robot.speed() == 0, 2)
