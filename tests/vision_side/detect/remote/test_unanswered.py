@@ -117,17 +117,17 @@ def test_a_model_is_requested_once_and_again_after_an_error(closes):
 
 
 def test_late_server_is_not_delayed_by_another_model_query():
-    """Each request takes 60 of 100 ms. That is enough for a known model, but not with a metadata request."""
+    """Each request takes 0.6 of 1 s. That is enough for a known model, but not with a metadata request."""
     with ModelServer(closes=False) as server:
         settings = OipSettings(address=f"oip+http://127.0.0.1:{server.port}/ball", labels=("b",))
         detector = ServerDetector("oip", HttpServer(parse_address(settings.address), settings))
         assert detector.detect([frame(1)], within(2)) != [None]
         server.takes_s = 0.2
         assert detector.detect([frame(2)], within(0.1)) == [None]
-        server.takes_s = 0.06
+        server.takes_s = 0.6
         time.sleep(0.2)
-        seen = [detector.detect([frame(seq)], within(0.1))[0] for seq in range(3, 9)]
-        assert sum(one is not None for one in seen) >= 4 and server.told == 1
+        seen = [detector.detect([frame(seq)], within(1.0))[0] for seq in range(3, 6)]
+        assert sum(one is not None for one in seen) >= 2 and server.told == 1
         detector.close()
 
 
