@@ -84,6 +84,7 @@ def naming(text):
     return found
 
 
+@pytest.mark.alone  # 0.8 s are left of the 2 s
 def test_a_parent_that_is_killed_leaves_no_process_and_no_folder_after_2_s(tmp_path):
     """One is stopped, one ignores SIGTERM and has a child; the oldest, e.g. the simulation, ends after the others."""
     (tmp_path / "member.py").write_text(_MEMBER)
