@@ -147,7 +147,7 @@ def stopped(tmp_path):
 def say_stop_once(link):
     stop = request(Verb.STOP)
     link.publish(REQUEST, stop.header, stop.payload)
-    time.sleep(0.3)  # until it has arrived: no event shows it while the driver process is stopped
+    time.sleep(1.0)  # until it has arrived: no event shows it while the driver process is stopped
 
 
 def test_stop_sent_once_arrives_through_a_full_socket(stopped):
