@@ -54,6 +54,11 @@ def age_of(picture) -> float:
     return time.monotonic() - picture.t_us / 1e6
 
 
+def ages_of(camera) -> list[float]:
+    """The ages of some images: on a busy machine one may wait, the youngest did not."""
+    return [age_of(next_picture(camera)) for _ in range(5)]
+
+
 def fault_of(camera, timeout_s=5.0) -> str:
     """The line of the next HardwareError."""
     deadline_s = time.monotonic() + timeout_s
@@ -102,7 +107,8 @@ def test_images_are_copied_only_for_a_reader(opened):
     before = device.retrieved, device.grabbed
     eventually(lambda: device.grabbed > before[1] + 5)
     assert device.retrieved == before[0]
-    assert age_of(next_picture(camera)) < 0.1
+    assert age_of(next_picture(camera)) < 1.0, "taken since"
+    assert min(ages_of(camera)) < 0.1
 
 
 # --- formats -----------------------------------------------------------------------------------------------------
@@ -143,14 +149,12 @@ NOW = Clocks(running_us=10_000_000, boot_us=500_000_000, day_us=1_700_000_000_00
 @pytest.mark.parametrize("clock", [time.monotonic, time.time, lambda: time.clock_gettime(time.CLOCK_BOOTTIME)])
 def test_buffer_time_is_converted_to_the_monotonic_clock(opened, clock):
     camera = opened(FakeDevice(clock=lambda: clock() - 0.040))
-    age_s = age_of(next_picture(camera))
-    assert 0.040 <= age_s < 0.140
+    assert 0.040 <= min(ages_of(camera)) < 0.140
 
 
 def test_image_without_a_time_has_the_configured_age(opened):
     camera = opened(FakeDevice(clock=lambda: 0.0), delay_ms=70)
-    age_s = age_of(next_picture(camera))
-    assert 0.070 <= age_s < 0.170
+    assert 0.070 <= min(ages_of(camera)) < 0.170
 
 
 @pytest.mark.parametrize(
@@ -204,7 +208,7 @@ def test_image_from_before_a_suspend_is_as_old_as_the_suspend():
 def test_images_that_waited_for_a_stalled_process_are_old(opened):
     delay_s = [0.040]
     camera = opened(FakeDevice(clock=lambda: time.monotonic() - delay_s[0]))
-    assert age_of(next_picture(camera)) < 0.140
+    assert min(ages_of(camera)) < 0.140
     delay_s[0] = 5.0
     eventually(lambda: age_of(next_picture(camera)) > 4.9, 2.0)
 
@@ -264,7 +268,7 @@ def test_camera_with_invalid_data_is_reported(opened):
 
 
 def test_a_camera_that_starts_slowly_is_waited_for(opened):
-    assert age_of(next_picture(opened(FakeDevice(starting_s=1.5)))) < 0.15
+    assert min(ages_of(opened(FakeDevice(starting_s=1.5)))) < 0.15
 
 
 def test_camera_frozen_from_the_start_does_not_open(opened):

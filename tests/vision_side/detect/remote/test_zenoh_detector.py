@@ -87,7 +87,8 @@ class Bench:
     def __init__(self, ending, detector=HSV, **serving):
         self.endpoint, self.words = free_endpoint(), []
         site = ending.enter_context(open_fleet("*", listen=[self.endpoint], role=ROLE, about=self._about))
-        self.service = DetectorService(site, detector, ServingOptions("hsv", **serving), self.words.append)
+        options = ServingOptions("hsv", **{"deadline_us": 5_000_000, **serving})
+        self.service = DetectorService(site, detector, options, self.words.append)
         ending.enter_context(_served(self.service))
         self._ending = ending
 
@@ -122,14 +123,14 @@ def test_boxes_name_the_frame_of_the_robot(bench):
     robot = bench.robot("r1")
     detector = bench.detector("r1")
     assert until(lambda: _result(robot, detector))
-    result = _result(robot, detector)
+    result = _result(robot, detector, seconds=5)
     expected = HSV.detect([frame()], 0)[0].detections[0]
     found = result.detections[0]
     assert [getattr(found, name) for name in CORNERS] == [getattr(expected, name) for name in CORNERS]
     assert found.circle.radius_px == pytest.approx(expected.circle.radius_px)
     assert (result.robot, result.session, result.seq) == ("r1", robot.session, robot.seq)
     assert (result.detector, result.device) == ("hsv", "cpu"), "the result names the remote detector and its device"
-    assert _result(robot, detector, GREY_JPEG).detections == (), "an image without a target is an answer too"
+    assert _result(robot, detector, GREY_JPEG, 5).detections == (), "an image without a target is an answer too"
 
 
 def test_one_detector_serves_every_robot_of_a_fleet(bench):
@@ -137,7 +138,7 @@ def test_one_detector_serves_every_robot_of_a_fleet(bench):
     detector = bench.detector("r1", "r2", "r3")
     assert until(lambda: all(_result(robot, detector) for robot in robots))
     for robot in robots:
-        assert (result := _result(robot, detector)).robot == robot.name and result.session == robot.session
+        assert (result := _result(robot, detector, seconds=5)).robot == robot.name and result.session == robot.session
 
 
 def test_missing_link_is_reported():
@@ -156,7 +157,7 @@ def test_a_bad_image_and_a_bad_header_get_no_answer_and_are_counted(bench):
         assert detector.detect([asked], within(0.05)) == [None]
         # The service detects in the newest frame alone: one that is sent before may be replaced and never counted.
         assert until(lambda count=count: bench.service.counters()["r1"].rejected == before + count)
-    assert _result(robot, detector) is not None
+    assert _result(robot, detector, seconds=5) is not None
 
 
 @pytest.mark.parametrize("size", [(1, 1), (15, 400), (8200, 16)])
@@ -324,10 +325,10 @@ def test_service_with_the_same_model_replaces_a_missing_answer_in_time(pair):
     assert _label(waiting, frame(2)) == "ball"
     robot.say(frame(3), OTHER, by="00000002", model="11111111")
     began_s = time.monotonic()
-    assert _label(waiting, frame(3), 0.2) == "box" and 0.05 < time.monotonic() - began_s < 0.2
+    assert _label(waiting, frame(3), 2.0) == "box" and 0.5 < time.monotonic() - began_s < 2.0
     began_s = time.monotonic()
     robot.say(frame(4), BOX, by="00000002", model="11111111")
-    assert _label(waiting, frame(4)) == "ball" and time.monotonic() - began_s < 0.2, "it is the preferred one now"
+    assert _label(waiting, frame(4), 4.0) == "ball" and time.monotonic() - began_s < 2.0, "it is the preferred one now"
     assert not waiting.rejected and waiting.notices() == ["detector zenoh (detector) answers"]
 
 
@@ -354,7 +355,7 @@ def test_newer_boxes_of_the_next_service_are_stored_for_their_frame(pair):
     robot.say(frame(2), BOX, by="00000001")
     assert _label(waiting, frame(2)) == "ball"
     robot.say(frame(4), OTHER, by="00000002")
-    assert _label(waiting, frame(3), 0.1) is None and waiting.rejected == {"OTHER_FRAME": 1}
+    assert _label(waiting, frame(3), 1.0) is None and waiting.rejected == {"OTHER_FRAME": 1}
     assert _label(waiting, frame(4), 0.0) == "box"
 
 
