@@ -73,7 +73,7 @@ def plan(
 
 
 def with_state_in(planned: InstallPlan, folder: Path) -> InstallPlan:
-    """Let the service store the STOP latch where its configuration says, not in the folder of the unit.
+    """Let the service store the STOP latch in the folder of its configuration, not in that of the unit.
 
     Raises:
         ConfigError: systemd cannot read the path, or it depends on the user.

@@ -220,7 +220,7 @@ def test_time_without_frames_ends_after_2_5_s(at_us, waits):
     assert (sharing.robots[robot].active_us == at_us) is waits
 
 
-def test_one_frame_without_an_answer_is_no_sign_of_the_driver():
+def test_one_frame_without_an_answer_does_not_show_a_driver_at_work():
     robot = robot_whose("b", "a")
     sharing = service(robot, driver(robot))
     for ms in (0, 100):
