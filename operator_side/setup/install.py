@@ -7,6 +7,7 @@ import grp
 import os
 import re
 import subprocess
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -26,8 +27,6 @@ MAX_INSTANCES = 64
 _STARTED_AT_BOOT = "multi-user.target.wants"
 _DROP_INS_PINS = "gpio_low 10 9 8 7 17"
 """The pins in the file of `robot_side/systemd`: those of the example car."""
-
-
 _GROUPS = "SupplementaryGroups=video gpio"
 _STATE_DIR = "Environment=SIGHTLINE_ROBOT__STATE_DIR=/var/lib/sightline"
 _NAME = " --name %l-%i"
@@ -155,14 +154,15 @@ def _other_units(planned: InstallPlan) -> list[str]:
 
 
 def _put(planned: InstallPlan) -> None:
+    part = planned.path.with_name(f".{planned.path.name}.part")  # a disk that is full must not leave half a unit
     try:
         if planned.path.name == _DROP_IN:
             planned.path.parent.mkdir(exist_ok=True)
-        part = planned.path.with_suffix(".part")  # a disk that is full must not leave half a unit
         part.write_text(planned.text)
         part.replace(planned.path)
     except OSError as error:
-        part.unlink(missing_ok=True)
+        with suppress(OSError):
+            part.unlink()
         raise ConfigError(f"cannot write {planned.path}: {error.strerror}; run it with sudo") from None
 
 

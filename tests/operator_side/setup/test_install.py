@@ -137,8 +137,9 @@ def test_a_service_that_could_not_begin_is_not_installed(capsys, tmp_path):
     assert "nonsense" in capsys.readouterr().err
 
 
-def test_folder_that_cannot_be_written_is_reported(tmp_path):
-    planned = install.plan("vision", PROGRAM, CONFIG, "pi", tmp_path / "absent")
+@pytest.mark.parametrize("name", ["sightline-vision.service", "gpio-low.conf"])
+def test_folder_that_cannot_be_written_is_reported(name, tmp_path):
+    planned = install.InstallPlan("robot", tmp_path / "absent" / "folder" / name, "[Service]\n")
     with pytest.raises(ConfigError, match=r"cannot write .*: No such file or directory; run it with sudo"):
         install.write(planned)
 
