@@ -299,10 +299,10 @@ class _Chain:
         """What is wrong with the first proof that does not continue those before it."""
         self.twists = 0
         self.announcing: int | None = None
-        """How many twists announced the chain that the last one ended in; None before a chain ended."""
+        """How many twists in a row announced the chain that the last one ended in; None before a chain ended."""
         self._robot, self._bench, self._announced = robot, robot.bench, 0
         self._session: Any = None
-        self._last, self._next = Proof(None), Proof(None)
+        self._last = Proof(None)
         self._bench.on(TWIST, self._read)
 
     def _read(self, received: Received) -> None:
@@ -310,16 +310,17 @@ class _Chain:
         self.twists += 1
         fields = read_answer(received).fields
         proof, following = (self._element(fields.get(name)) for name in ("proof", "next_proof"))
-        if self._last.proof is not None and fields.get("session") == self._session and not continues(proof, self._last):
-            if not continues(proof, self._next):
+        before, is_same = Proof(self._last.proof), fields.get("session") == self._session
+        if before.proof is not None and is_same and not continues(proof, before):
+            if not continues(proof, self._last):
                 self.fault = self.fault or (f"the proof of twist {self.twists}, {proof}, hashed 1 to {MAX_LOST} times, "
                                             "gives neither the last one nor the announced one")
-            self.announcing, self._announced, self._next = self._announced, 0, Proof(None)
-        if following is not None and following != self._next.proof:
+            self.announcing = self._announced
+        if following != self._last.next_proof:
             # An element that the first twist announces may have been announced before.
-            self._next, self._announced = Proof(following), MAX_LOST if self.twists == 1 else 0
+            self._announced = MAX_LOST if self.twists == 1 else 0
         self._announced += following is not None
-        self._last, self._session = Proof(proof), fields.get("session")
+        self._last, self._session = Proof(proof, following), fields.get("session")
 
     def _element(self, value: Any) -> str | None:
         if value is None or (isinstance(value, str) and _ELEMENT.fullmatch(value)):
@@ -347,7 +348,7 @@ def proofs_continue(bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.must("V-PROOF-02", "6.6 Proof", met)
 def next_chain_is_announced(bench: Bench, robot: RobotPlayed) -> None:
-    """A chain of proofs that ends continues in the next one, which at least 64 twists have announced."""
+    """A chain of proofs that ends continues in the next one, which its last 64 twists have announced."""
     chain = _Chain(robot)
     chain.follow(_FEW)
     bench.need(not chain.fault, "its proofs do not continue (V-PROOF-01)")
