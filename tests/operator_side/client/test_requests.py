@@ -76,6 +76,12 @@ def test_arm_drive_stop_reset():
         assert operator.request(Verb.DISARM).ok
 
 
+@pytest.mark.alone
+def test_stop_that_is_answered_is_not_slow():
+    with PumpedRobot() as robot:
+        assert robot.operator.wait_report() and robot.operator.stop(lambda: pytest.fail("300 ms")).state == "STOPPED"
+
+
 def test_arm_waits_for_valid_commands_and_reports_the_missing_condition():
     with PumpedRobot(drives=False) as robot:
         reply = robot.operator.arm(patience_s=0.05)
@@ -92,6 +98,7 @@ def test_request_without_an_answer_ends_in_time_with_an_error():
             robot.operator.request(Verb.ARM, timeout_s=0.3)
 
 
+@pytest.mark.alone
 def test_stop_is_repeated_at_20_hz_and_warns_when_it_is_slow():
     with PumpedRobot(receives=False) as robot:
         received, warned = [], []
@@ -99,10 +106,9 @@ def test_stop_is_repeated_at_20_hz_and_warns_when_it_is_slow():
         started_s = time.monotonic()
         with pytest.raises(LinkError, match="cut its power"):
             robot.operator.stop(lambda: warned.append(time.monotonic() - started_s), timeout_s=0.6)
-        # How soon, and how often at least, is measured in virtual time: a busy machine would decide here.
         assert len(warned) == 1
-        assert warned[0] >= 0.3
-        assert 2 <= len(received) <= 13
+        assert 0.3 <= warned[0] < 0.5
+        assert 6 <= len(received) <= 13
 
 
 def test_silence_and_another_version_have_different_errors():
