@@ -252,15 +252,20 @@ def test_driver_keeps_its_token_over_a_human_and_over_a_stop():
         assert lease.token == "", "a token that ended has no driver"
 
 
+def another_drives(lease, number):
+    """Let another driver take the free lease with a token, and lose both."""
+    lease.drop()
+    other = Vision(number + 2)
+    lease.add_token(other.token)
+    lease.take(other.who, 0, other.proof)
+    lease.end_token(other.token, 0)
+
+
 @pytest.mark.parametrize(("others", "known"), [(63, True), (64, False)])
 def test_tokens_of_sixty_four_former_drivers_are_known(others, known):
     lease, first = held()
     for number in range(others):
-        lease.drop()
-        other = Vision(number + 2)
-        lease.add_token(other.token)
-        lease.take(other.who, 0, other.proof)
-        lease.end_token(other.token, 0)
+        another_drives(lease, number)
     lease.take(first.who, 0, first.later(500))
     assert (lease.token == first.token) is known
 
@@ -268,11 +273,7 @@ def test_tokens_of_sixty_four_former_drivers_are_known(others, known):
 def test_the_driver_that_held_the_lease_longest_ago_is_forgotten_first():
     lease, first = held()
     for number in range(100):
-        lease.drop()
-        other = Vision(number + 2)
-        lease.add_token(other.token)
-        lease.take(other.who, 0, other.proof)
-        lease.end_token(other.token, 0)
+        another_drives(lease, number)
         lease.take(first.who, 0, first.later(500))
         assert lease.token == first.token
 
