@@ -20,6 +20,7 @@ from sightline.operator_side.cli.options import (
     Secure,
     check_camera_sets,
     command_group,
+    first_given,
     print_result,
 )
 from sightline.operator_side.client.pictures import viewer_role
@@ -73,8 +74,9 @@ def use(
 
     Client commands use --connect, else SIGHTLINE_CONNECT, else this address. Services ignore it.
     """
-    if address is None:
-        _check_alone({f"--robot {robot}": robot is not None, f"--secure {secure}": secure, "--no-check": no_check})
+    options = {f"--robot {robot}": robot is not None, f"--secure {secure}": secure, "--no-check": no_check}
+    if address is None and (option := first_given(options)):
+        raise ConfigError(f"{option.split()[0]} needs ADDRESS; write sightline use ADDRESS {option}")
     path = contexts.context_path(os.environ)
     if path is None:
         raise ConfigError("this user has no home folder; set XDG_CONFIG_HOME to a folder that you may write")
@@ -94,13 +96,6 @@ def use(
     contexts.write_context(path, context)
     saved = f"saved robot {robot} at {address} to {contexts.shown(path)}{note}"
     _print_use({"connect": address, "robot": robot, "secure": context.secure, "file": str(path)}, saved, as_json)
-
-
-def _check_alone(given: Mapping[str, object]) -> None:
-    """Raise ConfigError for the first option that is given, without ADDRESS."""
-    option = next((option for option, is_given in given.items() if is_given), "")
-    if option:
-        raise ConfigError(f"{option.split()[0]} needs ADDRESS; write sightline use ADDRESS {option}")
 
 
 def _show_target(as_json: bool) -> None:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, Final, TypeVar
 
 import typer
@@ -99,6 +99,11 @@ def _finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_finite(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def first_given(given: Mapping[str, object]) -> str:
+    """Return the first option whose value was given, or ""."""
+    return next((option for option, is_given in given.items() if is_given), "")
 
 
 def check_camera_sets(camera: str | None, camera_sets: list[str] | None) -> None:

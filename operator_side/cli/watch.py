@@ -5,7 +5,7 @@ import io
 import json
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Annotated
@@ -13,7 +13,7 @@ from typing import Annotated
 import typer
 
 from sightline.operator_side.cli.operate import follow_status
-from sightline.operator_side.cli.options import Connect, Json, Port, Robot, Secure
+from sightline.operator_side.cli.options import Connect, Json, Port, Robot, Secure, first_given
 from sightline.operator_side.client.messages import (
     TARGET_COLUMNS,
     ChannelInbox,
@@ -72,8 +72,9 @@ def watch(
     """
     if channel is None and (as_json or count):
         raise ConfigError("--json and --count need a channel; name it, e.g. sightline watch r1 status --json")
-    if channel is not None:
-        _check_unused(channel, {"--text": text, "--show": show != OVERLAY.name, "--port": port})
+    of_page = {"--text": text, "--show": show != OVERLAY.name, "--port": port}
+    if channel is not None and (unused := first_given(of_page)):
+        raise ConfigError(f"{unused} has no effect on channel '{channel}'; remove one of the two")
     if as_csv and (channel != _TARGET or as_json):
         raise ConfigError("--csv is for the target and without --json: sightline watch r1 target --csv")
     if channel is not None and channel not in (*CHANNELS, _TARGET):
@@ -95,13 +96,6 @@ def watch(
             while time.monotonic() < ends_s:
                 time.sleep(min(_WAIT_S, max(0.0, ends_s - time.monotonic())))
     return 0
-
-
-def _check_unused(channel: str, given: Mapping[str, object]) -> None:
-    """Raise ConfigError for an option of the page or of the terminal beside a channel."""
-    unused = next((option for option, is_given in given.items() if is_given), "")
-    if unused:
-        raise ConfigError(f"{unused} has no effect on channel '{channel}'; remove one of the two")
 
 
 def _message_form(as_json: bool) -> Callable[[Message], str]:
