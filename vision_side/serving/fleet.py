@@ -46,16 +46,16 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S, _DOUBLINGS = 1.0, 30.0, 16
 
 
 class _NotifyingLink(LinkWrapper):
-    """A link whose subscriptions set `bell` when a message has arrived."""
+    """A link whose subscriptions call `notify` when a message has arrived."""
 
-    def __init__(self, link: Link, bell: threading.Event) -> None:
+    def __init__(self, link: Link, notify: Callable[[], None]) -> None:
         super().__init__(link)
-        self._bell = bell
+        self._notify = notify
 
     def subscribe(self, channel: Channel, callback: Callable[[Message], None]) -> None:
         def ring(message: Message) -> None:
             callback(message)
-            self._bell.set()
+            self._notify()
 
         super().subscribe(channel, ring)
 
@@ -157,6 +157,9 @@ class Fleet:
     def _open(self, config: VisionConfig, link: Link, detector: Detector) -> Service:
         return open_service(config, link, self._report_of(config.robot), detector)
 
+    def _on_message(self) -> None:
+        self._bell.set()
+
     def _turn_of(self, robot: str) -> None:
         if not self._waits_for_service:
             self.services[robot].turn(0.0)
@@ -180,7 +183,7 @@ class Fleet:
         config = self._config.model_copy(update={"robot": robot})
         link = self._links[robot] = self._fleet_link.link(robot)
         if not self._waits_for_service:
-            notifying = _NotifyingLink(link, self._bell)
+            notifying = _NotifyingLink(link, self._on_message)
             self.services[robot] = self._open(config, notifying, self._detector)
             return
         own = self._another_detector(config) if self.services else None
@@ -224,10 +227,13 @@ class Fleet:
 
 
 _LONGEST_SHARED_WAIT_S = 0.02
-_TOKEN_ENDS_AFTER_US, _ROBOT_ENDS_AFTER_US, _MISSION_ENDS_AFTER_US = 5_000, 500_000, 10_000_000
-"""If the link ends, the tokens beyond it end before that is known: those of 200 robots for 0.1 s. A robot whose own
-link is cut for a moment is back so soon. Its requested mission goes on after a longer cut too, as without other
-services. The end of a driver or service must count at once."""
+_QUIET_US, _COUNTS_WITHIN_US = 30_000, 100_000
+"""If the link ends, the tokens beyond it end one after the other before that is known: those of 200 robots for 0.1 s.
+The end of a driver or service must count at once, but not then: it counts with the first message after it, for nothing
+comes over a link that ended. Without a message it counts after so long without the end of another token, or in all."""
+_ROBOT_ENDS_AFTER_US, _MISSION_ENDS_AFTER_US = 500_000, 10_000_000
+"""A robot whose own link is cut for a moment is back so soon. Its requested mission goes on after a longer cut too, as
+without other services."""
 _NEVER_US = 1 << 62
 _HANDS_OVER_WITHIN_S = 0.6
 _MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn, and ends that do not count yet
@@ -244,7 +250,8 @@ class SharedFleet(Fleet):
         self._tokens: deque[tuple[Token, bool, int]] = deque(maxlen=_MAX_TOKENS)
         """Each with its presence and the time when that was noted."""
         self._ends_us: dict[Token, int] = {}
-        """Tokens that ended and may be back soon: when their end counts."""
+        """Tokens that ended and whose end does not count yet: when they ended."""
+        self._newest_end_us = self._heard_us = 0
         self._is_up, self._losses = True, fleet_link.losses
         self._statuses: dict[str, LatestSlot[Message]] = {}
         self._withdraw: dict[str, Callable[[], None]] = {}
@@ -307,21 +314,29 @@ class SharedFleet(Fleet):
                     self._attempt(token.robot, self._drive_again)
                 self.sharing.on_token(token, True, now_us)
             elif len(self._ends_us) < _MAX_TOKENS:
-                self._ends_us[token] = at_us + self._ends_after_us(token)
+                self._ends_us[token] = self._newest_end_us = at_us
             else:
                 self.sharing.on_token(token, False, now_us)
-        for token in [one for one, end_us in self._ends_us.items() if end_us <= now_us or not self._is_up]:
+        for token in [one for one in self._ends_us if not self._is_up or self._counts_us(one) <= now_us]:
             del self._ends_us[token]
             self.sharing.on_token(token, False, now_us)
 
-    def _ends_after_us(self, token: Token) -> int:
-        """Return the time from the end of a token until it counts."""
+    def _counts_us(self, token: Token) -> int:
+        """Return when the end of a token counts."""
+        ended_us = self._ends_us[token]
         if not isinstance(token, RobotToken):
-            return _TOKEN_ENDS_AFTER_US
+            if self._heard_us > ended_us:
+                return self._heard_us
+            return min(self._newest_end_us + _QUIET_US, ended_us + _COUNTS_WITHIN_US)
         if self.sharing.is_named(token.robot):
             return _NEVER_US
         service = self.services.get(token.robot)
-        return _MISSION_ENDS_AFTER_US if service is not None and service.has_request else _ROBOT_ENDS_AFTER_US
+        has_request = service is not None and service.has_request
+        return ended_us + (_MISSION_ENDS_AFTER_US if has_request else _ROBOT_ENDS_AFTER_US)
+
+    def _on_message(self) -> None:
+        self._heard_us = monotonic_us()
+        super()._on_message()
 
     def _turn_of(self, robot: str) -> None:
         super()._turn_of(robot)
@@ -350,7 +365,7 @@ class SharedFleet(Fleet):
             self._bell.set()
 
     def _wait(self) -> None:
-        next_end_s = (min(self._ends_us.values(), default=_NEVER_US) - monotonic_us()) / 1e6
+        next_end_s = (min(map(self._counts_us, self._ends_us), default=_NEVER_US) - monotonic_us()) / 1e6
         self._bell.wait(min(max(0.001, next_end_s), _LONGEST_SHARED_WAIT_S))
         self._bell.clear()
 

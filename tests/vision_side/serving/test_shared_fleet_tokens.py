@@ -2,6 +2,7 @@
 
 import pytest
 
+from sightline.protocol.channels import STATUS
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
 from sightline.vision_side.config import DetectorConfig, ShareConfig, VisionConfig
@@ -41,6 +42,11 @@ class Site:
 
     def link(self, robot):
         return self._network.link(robot, role="vision")
+
+    def hear(self, robot):
+        """Let the message of a robot arrive."""
+        self._network.link(robot).publish(STATUS, b"", b"")
+        self._network.advance(self.now_us)
 
     def turn(self, times=1, ms=1):
         for _ in range(times):
@@ -113,21 +119,75 @@ def test_a_driver_that_gives_up_receives_frames_for_its_claim_and_answers_none(m
     assert robot.part is SharingPart.CLAIM and not service._is_subscribed
     site.note(DriverToken("r0", "b", "0" * 32), False)
     site.fleet._bell.clear()
-    site.turn(6)
+    site.turn(30)
     assert not service.is_standby and site.fleet._bell.is_set(), "a frame may wait"
 
 
-def test_service_that_ends_counts_after_five_milliseconds(monkeypatch):
+def ended(monkeypatch):
+    """A site with another service, whose token and the one with which it drives r0 end now."""
     site = Site(monkeypatch, 2)
-    other = VisionToken("b", 1.0, "0000000b")
-    site.note(other, True)
+    tokens = (VisionToken("b", 1.0, "0000000b"), DriverToken("r0", "b", "0" * 32))
+    for is_present in (True, False):
+        site.turn()
+        for token in tokens:
+            site.note(token, is_present)
+    return site
+
+
+def counts(site):
+    """Return whether the end of the other service counts by now, and that of its driver too."""
+    services = set(site.fleet.sharing.services())
+    assert ("b" in services) == bool(site.fleet.sharing.robots["r0"].drivers)
+    return services == {"a"}
+
+
+def test_service_that_ends_counts_with_the_next_message_of_a_robot(monkeypatch):
+    site = ended(monkeypatch)
+    site.turn(2)
+    assert not counts(site)
+    site.hear("r1")
     site.turn()
-    assert set(site.fleet.sharing.services()) == {"a", "b"}
-    site.note(other, False)
-    site.turn(4)
-    assert set(site.fleet.sharing.services()) == {"a", "b"}
+    assert counts(site)
+
+
+def test_service_that_ends_counts_without_a_message_30_ms_after_the_last_token_that_ended(monkeypatch):
+    site = ended(monkeypatch)
+    site.turn(29)
+    site.note(RobotToken("r1"), False)
+    site.turn(29)
+    assert not counts(site)
     site.turn()
-    assert set(site.fleet.sharing.services()) == {"a"}
+    assert counts(site)
+
+
+def test_service_that_ends_counts_after_100_ms_whatever_else_ends(monkeypatch):
+    site = ended(monkeypatch)
+    for number in range(99):
+        site.note(DriverToken("r1", f"c{number}", "1" * 32), False)
+        site.turn()
+    assert not counts(site)
+    site.turn()
+    assert counts(site)
+
+
+@pytest.mark.parametrize("each_ms", [1, 9, 20])
+def test_robots_get_no_second_driver_while_the_tokens_beyond_a_link_that_ended_end_one_by_one(monkeypatch, each_ms):
+    """The end of the link is known after that of the last token. The other service is there, and drives on."""
+    site = Site(monkeypatch, 3)
+    tokens = [VisionToken("b", 1.0, "0000000b"), *(DriverToken(robot, "b", "0" * 32) for robot in site.robots)]
+    for token in tokens:
+        site.note(token, True)
+    site.turn(20, ms=100)
+    site.hear("r0")
+    parts = {name: robot.part for name, robot in site.fleet.sharing.robots.items()}
+    assert SharingPart.STANDBY in parts.values()
+    for token in tokens:
+        site.turn()
+        site.note(token, False)
+        site.turn(each_ms)
+    site.connected, site.losses = False, 1
+    site.turn(each_ms)
+    assert {name: robot.part for name, robot in site.fleet.sharing.robots.items()} == parts
 
 
 def test_ends_that_wait_are_bounded(monkeypatch):
