@@ -387,3 +387,18 @@ def token_is_kept_over_another_driver(bench: Bench, held: tuple[Sender, Callable
     bench.rest(_TOKEN_US)
     third = Sender(first.robot)
     _expect_while_held(GOOD, first, third, "after the end of the token a third driver")
+
+
+@SUITE.must("R-LEASE-27", "6.8 Tokens", _with_token)
+def driver_that_left_takes_no_lease(bench: Bench, held: tuple[Sender, Callable[[], None]]) -> None:
+    """A driver whose token has just ended takes no lease with its first command, which its token may overtake."""
+    first, _ = held
+    first.fall_silent()
+    bench.rest(_LEASE_US * 3 // 2)
+    second = Sender(first.robot)
+    withdraw = second.declare()
+    bench.rest(_TOKEN_US)
+    withdraw()
+    bench.rest(_TOKEN_US)
+    second.expect("NOT_HOLDER", what="after the end of its token the first twist of a driver")
+    Sender(first.robot).expect(GOOD, what="after that a driver without a token")

@@ -392,7 +392,9 @@ class SafetyGate:
     def _why_not(self, who: Holder, holder: Holder | None) -> str:
         if self._lease.is_fenced(who):
             return f"the token of this session ended; {who.source} needs a new session"
-        return f"{_shown(holder)} drives" if holder else f"{who.source} may not drive"
+        if holder is not None:
+            return f"{_shown(holder)} drives"
+        return f"the token of this {who.source} just ended" if who.source in RANKS else f"{who.source} may not drive"
 
     def holder(self, now_us: int) -> Holder | None:
         """Return the driver that holds the lease now, or None."""

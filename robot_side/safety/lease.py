@@ -12,8 +12,8 @@ from sightline.protocol.proof import NO_PROOF, Proof, continues, tokens_of
 RANKS = {"guest": 0, "vision": 1, "teleop": 2}
 # After the loss of one of these drivers, the robot stops and must be armed again.
 HUMANS = frozenset({"teleop"})
-# Security limits: tokens of drivers, sessions that drive no more, and sessions whose token is known. The token of the
-# holder leaves last.
+# Security limits: tokens of drivers and ended ones, sessions that drive no more, and sessions whose token is known. The
+# token of the holder leaves last.
 _MAX_TOKENS, _MAX_FENCED, _MAX_KNOWN = 64, 64, 64
 
 
@@ -35,6 +35,8 @@ class Lease:
     token: str = ""
     """The token of the holder, "" without one. Its end is the end of the lease."""
     _tokens: OrderedDict[str, None] = field(default_factory=OrderedDict)
+    _ended: OrderedDict[str, int] = field(default_factory=OrderedDict)
+    """Tokens that ended within the life of a lease, and when."""
     _fenced: OrderedDict[Holder, None] = field(default_factory=OrderedDict)
     """Sessions whose token ended while they held the lease, or that were succeeded. A late command never drives."""
     _known: OrderedDict[Holder, str] = field(default_factory=OrderedDict)
@@ -48,14 +50,29 @@ class Lease:
         """Return True for a session that must not drive again."""
         return who in self._fenced
 
+    def has_left(self, who: Holder, proof: Proof, now_us: int) -> bool:
+        """Return True for a driver that has just withdrawn its token, which may overtake its last command.
+
+        A command that comes later than the life of a lease is too old. Until then no other driver may succeed a session
+        without a token.
+        """
+        while self._ended and now_us - next(iter(self._ended.values())) >= self.life_us:
+            self._ended.popitem(last=False)
+        # Others can compute the token of a driver from its proofs. A human must not be kept out by that.
+        if not self._ended or who.source in HUMANS:
+            return False
+        return any(token in self._ended for token in tokens_of(proof.proof))
+
     def may_take(self, who: Holder, now_us: int, proof: Proof = NO_PROOF) -> bool:
         """Return True if `who` holds the lease, outranks the holder or succeeds it, or if the lease is free."""
         holder = self.live_holder(now_us)
         if self.is_fenced(who):
             return False
         # Equal ranks do not succeed a holder that drives: two vision services would alternate at every command.
-        if holder is None or holder == who or RANKS[who.source] > RANKS[holder.source]:
+        if holder == who:
             return True
+        if holder is None or RANKS[who.source] > RANKS[holder.source]:
+            return not self.has_left(who, proof, now_us)
         silent_us = now_us - (self.expires_us - self.life_us)
         return bool(self.token) and silent_us > self.succession_us and who.source == holder.source \
             and bool(self._token_of(proof))
@@ -92,13 +109,18 @@ class Lease:
 
     def add_token(self, token: str) -> None:
         """Store the token of a driver that may take the lease. It costs no hash: a peer may declare any number."""
+        self._ended.pop(token, None)
         self._tokens[token] = None
         if len(self._tokens) > _MAX_TOKENS:
             del self._tokens[next(one for one in self._tokens if one != self.token)]
 
     def end_token(self, token: str, now_us: int) -> bool:
         """Return True if the lease ended with this token. Its session never drives again, also if it was over."""
-        self._tokens.pop(token, None)
+        if token in self._tokens:
+            del self._tokens[token]
+            self._ended[token] = now_us
+            if len(self._ended) > _MAX_TOKENS:
+                self._ended.popitem(last=False)
         if not token or token != self.token:
             return False
         is_live = self.live_holder(now_us) is not None

@@ -261,6 +261,7 @@ class Robot:
         lease._tokens = OrderedDict((TOKENS[driver], None) for driver in SHARING if present >> driver & 1)
         lease._fenced = OrderedDict((DRIVERS[driver], None) for driver in SHARING if fenced >> driver & 1)
         lease._known.clear()  # here each proof shows its token
+        lease._ended.clear()  # without it a driver that has just left may drive, so nothing is missed
         lease.token = TOKENS[holder] if bound else ""
         gate.state = STATES[state_index]
         gate._live_commands = live

@@ -181,6 +181,48 @@ def test_token_that_ended_is_of_no_later_driver():
     assert lease.token == ""
 
 
+@pytest.mark.parametrize(("after_us", "may"), [(0, False), (999, False), (1_000, True)])
+@pytest.mark.parametrize("commands", [0, 63, 64])
+def test_driver_that_has_just_left_takes_no_lease_with_one_of_its_first_commands(after_us, may, commands):
+    lease, second = Lease(1_000, 400), Vision(2)
+    proof = second.later(commands) if commands else second.proof
+    lease.add_token(second.token)
+    assert lease.may_take(second.who, 5_000, proof)
+    lease.end_token(second.token, 5_000)
+    assert lease.may_take(second.who, 5_000 + after_us, proof) is (may or commands == 64)
+    assert lease.may_take(Vision(3).who, 5_000 + after_us, Vision(3).proof)
+    assert lease.may_take(Holder(source="teleop", session="0000000f"), 5_000 + after_us, proof)
+    lease.end_token(second.token, 5_900)
+    lease.add_token(second.token)
+    assert lease.may_take(second.who, 5_000 + after_us, proof), "its token is back"
+
+
+def test_driver_that_has_just_left_takes_no_lease_of_a_lower_rank_and_keeps_its_own():
+    lease, second = held_by(GUEST, 0, 1_000), Vision(2)
+    lease.add_token(second.token)
+    lease.end_token(second.token, 10)
+    assert not lease.may_take(second.who, 20, second.proof)
+    lease.take(second.who, 30, second.proof)
+    assert lease.may_take(second.who, 40, second.proof)
+
+
+def test_ended_tokens_are_bounded_and_the_newest_count():
+    lease, drivers = Lease(1_000, 400), [Vision(number) for number in range(1, 70)]
+    for driver in drivers:
+        lease.add_token(driver.token)
+        lease.end_token(driver.token, 0)
+    assert len(lease._ended) == 64
+    assert lease.may_take(drivers[4].who, 1, drivers[4].proof)
+    assert not lease.may_take(drivers[5].who, 1, drivers[5].proof)
+    assert lease.may_take(drivers[-1].who, 1_000, drivers[-1].proof) and not lease._ended
+
+
+def test_token_that_was_never_there_keeps_no_driver_out():
+    lease, second = Lease(1_000, 400), Vision(2)
+    lease.end_token(second.token, 0)
+    assert lease.may_take(second.who, 1, second.proof)
+
+
 def test_holder_keeps_its_token_in_its_later_chains():
     lease, first = held()
     lease.take(first.who, 10, first.later(2_000))

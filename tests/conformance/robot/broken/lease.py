@@ -232,6 +232,11 @@ def later_proofs_have_no_token(robot):
     lease_of(robot, _known_token=lambda self, who: "")
 
 
+@breaks("R-LEASE-27")
+def ended_tokens_keep_no_driver_out(robot):
+    lease_of(robot, has_left=lambda self, who, proof, now_us: False)
+
+
 @breaks("R-LEASE-18")
 def acquire_of_a_watcher(robot):
     wrap(
