@@ -166,7 +166,7 @@ CASES: Final = (
     NetworkCase("moved", "the robot gets another address", (NetworkPhase(_NEAR),), scene="moved", transports=_SITE),
     NetworkCase(
         "fleet",
-        "20 robots at 320x240, 15 fps, into one vision",
+        "40 robots at 320x240, 15 fps, into one vision",
         (NetworkPhase(_NEAR),),
         scene="fleet",
         transports=_SITE,

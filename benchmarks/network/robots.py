@@ -2,7 +2,7 @@
 
     python -m sightline.benchmarks.network.robots SETTINGS_AS_JSON
 
-A robot's own two processes, twenty times on two cores, would measure themselves. Each robot here has its session, its
+A robot's own two processes, forty times on two cores, would measure themselves. Each robot here has its session, its
 credit and its 10 Hz status; it has no driver, so it takes every answer for accepted. Ages are from capture to the
 answer's arrival. Written at SIGTERM as JSON: for each robot the answers (captured_us, age_us).
 """

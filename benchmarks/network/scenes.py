@@ -1,4 +1,4 @@
-"""Cases with a course of their own: takeover, uplink, twenty robots, STOP through a full medium. Shell (processes).
+"""Cases with a course of their own: takeover, uplink, forty robots, STOP through a full medium. Shell (processes).
 
 The score uses the wheel commands: they stop, and turn again.
 """
@@ -254,10 +254,10 @@ def _uplink_run(row: NetworkCase, stage: Stage, injected: int, streams: Sequence
     return NetworkRun(row, stage.seed, injected, (), checks, facts)
 
 
-# A row of `bench network`: twenty robots and one vision for all of them. Shell (processes).
+# A row of `bench network`: forty robots and one vision for all of them. Shell (processes).
 
 
-ROBOTS: Final = 20
+ROBOTS: Final = 40
 WIDTH_PX, HEIGHT_PX, FPS = 320, 240, 15.0
 FLEET_LEAST_FPS: Final = 14.0
 MOST_P95_MS: Final = 80.0

@@ -165,8 +165,8 @@ SECTIONS: Final = (
         "network-sites",
         "Several machines",
         "The same wire. A robot stands and turns again in `standby`, `router` and `moved`, scored from its wheel "
-        "commands. In `fleet` one process plays the twenty robots, with sessions, headers and credit of their own: "
-        "forty robot processes on two cores would measure themselves.",
+        "commands. In `fleet` one process plays the forty robots, with sessions, headers and credit of their own: "
+        "eighty robot processes on two cores would measure themselves.",
         _rows("uplink", "standby", "router", "moved", "fleet"),
         since="2026-11-28",
     ),
