@@ -68,6 +68,11 @@ class HeartbeatMonitor:
         return self._last == FAILED
 
     @property
+    def is_running(self) -> bool:
+        """Return True if the loop has not announced its end. A process that is gone then did not end in order."""
+        return self._last in (AT_REST, MOVING)
+
+    @property
     def is_late(self) -> bool:
         """Return True if a heartbeat is missing, so that `look` needs the processor time of the driver."""
         return self._silence_us >= LATE_US and self._last not in (b"", IDLE)
@@ -123,18 +128,19 @@ class RestartBudget:
         return True
 
 
-def exit_code_after(code: int, end_signal: int | None) -> int | None:
+def exit_code_after(code: int, end_signal: int | None, *, was_running: bool) -> int | None:
     """Return the exit code of the whole robot after the end of a driver, or None if the driver starts again.
 
     Args:
         code: exit code of the driver; negative if a signal ended it.
         end_signal: the signal that requested the end of the robot, or None.
+        was_running: True if its loop had not announced its end: a plug-in's library ended the process, whatever `code`.
     """
-    if code >= 0:
-        return code
-    return None if end_signal is None else 128 + end_signal
+    if end_signal is None:
+        return None if code < 0 or was_running else code
+    return code if code >= 0 else 128 + end_signal
 
 
-def needs_zero(code: int, *, was_ready: bool) -> bool:
+def needs_zero(code: int, *, was_ready: bool, was_running: bool) -> bool:
     """Return True unless the driver ended by itself with the wheels at zero, or before it could move them."""
-    return code < 0 or (code != 0 and was_ready)
+    return code < 0 or was_running or (code != 0 and was_ready)

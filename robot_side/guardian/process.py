@@ -114,10 +114,10 @@ class Guardian:
             code = os.waitstatus_to_exitcode(self._watch())
             if self._monitor.drive_failed:  # the same whether the driver process was killed or quicker
                 code = _HARDWARE_EXIT
-            error = self._set_to_zero() if needs_zero(code, was_ready=self._monitor.is_ready) else None
+            error = self._set_to_zero() if self._needs_zero(code) else None
             self._log_end(code, error)  # after zero: the thread that writes the log has no real-time priority
             self._kill_orphans()
-            exit_code = exit_code_after(code, self._end_signal)
+            exit_code = exit_code_after(code, self._end_signal, was_running=self._monitor.is_running)
             if exit_code is not None:
                 return exit_code
             if self._setup["driver"] is None:
@@ -131,11 +131,16 @@ class Guardian:
             self._say(f"the driver process was killed: {self._reason}")
         elif code < 0:
             self._say(f"the driver process was ended by signal {-code}")
+        elif self._monitor.is_running:
+            self._say(f"the driver process ended by itself with code {code}; did a plug-in end it?")
         if error is not None:
             _log.error("robot %s: motors NOT set to zero: %s: %s; switch off their supply",
                        self._setup["robot"], type(error).__name__, error, exc_info=error)
-        elif needs_zero(code, was_ready=self._monitor.is_ready):
+        elif self._needs_zero(code):
             self._say("the motors are set to zero")
+
+    def _needs_zero(self, code: int) -> bool:
+        return needs_zero(code, was_ready=self._monitor.is_ready, was_running=self._monitor.is_running)
 
     def _give_up(self, why: str) -> int:
         _log.error("robot %s: the driver process is not started again: %s", self._setup["robot"], why)

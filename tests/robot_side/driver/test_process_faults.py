@@ -155,7 +155,7 @@ def test_drive_that_still_fails_at_the_end_gives_the_exit_code_that_calls_zero(r
     """A guardian calls `zero` of the drive unless the code is 0."""
     with pytest.raises(HardwareError, match=r"motors NOT set to zero: .* OSError: unplugged; switch off") as error:
         run_with(unplug)
-    assert needs_zero(error.value.exit_code, was_ready=True)
+    assert needs_zero(error.value.exit_code, was_ready=True, was_running=False)
 
 
 @pytest.mark.parametrize(("loop", "beat"), [(lambda _driver: 0, ENDING), (unplug, FAILED)])

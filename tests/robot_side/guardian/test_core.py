@@ -152,7 +152,14 @@ def test_five_restarts_within_a_minute_are_permitted():
     (-9, 15, 143), (-9, 2, 130),
 ])  # fmt: skip
 def test_exit_codes_are_forwarded_and_a_killed_driver_starts_again(code, end_signal, expected):
-    assert exit_code_after(code, end_signal) == expected
+    assert exit_code_after(code, end_signal, was_running=False) == expected
+
+
+@pytest.mark.parametrize(("code", "end_signal", "expected"), [
+    (0, None, None), (1, None, None), (-9, None, None), (0, 15, 0), (4, 15, 4), (-9, 15, 143),
+])  # fmt: skip
+def test_driver_that_ends_without_an_announcement_starts_again_whatever_its_code(code, end_signal, expected):
+    assert exit_code_after(code, end_signal, was_running=True) == expected
 
 
 @pytest.mark.parametrize(("code", "was_ready", "expected"), [
@@ -160,4 +167,12 @@ def test_exit_codes_are_forwarded_and_a_killed_driver_starts_again(code, end_sig
     (-1, False, True),
 ])  # fmt: skip
 def test_motors_are_set_to_zero_unless_the_driver_did_it(code, was_ready, expected):
-    assert needs_zero(code, was_ready=was_ready) is expected
+    assert needs_zero(code, was_ready=was_ready, was_running=False) is expected
+    assert needs_zero(code, was_ready=True, was_running=True)
+
+
+@pytest.mark.parametrize(("kind", "is_running"), [
+    (AT_REST, True), (MOVING, True), (IDLE, False), (ENDING, False), (FAILED, False),
+])
+def test_loop_runs_until_it_announces_its_end(kind, is_running):
+    assert beaten(kind).is_running is is_running and not HeartbeatMonitor(0).is_running
