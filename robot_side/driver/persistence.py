@@ -90,10 +90,12 @@ class LatchWriter:
             self._changed.set()
 
     def close(self) -> None:
-        """Write what is wanted, for a second at most."""
+        """Write what is wanted, for a second at most. Idempotent: writes what was wanted since the last close."""
         self._closing = True
         self._changed.set()
         self._thread.join(_CLOSE_S)
+        if not self._thread.is_alive():
+            self._write()
 
     def _write_all(self) -> None:
         while not (self._closing and self._stored == self._wanted):

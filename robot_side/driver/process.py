@@ -80,7 +80,7 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
     """
     check_robot_id(config.robot)
     limit_core_dump()
-    with ExitStack() as ending:
+    with ExitStack() as last, ExitStack() as ending:
         drive = DRIVES.build(config.motors)
         ending.callback(drive.close)
         ranges = RANGE_SENSORS.build(config.ranging) if config.ranging else None
@@ -93,6 +93,7 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         threading.stack_size(_STACK_BYTES)
         start_log_thread()
         driver = Driver(config, drive, ranges, reader, guardian)
+        last.callback(driver.finish)  # again: devices and network process may take seconds to close
         threading.stack_size(_PLUGIN_STACK_BYTES)
         ending.callback(driver.latch_writer.close)
         ending.callback(driver.driver_end.close)
@@ -243,7 +244,7 @@ class Driver:
         return self.driver_end.exit_code
 
     def finish(self) -> None:
-        """Latch and answer what arrived before the end. The motors are at zero."""
+        """Latch and answer what arrived so far. The motors are at zero."""
         self._drain()
         now_us = monotonic_us()
         for message in self._driver_core.messages(now_us):

@@ -144,6 +144,14 @@ def test_a_stop_that_arrives_as_the_process_ends_is_latched_and_answered(driver,
         assert reply.ok and reply.id == 7 and reply.state == State.STOPPED
 
 
+def test_a_stop_that_arrives_while_devices_are_closed_is_latched_and_proven(driver):
+    driver.finish()
+    assert not is_latched(driver)
+    driver.far.send(pack_number(42))
+    driver.finish()
+    assert is_latched(driver) and driver.latch_writer.is_stored and reports(driver)[-1][0] == 42
+
+
 @pytest.mark.parametrize(("changes", "addresses", "routers"), [
     ({}, [["127.0.0.1", 7448]], []),
     ({"listen": ["tcp/0.0.0.0:7447", "ws://10.0.0.7:9090"]}, [["0.0.0.0", 7448], ["10.0.0.7", 9091]], []),
