@@ -29,6 +29,8 @@ MOST_LOOKS: Final = 1.05
 ENDS_S: Final = 1.0
 JOINS_S: Final = 0.5
 """Longest time from the first image of a robot that joins to its first accepted command."""
+_LAST_US: Final = 1_000_000
+"""Of the run. All robots drive then, for each harm leaves them more time than that after it."""
 _SETTLE_S: Final = 4.0
 _PORTS: Final = (7447, 7450)
 _FROZEN_S: Final = 3.0
@@ -82,9 +84,12 @@ def worst_gap_ms(records: Mapping[str, Record], begin_us: int, end_us: int) -> f
 
 
 def longest_stand_s(records: Mapping[str, Record], begin_us: int, end_us: int) -> float:
-    """Return the longest time without motion of one robot, of those that began from `begin_us` to `end_us`."""
-    holds = (hold for record in records.values() for hold in record["holds"] if begin_us <= hold[0] < end_us)
-    return max(((hold[1] or end_us) - hold[0] for hold in holds), default=0) / 1e6
+    """Return the longest time without motion of one robot that overlaps `begin_us` to `end_us`, in full up to the end.
+
+    A robot that stands since before the first harm must not pass: its time counts from its own beginning.
+    """
+    holds = ((begin, min(end or end_us, end_us)) for record in records.values() for begin, end in record["holds"])
+    return max((end - begin for begin, end in holds if begin < end_us and end > begin_us), default=0) / 1e6
 
 
 def drivers_that_return(records: Mapping[str, Record]) -> int:
@@ -117,10 +122,12 @@ def sharing_checks(
     bounds: SharingBounds, records: Mapping[str, Record], spans_us: Sequence[tuple[int, int]], each: int = 1
 ) -> Iterator[Check]:
     """Yield the checks of a row. `spans_us` are the times from each harm to the next one, of `each` harms in turn."""
-    driven = sum(len(one["accepted"]) > 0 for one in records.values())
-    yield at_least("robots that drive", float(driven), "", bounds.robots)
+    begin_us, end_us = spans_us[0][0], spans_us[-1][1]
+    driven = sum(any(end_us - _LAST_US <= at_us < end_us for at_us, _, _ in one["accepted"])
+                 for one in records.values())
+    yield at_least("robots that drive at the end", float(driven), "", bounds.robots)
     if bounds.stands_s is not None:
-        stands = max(longest_stand_s(records, *span) for span in spans_us)
+        stands = longest_stand_s(records, begin_us, end_us)
         yield at_most(f"a robot stands, worst of {len(spans_us)} times", stands, "s", bounds.stands_s)
     if bounds.gap_ms is not None:
         gap = max(worst_gap_ms(records, *span) for span in spans_us[each - 1 :: each])

@@ -58,7 +58,7 @@ def test_a_gap_is_found_in_the_middle_at_the_end_and_for_a_robot_without_command
     assert failed(KILLED, {"r2": gap}) == ["between two commands, worst robot"]
     assert worst_gap_ms({"r1": record("a" * 10)}, 0, 6_000 * MS) == pytest.approx(6_000 - 9 * 66)
     assert worst_gap_ms({"r1": record("")}, 1_000 * MS, 3_000 * MS) == 2_000
-    assert "robots that drive" in failed(KILLED, {"r2": record("")})
+    assert "robots that drive at the end" in failed(KILLED, {"r2": record("")})
 
 
 def test_a_gap_counts_for_the_span_that_it_reaches_into():
@@ -77,17 +77,38 @@ def test_a_gap_counts_only_after_the_last_harm_of_several():
 
 
 def test_a_robot_that_joined_and_was_forgotten_is_found():
-    lost = record("a" * 20)
-    assert failed(BOUNDS["shared-200"], {"r150": lost}) == ["between two commands, worst robot"]
-    assert failed(BOUNDS["shared-200"], {"r150": record("")})[0] == "robots that drive"
+    both = ["robots that drive at the end", "between two commands, worst robot"]
+    assert failed(BOUNDS["shared-200"], {"r150": record("a" * 20)}) == both
+    assert failed(BOUNDS["shared-200"], {"r150": record("")}) == both
 
 
 def test_standing_is_found_also_until_the_end():
     stood = record("a" * 91, holds=[(1_000 * MS, 1_600 * MS), (2_000 * MS, 2_100 * MS)])
     assert longest_stand_s({"r1": stood}, 0, 6_000 * MS) == pytest.approx(0.6)
-    assert longest_stand_s({"r1": stood}, 1_500 * MS, 6_000 * MS) == pytest.approx(0.1)
+    assert longest_stand_s({"r1": stood}, 1_600 * MS, 6_000 * MS) == pytest.approx(0.1)
+    assert longest_stand_s({"r1": stood}, 0, 1_000 * MS) == 0
     assert longest_stand_s({"r1": record("a", holds=[(1_000 * MS, 0)])}, 0, 6_000 * MS) == pytest.approx(5.0)
     assert failed(BOUNDS["shared-frozen"], {"r1": stood}) == ["a robot stands, worst of 1 times"]
+
+
+STANDS = [name for name, bounds in BOUNDS.items() if bounds.stands_s is not None]
+
+
+@pytest.mark.parametrize("name", STANDS)
+@pytest.mark.parametrize(("begin_ms", "end_ms"), [(1_000, 0), (1_000, 50_000), (13_600, 0), (13_600, 59_000)])
+def test_standing_counts_in_full_whatever_harm_it_begins_before(name, begin_ms, end_ms):
+    stuck = record("a" * 908, holds=[(begin_ms * MS, end_ms * MS)])
+    spans_us = [(4_000 * MS, 14_000 * MS), (14_000 * MS, 60_000 * MS)]
+    records = {f"r{number}": record("a" * 908) for number in range(BOUNDS[name].robots - 1)}
+    found = [check for check in sharing_checks(BOUNDS[name], {**records, "stuck": stuck}, spans_us) if not check.ok]
+    assert [check.name for check in found] == ["a robot stands, worst of 2 times"]
+    assert found[0].value == pytest.approx((end_ms or 60_000) / 1000 - begin_ms / 1000)
+
+
+@pytest.mark.parametrize("name", BOUNDS)
+def test_robot_without_a_command_in_the_last_second_does_not_drive(name):
+    assert "robots that drive at the end" in failed(BOUNDS[name], {"r3": record("a" * 75)})
+    assert "robots that drive at the end" not in failed(BOUNDS[name], {"r3": record("a" * 77)})
 
 
 def test_frames_that_two_services_look_at_are_found():
