@@ -43,6 +43,8 @@ class NetworkCase:
     most_holds: int | None = None
     longest_hold_s: float | None = None
     flows_again_s: float | None = None
+    least_moving_percent: float = 95.0
+    """Of the time. A robot in HOLD keeps to all bounds of ages and holds."""
     scene: str = ""
     passes_through: bool = False
     transports: tuple[str, ...] = (ZENOH, WEBSOCKET)
@@ -73,7 +75,11 @@ _SITE: Final = (ZENOH,)
 CASES: Final = (
     NetworkCase("rtt40", "40 ms round trip", _steady(delay_ms=20), least_fps=28, p50_ms=40 + 15),
     NetworkCase(
-        "near", "no loss, 1 ms each way", (NetworkPhase(both()), NetworkPhase(_NEAR)), over_first_ms=2 + 1
+        "near",
+        "no loss, 1 ms each way",
+        (NetworkPhase(both()), NetworkPhase(_NEAR)),
+        least_fps=28,
+        over_first_ms=2 + 1,
     ),
     NetworkCase(
         "radio",
@@ -91,12 +97,14 @@ CASES: Final = (
         least_fps=12,
         p95_ms=160,
     ),
-    NetworkCase("thin", "2 Mbit/s, 10 ms round trip", _steady(delay_ms=5, rate_bit_s=2e6), p95_ms=250),
+    NetworkCase("thin", "2 Mbit/s, 10 ms round trip", _steady(delay_ms=5, rate_bit_s=2e6), least_fps=20, p95_ms=250),
     NetworkCase(
         "through",
         "2 Mbit/s, 10 ms round trip, a camera's own JPEGs of 46 kB",
         _steady(delay_ms=5, rate_bit_s=2e6),
+        least_fps=4,
         p95_ms=250,
+        least_moving_percent=80,
         passes_through=True,
     ),
     NetworkCase(
@@ -106,6 +114,7 @@ CASES: Final = (
             NetworkPhase(both(delay_ms=5, rate_bit_s=1e7)),
             NetworkPhase(both(delay_ms=5, rate_bit_s=1e6), settle_s=STEP_SETTLES_S),
         ),
+        least_fps=15,
         p95_ms=250,
     ),
     NetworkCase(

@@ -18,6 +18,7 @@ _OLD_US: Final = OLD_US + _LATE_US
 _RAMPED_OUT_US: Final = (RAMPED_US + 2 * _LATE_US) // TICK_US * TICK_US
 """Age of a frame, in whole ticks, at which even the ramp that it left behind is at its end; its answer and the zero may
 both be late."""
+_TENTH_US: Final = 100_000
 _FASTER_RAD_S: Final = 0.15
 """Smallest gain of speed. The conversion of a twist to wheel speeds rounds."""
 
@@ -82,13 +83,16 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class NetworkFigures:
-    """Figures of one period. Ages are from capture to `drive.set`, `validated_ms` (median) to the validation. A late
-    command counts as infinitely old."""
+    """Figures of one period. Ages are from capture to `drive.set` with moving wheels, `validated_ms` (median) to the
+    validation. A late command counts as infinitely old."""
 
     p50_ms: float | None
     p95_ms: float | None
     validated_ms: float | None
     fps: float
+    """Frames with an accepted command. The counter of accepted commands counts a twist that is sent twice two times."""
+    moving_percent: float
+    """Share of the tenths of a second with moving wheels."""
     executed_ms: float
     """The oldest frame that was driven on, as ten statuses a second show it."""
     holds_s: tuple[float, ...]
@@ -111,14 +115,16 @@ def figures_of(
     seconds = (stretch.end_us - stretch.judged_us) / 1e6
     never_ms = [float("inf")] * (inside[-1]["stale"] - inside[0]["stale"] if inside else 0)
     headers = [(row[0], row[1], row[2]) for row in notes["frames"]]
-    ages = [age for age in wheel_ages(headers, [row.t_us for row in rows])
-            if stretch.judged_us <= age.set_us < stretch.end_us]
+    moving_us = [row.t_us for row in rows if row.moves]
+    ages = [age for age in wheel_ages(headers, moving_us) if stretch.judged_us <= age.set_us < stretch.end_us]
+    moving = {t_us // _TENTH_US for t_us in moving_us if stretch.judged_us <= t_us < stretch.end_us}
     ages_ms = [*(age.age_us / 1000 for age in ages), *never_ms]
     return NetworkFigures(
         p50_ms=percentile(ages_ms, 50),
         p95_ms=percentile(ages_ms, 95),
         validated_ms=percentile([*(age.validated_us / 1000 for age in ages), *never_ms], 50),
-        fps=(inside[-1]["accepted"] - inside[0]["accepted"]) / seconds if inside else 0.0,
+        fps=len({age.set_us - age.age_us for age in ages}) / seconds,
+        moving_percent=min(100.0, len(moving) * 100 * _TENTH_US / 1e6 / seconds),
         executed_ms=max((one["frame_age_us"] or 0 for one in inside if one["state"] in DRIVING), default=0) / 1000,
         holds_s=tuple(_holds_s(inside)),
         flows_after_s=_flows_after_s(notes["frames"], stretch),
@@ -207,6 +213,7 @@ def network_checks(row: NetworkCase, figures: Sequence[NetworkFigures]) -> Itera
         yield at_most("longest hold", max(last.holds_s, default=0.0), "s", row.longest_hold_s)
     if row.flows_again_s is not None:
         yield at_most("flows again", last.flows_after_s, "s", row.flows_again_s)
+    yield at_least("wheels move", last.moving_percent, "% of the time", row.least_moving_percent)
     yield at_most("oldest executed", max(one.executed_ms for one in figures), "ms", OLD_US / 1000)
 
 

@@ -38,9 +38,9 @@ def frames(*latencies_ms, begin_s=0.0):
     ]
 
 
-def seen(frame_rows=(), statuses=(), end_s=10.0, judged_s=0.0):
+def seen(frame_rows=(), statuses=(), end_s=10.0, judged_s=0.0, rad_s=1.0):
     stretch = Stretch(0, round(judged_s * SECOND_US), round(end_s * SECOND_US))
-    wheels = [WheelCommand(t_us, 1.0, 1.0) for t_us in range(0, 10 * SECOND_US, 1000)]
+    wheels = [WheelCommand(t_us, rad_s, rad_s) for t_us in range(0, 10 * SECOND_US, 1000)]
     return figures_of({"frames": list(frame_rows), "statuses": list(statuses)}, wheels, stretch)
 
 
@@ -134,15 +134,42 @@ def test_ages_come_from_accepted_commands_and_late_ones_count_as_infinite():
     assert seen(rows[:1], [status(0), status(10)]).p50_ms is None
 
 
+def test_frame_answered_by_two_twists_counts_once():
+    """A link loses every second frame. Vision sends each twist twice then, and the robot accepts both."""
+    rows = [[seq, seq * 33_333, 4_000 + (seq - 1) // 2, 20_000] for seq in range(300)]
+    found = seen(rows, [status(n / 10, accepted=n * 3) for n in range(101)])
+    assert found.fps == pytest.approx(15, rel=0.02)
+    between = [[0, 0, None, 1], [1, 33_333, None, 1], [2, 50_050, 50_000, 1], [3, 83_000, 50_100, 1]]
+    assert seen(between).fps == 0.1, "a header that left between the two"
+
+
+def test_wheels_that_never_turn_give_no_ages_and_no_rate():
+    rows = frames(None, *range(40, 340))
+    dead = seen(rows, [status(0), status(10, accepted=300)], rad_s=0.0)
+    assert (dead.p50_ms, dead.p95_ms, dead.validated_ms, dead.fps, dead.moving_percent) == (None, None, None, 0.0, 0.0)
+    assert seen(rows, [status(0), status(10)]).moving_percent == 100
+
+
+@pytest.mark.parametrize("row", [row for row in CASES if not row.scene], ids=lambda row: row.name)
+def test_robot_that_only_stands_and_answers_a_frame_in_ten_seconds_passes_no_row(row):
+    rows = [[seq, seq * SECOND_US, 40_000 + seq, 20_000] for seq in range(0, 11, 10)]
+    standing = seen(rows, [status(n / 10, "HOLD") for n in range(101)], rad_s=0.0)
+    failed = [check.name for check in network_checks(row, [standing] * len(row.phases)) if not check.ok]
+    assert "wheels move" in failed
+    assert row.flows_again_s is not None or "answered" in failed
+
+
 def test_constant_latency_changes_nothing():
     same = [[number, number * 33_333, 40_000, 1] for number in range(10)]
     assert seen(same).p50_ms is None
 
 
 def test_rate_and_oldest_executed_are_of_the_scored_time_only():
-    statuses = [status(1, accepted=10, age_ms=900), *(status(2 + n / 10, accepted=100 + n * 2) for n in range(81))]
-    figures = seen((), statuses, judged_s=2.0)
-    assert figures.fps == pytest.approx(20, rel=0.05) and figures.executed_ms == 50
+    statuses = [status(1, age_ms=900), *(status(2 + n / 10) for n in range(81))]
+    figures = seen(frames(*(40 + n % 10 for n in range(300))), statuses, judged_s=2.0)
+    assert figures.fps == pytest.approx(30, rel=0.02) and figures.executed_ms == 50
+    half = seen(frames(*(40 + n % 10 for n in range(150))), statuses, judged_s=2.0)
+    assert half.fps == pytest.approx(30 * 3 / 8, rel=0.05), "150 frames take 5 s"
     held = [status(3, "HOLD", age_ms=800)]
     assert seen((), statuses + held, judged_s=2.0).executed_ms == 50, "held is not driven"
 
@@ -161,12 +188,13 @@ def test_flowing_again_is_the_first_acceptance_of_a_frame_of_the_stretch():
 
 def test_a_bound_that_is_broken_is_not_ok_and_none_is_never_ok():
     row = NetworkCase("x", "x", CASES[0].phases, least_fps=28, p50_ms=55, p95_ms=60, flows_again_s=1, most_holds=0)
-    good = network_checks(row, [seen(frames(*range(40, 50), begin_s=0.1), [status(0), status(9.9, accepted=300)])])
+    good = network_checks(row, [seen(frames(*(40 + n % 10 for n in range(295))), [status(0), status(9.9)])])
     assert all(check.ok for check in good)
-    bad = {check.name: check.ok for check in network_checks(row, [seen((), [status(0), status(1, "HOLD"), status(2)])])}
+    standing = seen((), [status(0), status(1, "HOLD"), status(2)], rad_s=0.0)
+    bad = {check.name: check.ok for check in network_checks(row, [standing])}
     assert bad == {
         "age p50": False, "age p95": False, "answered": False, "holds": False, "flows again": False,
-        "oldest executed": True,
+        "wheels move": False, "oldest executed": True,
     }
 
 
