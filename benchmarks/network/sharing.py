@@ -53,15 +53,21 @@ class SharingBounds:
     """What runs beyond the shaped wire. All else is on the robots' side."""
     robots: int = 20
     fps: float = 15.0
+    harm_s: float = 10.0
+    """Longest time of the harms in turn: so many are demanded as the time of the run has room for."""
+    least_changes: int = 0
+    """Of the driver, of all robots, for each harm."""
+    again_s: float | None = None
+    """Longest time from the last of the harms to the next command of a robot."""
 
 
 BOUNDS: Final[Mapping[str, SharingBounds]] = {
-    "shared-killed": SharingBounds(3, 0.0, gap_ms=250),
-    "shared-rolling": SharingBounds(3, 0.0, gap_ms=150),
-    "shared-scaled": SharingBounds(3, 0.0, gap_ms=150),
+    "shared-killed": SharingBounds(3, 0.0, gap_ms=250, harm_s=6, least_changes=8),
+    "shared-rolling": SharingBounds(3, 0.0, gap_ms=150, harm_s=6, least_changes=8),
+    "shared-scaled": SharingBounds(3, 0.0, gap_ms=150, least_changes=8),
     "shared-frozen": SharingBounds(3, 0.5),
     "shared-cut": SharingBounds(2, 0.5, beyond=("v0",)),
-    "shared-alone": SharingBounds(1, CUT_S + 0.5, beyond=("v0",)),
+    "shared-alone": SharingBounds(1, CUT_S + 0.5, beyond=("v0",), again_s=0.5),
     "shared-router": SharingBounds(3, 0.5, routers=2),
     "shared-router-frozen": SharingBounds(3, 3.0, routers=2),
     "shared-parted": SharingBounds(3, 0.6, gap_ms=150, routers=2, beyond=("v0", "router1")),
@@ -92,6 +98,13 @@ def longest_stand_s(records: Mapping[str, Record], begin_us: int, end_us: int) -
     return max((end - begin for begin, end in holds if begin < end_us and end > begin_us), default=0) / 1e6
 
 
+def slowest_again_s(records: Mapping[str, Record], since_us: int) -> float:
+    """Return the time from `since_us` to the first command of the last robot, or infinity."""
+    firsts_us = (next((at_us for at_us, _, _ in record["accepted"] if at_us >= since_us), math.inf)
+                 for record in records.values())
+    return (max(firsts_us) - since_us) / 1e6
+
+
 def drivers_that_return(records: Mapping[str, Record]) -> int:
     """Count the sessions that drove a robot again after another one had driven it: two drivers at once."""
     count = 0
@@ -118,6 +131,11 @@ def looks_per_frame(records: Mapping[str, Record]) -> float:
     return answers / max(1, sent)
 
 
+def least_harms(bounds: SharingBounds, seconds: float, each: int = 1) -> int:
+    """Return the number of harms that a run of so many seconds has room for, with `each` harms in turn."""
+    return each * max(1, int(seconds // bounds.harm_s))
+
+
 def sharing_checks(
     bounds: SharingBounds, records: Mapping[str, Record], spans_us: Sequence[tuple[int, int]], each: int = 1
 ) -> Iterator[Check]:
@@ -132,7 +150,12 @@ def sharing_checks(
     if bounds.gap_ms is not None:
         gap = max(worst_gap_ms(records, *span) for span in spans_us[each - 1 :: each])
         yield at_most("between two commands, worst robot", gap, "ms", bounds.gap_ms)
+    if bounds.again_s is not None:
+        again = max(slowest_again_s(records, begin) for begin, _ in spans_us[each - 1 :: each])
+        yield at_most("drives again, worst robot", again if again < math.inf else None, "s", bounds.again_s)
     changed = changes_of_driver(records)
+    if bounds.least_changes:
+        yield at_least("changes of the driver", float(changed), "", bounds.least_changes * len(spans_us))
     yield at_most(f"two drivers at once, in {changed} changes", float(drivers_that_return(records)), "", 0)
     if bounds.services > 1:
         yield at_most("answers of all services over frames", looks_per_frame(records), "", MOST_LOOKS)
@@ -291,7 +314,7 @@ def _nothing(_site: Site, _number: int) -> None:
 
 HARMS: Final[Mapping[str, Sequence[Callable[[Site, int], None]]]] = {
     "shared-killed": (_restarted(Site.kill),), "shared-rolling": (_restarted(Site.end),), "shared-scaled": (_scaled,),
-    "shared-frozen": (_frozen,), "shared-cut": (_cut,), "shared-alone": (_cut,), "shared-router": (_router_killed,),
+    "shared-frozen": (_frozen,), "shared-cut": (_cut,), "shared-alone": (_parted, _healed), "shared-router": (_router_killed,),
     "shared-router-frozen": (_router_frozen,), "shared-parted": (_parted, _healed), "shared-joined": (Site.join,),
     "shared-200": (_nothing,),
 }
@@ -311,7 +334,7 @@ def shared(row: NetworkCase, stage: Stage) -> NetworkRun:
         spans_us = list(pairwise([*begins_us, monotonic_us()]))
         site.processes.end()
     records = site.records()
-    checks = [at_least("injected", float(len(spans_us)), "times", 1.0),
+    checks = [at_least("injected", float(len(spans_us)), "times", least_harms(bounds, stage.setting.seconds, len(harms))),
               *sharing_checks(bounds, records, spans_us, len(harms))]
     if site.joined_s:
         slowest_s = max(site.joined_s)

@@ -10,6 +10,7 @@ from sightline.benchmarks.network.sharing import (
     HARMS,
     changes_of_driver,
     drivers_that_return,
+    least_harms,
     longest_stand_s,
     looks_per_frame,
     sharing_checks,
@@ -29,7 +30,7 @@ def record(drivers, step_us=STEP_US, holds=(), answers_per_frame=1.0):
 
 def failed(bounds, records, ends_us=(6_000 * MS,), each=1):
     """Names of the checks that fail."""
-    full = {f"r{number}": records.get(f"r{number}", record("a" * 91)) for number in range(bounds.robots)}
+    full = {f"r{number}": records.get(f"r{number}", record("a" * 45 + "b" * 46)) for number in range(bounds.robots)}
     return [check.name for check in sharing_checks(bounds, full, list(pairwise((0, *ends_us))), each) if not check.ok]
 
 
@@ -45,7 +46,7 @@ def test_a_healthy_site_passes_every_row():
 def test_a_planted_second_driver_is_found(at):
     both = record("a" * at + "b" + "a" * (90 - at))
     assert drivers_that_return({"r1": both}) == 1
-    assert failed(KILLED, {"r7": both}) == ["two drivers at once, in 2 changes"]
+    assert failed(KILLED, {"r7": both}) == ["two drivers at once, in 21 changes"]
     alternating = record("ab" * 45 + "a")
     assert drivers_that_return({"r1": alternating}) == 89
     assert changes_of_driver({"r1": alternating, "r2": record("aabbcc")}) == 92
@@ -99,7 +100,7 @@ STANDS = [name for name, bounds in BOUNDS.items() if bounds.stands_s is not None
 def test_standing_counts_in_full_whatever_harm_it_begins_before(name, begin_ms, end_ms):
     stuck = record("a" * 908, holds=[(begin_ms * MS, end_ms * MS)])
     spans_us = [(4_000 * MS, 14_000 * MS), (14_000 * MS, 60_000 * MS)]
-    records = {f"r{number}": record("a" * 908) for number in range(BOUNDS[name].robots - 1)}
+    records = {f"r{number}": record("a" * 450 + "b" * 458) for number in range(BOUNDS[name].robots - 1)}
     found = [check for check in sharing_checks(BOUNDS[name], {**records, "stuck": stuck}, spans_us) if not check.ok]
     assert [check.name for check in found] == ["a robot stands, worst of 2 times"]
     assert found[0].value == pytest.approx((end_ms or 60_000) / 1000 - begin_ms / 1000)
@@ -111,8 +112,30 @@ def test_robot_without_a_command_in_the_last_second_does_not_drive(name):
     assert "robots that drive at the end" not in failed(BOUNDS[name], {"r3": record("a" * 77)})
 
 
+def test_service_that_drives_late_after_the_return_of_its_link_is_found():
+    alone, late = BOUNDS["shared-alone"], record("a" * 91)
+    late["accepted"] = [one for one in late["accepted"] if not 1_200 * MS <= one[0] < 3_800 * MS]
+    assert failed(alone, {"r4": late}, (3_000 * MS, 6_000 * MS), each=2) == ["drives again, worst robot"]
+    assert failed(alone, {"r4": late}, (3_500 * MS, 6_000 * MS), each=2) == []
+    full = {f"r{number}": record("a" * 91) for number in range(1, 20)}
+    spans_us = [(0, 3_000 * MS), (3_000 * MS, 6_000 * MS)]
+    checks = {check.name: check for check in sharing_checks(alone, {**full, "r20": record("a" * 20)}, spans_us, 2)}
+    assert checks["drives again, worst robot"].value is None
+
+
+@pytest.mark.parametrize("name", [name for name, bounds in BOUNDS.items() if bounds.least_changes])
+def test_run_with_few_changes_of_the_driver_shows_nothing_about_two_drivers(name):
+    calm = {f"r{number}": record("a" * 91) for number in range(14)}
+    assert failed(BOUNDS[name], calm) == ["changes of the driver"], "6 of the other robots change"
+
+
+def test_number_of_harms_follows_from_the_length_of_the_run():
+    assert [least_harms(KILLED, seconds) for seconds in (4, 20, 120)] == [1, 3, 20]
+    assert [least_harms(BOUNDS["shared-parted"], seconds, 2) for seconds in (4, 20, 120)] == [2, 4, 24]
+
+
 def test_frames_that_two_services_look_at_are_found():
-    twice = {f"r{number}": record("a" * 91, answers_per_frame=2.0) for number in range(KILLED.robots)}
+    twice = {f"r{number}": record("a" * 90 + "b", answers_per_frame=2.0) for number in range(KILLED.robots)}
     assert looks_per_frame(twice) == 2.0
     assert failed(KILLED, twice) == ["answers of all services over frames"]
     assert failed(BOUNDS["shared-alone"], twice) == [], "one service cannot"
