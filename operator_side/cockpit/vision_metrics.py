@@ -46,6 +46,8 @@ class VisionMetrics:
         yield gauge("vision_hears", "whether frames arrive", each(lambda one: float(one.heard)), "robot")
         yield gauge("vision_drives", "whether it drives the robot; 0 while it stands by", each(lambda one: one.drives),
                     "robot")
+        yield counter("vision_frames_received", "frames that came, also those without an answer",
+                      each(lambda one: one.received), "robot")
         yield counter("vision_frames_answered", "frames answered", each(lambda one: one.answered), "robot")
         yield counter("vision_twists", "frames answered by a twist", each(lambda one: one.steered), "robot")
         yield counter("vision_frames_overtaken", "frames that a newer one replaced before their detection",

@@ -50,6 +50,8 @@ class ServiceCounts:
     """False for a robot that this service only stands by for."""
     restarts: int = 0
     """Times that this robot's service failed and another one was started."""
+    received: int = 0
+    """Frames that came, also those that no turn took."""
 
 
 LIVE_S: Final = 10.0
@@ -244,7 +246,7 @@ class Service:
         self._cameras: LatestSlot[Message] = link.latest(CAMERA)
         self._frames = self._arrivals()
         self._ahead = LatestSlot[Message]()
-        self._is_subscribed, self.is_standby = False, is_standby
+        self._is_subscribed, self.is_standby, self._received = False, is_standby, 0
         if not is_standby:
             self.listen()
         self._camera: CameraModel | None = None
@@ -279,6 +281,7 @@ class Service:
                 self._link.subscribe(channel, self._receive)
 
     def _receive(self, message: Message) -> None:
+        self._received += message.channel is FRAME
         (self._ahead if self.is_standby else self._frames).put(message)
 
     def begin(self) -> None:
@@ -336,7 +339,8 @@ class Service:
         """Return the counters. Safe from any thread."""
         heard, (compute_us, latency_us) = time.monotonic() - self._heard_s <= _SILENCE_S, self._newest
         return ServiceCounts(self._config.robot, heard and self.answered > 0, self.answered, self.steered,
-                      dict(self.skipped.copy()), self._frames.dropped, compute_us, latency_us)
+                      dict(self.skipped.copy()), self._frames.dropped, compute_us, latency_us,
+                      received=self._received)
 
     def _look_at_camera(self) -> None:
         """Take in the camera's model; a new one needs a new pipeline."""

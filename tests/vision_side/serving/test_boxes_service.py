@@ -158,6 +158,20 @@ def test_replaced_boxes_are_not_replaced_frames():
         bench.robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=seq, t_us=seq * FRAME_US)), b"image")
     bench.turn()
     assert bench.service.counts().overtaken == 1
+    assert bench.service.counts().received == 3, "boxes are not frames"
+
+
+def test_frames_that_a_standby_receives_count_as_received():
+    bench = Bench()
+    bench.frame(1)
+    before = bench.service.counts()
+    bench.service.rest()
+    bench.frame(2)
+    assert bench.service.counts().received == before.received == 1
+    bench.service.listen()
+    bench.frame(3)
+    after = bench.service.counts()
+    assert (after.received, after.answered, after.overtaken) == (2, before.answered, before.overtaken)
 
 
 def test_lost_frames_count_also_next_to_replaced_ones():
