@@ -196,6 +196,10 @@ CASES: Final = (
         )
     ),
     NetworkCase(
+        "shared-loaded", "20 robots, 15 fps, a detector of 8 ms, then 1, 2 and 4 vision services that share",
+        (NetworkPhase(_NEAR),), scene="loaded", transports=_SITE,
+    ),
+    NetworkCase(
         "shared-200", "200 robots, 5 fps, one router, 3 vision services that share", (NetworkPhase(_NEAR),),
         scene="shared", transports=_SITE,
     ),

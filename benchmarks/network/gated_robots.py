@@ -5,7 +5,7 @@
 A robot here has its own session, credit, status, driver core and gate, and no motors: the gate decides. Written at
 SIGTERM as JSON, for each robot: `accepted`, the accepted commands as (arrival_us, digest of the sender, capture_us of
 its frame), `holds`, the times (begin_us, end_us) without motion after the first command, `began_us`, the time of its
-first image, and the numbers of frames `sent` and of `answers`, accepted or not.
+first image, `sent_us`, the capture times of its frames, and the number of `answers`, accepted or not.
 """
 
 import sys
@@ -31,6 +31,7 @@ class GatedRobot(PlayedRobot):
         config = RobotConfig(robot=name, camera=log, drive=log, safety=SafetyConfig(auto_arm=True))
         self.core = DriverCore(config, self._session)
         self.accepted: list[tuple[int, str, int]] = []
+        self._sent_us: list[int] = []
         self._answers = 0
         self.holds: list[list[int]] = []
         self._tick_due_us = self._began_us = due_us
@@ -40,7 +41,7 @@ class GatedRobot(PlayedRobot):
     def record(self) -> dict[str, Any]:
         """Return what is written of this robot."""
         return {"accepted": self.accepted, "holds": self.holds, "answers": self._answers,
-                "began_us": self._began_us, "sent": self._network_core.status(0).sent}
+                "began_us": self._began_us, "sent_us": self._sent_us}
 
     def play(self, at_us: int) -> int:
         """Do the due work, also the gate's."""
@@ -63,6 +64,7 @@ class GatedRobot(PlayedRobot):
 
     def _on_sent(self, seq: int, t_us: int) -> None:
         self.core.on_issued(seq, t_us, 0)
+        self._sent_us.append(t_us)
 
     def _say(self, at_us: int) -> None:
         with self._lock:

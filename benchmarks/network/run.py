@@ -26,7 +26,7 @@ from sightline.benchmarks.network.figures import (
     on_old_sight,
 )
 from sightline.benchmarks.network.scenes import fleet, moved, router, standby, uplink
-from sightline.benchmarks.network.sharing import shared
+from sightline.benchmarks.network.sharing import loaded, shared
 from sightline.benchmarks.network.stage import (
     NetworkRun,
     NetworkSetting,
@@ -47,6 +47,7 @@ from sightline.sim.tun_emulator import ADDRESS_A, why_impossible
 WIDTH_PX, HEIGHT_PX, FPS = 640, 480, 30.0
 SCENES: Final[Mapping[str, Scene]] = {
     "uplink": uplink, "standby": standby, "router": router, "moved": moved, "fleet": fleet, "shared": shared,
+    "loaded": loaded,
 }
 _SETTLE_S: Final = 2.0
 

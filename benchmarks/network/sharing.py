@@ -6,10 +6,12 @@ The robots have their real gates (`gated_robots.py`). The score is theirs: accep
 import json
 import math
 import signal
+import subprocess
+import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, Final
 
@@ -20,12 +22,19 @@ from sightline.benchmarks.network.stage import DETECTOR, NetworkRun, ShapedWire,
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.processes import Processes
 from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import HardwareError
 from sightline.sim.network_emulator import LinkShapes
 from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B
 
 WIDTH_PX, HEIGHT_PX = 320, 240
 MOST_LOOKS: Final = 1.05
-"""Most answers for each frame. Two services that look at the same frames make two."""
+"""Most answers for each frame, and most services that receive it. Two services that look at the same frames make
+two."""
+LOADED_FPS: Final[Mapping[int, float]] = {1: 0.0, 2: 8.0, 4: 14.5}
+"""Number of services with a detector of 8 ms -> least answered frames of each robot. One service is for comparison."""
+LOADED_ROBOTS: Final = 20
+_LOADED_US: Final = 8_000
+_SLOW_DETECTOR: Final = "sightline.benchmarks.detector:SlowDetector"
 ENDS_S: Final = 1.0
 JOINS_S: Final = 0.5
 """Longest time from the first image of a robot that joins to its first accepted command."""
@@ -37,6 +46,10 @@ _FROZEN_S: Final = 3.0
 _HEALED_S: Final = 5.0
 _ROBOT_PROCESSES: Final = 5
 """With all robots in one process, its sessions wait for each other: 40 ms for each when they lose a router."""
+_RECEIVED: Final = "sightline_vision_frames_received_total{"
+_READ_METRICS: Final = """import sys, time, urllib.request
+pages = [urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics").read().decode() for port in sys.argv[1:]]
+print(time.monotonic_ns() // 1000, *pages, sep="\\n")"""
 Record = Mapping[str, Any]
 
 
@@ -57,6 +70,8 @@ class SharingBounds:
     """Longest time of the harms in turn: so many are demanded as the time of the run has room for."""
     least_changes: int = 0
     """Of the driver, of all robots, for each harm."""
+    each_us: int = 0
+    """Time of a slow detector for a frame, or 0 for the cheapest detector."""
     again_s: float | None = None
     """Longest time from the last of the harms to the next command of a robot."""
 
@@ -127,8 +142,25 @@ def changes_of_driver(records: Mapping[str, Record]) -> int:
 
 def looks_per_frame(records: Mapping[str, Record]) -> float:
     """Return the answers of all services over the frames of all robots."""
-    answers, sent = (sum(int(record[name]) for record in records.values()) for name in ("answers", "sent"))
-    return answers / max(1, sent)
+    sent = sum(len(record["sent_us"]) for record in records.values())
+    return sum(int(record["answers"]) for record in records.values()) / max(1, sent)
+
+
+def loaded_checks(
+    records: Mapping[str, Record], services: int, begin_us: int, end_us: int, received: float
+) -> Iterator[Check]:
+    """Yield the checks of so many services with a slow detector. They `received` frames from `begin_us` to `end_us`."""
+
+    def within(times_us: Iterable[int]) -> int:
+        return sum(begin_us <= at_us < end_us for at_us in set(times_us))
+
+    answered = sum(within(captured_us for _, _, captured_us in one["accepted"]) for one in records.values())
+    sent = sum(within(one["sent_us"]) for one in records.values())
+    fps = answered * 1e6 / (end_us - begin_us) / LOADED_ROBOTS
+    name = f"{services} service{'s' * (services > 1)}"
+    yield at_least(f"{name}: answered for each robot", fps, "fps", LOADED_FPS[services])
+    if services > 1:
+        yield at_most(f"{name}: frames received over frames sent", received / max(1, sent), "", MOST_LOOKS)
 
 
 def least_harms(bounds: SharingBounds, seconds: float, each: int = 1) -> int:
@@ -191,7 +223,7 @@ class Site:
         # To the router on its side first.
         near = ADDRESS_B if name in self.bounds.beyond else ADDRESS_A
         endpoints = sorted(_endpoints(self.bounds), key=lambda endpoint: near not in endpoint)
-        self._start(name, "shares robots", "vision", "--share", "--name", name, "--detector", DETECTOR,
+        self._start(name, "shares robots", "vision", "--share", "--name", name, *self._detector(name),
                     *_connect(endpoints))
 
     def start_robots(self, first: int, robots: int, pause_s: float) -> str:
@@ -209,6 +241,16 @@ class Site:
         for notes in self.stage.folder.glob("robots-*.json"):
             records |= json.loads(notes.read_text("utf-8"))
         return {name: record for name, record in records.items() if int(name[1:]) <= self.bounds.robots}
+
+    def received(self) -> tuple[int, float]:
+        """Return the time, and the frames that came to the services on the robots' side, by their own counters."""
+        ports = [_metrics_port(name) for name in self.running if name.startswith("v")]
+        command = ["ip", "netns", "exec", self.wire.robot_side, sys.executable, "-c", _READ_METRICS, *ports]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise HardwareError(f"the services show no metrics: {done.stderr[-160:]}")
+        at_us, *lines = done.stdout.splitlines()
+        return int(at_us), sum(float(line.split()[-1]) for line in lines if line.startswith(_RECEIVED))
 
     def join(self, number: int) -> None:
         """Let another robot join for a while."""
@@ -236,6 +278,13 @@ class Site:
         time.sleep(seconds)
         self.processes.signal(self.running[name], signal.SIGCONT)
 
+    def _detector(self, name: str) -> tuple[str, ...]:
+        """Return the detector of a service. One under load shows its counters."""
+        if not self.bounds.each_us:
+            return ("--detector", DETECTOR)
+        return ("--detector", _SLOW_DETECTOR, "--set", f"detector.options.each_us={self.bounds.each_us}",
+                "--metrics", _metrics_port(name))
+
     def _start(self, name: str, line: str, *arguments: str) -> None:
         # Each start has a log of its own, whose first line is waited for.
         self._starts += 1
@@ -243,6 +292,11 @@ class Site:
         namespace = self.wire.far_side if name in self.bounds.beyond else self.wire.robot_side
         self.processes.start(process, list(arguments), namespace=namespace)
         self.processes.wait_line(process, line)
+
+
+def _metrics_port(name: str) -> str:
+    """Return the port of the counters of service `v0`, `v1` and so on."""
+    return f"{9465 + int(name[1:])}"
 
 
 def _endpoints(bounds: SharingBounds) -> list[str]:
@@ -314,9 +368,9 @@ def _nothing(_site: Site, _number: int) -> None:
 
 HARMS: Final[Mapping[str, Sequence[Callable[[Site, int], None]]]] = {
     "shared-killed": (_restarted(Site.kill),), "shared-rolling": (_restarted(Site.end),), "shared-scaled": (_scaled,),
-    "shared-frozen": (_frozen,), "shared-cut": (_cut,), "shared-alone": (_parted, _healed), "shared-router": (_router_killed,),
-    "shared-router-frozen": (_router_frozen,), "shared-parted": (_parted, _healed), "shared-joined": (Site.join,),
-    "shared-200": (_nothing,),
+    "shared-frozen": (_frozen,), "shared-cut": (_cut,), "shared-alone": (_parted, _healed),
+    "shared-router": (_router_killed,), "shared-router-frozen": (_router_frozen,), "shared-parted": (_parted, _healed),
+    "shared-joined": (Site.join,), "shared-200": (_nothing,),
 }
 """What is done in turn."""
 
@@ -334,7 +388,8 @@ def shared(row: NetworkCase, stage: Stage) -> NetworkRun:
         spans_us = list(pairwise([*begins_us, monotonic_us()]))
         site.processes.end()
     records = site.records()
-    checks = [at_least("injected", float(len(spans_us)), "times", least_harms(bounds, stage.setting.seconds, len(harms))),
+    least = least_harms(bounds, stage.setting.seconds, len(harms))
+    checks = [at_least("injected", float(len(spans_us)), "times", least),
               *sharing_checks(bounds, records, spans_us, len(harms))]
     if site.joined_s:
         slowest_s = max(site.joined_s)
@@ -342,6 +397,21 @@ def shared(row: NetworkCase, stage: Stage) -> NetworkRun:
     if site.ended_s:
         checks.append(at_most("a service ends, slowest", max(site.ended_s), "s", ENDS_S))
     return NetworkRun(row, stage.seed, len(spans_us), (), tuple(checks))
+
+
+def loaded(row: NetworkCase, stage: Stage) -> NetworkRun:
+    """Load one, two and four services, one number after the other, with a detector that one of them is too slow for."""
+    checks: list[Check] = []
+    for services in LOADED_FPS:
+        part = replace(stage, folder=stage.folder / f"services-{services}")
+        part.folder.mkdir()
+        with _site(row, part, SharingBounds(services, None, robots=LOADED_ROBOTS, each_us=_LOADED_US)) as site:
+            begin_us, before = site.received()
+            time.sleep(stage.setting.seconds / len(LOADED_FPS))
+            end_us, after = site.received()
+            site.processes.end()
+        checks += loaded_checks(site.records(), services, begin_us, end_us, after - before)
+    return NetworkRun(row, stage.seed, 0, (), tuple(checks))
 
 
 @contextmanager

@@ -8,9 +8,12 @@ from sightline.benchmarks.network.cases import CASES
 from sightline.benchmarks.network.sharing import (
     BOUNDS,
     HARMS,
+    LOADED_FPS,
+    LOADED_ROBOTS,
     changes_of_driver,
     drivers_that_return,
     least_harms,
+    loaded_checks,
     longest_stand_s,
     looks_per_frame,
     sharing_checks,
@@ -19,13 +22,15 @@ from sightline.benchmarks.network.sharing import (
 
 MS = 1_000
 STEP_US = 66 * MS
+SECOND_US = 1_000 * MS
 
 
 def record(drivers, step_us=STEP_US, holds=(), answers_per_frame=1.0):
     """A robot that accepts a command of each of `drivers` in turn."""
     accepted = [(number * step_us, driver, number * step_us) for number, driver in enumerate(drivers)]
-    sent = len(accepted)
-    return {"accepted": accepted, "holds": list(holds), "sent": sent, "answers": round(sent * answers_per_frame)}
+    sent_us = [captured_us for _, _, captured_us in accepted]
+    answers = round(len(sent_us) * answers_per_frame)
+    return {"accepted": accepted, "holds": list(holds), "sent_us": sent_us, "answers": answers}
 
 
 def failed(bounds, records, ends_us=(6_000 * MS,), each=1):
@@ -139,6 +144,35 @@ def test_frames_that_two_services_look_at_are_found():
     assert looks_per_frame(twice) == 2.0
     assert failed(KILLED, twice) == ["answers of all services over frames"]
     assert failed(BOUNDS["shared-alone"], twice) == [], "one service cannot"
+
+
+def loaded(services, received=None, **changes):
+    """Names of the checks that fail for services that answer each frame of 15 a second, from 1 to 3 s."""
+    every = {"step_us": STEP_US, **changes}
+    records = {f"r{number}": record("a" * 91, **every) for number in range(LOADED_ROBOTS)}
+    sent = 20 * len([t_us for t_us in range(0, 91 * every["step_us"], every["step_us"]) if 1 <= t_us / SECOND_US < 3])
+    checks = loaded_checks(records, services, SECOND_US, 3 * SECOND_US, sent if received is None else received * sent)
+    return [check.name for check in checks if not check.ok]
+
+
+def test_services_with_a_slow_detector_must_answer_more_frames_together():
+    assert [loaded(services) for services in LOADED_FPS] == [[], [], []]
+    slow = {services: loaded(services, step_us=120 * MS) for services in LOADED_FPS}
+    assert slow == {1: [], 2: [], 4: ["4 services: answered for each robot"]}
+    assert loaded(2, step_us=140 * MS) == ["2 services: answered for each robot"]
+    assert loaded(1, step_us=900 * MS) == []
+
+
+def test_frames_that_come_to_services_without_an_answer_are_found():
+    assert loaded(4, received=1.04) == []
+    assert loaded(4, received=1.06) == ["4 services: frames received over frames sent"]
+
+
+def test_frame_that_is_answered_twice_counts_once_for_services_with_a_slow_detector():
+    twice = record("a" * 60, step_us=100 * MS)
+    twice["accepted"] = sorted(twice["accepted"] * 2)
+    checks = list(loaded_checks({f"r{number}": twice for number in range(LOADED_ROBOTS)}, 4, 0, 6 * SECOND_US, 0))
+    assert checks[0].value == pytest.approx(10) and not checks[0].ok
 
 
 def test_every_row_has_its_harm_and_its_bounds():
