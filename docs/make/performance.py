@@ -171,6 +171,18 @@ SECTIONS: Final = (
         since="2026-11-28",
     ),
     Section(
+        "network-shared",
+        "Vision services that share robots",
+        "Twenty robots with their real gates at 15 images per second of 320x240, all processes of a site together on "
+        "this machine, while services, routers and links fail or leave. A robot stands while its gate holds it. *Two "
+        "drivers at once* counts the sessions that drive a robot again after another one. In `shared-loaded` each "
+        "service has a detector that takes 8 ms, so that one service alone is too slow; its rate has no bound.",
+        _rows(*(f"shared-{name}" for name in (
+            "killed", "rolling", "scaled", "frozen", "cut", "alone", "router", "router-frozen", "parted", "joined",
+            "loaded")), seconds=120),
+        since="2026-11-28",
+    ),
+    Section(
         "network-stop",
         "STOP through a full medium",
         "One medium of 1 Mbit/s that both directions share, packet after packet, with video offered at 4 Mbit/s. "
