@@ -43,8 +43,6 @@ class NetworkCase:
     most_holds: int | None = None
     longest_hold_s: float | None = None
     flows_again_s: float | None = None
-    least_moving_percent: float = 95.0
-    """Of the time. A robot in HOLD keeps to all bounds of ages and holds."""
     scene: str = ""
     passes_through: bool = False
     transports: tuple[str, ...] = (ZENOH, WEBSOCKET)
@@ -104,7 +102,6 @@ CASES: Final = (
         _steady(delay_ms=5, rate_bit_s=2e6),
         least_fps=4,
         p95_ms=250,
-        least_moving_percent=80,
         passes_through=True,
     ),
     NetworkCase(
