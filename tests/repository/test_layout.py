@@ -72,7 +72,6 @@ SMALL_FILES = {  # with one importer, in their own folder: the reason why each i
     "robot_side/hardware/gpio_low.py": "all that the guardian imports of the drive gpio; also a process of its own",
     "robot_side/guardian/stop_receiver.py": "a process of its own",
     "robot_side/hardware/log_zero.py": "all that the guardian imports of the drive log",
-    "robot_side/driver/persistence.py": "the STOP latch on disk: the one place that a restart depends on",
 }
 
 
