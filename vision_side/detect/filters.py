@@ -27,6 +27,11 @@ class LabelFilter(DetectorWrapper):
         super().__init__(detector)
         self._labels = frozenset((*labels, COLOR_LABEL))
 
+    @property
+    def labels(self) -> Sequence[str]:
+        """Return those labels of the one inside that pass."""
+        return [one for one in super().labels if one in self._labels]
+
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         """Return the detections of the inner detector with the configured labels."""
         return [one and self._kept(one) for one in self.inner.detect(frames, deadline_us)]

@@ -70,6 +70,11 @@ class DetectorWrapper:
         return notices_of(self.inner)
 
     @property
+    def labels(self) -> Sequence[str]:
+        """Return the labels of the one inside."""
+        return labels_of(self.inner)
+
+    @property
     def maker(self) -> Maker | None:
         """Return the maker of the results, if the inner detector names it."""
         return maker_of(self.inner)
@@ -97,6 +102,12 @@ def notices_of(detector: Any) -> list[str]:
     except PLUGIN_ERRORS as error:  # a detector that only reports badly may still detect well
         report_fault("detector", error)
         return [_raises("the detector's notices()", error)]
+
+
+def labels_of(detector: Any) -> Sequence[str]:
+    """Return all labels that a detector can give; empty where they are unknown."""
+    labels: Sequence[str] = getattr(detector, "labels", ())
+    return labels
 
 
 def maker_of(detector: Any) -> Maker | None:

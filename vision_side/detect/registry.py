@@ -17,7 +17,7 @@ from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, Track
 from sightline.vision_side.detect.plugin_calls import OLD_NOTICES, plugin_guard
 from sightline.vision_side.detect.port import Detector, NoDetector
 from sightline.vision_side.detect.remote.client import EXAMPLES
-from sightline.vision_side.missions.registry import check_missions, configured_mission
+from sightline.vision_side.missions.registry import MissionSpec, check_missions, configured_mission
 from sightline.vision_side.plugins import shared_options
 
 BOXES: Final = "boxes"
@@ -82,8 +82,13 @@ def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
 def _check_used_labels(kind: str, known: Sequence[str], config: VisionConfig) -> None:
     """Raise ConfigError for a label of the filter or of the mission that is not among those that the detector lists."""
     _check_labels("detector.labels", kind, config.detector.labels, known)
-    mission = configured_mission(config) if known else None
-    if mission is not None and mission.label:
+    if known:
+        check_mission_label(configured_mission(config), kind, known)
+
+
+def check_mission_label(mission: MissionSpec, kind: str, known: Sequence[str]) -> None:
+    """Raise ConfigError for a mission whose label is not among those that the detector lists, if it lists any."""
+    if mission.label:
         _check_labels(f"mission {mission.name!r}", kind, (mission.label,), known)
 
 

@@ -5,7 +5,7 @@ a network kept back does not start anything.
 """
 
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from pydantic import ValidationError
@@ -28,8 +28,9 @@ from sightline.protocol.messages import (
 )
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 from sightline.vision_side.config import DetectorConfig, VisionConfig
-from sightline.vision_side.detect.plugin_calls import notices_of
+from sightline.vision_side.detect.plugin_calls import labels_of, notices_of
 from sightline.vision_side.detect.port import DetectionResult, Detector
+from sightline.vision_side.detect.registry import check_mission_label
 from sightline.vision_side.detect.shadow import ShadowDetector
 from sightline.vision_side.missions.ranges import decode_scan
 from sightline.vision_side.missions.registry import MissionSpec, configured_mission, requested_mission
@@ -43,8 +44,9 @@ _LONGEST: Final = 200
 class MissionRequests:
     """Applies each request once. `newest` is the last one, `rejection` why it was not applied."""
 
-    def __init__(self, config: VisionConfig) -> None:
-        self._config = config
+    def __init__(self, config: VisionConfig, labels: Sequence[str] = ()) -> None:
+        """Reject missions that follow a label that is not among `labels` of the detector, if it lists any."""
+        self._config, self._labels = config, labels
         self.newest: RequestId | None = None
         self.rejection = ""
 
@@ -65,7 +67,9 @@ class MissionRequests:
         self.newest, self.rejection = request_id, ""
         try:
             _check(header, message.source, frame)
-            return requested_mission(request, self._config)
+            mission = requested_mission(request, self._config)
+            check_mission_label(mission, self._config.detector.kind, self._labels)
+            return mission
         except (WireError, ConfigError) as error:
             self.rejection = " ".join(str(error).split())[:_LONGEST]
             return None
@@ -193,7 +197,7 @@ class MissionChannel:
         self._result: DetectionResult | None = None
         self._missions: LatestSlot[Message] = link.latest(MISSION)
         self._scans: LatestSlot[Message] | None = None
-        self._requests = MissionRequests(config)
+        self._requests = MissionRequests(config, labels_of(detector))
         self._reporter = Reporter(config.detector)
         self._session = secrets.token_hex(4)
         self._reports = 0

@@ -4,6 +4,7 @@ import array
 import math
 import struct
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -26,7 +27,9 @@ from sightline.protocol.messages import (
 from sightline.protocol.proof import session_digest
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.detect.filters import LabelFilter, TrackIds
 from sightline.vision_side.detect.port import Circle, Detection
+from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import Observation
 from sightline.vision_side.serving import mission_channel
 from sightline.vision_side.serving.dry_run import AckingService
@@ -131,6 +134,23 @@ def test_rejected_mission_is_reported_and_changes_nothing(how, words):
     assert report.mission == "follow" and words in report.refused and report.asked.id == 1
     bench.ask("band", 2).frames(5)
     assert (bench.report().refused, bench.answer().mission.id) == ("", 2)
+
+
+@pytest.mark.parametrize("wrap", [lambda inner: inner, TrackIds, lambda inner: LabelFilter(inner, ("ball", "legs"))])
+def test_mission_by_a_label_that_the_detector_never_gives_is_rejected(wrap):
+    inner = configured_detector(COLOR)
+    inner.labels = ("ball", "legs", "light-red")
+    bench = Bench(partial(Service, detector=wrap(inner))).frames(5)
+    rejection = bench.ask("follow", 1, options={"target.label": "legz"}).frames(3).report().refused
+    assert rejection == "mission 'follow': hsv has no label 'legz'; did you mean 'legs'?"
+    assert bench.ask("follow", 2, options={"target.label": "legs"}).frames(3).report().refused == ""
+
+
+def test_a_filter_leaves_only_its_own_labels_to_missions():
+    inner = configured_detector(COLOR)
+    inner.labels = ("ball", "legs")
+    bench = Bench(partial(Service, detector=LabelFilter(inner, ("ball",)))).frames(5)
+    assert "no label 'legs'; it gives ball" in bench.ask("legs", 1).frames(3).report().refused
 
 
 @pytest.mark.parametrize("payload", [b"", b"{", b"[]", b'{"id":1}', b'{"id":1,"name":"os:system"}', b"\xff" * 40])

@@ -284,7 +284,6 @@ class AutoDetector(DetectorWrapper):
     def __init__(self, config: OnnxDetector.Config) -> None:
         is_learned = _is_learned(config)
         super().__init__(OnnxDetector(config) if is_learned else Hsv(Hsv.Config(hsv=config.hsv)))
-        self.labels = self.inner.labels if isinstance(self.inner, OnnxDetector) else ()
         notices_of(self.inner)  # that no GPU runs it only surprises a user who has named a model
         self._notices: list[str] = [] if is_learned or config.hsv.shape == "any" else [
             "a color range finds the target, because ONNX Runtime is missing; for the learned detector: "
