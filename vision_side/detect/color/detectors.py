@@ -8,20 +8,12 @@ from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.config import HsvConfig
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.adaptive import AdaptiveConfig, AdaptiveTracker
-from sightline.vision_side.detect.color.hsv import HsvDetector
+from sightline.vision_side.detect.color.hsv import HsvDetector, RangeCheck
 from sightline.vision_side.detect.per_robot import PerSession
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Label, Maker
 from sightline.vision_side.detect.timing import timed
 
 _CPU: Final = "cpu"
-_FLOODED_SHARE: Final = 0.25
-"""Of an image: a range that marks so much of it marks a floor or a wall. Of 365 photographs of places without a target,
-the default range marks that much in 2 %."""
-_FLOODED_IMAGES: Final = 15
-"""So many ..."""
-_CHECKED_IMAGES: Final = 90
-"""... of the first images, for a notice."""
-
 
 class Hsv:
     """The color detector; it remembers nothing from frame to frame."""
@@ -36,7 +28,7 @@ class Hsv:
 
     def __init__(self, config: Config) -> None:
         self._hsv_detector = HsvDetector(config.hsv, config.label)
-        self._checked, self._flooded = 0, list[float]()
+        self._check = RangeCheck(self._hsv_detector.mask)
         self._notices: list[str] = []
 
     def notices(self) -> list[str]:
@@ -49,21 +41,9 @@ class Hsv:
         return [timed(frame, self.maker, self._largest) for frame in frames]
 
     def _largest(self, picture: DecodedImage) -> tuple[Detection, ...]:
-        if self._checked < _CHECKED_IMAGES:
-            self._check_range(picture)
+        if line := self._check.look(picture):
+            self._notices.append(f"{line}, or use `--detector onnx`")
         return self._hsv_detector.detect(picture)[:MAX_DETECTED_BOXES]
-
-    def _check_range(self, picture: DecodedImage) -> None:
-        """Note that the first images are full of the color. Later ones may show a target that is near."""
-        self._checked += 1
-        share = self._hsv_detector.mask.share(picture.bgr)
-        if share >= _FLOODED_SHARE:
-            self._flooded.append(share)
-        if len(self._flooded) == _FLOODED_IMAGES:
-            self._checked = _CHECKED_IMAGES
-            self._notices.append(f"the color range marks {sum(self._flooded) / _FLOODED_IMAGES:.0%} of the image: the "
-                                 "floor or a wall has that color in this light; pick the target's own with `sightline "
-                                 "pick-color`, or use `--detector onnx`")
 
 
 class Adaptive:

@@ -23,7 +23,7 @@ from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.config import Device, HsvConfig
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.color.detectors import Hsv
-from sightline.vision_side.detect.color.hsv import ColorMask
+from sightline.vision_side.detect.color.hsv import ColorMask, RangeCheck
 from sightline.vision_side.detect.color.refine import refined
 from sightline.vision_side.detect.onnx.engine import ModelEngine, OnnxHeader, open_engine
 from sightline.vision_side.detect.onnx.self_test import KEY, difference, golden_picture, read_golden
@@ -100,7 +100,10 @@ class OnnxDetector:
         """All that it can call a thing; empty where the model has only numbers."""
         self._refine = frozenset(config.refine)
         self._color = ColorMask(config.hsv.ranges) if config.hsv.ranges != HsvConfig().ranges else None
-        self._bonus = config.color_bonus if self._color else 0.0
+        self._color_check = RangeCheck(self._color) if self._color else None
+        self._colored = self._color
+        """The color that counts in the images at hand."""
+        self._bonus = config.color_bonus
         given = config.second_bonus
         self._second_bonus = _SECOND_BONUS.get(path, 0.0) if given is None else given
         # A model of any size gets the image unscaled, and a part of it would be no larger.
@@ -159,17 +162,28 @@ class OnnxDetector:
         return results
 
     def _detections(self, shown: Sequence[tuple[DetectFrame, DecodedImage]]) -> list[Sequence[Detection]]:
+        self._colored = self._color if all(self._is_color_usable(picture) for _, picture in shown) else None
         together = self._look([frame for frame, _ in shown], [picture for _, picture in shown])
         if self._second_look:
             together = [self._with_second_look(*one, found) for one, found in zip(shown, together, strict=True)]
         return [tuple(refined(picture, one) if one.label in self._refine else one for one in found)
                 for (_, picture), found in zip(shown, together, strict=True)]
 
+    def _is_color_usable(self, picture: DecodedImage) -> bool:
+        """Return False if the color marks the floor: all that stands there would get its bonus."""
+        if self._color is None or self._color_check is None:
+            return True
+        if line := self._color_check.look(picture):
+            self._notices.append(f"{line}; until then the color does not count")
+            self._color = None
+        return not self._color_check.is_flooded
+
     def _look(
         self, frames: Sequence[DetectFrame], pictures: Sequence[DecodedImage], bonus: float = 0.0
     ) -> list[tuple[Detection, ...]]:
         """Run the model. A target may have a score that is lower by `bonus`, and by that of the configured color."""
-        least_score = min(self._min_score, max(_NOISE, self._min_score - self._bonus - bonus))
+        color_bonus = self._bonus if self._colored else 0.0
+        least_score = min(self._min_score, max(_NOISE, self._min_score - color_bonus - bonus))
         together = _found(self._engine, pictures, self._form, least_score)
         return [self._with_bonus(*one, bonus) for one in zip(frames, pictures, together, strict=True)]
 
@@ -179,10 +193,10 @@ class OnnxDetector:
         def raised(one: Detection) -> Detection:
             if not frame.goes_by(one.label):
                 return one
-            more = self._bonus if self._color is not None and self._color.has_color(picture, one) else 0.0
+            more = self._bonus if self._colored is not None and self._colored.has_color(picture, one) else 0.0
             return replace(one, score=min(1.0, one.score + bonus + more))
 
-        if self._color is None and not bonus:
+        if self._colored is None and not bonus:
             return found
         counting = (one for one in map(raised, found) if one.score >= self._min_score)
         return tuple(sorted(counting, key=lambda one: -one.score))

@@ -71,8 +71,9 @@ def test_the_second_look_has_the_bonus_too():
     looks = iter([0.1, 0.4])
     colored._engine.run = lambda _pixels: {
         "boxes": np.float32([[100, 80, 160, 140]]), "scores": np.float32([next(looks)]), "labels": np.float32([BALL])}
-    yellow = jpeg_of(np.full((240, 320, 3), (30, 210, 230), np.uint8))
-    assert found(colored, yellow, expected_px=(160.0, 120.0)) == [("ball", 124, 0.85)], "and its own"
+    image = np.full((240, 320, 3), 110, np.uint8)
+    image[80:160, 110:190] = (30, 210, 230)
+    assert found(colored, jpeg_of(image), expected_px=(160.0, 120.0)) == [("ball", 124, 0.85)], "and its own"
 
 
 @pytest.mark.parametrize(("second_look", "nearest_m", "farthest_m"), [(False, 3.6, 8.0), (True, 7.0, 14.0)])
