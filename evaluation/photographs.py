@@ -51,13 +51,13 @@ def _read(path: Path) -> npt.NDArray[np.uint8]:
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or error}") from None
     width, height = _size(path, data)
-    if width < WIDTH_PX or height < HEIGHT_PX or width * height > _MOST_PIXELS:
+    scale = min(1.0, _LONGEST_PX / max(width, height, 1))
+    if width * scale < WIDTH_PX or height * scale < HEIGHT_PX or width * height > _MOST_PIXELS:
         raise ConfigError(f"{path} is {width}x{height} pixels; a photograph has {WIDTH_PX}x{HEIGHT_PX} to "
-                          f"{_MOST_PIXELS // 1_000_000} million")
+                          f"{_MOST_PIXELS // 1_000_000} million, and as many as the first at a length of {_LONGEST_PX}")
     bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if bgr is None:
         raise ConfigError(f"{path} cannot be decoded; save it again as JPEG, or remove it")
-    scale = min(1.0, _LONGEST_PX / max(bgr.shape[:2]))
     if scale < 1.0:
         bgr = cv2.resize(bgr, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), np.uint8)

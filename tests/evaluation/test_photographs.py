@@ -67,6 +67,7 @@ def png_of(width, height):
     (b"", "is not a JPEG or PNG"),
     (cv2.imencode(".png", np.zeros((1, 1, 3), np.uint8))[1].tobytes(), "is 1x1 pixels"),
     (png_of(30_000, 30_000), "is 30000x30000 pixels"),
+    (cv2.imencode(".jpg", np.zeros((320, 12_000, 3), np.uint8))[1].tobytes(), "is 12000x320 pixels"),
     (png_of(640, 480), "cannot be decoded"),
     (cv2.imencode(".jpg", photograph(1))[1].tobytes()[:20], "is not a JPEG or PNG"),
 ])
