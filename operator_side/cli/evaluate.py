@@ -226,8 +226,8 @@ def detectors(
         if demand:
             raise ConfigError("--demand checks the bounds of generated scenes; leave out --photos")
         return _score_photos(photos, lambda more: _subjects(names or COMPARED, config, (*(sets or ()), *more), device),
-                             frames or PHOTO_FRAMES, looks, column=column, tracked=tracked, colored=colored,
-                             as_json=as_json)
+                             frames or PHOTO_FRAMES, looks, seed=PHOTO_SEED if seeds == FROM else seeds, column=column,
+                             tracked=tracked, colored=colored, as_json=as_json)
     if tracked or colored:
         raise ConfigError("--tracked and --colored belong to --photos")
     if demand and seeds < FROM:
@@ -243,7 +243,7 @@ def detectors(
 
 
 def _score_photos(photos: Path, build: "Callable[[Sequence[str]], list[Subject]]", each: int, looks: int, *,
-                  column: str, tracked: bool, colored: bool, as_json: bool) -> int:
+                  seed: int, column: str, tracked: bool, colored: bool, as_json: bool) -> int:
     """`build` takes more settings."""
     from sightline.evaluation import photographs as folder
     from sightline.evaluation.score.ball_textures import KINDS
@@ -259,7 +259,7 @@ def _score_photos(photos: Path, build: "Callable[[Sequence[str]], list[Subject]]
     def scored(settings: Sequence[str], kinds: Sequence[str]) -> "PhotoReport":
         subjects = build(settings)
         try:
-            return score_photos(subjects, photographs, each, PHOTO_SEED, looks=looks, tracked=tracked, kinds=kinds,
+            return score_photos(subjects, photographs, each, seed, looks=looks, tracked=tracked, kinds=kinds,
                                 column=camera, advance=advance)
         finally:
             close_subjects(subjects)

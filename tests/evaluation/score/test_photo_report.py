@@ -134,6 +134,15 @@ def test_the_command_prints_json(folder, capsys):
     assert json.loads(capsys.readouterr().out)["figures"]["hsv"]["empty"] == FEWEST
 
 
+def test_seeds_choose_the_pictures(folder, capsys):
+    command = ["score", "detectors", "hsv", "--photos", str(folder), "--frames", "1"]
+    printed = []
+    for more in ([], ["--seeds", "1"], ["--seeds", "7"]):
+        assert cli.run([*command, *more]) == 0
+        printed.append(capsys.readouterr().out)
+    assert printed[0] == printed[1] != printed[2] and "seed 7" in printed[2]
+
+
 @pytest.mark.parametrize("arguments", [["--demand"], ["--column", "blur,nominal"], ["--column", "easy"]])
 def test_options_of_the_scenes_are_rejected_with_photographs(folder, arguments, capsys):
     assert cli.run(["score", "detectors", "hsv", "--photos", str(folder), *arguments]) == 2
