@@ -35,7 +35,7 @@ _CLASSES: Final = PluginRegistry("model class", "sightline.torch_models")
 _IS_CLASS: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 _SIDE_PX: Final = 640
 _LONGEST: Final = 200
-_RISK: Final = "is a Python pickle, which can run any code on this machine when it is loaded"
+_RISK: Final = "may be a Python pickle, which can run any code on this machine when it is loaded"
 _ULTRALYTICS: Final = {"YOLO_AUTOINSTALL": "false", "YOLO_OFFLINE": "true", "YOLO_VERBOSE": "false"}
 """Without these, the package downloads and installs by itself."""
 
@@ -292,7 +292,8 @@ class UltralyticsDetector(FrameworkDetector):
         """Open the file without downloads."""
         path = home_path(config.address)
         digest = digest_of(path)
-        note = _allowed_pickle(path, config) if path.suffix in (".pt", ".pth") else ""
+        # The package reads weights without these endings as pickles, or evaluates their text.
+        note = "" if path.suffix in (".onnx", ".torchscript") else _allowed_pickle(path, config)
         device = _device(importlib.import_module("torch"), config.device)
         model, least = framework.YOLO(str(path)), _least(config)
 

@@ -115,12 +115,12 @@ def test_ultralytics_boxes_and_names_become_detections(monkeypatch, tmp_path: Pa
     assert detector.maker.detector == "ultralytics:m.onnx" and len(detector.maker.model_hash) == 16
 
 
-@pytest.mark.parametrize("name", ["m.pt", "m.pth"])
-def test_weights_of_ultralytics_are_pickles(monkeypatch, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["m.pt", "m.pth", "m.yaml", "yolo11n", "m.engine"])
+def test_all_but_exported_models_of_ultralytics_may_run_code(monkeypatch, tmp_path: Path, name: str) -> None:
     fake_ultralytics(monkeypatch, None)
     path = tmp_path / name
     path.write_bytes(b"any")
-    assert "is a Python pickle, which can run any code" in rejected(UltralyticsDetector, address=str(path))
+    assert "which can run any code" in rejected(UltralyticsDetector, address=str(path))
     detector = made(UltralyticsDetector, address=str(path), pickle=True)
     assert any("can run any code" in line for line in detector.notices())
 
@@ -142,7 +142,7 @@ def test_folder_of_transformers_needs_weights_that_are_not_a_pickle(monkeypatch,
     (tmp_path / "config.json").write_text("{}")
     assert "no model.safetensors" in rejected(TransformersDetector, address=str(tmp_path))
     (tmp_path / "pytorch_model.bin").write_bytes(b"any")
-    assert "is a Python pickle" in rejected(TransformersDetector, address=str(tmp_path))
+    assert "may be a Python pickle" in rejected(TransformersDetector, address=str(tmp_path))
 
 
 def test_error_of_a_framework_is_one_line(monkeypatch, tmp_path: Path) -> None:
@@ -237,7 +237,7 @@ def test_pickle_runs_only_where_it_is_requested_by_name(torch, tmp_path: Path) -
     torch.save({"model": Ran(ran)}, tmp_path / "m.pt")
     (tmp_path / "old.pt").write_bytes(pickle.dumps(Ran(ran)))
     for name in ("m.pt", "old.pt"):
-        assert "is a Python pickle, which can run any code" in rejected(TorchDetector, address=str(tmp_path / name))
+        assert "may be a Python pickle, which can run any code" in rejected(TorchDetector, address=str(tmp_path / name))
     assert not ran.exists()
     rejected(TorchDetector, address=str(tmp_path / "m.pt"), pickle=True)
     assert ran.exists(), "the risk is real"
@@ -274,7 +274,7 @@ def test_class_of_a_module_gets_its_weights_without_code(torch, tmp_path: Path, 
     assert (one.label, one.score) == ("sports ball", pytest.approx(0.75))
     assert (one.x1_px, one.y1_px, one.x2_px, one.y2_px) == pytest.approx((40, 80, 120, 200))
     torch.save({"score": Ran(ran)}, tmp_path / "bad.pt")
-    assert "is a Python pickle" in rejected(TorchDetector, weights=str(tmp_path / "bad.pt"), **options)
+    assert "may be a Python pickle" in rejected(TorchDetector, weights=str(tmp_path / "bad.pt"), **options)
     assert not ran.exists()
     assert "not a torch.nn.Module" in rejected(TorchDetector, address="my_net:Other")
     assert "cannot be loaded" in rejected(TorchDetector, address="my_net:Nat")
@@ -283,7 +283,7 @@ def test_class_of_a_module_gets_its_weights_without_code(torch, tmp_path: Path, 
 @pytest.mark.slow
 def test_configuration_check_reads_the_model(torch, tmp_path: Path) -> None:
     (tmp_path / "m.pt").write_bytes(pickle.dumps(1))
-    with pytest.raises(ConfigError, match="is a Python pickle"):
+    with pytest.raises(ConfigError, match="may be a Python pickle"):
         check_vision(VisionConfig(detector=DetectorConfig(kind=f"torch:{tmp_path / 'm.pt'}")))
 
 
@@ -326,7 +326,7 @@ def test_random_model_of_ultralytics_keeps_its_labels_and_the_image(torch, tmp_p
     ultralytics = framework("ultralytics")
     path = tmp_path / "random.pt"
     ultralytics.YOLO(name).save(path)
-    assert "is a Python pickle" in rejected(UltralyticsDetector, address=str(path))
+    assert "may be a Python pickle" in rejected(UltralyticsDetector, address=str(path))
     detector = made(UltralyticsDetector, address=str(path), pickle=True, min_score=0.0)
     assert len(detector.labels) == 80
     result_of(detector)
