@@ -15,6 +15,7 @@ from sightline.evaluation.score.ball_textures import KINDS
 from sightline.evaluation.score.detector_report import Subject, answer_of, close_subjects, subjects
 from sightline.evaluation.score.photo_report import (
     COLORS,
+    PhotoFigures,
     PhotoPicture,
     PhotoReport,
     best_ball,
@@ -34,6 +35,8 @@ NAMES: Final = ("onnx", "onnx:rooms", "hsv")
 EACH, SEED = 60, 1
 """As in the command that the page prints."""
 HARD: Final = "all at once"
+_BOUNDED: Final = ("onnx", "onnx:rooms")
+_LEAST_EXPECTED: Final = {"white": 85, "basketball": 90, "football": 75}
 SHOWN_SEED: Final = 2
 _GREEN, _RED = (60, 220, 60), (40, 40, 255)
 
@@ -66,6 +69,43 @@ def image_of(picture: PhotoPicture, subject: Subject) -> Any:
     return bgr
 
 
+def bound_lines(plain: PhotoReport, tracked: PhotoReport, colored: Mapping[str, PhotoReport]) -> Iterator[str]:
+    """Yield a table of what a detector is meant to reach, and what it reaches. A bound that is missed is bold."""
+    def least_hits(reports: Mapping[str, PhotoReport], name: str) -> float:
+        tallies = [report.figures[name].kinds[kind] for kind, report in reports.items()]
+        return min(_percent(one.hit, one.balls) for one in tallies)
+
+    def two(name: str) -> PhotoFigures:
+        return tracked.figures[name]
+
+    rows: list[tuple[str, str, float, Callable[[str], float]]] = [
+        ("the worst kind with a color of its own", ">=", 85,
+         lambda name: least_hits(dict.fromkeys(COLORS, plain), name)),
+        ("the same, expected", ">=", 92, lambda name: least_hits(dict.fromkeys(COLORS, tracked), name)),
+        ("the same, with its color set", ">=", 90, lambda name: least_hits(colored, name)),
+        *((f"{kind}, expected", ">=", least, lambda name, kind=kind: least_hits({kind: tracked}, name))
+          for kind, least in _LEAST_EXPECTED.items()),
+        ("below 12 px radius, expected", ">=", 80, lambda name: _percent(two(name).small.hit, two(name).small.balls)),
+        ("from 12 px radius, expected", ">=", 96, lambda name: _percent(two(name).large.hit, two(name).large.balls)),
+        ("another place marked, the worst kind, expected", "<=", 3,
+         lambda name: max(_percent(one.wrong, one.balls) for one in two(name).kinds.values())),
+        ("photographs without a ball, with a false one", "<=", 3,
+         lambda name: _percent(plain.figures[name].false_alarms, plain.figures[name].empty)),
+        ("the upper end of its 95 % interval", "<=", 5, lambda name: 100 * plain.figures[name].interval[1]),
+    ]  # fmt: skip
+    yield f"| figure | bound | {' | '.join(_BOUNDED)} |"
+    yield "|---|---|" + "---|" * len(_BOUNDED)
+    for what, sign, bound, value_of in rows:
+        values = [value_of(name) for name in _BOUNDED]
+        is_reached = [one >= bound if sign == ">=" else one <= bound for one in values]
+        cells = [f"{one:.1f}" if ok else f"**{one:.1f}**" for one, ok in zip(values, is_reached, strict=True)]
+        yield f"| {what} | {sign} {bound:g} % | {' | '.join(cells)} |"
+
+
+def _percent(count: int, total: int) -> float:
+    return 100.0 * count / max(1, total)
+
+
 def page_lines(plain: PhotoReport, tracked: PhotoReport, hard: PhotoReport,
                colored: Mapping[str, PhotoReport]) -> Iterator[str]:
     """Yield the page, block by block."""
@@ -79,6 +119,14 @@ def page_lines(plain: PhotoReport, tracked: PhotoReport, hard: PhotoReport,
     yield (f"Written by `python -m docs.make.photographs` on {platform.machine()} with the model {shipped_digest()}, "
            f"ONNX Runtime {version('onnxruntime')}\nand OpenCV {version('opencv-python-headless')}.\n")
     yield f"![two images of each kind; green: the ball, red: the answer of {NAMES[0]}](photographs/images.jpg)\n"
+    yield "## What is asked\n"
+    yield (
+        f"Hits in percent, unless the row names something else; bold: not reached. {tracked.photographs} photographs "
+        "without a ball\nare too few to prove the last row: 150 are asked for. Expected: with the second look, where a "
+        "track expects the ball.\n"
+    )
+    yield from bound_lines(plain, tracked, colored)
+    yield ""
     for title, lines, option in (
         ("One look", photo_lines(plain), ""),
         ("Where a track expects the ball", photo_lines(tracked), " --tracked"),

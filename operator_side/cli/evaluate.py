@@ -403,8 +403,8 @@ BATCH = 32
 RATE = 0.003
 OVER_PHOTOS = 60_000
 VALIDATED = 5000
-"""The values of the shipped model, so that the same command makes a model like it; a test compares them. (Its rounds
-were trained one by one, the last from the file before, as its card states.)"""
+"""The values of DRAWN in the card of the shipped model; a test compares them. Other code made the last round of the
+shipped one on a GPU, as the card states."""
 OUT = Path("runs/train")
 _STEPS = "Steps of one round; repeat the option for more rounds, each with a new learning rate and more scenes."
 _START = "Train only the last round, starting from this model."
