@@ -119,10 +119,10 @@ def page_lines(plain: PhotoReport, tracked: PhotoReport, hard: PhotoReport,
     yield (f"Written by `python -m docs.make.photographs` on {platform.machine()} with the model {shipped_digest()}, "
            f"ONNX Runtime {version('onnxruntime')}\nand OpenCV {version('opencv-python-headless')}.\n")
     yield f"![two images of each kind; green: the ball, red: the answer of {NAMES[0]}](photographs/images.jpg)\n"
-    yield "## What is asked\n"
+    yield "## Bounds\n"
     yield (
         f"Hits in percent, unless the row names something else; bold: not reached. {tracked.photographs} photographs "
-        "without a ball\nare too few to prove the last row: 150 are asked for. Expected: with the second look, where a "
+        "without a ball\nare too few to prove the last row: 150 are required. Expected: with the second look, where a "
         "track expects the ball.\n"
     )
     yield from bound_lines(plain, tracked, colored)
