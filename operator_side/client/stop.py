@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sightline.protocol.errors import LinkError, SightlineError
 from sightline.protocol.transports.endpoints import stop_addresses
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from sightline.operator_side.client.requests import Operator
     from sightline.protocol.messages import Status
 
+Place = tuple[Any, ...]
+"""Address of a socket: host and port, with IPv6 also flow and scope."""
 DATAGRAM_PERIOD_S: Final = 0.02
 _STORED_S: Final = 1.0
 """Longest wait for the disk of a robot that is stopped, with its wheels at zero."""
@@ -106,7 +108,7 @@ class StopSender:
                 self._receive(sockets, time.monotonic() + DATAGRAM_PERIOD_S)
 
     @staticmethod
-    def _send(one: socket.socket, place: tuple[str, int], requests: StopRequests) -> None:
+    def _send(one: socket.socket, place: Place, requests: StopRequests) -> None:
         for data in requests.datagrams():
             with suppress(OSError):  # e.g. no route at present
                 one.sendto(data, place)
@@ -123,12 +125,13 @@ class StopSender:
                             self._latched.set()
 
 
-def _resolve(address: tuple[str, int]) -> list[tuple[socket.AddressFamily, tuple[str, int]]]:
+def _resolve(address: tuple[str, int]) -> list[tuple[socket.AddressFamily, Place]]:
+    """Return the first place of each family: a name may have both, while its host listens on one only."""
     try:
-        family, _, _, _, place = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)[0]
+        found = socket.getaddrinfo(*address, type=socket.SOCK_DGRAM)
     except (OSError, UnicodeError):
         return []
-    return [(family, (str(place[0]), int(place[1])))]
+    return list({family: place for family, _, _, _, place in reversed(found)}.items())
 
 
 class _LinkStop(threading.Thread):

@@ -15,10 +15,11 @@ from sightline.operator_side.client.stop import StopSender, stop_robot
 from sightline.protocol.errors import LinkError, RejectReason, WireError
 from sightline.protocol.messages import State, Status
 from sightline.protocol.transports import open as open_module
+from sightline.protocol.transports import stop_port
 from sightline.protocol.transports.stop_datagram import unpack_stop
 from sightline.robot_side.guardian.stop_core import DriverReport, ReceiverCore, pack_report, unpack_number
 from tests.fixtures.links import until
-from tests.fixtures.ports import free_port
+from tests.fixtures.ports import free_port, need_ipv6
 
 
 class Robot:
@@ -213,3 +214,36 @@ def test_datagrams_go_on_until_the_sender_is_closed(robot, port):
     count = len(one.reasons)
     time.sleep(0.1)
     assert len(one.reasons) == count
+
+
+@pytest.fixture
+def names(monkeypatch):
+    """Names and their addresses, in the order of the resolver."""
+    resolve, known = socket.getaddrinfo, {}
+
+    def getaddrinfo(name, *rest, **more):
+        return [one for address in known.get(name, (name,)) for one in resolve(address, *rest, **more)]
+
+    monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
+    return known
+
+
+@pytest.mark.parametrize("listens", ["127.0.0.1", "::1"])
+@pytest.mark.parametrize("order", [("::1", "127.0.0.1"), ("127.0.0.1", "::1")])
+def test_each_family_of_a_name_gets_the_datagrams(port, names, listens, order):
+    need_ipv6()
+    names["robot.local"] = order
+    with stop_port._bound((listens, port)) as robot, StopSender("r1", [f"tcp/robot.local:{port - 1}"]):
+        robot.settimeout(5)
+        assert unpack_stop(robot.recv(2048)).robot == "r1"
+
+
+def test_first_address_of_a_family_is_used(names):
+    names["robot.local"] = ("127.0.0.2", "127.0.0.1")
+    assert client._resolve(("robot.local", 7448)) == [(socket.AF_INET, ("127.0.0.2", 7448))]
+
+
+def test_scope_of_an_address_is_kept():
+    need_ipv6()
+    (family, place), = client._resolve(("fe80::1%lo", 7448))
+    assert (family, place[1:]) == (socket.AF_INET6, (7448, 0, socket.if_nametoindex("lo")))

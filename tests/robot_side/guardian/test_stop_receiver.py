@@ -30,9 +30,8 @@ from sightline.robot_side.guardian.stop_core import (
     unpack_ignored,
     unpack_number,
 )
-from tests.fixtures import demanded
 from tests.fixtures.links import START_S, until
-from tests.fixtures.ports import free_port
+from tests.fixtures.ports import free_port, need_ipv6
 
 MAX_RSS_KIB = 15_000
 SECRET = b"a secret of this site"
@@ -59,14 +58,6 @@ class Driver:
                     self.ignored[reason] = self.ignored.get(reason, 0) + count
         state = "STOPPED" if self.applied else "ACTIVE"
         send_packet(self.near, pack_report(DriverReport(self.applied, state, bool(self.applied), True)))
-
-
-def need_ipv6():
-    try:
-        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as probe:
-            probe.bind(("::1", free_port()))
-    except OSError as error:
-        demanded.do_without("ipv6", f"no IPv6 ({error.strerror}); run: sysctl net.ipv6.conf.lo.disable_ipv6=0")
 
 
 @pytest.fixture
