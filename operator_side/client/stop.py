@@ -10,7 +10,7 @@ import select
 import socket
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, Final
 
@@ -33,6 +33,7 @@ _ANSWERED_S: Final = 1.0
 _LINK_CLOSES_S: Final = 0.3
 _RESOLVED_S: Final = 0.5
 """Longest wait for the addresses of a robot's name."""
+_RESOLVE_AGAIN_S: Final = 1.0
 _FIRST_S: Final = 0.05
 """Time for the answer that the robot has applied a datagram, before the link is opened."""
 
@@ -48,13 +49,16 @@ class StopSender:
             endpoints: of the robot or of its router, as for a link.
             secret_file: file of the STOP secret, or "" without keys.
         """
-        secret = read_secret(secret_file)
-        self._requests = [(address, StopRequests(robot, secret, int.from_bytes(os.urandom(8)) >> 2))
-                          for address in stop_addresses(endpoints)]
+        self._robot, self._secret = robot, read_secret(secret_file)
+        self._requests: list[StopRequests] = []
+        """One for each address: two hosts of one name have challenges of their own."""
         self._ending = threading.Event()
         self._sent, self._latched = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._run, name="stop datagrams", daemon=True)
-        self._thread.start()
+        # One for each name: it may take seconds until a name server answers.
+        self._threads = [threading.Thread(target=self._run, args=(address,), name="stop datagrams", daemon=True)
+                         for address in stop_addresses(endpoints)]
+        for thread in self._threads:
+            thread.start()
 
     def __enter__(self) -> "StopSender":
         return self
@@ -69,12 +73,12 @@ class StopSender:
     @property
     def is_answered(self) -> bool:
         """Return True if a robot has answered."""
-        return any(one.answer is not None for _, one in self._requests)
+        return any(one.answer is not None for one in self._requests)
 
     @property
     def is_latched(self) -> bool:
         """Return True once the robot has applied this STOP. Its wheels may still turn."""
-        return any(one.is_latched for _, one in self._requests)
+        return any(one.is_latched for one in self._requests)
 
     def wait(self, seconds: float) -> bool:
         """Return True as soon as the robot has applied this STOP, False that time after the first datagrams."""
@@ -84,28 +88,35 @@ class StopSender:
     @property
     def is_stopped(self) -> bool:
         """Return True once the robot has applied this STOP and its wheels are at zero."""
-        return any(one.is_stopped for _, one in self._requests)
+        return any(one.is_stopped for one in self._requests)
 
     @property
     def is_stored(self) -> bool:
         """Return True once the STOP is on the disk of the robot, too."""
-        return any(one.is_stored for _, one in self._requests)
+        return any(one.is_stored for one in self._requests)
 
     @property
     def lacks_secret(self) -> bool:
         """Return True if the robot accepts only datagrams that are signed with its STOP secret."""
-        return any(one.lacks_secret for _, one in self._requests)
+        return any(one.lacks_secret for one in self._requests)
 
-    def _run(self) -> None:
+    def _run(self, address: tuple[str, int]) -> None:
+        while not (places := _resolve(address)):
+            self._sent.set()  # there is nothing to wait for
+            if self._ending.wait(_RESOLVE_AGAIN_S):
+                return
         with ExitStack() as ending:
-            places = [(ending.enter_context(socket.socket(family, socket.SOCK_DGRAM)), place, requests)
-                      for address, requests in self._requests for family, place in _resolve(address)]
-            sockets = [one for one, _, _ in places]
+            senders: dict[socket.socket, tuple[Place, StopRequests]] = {}
+            for family, place in places:
+                with suppress(OSError):  # a system without IPv6
+                    one = ending.enter_context(socket.socket(family, socket.SOCK_DGRAM))
+                    senders[one] = place, StopRequests(self._robot, self._secret, int.from_bytes(os.urandom(8)) >> 2)
+            self._requests += [requests for _, requests in senders.values()]
             while not self._ending.is_set():
-                for one, place, requests in places:
+                for one, (place, requests) in senders.items():
                     self._send(one, place, requests)
                 self._sent.set()
-                self._receive(sockets, time.monotonic() + DATAGRAM_PERIOD_S)
+                self._receive(senders, time.monotonic() + DATAGRAM_PERIOD_S)
 
     @staticmethod
     def _send(one: socket.socket, place: Place, requests: StopRequests) -> None:
@@ -113,16 +124,16 @@ class StopSender:
             with suppress(OSError):  # e.g. no route at present
                 one.sendto(data, place)
 
-    def _receive(self, sockets: Sequence[socket.socket], until_s: float) -> None:
+    def _receive(self, senders: Mapping[socket.socket, tuple[Place, StopRequests]], until_s: float) -> None:
         while (left_s := until_s - time.monotonic()) > 0:
-            for one in select.select(sockets, [], [], left_s)[0]:
+            for one in select.select(senders, [], [], left_s)[0]:
                 with suppress(OSError):
                     data, place = one.recvfrom(DATAGRAM_BYTES + 1)
-                    for _, requests in self._requests:
-                        if requests.on_datagram(data):
-                            self._send(one, place, requests)
-                        if requests.is_latched:
-                            self._latched.set()
+                    requests = senders[one][1]
+                    if requests.on_datagram(data):
+                        self._send(one, place, requests)
+                    if requests.is_latched:
+                        self._latched.set()
 
 
 def _resolve(address: tuple[str, int]) -> list[tuple[socket.AddressFamily, Place]]:

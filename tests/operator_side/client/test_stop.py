@@ -210,7 +210,8 @@ def test_datagrams_go_on_until_the_sender_is_closed(robot, port):
     with StopSender("r2", [f"tcp/127.0.0.1:{port - 1}"]) as sender:
         assert until(lambda: len(one.reasons) > 3)
         assert set(one.reasons) == {RejectReason.OTHER_ROBOT} and not sender.is_answered
-    sender._thread.join()
+    for thread in sender._threads:
+        thread.join()
     count = len(one.reasons)
     time.sleep(0.1)
     assert len(one.reasons) == count
@@ -218,11 +219,15 @@ def test_datagrams_go_on_until_the_sender_is_closed(robot, port):
 
 @pytest.fixture
 def names(monkeypatch):
-    """Names and their addresses, in the order of the resolver."""
+    """Names and their addresses, in the order of the resolver; an event in place of them ends without any."""
     resolve, known = socket.getaddrinfo, {}
 
     def getaddrinfo(name, *rest, **more):
-        return [one for address in known.get(name, (name,)) for one in resolve(address, *rest, **more)]
+        addresses = known.get(name, (name,))
+        if isinstance(addresses, threading.Event):
+            addresses.wait(5.0)
+            raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+        return [one for address in addresses for one in resolve(address, *rest, **more)]
 
     monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
     return known
@@ -247,3 +252,21 @@ def test_scope_of_an_address_is_kept():
     need_ipv6()
     (family, place), = client._resolve(("fe80::1%lo", 7448))
     assert (family, place[1:]) == (socket.AF_INET6, (7448, 0, socket.if_nametoindex("lo")))
+
+
+def test_a_name_that_does_not_resolve_delays_no_other_address(robot, port, names):
+    names["robot.example"] = waiting = threading.Event()
+    robot()
+    with StopSender("r1", [f"tcp/robot.example:{port - 1}", f"tcp/127.0.0.1:{port - 1}"]) as sender:
+        assert until(lambda: sender.is_stopped, 4.0) and not waiting.is_set()
+    waiting.set()
+
+
+def test_a_name_that_resolves_later_gets_the_datagrams(robot, port, names, monkeypatch):
+    monkeypatch.setattr(client, "_RESOLVE_AGAIN_S", 0.01)
+    names["robot.local"] = ()
+    robot()
+    with StopSender("r1", [f"tcp/robot.local:{port - 1}"]) as sender:
+        assert not sender.wait(0.0)
+        names["robot.local"] = ("127.0.0.1",)
+        assert until(lambda: sender.is_stopped, 4.0)
