@@ -5,6 +5,9 @@
 
 A legacy robot applies each command for ever and validates nothing. Its operators therefore send their requests to the
 vision service that drives it, and the commands of that service pass through here.
+
+The robot confirms no command. A zero counts as delivered once an image comes 100 ms later by the same connection. Until
+then the robot may drive on: its state is ACTIVE, and STOP and disarm are not confirmed.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from sightline.protocol.channels import DETECTIONS, REPLY, REQUEST, STATUS, TWIST, Channel
+from sightline.protocol.channels import DETECTIONS, FRAME, REPLY, REQUEST, STATUS, TWIST, Channel
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import check_sizes, decode, encode
 from sightline.protocol.errors import RejectReason, WireError
@@ -29,6 +32,7 @@ from sightline.protocol.messages import (
     DetectedBox,
     Detections,
     Echo,
+    FrameHeader,
     Reply,
     Request,
     RequestHeader,
@@ -49,6 +53,11 @@ _ZERO: Final = format_twist(STILL)
 _NO_BOX: Final = encode(Detections(width_px=LEAST_SIDE_PX, height_px=LEAST_SIDE_PX))
 _FRESH: Final = round(2.0 / STATUS_PERIOD_S)
 """Statuses that a request may cite: those of the last two seconds."""
+_IN_FLIGHT_US: Final = 100_000
+"""An image that arrives earlier after a zero may have left before it, and shows no delivery."""
+_PATIENCE_US: Final = 1_000_000
+"""Time for the delivery of a zero before a request is answered as failed. Its sender repeats it."""
+_NOT_DELIVERED: Final = "zero is not delivered to the robot; cut its power by hand"
 _DRIVING: Final = "legacy robot: it validates no image age, and has no watchdog"
 
 
@@ -97,12 +106,16 @@ class LegacyRobotLink(LinkWrapper):
         self._lock = threading.Lock()
         self._state, self._reason = State.ACTIVE, _DRIVING
         self._applied = (0.0, 0.0)
+        self._is_at_rest, self._zero_us = False, 0
+        """Whether zero is delivered since the last motion, and the first time that it was sent for that."""
+        self._connection = ""
         self._accepted = 0
         self._seqs = {STATUS: 0, REPLY: 0}
         # A request that permits motion cites one of these. STOP and disarm clear them.
         self._issued: deque[Echo] = deque(maxlen=_FRESH)
         self._ending = threading.Event()
         link.subscribe(REQUEST, self._on_request)
+        link.subscribe(FRAME, self._on_frame)
         threading.Thread(target=self._report, name="legacy status", daemon=True).start()
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
@@ -113,10 +126,10 @@ class LegacyRobotLink(LinkWrapper):
         with self._lock:
             if self._state is not State.ACTIVE:
                 payload = _ZERO if channel is TWIST else _NO_BOX
-            if channel is TWIST:
+            elif channel is TWIST:
                 twist = parse_twist(payload)
                 self._applied = (twist.linear_mps, twist.angular_rad_s)
-                self._accepted += self._state is State.ACTIVE
+                self._accepted += 1
             return self._link.publish(channel, header, payload, source)
 
     def close(self) -> None:
@@ -136,14 +149,16 @@ class LegacyRobotLink(LinkWrapper):
             if header.source != message.source:
                 raise WireError(RejectReason.UNKNOWN_SOURCE, "key and header disagree on the source")
             detail, ok = self._carry_out(header, request.verb), True
+            if not detail:
+                return
         except WireError as error:
             detail, ok = f"{error.reason}: {error.detail}"[:200], False
-        reply = Reply(to=header.digest, id=request.id, ok=ok, state=self._state, detail=detail)
+        reply = Reply(to=header.digest, id=request.id, ok=ok, state=self._shown()[0], detail=detail)
         self._post(REPLY, reply)
         self._post_status()
 
     def _carry_out(self, header: RequestHeader, verb: Verb) -> str:
-        """Return one line for the operator. Raises WireError for a request that is rejected."""
+        """Return one line for the operator, "" for no reply yet. Raises WireError for a request that is rejected."""
         if verb is Verb.STOP:
             return self._halt(State.STOPPED, f"STOP by {header.source}")
         if verb is Verb.DISARM:
@@ -161,19 +176,43 @@ class LegacyRobotLink(LinkWrapper):
                 return "reset; arm to drive"
             if self._state is State.STOPPED:
                 raise WireError(RejectReason.STOPPED, f"{self._reason}; reset first")
-            self._state, self._reason = State.ACTIVE, _DRIVING
+            self._state, self._reason, self._is_at_rest = State.ACTIVE, _DRIVING, False
             return "armed"
 
     def _halt(self, state: State, reason: str) -> str:
         """Send zero now, without waiting for the next frame. The link repeats it."""
         with self._lock:
             self._issued.clear()
+            if self._state is State.ACTIVE:
+                self._zero_us = self._now_us()
             if self._state is not state:
                 self._state, self._reason = state, reason
-            self._applied = (0.0, 0.0)
             for channel, zero in ((TWIST, _ZERO), (DETECTIONS, _NO_BOX)):
                 self._link.publish(channel, b"", zero)
-        return "STOPPED" if state is State.STOPPED else "disarmed"
+            if self._is_at_rest:
+                return "STOPPED" if state is State.STOPPED else "disarmed"
+            if self._now_us() - self._zero_us < _PATIENCE_US:
+                return ""
+        raise WireError(RejectReason.NOT_ALLOWED, _NOT_DELIVERED)
+
+    def _on_frame(self, message: Message) -> None:
+        try:
+            session, now_us = decode(FrameHeader, message.header).session, self._now_us()
+        except WireError:
+            return
+        with self._lock:
+            if session != self._connection:  # the one before may have lost the zero
+                self._connection, self._zero_us = session, now_us
+            if self._state is State.ACTIVE or self._is_at_rest or now_us - self._zero_us < _IN_FLIGHT_US:
+                return
+            self._is_at_rest, self._applied = True, (0.0, 0.0)
+        self._post_status()
+
+    def _shown(self) -> tuple[State, str]:
+        """Return state and reason for the operators."""
+        if self._is_at_rest or self._state is State.ACTIVE:
+            return self._state, self._reason
+        return State.ACTIVE, f"{self._reason}; {_NOT_DELIVERED}"
 
     # --- status ------------------------------------------------------------------------------------------------------
 
@@ -183,7 +222,8 @@ class LegacyRobotLink(LinkWrapper):
 
     def _post_status(self) -> None:
         with self._lock:
-            status = Status(state=self._state, reason=self._reason, applied=self._applied, accepted=self._accepted)
+            state, reason = self._shown()
+            status = Status(state=state, reason=reason, applied=self._applied, accepted=self._accepted)
         self._post(STATUS, status)
 
     def _post(self, channel: Channel, model: WireModel) -> None:

@@ -58,12 +58,28 @@ class Bench:
         message = self.statuses.take()
         return decode(Stamp, message.header), decode(Status, message.payload, STATUS.max_payload_bytes)
 
-    def request(self, verb: Verb, echo: Echo | None = None, source: str = "operator") -> Reply:
+    def send(self, verb: Verb, echo: Echo | None = None, source: str = "operator") -> Reply | None:
         header = RequestHeader(source=source, session="0000beef", seq=1, echo=echo)
         self.operator.publish(REQUEST, encode(header), encode(Request(id=7, verb=verb)), "operator")
         self.advance()
         self.advance()
-        return decode(Reply, self.replies.take().payload, REPLY.max_payload_bytes)
+        message = self.replies.take()
+        return message and decode(Reply, message.payload, REPLY.max_payload_bytes)
+
+    def image(self, after_us: int = 100_000, session: str = "0000abcd") -> None:
+        """An image of the robot. A new session is a new connection."""
+        self.network.advance(self.network.now_us + after_us)
+        header = FrameHeader(session=session, seq=1, t_us=self.network.now_us)
+        self.far.publish(FRAME, encode(header), b"an image")
+        self.advance()
+
+    def request(self, verb: Verb, echo: Echo | None = None, source: str = "operator") -> Reply:
+        """Send a request to a robot that sends images, as `Operator` does: again without a reply."""
+        for _ in range(3):
+            if (reply := self.send(verb, echo, source)) is not None:
+                return reply
+            self.image()
+        raise AssertionError("no reply")
 
 
 @pytest.fixture
@@ -82,10 +98,11 @@ def test_commands_pass_from_the_start(bench):
 @pytest.mark.parametrize(("verb", "state"), [(Verb.STOP, "STOPPED"), (Verb.DISARM, "DISARMED")])
 def test_stop_and_disarm_send_zero_at_once_and_hold_later_commands_at_zero(bench, verb, state):
     bench.drive()
-    reply = bench.request(verb)
-    assert (reply.ok, reply.state) == (True, state)
+    bench.send(verb)
     assert bench.twists.take().payload == ZERO
     assert decode(Detections, bench.boxes.take().payload).boxes == ()
+    reply = bench.request(verb)
+    assert (reply.ok, reply.state) == (True, state)
     assert bench.drive() == ZERO
     found = Detections(width_px=160, height_px=120, boxes=(
         DetectedBox(label="ball", score=1, x1_px=1, y1_px=1, x2_px=9, y2_px=9),))
@@ -93,6 +110,52 @@ def test_stop_and_disarm_send_zero_at_once_and_hold_later_commands_at_zero(bench
     bench.advance()
     assert decode(Detections, bench.boxes.take().payload).boxes == ()
     assert bench.status()[1].applied == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("verb", "state"), [(Verb.STOP, "STOPPED"), (Verb.DISARM, "DISARMED")])
+def test_stop_and_disarm_of_a_robot_out_of_reach_are_not_confirmed(bench, verb, state):
+    bench.image()
+    bench.drive()
+    assert bench.send(verb) is None
+    bench.image(50_000)  # it was in flight
+    assert bench.drive() == ZERO
+    assert bench.status()[1].applied == (0.2, -0.35)
+    assert bench.send(verb) is None
+    bench.network.advance(bench.network.now_us + 1_000_000)
+    reply = bench.send(verb)
+    assert (reply.ok, reply.state) == (False, "ACTIVE") and "cut its power by hand" in reply.detail
+    _, status = bench.status()
+    assert (status.state, status.applied) == ("ACTIVE", (0.2, -0.35)) and "zero is not delivered" in status.reason
+    bench.image()
+    _, status = bench.status()
+    assert (status.state, status.applied) == (state, (0.0, 0.0)) and "zero" not in status.reason
+    assert bench.send(verb).ok
+
+
+def test_first_image_of_a_new_connection_shows_no_delivery(bench):
+    """The connection before may have lost the zero, which the link repeats on the new one."""
+    bench.image()
+    bench.drive()
+    assert bench.send(Verb.STOP) is None
+    bench.image(500_000, session="0000abce")
+    assert bench.status()[1].state == "ACTIVE"
+    bench.image(session="0000abce")
+    assert bench.status()[1].state == "STOPPED"
+
+
+def test_motion_after_arm_needs_another_delivery(bench):
+    bench.request(Verb.DISARM)
+    bench.request(Verb.ARM, Echo.of(bench.status()[0]))
+    bench.drive()
+    assert bench.send(Verb.STOP) is None and bench.status()[1].applied == (0.2, -0.35)
+
+
+def test_malformed_header_of_an_image_shows_no_delivery(bench):
+    bench.send(Verb.STOP)
+    bench.network.advance(bench.network.now_us + 200_000)
+    bench.far.publish(FRAME, b"{", b"an image")
+    bench.advance()
+    assert bench.status()[1].state == "ACTIVE" and not bench.link.rejected
 
 
 def test_after_a_stop_only_reset_and_arm_with_a_new_status_permit_motion(bench):
