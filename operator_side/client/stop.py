@@ -218,8 +218,9 @@ def _wait(robot: str, sender: StopSender, link: _LinkStop, on_slow: Callable[[],
             return True
         if sender.is_stopped or link.status is not None:
             stopped_s = stopped_s or now_s
-            if not sender.is_answered or now_s - stopped_s > _STORED_S:
-                return not sender.is_answered
+            has_report = sender.is_answered and not sender.lacks_secret
+            if not has_report or now_s - stopped_s > _STORED_S:
+                return not sender.is_stopped
         elif link.error is not None and not sender.is_answered and now_s - began_s > _ANSWERED_S:
             raise link.error
         elif link.ident is None and now_s - began_s > _ANSWERED_S:  # it is applied, but the wheels are not at zero

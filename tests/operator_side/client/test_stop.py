@@ -205,6 +205,21 @@ def test_a_missing_secret_is_named(robot, link, port):
         stop(port, timeout_s=0.4)
 
 
+def test_without_the_secret_the_link_alone_proves_the_stop(robot, link, port, monkeypatch):
+    monkeypatch.setattr(client, "_STORED_S", 60.0)
+    robot(secret=b"a secret of this site")
+    link.status = STOPPED
+    assert stop(port)
+
+
+def test_datagrams_that_never_show_the_stop_deny_no_disk(robot, link, port, monkeypatch):
+    """The link shows it; a receiver without reports of its driver process cannot."""
+    monkeypatch.setattr(client, "_STORED_S", 0.1)
+    robot(state="ACTIVE")
+    link.status = STOPPED
+    assert stop(port)
+
+
 def test_datagrams_go_on_until_the_sender_is_closed(robot, port):
     one = robot()
     with StopSender("r2", [f"tcp/127.0.0.1:{port - 1}"]) as sender:
