@@ -200,8 +200,11 @@ MAX_ROBOTS: Final = 1024
 """Security limit: robots of one router."""
 MAX_PLACES: Final = 8
 """Security limit: addresses of one robot id. Without keys a third party may register the id too: STOP goes to all."""
-MAX_WAITING: Final = 4096
-"""Security limit: STOPs whose answer may still come."""
+MAX_OPERATORS: Final = 64
+"""Security limit: addresses of operators with STOPs whose answer may still come."""
+MAX_WAITING: Final = 64
+"""Security limit: such STOPs of one address, so that a flood from another one displaces none. 0.6 s of STOPs."""
+_NO_HMAC: Final = bytes(32)
 _FRESH_US: Final = 3_000_000
 Origin = tuple[int, tuple[str, int]]
 """Socket on which a datagram came, and the address of its sender."""
@@ -220,7 +223,8 @@ class ForwarderCore:
         self._secret, self._seed = secret, seed
         self._robots: dict[str, dict[str, tuple[Origin, int]]] = {}
         """Robot id -> host -> address and time of the last registration."""
-        self._waiting: OrderedDict[Hashable, Origin] = OrderedDict()
+        self._waiting: OrderedDict[str, OrderedDict[Hashable, Origin]] = OrderedDict()
+        """Host -> robot and counter of a STOP -> its sender."""
 
     def on_datagram(self, data: bytes, origin: Origin, now_us: int) -> list[tuple[bytes, Origin]]:
         """Take a datagram. Returns what to send.
@@ -232,16 +236,30 @@ class ForwarderCore:
         if one.kind is Kind.REGISTER:
             return self._register(data, one, origin, now_us)
         if one.kind is Kind.ANSWER:
-            sender = self._waiting.get((one.robot, one.counter))
+            stop = one.robot, one.counter
+            sender = next((stops[stop] for stops in self._waiting.values() if stop in stops), None)
             known = origin[1][0] in self._robots.get(one.robot, {})
             return [(data, sender)] if sender is not None and known else []
         places = self._robots.get(one.robot)
         if not places:
             raise WireError(RejectReason.OTHER_ROBOT, "for a robot that is not registered here")
-        self._waiting[one.robot, one.counter] = origin
-        if len(self._waiting) > MAX_WAITING:
-            self._waiting.popitem(last=False)
+        if self._secret and data.endswith(_NO_HMAC):
+            # Without an HMAC of its own: with one, a third party could hand it to an operator with the secret.
+            return [(pack_stop(StopDatagram(Kind.ANSWER, one.robot, one.counter, keyed=True)), origin)]
+        if self._secret:
+            check_hmac(data, self._secret)
+        self._note_sender(one, origin)
         return [(data, place) for place, _ in places.values()]
+
+    def _note_sender(self, one: StopDatagram, origin: Origin) -> None:
+        host = origin[1][0]
+        stops = self._waiting.setdefault(host, OrderedDict())
+        self._waiting.move_to_end(host)
+        stops[one.robot, one.counter] = origin
+        if len(stops) > MAX_WAITING:
+            stops.popitem(last=False)
+        if len(self._waiting) > MAX_OPERATORS:
+            self._waiting.popitem(last=False)
 
     def _register(
         self, data: bytes, one: StopDatagram, origin: Origin, now_us: int

@@ -9,12 +9,14 @@ from sightline.protocol.transports.stop_datagram import (
     STOPPED,
     Kind,
     StopDatagram,
+    StopRequests,
     challenge_of,
     check_hmac,
     pack_stop,
     unpack_stop,
 )
 from sightline.robot_side.guardian.stop_core import (
+    MAX_OPERATORS,
     MAX_PLACES,
     MAX_ROBOTS,
     MAX_WAITING,
@@ -199,8 +201,11 @@ def test_ignored_datagrams_are_reported_once_a_second_until_there_was_room(addre
 ROBOT, OPERATOR = (3, ("10.0.0.1", 50000)), (3, ("10.0.0.9", 60000))
 
 
-def stop_of(robot="r1", counter=7):
-    return pack_stop(StopDatagram(Kind.STOP, robot, counter))
+def stop_of(robot="r1", counter=7, secret=b""):
+    return pack_stop(StopDatagram(Kind.STOP, robot, counter), secret)
+
+
+SIGNED = stop_of(secret=SECRET)
 
 
 def register(core, robot="r1", origin=ROBOT, now_us=0):
@@ -259,19 +264,60 @@ def test_robots_and_waiting_operators_are_bounded():
     assert len(core._robots) == MAX_ROBOTS and "last" in core._robots
     register(core, "late", now_us=5_000_000)
     assert "late" in core._robots and len(core._robots) == MAX_ROBOTS
-    for counter in range(MAX_WAITING + 10):
-        core.on_datagram(stop_of("late", counter), OPERATOR, 5_000_000)
-    assert len(core._waiting) == MAX_WAITING
+    for host in range(MAX_OPERATORS + 10):
+        for counter in range(MAX_WAITING + 10):
+            core.on_datagram(stop_of("late", counter), (3, (str(host), 1)), 5_000_000)
+    assert [len(stops) for stops in core._waiting.values()] == [MAX_WAITING] * MAX_OPERATORS
+
+
+def test_a_flood_from_other_addresses_displaces_no_operator():
+    core = ForwarderCore(b"", CHALLENGE)
+    register(core)
+    core.on_datagram(stop_of(), OPERATOR, 0)
+    for counter in range(100, 100 + 2 * MAX_WAITING):
+        for host in range(MAX_OPERATORS - 1):
+            core.on_datagram(stop_of("r1", counter), (3, (str(host), counter)), 0)
+    reply = pack_stop(StopDatagram(Kind.ANSWER, "r1", 7))
+    assert core.on_datagram(reply, ROBOT, 0) == [(reply, OPERATOR)]
+
+
+def test_an_operator_that_still_sends_is_not_the_oldest():
+    core = ForwarderCore(b"", CHALLENGE)
+    register(core)
+    for host in range(2 * MAX_OPERATORS):
+        core.on_datagram(stop_of(), OPERATOR, 0)
+        core.on_datagram(stop_of("r1", 8), (3, (str(host), 1)), 0)
+    assert OPERATOR[1][0] in core._waiting and len(core._waiting) == MAX_OPERATORS
+
+
+def test_with_keys_only_a_valid_hmac_is_forwarded_and_waits():
+    core = ForwarderCore(SECRET, CHALLENGE)
+    registered(core, Registration("r1", SECRET, 5), ROBOT)
+    with pytest.raises(WireError, match="WRONG_KEY"):
+        core.on_datagram(stop_of(secret=b"another"), OPERATOR, 0)
+    assert not core._waiting
+    assert core.on_datagram(SIGNED, OPERATOR, 0) == [(SIGNED, ROBOT)]
+
+
+def test_with_keys_an_operator_without_the_secret_gets_to_know_it():
+    core, sender = ForwarderCore(SECRET, CHALLENGE), StopRequests("r1", b"", 7)
+    registered(core, Registration("r1", SECRET, 5), ROBOT)
+    [(reply, place)] = core.on_datagram(*sender.datagrams(), OPERATOR, 0)
+    assert place == OPERATOR and not core._waiting
+    sender.on_datagram(reply)
+    assert sender.lacks_secret and not sender.is_latched
+    with pytest.raises(WireError, match="WRONG_KEY"):
+        check_hmac(reply, SECRET)  # it must not count for a sender with the secret
 
 
 def test_with_keys_a_robot_registers_by_the_challenge_of_the_router():
     core, registration = ForwarderCore(SECRET, CHALLENGE), Registration("r1", SECRET, 5)
     [(reply, _)] = core.on_datagram(registration.datagram(), ROBOT, 0)
     with pytest.raises(WireError, match="OTHER_ROBOT"):
-        core.on_datagram(stop_of(), OPERATOR, 0)
+        core.on_datagram(SIGNED, OPERATOR, 0)
     second = registration.on_answer(reply, unpack_stop(reply))
     [(reply, _)] = core.on_datagram(second, ROBOT, 0)
-    assert core.on_datagram(stop_of(), OPERATOR, 0)
+    assert core.on_datagram(SIGNED, OPERATOR, 0)
     assert registration.on_answer(reply, unpack_stop(reply)) is None
 
 
@@ -286,7 +332,7 @@ def test_with_keys_no_third_party_registers(secret, challenge, reason):
     with pytest.raises(WireError, match=reason):
         core.on_datagram(data, OPERATOR, 0)
     with pytest.raises(WireError, match="OTHER_ROBOT"):
-        core.on_datagram(stop_of(), OPERATOR, 0)
+        core.on_datagram(SIGNED, OPERATOR, 0)
 
 
 def registered(core, registration, *origins):
@@ -310,16 +356,16 @@ def test_with_keys_a_recorded_registration_counts_only_from_its_own_address_and_
     assert unpack_stop(recorded).challenge != NO_CHALLENGE
     with pytest.raises(WireError, match="OTHER_SESSION"):
         core.on_datagram(recorded, origin, 4_000_000)
-    assert core.on_datagram(stop_of(), OPERATOR, 4_000_000) == [(stop_of(), ROBOT)]
+    assert core.on_datagram(SIGNED, OPERATOR, 4_000_000) == [(SIGNED, ROBOT)]
 
 
 def test_with_keys_a_robot_registers_from_both_families_and_from_a_new_port_of_its_nat():
     core, registration = ForwarderCore(SECRET, CHALLENGE), Registration("r1", SECRET, 5)
     second, moved = (4, ("2001:db8::1", 50001, 0, 0)), (3, ("10.0.0.1", 50007))
     registered(core, registration, ROBOT, second)
-    assert [place for _, place in core.on_datagram(stop_of(), OPERATOR, 0)] == [ROBOT, second]
+    assert [place for _, place in core.on_datagram(SIGNED, OPERATOR, 0)] == [ROBOT, second]
     registered(core, registration, moved, second)
-    assert [place for _, place in core.on_datagram(stop_of(), OPERATOR, 0)] == [moved, second]
+    assert [place for _, place in core.on_datagram(SIGNED, OPERATOR, 0)] == [moved, second]
 
 
 def test_a_router_that_starts_again_gives_its_new_challenge():
@@ -330,7 +376,7 @@ def test_a_router_that_starts_again_gives_its_new_challenge():
         assert unpack_stop(sent).challenge == NO_CHALLENGE
         [(reply, _)] = core.on_datagram(sent, ROBOT, 0)
         core.on_datagram(registration.on_answer(reply, unpack_stop(reply)), ROBOT, 0)
-        assert core.on_datagram(stop_of(), OPERATOR, 0)
+        assert core.on_datagram(SIGNED, OPERATOR, 0)
 
 
 def test_an_answer_to_another_registration_is_ignored():
