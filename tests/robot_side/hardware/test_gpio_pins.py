@@ -1,8 +1,10 @@
 """The source of the pins and their state afterwards: gpiozero, lgpio, and machines without both."""
 
+import json
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,6 +25,20 @@ from sightline.robot_side.plugins import DRIVES
 from tests.fixtures.gpio import FakeLgpio, NotingPin, config
 
 ROOT = Path(__file__).parent.parent.parent.parent
+MEMORY_KB = 15_000
+GUARDIAN = """
+import json, os, sys
+root, sys.path[:] = sys.argv.pop(), json.loads(sys.argv.pop())
+top = type(sys)('sightline'); top.__path__ = [root]; sys.modules['sightline'] = top
+import sightline.robot_side.guardian.process
+from sightline.robot_side.hardware import gpio_low
+made = []
+sys.addaudithook(lambda event, given: event == "os.mkdir" and made.append(given[0]))
+gpio_low.prepare()
+print(os.getcwd(), len(made), *map(os.path.exists, made), os.environ.get("LG_WD"), sys.modules["lgpio"].__name__)
+print(*open("/proc/self/status"))
+"""
+"""What the guardian of a gpio robot imports, as `robot_side/guardian/start.py` starts it."""
 
 
 @pytest.mark.parametrize("module", ["gpiozero", "lgpio"])
@@ -87,6 +103,16 @@ def test_zero_needs_its_library_before_its_moment(monkeypatch):
     monkeypatch.setattr(gpio_low, "import_lgpio", lambda: imported.append(1))
     gpio_low.prepare()
     assert imported == [1] and zero_module(GpioDrive) is gpio_low
+
+
+def test_guardian_of_a_gpio_robot_is_small_and_lgpio_leaves_no_trace(tmp_path):
+    if find_spec("lgpio") is None:
+        demanded.do_without("lgpio", "no lgpio; run: pip install -e '.[robot-pi]'")
+    command = [sys.executable, "-I", "-S", "-c", GUARDIAN, json.dumps(sys.path), str(ROOT)]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path).stdout
+    assert printed.startswith(f"{tmp_path} 1 False None lgpio\n")
+    assert list(tmp_path.iterdir()) == []
+    assert int(printed.partition("VmRSS:")[2].split()[0]) <= MEMORY_KB
 
 
 def zero_module(plugin):
