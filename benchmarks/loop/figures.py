@@ -90,7 +90,7 @@ def peers_of(text: str) -> tuple[str, ...]:
 Header = tuple[int, int, int | None]
 """Of a frame: (seq, t_us, latency_us of the command accepted last before it)."""
 Accepted = tuple[int, int]
-"""Of a status: (t_us, commands accepted so far)."""
+"""Of a status: (t_us, commands accepted so far). A command that is sent twice is accepted twice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,9 +207,13 @@ def wheel_ages(headers: Sequence[Header], sets_us: Sequence[int]) -> Iterator[Wh
 
 
 def course_of_headers(
-    headers: Sequence[Header], accepted: Sequence[Accepted], sets_us: Sequence[int], begin_us: int, end_us: int
+    headers: Sequence[Header], accepted: Sequence[Accepted], sets_us: Sequence[int], begin_us: int, end_us: int,
+    copies: float,
 ) -> Course:
-    """Return the course of the services: ages at the wheels, and the driver's count of accepted commands."""
+    """Return the course of the services: ages at the wheels, and the driver's count of accepted commands.
+
+    The vision service sent `copies` commands for each image, on average.
+    """
     inside = [header for header in headers if begin_us <= header[1] < end_us]
     ages = [age for age in wheel_ages(headers, sets_us) if begin_us <= age.set_us < end_us]
     if not ages or not inside:
@@ -217,18 +221,20 @@ def course_of_headers(
     lag_us = round(median(age.validated_us for age in ages))
     statuses = [status for status in accepted if begin_us <= status[0] < end_us]
     captured = inside[-1][0] - inside[0][0] + 1  # by number: those that never arrived count too
-    return Course(captured, _accepted_percent(headers, statuses, lag_us),
+    return Course(captured, min(100.0, _accepted_percent(headers, statuses, lag_us) / copies),
                   tuple((age.set_us, age.age_us) for age in ages), tuple(age.validated_us for age in ages))
 
 
 def _accepted_percent(headers: Sequence[Header], statuses: Sequence[Accepted], lag_us: int) -> float:
-    """Share of the frames captured between the first and the last status; results lag captures by `lag_us`."""
+    """Return the commands per hundred frames captured between the first and the last status.
+
+    Results lag captures by `lag_us`. A result at the boundary may count on its other side.
+    """
     times_us = [t_us for _, t_us, _ in headers]
     seqs = [headers[max(0, bisect_right(times_us, t_us - lag_us) - 1)][0] for t_us, _ in statuses]
     if len(statuses) < 2 or seqs[-1] == seqs[0]:
         return 0.0
-    # A result at the boundary may count on its other side.
-    return min(100.0, 100 * (statuses[-1][1] - statuses[0][1]) / (seqs[-1] - seqs[0]))
+    return 100 * (statuses[-1][1] - statuses[0][1]) / (seqs[-1] - seqs[0])
 
 
 # The figures of `bench loop` and the bounds they are held against. Pure.

@@ -46,9 +46,10 @@ class Ours:
 
     def course(self, begin_us: int, end_us: int) -> Course:
         """Return the course of that time. Call it only after the end of the vision service."""
-        headers = [(seq, t_us, latency_us) for seq, t_us, latency_us in json.loads(self.tally.read_text())]
+        noted = json.loads(self.tally.read_text())
+        headers = [(seq, t_us, latency_us) for seq, t_us, latency_us in noted["headers"]]
         sets_us = [row.t_us for row in read_wheel_commands(self.wheels.read_text("ascii"))]
-        return course_of_headers(headers, self.accepted, sets_us, begin_us, end_us)
+        return course_of_headers(headers, self.accepted, sets_us, begin_us, end_us, noted["copies"])
 
 
 def endpoint_of(transport: str, port: int) -> str:

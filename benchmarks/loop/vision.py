@@ -137,7 +137,7 @@ class TappedService(Service):
 
 
 def main(settings: dict[str, object]) -> None:
-    """Serve until SIGTERM, then write the headers as (seq, t_us, latency_us)."""
+    """Serve until SIGTERM, then write the headers as (seq, t_us, latency_us), and the commands sent per image."""
     config = contestant_config(robot=settings["robot"], connect=settings["connect"])
     ending = threading.Event()
     with open_link(config.robot, connect=config.connect, role=SOURCE) as link:
@@ -148,7 +148,8 @@ def main(settings: dict[str, object]) -> None:
             service.turn(_WAIT_S)
     headers = [decode(FrameHeader, header, MAX_HEADER_BYTES) for header in service.headers]
     rows = [(header.seq, header.t_us, header.latency_us) for header in headers]
-    Path(str(settings["tally"])).write_text(json.dumps(rows))
+    copies = max(1, service.sender.twists) / max(1, service.steered)
+    Path(str(settings["tally"])).write_text(json.dumps({"headers": rows, "copies": copies}))
 
 
 if __name__ == "__main__":

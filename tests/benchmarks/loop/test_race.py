@@ -32,7 +32,15 @@ from sightline.benchmarks.loop.figures import (
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.race import run_race
 from sightline.benchmarks.loop.vision import overloaded, with_overload
+from sightline.protocol.channels import TWIST
+from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
+from sightline.protocol.transports.link import Message
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.driver.core import DriverCore
+from sightline.robot_side.safety.limits import SafetyConfig
+from sightline.vision_side.pipeline import FrameLoss
 
 SMALL = LoopSetting(Path(), 160, 120, fps=30.0, seconds=2.0, tries=1)
 MS = 1000
@@ -92,7 +100,7 @@ def statuses(rows, refused=()):
         yield t_us, sum(at_us + 2 * MS <= t_us and seq not in refused for seq, at_us, _ in rows)
 
 
-SETS_US = range(0, 100 * 33 * MS, 250)
+SETS_US = range(0, 300 * 33 * MS, 250)
 """Times of `drive.set`."""
 
 
@@ -115,7 +123,7 @@ def test_image_of_a_command_is_the_newest_one_that_is_so_old():
 @given(st.sets(st.integers(5, 85), max_size=30))
 def test_rejected_commands_are_missing_from_the_headers(refused):
     rows = header_rows(100, refused)
-    course = course_of_headers(rows, list(statuses(rows, refused)), SETS_US, 0, rows[-1][1] + 1)
+    course = course_of_headers(rows, list(statuses(rows, refused)), SETS_US, 0, rows[-1][1] + 1, 1.0)
     assert course.captured == 100
     assert len(course.ages_us) == 99 - len(refused)
     assert course.validated_us == tuple(2 * MS + seq for seq in range(99) if seq not in refused)
@@ -126,9 +134,33 @@ def test_frames_that_the_vision_service_did_not_receive_are_unanswered():
     rows = header_rows(100)
     kept = [row for row in rows if not 40 <= row[0] < 60]
     accepted = list(statuses(rows, range(40, 60)))
-    course = course_of_headers(kept, accepted, SETS_US, 0, rows[-1][1] + 1)
+    course = course_of_headers(kept, accepted, SETS_US, 0, rows[-1][1] + 1, 1.0)
     assert course.captured == 100
     assert course.answered_percent == pytest.approx(80, abs=2.5)
+
+
+def test_command_that_is_sent_twice_answers_one_image():
+    """The real driver accepts both copies. Every second image is lost."""
+    safety = SafetyConfig(auto_arm=True)
+    core = DriverCore(RobotConfig(safety=safety, range_sensor=PluginChoice(kind="none")), "0000aaaa")
+    loss, headers, accepted, sent = FrameLoss(), [], [], 0
+    for seq in range(300):
+        frame = FrameHeader(session="0000aaaa", seq=seq, t_us=(seq + 1) * 33 * MS)
+        core.on_issued(seq, frame.t_us, 0)
+        if seq % 2:
+            accepted.append((frame.t_us, core.gate.accepted))
+            continue
+        headers.append((seq, frame.t_us, core.gate.latency_us))
+        loss.update(frame, 0)
+        for copy in range(loss.copies):
+            sent += 1
+            header = AnswerHeader(source="vision", session="0000bbbb", seq=sent, echo=Echo.of(frame))
+            at_us = frame.t_us + 4 * MS + copy + seq
+            core.on_twist(Message(TWIST, "vision", encode(header), b"0.1000|0.0000"), at_us)
+        core.tick(frame.t_us + 5 * MS, None, None)
+    assert core.gate.accepted > 280, "of 150 images"
+    course = course_of_headers(headers, accepted, SETS_US, 40 * 33 * MS, 280 * 33 * MS, sent / 150)
+    assert course.answered_percent == pytest.approx(50, abs=1)
 
 
 def test_without_an_answer_there_are_no_figures_and_no_check_holds():
