@@ -21,6 +21,8 @@ PEERS: Final = ("tcp", *ZENOH, "openpi", "lekiwi", OLDER)
 """What a user would build, one by one."""
 MAX_FPS: Final = 240.0
 """As much as the robot service takes."""
+MAX_ANGULAR_RAD_S: Final = 8.0
+"""Turn rate that no command for these images reaches, rad/s. At a limit, one command would equal the next."""
 TAKEN_BOUND_PERCENT: Final = 5.0
 """More of the machine's time than this in other hands makes a sample inconclusive."""
 
@@ -97,8 +99,8 @@ Accepted = tuple[int, int]
 class Course:
     """`ages_us` are (time of the result, age of the image at the result), in the order of time.
 
-    The result of the services is the first `drive.set` after the validation of a command; `validated_us` are the ages
-    at the validation. A peer has no wheels: its result is the command in its robot process.
+    The result of the services is the first `drive.set` with other speeds after the validation of a command;
+    `validated_us` are the ages at the validation. A peer has no wheels: its result is the command in its robot process.
     """
 
     captured: int
@@ -182,6 +184,11 @@ def read_wheel_commands(text: str) -> list[WheelCommand]:
     return [WheelCommand(int(t), float(left), float(right)) for t, left, right in parts]
 
 
+def changes_us(rows: Sequence[WheelCommand]) -> list[int]:
+    """Return the times of the lines that set other speeds than the line before: only those carry a new command."""
+    return [row.t_us for before, row in pairwise(rows) if row[1:] != before[1:]]
+
+
 class WheelAge(NamedTuple):
     """Age of the image of an accepted command, at `drive.set` and at the validation."""
 
@@ -208,7 +215,7 @@ def wheel_ages(headers: Sequence[Header], sets_us: Sequence[int]) -> Iterator[Wh
 
 def course_of_headers(
     headers: Sequence[Header], accepted: Sequence[Accepted], sets_us: Sequence[int], begin_us: int, end_us: int,
-    copies: float,
+    *, copies: float,
 ) -> Course:
     """Return the course of the services: ages at the wheels, and the driver's count of accepted commands.
 

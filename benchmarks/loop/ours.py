@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Final
 
 from sightline.benchmarks.loop.figures import (
+    MAX_ANGULAR_RAD_S,
     Accepted,
     Course,
     LoopSetting,
+    changes_us,
     course_of_headers,
     read_wheel_commands,
 )
@@ -48,8 +50,8 @@ class Ours:
         """Return the course of that time. Call it only after the end of the vision service."""
         noted = json.loads(self.tally.read_text())
         headers = [(seq, t_us, latency_us) for seq, t_us, latency_us in noted["headers"]]
-        sets_us = [row.t_us for row in read_wheel_commands(self.wheels.read_text("ascii"))]
-        return course_of_headers(headers, self.accepted, sets_us, begin_us, end_us, noted["copies"])
+        sets_us = changes_us(read_wheel_commands(self.wheels.read_text("ascii")))
+        return course_of_headers(headers, self.accepted, sets_us, begin_us, end_us, copies=noted["copies"])
 
 
 def endpoint_of(transport: str, port: int) -> str:
@@ -80,13 +82,18 @@ def running_services(setting: LoopSetting, folder: Path, processes: Processes) -
 
 
 def _robot_toml(setting: LoopSetting, folder: Path, endpoint: str) -> Path:
-    """JSON's strings and numbers are TOML's too."""
+    """JSON's strings and numbers are TOML's too.
+
+    The ramp is as fast as it may be. It ends before the next command, so that only a new command changes the speeds.
+    """
     path = folder / "robot.toml"
     path.write_text(
         f"robot = {json.dumps(ROBOT)}\nlisten = [{json.dumps(endpoint)}]\nstate_dir = {json.dumps(str(folder))}\n"
         f'[camera]\nkind = "folder"\noptions = {{path = {json.dumps(str(setting.pictures))}, fps = {setting.fps}}}\n'
         f'[drive]\nkind = "log"\noptions = {{path = {json.dumps(str(folder / _WHEELS))}}}\n'
-        f'[safety]\nauto_arm = true\n[stream]\nmax_fps = {setting.fps}\n',
+        f'[safety]\nauto_arm = true\nmax_angular_rad_s = {MAX_ANGULAR_RAD_S}\nmax_acceleration_mps2 = 20.0\n'
+        "max_acceleration_rad_s2 = 100.0\nmax_jerk_mps3 = 500.0\nmax_jerk_rad_s3 = 2000.0\n"
+        f"[stream]\nmax_fps = {setting.fps}\n",
         "utf-8",
     )
     return path

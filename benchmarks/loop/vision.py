@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import median
 from typing import Final
 
-from sightline.benchmarks.loop.figures import MAX_FPS, LoopSetting
+from sightline.benchmarks.loop.figures import MAX_ANGULAR_RAD_S, MAX_FPS, LoopSetting
 from sightline.benchmarks.loop.pictures import camera_of
 from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.codec import decode
@@ -47,8 +47,9 @@ class DelayedDetector:
 
 
 def contestant_config(**settings: object) -> VisionConfig:
-    """Return these settings with the detector that all contestants have: the service, the floor and the rivals."""
-    return VisionConfig.model_validate({**settings, "detector": {"kind": "hsv"}})
+    """Return these settings with detector and steering of all contestants: the service, the floor and the rivals."""
+    steer = {"max_angular_rad_s": MAX_ANGULAR_RAD_S}
+    return VisionConfig.model_validate({**settings, "detector": {"kind": "hsv"}, "steer": steer})
 
 
 def delayed_detector(config: VisionConfig, delay_ms: float, busy_ms: float) -> Detector:

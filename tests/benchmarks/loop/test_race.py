@@ -1,5 +1,6 @@
 """`sightline bench loop`: its figures, its bounds and its options."""
 
+import json
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
@@ -19,6 +20,8 @@ from sightline.benchmarks.loop.figures import (
     Course,
     LoopSample,
     LoopSetting,
+    WheelCommand,
+    changes_us,
     course_of_headers,
     course_of_tally,
     figures_of,
@@ -29,6 +32,7 @@ from sightline.benchmarks.loop.figures import (
     size_of,
     wheel_ages,
 )
+from sightline.benchmarks.loop.ours import Ours
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.race import run_race
 from sightline.benchmarks.loop.vision import overloaded, with_overload
@@ -120,10 +124,34 @@ def test_image_of_a_command_is_the_newest_one_that_is_so_old():
     assert list(wheel_ages(headers, range(0, 80, 10))) == [(70, 70, 70)], "the wheels never received the second one"
 
 
+@pytest.mark.parametrize(("turned", "late_ms"), [(True, [0, 0, 0]), (False, [20, 20, 20])])
+def test_wheels_count_from_the_line_that_carries_the_new_command(turned, late_ms):
+    """A driver that sets the former speeds when a command arrives, and the new ones 20 ms later, is late."""
+    headers = [(seq, seq * 33 * MS, 3 * MS + seq if seq else None) for seq in range(1, 5)]
+    headers.insert(0, (0, 0, None))
+    lines, speed = [WheelCommand(0, 0.0, 0.0)], 0.0
+    for seq in range(4):
+        at_us = seq * 33 * MS + 3 * MS + seq + 1
+        first = WheelCommand(at_us, seq + 1.0 if turned else speed, 1.0)
+        lines += [first, WheelCommand(at_us + 20 * MS, seq + 1.0, 1.0)]
+        speed = seq + 1.0
+    ages = list(wheel_ages(headers, changes_us(lines)))
+    assert [round((age.age_us - age.validated_us) / MS) for age in ages[1:]] == late_ms
+
+
+@pytest.mark.parametrize(("radius", "ages"), [(1.0, 99), (0.0, 0)])
+def test_dead_wheels_have_no_course(tmp_path, radius, ages):
+    rows = header_rows(100)
+    ours = Ours({}, (), "", tmp_path / "tally", tmp_path / "wheels", list(statuses(rows)))
+    ours.tally.write_text(json.dumps({"headers": rows, "copies": 1.0}))
+    ours.wheels.write_text("".join(f"{t_us},{radius * t_us},0.0\n" for t_us in SETS_US))
+    assert len(ours.course(0, rows[-1][1] + 1).ages_us) == ages
+
+
 @given(st.sets(st.integers(5, 85), max_size=30))
 def test_rejected_commands_are_missing_from_the_headers(refused):
     rows = header_rows(100, refused)
-    course = course_of_headers(rows, list(statuses(rows, refused)), SETS_US, 0, rows[-1][1] + 1, 1.0)
+    course = course_of_headers(rows, list(statuses(rows, refused)), SETS_US, 0, rows[-1][1] + 1, copies=1.0)
     assert course.captured == 100
     assert len(course.ages_us) == 99 - len(refused)
     assert course.validated_us == tuple(2 * MS + seq for seq in range(99) if seq not in refused)
@@ -134,7 +162,7 @@ def test_frames_that_the_vision_service_did_not_receive_are_unanswered():
     rows = header_rows(100)
     kept = [row for row in rows if not 40 <= row[0] < 60]
     accepted = list(statuses(rows, range(40, 60)))
-    course = course_of_headers(kept, accepted, SETS_US, 0, rows[-1][1] + 1, 1.0)
+    course = course_of_headers(kept, accepted, SETS_US, 0, rows[-1][1] + 1, copies=1.0)
     assert course.captured == 100
     assert course.answered_percent == pytest.approx(80, abs=2.5)
 
@@ -159,7 +187,7 @@ def test_command_that_is_sent_twice_answers_one_image():
             core.on_twist(Message(TWIST, "vision", encode(header), b"0.1000|0.0000"), at_us)
         core.tick(frame.t_us + 5 * MS, None, None)
     assert core.gate.accepted > 280, "of 150 images"
-    course = course_of_headers(headers, accepted, SETS_US, 40 * 33 * MS, 280 * 33 * MS, sent / 150)
+    course = course_of_headers(headers, accepted, SETS_US, 40 * 33 * MS, 280 * 33 * MS, copies=sent / 150)
     assert course.answered_percent == pytest.approx(50, abs=1)
 
 
