@@ -129,10 +129,14 @@ class Course:
         sizes = [size for at, _, size in self.answers if since_s <= at / 1e6 < until_s]
         return sum(sizes) / max(1, len(sizes))
 
-    def longest_gap_ms(self, since_s=2.0):
-        """Between commands young enough to be driven on."""
+    def gaps_ms(self, since_s=2.0):
+        """Between commands young enough to be driven on; before the first and after the last one too."""
         times = [at / 1000 for at, age, _ in self.answers if at >= since_s * 1e6 and age <= MAX_AGE_US]
-        return max(b - a for a, b in pairwise(times)) if len(times) > 1 else 1e9
+        end_ms = len(self.windows)  # one for each millisecond
+        return [after - before for before, after in pairwise([since_s * 1000, *times, end_ms])]
+
+    def longest_gap_ms(self, since_s=2.0):
+        return max(self.gaps_ms(since_s))
 
 
 def run(out, back, *, seconds=20.0, compute_us=3_000, camera=None, config=None, slot_us=500, copies=1):

@@ -1,6 +1,5 @@
 """The stream on links that lose whole messages, in virtual time, and with peers and clocks that are wrong."""
 
-from itertools import pairwise
 
 import pytest
 
@@ -26,8 +25,7 @@ def course(gone, *, in_a_row=1.0, delay_us=25_000, rate_bit_s=0.0, steps=(), see
 
 def stands_ms(seen):
     """Return how long the robot had no command that was younger than 300 ms, each time, from the third second on."""
-    times = [at / 1000 for at, _, _ in seen.answers if at >= 2e6]
-    return [after - before for before, after in pairwise(times) if after - before > 300]
+    return [gap_ms for gap_ms in seen.gaps_ms() if gap_ms > 300]
 
 
 def share_sent(gone, **link):
@@ -60,6 +58,15 @@ def test_twenty_minutes_of_loss_with_six_seeds_stop_the_robot_seldom(gone, a_min
     stands = [one for seed in range(6) for one in stands_ms(course(gone, seed=seed, seconds=1200.0, copies=2))]
     assert len(stands) <= a_minute * 6 * 20
     assert max(stands, default=0) <= longest_ms
+
+
+@pytest.mark.parametrize("ends_us", [1_000_000, 6_000_000])
+def test_stream_that_ends_for_good_is_a_stand_until_the_end(monkeypatch, ends_us):
+    may_capture = Stream.may_capture
+    monkeypatch.setattr(Stream, "may_capture", lambda stream, now_us, listening: (
+        now_us < ends_us and may_capture(stream, now_us, listening=listening)))
+    stands = stands_ms(course(0.1, seconds=10.0, copies=2))
+    assert len(stands) == 1 and stands[0] >= 3_800
 
 
 @pytest.mark.parametrize("gone", [0.0, 0.1, 0.2])
