@@ -267,6 +267,8 @@ TIMES_BEST: Final = 1.02
 LOADED_P50_OVER_DELAY_MS: Final = 10.0
 LOADED_P99_OVER_DELAY_MS: Final = 40.0
 DRIFT_PERCENT: Final = 10.0
+_WHOLE: Final = 0.99
+"""Share of the requested seconds that a sample must have."""
 _PART_US: Final = 10_000_000
 _PARTS: Final = 5
 """Drift is from the first ten seconds to the last, of a shorter time from its first fifth to its last."""
@@ -300,13 +302,14 @@ class LoopFigures:
     memory_mb: Mapping[str, float]
     bytes_per_picture: float | None
     taken_percent: float
+    is_short: bool
     tries: int
     hot_ms: float | None
 
     @property
     def is_disturbed(self) -> bool:
-        """Return True if others had too much of the machine's time."""
-        return self.taken_percent > TAKEN_BOUND_PERCENT
+        """Return True if others had too much of the machine's time, or left too little for the sample."""
+        return self.taken_percent > TAKEN_BOUND_PERCENT or self.is_short
 
 
 def percentile(values: Sequence[float], percent: float) -> float | None:
@@ -318,8 +321,8 @@ def percentile(values: Sequence[float], percent: float) -> float | None:
     return ordered[max(0, int(rank) - 1)]
 
 
-def figures_of(sample: LoopSample, offered_fps: float) -> LoopFigures:
-    """Compute the figures of a sample. The camera offers so many images a second."""
+def figures_of(sample: LoopSample, setting: LoopSetting) -> LoopFigures:
+    """Compute the figures of a sample."""
     course, fps = sample.course, sample.course.fps(sample.seconds)
     ages_ms = [age_us / 1000 for _, age_us in course.ages_us]
     parts = _parts(course.ages_us)
@@ -328,7 +331,7 @@ def figures_of(sample: LoopSample, offered_fps: float) -> LoopFigures:
         name=sample.name,
         captured=course.captured,
         fps=fps,
-        answered_percent=100 * fps / offered_fps,
+        answered_percent=100 * fps / setting.fps,
         accepted_percent=course.answered_percent,
         p50_ms=percentile(ages_ms, 50),
         p95_ms=percentile(ages_ms, 95),
@@ -342,6 +345,7 @@ def figures_of(sample: LoopSample, offered_fps: float) -> LoopFigures:
         memory_mb=dict(sample.memory_mb),
         bytes_per_picture=None if sample.carried_bytes is None else sample.carried_bytes / max(1, course.captured),
         taken_percent=sample.taken_percent,
+        is_short=sample.seconds < _WHOLE * setting.seconds,
         tries=sample.tries,
         hot_ms=None if sample.hot_us is None else sample.hot_us / 1000,
     )

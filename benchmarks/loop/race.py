@@ -1,6 +1,7 @@
 """One race: each contestant is started, sampled with the kernel's counters, and ended. Shell (processes).
 
-A sample during which others had the machine's time is marked and taken again, as often as the setting allows.
+A sample during which others had the machine's time is marked and taken again, as often as the setting allows and the
+time of the run permits.
 """
 
 import json
@@ -43,6 +44,10 @@ from sightline.protocol.clock import monotonic_us
 
 _SETTLE_S: Final = 1.5
 _DRAIN_S: Final = 0.3
+_LEAST_SAMPLE_S: Final = 2.0
+_RUN_S: Final = 225.0
+"""For the samples of a run of `_RUN_OF_S` for each contestant, which ends within 240 s; a longer one gets more."""
+_RUN_OF_S: Final = 10.0
 _MODULE: Final = "sightline.benchmarks.peers"
 
 
@@ -79,23 +84,34 @@ class Contestants:
 
 
 @dataclass(slots=True)
-class Spare:
-    """Time of a run for samples that are taken again: a busy machine would not end."""
+class Budget:
+    """Time of a run: until `end_s`, with `samples` still to take. On a busy machine samples get shorter."""
 
-    left_s: float = 60.0
+    end_s: float
+    samples: int
+    beside_s: float = _SETTLE_S + _DRAIN_S
+    """What a sample takes beside its seconds: to start, settle and end."""
+
+    def seconds(self) -> float:
+        """Return the time that is left for each sample."""
+        return (self.end_s - time.monotonic()) / self.samples - self.beside_s
 
 
-def take_sample(name: str, setting: LoopSetting, folder: Path, spare: Spare, say: Callable[[str], None]) -> LoopSample:
+def take_sample(
+    name: str, setting: LoopSetting, folder: Path, budget: Budget, say: Callable[[str], None]
+) -> LoopSample:
     """Return the least disturbed of up to `setting.tries` samples. Raises HardwareError without a start."""
     taken: list[LoopSample] = []
-    while not taken or (len(taken) < setting.tries and spare.left_s > 0):
+    while not taken or (len(taken) < setting.tries and budget.seconds() >= setting.seconds):
         began_s, number = time.monotonic(), len(taken) + 1
-        taken.append(_take_one(name, setting, folder / f"{name}-{number}", number))
-        spare.left_s -= time.monotonic() - began_s if number > 1 else 0.0
+        part = replace(setting, seconds=max(_LEAST_SAMPLE_S, min(setting.seconds, budget.seconds())))
+        taken.append(_take_one(name, part, folder / f"{name}-{number}", number))
+        budget.beside_s = (budget.beside_s + time.monotonic() - began_s - taken[-1].seconds) / 2
         others = taken[-1].taken_percent
         say(f"{name}: {len(taken[-1].course.ages_us)} answers; others had {others:.1f} % of the machine's time")
         if others <= TAKEN_BOUND_PERCENT:
             break
+    budget.samples -= 1
     return min(taken, key=lambda sample: sample.taken_percent)
 
 
@@ -180,7 +196,7 @@ def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
         if setting.overload:
             ready = overloaded(ready, say)
         samples = _samples(ready, Path(name), say)
-    figures = {one: figures_of(sample, ready.fps) for one, sample in samples.items()}
+    figures = {one: figures_of(sample, ready) for one, sample in samples.items()}
     return Race(ready, jpeg_bytes, samples, figures, loop_checks(figures, ready))
 
 
@@ -191,9 +207,11 @@ def _samples(setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> 
     Under load there is one turn, because the age must be observed over the whole time.
     """
     turns = 1 if setting.is_loaded else max(1, min(_TURNS, int(setting.seconds // _LEAST_TURN_S)))
-    part, spare = replace(setting, seconds=setting.seconds / turns), Spare()
-    taken = [
-        {one: take_sample(one, part, folder / f"turn-{turn}", spare, say) for one in setting.contestants}
-        for turn in range(turns)
-    ]
+    part = replace(setting, seconds=setting.seconds / turns)
+    run_s = _RUN_S * max(1.0, setting.seconds / _RUN_OF_S)
+    budget = Budget(time.monotonic() + run_s, turns * len(setting.contestants))
+    taken: list[dict[str, LoopSample]] = []
+    while len(taken) < turns and (not taken or budget.seconds() >= _LEAST_SAMPLE_S):
+        turn = folder / f"turn-{len(taken)}"
+        taken.append({one: take_sample(one, part, turn, budget, say) for one in setting.contestants})
     return {one: joined([samples[one] for samples in taken]) for one in setting.contestants}

@@ -1,6 +1,7 @@
 """`sightline bench loop`: its figures, its bounds and its options."""
 
 import json
+import time
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
@@ -60,7 +61,7 @@ def sample(name, ages_ms, cpu_s=0.1, answered_percent=100.0, taken=0.0, waits_ms
 
 
 def judged(setting=SMALL, **samples):
-    figures = {name: figures_of(one, setting.fps) for name, one in samples.items()}
+    figures = {name: figures_of(one, setting) for name, one in samples.items()}
     return {check.name: check.ok for check in loop_checks(figures, setting)}
 
 
@@ -192,7 +193,7 @@ def test_command_that_is_sent_twice_answers_one_image():
 
 
 def test_without_an_answer_there_are_no_figures_and_no_check_holds():
-    silent = figures_of(sample(OURS, []), 30.0)
+    silent = figures_of(sample(OURS, []), SMALL)
     assert (silent.p50_ms, silent.p95_ms, silent.first_ms, silent.most_wait_ms) == (None, None, None, None)
     found = judged(**{OURS: sample(OURS, [], answered_percent=0), FLOOR: sample(FLOOR, [1.0] * 100)})
     assert not found["p50, times the floor"]
@@ -218,7 +219,7 @@ def test_the_bounds_are_held_against_the_floor_of_the_same_run():
 def test_few_images_fail_although_each_is_answered():
     floor, ours = sample(FLOOR, [1.0] * 450), sample(OURS, [1.0] * 15, seconds=15.0)
     assert not judged(**{FLOOR: floor, OURS: ours})["answered per second"]
-    figures = figures_of(ours, 30.0)
+    figures = figures_of(ours, SMALL)
     assert (figures.fps, figures.answered_percent, figures.accepted_percent) == (1.0, pytest.approx(100 / 30), 100.0)
 
 
@@ -267,9 +268,9 @@ def test_age_with_a_slow_detector_has_separate_bounds_and_does_not_grow():
 
 def test_drift_is_from_the_first_ten_seconds_to_the_last():
     late = [80.0] * 310 + [200.0] * 1400 + [84.0] * 310  # 33 ms each: a minute, bad in its middle
-    ours = figures_of(sample(OURS, late), 30.0)
+    ours = figures_of(sample(OURS, late), SMALL)
     assert (ours.first_ms, ours.last_ms) == (80.0, 84.0)
-    short = figures_of(sample(OURS, [80.0] * 60 + [200.0] * 180 + [84.0] * 60), 30.0)
+    short = figures_of(sample(OURS, [80.0] * 60 + [200.0] * 180 + [84.0] * 60), SMALL)
     assert (short.first_ms, short.last_ms) == (80.0, 84.0)
 
 
@@ -308,8 +309,36 @@ def test_a_disturbed_sample_fails_the_run():
 def test_disturbed_sample_is_taken_again_while_there_is_time(monkeypatch, left_s, taken):
     others, said = iter([9.0, 8.0, 7.0]), []
     monkeypatch.setattr(race, "_take_one", lambda *_given: sample(OURS, [1.0], taken=next(others)))
-    least = race.take_sample(OURS, replace(SMALL, tries=3), Path(), race.Spare(left_s), said.append)
+    budget = race.Budget(time.monotonic() + left_s, 1)
+    least = race.take_sample(OURS, replace(SMALL, tries=3), Path(), budget, said.append)
     assert (least.taken_percent, len(said)) == (taken[-1], len(taken))
+
+
+@pytest.mark.parametrize(("start_s", "seconds", "least_s"), [
+    (2.0, 10.0, 10.0), (5.0, 10.0, 7.0), (9.0, 10.0, 2.0), (20.0, 10.0, 2.0), (5.0, 60.0, 60.0),
+])
+def test_run_ends_within_four_minutes_and_marks_what_it_shortened(monkeypatch, start_s, seconds, least_s):
+    """Others have 50 % of the machine, and each contestant needs `start_s` to start and end."""
+    now = [1000.0]
+    monkeypatch.setattr(race.time, "monotonic", lambda: now[0])
+
+    def take(name, setting, *_given):
+        now[0] += start_s + setting.seconds
+        return sample(name, [1.0] * round(setting.seconds * 30), taken=50.0)
+
+    monkeypatch.setattr(race, "_take_one", take)
+    setting = replace(SMALL, seconds=seconds, tries=3)
+    samples = race._samples(setting, Path(), lambda _line: None)
+    assert set(samples) == set(setting.contestants)
+    assert now[0] - 1000.0 <= 235 * seconds / 10
+    assert min(one.seconds for one in samples.values()) >= least_s
+    assert any(figures_of(one, setting).is_short for one in samples.values()) is (least_s < seconds)
+
+
+def test_shortened_sample_is_marked():
+    whole = figures_of(sample(OURS, [1.0] * 60), SMALL)
+    cut = figures_of(sample(OURS, [1.0] * 58), SMALL)
+    assert (whole.is_disturbed, cut.is_disturbed, cut.taken_percent) == (False, True, 0.0)
 
 
 def test_time_of_other_processes_excludes_idle_and_own_time(monkeypatch):
