@@ -73,8 +73,8 @@ def running_services(setting: LoopSetting, folder: Path, processes: Processes) -
         settings = {"robot": ROBOT, "connect": [endpoint], "tally": str(tally),
                     "delay_ms": setting.detector_delay_ms, "busy_ms": setting.busy_ms}
         vision = processes.start("vision", [json.dumps(settings)], module="sightline.benchmarks.loop.vision")
-        robot = {"guardian": guardian, "driver": processes.driver("robot"), "network": processes.network("robot")}
-        pids = {**robot, "vision": vision}
+        pids = {"guardian": guardian, "driver": processes.driver("robot"), "network": processes.network("robot"),
+                "stop": processes.stop("robot"), "vision": vision}
         ours = Ours(pids, (port,), endpoint, tally, folder / _WHEELS)
         link.subscribe(STATUS, ours.note)
         processes.wait_line("vision", "target seen")

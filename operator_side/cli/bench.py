@@ -136,7 +136,7 @@ def loop(
 ) -> int:
     """Compare the time from capture to wheels with other designs
 
-    The others are the in-process minimum, bare TCP and other designs. `!` marks a sample that was disturbed.
+    The others are the in-process minimum, bare TCP and other designs. `!` marks a sample that others disturbed or cut.
     """
     with needs("bench"):
         from sightline.benchmarks.loop.figures import LoopSetting, peers_of, size_of
@@ -181,7 +181,7 @@ def _race_result(race: "Race") -> dict[str, Any]:
     return {
         **to_dict(race.checks),
         "setting": {**asdict(race.setting), "pictures": None, "jpeg_bytes": race.jpeg_bytes},
-        "contestants": [asdict(figures) for figures in race.figures.values()],
+        "contestants": [{**asdict(one), "is_disturbed": one.is_disturbed} for one in race.figures.values()],
     }
 
 
@@ -197,8 +197,8 @@ def _leave(folder: Path, race: "Race", result: dict[str, Any]) -> None:
 
 
 def _table(race: "Race") -> list[str]:
-    names = f"{'answered':>9} {'fps':>6} {'p50':>8} {'p95':>8} {'p99':>8} ms {'validated':>9} {'bytes':>8} "
-    names += f"{'others':>7}"
+    names = f"{'answered':>9} {'fps':>6} {'p50':>8} {'p95':>8} {'p99':>8} ms {'validated':>9} "
+    names += f"{'unpaced':>7} {'bytes':>8} {'others':>7}"
     head = f"{'':18} {names}  CPU ms per image; MB"
     return [head, *(_row(name, race) for name in race.figures)]
 
@@ -208,9 +208,9 @@ def _row(name: str, race: "Race") -> str:
     ages = " ".join(f"{'never' if age is None else f'{age:.1f}':>8}" for age in (one.p50_ms, one.p95_ms, one.p99_ms))
     cpu = " ".join(f"{process} {cpu_ms:.2f}" for process, cpu_ms in one.cpu_ms.items())
     memory = " ".join(f"{megabytes:.0f}" for megabytes in one.memory_mb.values())
-    validated = "" if one.validated_ms is None else f"{one.validated_ms:.1f}"
+    validated, unpaced = ("" if age is None else f"{age:.1f}" for age in (one.validated_ms, one.hot_ms))
     others = f"{one.taken_percent:5.1f} %{'!' if one.is_disturbed else ' '}"
-    carried = f"{validated:>9} {one.bytes_per_picture or 0:8.0f} {others}"
+    carried = f"{validated:>9} {unpaced:>7} {one.bytes_per_picture or 0:8.0f} {others}"
     return f"{name:18} {one.answered_percent:7.1f} % {one.fps:6.1f} {ages}    {carried}  {cpu}; {memory}"
 
 

@@ -15,7 +15,7 @@ NAMED = {section.name: section for section in SECTIONS}
 CHECKS = {"checks": [{"name": "offer and step", "value": 13.2, "unit": "us", "bound": 20, "ok": True}], "ok": True}
 RACER = {
     "name": "sightline", "answered_percent": 100.0, "fps": 30.0, "p50_ms": 3.5, "p95_ms": 4.2, "p99_ms": None,
-    "validated_ms": 3.1,
+    "validated_ms": 3.1, "hot_ms": 1.2, "is_disturbed": True,
     "bytes_per_picture": 47126.4, "cpu_ms": {"driver": 1.0, "vision": 2.5},
     "memory_mb": {"driver": 44.0, "vision": 80.0},
 }
@@ -94,7 +94,7 @@ def test_a_race_shows_its_contestants_and_its_picture(tmp_path, commands):
     page.parent.mkdir()
     assert write_report(page, sections_named(["loop"]), lambda _: None)
     text = page.read_text()
-    row = "| sightline | 100 | 30 | 3.5 | 4.2 | none | 3.1 | 47126 | driver 1, vision 2.5 | driver 44, vision 80 |"
+    row = "| sightline (disturbed) | 100 | 30 | 3.5 | 4.2 | none | 3.1 | 1.2 | 47126 | driver 1, vision 2.5 | driver 44, vision 80 |"
     assert row in text
     assert "(img/loop-zenoh.png)" in text
     assert (page.parent / "img" / "loop-zenoh.png").read_bytes() == b"picture of loop"

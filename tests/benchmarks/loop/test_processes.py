@@ -89,7 +89,7 @@ def test_a_short_race_of_the_services_over_each_transport(transport):
     ours = race.figures[OURS]
     assert ours.captured > 20
     assert ours.answered_percent > 50
-    assert set(ours.cpu_ms) == {"guardian", "driver", "network", "vision"}
+    assert set(ours.cpu_ms) == {"guardian", "driver", "network", "stop", "vision"}
     assert ours.bytes_per_picture > race.jpeg_bytes
     assert ours.memory_mb["vision"] < race.figures[FLOOR].memory_mb["vision"] + 30, "the same detector for both"
     assert race.figures[FLOOR].hot_ms is not None

@@ -37,6 +37,7 @@ from sightline.benchmarks.loop.ours import Ours
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.benchmarks.loop.race import run_race
 from sightline.benchmarks.loop.vision import overloaded, with_overload
+from sightline.operator_side.cli import bench
 from sightline.protocol.channels import TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError
@@ -333,6 +334,15 @@ def test_run_ends_within_four_minutes_and_marks_what_it_shortened(monkeypatch, s
     assert now[0] - 1000.0 <= 235 * seconds / 10
     assert min(one.seconds for one in samples.values()) >= least_s
     assert any(figures_of(one, setting).is_short for one in samples.values()) is (least_s < seconds)
+
+
+def test_table_shows_unpaced_figures_and_marks_disturbed_samples():
+    floor = replace(sample(FLOOR, [1.0] * 60), hot_us=1234.0)
+    samples = {FLOOR: floor, OURS: sample(OURS, [2.0] * 60, taken=9.0)}
+    figures = {name: figures_of(one, SMALL) for name, one in samples.items()}
+    head, *rows = bench._table(race.Race(SMALL, 1.0, samples, figures, loop_checks(figures, SMALL)))
+    assert [row[head.index("unpaced"):][:7].strip() for row in rows] == ["1.2", ""]
+    assert ["!" in row for row in rows] == [False, True]
 
 
 def test_shortened_sample_is_marked():
