@@ -1,6 +1,9 @@
 """One WebSocket request per image, as openpi does it: the robot sends it, waits, and applies the answer. Shell.
 
-The vision is an asyncio server that computes inside its handler; compression is off and messages are binary, as there.
+The vision is an asyncio server that computes inside its handler; compression is off and messages are binary, as in
+`packages/openpi-client/src/openpi_client/websocket_client_policy.py` and
+`src/openpi/serving/websocket_policy_server.py` of github.com/Physical-Intelligence/openpi at 15a9616a. There msgpack
+packs the fields, here `struct` does.
 """
 
 from __future__ import annotations

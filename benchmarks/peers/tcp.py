@@ -1,6 +1,7 @@
 """A bare TCP exchange: length and stamp, JPEG out; a line of text back. Shell.
 
-The robot sends from one thread and listens in another; the vision answers one image after the other.
+The robot sends from one thread and listens in another; the vision answers one image after the other. It follows no
+project: it is the least code with Python's `socket` module.
 """
 
 from __future__ import annotations
