@@ -301,6 +301,21 @@ def test_every_peer_is_a_rival(rival):
     assert not beaten[f"p95 behind {rival}"] and not beaten[f"p99 behind {rival}"]
 
 
+@pytest.mark.parametrize("rival", PEERS)
+@pytest.mark.parametrize("load", [{"detector_delay_ms": 80.0}, {"fps": 60.0, "overload": 2.0}])
+def test_loaded_sightline_is_compared_with_every_rival(rival, load):
+    """The best rival decides, whichever it is: 2 % at the median, and ahead at p95."""
+    slow, others = replace(SMALL, **load), {name: sample(name, [200.0] * 100) for name in PEERS if name != rival}
+    for ours_ms, rival_ms, failed in (
+        ([51.0] * 100, [50.0] * 90 + [52.0] * 10, set()),
+        ([51.1] * 100, [50.0] * 90 + [52.0] * 10, {"p50, times the best rival"}),
+        ([51.0] * 90 + [52.1] * 10, [50.0] * 90 + [52.0] * 10, {f"p95 behind {rival}"}),
+    ):
+        found = judged(slow, **{FLOOR: sample(FLOOR, [36.0] * 100), OURS: sample(OURS, ours_ms)}, **others,
+                       **{rival: sample(rival, rival_ms)})
+        assert {name for name, ok in found.items() if not ok} == failed
+
+
 def test_a_disturbed_sample_fails_the_run():
     found = judged(**{FLOOR: sample(FLOOR, [1.0] * 9, taken=50.0), OURS: sample(OURS, [2.0] * 9)})
     assert not found["samples disturbed by others"]
