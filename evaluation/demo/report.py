@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 
 REAL_TIME_FACTOR: Final = 1.5
 """The bounds are those of lockstep; a real machine is granted this much more."""
+HOLDS_A_MINUTE: Final = 1.0
+"""At most, up to this loss on each leg and this latency."""
+HOLDS_LOSS, HOLDS_LATENCY_MS = 0.2, 50.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +163,17 @@ def _injection_checks(run: DemoRun, injected: dict[str, Any] | None) -> list[Che
     wanted = run.options.loss
     # Three standard deviations of a fair draw. Outside of them the loss differs from the requested one.
     near = 3 * math.sqrt(wanted * (1 - wanted) / sent) if sent else 0.0
-    return [Check("injected_loss", share, "share", wanted, sent > 0 and abs(share - wanted) <= near + 1e-9)]
+    found = Check("injected_loss", share, "share", wanted, sent > 0 and abs(share - wanted) <= near + 1e-9)
+    return [found, *_hold_checks(run)]
+
+
+def _hold_checks(run: DemoRun) -> list[Check]:
+    """Check that loss alone seldom stops the robot."""
+    options = run.options
+    if options.loss > HOLDS_LOSS or options.latency_ms > HOLDS_LATENCY_MS or options.transport == "legacy":
+        return []
+    seconds = round((run.samples[-1].t_us - run.samples[0].t_us) / 1e6)
+    return [at_most("holds", run.holds, "", HOLDS_A_MINUTE * seconds / 60)]
 
 
 def _checks(run: DemoRun, result: Score) -> list[Check]:

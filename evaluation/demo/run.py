@@ -2,11 +2,13 @@
 
 import math
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -101,6 +103,8 @@ class DemoRun:
     scenario: Scenario
     folder: Path
     samples: list[Truth] = field(default_factory=list)
+    holds: int = 0
+    """HOLDs after the first motion, by the log of the robot: a status every 100 ms would miss short ones."""
     dropped_by_recorder: int = 0
     recorder_failed: str = ""
     killed: list[str] = field(default_factory=list)
@@ -171,6 +175,7 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str]
         try:
             _watch(run, processes, operator, truth, block)
         finally:
+            run.holds = holds_in(processes.log("robot").read_text("utf-8", "replace"))
             recorder.close()
             run.dropped_by_recorder, run.recorder_failed = recorder.dropped, recorder.failed
 
@@ -203,6 +208,12 @@ def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthR
         report = operator.report
         lines = _lines(report.status if report else None, sample, run.scenario.stand_off_m)
         block.show([f"{time.monotonic() - started_s:5.1f} {until}", *lines])
+
+
+def holds_in(log: str) -> int:
+    """Count the HOLDs after the first motion in the log of a robot."""
+    states = re.findall(rf" robot {ROBOT}: (ACTIVE|DEGRADED|HOLD) \(", log)
+    return sum(state == "HOLD" and before != "HOLD" for before, state in pairwise(states))
 
 
 def _discard_old(truth: TruthReader) -> None:

@@ -85,6 +85,28 @@ def test_demo_with_a_latency_without_bounds_is_not_evaluated(lights, transport):
     assert any("not evaluated" in line for line in demo_report.summary(late))
 
 
+@pytest.mark.parametrize(("states", "holds"), [
+    ("", 0), ("HOLD HOLD", 0), ("HOLD ACTIVE", 0), ("ACTIVE HOLD", 1), ("HOLD DEGRADED HOLD ACTIVE HOLD DISARMED", 2),
+])
+def test_holds_after_the_first_motion_are_counted(states, holds):
+    log = "".join(f"2026-03-01T10:00:00.000Z info robot r1: {state} (reason)\n" for state in states.split())
+    assert demo_run.holds_in(log) == holds
+
+
+@pytest.mark.parametrize(("options", "seconds", "holds", "ok"), [
+    ({"loss": 0.2, "latency_ms": 50.0}, 60, 1, True), ({"loss": 0.2, "latency_ms": 50.0}, 60, 2, False),
+    ({"loss": 0.1}, 59, 1, False), ({"loss": 0.2}, 120, 2, True), ({"loss": 0.01}, 20, 0, True),
+    ({"loss": 0.3, "latency_ms": 50.0}, 60, 9, None), ({"loss": 0.2, "latency_ms": 100.0}, 60, 9, None),
+    ({"latency_ms": 50.0}, 60, 9, None), ({"loss": 0.1, "transport": "legacy"}, 60, 9, None),
+])
+def test_loss_may_stop_the_robot_once_a_minute(lights, options, seconds, holds, ok):
+    ends_us = lights.samples[0].t_us + seconds * 1_000_000 - 20_000
+    driven = replace(lights, options=replace(lights.options, **options), holds=holds,
+                     samples=[lights.samples[0], replace(lights.samples[-1], t_us=ends_us)])
+    checks = demo_report._injection_checks(driven, None)
+    assert next((check.ok for check in checks if check.name == "holds"), None) is ok
+
+
 def test_summary_shows_what_the_detector_reported_each_line_once_and_the_first_three(lights):
     judged = demo_report.report(lights)
     before = demo_report.summary(judged)
