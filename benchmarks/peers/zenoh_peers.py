@@ -1,7 +1,7 @@
 """Zenoh without Sightline's protocol: publish every image, and three usual ways to receive them. Shell.
 
-`callback` computes in the subscriber's callback, as `examples/z_sub.py` of github.com/eclipse-zenoh/zenoh-python at
-116b38cd does. `ring` reads a ring channel of one image, which drops the older one, as `examples/z_pull.py` there; that
+`callback` computes in the subscriber's callback, as the example `z_sub` of github.com/eclipse-zenoh/zenoh-python at
+116b38cd does. `ring` reads a ring channel of one image, which drops the older one, as the example `z_pull` there; that
 one polls, `ring` waits. `newest` keeps the newest image in a variable and computes outside the callback, as
 `computer-vision/object-detection` of github.com/eclipse-zenoh/zenoh-demos at c7d28557 does; there a pause of 50 ms
 comes after each image, here the callback wakes the computation.

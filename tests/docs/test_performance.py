@@ -94,7 +94,8 @@ def test_a_race_shows_its_contestants_and_its_picture(tmp_path, commands):
     page.parent.mkdir()
     assert write_report(page, sections_named(["loop"]), lambda _: None)
     text = page.read_text()
-    row = "| sightline (disturbed) | 100 | 30 | 3.5 | 4.2 | none | 3.1 | 1.2 | 47126 | driver 1, vision 2.5 | driver 44, vision 80 |"
+    row = ("| sightline (disturbed) | 100 | 30 | 3.5 | 4.2 | none | 3.1 | 1.2 | 47126 | driver 1, vision 2.5 "
+           "| driver 44, vision 80 |")
     assert row in text
     assert "(img/loop-zenoh.png)" in text
     assert (page.parent / "img" / "loop-zenoh.png").read_bytes() == b"picture of loop"
