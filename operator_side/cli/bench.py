@@ -57,7 +57,7 @@ def pipeline(*, as_json: Json = False) -> int:
     The steps are decode, detect, track and steer. It also measures the network of the learned detector.
     """
     with needs("vision"):
-        from sightline.benchmarks.pipeline import LEARNED_BOUND_US, time_learned, time_steps
+        from sightline.benchmarks.pipeline import LEARNED_BOUND_US, TWO_LOOKS_BOUND_US, time_learned, time_steps
     from sightline.evaluation.checks import Check, at_most
 
     checks = []
@@ -76,7 +76,11 @@ def pipeline(*, as_json: Json = False) -> int:
         f"from JPEG to boxes {learned.whole_us:.0f}, decode {learned.decode_us:.0f}; {learned.engine})",
         learned.network_us, "us", LEARNED_BOUND_US,
     ))
-    checks.append(at_most("images in which onnx finds no ball", learned.missed, "", 0))
+    checks += [
+        at_most("onnx at 320x240, two looks, from JPEG to boxes, hot", learned.two_us, "us", TWO_LOOKS_BOUND_US),
+        at_most("images in which onnx finds no ball", learned.missed, "", 0),
+        at_most("images without a ball in which onnx finds one", learned.false, "", 0),
+    ]
     return _print_checks(checks, as_json)
 
 
