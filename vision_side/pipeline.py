@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from sightline.protocol.errors import WireError
+from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHeader, RequestId, ScanHeader, Twist
 from sightline.protocol.proof import NO_PROOF, Proof
 from sightline.vision_side.config import VisionConfig
@@ -21,6 +22,8 @@ NO_ANSWER = "NO_ANSWER"
 _MAX_DT_S = 0.5
 # A target that was seen so long ago, at most, is expected near its last place.
 _EXPECTED_US = 500_000
+# Rounding of a camera model, at most, that its robot scales to another size.
+_SAME_LENS_PX = 0.5
 # Weight of the earlier frames in the share of lost ones. About sixty frames decide, two seconds at 30 fps.
 _LOSS_WEIGHT = 63 / 64
 # Share of lost frames above which each twist is sent twice. A long run of losses is then rare in both directions.
@@ -96,6 +99,8 @@ class Pipeline:
         """
         self._config = config
         self._camera = camera
+        self._next_camera: CameraModel | None = None
+        """A model of another size, until its first image comes."""
         self._detector = detector
         self._decoder = Decoder(camera.width_px, camera.height_px, config.max_pixels)
         self._first = chosen or configured_mission(config)
@@ -110,10 +115,15 @@ class Pipeline:
         self.restart_clock()
 
     def restart_clock(self) -> None:
-        """Forget the time of the last frame, if it was not true or is of another camera model."""
+        """Forget the time of the last frame, if it was not true or is of another lens."""
         self._latency = LatencyEstimator(self._config.latency)
         self._last_us: int | None = None
         self._seen_at: tuple[int, float, float] | None = None
+
+    @property
+    def camera(self) -> CameraModel:
+        """Return the camera model of the last image."""
+        return self._camera
 
     @property
     def mission(self) -> MissionSpec:
@@ -151,16 +161,32 @@ class Pipeline:
         self._scan = (stamp, scan)
 
     def set_camera(self, camera: CameraModel) -> None:
-        """Use another camera model from the next frame on. A running mission that needs it starts again."""
+        """Use another camera model from the next frame on, or from its first image on if that has another size."""
+        # Images of the former size may still come: they wait behind a computation, or this model overtook them.
+        self._next_camera = camera
+        if _size_px(camera) == _size_px(self._camera):
+            self._use_next_camera()
+
+    def _use_next_camera(self) -> None:
+        """Use the model that waits. The mission of another lens starts again, that of another size continues."""
+        if self._next_camera is None:
+            return
+        former, camera, self._next_camera = self._camera, self._next_camera, None
         self._camera = camera
         self._decoder = Decoder(camera.width_px, camera.height_px, self._config.max_pixels)
-        self.restart_clock()
-        # Tracks of another camera model do not fit the new one.
-        self._mission_switch.set_camera(camera)
+        is_scaled = _is_scaled(former, camera)
+        if self._mission_switch.set_camera(camera, is_scaled=is_scaled) or not is_scaled:
+            self.restart_clock()
+        elif self._seen_at is not None:
+            t_us, x_px, y_px = self._seen_at
+            across, down = camera.width_px / former.width_px, camera.height_px / former.height_px
+            self._seen_at = (t_us, x_px * across, y_px * down)
 
     def fits(self, jpeg: bytes) -> bool:
-        """Return True if an image has the size of the camera model. Does not decode."""
+        """Return True if an image has the size of the newest camera model. Does not decode."""
         try:
+            if self._next_camera is not None:
+                return _is_of(jpeg, self._next_camera, self._config.max_pixels)
             self._decoder.check(jpeg)
         except WireError:
             return False
@@ -179,6 +205,8 @@ class Pipeline:
         if not self._is_new(frame.header):
             return self._skip("OUT_OF_ORDER", "frame is not newer than the last")
         try:
+            if self._next_camera is not None and _is_of(frame.jpeg, self._next_camera, self._config.max_pixels):
+                self._use_next_camera()
             picture = self._decoder.decode(frame.jpeg)
         except WireError as error:
             # An invalid image is acknowledged too. Otherwise the robot waits for its credit until the timeout.
@@ -202,6 +230,7 @@ class Pipeline:
         """
         if not self._is_new(header):
             return self._skip("OUT_OF_ORDER", "the examined frame is not newer than the last")
+        self._use_next_camera()  # the caller read the boxes by it
         return self._answer(header, detections, None)
 
     def _is_new(self, header: FrameHeader) -> bool:
@@ -251,6 +280,26 @@ class Pipeline:
         if self._scan is None or not self.mission.wants_scan or self._scan[0].session != header.session:
             return None, None
         return self._scan
+
+
+def _size_px(camera: CameraModel) -> tuple[int, int]:
+    return camera.width_px, camera.height_px
+
+
+def _is_of(jpeg: bytes, camera: CameraModel, max_pixels: int) -> bool:
+    """Return True if an image has the size of `camera`. Raises WireError for bytes that are not an image."""
+    size = read_jpeg_size(jpeg, max_pixels)
+    return (size.width_px, size.height_px) == _size_px(camera)
+
+
+def _is_scaled(former: CameraModel, camera: CameraModel) -> bool:
+    """Return True if `camera` is `former` for images of another size: the same ray at each share of the image."""
+    across, down = camera.width_px / former.width_px, camera.height_px / former.height_px
+    scaled = {"fx_px": former.fx_px * across, "cx_px": former.cx_px * across,
+              "fy_px": former.fy_px * down, "cy_px": former.cy_px * down}
+    own = {name: getattr(camera, name) for name in ("width_px", "height_px", *scaled)}
+    return former.model_copy(update=own) == camera and all(
+        abs(own[name] - value) <= _SAME_LENS_PX for name, value in scaled.items())
 
 
 def _seen(plan: Plan, detections: tuple[Detection, ...]) -> Observation:

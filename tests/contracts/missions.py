@@ -19,6 +19,8 @@ from sightline.vision_side.missions.registry import MissionSpec
 from sightline.vision_side.missions.switch import MAX_COMMAND
 
 CAMERA = CameraModel(width_px=320, height_px=240, fx_px=190.7, fy_px=190.7, cx_px=160.0, cy_px=120.0, z_m=0.1)
+LARGE = CAMERA.model_copy(update={"width_px": 640, "height_px": 480, "fx_px": 381.4, "fy_px": 381.4, "cx_px": 320.0,
+                                  "cy_px": 240.0})
 LABELS = ("target", "legs", "light", "person")
 
 
@@ -26,6 +28,8 @@ def check_mission(chosen: MissionSpec, frames: int = 200, seed: int = 7) -> None
     """Every promise in turn; an AssertionError names the one that is broken."""
     plans = _plans(chosen, views(seed, frames))
     assert plans == _plans(chosen, views(seed, frames)), "the same frames give the same plans"
+    if chosen.scales:
+        assert plans == _plans(chosen, views(seed, frames), LARGE), "it uses the camera model of each view"
     for plan in plans:
         _check_plan(plan)
     for kind in (_blind, _still, _hostile):
@@ -43,9 +47,9 @@ def _check_plan(plan: Plan) -> None:
     assert plan.distance_m is None or math.isfinite(plan.distance_m)
 
 
-def _plans(chosen: MissionSpec, seen: Iterator[View]) -> list[Plan]:
+def _plans(chosen: MissionSpec, seen: Iterator[View], camera: CameraModel = CAMERA) -> list[Plan]:
     """Return a mission's plans up to the plan that ends it; the mission receives no further view."""
-    mission, plans = chosen.build(CAMERA), []
+    mission, plans = chosen.build(camera), []
     for view in seen:
         plans.append(mission.step(view))
         if plans[-1].done:

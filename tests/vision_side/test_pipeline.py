@@ -3,6 +3,7 @@
 import ast
 import json
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -14,15 +15,18 @@ from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import STILL, AnswerHeader, FrameHeader, RequestId
 from sightline.protocol.text import format_twist
-from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.config import MissionConfig, VisionConfig
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, result_of
 from sightline.vision_side.detect.registry import configured_detector
+from sightline.vision_side.missions.port import Plan, View
+from sightline.vision_side.missions.registry import mission_spec
 from sightline.vision_side.pipeline import Frame, FrameLoss, Observation, Pipeline, PipelineAnswer, answer_header
 from tests.fixtures.vision.vision import Rig, camera, eight, jpeg_of, scene
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2, shaded=True))
 EMPTY = jpeg_of(np.full((240, 320, 3), 140, np.uint8))
+QUARTER = jpeg_of(np.full((120, 160, 3), 140, np.uint8))
 FRAME_US = 33_333
 
 
@@ -49,6 +53,25 @@ def test_seen_coasted_searched_and_found() -> None:
     turning = answers[69].twist
     assert turning is not None and 0 < turning.angular_rad_s <= 1.2  # the ball was last seen on the left
     assert answers[9].seen.distance_m is not None and answers[9].seen.target in answers[9].seen.detections
+
+
+class Noting:
+    """A mission that notes each view."""
+
+    Config = MissionConfig  # any model with free options
+    scales = True
+    views: ClassVar[list[View]] = []
+
+    def __init__(self, config, camera):
+        pass
+
+    def step(self, view):
+        self.views.append(view)
+        return Plan(STILL, "noting")
+
+
+class BlindNoting(Noting):
+    needs_camera = False
 
 
 class NotedDetector:
@@ -82,10 +105,61 @@ def test_a_new_session_and_another_camera_expect_no_target() -> None:
     one = Pipeline(VisionConfig(), MODEL, noted)
     one.step(Frame(header(1), EMPTY))
     one.step(Frame(header(2, "1111aaaa"), EMPTY))
-    one.set_camera(MODEL)
+    one.set_camera(MODEL.model_copy(update={"fx_px": 300.0}))
     one.step(Frame(header(3, "1111aaaa"), EMPTY))
     one.step(Frame(header(4, "1111aaaa"), EMPTY))
     assert noted.expected == [None, None, None, (120.0, 120.0)]
+
+
+@pytest.mark.parametrize(("change", "is_same_lens"), [
+    ({}, True),
+    ({"fx_px": 95.7, "cx_px": 79.6}, True),  # rounded by the robot
+    ({"fy_px": 95.7, "cy_px": 60.4}, True),
+    ({"fx_px": 96.0}, False),
+    ({"fx_px": 94.7}, False),
+    ({"fy_px": 96.0}, False),
+    ({"cx_px": 80.6}, False),
+    ({"cy_px": 59.4}, False),
+    ({"x_m": 0.06}, False),
+    ({"pitch_rad": 0.1}, False),
+    ({"distortion": (0.1,)}, False),
+])
+def test_target_is_expected_at_its_share_of_an_image_of_another_size_of_the_same_lens(change, is_same_lens) -> None:
+    ball = Detection(100.0, 100.0, 140.0, 160.0, 0.9, "ball")
+    noted = NotedDetector([(ball,), ()])
+    one = Pipeline(VisionConfig(), MODEL, noted)
+    one.step(Frame(header(1), EMPTY))
+    one.set_camera(camera(160, 120).model_copy(update=change))
+    one.step(Frame(header(2), QUARTER))
+    assert noted.expected == [None, (60.0, 65.0) if is_same_lens else None]
+
+
+def test_latency_of_the_robot_is_kept_at_another_image_size_only() -> None:
+    """The time of the last frame is kept too, so that the next one has a time step."""
+    views = []
+    other = MODEL.model_copy(update={"fx_px": 300.0})
+    for name, model, jpeg in (("", camera(160, 120), QUARTER), ("", other, EMPTY), ("Blind", other, EMPTY)):
+        chosen = mission_spec(f"{__name__}:{name}Noting", {"options": {}}, VisionConfig())
+        one = Pipeline(VisionConfig(), MODEL, NotedDetector([()] * 41), chosen)
+        for seq in range(1, 41):
+            one.step(Frame(header(seq).model_copy(update={"latency_us": 200_000}), EMPTY))
+        one.set_camera(model)
+        one.step(Frame(header(41), jpeg))
+        views.append(Noting.views[-2:])
+    (before, scaled), *others = views
+    assert scaled.latency_s == before.latency_s
+    assert round(scaled.dt_s, 4) == 0.0333
+    assert all(one.latency_s < before.latency_s and one.dt_s == 0 for _, one in others)
+    assert scaled.camera == camera(160, 120)
+
+
+def test_boxes_are_located_by_the_newest_camera_model() -> None:
+    chosen = mission_spec(f"{__name__}:Noting", {"options": {}}, VisionConfig())
+    one = Pipeline(VisionConfig(), MODEL, NotedDetector([]), chosen)
+    one.set_camera(camera(160, 120))
+    assert one.camera == MODEL
+    one.follow(header(1), ())
+    assert Noting.views[-1].camera == one.camera == camera(160, 120)
 
 
 def test_robot_does_not_drive_to_where_the_target_was_before_a_gap_of_eight_seconds() -> None:
@@ -258,3 +332,6 @@ def test_image_fits_by_its_size_alone() -> None:
     assert one.fits(BALL)
     assert not one.fits(jpeg_of(scene(camera(640, 480), 1.0, 0.2)))
     assert not one.fits(b"junk")
+    one.set_camera(camera(640, 480))
+    assert not one.fits(BALL) and not one.fits(b"junk"), "the newest model is of another size"
+    assert one.fits(jpeg_of(scene(camera(640, 480), 1.0, 0.2)))

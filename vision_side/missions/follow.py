@@ -53,6 +53,7 @@ class Follow:
         search: SearchConfig = SearchConfig()
         boxes: BoxesConfig = BoxesConfig()
 
+    scales: ClassVar[bool] = True
     has_look: ClassVar[bool] = True
     """Whether the middle of a box shows the object. That of two legs shows what is behind them."""
 
@@ -68,6 +69,7 @@ class Follow:
 
     def step(self, view: View) -> Plan:
         """Compute the plan for one frame."""
+        self._camera = view.camera
         places = self._places(view)
         self._hear(view)
         seen = self._track.step(self._gap_s(view), view.header.pose, self._sightings(places, view))

@@ -89,7 +89,8 @@ class Mission(Protocol):
     """Maps each frame to a plan for the robot.
 
     A class may set `wants_scan = True` to receive range scans, and `needs_camera = False` to continue unchanged when
-    the camera model changes.
+    the camera model changes. With `scales = True` it continues when only the image size changes, and uses `view.camera`
+    at each step. Any other mission starts again.
     """
 
     def step(self, view: View) -> Plan:

@@ -39,6 +39,11 @@ class MissionSpec:
         return bool(getattr(self.plugin, "needs_camera", True))
 
     @property
+    def scales(self) -> bool:
+        """Return True if it continues with images of another size of the same lens."""
+        return bool(getattr(self.plugin, "scales", False))
+
+    @property
     def label(self) -> str:
         """The label that it follows, by the `label` or `target` of its configuration; empty for any."""
         own, target = getattr(self.config, "label", None), getattr(self.config, "target", None)

@@ -41,10 +41,21 @@ class MissionSwitch:
         """Come to rest from the next frame on, then start `chosen`."""
         self.chosen, self._switching, self._waited_s = chosen, True, 0.0
 
-    def set_camera(self, camera: CameraModel) -> None:
-        """Start a running mission again if it needs the camera. One that is over stays over."""
-        if self._over is None and not self._switching and self.chosen.needs_camera:
-            self._begin(camera)
+    def set_camera(self, camera: CameraModel, *, is_scaled: bool) -> bool:
+        """Start a running mission again if it needs the camera. One that is over stays over.
+
+        Args:
+            camera: the new model.
+            is_scaled: True if it is the former model for images of another size.
+
+        Returns:
+            True if the mission starts again.
+        """
+        continues = not self.chosen.needs_camera or (is_scaled and self.chosen.scales)
+        if self._over is not None or self._switching or continues:
+            return False
+        self._begin(camera)
+        return True
 
     def step(self, view: View) -> Plan:
         """Compute the plan for one frame."""

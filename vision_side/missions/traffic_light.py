@@ -124,6 +124,7 @@ class TrafficLight:
     """Three lamps in a housing."""
 
     Config = TrafficLightConfig
+    scales: ClassVar[bool] = True
     reader: ClassVar[type[HousingLightReader] | type[BoxLightReader]] = HousingLightReader
 
     def __init__(self, config: TrafficLightConfig, camera: CameraModel) -> None:
@@ -137,6 +138,7 @@ class TrafficLight:
 
     def step(self, view: View) -> Plan:
         """Compute the twist along the lane."""
+        self._camera = view.camera
         self._motion_predictor.measure(view.header.latency_us, view.dt_s)
         plan = self._plan(view)
         self._motion_predictor.sent(view.header.t_us, plan.twist)

@@ -382,10 +382,10 @@ class Service:
             self.skipped[answer.skipped] += 1
         self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._report_phase(answer)
-        self._mission_channel.report(time.monotonic(), answer, header, self._camera)
+        self._mission_channel.report(time.monotonic(), answer, header, self._pipeline.camera)
         if not self._is_legacy:
             self._viewing.publish_detections(header, answer, started_ns)
-        self._viewing.show(header, answer, self._camera, started_ns=started_ns, jpeg=message.payload)
+        self._viewing.show(header, answer, self._pipeline.camera, started_ns=started_ns, jpeg=message.payload)
 
     def _is_of_robot(self, header: FrameHeader, replaced_frames: int = 0) -> bool:
         """Return True for a frame of the steered robot. Others are counted, and logged once.

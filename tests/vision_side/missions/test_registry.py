@@ -46,9 +46,23 @@ class Raising:
         return Plan(STILL, "fine" if self.count < 50 else "two\nlines")
 
 
+class Unscaled(Raising):
+    """It claims to read the camera model of each view."""
+
+    scales = True
+
+    def __init__(self, config, camera):
+        self.width_px = camera.width_px
+
+    def step(self, view):
+        return Plan(STILL, f"{self.width_px} px")
+
+
 def test_contract_finds_each_broken_promise():
     with pytest.raises(AssertionError, match="one line"):
         check_mission(mission_spec(f"{__name__}:Raising", {}, CONFIG))
+    with pytest.raises(AssertionError, match="camera model of each view"):
+        check_mission(mission_spec(f"{__name__}:Unscaled", {}, CONFIG))
 
 
 # --- choosing --------------------------------------------------------------------------------------------------------

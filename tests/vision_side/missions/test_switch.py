@@ -186,11 +186,24 @@ def test_mission_that_is_over_does_not_start_again_with_another_camera(options, 
         assert (answer.twist, answer.seen.done, answer.seen.phase) == (STILL, True, phase)
 
 
-def test_mission_that_waits_for_rest_waits_on_with_another_camera():
+@pytest.mark.parametrize("is_scaled", [False, True])
+def test_mission_that_waits_for_rest_waits_on_with_another_camera(is_scaled):
     switch = MissionSwitch(scripted(), CAMERA)
     switch.switch(scripted(speed=-0.2))
-    switch.set_camera(CAMERA)
+    assert not switch.set_camera(CAMERA, is_scaled=is_scaled)
     assert switch.step(view(1, moving=(0.2, 0.0))).phase == "switching"
+
+
+@pytest.mark.parametrize(("scales", "is_scaled", "continues"), [
+    (True, True, True), (True, False, False), (False, True, False), (False, False, False),
+])
+def test_mission_continues_at_another_image_size_if_it_scales(scales, is_scaled, continues):
+    chosen = scripted()
+    object.__setattr__(chosen, "plugin", type("Scaling", (Scripted,), {"scales": scales}))
+    switch = MissionSwitch(chosen, CAMERA)
+    switch.step(view(1))
+    assert switch.set_camera(CAMERA, is_scaled=is_scaled) is not continues
+    assert switch.step(view(2)).note == ("2 after 0.03" if continues else "1 after 0.03")
 
 
 def test_pipeline_with_an_unknown_mission_is_rejected():

@@ -201,7 +201,9 @@ def light_at(x_m: float, colour: str) -> DetectedLight:
 
 def plans_at_lights(*frames: list[DetectedLight]) -> list[Plan]:
     """Return the plan for each frame, given the lights in it. The robot does not move."""
-    mission, plans = TrafficLight(TrafficLight.Config(block_height_m=BLOCK_M), LENS), []
+    # The images had another size when the mission began.
+    before = LENS.model_copy(update={"height_px": 2 * LENS.height_px, "fy_px": 2 * LENS.fy_px, "cy_px": 2 * LENS.cy_px})
+    mission, plans = TrafficLight(TrafficLight.Config(block_height_m=BLOCK_M), before), []
     blocks = tuple(box_at(x, 0.5, BLOCK_M, 0.1) for x in (1.5, 2.0, 2.5))
     for seq, lights in enumerate(frames):
         mission._reader.read = lambda *_, lights=lights: lights

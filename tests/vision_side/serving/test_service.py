@@ -6,12 +6,13 @@ import sys
 import threading
 import time
 
+import cv2
 import numpy as np
 import pytest
 
 from sightline.protocol.channels import ACK, CAMERA, FRAME, TWIST
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.messages import AnswerHeader, CameraModel, FrameHeader, Stamp
+from sightline.protocol.messages import AnswerHeader, CameraModel, FrameHeader, Stamp, Twist
 from sightline.protocol.proof import session_digest
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Message
@@ -20,7 +21,7 @@ from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.serving.process import serve
 from sightline.vision_side.serving.service import Service, SkipCounter
 from tests.fixtures.ports import free_endpoint
-from tests.fixtures.vision.vision import camera, jpeg_of, scene
+from tests.fixtures.vision.vision import YELLOW_BGR, camera, jpeg_of, scene
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2))
@@ -203,6 +204,71 @@ def test_first_image_of_another_size_is_answered_by_a_twist(bench: Bench, size_p
     assert not bench.service.skipped
 
 
+def publish_model(bench: Bench, model: CameraModel) -> None:
+    bench.robot.publish(CAMERA, encode(Stamp(session="0000abcd", seq=2, t_us=bench.now_us)), encode(model))
+
+
+def test_image_of_the_old_size_that_waits_behind_a_computation_is_answered_by_a_twist(bench: Bench) -> None:
+    """The model of the new size arrives before it is looked at. Only the first image of that size needs the model."""
+    bench.camera()
+    bench.frame(BALL, 1)
+    bench.twists.take()
+    large = camera(640, 480)
+    publish_model(bench, large)
+    bench.frame(BALL, 2)
+    bench.frame(BALL, 3)
+    bench.frame(b"junk", 4)
+    answered = []
+    for seq, jpeg in ((5, BALL), (6, jpeg_of(scene(large, 1.0, 0.2)))):
+        bench.frame(jpeg, seq)
+        message = bench.twists.take()
+        answered.append(message and decode(AnswerHeader, message.header).echo.seq)
+    assert answered == [5, 6]
+    assert bench.service.skipped == {"MALFORMED": 1}, "the image that does not decode"
+
+
+def balls(model: CameraModel, *places: tuple[int, int, int]) -> bytes:
+    """Draw balls at x, y with a radius, in px of an image 320 px wide."""
+    picture, share = np.full((model.height_px, model.width_px, 3), 140, np.uint8), model.width_px / 320
+    for x, y, radius in places:
+        cv2.circle(picture, (round(x * share), round(y * share)), round(radius * share), YELLOW_BGR, -1, cv2.LINE_AA)
+    return jpeg_of(picture)
+
+
+def twist_of(bench: Bench, jpeg: bytes, seq: int) -> Twist:
+    bench.frame(jpeg, seq)
+    message = bench.twists.take()
+    assert message is not None
+    return parse_twist(message.payload)
+
+
+@pytest.mark.parametrize("size_px", [(640, 480), (160, 120)])
+def test_robot_drives_on_at_the_first_image_of_another_size(bench: Bench, size_px: tuple[int, int]) -> None:
+    bench.camera()
+    far, other = jpeg_of(scene(MODEL, 2.0, 0.3)), camera(*size_px)
+    before = [twist_of(bench, far, seq) for seq in range(1, 8)][-1]
+    publish_model(bench, other)
+    after = [twist_of(bench, jpeg_of(scene(other, 2.0, 0.3)), seq) for seq in range(8, 48)]
+    assert {one.linear_mps for one in (before, *after)} == {0.5}
+    assert [one.angular_rad_s for one in after] == pytest.approx([before.angular_rad_s] * len(after), abs=0.03)
+
+
+@pytest.mark.parametrize(("focal_px", "turns_to"), [(95.3, -1), (120.0, 1)])
+def test_robot_follows_the_same_ball_at_another_image_size_and_the_nearest_with_another_lens(
+    bench: Bench, focal_px: float, turns_to: int
+) -> None:
+    bench.camera()
+    small, large = (230, 130, 10), (60, 130, 26)
+    for seq in range(1, 8):
+        twist_of(bench, balls(MODEL, small), seq)
+    assert twist_of(bench, balls(MODEL, small, large), 8).angular_rad_s < -1
+    half = camera(160, 120).model_copy(update={"fx_px": focal_px})
+    publish_model(bench, half)
+    for seq in range(9, 13):
+        turning = twist_of(bench, balls(half, small, large), seq).angular_rad_s
+    assert turning * turns_to > 1
+
+
 def test_lines_are_logged_per_change_and_never_per_frame(bench: Bench) -> None:
     bench.camera()
     for seq in range(1, 50):
@@ -313,9 +379,11 @@ def test_skipped_frames_are_counted_over_all_cameras(bench: Bench) -> None:
     bench.camera()
     for seq in range(1, 4):
         bench.frame(b"junk", seq)
-    bench.camera(camera(640, 480))
-    bench.frame(b"junk", 4)
-    bench.frame(BALL, 5)  # the last camera's size
+    large = camera(640, 480)
+    bench.camera(large)
+    bench.frame(jpeg_of(scene(large, 1.0, 0.2)), 4)
+    bench.frame(b"junk", 5)
+    bench.frame(BALL, 6)  # the last camera's size
     assert bench.service.skipped == {"MALFORMED": 5}
 
 
