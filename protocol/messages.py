@@ -249,7 +249,7 @@ class StreamStatus(WireModel):
     fps: Number = Field(default=0.0, description="frames sent in the last second")
     dropped_commands: Counter = Field(default=0, description="commands that the driver did not take in time")
     refused_pictures: Counter = Field(
-        default=0, description="images of the camera too large or not newer than the last"
+        default=0, description="images of the camera too large, not newer than the last or in the future"
     )
     calibrated: bool = Field(default=False, description="whether the camera's model was measured")
     overtaken: Counter = Field(default=0, description="frames that a newer one replaced on the way")

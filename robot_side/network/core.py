@@ -40,6 +40,8 @@ class NetworkCore:
     def __init__(self, config: StreamConfig, session: str, first_seq: int, max_frame_bytes: int) -> None:
         self.motion = RobotMotion()
         self._rejected_pictures = 0
+        self._time_fault = ""
+        """Why the newest image was rejected, if its capture time is in the future."""
         self._stream = Stream(config)
         self._session = session
         self._seq = first_seq
@@ -71,9 +73,13 @@ class NetworkCore:
             now_us: monotonic clock.
 
         Returns:
-            Header and message, or None for an image that is too large or not newer than the last, which is counted.
+            Header and message, or None for an image that is too large, not newer than the last, or in the future. It is
+            counted.
         """
-        if picture.t_us <= self._last_t_us or len(picture.jpeg) > self._max_frame_bytes:
+        # The frames after one of the future would not be newer, until that time.
+        ahead_s = (picture.t_us - now_us) / 1e6
+        self._time_fault = f"image is {ahead_s:.3f} s in the future" if ahead_s > 0 else ""
+        if self._time_fault or picture.t_us <= self._last_t_us or len(picture.jpeg) > self._max_frame_bytes:
             self._rejected_pictures += 1
             return None
         self._last_t_us = picture.t_us
@@ -177,7 +183,7 @@ class NetworkCore:
             missed_captures=missed_captures,
             quality_percent=self._applied.quality_percent,
             scale_percent=self._applied.scale_percent,
-            camera_fault=camera_fault[:200],
+            camera_fault=(camera_fault or self._time_fault)[:200],
         )
 
 

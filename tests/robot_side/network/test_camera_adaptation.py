@@ -115,7 +115,7 @@ def test_a_scaled_model_sees_every_pixel_along_the_same_ray(scale_percent):
 
 def test_a_new_model_is_announced_before_the_first_image_of_it():
     core = Core()
-    core.on_camera(Picture(b"", 1), 0)
+    core.on_camera(Picture(b"", 0), 0)
     first = core.announce_camera(MODEL, 0)
     assert first is not None and first.channel is CAMERA
     core.on_camera(Picture(b"", 2), 1_000)

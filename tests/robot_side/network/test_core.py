@@ -67,6 +67,29 @@ def test_image_that_is_too_large_or_not_newer_than_the_last_is_counted(t_us, siz
         assert core.on_camera(Picture(b"x" * 1_000, 101), 300) is not None, "and moves no time"
 
 
+def test_image_of_the_future_is_counted_and_named_and_the_stream_goes_on():
+    """A camera whose clock steps gives such images."""
+    core, now_us, sent = core_of(), 1_000_000, []
+    for count in range(30):
+        now_us += 33_333
+        frame = core.on_camera(Picture(b"", now_us + 3_600_000_000 * (count == 9)), now_us)
+        if frame is not None:
+            core.on_command_ack(CommandAck(HOLDER, frame[0].seq, 0, HOLDER), now_us + 5_000)
+        sent.append(frame is not None and core.may_capture(now_us + 33_333, True))
+        fault = "image is 3600.000 s in the future" if count == 9 else ""
+        assert core.status(now_us).camera_fault == fault
+    assert sent == [True] * 9 + [False] + [True] * 20
+    assert core.status(now_us).refused_pictures == 1
+
+
+@pytest.mark.parametrize(("t_us", "leaves"), [(1_000, True), (1_001, False)])
+def test_image_that_was_captured_after_now_is_of_the_future(t_us, leaves):
+    core = core_of()
+    assert (core.on_camera(Picture(b"", t_us), 1_000) is not None) == leaves
+    assert bool(core.status(1_000).camera_fault) != leaves
+    assert core.status(1_000, camera_fault="unplugged").camera_fault == "unplugged", "it comes first"
+
+
 def test_size_of_a_frame_and_the_times_of_both_clocks_reach_the_stream():
     core = core_of()
     core.on_camera(Picture(b"", 10_000), 25_000)
@@ -109,7 +132,7 @@ def test_ack_of_a_frame_of_this_session_returns_credit(changes, returns):
 def test_newest_frames_are_those_that_an_ack_may_cite():
     core = core_of(seq=7)
     for count in range(300):
-        core.on_camera(Picture(b"", count + 1), count)
+        core.on_camera(Picture(b"", count + 1), count + 1)
     assert core._frame_times == {7 + count: count + 1 for count in range(300 - 256, 300)}
 
 
@@ -250,7 +273,7 @@ def test_model_is_announced_again_for_a_driver_that_arrives_and_then_each_half_s
 
 def test_driver_that_arrives_gets_a_frame_at_once():
     core = core_of()
-    core.on_camera(Picture(b"", 1), 0)
+    core.on_camera(Picture(b"", 1), 1)
     assert not core.may_capture(100_000, True), "the frame in flight has the only credit"
     core.on_new_driver()
     assert core.may_capture(100_000, True)
@@ -276,7 +299,7 @@ def test_same_model_is_found_without_a_comparison_of_its_fields():
 def test_status_shows_every_counter():
     core = core_of()
     for seq in range(3):
-        core.on_camera(Picture(b"", seq + 1), seq)
+        core.on_camera(Picture(b"", seq + 1), seq + 1)
     core.on_ack(ack(seq=1, t_us=2), 10_000)
     assert core.may_capture(500_000, True), "the third has timed out"
     assert core.status(500_000) == StreamStatus(sent=3, fps=3.0, overtaken=1, credit_timeouts=1)
