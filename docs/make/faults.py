@@ -13,6 +13,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -49,9 +50,10 @@ Record = Mapping[str, Any]
 
 
 def describe_machine() -> list[str]:
-    """CPU, cores, load, kernel, Python and the packages that matter, one line each."""
+    """CPU, cores, load, date, kernel, Python and the packages that matter, one line each."""
+    load = f"load average at the start {os.getloadavg()[0]:.1f}, on {datetime.now(UTC):%Y-%m-%d}"
     return [
-        f"CPU: {processor()}, {os.cpu_count()} cores; load average at the start {os.getloadavg()[0]:.1f}",
+        f"CPU: {processor()}, {os.cpu_count()} cores; {load}",
         f"system: {platform.system()} {platform.release()}, {platform.machine()}",
         f"Python {platform.python_version()}; " + ", ".join(f"{name} {version(name)}" for name in PACKAGES),
     ]

@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections import Counter
+from datetime import UTC, date, datetime
 from types import SimpleNamespace
 
 import pytest
@@ -352,6 +353,12 @@ def test_the_report_is_one_object_and_one_table():
 def test_the_machine_is_described_without_naming_it():
     text = " ".join(describe_machine())
     assert "Python 3" in text and "cores" in text and "/" not in text.replace("x86_64", "")
+
+
+def test_the_machine_is_described_with_the_date_of_the_measurement():
+    before = datetime.now(UTC).date()
+    (shown,) = re.findall(r"\d{4}-\d\d-\d\d", describe_machine()[0])
+    assert before <= date.fromisoformat(shown) <= datetime.now(UTC).date()
 
 
 def test_the_command_lists(capsys):
