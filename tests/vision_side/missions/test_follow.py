@@ -1,6 +1,7 @@
 """The mission `follow`, frame by frame: which detection it means, where it is, and what the wheels get."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -92,6 +93,14 @@ def test_detection_is_a_box_without_pixels_or_without_an_outline_if_a_size_is_kn
     boxes, target = BoxesConfig(**sizes), TargetConfig(radius_m=0.25, stand_off_m=0.9)
     follow_of(boxes=boxes, target=target).step(view(at(1.0, outline=outline), picture=picture))
     assert located == [("box", CAMERA, boxes, 0.9) if kind == "box" else ("sphere", CAMERA, 0.25)]
+
+
+def test_detection_is_located_by_the_camera_model_of_its_image(located):
+    """So the mission continues with images of another size."""
+    follow, half = follow_of(), CAMERA.model_copy(update={"width_px": 160})
+    follow.step(view(at(1.0)))
+    follow.step(replace(view(at(1.0)), camera=half))
+    assert Follow.scales and [one[1] for one in located] == [CAMERA, half]
 
 
 @pytest.mark.parametrize(("label", "sizes", "used"), [

@@ -202,7 +202,7 @@ def test_mission_continues_at_another_image_size_if_it_scales(scales, is_scaled,
     object.__setattr__(chosen, "plugin", type("Scaling", (Scripted,), {"scales": scales}))
     switch = MissionSwitch(chosen, CAMERA)
     switch.step(view(1))
-    assert switch.set_camera(CAMERA, is_scaled=is_scaled) is not continues
+    assert switch.set_camera(CAMERA, is_scaled=is_scaled) is (not continues)
     assert switch.step(view(2)).note == ("2 after 0.03" if continues else "1 after 0.03")
 
 
