@@ -35,7 +35,8 @@ def tells_no_holder(robot):
 def lets_two_drive(robot):
     def may_take(self, who, now_us, proof=NO_PROOF):
         holder = self.live_holder(now_us)
-        return Lease.may_take(self, who, now_us, proof) or who.source == holder.source == "vision"
+        return Lease.may_take(self, who, now_us, proof) or (
+            holder is not None and who.source == holder.source == "vision")
 
     lease_of(robot, may_take=may_take)
 
