@@ -71,12 +71,18 @@ def measured(arguments: Sequence[str]) -> Record:
 
 
 def merged(record: Record, newer: Record) -> Record:
-    """`record` with the rows that `newer` ran in place of its own; rows that only `newer` has come last."""
+    """`record` with the rows that `newer` ran in place of its own; rows that only `newer` has come last.
+
+    A row that had not passed keeps its figures in the note of the later run.
+    """
     again = {row["id"]: row for row in newer["rows"]}
+    failed = {row["id"]: _figures(row, _checks(record, row)) for row in record["rows"]
+              if row["id"] in again and not row["ok"]}
     rows = {row["id"]: row for row in record["rows"]} | again
     checks = [one for one in record["checks"] if _id_of(one) not in again] + newer["checks"]
-    note = {"command": newer["command"], "machine": newer["machine"], "rows": list(again)}
-    return {**record, "rows": list(rows.values()), "checks": checks, "again": [*record["again"], note]}
+    note = {"command": newer["command"], "machine": newer["machine"], "rows": list(again), "failed": failed}
+    is_ok = all(row["ok"] for row in rows.values() if not row["skipped"])
+    return {**record, "ok": is_ok, "rows": list(rows.values()), "checks": checks, "again": [*record["again"], note]}
 
 
 def report_page(record: Record, known: Iterable[str] = ()) -> str:
@@ -84,7 +90,7 @@ def report_page(record: Record, known: Iterable[str] = ()) -> str:
     ran = _ran(record)
     missing = [f"`{row}`" for row in known if row not in {one["id"] for one in record["rows"]}]
     again = [f"by `{one['command']}` on {one['machine'][0].removeprefix('CPU: ')}: "
-             + ", ".join(f"`{row}`" for row in one["rows"]) for one in record["again"]]
+             + ", ".join(f"`{row}`" + _before(row, one) for row in one["rows"]) for one in record["again"]]
     return "\n".join([
         "# Fault results",
         "",
@@ -102,15 +108,22 @@ def report_page(record: Record, known: Iterable[str] = ()) -> str:
     ])
 
 
+def _before(row: str, note: Record) -> str:
+    figures = note.get("failed", {}).get(row)
+    return f" (did not pass before: {figures})" if figures else ""
+
+
 def _table_row(row: Record, checks: Iterable[Record]) -> str:
     name = f"| `{row['id']}` | {row['what']} | {row['demanded']} |"
     if row["skipped"]:
         return f"{name} {row['skipped']} | not run |"
+    return f"{name} {_figures(row, checks)} | {'yes' if row['ok'] else '**no**'} |"
+
+
+def _figures(row: Record, checks: Iterable[Record]) -> str:
     shown = [figure_text(one["name"], one["value"], one["unit"]) for one in checks
              if not one["ok"] or one["name"] not in _SHOWN_IF_WRONG]
-    trouble = [row["trouble"]] if row["trouble"] else []
-    figures, passed = ", ".join([*trouble, *shown]), "yes" if row["ok"] else "**no**"
-    return f"{name} {figures} | {passed} |"
+    return ", ".join([row["trouble"], *shown] if row["trouble"] else shown)
 
 
 def safety_page(page: str, record: Record) -> str:

@@ -84,10 +84,18 @@ def test_rows_that_ran_again_replace_their_own_and_no_others():
     old = record(row("a: 1", "stop", falls=1), row("b: 1", "stop", ok=False, falls=9), row("c: 1", "stop", falls=1))
     report = report_page(merged(old, record(row("b: 1", "stop", falls=2), command="sightline faults --only b")))
     assert "3 of 3 rows passed" in report and "Written by `sightline faults --repeat 2`" in report
-    assert "- by `sightline faults --only b` on one: `b.1`\n\n| row | fault" in report
+    before = "- by `sightline faults --only b` on one: `b.1` (did not pass before: falls 9 ms)\n\n| row | fault"
+    assert before in report
     lines = [line for line in report.splitlines() if "stop" in line and line.startswith("| ")]
     assert [line.split(" | ")[1] for line in lines] == ["a: 1", "b: 1", "c: 1"]
-    assert "falls 2 ms" in report and "falls 9 ms" not in report
+    assert "| falls 2 ms | yes |" in report and report.count("falls 9 ms") == 1
+
+
+def test_all_rows_pass_once_those_that_did_not_have_passed():
+    old = {**record(row("a: 1", "stop", falls=1), row("b: 1", "stop", ok=False, falls=9)), "ok": False}
+    newer = merged(old, record(row("b: 1", "stop", falls=2)))
+    assert newer["ok"] and "(did not pass before: falls 9 ms)" in report_page(merged(newer, record(row("a: 1", USUAL))))
+    assert not merged(newer, record(row("a: 1", "stop", ok=False, falls=1)))["ok"]
 
 
 def test_a_row_that_fails_when_it_runs_again_is_shown():
