@@ -217,6 +217,8 @@ class Setup:
     """Camera mode from the beginning."""
     source: str = "vision"
     """The role that a scripted driver takes."""
+    linear_mps: float = 0.5
+    """The speed that a scripted driver sends."""
     secure: bool = False
     """The links have keys, and the driver has the session `SESSION`, which an attacker knows."""
     web: bool = False
@@ -230,8 +232,8 @@ class Setup:
 
     @property
     def at_speed_mps(self) -> float:
-        """Return the speed before a fault. A script sends 0.5 m/s, a guest 0.2; vision follows a ball at 0.4."""
-        return {"vision": 0.3, "guest": 0.18}.get(self.driver, 0.48)
+        """Return the speed before a fault. A guest has 0.2 m/s; vision follows a ball at 0.4."""
+        return {"vision": 0.3, "guest": 0.18}.get(self.driver, 0.96 * self.linear_mps)
 
     @property
     def kept_mps(self) -> float:
@@ -313,7 +315,8 @@ class RobotFixture:
     def _start_own(self) -> None:
         self.start_robot()
         session = {"session": SESSION} if self.setup.secure else {}
-        self.start_peer("peer", self.setup.driver, fault=self.setup.fault, source=self.setup.source, **session)
+        self.start_peer("peer", self.setup.driver, fault=self.setup.fault, source=self.setup.source,
+                        linear_mps=self.setup.linear_mps, **session)
 
     def _write_files(self, sockets: str) -> None:
         device = {"kind": "sim", "options": {"socket_dir": sockets}}

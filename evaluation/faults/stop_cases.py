@@ -97,6 +97,8 @@ def _replay(rig: RobotFixture) -> Injected:
 
 
 TYPED_FALLS_MS: Final = 200.0
+TYPED_ZERO_MS: Final = {0.5: 550.0, 0.2: 350.0}
+"""From the start of the command until the wheels stand, for each speed before it. The ramp takes most of it."""
 TYPED_CPU_S: Final = 0.2
 
 
@@ -112,7 +114,8 @@ def _typed(rig: RobotFixture) -> Injected:
     rig.watch(ZERO_MS / 1000)
     falls_ms = measure_stop(rig.motors(), at_us).falls_ms
     return Injected(1, at_us, checks=(
-        *moving_stop(rig.motors(), at_us, rig.setup.kept_mps, "the start of the command"),
+        *moving_stop(rig.motors(), at_us, rig.setup.at_speed_mps, "the start of the command",
+                     TYPED_ZERO_MS[rig.setup.linear_mps]),
         at_most("speed falls after the start of the command", falls_ms, "ms", TYPED_FALLS_MS),
         at_most("CPU time of the command", cpu_s, "s", TYPED_CPU_S), at_most("exit code of stop", code, "", 0),
     ))
@@ -267,8 +270,13 @@ STOP_CASES: Final = (
               Setup("guest", guests=True), blind=True, also=f"zero <= {_GUEST.guest_unchanged_ms / 1000:g} s and "
               f"{_GUEST.guest_unchanged_m:g} m, plus braking; {_DEMANDED}"),
     *LEGACY_CASES,
-    FaultCase("stop.typed", "STOP: the command `sightline stop`, counted from its start", _typed, Setup(), blind=True,
-              alone=True, also=f"falls <= {TYPED_FALLS_MS:g} ms after its start; CPU time <= {TYPED_CPU_S:g} s"),
+    *(
+        FaultCase(f"stop.typed{ending}", f"STOP: the command `sightline stop` at {linear_mps:g} m/s, counted from its "
+                  "start", _typed, Setup(linear_mps=linear_mps), blind=True, alone=True,
+                  also=f"falls <= {TYPED_FALLS_MS:g} ms and zero <= {TYPED_ZERO_MS[linear_mps]:g} ms after its start; "
+                  f"CPU time <= {TYPED_CPU_S:g} s")
+        for ending, linear_mps in (("", 0.5), ("_slow", 0.2))
+    ),
     FaultCase("stop.busy", f"STOP by a new operator: {BUSY} busy processes beside it", _busy, Setup(), blind=True,
               also=_DEMANDED, alone=True),
     FaultCase("stop.no_descriptors", "STOP by a new operator: the robot has no file descriptor left", _no_descriptors,
