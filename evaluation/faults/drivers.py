@@ -1,10 +1,21 @@
 """Rows: commands with a false echo, invalid commands, too many commands, copied identities, several drivers. Shell."""
 
+import itertools
+import signal
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, Final
 
-from sightline.evaluation.checks import at_least, at_most
-from sightline.evaluation.faults.evidence import FLOOD_AT_LEAST, INJECTED, ZERO_MS, most_gain_mps2, wheel_mps
+from sightline.evaluation.checks import Check, at_least, at_most
+from sightline.evaluation.faults.evidence import (
+    FLOOD_AT_LEAST,
+    INJECTED,
+    ZERO_MS,
+    MotorRow,
+    SentCommand,
+    most_gain_mps2,
+    wheel_mps,
+)
 from sightline.evaluation.faults.fixture import KEPT_MPS, SESSION, RobotFixture, Setup
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.protocol.clock import monotonic_us
@@ -173,6 +184,111 @@ def _holder_dies(rig: RobotFixture) -> Injected:
     return Injected(1, at_us, last_us + LEASE_US - 20_000, bool(moving), checks)
 
 
+# --- services that share robots --------------------------------------------------------------------------------------
+
+
+OWNER, STANDBY = "a", "b"
+"""Names of two services; the first is the better choice of the bench's robot."""
+RIGHT_RAD_S: Final = -0.4
+"""The first driver turns left."""
+KILLED_GAP_MS: Final = 250.0
+JOINED_GAP_MS: Final = 150.0
+ENDS_S: Final = 1.0
+_SIDE_RAD_S: Final = 0.3
+"""The wheels of a circle at 0.4 rad/s differ by more than this."""
+
+
+def drivers_of(rows: Sequence[MotorRow]) -> list[int]:
+    """Return the direction of each driver in turn: 1 turns left, -1 right."""
+    differences = (row.right_rad_s - row.left_rad_s for row in rows)
+    sides = (1 if one > 0 else -1 for one in differences if abs(one) > _SIDE_RAD_S)
+    return [side for side, _ in itertools.groupby(sides)]
+
+
+def handover_checks(
+    rows: Sequence[MotorRow], sent: Sequence[SentCommand], changes: int, gap_ms: float, until_us: int
+) -> Iterator[Check]:
+    """Yield the checks of a robot that drives while its driver changes.
+
+    Args:
+        rows: the motor log.
+        sent: commands of all drivers, from before the first change on.
+        changes: changes of the driver.
+        gap_ms: longest time between two commands.
+        until_us: end of the measurement; the robot may stand later.
+    """
+    driven = [row for row in rows if sent[0].t_us <= row.t_us <= until_us]
+    times = [*(one.t_us for one in sent if one.t_us <= until_us), until_us]
+    longest_us = max(after - before for before, after in itertools.pairwise(times))
+    changed = len(drivers_of(rows)) - 1
+    yield at_least("speed kept", min(map(wheel_mps, driven)), "m/s", KEPT_MPS)
+    yield at_most("between two commands", longest_us / 1000, "ms", gap_ms)
+    yield at_least("changes of the driver", changed, "", changes)
+    yield at_most("no more changes", changed, "", changes)
+
+
+def _goes(rig: RobotFixture, side: int) -> bool:
+    return drivers_of(rig.motors()[-1:]) == [side]
+
+
+def _join(rig: RobotFixture, name: str, line: str) -> None:
+    """Start a second service, which turns right, and wait until it logs `line`."""
+    rig.start_peer("second", "shared", share=name, angular_rad_s=RIGHT_RAD_S)
+    rig.processes.wait_line("second", line)
+
+
+def _sent_from(rig: RobotFixture, from_us: int) -> list[SentCommand]:
+    return [one for one in rig.sent() if one.t_us >= from_us]
+
+
+def _kill_owner(rig: RobotFixture) -> Injected:
+    """Kill the driving one of two services; the other one drives on."""
+    _join(rig, STANDBY, "stands by")
+    rig.watch(SETTLED_S)
+    at_us = monotonic_us()
+    rig.processes.kill("peer")
+    rig.watch(ATTACKED_S)
+    sent = _sent_from(rig, at_us - LEASE_US)
+    checks = tuple(handover_checks(rig.motors(), sent, 1, KILLED_GAP_MS, at_us + int(ATTACKED_S * 1e6)))
+    return Injected(1, at_us, checks=checks, from_us=at_us - LEASE_US)
+
+
+def _hand_over(rig: RobotFixture) -> Injected:
+    """A better choice joins and drives; then it ends by SIGTERM, and the former one drives again."""
+    from_us = monotonic_us()
+    _join(rig, OWNER, "drives it")
+    rig.until(lambda: _goes(rig, -1), 5.0, "the second service driving")
+    rig.watch(SETTLED_S)
+    at_us = monotonic_us()
+    rig.processes.signal("second", signal.SIGTERM)
+    code = rig.processes.exit_code("second", 5 * ENDS_S)
+    ended_s = (monotonic_us() - at_us) / 1e6
+    rig.watch(SETTLED_S)
+    until_us = monotonic_us()
+    first_us = rig.sent("second")[0].t_us
+    overlaps = sum(first_us < one.t_us < at_us for one in rig.sent("peer"))
+    checks = handover_checks(rig.motors(), _sent_from(rig, from_us), 2, JOINED_GAP_MS, until_us)
+    return Injected(2, at_us, from_us=from_us, checks=(
+        *checks, at_most("commands beside the driver", overlaps, "", 0), at_most("ends after", ended_s, "s", ENDS_S),
+        at_most("exit code", code, "", 0),
+    ))
+
+
+def _drive_without_token(rig: RobotFixture) -> Injected:
+    """A driver ends its token and goes on; a service drives. Then that one is killed, and the former still goes on."""
+    _join(rig, STANDBY, "shares robots")
+    rig.watch(LEASE_US / 2e6)
+    ended_us = rig.trigger()
+    rig.until(lambda: _goes(rig, -1), 5.0, "the service driving")
+    rig.watch(SETTLED_S)
+    at_us = monotonic_us()
+    rig.processes.kill("second")
+    rig.watch(ATTACKED_S)
+    sent = _sent_from(rig, ended_us - LEASE_US // 2)
+    checks = handover_checks(rig.motors(), sent, 1, KILLED_GAP_MS, at_us)
+    return Injected(rig.injected(), at_us, checks=tuple(checks), from_us=ended_us)
+
+
 def _command_case(name: str, what: str, *, short: bool = False) -> FaultCase:
     return FaultCase(f"command.{name}", f"commands: {what}", _attack, Setup(fault=name), short=short)
 
@@ -219,4 +335,14 @@ COMMAND_CASES: Final = (
         "driver.dies", "drivers: the holder dies while another waits", _holder_dies, Setup(), blind=True, again=True,
         also="the other drives only after the lease"
     ),
+    FaultCase("token.end", "tokens: the driving one of two services that share is killed", _kill_owner,
+              Setup("shared", routed=True, share=OWNER), stops=False,
+              also=f"the other drives on: speed >= {KEPT_MPS:g} m/s, <= {KILLED_GAP_MS:g} ms between commands"),
+    FaultCase("token.handover", "tokens: a better choice joins, then ends by SIGTERM", _hand_over,
+              Setup("shared", routed=True, share=STANDBY), stops=False,
+              also=f"speed >= {KEPT_MPS:g} m/s, <= {JOINED_GAP_MS:g} ms between commands, one driver at a time; "
+              f"ends <= {ENDS_S:g} s"),
+    FaultCase("token.late", "tokens: a driver goes on after the end of its token, also when its successor is killed",
+              _drive_without_token, Setup(fault="after_token", routed=True, share="former"),
+              also=f"0 motor log lines of it; until the kill speed >= {KEPT_MPS:g} m/s"),
 )

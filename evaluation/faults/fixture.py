@@ -227,6 +227,8 @@ class Setup:
     """In place of the robot a legacy one, with this text format in its address. `fault` names its library."""
     guests: bool = False
     """It also accepts legacy clients, in place of WebSocket ones."""
+    share: str = ""
+    """The name that the first driver has in its token; "" without one."""
     routed: bool = False
     """The robot connects to a router, and all others know only that one."""
 
@@ -316,7 +318,7 @@ class RobotFixture:
         self.start_robot()
         session = {"session": SESSION} if self.setup.secure else {}
         self.start_peer("peer", self.setup.driver, fault=self.setup.fault, source=self.setup.source,
-                        linear_mps=self.setup.linear_mps, **session)
+                        linear_mps=self.setup.linear_mps, share=self.setup.share, **session)
 
     def _write_files(self, sockets: str) -> None:
         device = {"kind": "sim", "options": {"socket_dir": sockets}}
@@ -496,7 +498,7 @@ class RobotFixture:
         """Sightline's own processes; what a scripted driver needs to send 10 MB is its own affair."""
         if self.setup.legacy is not None:  # its robot is a third-party server
             return ("sim", "vision")
-        peer = ("peer",) if self.setup.driver == "vision" else ()
+        peer = ("peer",) if self.setup.driver in ("vision", "shared") else ()
         router = ("router",) if self.setup.routed else ()
         return ("sim", "robot", *peer, *router)
 

@@ -17,12 +17,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final, Literal, NamedTuple
 
 from sightline.evaluation.faults.evidence import FLOOD_AT_LEAST, GOOD, INJECTED, REQUESTED, EventLog
+from sightline.evaluation.faults.shared_service import run_shared
 from sightline.operator_side.client.requests import SOURCE as OPERATOR_SOURCE
 from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.client.stop import stop_robot
@@ -51,8 +52,9 @@ from sightline.protocol.transports.link import LatestSlot, Link, LinkWrapper, Me
 from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.stop_datagram import StopRequests
 from sightline.protocol.transports.stop_port import stop_secret_file
+from sightline.protocol.transports.tokens import DriverToken
 from sightline.protocol.transports.websocket.legacy_text import encode_picture
-from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
+from sightline.protocol.transports.zenoh.link import ZenohLink, declare_token, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
 from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
 from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
@@ -62,7 +64,7 @@ from sightline.vision_side.detect.onnx.detector import AutoDetector
 from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
 from sightline.vision_side.serving.process import serve
 
-Role = Literal["vision", "driver", "guest", "legacy", "operator", "stop"]
+Role = Literal["vision", "shared", "driver", "guest", "legacy", "operator", "stop"]
 
 
 class PeerOptions(Config):
@@ -90,6 +92,8 @@ class PeerOptions(Config):
     certificate: str = ""
     session: str = ""
     """The session to drive with; random without one."""
+    share: str = ""
+    """Name of a service that shares robots, or of a scripted driver with a token."""
     seconds: float | None = None
     """End by itself after this long."""
 
@@ -109,35 +113,10 @@ def main() -> int:
     """Run one peer; returns its exit code."""
     options = PeerOptions.model_validate_json(sys.argv[1])
     trigger, ledger = Trigger(), EventLog(options.ledger)
-    return _entry(options.role)(options, trigger.pulled, ledger)
-
-
-def _entry(role: Role) -> Callable[[PeerOptions, threading.Event, EventLog], int]:
-    """Imported late: only vision needs OpenCV."""
-    if role == "vision":
-
-        return run_vision
-    if role == "driver":
-
-        return run_driver
-
-    if role == "guest":
-
-        return run_guest
-
-    if role == "legacy":
-
-        return run_legacy_robot
-
-    if role == "stop":
-
-        return run_stop
-
-    return run_operator
+    return ROLES[options.role](options, trigger.pulled, ledger)
 
 
 # A driver by script: answers each frame with one twist, citing it properly, until its fault is triggered. Shell.
-
 
 KEPT: Final = 256
 WAIT_S: Final = 0.05
@@ -162,10 +141,12 @@ def read_recording(path: Path) -> list[SentMessage]:
 class Script:
     """The context of an attack: the link, the newest frame, all sent messages."""
 
-    def __init__(self, options: "PeerOptions", link: ZenohLink, ledger: EventLog) -> None:
-        self.options, self.link = options, link
+    def __init__(
+        self, options: "PeerOptions", link: ZenohLink, ledger: EventLog, proofs: ProofChain,
+        withdraw: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.options, self.link, self.proofs, self.withdraw = options, link, proofs, withdraw
         self.session = options.session or secrets.token_hex(4)
-        self.proofs = ProofChain(secrets.token_bytes)
         self.seq = self._requests = 0
         self.sent: deque[SentMessage] = deque(maxlen=KEPT)
         self.twist = Twist(linear_mps=options.linear_mps, angular_rad_s=options.angular_rad_s)
@@ -231,13 +212,24 @@ class Script:
         return key_for(self.link.robot, TWIST, self.options.source)
 
 
+def _declare_driver(options: "PeerOptions", proofs: ProofChain, ending: ExitStack) -> Callable[[], None]:
+    """Declare the token of a driver that has one. Returns the function that ends it."""
+    if not options.share:
+        return lambda: None
+    session = ending.enter_context(open_session((), [options.endpoint], 5.0))
+    return declare_token(session, DriverToken(options.robot, options.share, proofs.token))
+
+
 def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
     """Drive, then do what `options.fault` names, for ever or for `options.seconds`."""
-
     end_s = time.monotonic() + options.seconds if options.seconds else float("inf")
-    with open_zenoh(options.robot, connect=[options.endpoint], role=options.certificate or options.source,
-                    timeout_s=15, secure=options.secure) as link:
-        script = Script(options, link, ledger)
+    proofs = ProofChain(secrets.token_bytes)
+    with ExitStack() as ending:
+        withdraw = _declare_driver(options, proofs, ending)  # first: the robot must know it before the first command
+        link = ending.enter_context(open_zenoh(
+            options.robot, connect=[options.endpoint], role=options.certificate or options.source, timeout_s=15,
+            secure=options.secure))
+        script = Script(options, link, ledger, proofs, withdraw)
         while not (pulled.is_set() and options.fault) and time.monotonic() < end_s:
             frame = script.frame()
             if frame is not None:
@@ -248,7 +240,6 @@ def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog
 
 
 # A client of the legacy protocol, which names no image. Shell.
-
 
 GUEST_HZ: Final = 20
 
@@ -406,7 +397,6 @@ def run_legacy_robot(options: "PeerOptions", _pulled: threading.Event, ledger: E
 
 
 # Commands that must not move the wheels, and good ones that must not hurt: what a scripted driver sends. Shell.
-
 
 LATE_S: Final = 0.5
 HOUR_US: Final = 3_600_000_000
@@ -573,15 +563,23 @@ def thousand(script: Script) -> None:
         script.attack(script.answer(frame))
 
 
+def after_token(script: Script) -> None:
+    """End the token of this driver; repeat its last twist, and send newer ones of its session on young frames."""
+    last = script.sent[-1]
+    script.withdraw()
+    for frame in _frames(script):
+        script.replay(last)
+        script.attack(script.answer(frame))
+
+
 ATTACKS: Final[dict[str, Callable[[Script], None]]] = {
     attack.__name__: attack
     for attack in (late, replay, never_issued, from_future, wrapped, malformed, flood, reversal, heartbeat, thousand,
-                   copied, copied_requests, future_frames, turn_round)
+                   copied, copied_requests, future_frames, turn_round, after_token)
 }
 
 
 # An operator as a process: requests STOP (then reset), or the presence of the robot. Shell.
-
 
 def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
     """Wait for the trigger, send the request, and print the reply."""
@@ -607,7 +605,6 @@ def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventL
 
 
 # A new operator: what `sightline stop` runs, in this process so that its first packet is noted. Shell.
-
 
 def run_stop(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
     """Wait for the trigger, stop the robot, and exit as the command does. A recording gets the datagrams."""
@@ -639,7 +636,6 @@ def run_stop(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) 
 
 
 # The real vision service with a ledger between it and the link, and a detector that can be made to fail. Shell.
-
 
 SLOW_S: Final = 0.33
 """Ten frame intervals at 30 fps."""
@@ -689,12 +685,16 @@ def run_vision(options: "PeerOptions", pulled: threading.Event, ledger: EventLog
                           options={"connect": (options.endpoint,)}, environ=os.environ)
     config = loaded.config
     assert isinstance(config, VisionConfig)
-    with LoggingLink(
-        open_zenoh(config.robot, connect=config.connect, role=VISION_SOURCE, timeout_s=15), ledger
-    ) as link:
+    opened = open_zenoh(config.robot, connect=config.connect, role=VISION_SOURCE, timeout_s=15)
+    with LoggingLink(opened, ledger) as link:
         serve(config, link, threading.Event(), lambda line: print(line, flush=True))
     return 0
 
+
+ROLES: Final[dict[Role, Callable[[PeerOptions, threading.Event, EventLog], int]]] = {
+    "vision": run_vision, "shared": run_shared, "driver": run_driver, "guest": run_guest, "legacy": run_legacy_robot,
+    "operator": run_operator, "stop": run_stop,
+}
 
 if __name__ == "__main__":
     sys.exit(main())

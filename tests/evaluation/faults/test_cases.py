@@ -17,8 +17,9 @@ from hypothesis import strategies as st
 
 from docs.make.faults import describe_machine, report_page
 from sightline.evaluation.checks import Check, at_most, worst_checks
-from sightline.evaluation.faults import cases, devices
+from sightline.evaluation.faults import cases, devices, drivers, stop_cases
 from sightline.evaluation.faults.cases import CASES, chosen
+from sightline.evaluation.faults.drivers import JOINED_GAP_MS, OWNER, STANDBY, handover_checks
 from sightline.evaluation.faults.evidence import (
     GOOD,
     INJECTED,
@@ -36,6 +37,7 @@ from sightline.evaluation.faults.evidence import (
     read_motors,
     stop_checks,
 )
+from sightline.evaluation.faults.fixture import ROBOT
 from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED, read_recording
 from sightline.evaluation.faults.report import passed, run_line, to_dict
 from sightline.evaluation.faults.runner import FaultOutcome, Injected, run_case, watched_us
@@ -48,6 +50,7 @@ from sightline.protocol.jpeg import read_jpeg_size
 from sightline.protocol.text import parse_twist
 from sightline.robot_side.kinematics import DiffDriveConfig
 from sightline.robot_side.safety.limits import SafetyConfig, stop_bound
+from sightline.vision_side.serving.assignment import assign
 
 RADIUS_M = DiffDriveConfig().wheel_radius_m
 TICK_US = 20_000
@@ -286,6 +289,94 @@ def test_robot_may_drive_from_the_first_command_that_a_new_network_process_lets_
     )
     [case] = chosen([row], short=False)
     assert case.inject(rig).resumed_us == began_us + 2_750_000 and [pid for pid, _ in signaled] == [7]
+
+
+@pytest.mark.parametrize(("row", "falls_ms", "zero_ms", "cpu_s", "ok"), [
+    ("stop.typed", 100, 540, 0.1, True), ("stop.typed", 100, 560, 0.1, False), ("stop.typed", 220, 540, 0.1, False),
+    ("stop.typed_slow", 100, 340, 0.1, True), ("stop.typed_slow", 100, 360, 0.1, False),
+    ("stop.typed_slow", 220, 340, 0.1, False), ("stop.typed_slow", 100, 340, 0.25, False),
+])
+def test_typed_stop_has_the_bounds_of_its_speed(monkeypatch, row, falls_ms, zero_ms, cpu_s, ok):
+    [case] = chosen([row], short=False)
+    before, ramp = [case.setup.linear_mps] * (200 // 20), (zero_ms - falls_ms) // 20 + 1
+    fast = [case.setup.linear_mps] * (falls_ms // 20)
+    speeds = [*before, *fast, *(fast[0] * (1 - k / ramp) for k in range(1, ramp + 1)), *[0.0] * 30]
+    used_s = iter([1.0, 1.0 + cpu_s])
+    monkeypatch.setattr(stop_cases, "monotonic_us", lambda: 200_000 - 1)
+    monkeypatch.setattr(stop_cases, "resource", SimpleNamespace(
+        RUSAGE_CHILDREN=0, getrusage=lambda who: SimpleNamespace(ru_utime=next(used_s), ru_stime=0.0)))
+    monkeypatch.setattr(stop_cases, "subprocess", SimpleNamespace(run=lambda *_, **__: SimpleNamespace(returncode=0)))
+    rig = SimpleNamespace(endpoint="", setup=case.setup, motors=lambda: log(speeds), watch=lambda seconds: None)
+    assert all(check.ok for check in case.inject(rig).checks) is ok
+
+
+# --- services that share robots ----------------------------------------------------------------------------------
+
+
+def circles(*sides, each=50, mps=0.5):
+    """A motor log of drivers that turn to one side each: 1 left, -1 right."""
+    turns = [side for side in sides for _ in range(each)]
+    return [MotorRow(index * TICK_US, mps / RADIUS_M - turn, mps / RADIUS_M + turn, 0.0, 0.0)
+            for index, turn in enumerate(turns)]
+
+
+def test_first_service_of_the_rows_is_the_better_choice_of_the_robot():
+    assert assign([ROBOT], {OWNER: 1.0, STANDBY: 1.0})[ROBOT] == (OWNER, STANDBY)
+
+
+def handed_over(rows, changes=1, gap_us=SENT_EVERY_US):
+    sent = [SentCommand(t_us, t_us) for t_us in (*range(0, 900_000, SENT_EVERY_US), *range(
+        891_000 + gap_us, rows[-1].t_us, SENT_EVERY_US))]
+    return [check.name for check in handover_checks(rows, sent, changes, JOINED_GAP_MS, rows[-1].t_us) if not check.ok]
+
+
+def test_robot_that_drives_on_under_the_next_driver_passes():
+    assert handed_over(circles(1, -1)) == handed_over(circles(1, -1, 1), 2) == []
+
+
+@pytest.mark.parametrize(("rows", "failed"), [
+    (circles(1, each=100), ["changes of the driver"]), (circles(1, -1, 1), ["no more changes"]),
+    (circles(*[1, -1] * 50, each=2), ["no more changes"]),
+    ([*circles(1, -1)[:60], *circles(1, -1, mps=0.0)[60:62], *circles(1, -1)[62:]], ["speed kept"]),
+])
+def test_robot_without_driver_or_with_two_is_found_in_the_motor_log(rows, failed):
+    assert handed_over(rows) == failed
+
+
+def test_robot_that_receives_no_command_for_a_while_is_found():
+    assert handed_over(circles(1, -1), gap_us=170_000) == ["between two commands"]
+    ended = handover_checks(circles(1, -1), commands(900_000), 1, JOINED_GAP_MS, 1_980_000)
+    assert [check.name for check in ended if not check.ok] == ["between two commands"]
+
+
+@pytest.mark.parametrize(("late_us", "code", "failed"), [
+    (0, 0, []), (100_000, 0, ["commands beside the driver"]), (0, 1, ["exit code"]), (0, None, ["exit code"]),
+])
+def test_handover_with_two_drivers_or_an_error_is_found(monkeypatch, late_us, code, failed):
+    rows, times = circles(1, -1, 1), range(0, 2_960_000, SENT_EVERY_US)
+    second = [one for one in map(SentCommand, times, times) if 1_000_000 <= one.t_us < 2_000_000]
+    first = [one for one in map(SentCommand, times, times) if not 1_000_000 + late_us <= one.t_us < 2_000_000]
+    clock = iter([0, 2_000_000, 2_500_000, rows[-1].t_us])
+    monkeypatch.setattr(drivers, "monotonic_us", lambda: next(clock))
+    processes = SimpleNamespace(wait_line=lambda *_: None, signal=lambda *_: None, exit_code=lambda *_: code)
+    rig = SimpleNamespace(
+        processes=processes, start_peer=lambda *_, **__: None, watch=lambda _: None, until=lambda *_: None,
+        motors=lambda: rows, sent=lambda name="": {"peer": first, "second": second}.get(name, sorted(
+            [*first, *second], key=lambda one: one.t_us)),
+    )
+    [case] = chosen(["token.handover"], short=False)
+    assert [check.name for check in case.inject(rig).checks if not check.ok] == failed
+
+
+def test_driver_repeats_its_last_twist_and_sends_newer_ones_only_after_its_token_ended():
+    done, frames = [], iter(["frame"])
+    script = SimpleNamespace(
+        sent=["first", "last"], withdraw=lambda: done.append("ended"), replay=done.append, attack=done.append,
+        answer=lambda frame: f"answer to {frame}", frame=lambda: next(frames),
+    )
+    with pytest.raises(RuntimeError):  # no more frames
+        ATTACKS["after_token"](script)
+    assert done == ["ended", "last", "answer to frame"]
 
 
 def test_rows_have_unique_names_and_state_their_bounds():
