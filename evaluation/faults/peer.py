@@ -23,11 +23,10 @@ from types import FrameType
 from typing import Any, Final, Literal, NamedTuple
 
 from sightline.evaluation.faults.evidence import FLOOD_AT_LEAST, GOOD, INJECTED, REQUESTED, EventLog
-from sightline.evaluation.faults.shared_service import run_shared
+from sightline.evaluation.faults.vision_peer import run_shared, run_vision
 from sightline.operator_side.client.requests import SOURCE as OPERATOR_SOURCE
 from sightline.operator_side.client.requests import Operator
 from sightline.operator_side.client.stop import stop_robot
-from sightline.operator_side.config.loading import load_service
 from sightline.protocol.channels import ACK, CHANNELS, FRAME, MAX_HEADER_BYTES, REQUEST, STATUS, TWIST, Channel, key_for
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
@@ -48,7 +47,7 @@ from sightline.protocol.messages import (
 from sightline.protocol.proof import NO_PROOF, ProofChain
 from sightline.protocol.text import format_twist
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint
-from sightline.protocol.transports.link import LatestSlot, Link, LinkWrapper, Message
+from sightline.protocol.transports.link import LatestSlot, Message
 from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.stop_datagram import StopRequests
 from sightline.protocol.transports.stop_port import stop_secret_file
@@ -59,10 +58,6 @@ from sightline.protocol.transports.zenoh.session import open_session
 from sightline.robot_side.kinematics import DiffDriveConfig, wheel_speeds
 from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
 from sightline.sim.bus import SimCamera, SimDrive, SimSocketConfig
-from sightline.vision_side.config import VisionConfig
-from sightline.vision_side.detect.onnx.detector import AutoDetector
-from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
-from sightline.vision_side.serving.process import serve
 
 Role = Literal["vision", "shared", "driver", "guest", "legacy", "operator", "stop"]
 
@@ -635,65 +630,12 @@ def run_stop(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) 
     os._exit(code)  # the link may still be opened
 
 
-# The real vision service with a ledger between it and the link, and a detector that can be made to fail. Shell.
-
-SLOW_S: Final = 0.33
-"""Ten frame intervals at 30 fps."""
-
-
-class LoggingLink(LinkWrapper):
-    """A link that notes every twist before it leaves."""
-
-    def __init__(self, link: Link, ledger: EventLog) -> None:
-        super().__init__(link)
-        self._ledger = ledger
-
-    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
-        """Publish with the fault of this peer, see `Link`."""
-        if channel is TWIST:
-            self._ledger.note(GOOD, decode(AnswerHeader, header).echo.t_us)
-        return self._link.publish(channel, header, payload, source)
-
-
-def _raise() -> None:
-    raise RuntimeError("the detector fails (injected by the bench)")
-
-
-FAULTS: Final[dict[str, Callable[[], None]]] = {
-    "raises": _raise, "hangs": lambda: time.sleep(3600), "slow": lambda: time.sleep(SLOW_S),
-}
-
-
-def _spoil_detector(fault: str, pulled: threading.Event, ledger: EventLog) -> None:
-    """Every detector built from now on does `fault` before it detects, once the trigger is pulled."""
-    detect = AutoDetector.detect
-
-    def spoiled(self: AutoDetector, *given: Any) -> Any:
-        if pulled.is_set():
-            ledger.note(INJECTED)
-            FAULTS[fault]()
-        return detect(self, *given)
-
-    AutoDetector.detect = spoiled  # type: ignore[assignment, method-assign]
-
-
-def run_vision(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
-    """Serve for ever."""
-    if options.fault:
-        _spoil_detector(options.fault, pulled, ledger)
-    loaded = load_service("vision", file=str(options.config) if options.config else None,
-                          options={"connect": (options.endpoint,)}, environ=os.environ)
-    config = loaded.config
-    assert isinstance(config, VisionConfig)
-    opened = open_zenoh(config.robot, connect=config.connect, role=VISION_SOURCE, timeout_s=15)
-    with LoggingLink(opened, ledger) as link:
-        serve(config, link, threading.Event(), lambda line: print(line, flush=True))
-    return 0
-
-
 ROLES: Final[dict[Role, Callable[[PeerOptions, threading.Event, EventLog], int]]] = {
-    "vision": run_vision, "shared": run_shared, "driver": run_driver, "guest": run_guest, "legacy": run_legacy_robot,
-    "operator": run_operator, "stop": run_stop,
+    "vision": lambda options, pulled, ledger: run_vision(
+        options.endpoint, options.config, options.fault, pulled, ledger),
+    "shared": lambda options, _pulled, ledger: run_shared(
+        options.endpoint, options.share, options.linear_mps, options.angular_rad_s, ledger),
+    "driver": run_driver, "guest": run_guest, "legacy": run_legacy_robot, "operator": run_operator, "stop": run_stop,
 }
 
 if __name__ == "__main__":

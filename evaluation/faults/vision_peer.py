@@ -1,0 +1,120 @@
+"""The vision service as a peer: alone, with a detector that can be made to fail, or with others that share robots.
+
+Shell. A ledger has each twist before it leaves.
+"""
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from sightline.evaluation.faults.evidence import GOOD, INJECTED, EventLog
+from sightline.operator_side.config.loading import load_service
+from sightline.protocol.channels import TWIST, Channel
+from sightline.protocol.codec import decode
+from sightline.protocol.config import Config
+from sightline.protocol.log import LOG_FORMATS, start_log
+from sightline.protocol.messages import AnswerHeader, CameraModel, Twist
+from sightline.protocol.transports.link import Link, LinkWrapper
+from sightline.protocol.transports.zenoh.link import ZenohLink, open_zenoh
+from sightline.vision_side.config import MissionConfig, ShareConfig, VisionConfig
+from sightline.vision_side.detect.onnx.detector import AutoDetector
+from sightline.vision_side.missions.port import Plan, View
+from sightline.vision_side.pipeline import SOURCE as VISION_SOURCE
+from sightline.vision_side.serving.process import run, serve
+
+SLOW_S: Final = 0.33
+"""Ten frame intervals at 30 fps."""
+
+
+class LoggingLink(LinkWrapper):
+    """A link that notes every twist before it leaves."""
+
+    def __init__(self, link: Link, ledger: EventLog) -> None:
+        super().__init__(link)
+        self._ledger = ledger
+
+    def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        """Publish with the fault of this peer, see `Link`."""
+        if channel is TWIST:
+            self._ledger.note(GOOD, decode(AnswerHeader, header).echo.t_us)
+        return self._link.publish(channel, header, payload, source)
+
+
+def _raise() -> None:
+    raise RuntimeError("the detector fails (injected by the bench)")
+
+
+FAULTS: Final[dict[str, Callable[[], None]]] = {
+    "raises": _raise, "hangs": lambda: time.sleep(3600), "slow": lambda: time.sleep(SLOW_S),
+}
+
+
+def _spoil_detector(fault: str, pulled: threading.Event, ledger: EventLog) -> None:
+    """Every detector built from now on does `fault` before it detects, once the trigger is pulled."""
+    detect = AutoDetector.detect
+
+    def spoiled(self: AutoDetector, *given: Any) -> Any:
+        if pulled.is_set():
+            ledger.note(INJECTED)
+            FAULTS[fault]()
+        return detect(self, *given)
+
+    AutoDetector.detect = spoiled  # type: ignore[assignment, method-assign]
+
+
+def run_vision(endpoint: str, file: Path | None, fault: str, pulled: threading.Event, ledger: EventLog) -> int:
+    """Serve for ever. The detector does `fault` once the trigger is pulled."""
+    if fault:
+        _spoil_detector(fault, pulled, ledger)
+    loaded = load_service("vision", file=str(file) if file else None, options={"connect": (endpoint,)},
+                          environ=os.environ)
+    config = loaded.config
+    assert isinstance(config, VisionConfig)
+    opened = open_zenoh(config.robot, connect=config.connect, role=VISION_SOURCE, timeout_s=15)
+    with LoggingLink(opened, ledger) as link:
+        serve(config, link, threading.Event(), lambda line: print(line, flush=True))
+    return 0
+
+
+# Services that share robots.
+
+_CIRCLE: Final = "sightline.evaluation.faults.vision_peer:CircleMission"
+
+
+class CircleConfig(Config):
+    """The twist that answers each frame."""
+
+    linear_mps: float
+    angular_rad_s: float
+
+
+class CircleMission:
+    """A mission: one circle. The motor log shows by its direction which service drives."""
+
+    Config = CircleConfig
+
+    def __init__(self, config: CircleConfig, _camera: CameraModel) -> None:
+        self._plan = Plan(Twist.model_validate(config.model_dump()), "circle")
+
+    def step(self, _view: View) -> Plan:
+        """Return the same plan for each frame."""
+        return self._plan
+
+
+def run_shared(endpoint: str, name: str, linear_mps: float, angular_rad_s: float, ledger: EventLog) -> int:
+    """Run what `sightline vision --share --name NAME` runs, until SIGTERM. The wheels of its robots make a circle."""
+    publish = ZenohLink.publish
+
+    def noted(self: ZenohLink, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
+        if channel is TWIST:
+            ledger.note(GOOD, decode(AnswerHeader, header).echo.t_us)
+        return publish(self, channel, header, payload, source)
+
+    ZenohLink.publish = noted  # type: ignore[method-assign]
+    start_log(LOG_FORMATS[0], "vision")
+    twist = {"linear_mps": linear_mps, "angular_rad_s": angular_rad_s}
+    return run(VisionConfig(robot="*", connect=(endpoint,), share=ShareConfig(enabled=True, name=name),
+                            mission=MissionConfig(kind=_CIRCLE, options=twist)))
