@@ -336,13 +336,13 @@ COMMAND_CASES: Final = (
         also="the other drives only after the lease"
     ),
     FaultCase("token.end", "tokens: the driving one of two services that share is killed", _kill_owner,
-              Setup("shared", routed=True, share=OWNER), stops=False,
+              Setup("shared", routed=True, share=OWNER), stops=False, alone=True,
               also=f"the other drives on: speed >= {KEPT_MPS:g} m/s, <= {KILLED_GAP_MS:g} ms between commands"),
     FaultCase("token.handover", "tokens: a better choice joins, then ends by SIGTERM", _hand_over,
-              Setup("shared", routed=True, share=STANDBY), stops=False,
+              Setup("shared", routed=True, share=STANDBY), stops=False, alone=True,
               also=f"speed >= {KEPT_MPS:g} m/s, <= {JOINED_GAP_MS:g} ms between commands, one driver at a time; "
               f"ends <= {ENDS_S:g} s"),
     FaultCase("token.late", "tokens: a driver goes on after the end of its token, also when its successor is killed",
-              _drive_without_token, Setup(fault="after_token", routed=True, share="former"),
+              _drive_without_token, Setup(fault="after_token", routed=True, share="former"), alone=True,
               also=f"0 motor log lines of it; until the kill speed >= {KEPT_MPS:g} m/s"),
 )

@@ -1,6 +1,6 @@
-"""The vision service as a peer: alone, with a detector that can be made to fail, or with others that share robots.
+"""The vision service as a peer: alone with a detector that fails on command, or with others that share robots. Shell.
 
-Shell. A ledger has each twist before it leaves.
+A ledger has each twist before it leaves.
 """
 
 import os
