@@ -2,7 +2,9 @@
 
 Each service computes the same order of services for a robot (`assignment.ranked`) from the tokens of all. The first one
 serves the robot. A service that serves a robot continues until one that is before it in the order has answered, so that
-a service that joins, or only claims to, leaves no robot without answers.
+a service that joins, or only claims to, leaves no robot without answers. The next two receive the answers of a robot.
+Each later one looks there only if it receives no answer of the services before it, to any robot, for its own number of
+seconds.
 """
 
 from collections.abc import Iterable
@@ -20,7 +22,7 @@ MAX_KEPT_TOKENS: Final = 1_000
 """Security limit: tokens that are stored. After a flood of more, the caller watches all that are present once more."""
 RECALL_US: Final = 5_000_000
 """Time in which the second watch has reported the tokens of before, also on a busy machine."""
-_WATCHED: Final = 2
+_STANDING_BY: Final = 2
 """Services that stand by for a robot, behind the one that serves it."""
 SILENT_US: Final = 1_000_000
 """Time without an answer, after which the next service looks whether there are frames to answer."""
@@ -74,6 +76,8 @@ class Assignment:
         self._ended: set[DetectorToken] | None = None
         """Tokens that ended since the second watch began, while it reports those of before; else None."""
         self._recall_us = 0
+        self._answered_us: dict[str, int] = {}
+        """Time of the newest answer of each other service, to any robot."""
         self._services = {own.session: own}
         self._robots: dict[str, _Robot] = {}
 
@@ -118,6 +122,8 @@ class Assignment:
         if services == self._services:
             return False
         self._services = services
+        for name in self._answered_us.keys() - services.keys():
+            del self._answered_us[name]
         # Without sharing no order is used, and that of a flood would take long.
         for robot, state in self._robots.items() if self.is_shared else ():
             state.order = self._order(robot)
@@ -147,11 +153,10 @@ class Assignment:
             state.serving = True
         if state.serving:
             return Duty.SERVE
-        if len(before) > _WATCHED:
-            return Duty.NOTHING
-        if now_us - _answered_us(state) < len(before) * _silent_us(state):
+        stands_by = len(before) <= _STANDING_BY
+        if now_us - self._heard_us(state, before) < len(before) * (_silent_us(state) if stands_by else SILENT_US):
             state.frames_since_us = None
-            return Duty.STAND_BY
+            return Duty.STAND_BY if stands_by else Duty.NOTHING
         if not _is_unanswered(state, now_us, self._unanswered_us):
             return Duty.WATCH
         state.silent.update(before)
@@ -176,7 +181,7 @@ class Assignment:
         gap_us = now_us - _answered_us(state)
         if state.answered_us and gap_us < SILENT_US:
             state.interval_us += (gap_us - state.interval_us) * (_SMOOTHING if state.interval_us else 1.0)
-        state.answered_us[service] = now_us
+        state.answered_us[service] = self._answered_us[service] = now_us
         state.silent.discard(service)
         for one in _until(state.order, service):
             if now_us - state.answered_us.get(one, state.since_us) > SILENT_US:
@@ -197,6 +202,13 @@ class Assignment:
     def _order(self, robot: str) -> list[str]:
         fit = {name: one.weight for name, one in self._services.items() if fnmatchcase(robot, one.robots)}
         return ranked(robot, fit)
+
+    def _heard_us(self, state: _Robot, before: list[str]) -> int:
+        """Return the time of the newest answer that counts for this robot."""
+        if len(before) <= _STANDING_BY:
+            return _answered_us(state)
+        # It does not receive the robot's answers. That a service before it answers another robot shows that it works.
+        return max(_answered_us(state), *(self._answered_us.get(name, 0) for name in before))
 
     def _before(self, state: _Robot) -> list[str]:
         return [name for name in _until(state.order, self._own.session) if name not in state.silent]

@@ -2,6 +2,8 @@
 
 from collections import Counter
 
+import pytest
+
 from sightline.protocol.transports.tokens import DetectorToken
 from sightline.vision_side.serving.assignment import ranked
 from sightline.vision_side.serving.detector_sharing import (
@@ -126,10 +128,62 @@ def test_service_with_a_long_deadline_is_not_replaced_before_it():
     assert time_to_replace(50_000, deadline_us=500_000) == 500_000 + 1_000_000
 
 
-def test_third_service_replaces_two_that_never_answer():
+def time_to_serve(robot, silent, weight=1.0):
+    """Return when a service serves a robot beside so many others that never answer, us."""
+    own, others = "ffffffff", [f"{number:08x}" for number in range(silent)]
+    one = Assignment(token(own), 100_000)
+    for name in others:
+        one.on_token(token(name, weight=weight), True)
+    one.update(0)
+    for now_us in range(0, 30_000_000, 20_000):
+        if one.duty(robot, now_us) is Duty.SERVE:
+            return now_us
+        if one.duty(robot, now_us) is Duty.WATCH:
+            one.on_frame(robot, now_us)
+    return None
+
+
+@pytest.mark.parametrize("silent", [1, 2, 3, 5, 9])
+def test_each_choice_replaces_those_before_it_after_its_own_number_of_seconds(silent):
+    """Any number of tokens that never answer, of any weight, leaves no robot without answers."""
+    assert time_to_serve("r1", silent, weight=1000.0) == silent * SILENT_US + UNANSWERED_US
+
+
+def test_later_choice_receives_nothing_of_a_robot_before_that():
     first, second, third, fourth = names_for("r1")
-    assert watch(service(third, first, second), "r1", 0, 10_000_000) == [Duty.STAND_BY, Duty.WATCH, Duty.SERVE]
-    assert watch(service(fourth, first, second, third), "r1", 0, 10_000_000) == [Duty.NOTHING]
+    one = service(fourth, first, second, third)
+    assert watch(one, "r1", 0, 10_000_000) == [Duty.NOTHING, Duty.WATCH, Duty.SERVE]
+
+
+def test_later_choice_that_receives_an_answer_looks_again_as_long_after_it():
+    first, second, third, fourth = names_for("r1")
+    one = service(fourth, first, second, third)
+    assert one.duty("r1", 0) is Duty.NOTHING
+    for last_us in (0, 3_000_000, 6_000_000):
+        assert one.duty("r1", last_us + 3 * SILENT_US - 1) is Duty.NOTHING
+        assert one.duty("r1", last_us + 3 * SILENT_US) is Duty.WATCH and not one.on_frame("r1", last_us + 3_000_000)
+        assert one.on_answer("r1", first, last_us + 3 * SILENT_US)
+    one.on_answer("r1", first, 9_033_000)
+    assert one.duty("r1", 9_033_000 + 3 * SILENT_US - 1) is Duty.NOTHING, "also after two answers in a row"
+    one.on_answer("r1", third, 12_000_000)
+    assert one.duty("r1", 12_000_000) is Duty.STAND_BY, "the first two are silent, so one service is before it"
+
+
+def test_later_choice_receives_nothing_while_a_service_before_it_answers_another_robot():
+    names = [f"s{number}" for number in range(6)]
+    robot, other = (next(one for one in ROBOTS if ranked(one, dict.fromkeys(names, 1.0)).index("s0") == place)
+                    for place in (5, 1))
+    one = service("s0", *names[1:])
+    first = ranked(other, dict.fromkeys(names, 1.0))[0]
+    duties = set()
+    for now_us in range(0, 20_000_000, FRAME_US):
+        one.on_answer(other, first, now_us)
+        duties.add(one.duty(robot, now_us))
+    assert duties == {Duty.NOTHING}
+    assert one.duty(robot, now_us + 5 * SILENT_US - 1) is Duty.NOTHING
+    assert one.duty(robot, now_us + 5 * SILENT_US) is Duty.WATCH
+    set_services(one, *(name for name in names[1:] if name != first), now_us=now_us)
+    assert first not in one._answered_us
 
 
 def test_answers_of_the_second_keep_the_third_from_serving():

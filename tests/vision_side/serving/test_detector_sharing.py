@@ -177,16 +177,18 @@ def test_detector_is_warm_before_its_service_joins(site):
     assert site.services[0]._detector.robots == [""]
 
 
-def test_tokens_that_never_answer_leave_no_robot_without_answers(site, monkeypatch):
+@pytest.mark.parametrize("silent", [1, 4])
+def test_tokens_that_never_answer_leave_no_robot_without_answers(site, monkeypatch, silent):
     """A service with a hanging detector, or none at all behind a token."""
     monkeypatch.setattr(detector_sharing, "SILENT_US", 100_000)
     monkeypatch.setattr(detector_sharing, "UNANSWERED_US", 50_000)
     mute = site.opened(open_fleet("*", role=ROLE, connect=[site.endpoint]))
-    withdraw = mute.declare_token(DetectorToken(GROUP, 5.0, "ffffffff"))
+    ends = [mute.declare_token(DetectorToken(GROUP, 1000.0, f"fffffff{number}")) for number in range(silent)]
     site.service()
     assert site.settled(1) and answers_of_a_round(site) == [1] * len(NAMES)
-    assert "of 2 services" in site.services[0].about()
-    withdraw()
+    assert f"of {silent + 1} services" in site.services[0].about()
+    for withdraw in ends:
+        withdraw()
     assert until(lambda: "of 1 services" in site.services[0].about())
 
 
