@@ -317,8 +317,12 @@ class FleetLink(Closing):
         """Declare a token. It ends with the returned function, which the caller keeps, with the session or process."""
 
     @abstractmethod
-    def watch_tokens(self, callback: Callable[[Token, bool], None]) -> None:
-        """Call `callback` on a transport thread with each token of robots and vision services, and its presence."""
+    def watch_tokens(self, callback: Callable[[Token, bool], None]) -> Callable[[], None]:
+        """Call `callback` on a transport thread with each token of robots and vision services, and its presence.
+
+        Returns:
+            What ends it. It ends with the session, too.
+        """
 
     @abstractmethod
     def watch_detectors(self, group: str, callback: Callable[[DetectorToken, bool], None]) -> Callable[[], None]:

@@ -38,13 +38,13 @@ from sightline.protocol.messages import (
     FrameHeader,
 )
 from sightline.protocol.transports.link import FleetLink, LatestSlot, Link, Message
-from sightline.protocol.transports.tokens import DetectorToken, parse_token
+from sightline.protocol.transports.tokens import DetectorToken, RobotToken, Token, parse_token
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.per_robot import DecoderPool
 from sightline.vision_side.detect.plugin_calls import checked_results, maker_of, notices_of
 from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector, detections_payload
 from sightline.vision_side.serving.detector_queue import BatchClock, FairQueue, FrameCounters, QueuedFrame
-from sightline.vision_side.serving.detector_sharing import Assignment, Duty
+from sightline.vision_side.serving.detector_sharing import Assignment, Duty, RobotTokens
 from sightline.vision_side.serving.process import ends_on_signal
 from sightline.vision_side.serving.service import LIVE_S
 
@@ -61,8 +61,9 @@ _MAX_REASONS: Final = 8
 """Reasons that are reported: a plug-in's may be another each time."""
 _OVERLOAD: Final = 0.1
 """Share of unanswered frames, above which an overload is reported."""
-_LOOK_PERIOD_S: Final = 0.02
-"""Between two looks at robots and other services, unless one of them has changed."""
+_LOOK_PERIOD_S, _LOOK_EACH_S = 0.02, 20e-6
+"""Between two looks at robots and other services, unless one of them has changed; and more for each robot: a look takes
+3 us for each."""
 _FOREIGN: Final = 10
 """Answers of a service that does not share, after which they are reported. One that joins may answer before its token
 has come."""
@@ -115,7 +116,7 @@ def run(
     with limit_floods(config.listen, lambda line: _log.info("detector: %s", line)):
         opened = open_fleet(
             config.robot, listen=config.listen, connect=config.connect, role=ROLE, secure=config.secure,
-            max_frame_bytes=config.max_frame_bytes,
+            max_frame_bytes=config.max_frame_bytes, by_status=options.weight is None,
             about=lambda: services[0].about() if services else f"{options.name}: starts",
         )
         with opened as fleet_link, ends_on_signal(ending):
@@ -250,7 +251,7 @@ class DetectorService:
         self._bell.put(True)
 
     def _look_if_due(self, now_s: float) -> None:
-        if self._changed.is_set() or now_s - self._looked_s >= _LOOK_PERIOD_S:
+        if self._changed.is_set() or now_s - self._looked_s >= _LOOK_PERIOD_S + _LOOK_EACH_S * len(self._duties):
             self._changed.clear()
             self._looked_s = now_s
             self._look_around()
@@ -259,11 +260,11 @@ class DetectorService:
         """Report the detector's notices, drop robots that left, add new ones, and take up or end their service."""
         for line in notices_of(self._detector):
             self._report(f"detector: {line}")
-        present = self._fleet_link.robots()
-        for robot in self._duties.keys() - present:
-            self._forget(robot)
         if self._sharing is not None:
             self._sharing.update(monotonic_us())
+        present = self._sharing.robots(monotonic_us()) if self._sharing is not None else self._fleet_link.robots()
+        for robot in self._duties.keys() - present:
+            self._forget(robot)
         for robot in present:
             duty = self._sharing.duty(robot, monotonic_us()) if self._sharing is not None else Duty.SERVE
             before = self._duties.get(robot, Duty.NOTHING)
@@ -474,6 +475,7 @@ class _Sharing:
         """Answers of services that do not share."""
         fleet_link.watch_detectors(own.group, self._note)
         self._end_recall: Callable[[], None] = lambda: None
+        self._watch_robots(RobotTokens(own.robots))
         time.sleep(_JOIN_S)
         self.leave = fleet_link.declare_token(own)
 
@@ -487,6 +489,27 @@ class _Sharing:
             if is_present:
                 self._assignment.on_recalled(token)
         self._on_change()
+
+    def _watch_robots(self, robots: RobotTokens) -> None:
+        """Note the tokens of robots in `robots` from now on, also those that are there."""
+
+        def note(token: Token, is_present: bool) -> None:
+            if isinstance(token, RobotToken):
+                with self._guard:
+                    robots.on_token(token.robot, is_present, monotonic_us())
+                self._on_change()
+
+        self._robots = robots
+        self._end_robots = self._fleet_link.watch_tokens(note)
+
+    def robots(self, now_us: int) -> list[str]:
+        """Return the present robots."""
+        with self._guard:
+            present, needs_tokens = self._robots.present(now_us), self._robots.needs_tokens(now_us)
+        if needs_tokens:
+            self._end_robots()
+            self._watch_robots(RobotTokens(self._own.robots, present, now_us))
+        return present
 
     @property
     def services(self) -> int:

@@ -22,6 +22,10 @@ MAX_KEPT_TOKENS: Final = 1_000
 """Security limit: tokens that are stored. After a flood of more, the caller watches all that are present once more."""
 RECALL_US: Final = 5_000_000
 """Time in which the second watch has reported the tokens of before, also on a busy machine."""
+MAX_ROBOTS: Final = 10_000
+"""Security limit: robots that are known. After a flood of more, the caller watches all tokens once more."""
+LEFT_US: Final = 10_000_000
+"""Time without its token after which a robot has left. Its link, or that of this service, may be back before."""
 _STANDING_BY: Final = 2
 """Services that stand by for a robot, behind the one that serves it."""
 SILENT_US: Final = 1_000_000
@@ -62,6 +66,44 @@ class _Robot:
     frames_since_us: int | None = None
     """Time of the first frame of the stream that this service watches."""
     frame_us: int = 0
+
+
+class RobotTokens:
+    """The robots that have a token, or had one a moment ago."""
+
+    def __init__(self, pattern: str, before: Iterable[str] = (), now_us: int = 0) -> None:
+        """Create it. The robots in `before` leave unless their token is reported once more.
+
+        Args:
+            pattern: of the robots that count. One without wildcards needs no token, so that an older robot is served.
+            before: robots that were known.
+            now_us: time.
+        """
+        self._pattern = pattern
+        self._ended_us: dict[str, int | None] = dict.fromkeys(before, now_us)
+        """Robots, and when their token ended; None while it is present."""
+        if not set("*?") & set(pattern):
+            self._ended_us[pattern] = None
+        self._began_us, self._left_out = now_us, False
+
+    def on_token(self, robot: str, is_present: bool, now_us: int) -> None:
+        """Note a robot's token that appeared or ended."""
+        if robot == self._pattern or not fnmatchcase(robot, self._pattern):
+            return
+        if robot in self._ended_us or (is_present and len(self._ended_us) < MAX_ROBOTS):
+            self._ended_us[robot] = None if is_present else now_us
+        else:
+            self._left_out |= is_present
+
+    def present(self, now_us: int) -> list[str]:
+        """Return the robots, and forget those that have left."""
+        for robot in [one for one, at_us in self._ended_us.items() if at_us is not None and now_us - at_us >= LEFT_US]:
+            del self._ended_us[robot]
+        return list(self._ended_us)
+
+    def needs_tokens(self, now_us: int) -> bool:
+        """Return True if there is room for tokens that were left out: the caller watches all once more."""
+        return self._left_out and len(self._ended_us) < MAX_ROBOTS and now_us - self._began_us >= LEFT_US
 
 
 class Assignment:

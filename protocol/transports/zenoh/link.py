@@ -461,14 +461,16 @@ class ZenohFleet(FleetLink):
         """Declare a token. It ends with the returned function, which the caller keeps, with the session or process."""
         return declare_token(self._session, token)
 
-    def watch_tokens(self, callback: Callable[[Token, bool], None]) -> None:
+    def watch_tokens(self, callback: Callable[[Token, bool], None]) -> Callable[[], None]:
         """Call `callback` on a thread of Zenoh with each token of robots and vision services, and its presence."""
         def note(token: AnyToken, is_present: bool) -> None:
             # Detectors have groups of their own. `watch_detectors` reports one of them.
             if not isinstance(token, DetectorToken):
                 callback(token, is_present)
 
-        self._ending.callback(watch_tokens(self._session, ALL_TOKENS, note))
+        end = watch_tokens(self._session, ALL_TOKENS, note)
+        self._ending.callback(end)
+        return end
 
     def watch_detectors(self, group: str, callback: Callable[[DetectorToken, bool], None]) -> Callable[[], None]:
         """Call `callback` on a thread of Zenoh with each token in `group`, and whether it is present."""
@@ -476,7 +478,7 @@ class ZenohFleet(FleetLink):
             if isinstance(token, DetectorToken):
                 callback(token, is_present)
 
-        # Not all tokens: a site has many robots, and a detector service needs none of their tokens.
+        # Not all tokens: a site has many robots, and `watch_tokens` reports theirs.
         end = watch_tokens(self._session, detectors_of(group), note)
         self._ending.callback(end)
         return end

@@ -7,13 +7,16 @@ import pytest
 from sightline.protocol.transports.tokens import DetectorToken
 from sightline.vision_side.serving.assignment import ranked
 from sightline.vision_side.serving.detector_sharing import (
+    LEFT_US,
     MAX_KEPT_TOKENS,
+    MAX_ROBOTS,
     MAX_SERVICES,
     RECALL_US,
     SILENT_US,
     UNANSWERED_US,
     Assignment,
     Duty,
+    RobotTokens,
 )
 
 ROBOTS = [f"r{number}" for number in range(200)]
@@ -310,3 +313,51 @@ def test_token_that_is_known_does_not_count_as_left_out():
     flood(one, range(MAX_KEPT_TOKENS))
     flood(one, range(MAX_KEPT_TOKENS), is_present=False)
     assert not one.needs_tokens(0)
+
+
+def test_robot_is_present_from_its_token_on_and_for_a_while_after_it():
+    robots = RobotTokens("r*")
+    for name in ("r1", "r2", "a1"):
+        robots.on_token(name, True, 0)
+    assert robots.present(0) == ["r1", "r2"]
+    robots.on_token("r1", False, 1)
+    assert robots.present(LEFT_US) == ["r1", "r2"] and robots.present(LEFT_US + 1) == ["r2"]
+    robots.on_token("r1", False, LEFT_US + 2)
+    assert robots.present(LEFT_US + 2) == ["r2"], "the end of a token that was not known"
+    robots.on_token("r2", False, LEFT_US + 2)
+    robots.on_token("r2", True, LEFT_US + 3)
+    assert robots.present(9 * LEFT_US) == ["r2"], "its link was cut for a moment"
+
+
+def test_robot_that_is_named_needs_no_token():
+    robots = RobotTokens("r1")
+    robots.on_token("r1", False, 0)
+    robots.on_token("r2", True, 0)
+    assert robots.present(9 * LEFT_US) == ["r1"] and not robots.needs_tokens(9 * LEFT_US)
+
+
+def test_robot_that_came_in_a_flood_of_tokens_is_found_after_it():
+    robots = RobotTokens("*")
+    for number in range(MAX_ROBOTS):
+        robots.on_token(f"f{number}", True, 0)
+    robots.on_token("r1", True, 0)
+    assert len(robots.present(LEFT_US)) == MAX_ROBOTS and not robots.needs_tokens(LEFT_US)
+    robots.on_token("f0", False, 1)
+    robots.on_token("f1", True, 1)
+    assert robots.present(LEFT_US) and not robots.needs_tokens(LEFT_US)
+    present = robots.present(LEFT_US + 1)
+    assert len(present) == MAX_ROBOTS - 1 and robots.needs_tokens(LEFT_US + 1)
+    again = RobotTokens("*", present, LEFT_US + 1)
+    for name in ("r1", "f1"):
+        again.on_token(name, True, LEFT_US + 1)
+    assert len(again.present(LEFT_US + 1)) == MAX_ROBOTS, "none has left yet"
+    assert again.present(2 * LEFT_US + 1) == ["f1", "r1"]
+
+
+def test_all_tokens_are_watched_again_once_in_a_while_at_most():
+    robots = RobotTokens("*", now_us=LEFT_US)
+    for number in range(MAX_ROBOTS + 1):
+        robots.on_token(f"f{number}", True, LEFT_US)
+    robots.on_token("f0", False, 0)
+    assert len(robots.present(LEFT_US)) == MAX_ROBOTS - 1
+    assert not robots.needs_tokens(2 * LEFT_US - 1) and robots.needs_tokens(2 * LEFT_US)

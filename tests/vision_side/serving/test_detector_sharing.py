@@ -10,7 +10,7 @@ from sightline.protocol.channels import DETECTIONS, FRAME, STATUS
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import DetectionsHeader, FrameHeader, Stamp, State, Status
-from sightline.protocol.transports.tokens import DetectorToken
+from sightline.protocol.transports.tokens import DetectorToken, RobotToken
 from sightline.protocol.transports.zenoh.link import declare_token, open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.session import open_session
 from sightline.vision_side.decode import Decoder
@@ -65,7 +65,7 @@ class Site:
     def service(self, share=True):
         """Start one more service; returns what ends it."""
         lines, over = [], threading.Event()
-        fleet_link = self.opened(open_fleet("*", connect=[self.endpoint], role=ROLE))
+        fleet_link = self.opened(open_fleet("*", connect=[self.endpoint], role=ROLE, by_status=not share))
         service = DetectorService(fleet_link, Finder(), ServingOptions("finder", 1_000_000), lines.append)
         # Of two random ones, one in 128 pairs leaves all robots to one service.
         service._session = f"0a0a0a{len(self.lines):02x}"
@@ -87,7 +87,7 @@ class Site:
         return end
 
     def send(self, *names):
-        """Let each robot send its status and one frame."""
+        """Let each robot send its status and one frame. Services that share find it by its token."""
         for name in names or NAMES:
             self.seq += 1
             stamp = {"session": "0000abcd", "seq": self.seq, "t_us": self.seq * 1_000}
@@ -223,3 +223,16 @@ def test_flood_of_tokens_ends_the_sharing_and_no_answers(site, monkeypatch):
         assert answers_of_a_round(site, 2) == [2] * len(NAMES), "as without sharing"
     assert site.settled(2) and answers_of_a_round(site) == [1] * len(NAMES)
     assert all("detector: 2 services share the robots" in lines for lines in site.lines)
+
+
+def test_robots_that_come_in_a_flood_of_tokens_are_served_after_it(site, monkeypatch):
+    monkeypatch.setattr(detector_sharing, "MAX_ROBOTS", 4)
+    monkeypatch.setattr(detector_sharing, "LEFT_US", 100_000)
+    for name in NAMES[:-1]:
+        site.links.pop(name).close()
+    with closing(open_session((), [site.endpoint], 5.0)) as flood:
+        declared = [declare_token(flood, RobotToken(f"f{number}")) for number in range(9)]
+        late = site.opened(open_zenoh("r9", connect=[site.endpoint], role="robot"))
+        site.service()
+        assert until(lambda: site.serving() == [4]) and len(declared) == 9 and late.connected
+    assert until(lambda: set(site.services[0]._duties) == {NAMES[-1], "r9"})
