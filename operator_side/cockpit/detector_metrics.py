@@ -30,7 +30,7 @@ class DetectorMetrics:
 
     def is_ready(self) -> bool:
         """Return True while frames would be answered, whether or not a robot is present."""
-        return self._service is not None and self._service.is_live()
+        return self._service is not None and self._service.is_ready()
 
     def collect(self) -> Iterator[Family]:
         """Yield the present metrics."""

@@ -218,6 +218,11 @@ class Link(Closing):
 
     robot: str
 
+    @property
+    @abstractmethod
+    def connected(self) -> bool:
+        """Return True if at least one peer is connected. Never blocks."""
+
     @abstractmethod
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
         """Send a message now, or drop it. Never blocks on a slow peer.
@@ -339,6 +344,11 @@ class LinkWrapper(Link):
     def __init__(self, link: Link) -> None:
         self.robot = link.robot
         self._link = link
+
+    @property
+    def connected(self) -> bool:
+        """Forward to the link."""
+        return self._link.connected
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
         """Forward to the link."""
@@ -481,8 +491,3 @@ class BaseLink(Link):
     def rejected(self) -> Counter[str]:
         """Return the rejected messages and peers, by reason."""
         return self._rules.rejected
-
-    @property
-    @abstractmethod
-    def connected(self) -> bool:
-        """Return True if at least one peer is connected. Never blocks."""

@@ -100,6 +100,11 @@ class LinkGroup(Link):
         self.robot = links[0].robot
         self.links = tuple(links)
 
+    @property
+    def connected(self) -> bool:
+        """Return True if at least one link has a peer."""
+        return any(link.connected for link in self.links)
+
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
         """Publish on all links. Returns True if at least one accepted the message."""
         # A list, not a generator: `any` would stop at the first link that accepts, and the others would get nothing.

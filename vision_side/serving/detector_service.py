@@ -120,10 +120,12 @@ def run(
             about=lambda: services[0].about() if services else f"{options.name}: starts",
         )
         with opened as fleet_link, ends_on_signal(ending):
-            services.append(DetectorService(fleet_link, detector, options, _log.info))
+            services.append(DetectorService(fleet_link, detector, options, _log.info, bool(config.connect)))
             where = ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)])
             _log.info("detector: %s for robots %s at %s", options.name, config.robot, where)
-            if options.weight is not None:
+            if options.weight is None:
+                services[0].warm_up()
+            else:
                 services[0].join(options.weight, options.robots)
             if observe is not None:
                 observe(services[0])
@@ -143,8 +145,13 @@ class _Batch:
 class DetectorService:
     """One detector, a place for the newest frame of each robot, and turns. Frames arrive on the link's threads."""
 
-    def __init__(self, fleet_link: FleetLink, detector: Detector, options: ServingOptions, report: LogLine) -> None:
+    def __init__(
+        self, fleet_link: FleetLink, detector: Detector, options: ServingOptions, report: LogLine,
+        needs_peer: bool = False,
+    ) -> None:
+        """Create the service. With `needs_peer` it is not ready without a session to a router or robot."""
         self._fleet_link, self._detector, self._options, self._report = fleet_link, detector, options, report
+        self._needs_peer, self._is_warm, self._ending = needs_peer, False, threading.Event()
         self._session = secrets.token_hex(4)
         self._guard = threading.Lock()
         self._queue: FairQueue[Message] = FairQueue(options.max_batch, options.deadline_us)
@@ -183,7 +190,7 @@ class DetectorService:
         Raises:
             ConfigError: no other service would accept the share.
         """
-        self._warm_up()
+        self.warm_up()
         maker = maker_of(self._detector)
         what = maker.model_hash if maker is not None and maker.model_hash else self._options.name
         # A token has three decimals. All services must compute with one weight.
@@ -195,6 +202,7 @@ class DetectorService:
 
     def serve(self, ending: threading.Event) -> None:
         """Serve until `ending` is set."""
+        self._ending = ending
         thread = threading.Thread(target=self._prepare_ahead, name="prepare", daemon=True)
         thread.start()
         try:
@@ -245,6 +253,11 @@ class DetectorService:
         with self._guard:
             busy_us = self._batch_clock.busy_us(monotonic_us())
         return busy_us < LIVE_S * 1e6 and time.monotonic() - self._looked_s <= LIVE_S
+
+    def is_ready(self) -> bool:
+        """Return True while frames would be answered: detector and session are open, and it does not end."""
+        is_open = self._fleet_link.connected or not self._needs_peer
+        return self._is_warm and is_open and not self._ending.is_set() and self.is_live()
 
     def _on_change(self) -> None:
         self._changed.set()
@@ -311,12 +324,13 @@ class DetectorService:
 
         return receive
 
-    def _warm_up(self) -> None:
+    def warm_up(self) -> None:
         """Detect in a gray image: the first one takes seconds on some devices."""
         jpeg = simplejpeg.encode_jpeg(np.full((*reversed(_WARM_UP_PX), 3), 128, np.uint8))
         header = FrameHeader(session="00000000", seq=0, t_us=0)
         frame = self._pixels.frame("", header, jpeg, _WARM_UP_PX)
         checked_results(self._detector, [frame], monotonic_us() + _WARM_UP_US, monotonic_us)
+        self._is_warm = True
 
     # --- batches: taken and decoded, here or ahead on another thread, then examined here ---
 

@@ -88,7 +88,8 @@ class Fleet:
 
     def serve(self, ending: threading.Event, observe: Observe | None = None) -> None:
         """Serve until `ending` is set. `observe` receives the state."""
-        state = ServingState(self.counts, ending, time.monotonic())
+        state = ServingState(self.counts, ending, time.monotonic(),
+                             lambda: not self._config.connect or self._fleet_link.connected)
         if observe is not None:
             observe(state)
         try:

@@ -100,7 +100,8 @@ def serve(
 ) -> None:
     """Answer frames that come over `link` until `ending` is set."""
     service = open_service(config, link, report, detector)
-    state = ServingState(lambda: [service.counts()], ending, time.monotonic())
+    state = ServingState(lambda: [service.counts()], ending, time.monotonic(),
+                         lambda: not config.connect or link.connected)
     if observe is not None:
         observe(state)
     while state.turns():

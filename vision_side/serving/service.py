@@ -67,6 +67,8 @@ class ServingState:
     ending: threading.Event
     turned_s: float
     """Begin of the newest turn of its loop, on `time.monotonic`."""
+    is_open: Callable[[], bool]
+    """Whether there is a session to a router or robot. It need not be there where the service only listens."""
 
     @property
     def is_live(self) -> bool:
@@ -75,8 +77,8 @@ class ServingState:
 
     @property
     def is_ready(self) -> bool:
-        """Return True while new robots may come: link and detector are open, and it does not end."""
-        return self.is_live and not self.ending.is_set()
+        """Return True while new robots may come: session and detector are open, and it does not end."""
+        return self.is_live and self.is_open() and not self.ending.is_set()
 
     def turns(self) -> bool:
         """Note a turn. Returns False when the service must end."""

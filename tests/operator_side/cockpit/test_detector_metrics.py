@@ -32,6 +32,8 @@ def test_load_ages_and_outcomes_are_served(monkeypatch):
         assert get(port, "ready")[0] == 503 and get(port, "live")[0] == 200, "it starts"
         assert "detector" not in get(port, "metrics")[1]
         observe(bench.service)
+        assert get(port, "ready")[0] == 503 and get(port, "live")[0] == 200, "its detector is not warm"
+        bench.service.warm_up()
         assert get(port, "ready")[0] == get(port, "live")[0] == 200
         text = get(port, "metrics")[1]
         values = dict(line.rsplit(" ", 1) for line in text.splitlines() if line.startswith("sightline_detector"))

@@ -62,18 +62,24 @@ def test_probes_of_a_supervisor(live, ready):
 def test_vision_service_is_live_while_its_loop_turns_and_ready_until_it_ends():
     metrics, ending = VisionMetrics(), threading.Event()
     assert (metrics.is_live(), metrics.is_ready()) == (True, False), "before the link is open"
-    state = ServingState(list, ending, time.monotonic())
+    sessions = ["router"]
+    state = ServingState(list, ending, time.monotonic(), lambda: bool(sessions))
     metrics.look_at(state)
     assert (metrics.is_live(), metrics.is_ready()) == (True, True), "without a robot"
     state.turned_s -= LIVE_S + 0.1
     assert (metrics.is_live(), metrics.is_ready()) == (False, False), "its loop hangs"
     assert state.turns() and metrics.is_ready()
+    assert sessions.pop() and (metrics.is_live(), metrics.is_ready()) == (True, False), "its session ended"
+    sessions.append("router")
+    assert metrics.is_ready()
     ending.set()
     assert not state.turns() and (metrics.is_live(), metrics.is_ready()) == (True, False), "it ends"
 
 
 class EmptySite:
     """A link to a site without a robot. Its loop hangs in `robots` while `hang` is set."""
+
+    connected = True
 
     def __init__(self):
         self.hang, self.on_new_robot = threading.Event(), lambda callback: None
@@ -91,8 +97,8 @@ def idle_fleet(monkeypatch):
     monkeypatch.setattr(fleet, "_LONGEST_WAIT_S", 0.02)
     port, site, ending, states = free_port(), EmptySite(), threading.Event(), []
 
-    def begin():
-        running = fleet.Fleet(VisionConfig(robot="r*"), site, lambda line: None)
+    def begin(connect=("tcp/127.0.0.1:1",)):
+        running = fleet.Fleet(VisionConfig(robot="r*", connect=connect), site, lambda line: None)
         arguments = (ending, lambda one: (states.append(one), observe(one)))
         threading.Thread(target=running.serve, args=arguments, daemon=True).start()
         assert until(lambda: states, 3)
@@ -119,6 +125,17 @@ def test_fleet_without_a_robot_is_ready_until_it_ends_and_live_while_its_loop_tu
     assert until(lambda: probes() == [200, 200, 200], 3)
     ending.set()
     assert probes() == [200, 503, 503]
+
+
+@pytest.mark.parametrize(("connect", "ready"), [(("tcp/127.0.0.1:1",), 503), ((), 200)])
+def test_fleet_that_connects_is_ready_only_with_a_session(idle_fleet, connect, ready):
+    port, site, _, begin = idle_fleet
+    begin(connect)
+    assert [_status(port, path) for path in ("live", "ready")] == [200, 200]
+    site.connected = False
+    assert [_status(port, path) for path in ("live", "ready", "health")] == [200, ready, ready]
+    site.connected = True
+    assert _status(port, "ready") == 200
 
 
 @pytest.mark.parametrize("said", [b"", b"GET /hea"])

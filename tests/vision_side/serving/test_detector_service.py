@@ -1,7 +1,9 @@
 """The detector service over a link in memory: its messages, drops and counts for every answer of the detector."""
 
+import signal
 import threading
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 
 import pytest
@@ -46,6 +48,8 @@ class Named:
 class Bench:
     """A robot, and the service that looks at its frames."""
 
+    connected = True
+
     def __init__(self, detector, **serving):
         self.network, self.words, self.seq, self.present = MemoryNetwork(seed=31), [], 0, ["r1"]
         self.robot = self.network.link("r1")
@@ -55,6 +59,15 @@ class Bench:
 
     def robots(self):
         return self.present
+
+    def watch_detectors(self, _group, _callback):
+        return lambda: None
+
+    def watch_tokens(self, _callback):
+        return lambda: None
+
+    def declare_token(self, _token):
+        return lambda: None
 
     def on_new_robot(self, callback):
         self.ring = callback
@@ -313,3 +326,30 @@ def test_service_that_shares_subscribes_to_no_status(monkeypatch, weight):
     with pytest.raises(LinkError):
         run(VisionConfig(), Named(GOOD), ServingOptions("named", weight=weight))
     assert opened["by_status"] is (weight is None)
+
+
+@pytest.mark.parametrize("weight", [None, 1.0])
+@pytest.mark.parametrize(("connect", "ready"), [(("tcp/127.0.0.1:1",), [True, False, True]), ((), [True, True, True])])
+def test_service_is_ready_once_it_is_warm_while_its_session_is_open_and_until_it_ends(
+    monkeypatch, weight, connect, ready
+):
+    bench, found = Bench(Named(GOOD)), []
+    monkeypatch.setattr("sightline.protocol.transports.zenoh.link.open_fleet", lambda *_, **__: nullcontext(bench))
+    assert not bench.service.is_ready(), "not warm"
+
+    def observe(service):
+        found.append(service)
+        for bench.connected in (True, False, True):
+            found.append(service.is_ready())
+        monkeypatch.setattr(service, "_look_around", end)
+
+    def end():
+        signal.raise_signal(signal.SIGTERM)
+        found.append(found[0].is_ready())
+
+    options = ServingOptions("named", weight=weight)
+    assert run(VisionConfig(connect=connect), Named(GOOD), options, observe) == 0
+    assert found[1:] == [*ready, False], "it ends"
+    monkeypatch.setattr("sightline.vision_side.serving.detector_service.LIVE_S", -1.0)
+    found[0]._ending.clear()
+    assert not found[0].is_ready(), "it hangs"

@@ -455,3 +455,15 @@ def test_second_robot_with_one_id_is_rejected_and_logged(bench, monkeypatch):
     refused = [line for line in bench.said if "rejecting frames" in line]
     assert len(refused) == 2, refused  # first the old one, for a moment, then the second robot
     assert f"rejecting frames of session {OTHER}: robot r1 is steered in session {SHOWN}" in refused[-1]
+
+
+def test_service_of_one_robot_that_connects_is_open_with_a_session():
+    for connect, is_open in ((("tcp/127.0.0.1:1",), [True, False]), ((), [True, True])):
+        network, states, ending = MemoryNetwork(seed=1), [], threading.Event()
+        link = network.link("r1", role="vision")
+        ending.set()
+        serve(COLOR.model_copy(update={"connect": connect}), link, ending, lambda _line: None, states.append)
+        network.link("r1")
+        found = [states[0].is_open()]
+        link.close()
+        assert [*found, states[0].is_open()] == is_open
