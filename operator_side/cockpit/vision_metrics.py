@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
@@ -23,9 +25,12 @@ class VisionMetrics:
 
     def __init__(self) -> None:
         self._state: ServingState | None = None
+        self._busy: tuple[float, dict[str, int]] = (0.0, {})
+        """Time of the newest scrape, and how long each robot's frames had been answered by then."""
 
     def look_at(self, state: ServingState) -> None:
         """Use `state` as the source."""
+        self._busy = time.monotonic(), {}
         self._state = state
 
     def is_live(self) -> bool:
@@ -43,6 +48,9 @@ class VisionMetrics:
         def each(value: Callable[[ServiceCounts], float]) -> dict[tuple[str, ...], float]:
             return {(one.robot,): value(one) for one in rows}
 
+        yield gauge("vision_robots", "robots that it drives", {(): sum(one.drives for one in rows)})
+        yield gauge("vision_busy_ratio", "share of the time since the scrape before in which it answered frames; of "
+                    "several threads that of the busiest", {(): self._busy_ratio(rows)})
         yield gauge("vision_hears", "whether frames arrive", each(lambda one: float(one.heard)), "robot")
         yield gauge("vision_drives", "whether it drives the robot; 0 while it stands by", each(lambda one: one.drives),
                     "robot")
@@ -60,10 +68,24 @@ class VisionMetrics:
         yield counter("vision_frames_skipped", "frames without a detection", skipped, "robot", "reason")
         yield gauge("vision_compute_seconds", "frame to answer, the newest", each(lambda one: one.compute_us / 1e6),
                     "robot")
+        ages: dict[tuple[str, ...], float] = {
+            (one.robot,): one.queue_p95_us / 1e6 for one in rows if one.queue_p95_us is not None
+        }
+        yield gauge("vision_queue_age_seconds", "age of frames when their turn came, 95th percentile", ages, "robot")
         known: dict[tuple[str, ...], float] = {
             (one.robot,): one.latency_us / 1e6 for one in rows if one.latency_us is not None
         }
         yield gauge("vision_latency_seconds", "capture to accepted command, as the robot measured it", known, "robot")
+
+    def _busy_ratio(self, rows: list[ServiceCounts]) -> float:
+        now_s, (before_s, before) = time.monotonic(), self._busy
+        self._busy = now_s, {one.robot: one.busy_us for one in rows}
+        threads: Counter[int] = Counter()
+        for one in rows:
+            earlier_us = before.get(one.robot, 0)
+            # A service that was started again counts from 0.
+            threads[one.thread] += one.busy_us - (earlier_us if earlier_us <= one.busy_us else 0)
+        return min(1.0, max(threads.values(), default=0) / 1e6 / max(1e-6, now_s - before_s))
 
 
 @contextmanager

@@ -175,17 +175,18 @@ class BatchClock:
 
     def queue_p95_us(self) -> int | None:
         """Return the 95th percentile of the age of frames when their turn came, us."""
-        return _p95(self._queue_ages_us)
+        return percentile_95(self._queue_ages_us)
 
     def answer_p95_us(self) -> int | None:
         """Return the 95th percentile of the age of frames when their boxes were sent, us."""
-        return _p95(self._answer_ages_us)
+        return percentile_95(self._answer_ages_us)
 
 
 def _smoothed(before: float, now: float) -> float:
     return before + (now - before) * (_SMOOTHING if before else 1.0)
 
 
-def _p95(ages: deque[int]) -> int | None:
+def percentile_95(ages: deque[int]) -> int | None:
+    """Return the 95th percentile, or None without an age. Another thread may add ages meanwhile."""
     ordered = sorted(ages.copy())
     return ordered[int(len(ordered) * 0.95)] if ordered else None

@@ -23,6 +23,7 @@ from sightline.vision_side.detect.plugin_calls import attach_detector
 from sightline.vision_side.detect.port import Detector
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.pipeline import Frame, FrameLoss, Observation, Pipeline, PipelineAnswer, answer_header
+from sightline.vision_side.serving.detector_queue import percentile_95
 from sightline.vision_side.serving.legacy_robot import assumed_camera, camera_line, is_legacy, target_box
 from sightline.vision_side.serving.mission_channel import NO_FRAMES, MissionChannel
 from sightline.vision_side.tracking.locate import REMEMBERED, BoxReader
@@ -52,8 +53,15 @@ class ServiceCounts:
     """Times that this robot's service failed and another one was started."""
     received: int = 0
     """Frames that came, also those that no turn took."""
+    busy_us: int = 0
+    """Time in which its frames were answered, in `thread`."""
+    thread: int = 0
+    queue_p95_us: int | None = None
+    """95th percentile of the age of its frames when their turn came; None without one."""
 
 
+_QUEUE_AGES: Final = 256
+"""Ages stored for the percentile: those of some seconds."""
 LIVE_S: Final = 10.0
 """A loop that has not turned for this long hangs. A turn waits 0.2 s for a frame, and computes one detection."""
 
@@ -266,6 +274,8 @@ class Service:
         self._blind_since_s = 0.0
         self._newest: tuple[int, int | None] = (0, None)
         self.answered = self.steered = 0
+        self._arrived_us = self._busy_us = self._thread = 0
+        self._queue_ages_us: deque[int] = deque(maxlen=_QUEUE_AGES)
         self.skipped: Counter[str] = Counter()
         self._skipped_images = SkipCounter()
         self._mission_channel = MissionChannel(config, link, self._detector, self._log_change, self._reject)
@@ -283,7 +293,9 @@ class Service:
                 self._link.subscribe(channel, self._receive)
 
     def _receive(self, message: Message) -> None:
-        self._received += message.channel is FRAME
+        if message.channel is FRAME:
+            self._received += 1
+            self._arrived_us = monotonic_us()
         (self._ahead if self.is_standby else self._frames).put(message)
 
     def begin(self) -> None:
@@ -342,7 +354,8 @@ class Service:
         heard, (compute_us, latency_us) = time.monotonic() - self._heard_s <= _SILENCE_S, self._newest
         return ServiceCounts(self._config.robot, heard and self.answered > 0, self.answered, self.steered,
                       dict(self.skipped.copy()), self._frames.dropped, compute_us, latency_us,
-                      received=self._received)
+                      received=self._received, busy_us=self._busy_us, thread=self._thread,
+                      queue_p95_us=percentile_95(self._queue_ages_us))
 
     def _look_at_camera(self) -> None:
         """Take in the camera's model; a new one needs a new pipeline."""
@@ -363,6 +376,15 @@ class Service:
         self._log_change("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
 
     def _frame(self, message: Message, started_ns: int) -> None:
+        """Answer a message. Note how long a frame waited, and how long its answer took."""
+        if message.channel is FRAME:
+            arrived_us = self._arrived_us  # read before the clock: the next frame may arrive now
+            self._queue_ages_us.append(monotonic_us() - arrived_us)
+        self._answer(message, started_ns)
+        self._busy_us += (time.perf_counter_ns() - started_ns) // 1000
+        self._thread = threading.get_ident()
+
+    def _answer(self, message: Message, started_ns: int) -> None:
         header = self._decoded(FrameHeader, message.header, MAX_HEADER_BYTES)
         if header is None:
             return
@@ -565,7 +587,7 @@ class BoxesService(Service):
     def _arrivals(self) -> LatestSlot[Message]:
         return self._inbox
 
-    def _frame(self, message: Message, started_ns: int) -> None:
+    def _answer(self, message: Message, started_ns: int) -> None:
         """Acknowledge a frame, or answer boxes."""
         if message.channel is DETECTIONS:
             self._boxes(message, started_ns)

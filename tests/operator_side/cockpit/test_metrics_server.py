@@ -7,17 +7,19 @@ import time
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
+from dataclasses import replace
+from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import pytest
 
-from sightline.operator_side.cockpit import http_server
+from sightline.operator_side.cockpit import http_server, vision_metrics
 from sightline.operator_side.cockpit.http_server import MAX_CONNECTIONS
 from sightline.operator_side.cockpit.metrics import serving
 from sightline.operator_side.cockpit.vision_metrics import VisionMetrics, served
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving import fleet
-from sightline.vision_side.serving.service import LIVE_S, ServingState
+from sightline.vision_side.serving.service import LIVE_S, ServiceCounts, ServingState
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
 
@@ -136,6 +138,34 @@ def test_fleet_that_connects_is_ready_only_with_a_session(idle_fleet, connect, r
     assert [_status(port, path) for path in ("live", "ready", "health")] == [200, ready, ready]
     site.connected = True
     assert _status(port, "ready") == 200
+
+
+def samples(metrics):
+    """Return the values of the metrics by name and robot."""
+    return {(one.name, *one.labels.values()): one.value for family in metrics.collect() for one in family.samples}
+
+
+def test_load_and_robots_of_a_vision_service(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(vision_metrics, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    rows = [ServiceCounts("r1", True, 1, 1, {}, 0, 0, None, thread=1, queue_p95_us=20_000),
+            ServiceCounts("r2", True, 1, 1, {}, 0, 0, None, thread=1),
+            ServiceCounts("r3", True, 1, 1, {}, 0, 0, None, thread=2, drives=False)]
+    metrics = VisionMetrics()
+    assert samples(metrics)["sightline_vision_busy_ratio",] == samples(metrics)["sightline_vision_robots",] == 0
+    metrics.look_at(ServingState(lambda: rows, threading.Event(), 0.0, lambda: True))
+    for seconds, busy_us, ratio in ((10, (2_000_000, 1_000_000, 400_000), 0.3),
+                                    (5, (2_500_000, 1_000_000, 400_000), 0.1),
+                                    (1, (300_000, 1_000_000, 400_000), 0.3),  # a new service of r1
+                                    (1, (300_000, 1_000_000, 999_000), 0.599),
+                                    (0, (900_000, 1_000_000, 999_000), 1.0)):
+        clock[0] += seconds
+        rows = [replace(one, busy_us=us) for one, us in zip(rows, busy_us, strict=True)]
+        found = samples(metrics)
+        assert found["sightline_vision_busy_ratio",] == pytest.approx(ratio)
+    assert found["sightline_vision_robots",] == 2
+    assert found["sightline_vision_queue_age_seconds", "r1"] == 0.02
+    assert ("sightline_vision_queue_age_seconds", "r2") not in found
 
 
 @pytest.mark.parametrize("said", [b"", b"GET /hea"])

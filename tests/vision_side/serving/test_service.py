@@ -18,6 +18,7 @@ from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Message
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.serving import service as service_module
 from sightline.vision_side.serving.process import serve
 from sightline.vision_side.serving.service import Service, SkipCounter
 from tests.fixtures.ports import free_endpoint
@@ -455,6 +456,25 @@ def test_second_robot_with_one_id_is_rejected_and_logged(bench, monkeypatch):
     refused = [line for line in bench.said if "rejecting frames" in line]
     assert len(refused) == 2, refused  # first the old one, for a moment, then the second robot
     assert f"rejecting frames of session {OTHER}: robot r1 is steered in session {SHOWN}" in refused[-1]
+
+
+def test_wait_of_frames_and_time_of_answers_are_counted(monkeypatch):
+    bench, clock = Bench(), [1_000_000]
+    monkeypatch.setattr(service_module, "monotonic_us", lambda: clock[0])
+    bench.camera()
+    assert bench.service.counts().queue_p95_us is None and bench.service.counts().busy_us == 0
+    for seq in range(1, 21):
+        bench.robot.publish(FRAME, encode(FrameHeader(session="0000abcd", seq=seq, t_us=seq * 33_333)), BALL)
+        bench.now_us += 33_333
+        bench.network.advance(bench.now_us)
+        clock[0] += 40_000 if seq == 20 else 5_000
+        bench.service.turn(0.0)
+        clock[0] += 28_333
+    counts = bench.service.counts()
+    assert counts.queue_p95_us == 40_000 and counts.busy_us > 0 and counts.thread == threading.get_ident()
+    bench.robot.publish(CAMERA, encode(Stamp(session="0000abcd", seq=2, t_us=0)), encode(MODEL))
+    bench.turn()
+    assert bench.service.counts() == counts, "without a frame"
 
 
 def test_service_of_one_robot_that_connects_is_open_with_a_session():
