@@ -15,8 +15,8 @@ from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, parse_zeno
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.protocol.transports.tokens import DriverToken, RobotToken, Token, VisionToken
-from sightline.protocol.transports.zenoh.discovery import Discovered, discover, find_listeners
-from sightline.protocol.transports.zenoh.presence import PeerInfo
+from sightline.protocol.transports.zenoh.discovery import MAX_ROBOTS, Discovered, discover, find_listeners
+from sightline.protocol.transports.zenoh.presence import MAX_PEERS, PeerInfo
 
 _ROLE_WIDTH = 9
 
@@ -25,23 +25,34 @@ def lines(found: Discovered) -> Iterator[str]:
     """Format a line for each: robots first, then the other peers."""
     statuses, peers, shared = found.statuses, found.peers, shared_robots(found.tokens)
     robots = {peer.presence.robot: peer for peer in peers if peer.presence.role == ROBOT_ROLE}
-    for robot in sorted({*statuses, *robots}):
+    for robot in sorted(_robots(found)):
         state = _status_words(robot, statuses[robot]) if robot in statuses else f"{robot}: no status"
         services = f"; {_services(*shared[robot])}" if robot in shared else ""
         yield f"{ROBOT_ROLE:{_ROLE_WIDTH}} {state}{_about(robots.get(robot))}{services}"
     for peer in peers:
         if peer.presence.role != ROBOT_ROLE:
             yield f"{peer.presence.role:{_ROLE_WIDTH}} of {peer.presence.robot}{_about(peer)}"
+    if len(peers) >= MAX_PEERS:
+        yield f"{MAX_PEERS} peers are listed, which is the limit; versions of other robots are not known"
+    if found.left_out:
+        yield f"{found.left_out} more robots are not listed; the limit is {MAX_ROBOTS}"
+
+
+def _robots(found: Discovered) -> set[str]:
+    """Return the robots with a status, an answer or a token."""
+    answered = (peer.presence.robot for peer in found.peers if peer.presence.role == ROBOT_ROLE)
+    return {*found.statuses, *answered, *(token.robot for token in found.tokens if isinstance(token, RobotToken))}
 
 
 def as_object(found: Discovered) -> dict[str, Any]:
     """Return the robots and the other peers as JSON types, for scripts."""
     shared = shared_robots(found.tokens)
-    robots = [_status_object(name, found.statuses[name]) for name in sorted(found.statuses)]
+    robots = [_status_object(name, found.statuses[name]) if name in found.statuses
+              else {"robot": name, "error": "no status"} for name in sorted(_robots(found))]
     for robot in robots:
         if robot["robot"] in shared:
             robot["driven_by"], robot["standby"] = shared[robot["robot"]]
-    return {"robots": robots, "peers": [_peer_object(peer) for peer in found.peers]}
+    return {"robots": robots, "peers": [_peer_object(peer) for peer in found.peers], "left_out": found.left_out}
 
 
 def shared_robots(tokens: Collection[Token]) -> dict[str, tuple[str, str]]:
@@ -122,13 +133,15 @@ class DiscoveryReport:
 
     def as_object(self) -> dict[str, Any]:
         """Return the robots and peers of all places as JSON types, and the error of each failed place."""
-        whole: dict[str, Any] = {"robots": [], "peers": [], "places": list(self.places), "errors": {}}
+        whole: dict[str, Any] = {"robots": [], "peers": [], "left_out": 0, "places": list(self.places), "errors": {}}
         for place, found in self.places.items():
             if isinstance(found, SightlineError):
                 whole["errors"][place] = str(found)
                 continue
-            for name, rows in as_object(found).items():
-                whole[name] += [{**row, "at": place} for row in rows]
+            rows = as_object(found)
+            whole["left_out"] += rows["left_out"]
+            for name in ("robots", "peers"):
+                whole[name] += [{**row, "at": place} for row in rows[name]]
         return whole
 
 
@@ -154,7 +167,7 @@ def discover_all(connect: Sequence[str] | None, seconds: float, secure: str) -> 
 
 
 def _checked(report: DiscoveryReport, seconds: float) -> DiscoveryReport:
-    if any(isinstance(found, Discovered) and (found.statuses or found.peers) for found in report.places.values()):
+    if any(isinstance(found, Discovered) and (found.peers or _robots(found)) for found in report.places.values()):
         return report
     errors = "; ".join(report.lines())  # without a robot or peer, only errors have a line
     raise LinkError(

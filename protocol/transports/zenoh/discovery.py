@@ -15,10 +15,17 @@ from sightline.protocol.errors import ConfigError, home_path, install_command
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_zenoh_endpoint
 from sightline.protocol.transports.link import LinkRules, Message
 from sightline.protocol.transports.security import RoleKeys, load_role_keys
-from sightline.protocol.transports.tokens import ALL_TOKENS, AnyToken, DetectorToken, Token
+from sightline.protocol.transports.tokens import (
+    ALL_TOKENS,
+    AnyToken,
+    DetectorToken,
+    DriverToken,
+    RobotToken,
+    Token,
+    VisionToken,
+)
 from sightline.protocol.transports.zenoh.link import watch_tokens
 from sightline.protocol.transports.zenoh.presence import (
-    MAX_PEERS,
     QUERY_ROUNDS,
     REPLY_TIMEOUT_S,
     PeerInfo,
@@ -36,7 +43,9 @@ _BETWEEN_QUERIES_S: Final = 0.05
 
 # Security limits: no more answers and tokens than this are kept.
 MAX_LISTENERS: Final = 64
-MAX_TOKENS: Final = 10_000
+MAX_ROBOTS: Final = 10_000
+MAX_SERVICES: Final = 256
+_MOST: Final[dict[type[AnyToken], int]] = {RobotToken: MAX_ROBOTS, DriverToken: MAX_ROBOTS, VisionToken: MAX_SERVICES}
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +55,8 @@ class Discovered:
     statuses: dict[str, Message]
     peers: list[PeerInfo]
     tokens: frozenset[Token] = frozenset()
+    left_out: int = 0
+    """Robots whose token did not fit."""
 
 
 def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discovered:
@@ -54,18 +65,36 @@ def discover(connect: Sequence[str], seconds: float, secure: str = "") -> Discov
     with ExitStack() as ending:
         session = open_session((), connect, seconds, _own_keys(secure))
         ending.callback(session.close)
-        tokens: set[Token] = set()
-        ending.callback(watch_tokens(session, ALL_TOKENS, lambda token, is_present: _note(tokens, token, is_present)))
-        return Discovered(_statuses(session, ending), _listen(session, seconds), frozenset(tokens))
+        tokens = PresentTokens()
+        ending.callback(watch_tokens(session, ALL_TOKENS, tokens.note))
+        return Discovered(_statuses(session, ending), _listen(session, seconds), tokens.all(), tokens.left_out)
 
 
-def _note(tokens: set[Token], token: AnyToken, is_present: bool) -> None:
-    if isinstance(token, DetectorToken):
-        return
-    if not is_present:
-        tokens.discard(token)
-    elif len(tokens) < MAX_TOKENS:
-        tokens.add(token)
+class PresentTokens:
+    """The tokens of robots and of the services that share them, as far as they fit."""
+
+    def __init__(self) -> None:
+        self._kept: dict[type[AnyToken], set[Token]] = {kind: set() for kind in _MOST}
+        self.left_out = 0
+        """Robots whose token did not fit."""
+
+    def note(self, token: AnyToken, is_present: bool) -> None:
+        """Note a token that appeared or ended."""
+        if isinstance(token, DetectorToken):
+            return
+        # Each kind has its own limit, so that a flood of services or drivers hides no robot.
+        kept = self._kept[type(token)]
+        if is_present and (token in kept or len(kept) < _MOST[type(token)]):
+            kept.add(token)
+        elif token in kept:
+            kept.discard(token)
+        elif isinstance(token, RobotToken):
+            # Zenoh may report an end whose begin it did not report.
+            self.left_out = max(0, self.left_out + (1 if is_present else -1))
+
+    def all(self) -> frozenset[Token]:
+        """Return those that are present."""
+        return frozenset().union(*self._kept.values())
 
 
 def _own_keys(folder: str) -> RoleKeys | None:
@@ -102,7 +131,7 @@ def _statuses(session: zenoh.Session, ending: ExitStack) -> dict[str, Message]:
     def note(sample: zenoh.Sample) -> None:
         key, attachment = str(sample.key_expr), sample.attachment
         parsed = parse_key(key)
-        if parsed is None or (parsed[0] not in found and len(found) >= MAX_PEERS):
+        if parsed is None or (parsed[0] not in found and len(found) >= MAX_ROBOTS):
             return
         robot, header = parsed[0], b"" if attachment is None else attachment.to_bytes()
         LinkRules(robot).deliver(STATUS, key, header, sample.payload.to_bytes(),

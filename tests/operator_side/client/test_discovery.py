@@ -7,6 +7,7 @@ from sightline.operator_side.client.discovery import discover_all
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.link import Message
+from sightline.protocol.transports.tokens import RobotToken
 from sightline.protocol.transports.zenoh.discovery import Discovered
 
 PLACES = ["tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447"]
@@ -42,6 +43,13 @@ def test_errors_of_places_without_a_robot_are_reported(network):
     with pytest.raises(LinkError) as error:
         discover_all(None, 0.6, "")
     assert str(error.value) == f"{PLACES[1]}: pass --secure DIR"
+
+
+def test_robot_with_only_a_token_is_listed(network):
+    network.update(zip(PLACES, [EMPTY, Discovered({}, [], frozenset([RobotToken("r1")]))], strict=True))
+    report = discover_all(None, 0.6, "")
+    assert list(report.lines()) == [f"{PLACES[1]}: robot     r1: no status  (no version reported)"]
+    assert report.as_object()["robots"] == [{"robot": "r1", "error": "no status", "at": PLACES[1]}]
 
 
 @pytest.mark.parametrize("other", [EMPTY, LinkError("no answer")])

@@ -3,11 +3,21 @@
 import os
 import subprocess
 import sys
+import threading
+from contextlib import closing
 
 import pytest
 
-from sightline.protocol.transports.zenoh.discovery import find_listeners
-from sightline.protocol.transports.zenoh.session import MULTICAST_OFF, multicast_section, session_config
+from sightline.operator_side.client.discovery import DiscoveryReport, as_object, lines
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import Stamp, State, Status
+from sightline.protocol.transports.tokens import DetectorToken, DriverToken, RobotToken, VisionToken
+from sightline.protocol.transports.zenoh import discovery
+from sightline.protocol.transports.zenoh.discovery import Discovered, PresentTokens, discover, find_listeners
+from sightline.protocol.transports.zenoh.link import declare_token
+from sightline.protocol.transports.zenoh.presence import MAX_PEERS, PeerInfo, Presence
+from sightline.protocol.transports.zenoh.session import MULTICAST_OFF, multicast_section, open_session, session_config
+from tests.fixtures.ports import free_endpoint
 
 INSIDE = """
 import fcntl, os, socket, struct, subprocess, sys
@@ -78,3 +88,63 @@ def test_two_robots_on_a_network_are_found_despite_a_used_group_port():
         "tcp/10.9.8.1:7702: robot     r2: no status",
         "robot     r4: no status",
     ], done
+
+
+def test_every_robot_with_a_token_is_listed_and_the_others_are_counted():
+    tokens = PresentTokens()
+    for number in range(discovery.MAX_ROBOTS + 3):
+        tokens.note(RobotToken(f"r{number}"), True)
+        tokens.note(DriverToken(f"r{number}", "a", "0" * 32), True)
+    for number in range(discovery.MAX_SERVICES + 3):
+        tokens.note(VisionToken(f"v{number}", 1.0, "0000000a"), True)
+    tokens.note(DetectorToken("0a1b2c3d", 1.0, "0000abcd"), True)
+    tokens.note(RobotToken("r0"), True)
+    assert len(tokens.all()) == 2 * discovery.MAX_ROBOTS + discovery.MAX_SERVICES and tokens.left_out == 3
+    tokens.note(RobotToken("r10001"), False)
+    tokens.note(RobotToken("r0"), False)
+    assert tokens.left_out == 2
+    for _ in range(3):
+        tokens.note(RobotToken("r10002"), False)
+    assert tokens.left_out == 0, "also if an end is reported twice"
+
+
+def test_lines_of_many_robots_end_with_what_is_left_out():
+    robots = frozenset(RobotToken(f"r{number}") for number in range(500))
+    found = Discovered({}, [], robots, 7)
+    said = list(lines(found))
+    assert len(said) == 501 and said[-1] == f"7 more robots are not listed; the limit is {discovery.MAX_ROBOTS}"
+    assert len(as_object(found)["robots"]) == 500 and as_object(found)["left_out"] == 7
+    whole = DiscoveryReport({"a": found, "b": found}).as_object()
+    assert len(whole["robots"]) == 1000 and whole["left_out"] == 14
+
+
+def test_robots_beyond_the_limit_of_peers_have_no_version_and_a_line_names_the_limit():
+    peers = [PeerInfo(Presence(role="robot", robot=f"r{number}", session=f"{number:08x}"), 0, 0)
+             for number in range(MAX_PEERS)]
+    robots = frozenset(RobotToken(f"r{number}") for number in range(MAX_PEERS + 1))
+    assert len(list(lines(Discovered({}, peers[:-1], robots)))) == MAX_PEERS + 1
+    said = list(lines(Discovered({}, peers, robots)))
+    assert len(said) == MAX_PEERS + 2 and f"robot     r{MAX_PEERS}: no status  (no version reported)" in said
+    assert said[-1] == "256 peers are listed, which is the limit; versions of other robots are not known"
+
+
+def test_all_robots_of_a_large_site_are_found_by_status_and_token():
+    endpoint, done = free_endpoint(), threading.Event()
+    header, status = encode(Stamp(session="0000abcd", seq=1, t_us=1)), encode(Status(state=State.HOLD, reason="test"))
+
+    def publish():
+        while not done.wait(0.1):
+            for number in range(300):
+                site.put(f"sightline/r{number}/status", status, attachment=header)
+
+    with closing(open_session([endpoint], (), 5.0)) as site:
+        declared = [declare_token(site, RobotToken(f"r{number}")) for number in range(100, 400)]
+        thread = threading.Thread(target=publish)
+        thread.start()
+        try:
+            found = discover([endpoint], 0.6)
+        finally:
+            done.set()
+            thread.join()
+    assert len(found.statuses) == len(found.tokens) == len(declared) == 300 and found.left_out == 0
+    assert sum(line.startswith("robot ") for line in lines(found)) == 400

@@ -103,7 +103,9 @@ def test_robots_that_services_share_are_listed_with_their_driver_and_standby():
     said = list(lines(found))
     assert said[0].endswith("; service a, standby b")
     assert said[1].endswith("; service b, standby a")
-    assert as_object(found)["robots"][0] | {"error": ""} == {
+    assert said[2:] == ["robot     r3: no status  (no version reported); no service drives it, standby b"]
+    assert [row["robot"] for row in as_object(found)["robots"]] == ["r1", "r2", "r3"]
+    assert as_object(found)["robots"][1] | {"error": ""} == {
         "robot": "r2", "error": "", "driven_by": "b", "standby": "a"
     }
     assert shared_robots({*robots, services[0]}) == dict.fromkeys(("r1", "r2", "r3"), ("", "a")), "nothing drives yet"
