@@ -8,6 +8,7 @@ import pytest
 from sightline.protocol.channels import FRAME, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports import open as open_module
+from sightline.protocol.transports.link import LinkWrapper
 from sightline.protocol.transports.open import LinkGroup, open_link
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
@@ -16,11 +17,12 @@ from tests.fixtures.ports import free_endpoint
 def test_peers_of_both_kinds_send_and_receive():
     zenoh, web = free_endpoint(), free_endpoint("ws://")
     with open_link("r1", listen=[zenoh, web], role="robot") as robot:
+        assert not robot.connected and not LinkWrapper(robot).connected
         twists = robot.latest(TWIST)
         for endpoint in (zenoh, web):
             with open_link("r1", connect=[endpoint], role="vision") as peer:
                 frames = peer.latest(FRAME)
-                assert until(lambda: robot.has_listener(FRAME))
+                assert until(lambda: robot.has_listener(FRAME)) and robot.connected and LinkWrapper(robot).connected
                 assert until(lambda taken=frames.take: robot.publish(FRAME, b"{}", b"jpeg") and taken(0.05))
                 assert until(lambda say=peer.publish: say(TWIST, b"{}", b"0|0") and twists.take(0.05))
             assert until(lambda: not robot.has_listener(FRAME))

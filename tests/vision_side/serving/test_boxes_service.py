@@ -174,6 +174,13 @@ def test_frames_that_a_standby_receives_count_as_received():
     assert (after.received, after.answered, after.overtaken) == (2, before.answered, before.overtaken)
 
 
+def test_only_frames_have_a_queue_age():
+    bench = Bench()
+    bench.frame(1)
+    bench.boxes(1, ball_at(1.0, 0.3))
+    assert len(bench.service._queue_ages_us) == 1 and bench.service.counts().busy_us > 0
+
+
 def test_lost_frames_count_also_next_to_replaced_ones():
     """The header of each replaced frame is noted, so that it leaves no gap. Three of 25 frames do not arrive."""
     bench = Bench()

@@ -14,11 +14,14 @@ from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import Detections, FrameHeader
 from sightline.protocol.transports.memory import MemoryNetwork
+from sightline.protocol.transports.tokens import DriverToken, RobotToken, VisionToken
 from sightline.vision_side.config import HsvConfig, VisionConfig
 from sightline.vision_side.detect.color.detectors import Hsv
 from sightline.vision_side.detect.filters import LabelFilter
 from sightline.vision_side.detect.port import Circle, Detection, Maker, result_of
+from sightline.vision_side.serving import detector_sharing
 from sightline.vision_side.serving.detector_service import DetectorService, ServingOptions, _BatchDecoder, run
+from sightline.vision_side.serving.detector_sharing import Duty
 from tests.fixtures.links import until
 from tests.fixtures.vision.remote import BALL_JPEG, GREY_JPEG
 
@@ -52,6 +55,8 @@ class Bench:
 
     def __init__(self, detector, **serving):
         self.network, self.words, self.seq, self.present = MemoryNetwork(seed=31), [], 0, ["r1"]
+        self.watches = []
+        """What receives the tokens of robots."""
         self.robot = self.network.link("r1")
         self.heard = self.robot.latest(DETECTIONS)
         serving = {"deadline_us": 5_000_000, **serving}  # a machine that halts for a moment makes no answer late
@@ -63,8 +68,9 @@ class Bench:
     def watch_detectors(self, _group, _callback):
         return lambda: None
 
-    def watch_tokens(self, _callback):
-        return lambda: None
+    def watch_tokens(self, callback):
+        self.watches.append(callback)
+        return lambda: self.watches.remove(callback)
 
     def declare_token(self, _token):
         return lambda: None
@@ -353,3 +359,42 @@ def test_service_is_ready_once_it_is_warm_while_its_session_is_open_and_until_it
     monkeypatch.setattr("sightline.vision_side.serving.detector_service.LIVE_S", -1.0)
     found[0]._ending.clear()
     assert not found[0].is_ready(), "it hangs"
+
+
+@pytest.mark.parametrize(("robots", "looks"), [(0, [False, True, True]), (5_000, [False, False, True])])
+def test_looks_at_many_robots_leave_time_for_their_frames(monkeypatch, robots, looks):
+    bench, found = Bench(Named(GOOD)), []
+    bench.service._changed.clear()
+    bench.service._duties = dict.fromkeys(map(str, range(robots)), Duty.NOTHING)
+    monkeypatch.setattr(bench.service, "_look_around", lambda: found.append(True))
+    for after_s, is_due in zip((0.019, 0.099, 0.121), looks, strict=True):
+        bench.service._looked_s = 100.0
+        bench.service._look_if_due(100.0 + after_s)
+        assert bool(found) is is_due
+        found.clear()
+    bench.ring()
+    bench.service._look_if_due(bench.service._looked_s)
+    assert found, "as soon as one comes"
+
+
+def test_tokens_of_robots_that_did_not_fit_are_watched_again_in_place_of_the_first_watch(monkeypatch):
+    monkeypatch.setattr(detector_sharing, "MAX_ROBOTS", 2)
+    monkeypatch.setattr(detector_sharing, "LEFT_US", 0)
+    bench = Bench(Named(GOOD))
+    bench.service.join(1.0, "*")
+    first, = bench.watches
+    others = VisionToken("a", 1.0, "0000000a"), DriverToken("r9", "a", "0" * 32)
+    for token in (*others, *map(RobotToken, ("r1", "r2", "r3"))):
+        first(token, True)
+    bench.service._look_around()
+    assert set(bench.service._duties) == {"r1", "r2"} and bench.watches == [first]
+    first(RobotToken("r1"), False)
+    bench.service._look_around()
+    again, = bench.watches
+    assert again is not first and set(bench.service._duties) == {"r2"}
+    monkeypatch.setattr(detector_sharing, "LEFT_US", 60_000_000)
+    bench.service._look_around()
+    assert set(bench.service._duties) == {"r2"} and bench.watches == [again], "none has left meanwhile"
+    again(RobotToken("r3"), True)
+    bench.service._look_around()
+    assert set(bench.service._duties) == {"r2", "r3"}
