@@ -74,14 +74,16 @@ class Site:
         thread = threading.Thread(target=service.serve, args=(over,), daemon=True)
         thread.start()
 
-        def end():
-            fleet_link.close()
+        def stop():
             over.set()
             thread.join(5)
-            if service in self.services:
-                self.services.remove(service)
 
-        self._ending.callback(end)
+        def end():
+            fleet_link.close()
+            stop()
+            self.services.remove(service)
+
+        self._ending.callback(stop)
         self.services.append(service)
         self.lines.append(lines)
         return end
