@@ -122,13 +122,13 @@ def test_services_share_the_robots_and_each_frame_goes_to_one(site):
     robots, (first, second), *_ = site
     assert not first.driving & second.driving
     since_us = monotonic_us()
-    sent = sum(robot.record["sent"] for robot in robots)
+    sent = sum(len(robot.record["sent_us"]) for robot in robots)
     assert drives_on(robots, since_us)
-    sent = sum(robot.record["sent"] for robot in robots) - sent
+    sent = sum(len(robot.record["sent_us"]) for robot in robots) - sent
     answered = sum(service.answered for one in (first, second) for service in one.fleet.services.values())
     accepted = sum(at_us > since_us for robot in robots for at_us, _, _ in robot.accepted)
     assert sent - 2 * len(robots) <= accepted <= sent + len(robots), (accepted, sent)
-    assert answered <= sum(robot.record["sent"] for robot in robots), "no frame goes to two services"
+    assert answered <= sum(len(robot.record["sent_us"]) for robot in robots), "no frame goes to two services"
 
 
 @pytest.mark.parametrize("how", ["die", "end"])
