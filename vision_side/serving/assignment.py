@@ -27,15 +27,16 @@ def ranked(robot: str, weights: Mapping[str, float]) -> list[str]:
     return [names[index] for index in np.argsort(-scores)]
 
 
-def assign(robots: Collection[str], weights: Mapping[str, float]) -> dict[str, tuple[str, str]]:
-    """Return the owner and the standby of each robot.
+def assign(robots: Collection[str], weights: Mapping[str, float], choices: int = 2) -> dict[str, tuple[str, ...]]:
+    """Return the first choices of each robot: the owner and the standby, or more.
 
     Args:
         robots: ids of the robots.
         weights: name of each service -> its weight, above 0.
+        choices: number of choices, 1 or more.
 
     Returns:
-        robot -> (owner, standby). The standby is "" with one service. Empty without services.
+        robot -> (owner, standby, ...), with "" for each choice beyond the services. Empty without services.
     """
     names, all_robots = sorted(weights), sorted(robots)
     if not names:
@@ -43,12 +44,12 @@ def assign(robots: Collection[str], weights: Mapping[str, float]) -> dict[str, t
     total = sum(weights[name] for name in names)
     room = [ceil(MAX_LOAD * len(all_robots) * weights[name] / total) for name in names]
     order = np.argsort(-_scores(all_robots, names, weights)).tolist()
-    found: dict[str, tuple[str, str]] = {}
+    found: dict[str, tuple[str, ...]] = {}
     for row, robot in enumerate(all_robots):
-        choices = order[row]
-        owner = next(one for one in choices if room[one] > 0)
+        owner = next(one for one in order[row] if room[one] > 0)
         room[owner] -= 1
-        found[robot] = names[owner], next((names[one] for one in choices if one != owner), "")
+        others = [names[one] for one in order[row][:choices] if one != owner]
+        found[robot] = names[owner], *others[:choices - 1], *[""] * (choices - 1 - len(others))
     return found
 
 

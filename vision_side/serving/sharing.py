@@ -1,14 +1,15 @@
 """Decide which robots this vision service drives, beside other services. Pure.
 
-    tokens of robots and services -> assignment -> owner and standby of each robot
+    tokens of robots and services -> assignment -> owner and two standbys of each robot
     part      subscribes to           its token of a driver   left when
-    STANDBY   camera model, status    no                      the robot gets another owner or standby
+    STANDBY   camera model, status    no                      the robot gets other choices, and its driver works
     CLAIM     frames too              yes                     no other driver is left, or it is silent
     DRIVE     the same                yes                     a better choice claims it, or another one keeps the lease
 
 The owner claims; the former driver sees the token and leaves; then the owner drives, first by the newest frame. A claim
 that has no effect for a second, e.g. because a mission goes on, receives no more frames. So two services never look at
 the frames of one robot, except while one of them hangs. The robot decides by its lease who drives. Nothing here does.
+A service that left for a claim stands by until the claimer works: the token may be that of one that never answers.
 """
 
 from dataclasses import dataclass, field
@@ -23,12 +24,17 @@ from sightline.vision_side.serving.assignment import assign, ranked
 SILENT_US: Final = 380_000
 """Time without a sign of the driver after which the standby drives: four statuses. The robot permits it after 400 ms,
 and the first command comes later."""
-NO_DRIVER_US: Final = 1_500_000
-"""Time without a token of a driver after which the standby claims a robot, and each further choice a second later."""
+SECOND_STANDBY_US: Final = 1_000_000
+"""Time from the silence, or the newest token of a driver, after which the second standby drives: the first hangs too."""
+NO_DRIVER_US, NEXT_CHOICE_US = 1_500_000, 500_000
+"""Time without a token of a driver after which the standby claims a robot, and the two next choices later."""
 BETWEEN_CHANGES_US: Final = 1_000_000
 """Shortest time between two claims of one robot by one service. It doubles while they have no effect."""
+SETTLED_US: Final = 1_200_000
+"""Age of the newest token of a driver at which the owner claims from one that works. A service that has just started
+knows nothing of earlier changes, and a claim takes up to 0.2 s until it has an effect: one change a second remains."""
 MAX_DOUBLINGS: Final = 2
-NO_FRAMES_US: Final = 2_500_000
+NO_FRAMES_US: Final = 2_300_000
 """Time without a frame of the robot after which a driver without a command is silent. A camera that fails is named in
 `status` by then. A driver that does not subscribe to frames gets none either."""
 NOT_MINE_US: Final = 300_000
@@ -77,6 +83,10 @@ class SharedRobot:
     """Drivers that were silent. A new session of them counts again."""
     driverless_us: int = 0
     """When the token of a driver ended last, or this robot became known."""
+    driver_us: int = 0
+    """When the newest token of a driver appeared."""
+    has_left: bool = False
+    """True after it left for another driver, until a status shows that one at work."""
     changed_us: int = -BETWEEN_CHANGES_US << MAX_DOUBLINGS
     renewed_us: int = -BETWEEN_CHANGES_US << MAX_DOUBLINGS
     tries: int = 0
@@ -147,7 +157,7 @@ class Sharing:
         self.robots = {robot: SharedRobot(self._drivers[robot]) for robot in named}
         self._named = frozenset(named)
         self._services: set[VisionToken] = set()
-        self._choices: dict[str, tuple[str, str]] = {}
+        self._choices: dict[str, tuple[str, ...]] = {}
         self._is_changed = True
         self._is_up, self._up_us = True, -SERVICE_RETURNS_US
         self._ended: set[Token] = set()
@@ -156,7 +166,11 @@ class Sharing:
     @property
     def has_twin(self) -> bool:
         """Return True if another service has this name and counts instead of this one."""
-        return any(one.name == self.own.name and one.instance < self.own.instance for one in self._services)
+        return self._twins > 0
+
+    @property
+    def _twins(self) -> int:
+        return sum(one.name == self.own.name and one.instance < self.own.instance for one in self._services)
 
     def add_own(self, token: DriverToken) -> None:
         """Note a token with which this service drives, before it is declared."""
@@ -204,7 +218,8 @@ class Sharing:
 
     def _on_robot(self, robot: str, is_present: bool, now_us: int) -> None:
         if is_present and robot not in self.robots and len(self.robots) < MAX_ROBOTS:
-            self.robots[robot] = SharedRobot(self._drivers.setdefault(robot, set()), driverless_us=now_us)
+            self.robots[robot] = SharedRobot(
+                self._drivers.setdefault(robot, set()), driverless_us=now_us, driver_us=now_us)
             self._is_changed = True
         elif not is_present and robot in self.robots and robot not in self._named:
             del self.robots[robot]
@@ -217,8 +232,10 @@ class Sharing:
             return
         # The tokens of a robot and of its driver arrive in any order.
         drivers, robot = self._drivers.setdefault(token.robot, set()), self.robots.get(token.robot)
-        if is_present and len(drivers) < MAX_DRIVERS and len(self._drivers) <= MAX_ROBOTS:
+        if is_present and token not in drivers and len(drivers) < MAX_DRIVERS and len(self._drivers) <= MAX_ROBOTS:
             drivers.add(token)
+            if robot is not None:
+                robot.driver_us = now_us
         elif not is_present:
             drivers.discard(token)
         if robot is not None and not is_present:
@@ -250,14 +267,18 @@ class Sharing:
         refused = sum(count for reason, count in status.refused.items() if reason in OF_DRIVERS)
         stream, arrived = status.stream, status.accepted + refused
         answered = stream.sent - stream.credit_timeouts
-        one.answered = min(one.answered, stream.sent)  # after a restart of the robot they begin again
+        is_first = one.frames == _UNKNOWN
+        # After a restart of the robot they begin again. Those before this part are of another driver.
+        one.answered = answered if is_first else min(one.answered, stream.sent)
         answers = answered > one.answered + stream.window
         one.answered = answered if answers else one.answered
-        if needs_no_driver or answers or arrived != one.arrived or one.frames == _UNKNOWN:
+        if needs_no_driver or answers or arrived != one.arrived or is_first:
             one.worked_us, one.frames = now_us, stream.sent
         if stream.sent == one.frames and now_us - one.worked_us < NO_FRAMES_US:
             one.active_us = now_us
         one.arrived = arrived
+        if answers or (status.holder is not None and not human and not is_mine):
+            one.has_left = False
         if is_mine or needs_no_driver or sent == one.sent:
             one.mine_us = now_us
         if is_mine:
@@ -292,7 +313,7 @@ class Sharing:
             if now_us - self._up_us >= returns_us:
                 self.on_token(token, False, now_us)
         if self._is_changed:
-            self._choices, self._is_changed = assign(self.robots, self.services()), False
+            self._choices, self._is_changed = assign(self.robots, self.services(), 3), False
         changed = {}
         for name, robot in self.robots.items():
             before = robot.part
@@ -310,6 +331,7 @@ class Sharing:
             robot.ignored |= robot.drivers
             robot.has_held = False
             robot.begin_session(now_us)
+        robot.has_left |= robot.part is SharingPart.DRIVE
         # Without a part, no status came: what it showed before is over. A standby knows that the driver is silent.
         if part is not SharingPart.CLAIM or robot.part is SharingPart.NONE:
             robot.begin_part()
@@ -318,42 +340,46 @@ class Sharing:
     def _next_part(self, name: str, robot: SharedRobot, now_us: int) -> SharingPart:
         if robot.part is SharingPart.CLAIM and (not robot.others or robot.is_silent):
             return SharingPart.DRIVE
-        is_choice = not self._is_out and self.own.name in self._choices[name]
-        beside = SharingPart.STANDBY if is_choice else SharingPart.NONE
+        has_left = robot.has_left or robot.part is SharingPart.DRIVE
+        watches = not self._is_leaving and (has_left or self._is_choice(name))
+        beside = SharingPart.STANDBY if watches else SharingPart.NONE
         if robot.part in (SharingPart.CLAIM, SharingPart.DRIVE):
             kept = SharingPart.CLAIM if robot.is_kept else robot.part
             return beside if self._must_leave(name, robot) else kept
-        waits = now_us - self._up_us < SERVICE_RETURNS_US or _is_within_wait(robot.changed_us, robot.tries, now_us)
-        may_claim = not self._is_out and not waits and self._is_next(name, robot, now_us)
-        return SharingPart.CLAIM if may_claim else beside
+        return SharingPart.CLAIM if self._may_claim(name, robot, now_us) else beside
 
-    @property
-    def _is_out(self) -> bool:
-        return self._is_leaving or self.has_twin
+    def _is_choice(self, name: str) -> bool:
+        return self.own.name in self._choices[name] and not self.has_twin
 
     def _must_leave(self, name: str, robot: SharedRobot) -> bool:
         """Return True if another driver has the better claim."""
         # A silent driver counts again if it has the lease.
         others = robot.drivers if robot.is_not_mine else robot.others
-        if self._is_out or robot.is_busy:
-            return bool(others) and (self._is_out or robot.is_not_mine)
+        if self._is_leaving or robot.is_busy:
+            return bool(others) and (self._is_leaving or robot.is_not_mine)
         return any(other.name in self._before(name) for other in others)
 
     def _before(self, robot: str) -> list[str]:
-        """Return the services that may claim a robot before this one, in their order."""
+        """Return the services that may claim a robot before this one, in their order. Twins follow one another."""
         first = self._choices[robot]
         order = [*first, *(one for one in ranked(robot, self.services()) if one not in first)]
-        return order[: order.index(self.own.name)]
+        return order[: order.index(self.own.name)] + self._twins * [self.own.name]
 
-    def _is_next(self, name: str, robot: SharedRobot, now_us: int) -> bool:
+    def _may_claim(self, name: str, robot: SharedRobot, now_us: int) -> bool:
         """Return True if it is the turn of this service to claim a robot."""
-        owner, standby = self._choices[name]
-        waited_us = now_us - robot.driverless_us - NO_DRIVER_US
-        has_no_driver = not robot.drivers and waited_us >= 0
-        if self.own.name in (owner, standby):
-            return self.own.name == owner or has_no_driver or robot.is_silent
-        # The third choice after 2.5 s, all others a second later.
-        return has_no_driver and waited_us // BETWEEN_CHANGES_US >= min(2, len(self._before(name)) - 1)
+        if self._is_leaving or now_us - self._up_us < SERVICE_RETURNS_US:
+            return False
+        owner, _, second = self._choices[name]
+        is_owner = self.own.name == owner and not self.has_twin
+        if not robot.drivers:
+            late_us = now_us - robot.driverless_us - NO_DRIVER_US
+            return is_owner or late_us >= 0 and late_us >= NEXT_CHOICE_US * min(2, len(self._before(name)) - 1)
+        if _is_within_wait(robot.changed_us, robot.tries, now_us):
+            return False
+        if robot.is_silent:
+            since_us = max(robot.active_us + SILENT_US, robot.driver_us)
+            return self.own.name != second or robot.has_left or robot.status_us - since_us >= SECOND_STANDBY_US
+        return is_owner and now_us - robot.driver_us >= SETTLED_US
 
 
 def _is_within_wait(changed_us: int, tries: int, now_us: int) -> bool:

@@ -29,10 +29,10 @@ def robot_whose(*order):
 
 
 def service(robot, *drivers, at_us=0, others=OTHERS):
-    """Return service `a` with others, a robot and its drivers, after its first decision."""
+    """Return service `a` with others, a robot and its drivers of before, after its first decision."""
     sharing = Sharing(OWN)
     for token in (*others, RobotToken(robot), *drivers):
-        sharing.on_token(token, True, at_us)
+        sharing.on_token(token, True, at_us - 1_200 * MS * (token in drivers))
     sharing.step(at_us)
     return sharing
 
@@ -158,15 +158,27 @@ def test_an_owner_of_a_robot_without_driver_drives_in_one_step():
     assert sharing.step(0) == {"r1": DRIVE} and sharing.step(1) == {}
 
 
-@pytest.mark.parametrize("later_ms", [0, 20, 290])
-def test_a_service_that_starts_does_not_drive_beside_a_driver_whose_token_comes_after_that_of_the_robot(later_ms):
+@pytest.mark.parametrize("later_ms", [-1, 0, 20, 290])
+def test_a_service_that_starts_claims_from_a_driver_1_2_s_after_its_token(later_ms):
+    """The token of a driver may come before or after that of the robot."""
+    sharing, claims_us = Sharing(OWN), (5_001 + max(0, later_ms) + 1_200) * MS
+    sharing.on_link(True, 5_000 * MS)
+    tokens = [(5_001, RobotToken("r1")), (5_001 + later_ms, driver("r1"))]
+    for ms, token in sorted(tokens):
+        sharing.on_token(token, True, ms * MS)
+    assert sharing.step(5_001 * MS) == {"r1": STANDBY}
+    sharing.on_token(driver("r1"), True, 6_000 * MS)  # it is known
+    assert sharing.step(claims_us - 1) == {}
+    assert sharing.step(claims_us) == {"r1": CLAIM}
+
+
+def test_a_service_that_starts_drives_a_robot_without_a_driver_after_the_time_in_which_tokens_come():
     sharing = Sharing(OWN)
     sharing.on_link(True, 5_000 * MS)
     sharing.on_token(RobotToken("r1"), True, 5_001 * MS)
     assert sharing.step(5_001 * MS) == {"r1": STANDBY}
-    sharing.on_token(driver("r1"), True, (5_001 + later_ms) * MS)
     assert sharing.step(5_300 * MS - 1) == {}
-    assert sharing.step(5_300 * MS) == {"r1": CLAIM}
+    assert sharing.step(5_300 * MS) == {"r1": DRIVE}
 
 
 @pytest.mark.parametrize("is_beside", [False, True])
@@ -211,8 +223,8 @@ def test_an_owner_that_had_the_lease_stays_beside_another_driver_and_gives_up_on
     assert part(sharing) is CLAIM
 
 
-@pytest.mark.parametrize(("at_us", "waits"), [(2_499_999, True), (2_500_000, False)])
-def test_time_without_frames_ends_after_2_5_s(at_us, waits):
+@pytest.mark.parametrize(("at_us", "waits"), [(2_299_999, True), (2_300_000, False)])
+def test_time_without_frames_ends_after_2_3_s(at_us, waits):
     robot = robot_whose("b", "a")
     sharing = service(robot, driver(robot))
     for us in (0, at_us):
@@ -228,10 +240,10 @@ def test_one_frame_without_an_answer_does_not_show_a_driver_at_work():
     assert sharing.robots[robot].active_us == 0
 
 
-@pytest.mark.parametrize(("order", "after_ms"), [("ba", 1_500), ("bca", 2_500), ("bcda", 3_500), ("bcdea", 3_500)])
+@pytest.mark.parametrize(("order", "after_ms"), [("ba", 1_500), ("bca", 2_000), ("bcda", 2_500), ("bcdea", 2_500)])
 @pytest.mark.parametrize("begin_ms", [0, 7_000])
 def test_choice_claims_a_robot_without_a_driver_after_its_turn(order, after_ms, begin_ms):
-    sharing, before = service(robot_whose(*order), at_us=begin_ms * MS), STANDBY if order == "ba" else NONE
+    sharing, before = service(robot_whose(*order), at_us=begin_ms * MS), STANDBY if len(order) < 4 else NONE
     for us in (*range(0, after_ms * MS, 50 * MS), after_ms * MS - 1):
         sharing.step(begin_ms * MS + us)
         assert part(sharing) is before
@@ -248,20 +260,20 @@ def test_choice_waits_while_a_driver_is_there_and_its_turn_counts_from_the_end_o
     sharing.on_token(first, False, 6_000 * MS)
     assert sharing.step(9_000 * MS) == {}
     sharing.on_token(second, False, 9_000 * MS)
-    after_ms = 1_500 if order == "ba" else 2_500
+    after_ms = 1_500 if order == "ba" else 2_000
     assert sharing.step((9_000 + after_ms) * MS - 1) == {}
     assert sharing.step((9_000 + after_ms) * MS) == {robot: DRIVE}
 
 
 def test_a_later_choice_takes_no_part_before_it_claims():
-    robot = robot_whose("b", "c", "a")
+    robot = robot_whose("b", "c", "d", "a")
     sharing = service(robot, driver(robot, 1, "e"))
     assert part(sharing) is NONE
     see(sharing, 2_000 * MS)
-    see(sharing, 2_900 * MS)
-    assert sharing.step(2_900 * MS) == {}, "only the standby may succeed a silent driver"
-    sharing.on_token(OTHERS[1], False, 2_900 * MS)
-    assert sharing.step(2_900 * MS) == {robot: STANDBY}, "and what it saw before does not count"
+    see(sharing, 4_900 * MS)
+    assert sharing.step(4_900 * MS) == {}, "only a standby may succeed a silent driver"
+    sharing.on_token(OTHERS[1], False, 4_900 * MS)
+    assert sharing.step(4_900 * MS) == {robot: STANDBY}, "and what it saw before does not count"
 
 
 # --- a silent driver --------------------------------------------------------------------------------------------------
@@ -350,35 +362,37 @@ def test_answers_count_above_the_frames_that_may_be_on_their_way():
 
 
 @pytest.mark.parametrize("begin_ms", [0, 7_000])
-def test_a_driver_of_a_robot_that_sends_no_frame_is_silent_after_its_first_2_5_s(begin_ms):
+def test_a_driver_of_a_robot_that_sends_no_frame_is_silent_after_its_first_2_3_s(begin_ms):
     robot = robot_whose("b", "a")
     sharing = service(robot, driver(robot), at_us=begin_ms * MS)
     drives = []
     for ms in range(0, 5_000, 10):
         see(sharing, (begin_ms + ms) * MS, sent=7)
         drives += [ms] if sharing.step((begin_ms + ms) * MS) else []
-    assert drives == [2_500 + 370], "the last status in which it waited came at 2,490 ms"
+    assert drives == [2_300 + 370], "the last status in which it waited came at 2,290 ms"
 
 
 def test_what_was_seen_of_a_robot_before_a_part_ended_does_not_count():
-    robot = robot_whose("b", "c", "a", "d")
+    robot = robot_whose("b", "c", "d", "a")
     sharing = service(robot)
     assert sharing.step(2_500 * MS) == {robot: DRIVE}
     see(sharing, 2_500 * MS, sent=1, accepted=1)
     see(sharing, 2_550 * MS, sent=2, accepted=1)
     sharing.on_token(driver(robot, 1, "c"), True, 2_600 * MS)
-    assert sharing.step(2_600 * MS) == {robot: NONE}
+    assert sharing.step(2_600 * MS) == {robot: STANDBY}
+    see(sharing, 2_700 * MS, sent=2, accepted=1, holder=VISION)
+    assert sharing.step(2_700 * MS) == {robot: NONE}
     see(sharing, 9_000 * MS, sent=2, accepted=1)
-    for token in OTHERS[:2]:
+    for token in OTHERS[:3]:
         sharing.on_token(token, False, 9_000 * MS)
     assert sharing.step(9_000 * MS) == {robot: CLAIM}
     see(sharing, 9_500 * MS, sent=2, accepted=1)
     assert sharing.step(9_500 * MS) == {}, "the other driver may wait for its first frame"
-    for ms in range(9_600, 12_300, 100):
+    for ms in range(9_600, 12_100, 100):
         see(sharing, ms * MS, sent=2, accepted=1)
         assert sharing.step(ms * MS) == {}
-    see(sharing, 12_300 * MS, sent=2, accepted=1)
-    assert sharing.step(12_300 * MS) == {robot: DRIVE}
+    see(sharing, 12_100 * MS, sent=2, accepted=1)
+    assert sharing.step(12_100 * MS) == {robot: DRIVE}
 
 
 def test_silence_from_the_time_as_driver_does_not_count_for_a_standby():
@@ -403,7 +417,7 @@ def test_first_frame_ends_the_wait_for_it():
     assert drives == [500 - 10 + 380]
 
 
-@pytest.mark.parametrize(("pause_ms", "drives"), [(500, []), (1_900, []), (2_400, []), (3_000, [2_490 + 380])])
+@pytest.mark.parametrize(("pause_ms", "drives"), [(500, []), (1_900, []), (2_400, []), (3_000, [2_290 + 380])])
 @pytest.mark.parametrize("unanswered", [0, 1])
 def test_a_driver_without_frames_to_answer_is_not_silent(pause_ms, drives, unanswered):
     """A camera may pause, e.g. for its exposure, and a robot may send a frame every half second."""
@@ -443,18 +457,59 @@ def test_owner_drives_on_beside_a_worse_choice_and_standby_leaves_for_a_better_o
     assert sharing.step(1_700 * MS) == {robot: STANDBY}
 
 
-def test_a_third_choice_leaves_for_the_standby_and_then_has_no_part():
-    robot = robot_whose("b", "c", "a")
+def left(*order):
+    """Return a service after it left for the driver `b`, at 4 s, and its robot."""
+    robot = robot_whose(*order)
     sharing = service(robot)
     assert sharing.step(2_500 * MS) == {robot: DRIVE}
-    sharing.on_token(driver(robot, 1, "c"), True, 2_600 * MS)
-    assert sharing.step(2_600 * MS) == {robot: NONE}
+    sharing.on_token(driver(robot), True, 4_000 * MS)
+    assert sharing.step(4_000 * MS) == {robot: STANDBY}
+    return sharing, robot
+
+
+@pytest.mark.parametrize(("shown", "works"), [
+    ({"holder": VISION, "mine": True}, False), ({"holder": HUMAN}, False), ({"sent": 11, "window": 1}, False),
+    ({"accepted": 1}, False), ({"refused": {"STALE": 9}}, False), ({"holder": VISION}, True),
+    ({"sent": 12, "window": 1}, True),
+], ids=["own lease", "human", "frame on its way", "own command", "rejected", "lease", "answers"])
+def test_a_fourth_choice_that_left_stands_by_until_the_other_driver_works(shown, works):
+    sharing, robot = left("b", "c", "d", "a")
+    see(sharing, 4_010 * MS, sent=10, window=1)
+    assert sharing.step(4_010 * MS) == {}, "frames of before are its own"
+    see(sharing, 4_100 * MS, **{"sent": 10, **shown})
+    assert sharing.step(4_100 * MS) == ({robot: NONE} if works else {})
+
+
+@pytest.mark.parametrize("order", ["bca", "bcda", "bcdea"])
+@pytest.mark.parametrize("others", [0, 2])
+def test_a_choice_that_left_succeeds_a_claimer_that_is_silent_as_the_standby_does(order, others):
+    sharing, robot = left(*order)
+    for number in range(others):
+        sharing.on_token(driver(robot, 7 + number, "e"), True, 4_010 * MS)
+    drives = []
+    for ms in range(4_010, 4_600, 10):
+        see(sharing, ms * MS, sent=10 + (ms > 4_020))
+        drives += [ms - 4_020] if sharing.step(ms * MS) else []
+    assert drives == [380] and part(sharing) is DRIVE
+
+
+@pytest.mark.parametrize(("driver_ms", "after_ms"), [(-9_000, 1_380), (200, 1_380), (380, 1_380), (500, 1_500)])
+def test_second_standby_drives_1_s_after_the_silence_or_a_new_driver(driver_ms, after_ms):
+    robot = robot_whose("b", "c", "a")
+    sharing, drives = service(robot, driver(robot), at_us=9_000 * MS), []
+    see(sharing, 9_990 * MS, sent=5, accepted=4)
+    see(sharing, 10_000 * MS, sent=5, accepted=5)
+    for ms in range(10, 2_000, 10):
+        if ms == max(10, driver_ms):
+            sharing.on_token(driver(robot, 2, "c"), True, (10_000 + driver_ms) * MS)
+        see(sharing, (10_000 + ms) * MS, sent=6, accepted=5)
+        drives += [ms] if sharing.step((10_000 + ms) * MS) else []
+    assert drives == [after_ms] and part(sharing) is DRIVE
 
 
 def test_a_claim_is_withdrawn_for_a_better_one():
     robot = robot_whose("b", "a")
-    sharing = service(robot)
-    sharing.on_token(driver(robot, 1, "d"), True, 0)
+    sharing = service(robot, driver(robot, 1, "d"))
     sharing.on_token(OTHERS[0], False, 10)
     assert sharing.step(10) == {robot: CLAIM}
     sharing.on_token(OTHERS[0], True, 20)
@@ -471,7 +526,7 @@ def test_a_claim_holds_beside_a_better_choice_that_was_silent():
     assert sharing.step(900 * MS) == {}
 
 
-def test_a_robot_is_claimed_at_most_once_a_second():
+def test_a_service_claims_a_robot_that_has_a_driver_at_most_once_a_second():
     robot = robot_whose("b", "a")
     sharing = service(robot, others=OTHERS[1:])
     assert part(sharing) is DRIVE
@@ -479,9 +534,20 @@ def test_a_robot_is_claimed_at_most_once_a_second():
     sharing.on_token(driver(robot), True, 100 * MS)
     assert sharing.step(100 * MS) == {robot: STANDBY}
     sharing.on_token(OTHERS[0], False, 200 * MS)
-    sharing.on_token(driver(robot), False, 200 * MS)
+    sharing.robots[robot].driver_us = -1_200 * MS
     assert sharing.step(1_000 * MS - 1) == {}
-    assert sharing.step(1_000 * MS) == {robot: DRIVE}
+    assert sharing.step(1_000 * MS) == {robot: CLAIM}
+
+
+def test_a_robot_without_a_driver_waits_for_no_limit():
+    robot = robot_whose("b", "a")
+    sharing = service(robot, others=OTHERS[1:])
+    sharing.on_token(OTHERS[0], True, 100 * MS)
+    sharing.on_token(driver(robot), True, 100 * MS)
+    assert sharing.step(100 * MS) == {robot: STANDBY}
+    sharing.on_token(OTHERS[0], False, 200 * MS)
+    sharing.on_token(driver(robot), False, 200 * MS)
+    assert sharing.step(200 * MS) == {robot: DRIVE}
 
 
 def test_a_mission_keeps_its_robot_while_the_lease_is_here():
@@ -594,6 +660,19 @@ def test_of_two_services_with_one_name_the_lower_instance_counts():
     assert not sharing.has_twin
 
 
+@pytest.mark.parametrize(("twins", "after_ms"), [(1, 1_500), (2, 2_000), (9, 2_500)])
+def test_a_twin_claims_a_robot_without_a_driver_after_its_namesake_and_leaves_it_to_that(twins, after_ms):
+    robot = robot_whose("a", "b")
+    sharing = service(robot, others=[*OTHERS, *(OWN._replace(instance=f"0000000{number}") for number in range(twins))])
+    for us in (0, after_ms * MS - 1):
+        assert sharing.step(us) == {} and part(sharing) is NONE
+    assert sharing.step(after_ms * MS) == {robot: DRIVE}
+    sharing.on_token(driver(robot, 1, "b"), True, 3_600 * MS)
+    assert sharing.step(3_600 * MS) == {}
+    sharing.on_token(driver(robot, 2, "a"), True, 3_700 * MS)
+    assert sharing.step(3_700 * MS) == {robot: STANDBY}
+
+
 def test_a_service_that_ends_leaves_its_robots():
     robot = robot_whose("b", "a")
     sharing = service(robot)
@@ -626,7 +705,7 @@ def test_a_robot_that_leaves_moves_another_to_keep_the_load():
     for token in (OTHERS[0], *map(RobotToken, names)):
         sharing.on_token(token, True, 0)
     for name in names:
-        sharing.on_token(driver(name), before[name][0] == "b", 0)
+        sharing.on_token(driver(name), before[name][0] == "b", -1_200 * MS)
     assert sharing.step(0)["r6"] is STANDBY
     sharing.on_token(RobotToken("r1"), False, 1)
     assert sharing.step(1) == {"r6": CLAIM}
@@ -659,7 +738,7 @@ def test_drivers_count_from_before_their_robot_and_end_without_it():
     token = driver("r1")
     sharing.on_token(token, True, 0)
     sharing.on_token(RobotToken("r1"), True, 0)
-    assert sharing.step(0) == {"r1": CLAIM}
+    assert sharing.step(1_200 * MS) == {"r1": CLAIM}
     sharing.on_token(RobotToken("r1"), False, 1)
     sharing.on_token(RobotToken("r1"), True, 2)
     assert sharing.robots["r1"].drivers == {token}, "its driver is still there"
