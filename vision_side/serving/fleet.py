@@ -238,6 +238,8 @@ without other services."""
 _NEVER_US = 1 << 62
 _HANDS_OVER_WITHIN_S = 0.6
 _MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn, and ends that do not count yet
+_RECALL_US = 5_000_000
+"""Time in which a second watch has reported the tokens of before, also on a busy machine."""
 
 
 class SharedFleet(Fleet):
@@ -252,7 +254,10 @@ class SharedFleet(Fleet):
         """Each with its presence and the time when that was noted."""
         self._ends_us: dict[Token, int] = {}
         """Tokens that ended and whose end does not count yet: when they ended."""
-        self._newest_end_us = self._heard_us = 0
+        self._newest_end_us = self._heard_us = self._recall_us = 0
+        self._end_recall: Callable[[], None] = lambda: None
+        self._ended_meanwhile: set[Token] | None = None
+        """Tokens that ended during the second watch; None without one."""
         self._is_up, self._losses = True, fleet_link.losses
         self._statuses: dict[str, LatestSlot[Message]] = {}
         self._withdraw: dict[str, Callable[[], None]] = {}
@@ -273,6 +278,7 @@ class SharedFleet(Fleet):
         now_us = monotonic_us()
         self._watch_link(now_us)
         self._take_tokens(now_us)
+        self._recall_tokens(now_us)
         changed = self.sharing.step(now_us)
         super().turn()
         for robot, part in changed.items():
@@ -361,9 +367,25 @@ class SharedFleet(Fleet):
 
     def _note(self, token: Token, is_present: bool) -> None:
         robot = token.robot if isinstance(token, RobotToken | DriverToken) else ""
+        if not is_present and (ended := self._ended_meanwhile) is not None and len(ended) < _MAX_TOKENS:
+            ended.add(token)
         if not robot or fnmatchcase(robot, self._config.robot):
             self._tokens.append((token, is_present, monotonic_us()))
             self._bell.set()
+
+    def _recall_tokens(self, now_us: int) -> None:
+        """Watch the tokens once more, for a while, when there is room for those that did not count."""
+        if self._ended_meanwhile is not None and now_us - self._recall_us >= _RECALL_US:
+            self._end_recall()
+            self._ended_meanwhile = None
+        if self._ended_meanwhile is None and self.sharing.needs_tokens():
+            self._ended_meanwhile, self._recall_us = set(), now_us
+            self._end_recall = self._fleet_link.watch_tokens(self._note_recalled)
+
+    def _note_recalled(self, token: Token, is_present: bool) -> None:
+        # Zenoh may report a token after the first watch reported its end.
+        if is_present and token not in (self._ended_meanwhile or ()):
+            self._note(token, True)
 
     def _wait(self) -> None:
         next_end_s = (min(map(self._counts_us, self._ends_us), default=_NEVER_US) - monotonic_us()) / 1e6

@@ -12,6 +12,7 @@ the frames of one robot, except while one of them hangs. The robot decides by it
 A service that left for a claim stands by until the claimer works: the token may be that of one that never answers.
 """
 
+from collections.abc import Sized
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
@@ -25,7 +26,7 @@ SILENT_US: Final = 380_000
 """Time without a sign of the driver after which the standby drives: four statuses. The robot permits it after 400 ms,
 and the first command comes later."""
 SECOND_STANDBY_US: Final = 1_000_000
-"""Time from the silence, or the newest token of a driver, after which the second standby drives: the first hangs too."""
+"""Time from the silence, or the newest token of a driver, after which the second standby drives; the first hangs too"""
 NO_DRIVER_US, NEXT_CHOICE_US = 1_500_000, 500_000
 """Time without a token of a driver after which the standby claims a robot, and the two next choices later."""
 BETWEEN_CHANGES_US: Final = 1_000_000
@@ -55,7 +56,7 @@ SERVICE_RETURNS_US: Final = 300_000
 """The same for tokens of services and drivers. A service may have died with its router, and its robots stand. One that
 returns later gets its robots back. As long, nothing is claimed: the token of a driver may follow that of its robot."""
 MAX_ROBOTS, MAX_SERVICES, MAX_DRIVERS = 10_000, 256, 16
-"""Security limits: robots, services, and drivers of one robot. Further tokens do not count."""
+"""Security limits: robots, services, and drivers of one robot. Further tokens count when there is room for them."""
 MAX_OWN: Final = 2 * MAX_ROBOTS
 """Newest tokens of this service that are stored."""
 _UNKNOWN: Final = -1
@@ -159,6 +160,8 @@ class Sharing:
         self._services: set[VisionToken] = set()
         self._choices: dict[str, tuple[str, ...]] = {}
         self._is_changed = True
+        self._full: dict[int, tuple[Sized, int]] = {}
+        """Tables that had no room for a token, with their limits."""
         self._is_up, self._up_us = True, -SERVICE_RETURNS_US
         self._ended: set[Token] = set()
         """Tokens that ended with the link of this service, so that nothing is known of what they stand for."""
@@ -212,12 +215,12 @@ class Sharing:
         elif token != self.own:
             if not is_present:
                 self._services.discard(token)
-            elif len(self._services) < MAX_SERVICES:
+            elif not self._is_full(self._services, MAX_SERVICES):
                 self._services.add(token)
             self._is_changed = True
 
     def _on_robot(self, robot: str, is_present: bool, now_us: int) -> None:
-        if is_present and robot not in self.robots and len(self.robots) < MAX_ROBOTS:
+        if is_present and robot not in self.robots and not self._is_full(self.robots, MAX_ROBOTS):
             self.robots[robot] = SharedRobot(
                 self._drivers.setdefault(robot, set()), driverless_us=now_us, driver_us=now_us)
             self._is_changed = True
@@ -230,9 +233,11 @@ class Sharing:
     def _on_driver(self, token: DriverToken, is_present: bool, now_us: int) -> None:
         if token in self._own_drivers:
             return
+        if is_present and token.robot not in self._drivers and self._is_full(self._drivers, MAX_ROBOTS):
+            return
         # The tokens of a robot and of its driver arrive in any order.
         drivers, robot = self._drivers.setdefault(token.robot, set()), self.robots.get(token.robot)
-        if is_present and token not in drivers and len(drivers) < MAX_DRIVERS and len(self._drivers) <= MAX_ROBOTS:
+        if is_present and token not in drivers and not self._is_full(drivers, MAX_DRIVERS):
             drivers.add(token)
             if robot is not None:
                 robot.driver_us = now_us
@@ -243,6 +248,18 @@ class Sharing:
             robot.driverless_us = now_us
         if robot is None and not drivers:
             del self._drivers[token.robot]
+
+    def _is_full(self, table: Sized, limit: int) -> bool:
+        if len(table) >= limit:
+            self._full[id(table)] = table, limit
+        return len(table) >= limit
+
+    def needs_tokens(self) -> bool:
+        """Return True, once, if there is room for tokens that did not count: the caller watches all once more."""
+        if not any(len(table) < limit for table, limit in self._full.values()):
+            return False
+        self._full.clear()
+        return True
 
     def on_status(self, robot: str, status: Status, *, is_mine: bool, sent: int, now_us: int) -> None:
         """Note a status of a robot that this service has a part in.
@@ -373,7 +390,9 @@ class Sharing:
         is_owner = self.own.name == owner and not self.has_twin
         if not robot.drivers:
             late_us = now_us - robot.driverless_us - NO_DRIVER_US
-            return is_owner or late_us >= 0 and late_us >= NEXT_CHOICE_US * min(2, len(self._before(name)) - 1)
+            if is_owner or late_us < 0:
+                return is_owner
+            return late_us >= NEXT_CHOICE_US * min(2, len(self._before(name)) - 1)
         if _is_within_wait(robot.changed_us, robot.tries, now_us):
             return False
         if robot.is_silent:

@@ -19,7 +19,7 @@ class Site:
 
     def __init__(self, monkeypatch, count, pattern="r*"):
         self.now_us, self.connected, self.losses = 1_000_000, True, 0
-        self._network, self.declared = MemoryNetwork(seed=1), []
+        self._network, self.declared, self.watching = MemoryNetwork(seed=1), [], []
         monkeypatch.setattr(fleet_module, "monotonic_us", lambda: self.now_us)
         config = VisionConfig(robot=pattern, connect=("tcp/127.0.0.1:1",), detector=DetectorConfig(kind="hsv"),
                               share=ShareConfig(enabled=True, name="a"))
@@ -34,7 +34,12 @@ class Site:
         pass
 
     def watch_tokens(self, callback):
-        self.note = callback
+        self.watching.append(callback)
+        return lambda: self.watching.remove(callback)
+
+    def note(self, token, is_present):
+        for callback in self.watching.copy():
+            callback(token, is_present)
 
     def declare_token(self, token):
         self.declared.append(token)
@@ -188,6 +193,33 @@ def test_robots_get_no_second_driver_while_the_tokens_beyond_a_link_that_ended_e
     site.connected, site.losses = False, 1
     site.turn(each_ms)
     assert {name: robot.part for name, robot in site.fleet.sharing.robots.items()} == parts
+
+
+def test_token_of_a_service_that_came_during_a_flood_counts_after_it(monkeypatch):
+    site, real = Site(monkeypatch, 1), VisionToken("b", 1.0, "0000000b")
+    fakes = [VisionToken(f"x{number}", 0.01, "00000001") for number in range(256)]
+    for token in (*fakes, real):
+        site.note(token, True)
+    site.turn(2, ms=6_000)
+    assert "b" not in site.fleet.sharing.services() and len(site.watching) == 1
+    for token in fakes:
+        site.note(token, False)
+    site.turn(3, ms=100)
+    first, second = site.watching
+    for token in (real, fakes[0]):
+        first(token, False)
+        second(token, True)  # late
+    second(VisionToken("c", 1.0, "0000000c"), True)
+    site.turn(3, ms=100)
+    assert set(site.fleet.sharing.services()) == {"a", "c"}
+    second(VisionToken("c", 1.0, "0000000c"), False)
+    site.turn(44, ms=100)
+    assert set(site.fleet.sharing.services()) == {"a", "c"} and len(site.watching) == 2, "the first watch counts"
+    site.turn(ms=100)
+    assert site.watching == [first]
+    first(real, True)
+    site.turn(20, ms=600)
+    assert set(site.fleet.sharing.services()) == {"a", "b", "c"} and len(site.watching) == 1
 
 
 def test_ends_that_wait_are_bounded(monkeypatch):

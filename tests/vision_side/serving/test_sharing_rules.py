@@ -879,6 +879,28 @@ def test_tokens_beyond_the_limits_do_not_count():
     assert len(sharing._drivers) == 10_000
 
 
+@pytest.mark.parametrize(("fakes", "real"), [
+    ([VisionToken(f"v{number}", 1.0, "00000001") for number in range(256)], OTHERS[0]),
+    ([RobotToken(f"z{number}") for number in range(9_999)], RobotToken("r2")),
+    ([driver(f"z{number}") for number in range(9_999)], driver("r2")),
+    ([driver("r1", number) for number in range(16)], driver("r1", 99)),
+], ids=["services", "robots", "driven robots", "drivers"])
+def test_tokens_that_did_not_count_are_needed_once_when_there_is_room(fakes, real):
+    sharing = Sharing(OWN)
+    for token in (RobotToken("r1"), *fakes):
+        sharing.on_token(token, True, 0)
+    assert not sharing.needs_tokens()
+    for _ in range(3):
+        sharing.on_token(real, True, 1)
+        assert not sharing.needs_tokens()
+    sharing.on_token(fakes[0], False, 2)
+    assert sharing.needs_tokens() and not sharing.needs_tokens()
+    sharing.on_token(real, True, 3)
+    assert not sharing.needs_tokens()
+    known = {*sharing._services, *map(RobotToken, sharing.robots)}.union(*sharing._drivers.values())
+    assert real in known
+
+
 def test_newest_20_000_own_tokens_are_known():
     sharing = Sharing(OWN)
     for number in range(20_001):

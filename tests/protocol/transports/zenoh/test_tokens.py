@@ -55,8 +55,13 @@ def test_robots_and_services_see_each_other_also_who_comes_later(site):
     declared.append(second.declare_token(own[1]))
     assert until(lambda: watchers[0].present >= {RobotToken("r1"), own[1]})
     assert until(lambda: watchers[1].present >= {RobotToken("r1"), own[0]})
+    again = Watcher()
+    end = first.watch_tokens(again)
+    assert until(lambda: again.present >= {RobotToken("r1"), own[1]}), "each watch has the tokens of before"
+    end()
     robot.close()
     assert until(lambda: all(RobotToken("r1") not in watcher.present for watcher in watchers))
+    assert RobotToken("r1") in again.present, "it has ended"
     declared[0]()
     assert until(lambda: own[0] not in watchers[1].present)
 
