@@ -330,6 +330,10 @@ class FleetLink(Closing):
         """
 
     @abstractmethod
+    def find_robots(self) -> set[str]:
+        """Query the ids of all robots, also of those without a token or a status, within half a second."""
+
+    @abstractmethod
     def watch_detectors(self, group: str, callback: Callable[[DetectorToken, bool], None]) -> Callable[[], None]:
         """Call `callback` on a transport thread with each token in `group`, and whether it is present.
 

@@ -236,6 +236,9 @@ _ROBOT_ENDS_AFTER_US, _MISSION_ENDS_AFTER_US = 500_000, 10_000_000
 """A robot whose own link is cut for a moment is back so soon. Its requested mission goes on after a longer cut too, as
 without other services."""
 _NEVER_US = 1 << 62
+_LOOKS_EVERY_S, _TOKENS_COME_S = 60.0, 2.0
+"""Time between two looks for robots of older releases, which have no token; and that of a robot that has just begun."""
+_MAX_REPORTED = 256  # security limit: such robots that are reported
 _HANDS_OVER_WITHIN_S = 0.6
 _MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn, and ends that do not count yet
 _RECALL_US = 5_000_000
@@ -272,6 +275,25 @@ class SharedFleet(Fleet):
         fleet_link.watch_tokens(self._note)
         self._leave_services = fleet_link.declare_token(own)
         report(f"vision: shares robots as {own.name}, weight {own.weight:g}")
+
+    def serve(self, ending: threading.Event, observe: Observe | None = None) -> None:
+        """Serve until `ending` is set, see `Fleet`. Robots of older releases are reported."""
+        threading.Thread(target=self._report_older, name="vision older robots", daemon=True).start()
+        super().serve(ending, observe)
+
+    def _report_older(self) -> None:
+        """Report each robot without a token once: no service that shares drives it."""
+        reported: set[str] = set()
+        while len(reported) < _MAX_REPORTED:
+            found = [one for one in self._fleet_link.find_robots() - reported if one not in self.sharing.robots]
+            if self._ending.wait(_TOKENS_COME_S):
+                return
+            for robot in found:
+                if robot not in self.sharing.robots and fnmatchcase(robot, self._config.robot):
+                    reported.add(robot)
+                    self._report(f"vision: {robot}: not shared (no token); update it or pass --robot {robot}")
+            if self._ending.wait(_LOOKS_EVERY_S):
+                return
 
     def turn(self) -> None:
         """Decide the part in each robot, then serve those that it drives."""

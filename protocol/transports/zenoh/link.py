@@ -472,6 +472,15 @@ class ZenohFleet(FleetLink):
         self._ending.callback(end)
         return end
 
+    def find_robots(self) -> set[str]:
+        """Query the ids of all robots, also of those without a token or a status, within half a second."""
+        import zenoh
+
+        with suppress(zenoh.ZError):  # closed meanwhile
+            peers = [peer.presence for peer in query_presence(self._session)]
+            return {one.robot for one in peers if one.role == ROBOT_ROLE}
+        return set()
+
     def watch_detectors(self, group: str, callback: Callable[[DetectorToken, bool], None]) -> Callable[[], None]:
         """Call `callback` on a thread of Zenoh with each token in `group`, and whether it is present."""
         def note(token: AnyToken, is_present: bool) -> None:
