@@ -84,7 +84,7 @@ class SharedRobot:
     """Drivers that were silent. A new session of them counts again."""
     driverless_us: int = 0
     """When the token of a driver ended last, or this robot became known."""
-    driver_us: int = 0
+    driver_us: int = _UNKNOWN
     """When the newest token of a driver appeared."""
     has_left: bool = False
     """True after it left for another driver, until a status shows that one at work."""
@@ -94,7 +94,7 @@ class SharedRobot:
     """Claims and new sessions since this service last held the lease. Each one waits twice as long."""
     arrived: int = _UNKNOWN
     """Commands of its driver, accepted or not, as the newest status shows them."""
-    answered: int = 0
+    answered: int = _UNKNOWN
     """Frames that were answered or are on their way, at the last sign of more answers than frames on their way."""
     status_us: int = _UNKNOWN
     """Time of the newest status."""
@@ -233,7 +233,7 @@ class Sharing:
     def _on_driver(self, token: DriverToken, is_present: bool, now_us: int) -> None:
         if token in self._own_drivers:
             return
-        if is_present and token.robot not in self._drivers and self._is_full(self._drivers, MAX_ROBOTS):
+        if token.robot not in self._drivers and self._is_full(self._drivers, MAX_ROBOTS):
             return
         # The tokens of a robot and of its driver arrive in any order.
         drivers, robot = self._drivers.setdefault(token.robot, set()), self.robots.get(token.robot)
@@ -256,10 +256,10 @@ class Sharing:
 
     def needs_tokens(self) -> bool:
         """Return True, once, if there is room for tokens that did not count: the caller watches all once more."""
-        if not any(len(table) < limit for table, limit in self._full.values()):
-            return False
-        self._full.clear()
-        return True
+        has_room = any(len(table) < limit for table, limit in self._full.values())
+        if has_room:
+            self._full.clear()
+        return has_room
 
     def on_status(self, robot: str, status: Status, *, is_mine: bool, sent: int, now_us: int) -> None:
         """Note a status of a robot that this service has a part in.
@@ -357,13 +357,13 @@ class Sharing:
     def _next_part(self, name: str, robot: SharedRobot, now_us: int) -> SharingPart:
         if robot.part is SharingPart.CLAIM and (not robot.others or robot.is_silent):
             return SharingPart.DRIVE
-        has_left = robot.has_left or robot.part is SharingPart.DRIVE
-        watches = not self._is_leaving and (has_left or self._is_choice(name))
+        watches = not self._is_leaving and (robot.has_left or self._is_choice(name))
         beside = SharingPart.STANDBY if watches else SharingPart.NONE
         if robot.part in (SharingPart.CLAIM, SharingPart.DRIVE):
             kept = SharingPart.CLAIM if robot.is_kept else robot.part
             return beside if self._must_leave(name, robot) else kept
-        return SharingPart.CLAIM if self._may_claim(name, robot, now_us) else beside
+        may_claim = not self._is_leaving and now_us - self._up_us >= SERVICE_RETURNS_US
+        return SharingPart.CLAIM if may_claim and self._is_next(name, robot, now_us) else beside
 
     def _is_choice(self, name: str) -> bool:
         return self.own.name in self._choices[name] and not self.has_twin
@@ -379,13 +379,11 @@ class Sharing:
     def _before(self, robot: str) -> list[str]:
         """Return the services that may claim a robot before this one, in their order. Twins follow one another."""
         first = self._choices[robot]
-        order = [*first, *(one for one in ranked(robot, self.services()) if one not in first)]
+        order = [*first, *ranked(robot, self.services())]
         return order[: order.index(self.own.name)] + self._twins * [self.own.name]
 
-    def _may_claim(self, name: str, robot: SharedRobot, now_us: int) -> bool:
+    def _is_next(self, name: str, robot: SharedRobot, now_us: int) -> bool:
         """Return True if it is the turn of this service to claim a robot."""
-        if self._is_leaving or now_us - self._up_us < SERVICE_RETURNS_US:
-            return False
         owner, _, second = self._choices[name]
         is_owner = self.own.name == owner and not self.has_twin
         if not robot.drivers:
@@ -393,12 +391,12 @@ class Sharing:
             if is_owner or late_us < 0:
                 return is_owner
             return late_us >= NEXT_CHOICE_US * min(2, len(self._before(name)) - 1)
-        if _is_within_wait(robot.changed_us, robot.tries, now_us):
-            return False
         if robot.is_silent:
             since_us = max(robot.active_us + SILENT_US, robot.driver_us)
-            return self.own.name != second or robot.has_left or robot.status_us - since_us >= SECOND_STANDBY_US
-        return is_owner and now_us - robot.driver_us >= SETTLED_US
+            is_turn = self.own.name != second or robot.has_left or robot.status_us - since_us >= SECOND_STANDBY_US
+        else:
+            is_turn = is_owner and now_us - robot.driver_us >= SETTLED_US
+        return is_turn and not _is_within_wait(robot.changed_us, robot.tries, now_us)
 
 
 def _is_within_wait(changed_us: int, tries: int, now_us: int) -> bool:

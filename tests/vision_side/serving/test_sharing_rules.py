@@ -480,6 +480,32 @@ def test_a_fourth_choice_that_left_stands_by_until_the_other_driver_works(shown,
     assert sharing.step(4_100 * MS) == ({robot: NONE} if works else {})
 
 
+def test_a_fourth_choice_without_the_lease_stands_by_after_its_claim():
+    robot = robot_whose("b", "c", "d", "a")
+    sharing = service(robot)
+    sharing.step(2_500 * MS)
+    sharing.on_token(driver(robot, 2, "e"), True, 2_500 * MS)
+    for ms in (2_500, 2_600, 2_700, 2_800):
+        see(sharing, ms * MS, ms)
+    assert sharing.step(2_800 * MS) == {robot: CLAIM}
+    sharing.on_token(driver(robot), True, 2_900 * MS)
+    assert sharing.step(2_900 * MS) == {robot: STANDBY}
+
+
+def test_the_order_of_all_services_is_computed_only_for_a_robot_whose_turn_may_have_come(monkeypatch):
+    computed = []
+    monkeypatch.setattr(f"{Sharing.__module__}.ranked", lambda *given: computed.append(given) or ranked(*given))
+    assert part(service(robot_whose("a", "b"))) is DRIVE
+    sharing = service(robot_whose("b", "a"))
+    sharing.step(1_500 * MS - 1)
+    mine = Sharing(OWN)
+    mine.on_link(True, 9_000 * MS)  # the robot has no driver for long, and this service its first turn
+    mine.on_token(RobotToken("r1"), True, 0)
+    assert mine.step(9_300 * MS) == {"r1": DRIVE} and not computed
+    sharing.step(1_500 * MS)
+    assert len(computed) == 1
+
+
 @pytest.mark.parametrize("order", ["bca", "bcda", "bcdea"])
 @pytest.mark.parametrize("others", [0, 2])
 def test_a_choice_that_left_succeeds_a_claimer_that_is_silent_as_the_standby_does(order, others):
@@ -491,6 +517,20 @@ def test_a_choice_that_left_succeeds_a_claimer_that_is_silent_as_the_standby_doe
         see(sharing, ms * MS, sent=10 + (ms > 4_020))
         drives += [ms - 4_020] if sharing.step(ms * MS) else []
     assert drives == [380] and part(sharing) is DRIVE
+
+
+@pytest.mark.parametrize(("driver_ms", "after_ms"), [(-9_000, 1_380), (200, 1_380), (380, 1_380), (500, 1_500)])
+def test_second_standby_drives_after_1_s_by_the_newest_status(driver_ms, after_ms):
+    robot = robot_whose("b", "c", "a")
+    sharing = service(robot, driver(robot), at_us=9_000 * MS)
+    for us in (9_900 * MS, 10_000 * MS):
+        see(sharing, us, sent=5, accepted=us // MS)
+    sharing.robots[robot].driver_us = (10_000 + driver_ms) * MS
+    for us in (*range(10_100 * MS, (10_000 + after_ms) * MS, 100 * MS), (10_000 + after_ms) * MS - 1):
+        see(sharing, us, sent=6, accepted=10_000)
+        assert sharing.step(us) == {}
+    see(sharing, (10_000 + after_ms) * MS, sent=6, accepted=10_000)
+    assert sharing.step((10_000 + after_ms) * MS) == {robot: DRIVE}
 
 
 @pytest.mark.parametrize(("driver_ms", "after_ms"), [(-9_000, 1_380), (200, 1_380), (380, 1_380), (500, 1_500)])
@@ -899,6 +939,16 @@ def test_tokens_that_did_not_count_are_needed_once_when_there_is_room(fakes, rea
     assert not sharing.needs_tokens()
     known = {*sharing._services, *map(RobotToken, sharing.robots)}.union(*sharing._drivers.values())
     assert real in known
+
+
+def test_drivers_of_known_robots_count_and_end_when_there_is_no_room_for_more_robots():
+    sharing = Sharing(OWN)
+    for number in range(10_000):
+        sharing.on_token(driver(f"z{number}"), True, 0)
+    sharing.on_token(driver("z5", 2), True, 1)
+    assert len(sharing._drivers["z5"]) == 2
+    sharing.on_token(driver("z5"), False, 2)
+    assert sharing._drivers["z5"] == {driver("z5", 2)}
 
 
 def test_newest_20_000_own_tokens_are_known():
