@@ -231,3 +231,19 @@ def test_ends_that_wait_are_bounded(monkeypatch):
     site.note(RobotToken("r1"), False)
     site.turn()
     assert len(site.fleet._ends_us) == 50 and set(site.fleet.services) == {"r0"}, "the end counts at once"
+
+
+def test_robot_whose_token_comes_soon_after_its_reply_is_not_reported(monkeypatch):
+    site, lines = Site(monkeypatch, 1), []
+    site.find_robots = lambda: {"r0", "r7", "r8"}
+    monkeypatch.setattr(site.fleet, "_report", lines.append)
+
+    def wait(seconds):
+        site.note(RobotToken("r7"), True)
+        site.turn()
+        return seconds == 60.0
+
+    monkeypatch.setattr(site.fleet._ending, "wait", wait)
+    site.fleet._report_older()
+    assert [line for line in lines if "token" in line] == [
+        "vision: r8: not shared (no token); update it or pass --robot r8"]
