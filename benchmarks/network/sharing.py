@@ -245,7 +245,7 @@ class Site:
     def received(self) -> tuple[int, float]:
         """Return the time, and the frames that came to the services on the robots' side, by their own counters."""
         ports = [_metrics_port(name) for name in self.running if name.startswith("v")]
-        command = ["ip", "netns", "exec", self.wire.robot_side, sys.executable, "-c", _READ_METRICS, *ports]
+        command = ["ip", "netns", "exec", self.wire.robot_side, sys.executable, "-P", "-c", _READ_METRICS, *ports]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise HardwareError(f"the services show no metrics: {done.stderr[-160:]}")

@@ -31,7 +31,7 @@ def tells_no_holder(robot):
     bend_out(robot, "status", lambda _header, payload: payload.pop("holder", None))
 
 
-@breaks("R-LEASE-02", "R-LEASE-22", "R-LEASE-23", "R-LEASE-25", "R-SEQ-12")
+@breaks("R-LEASE-02", "R-LEASE-23", "R-LEASE-25", "R-SEQ-12")
 def lets_two_drive(robot):
     def may_take(self, who, now_us, proof=NO_PROOF):
         holder = self.live_holder(now_us)
