@@ -4,10 +4,29 @@ import math
 import random
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
+from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.config import SearchConfig, VisionConfig
-from tests.fixtures.vision.vision import Path, Rig, acquired_at, circle, eight, errors_after, still
+from sightline.vision_side.decode import DecodedImage
+from sightline.vision_side.detect.port import Circle, Detection
+from sightline.vision_side.missions.follow import Follow
+from sightline.vision_side.missions.port import View
+from tests.fixtures.vision.vision import (
+    FLOOR_BGR,
+    YELLOW_BGR,
+    Path,
+    Rig,
+    acquired_at,
+    ball_about_lens,
+    camera,
+    circle,
+    draw_ball,
+    eight,
+    errors_after,
+    still,
+)
 
 SEEDS = (1, 2, 3, 4, 5, 6)
 
@@ -105,3 +124,75 @@ def test_a_pushed_ball_is_never_lost() -> None:
 def test_robot_on_a_late_link_does_not_move() -> None:
     run = Rig(circle(), latency_s=0.45).run(4)
     assert max(abs(row.moving[0]) + abs(row.moving[1]) for row in run) == 0.0
+
+
+# --- a ball in front of the target -------------------------------------------------------------------------------
+
+RED_BGR, BLUE_BGR = (25, 25, 217), (204, 77, 26)
+MODEL, TARGET_M = camera(), 2.0
+Bgr = tuple[int, int, int]
+
+
+def seen_ball(picture: np.ndarray, x_m: float, y_m: float, color: Bgr) -> Detection:
+    """Draw a ball and return the detection of it."""
+    right, down, ahead = center = ball_about_lens(MODEL, x_m, y_m)
+    draw_ball(MODEL, center, picture, color)
+    x_px, y_px, r_px = (MODEL.cx_px + MODEL.fx_px * right / ahead, MODEL.cy_px + MODEL.fx_px * down / ahead,
+                        MODEL.fx_px * 0.1 / ahead)
+    return Detection(x_px - r_px, y_px - r_px, x_px + r_px, y_px + r_px, 0.9, "ball", Circle(x_px, y_px, r_px))
+
+
+def followed(fps: int, nearer_m: float, places: list[float | None], color: Bgr, own: Bgr = YELLOW_BGR) -> list[str]:
+    """Return what is followed in each frame: the ball, another one that is nearer, or the phase.
+
+    `places` are those of the other one to the left, from 1 s on. It hides the ball while it is in front of it. `own` is
+    the color of the ball from then on.
+    """
+    follow, names = Follow(Follow.Config(), MODEL), []
+    for number, y_m in enumerate([None] * fps + places):
+        picture = np.full((240, 320, 3), FLOOR_BGR, np.uint8)
+        is_hidden, is_later = y_m is not None and abs(y_m) < 0.13, number >= fps
+        target = seen_ball(picture, TARGET_M, 0.0, own if is_later else YELLOW_BGR)
+        other = None if y_m is None else seen_ball(picture, TARGET_M - nearer_m, y_m, color)
+        shown = tuple(one for one in (other, None if is_hidden else target) if one is not None)
+        header = FrameHeader(session="0000abcd", seq=number + 1, t_us=round((number + 1) * 1e6 / fps))
+        plan = follow.step(View(header, 1 / fps if number else 0.0, 0.05, MODEL, shown, DecodedImage(picture, 1)))
+        names.append({target: "ball", other: "other", None: plan.phase}[plan.target])
+    return names[fps:]
+
+
+def rolls(fps: int, from_m: float, speed_mps: float, hold_s: float) -> list[float | None]:
+    """Return the places of a ball that rolls to the front of the target, stays there, and rolls on to 1.1 m."""
+    step_m = speed_mps / fps
+    coming = [from_m + step_m * number for number in range(math.ceil(-from_m / step_m))]
+    leaving = [step_m * number for number in range(round(1.1 / step_m))]
+    return [*coming, *[0.0] * round(hold_s * fps), *leaving, *[1.1] * fps]
+
+
+@pytest.mark.parametrize(("fps", "from_m", "speed_mps", "hold_s", "color"), [
+    (30, 0.0, 0.4, 1.0, RED_BGR), (15, 0.0, 0.4, 1.0, BLUE_BGR), (10, -0.6, 1.2, 3.0, RED_BGR),
+    (5, -0.6, 0.6, 3.0, BLUE_BGR), (5, -1.3, 1.5, 3.0, RED_BGR), (4, -1.3, 1.2, 3.0, RED_BGR),
+    (2, -1.3, 0.6, 3.0, RED_BGR),
+])  # fmt: skip
+def test_ball_of_another_color_in_front_of_the_target_is_never_followed(
+    fps: int, from_m: float, speed_mps: float, hold_s: float, color: Bgr
+) -> None:
+    """It is 0.3 m nearer. It comes at once, or after fewer than five frames beside the target."""
+    names = followed(fps, 0.3, rolls(fps, from_m, speed_mps, hold_s), color)
+    assert "other" not in names and {"lost", "searching"} & {*names}
+    assert names[-fps:] == ["ball"] * fps
+
+
+@pytest.mark.parametrize(("fps", "hold_s"), [(30, 0.5), (15, 1.5), (10, 0.3), (5, 2.0)])
+def test_ball_of_another_color_at_the_place_of_the_target_is_followed_no_longer_than_it_hides_the_target(
+    fps: int, hold_s: float
+) -> None:
+    """10 cm nearer, it could be the target in another light."""
+    names = followed(fps, 0.1, rolls(fps, 0.0, 0.4, hold_s), RED_BGR)
+    assert names[-2 * fps:] == ["ball"] * 2 * fps
+
+
+@pytest.mark.parametrize("fps", [5, 15])
+def test_target_in_another_light_is_followed_without_a_break(fps: int) -> None:
+    names = followed(fps, 0.3, [None] * fps * 6, RED_BGR, own=BLUE_BGR)
+    assert names == ["ball"] * fps * 6

@@ -70,9 +70,9 @@ class Follow:
     def step(self, view: View) -> Plan:
         """Compute the plan for one frame."""
         self._camera = view.camera
-        places = self._places(view)
+        places, gap_s = self._places(view), self._gap_s(view)
         self._hear(view)
-        seen = self._track.step(self._gap_s(view), view.header.pose, self._sightings(places, view))
+        seen = self._track.step(gap_s, view.header.pose, self._sightings(places, view, gap_s))
         plan = self._act(view, seen)
         self._motion_predictor.sent(view.header.t_us, plan.twist)
         return plan
@@ -113,15 +113,22 @@ class Follow:
         label = self._config.target.label
         return (view.picture is None and not label) or is_followable(one.label, label)
 
-    def _sightings(self, places: list[Sighting | None], view: View) -> list[Sighting]:
+    def _sightings(self, places: list[Sighting | None], view: View, gap_s: float) -> list[Sighting]:
         """Return the places within the range, with the look of each object where it may matter."""
         most_m = self._config.target.max_range_m
         near = [one for one in places if one and one.x_m**2 + one.y_m**2 <= most_m**2]
-        target = self._track.target
-        is_alone = len(near) < 2 and target is not None and not target.unseen_us
-        if view.picture is None or not self.has_look or (is_alone and view.header.seq % _LOOKS_EACH):
+        needed = len(near) > 1 or not view.header.seq % _LOOKS_EACH or not self._are_expected(near, view, gap_s)
+        if view.picture is None or not self.has_look or not needed:
             return near
         return [replace(one, look=look_of(view.picture, one.detection)) for one in near]
+
+    def _are_expected(self, near: list[Sighting], view: View, gap_s: float) -> bool:
+        """Return True if the target was in the last frame, and each place is where it should be by now."""
+        target, apart_m = self._track.target, self._config.track.apart_m
+        if target is None or target.unseen_us:
+            return False
+        expected = from_odometry(view.header.pose, *target.after(gap_s))
+        return all(math.dist((one.x_m, one.y_m), expected) < apart_m for one in near)
 
     def _expected_m(self, pose: Pose) -> float:
         """Return the assumed distance of a box without a known size, in m: its last one, or the stand-off."""
@@ -178,6 +185,6 @@ def _track(config: Follow.Config) -> TrackConfig:
 
 def aim_at(target: Target, robot: PredictedMotion, camera: CameraModel, ahead_s: float) -> Aim:
     """Predict `target` `ahead_s` from now, relative to the lens of `robot`."""
-    x, y = from_odometry(robot.pose, target.x_m + target.vx_mps * ahead_s, target.y_m + target.vy_mps * ahead_s)
+    x, y = from_odometry(robot.pose, *target.after(ahead_s))
     vx, vy = from_odometry((0.0, 0.0, robot.pose[2]), target.vx_mps, target.vy_mps)
     return Aim(x - camera.x_m, y - camera.y_m, vx, vy, camera.x_m)

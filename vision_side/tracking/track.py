@@ -4,10 +4,11 @@ In this frame the state of an object is only its position and velocity, without 
 which both axes share one 2x2 covariance, because they have the same noise. The clock is the capture time of the frames.
 
 The other objects in view are tracked too, so that the target does not become one of them where they cross or hide each
-other. Each sighting belongs to the object that it fits best, by the likelihood of its position and its look. Where two
-objects could be exchanged, neither is corrected: both go on as before, until they are apart. Where one hides a part of
-the other, both are corrected less. A target that stays in doubt is lost. For a while after its loss nothing is followed
-that looks like another object.
+other. Each sighting belongs to the object that it fits best, by the likelihood of its position and its look. One of
+another look is of another object, except at the place of the object, because the light changes a look and moves
+nothing. Where two objects could be exchanged, neither is corrected: both go on as before, until they are apart. Where
+one hides a part of the other, both are corrected less. A target that stays in doubt is lost. For a while after its loss
+nothing is followed that looks like another object.
 """
 
 import math
@@ -59,11 +60,15 @@ class Target:
     unseen_us: int
     sightings: int
 
+    def after(self, dt_s: float) -> tuple[float, float]:
+        """Return the position that is expected `dt_s` later."""
+        return self.x_m + self.vx_mps * dt_s, self.y_m + self.vy_mps * dt_s
+
 
 class _Object:
     """Filter of one object."""
 
-    __slots__ = ("_acceleration_mps2", "is_rival", "look", "state", "variance")
+    __slots__ = ("_acceleration_mps2", "_unlike_us", "look", "state", "variance", "was_beside")
 
     def __init__(self, place: "_Place", acceleration_mps2: float) -> None:
         self._acceleration_mps2 = acceleration_mps2
@@ -71,8 +76,10 @@ class _Object:
         self.variance = (place.noise_m2, 0.0, _FIRST_SPEED_MPS**2)
         """Of position, both, velocity."""
         self.look = place.sighting.look
-        self.is_rival = False
-        """True once it was seen beside the target, so that it is not the target."""
+        self._unlike_us = 0
+        """Time since it last looked so."""
+        self.was_beside = False
+        """True once it was seen again, beside the target. A sighting that fits it better is not of the target."""
 
     def advance(self, dt_s: float) -> None:
         """Predict with constant velocity and white acceleration."""
@@ -81,13 +88,18 @@ class _Object:
         self.variance = (position + dt_s * (2 * both + dt_s * velocity) + power * dt_s**2 / 3,
                          both + dt_s * velocity + power * dt_s / 2, velocity + power)
         was = self.state
-        self.state = Target(was.x_m + was.vx_mps * dt_s, was.y_m + was.vy_mps * dt_s, was.vx_mps, was.vy_mps,
-                            was.unseen_us + round(dt_s * 1e6), was.sightings)
+        self.state = Target(*was.after(dt_s), was.vx_mps, was.vy_mps, was.unseen_us + round(dt_s * 1e6), was.sightings)
+        self._unlike_us += round(dt_s * 1e6)
 
     @property
     def is_known(self) -> bool:
         """Return True if it was seen often."""
         return self.state.sightings >= _KNOWN_AFTER
+
+    @property
+    def is_rival(self) -> bool:
+        """Return True if it is another object than the target."""
+        return self.was_beside and self.is_known
 
     @property
     def is_forgotten(self) -> bool:
@@ -98,16 +110,19 @@ class _Object:
         """Return the distance of a sighting from the expected position."""
         return _apart_m(self.state, place)
 
+    def unlike(self, place: "_Place") -> float:
+        """Return the difference of the looks of the object and of a sighting."""
+        return difference(self.look, place.sighting.look)
+
     def misfit(self, place: "_Place") -> float:
         """Return minus twice the logarithm of the likelihood of a sighting, without its constant."""
         variance = self.variance[0] + min(max(place.noise_m2, _LEAST_NOISE_M2), _MOST_NOISE_M2)
-        unlike = difference(self.look, place.sighting.look)
-        return self.away_m(place) ** 2 / variance + 2 * math.log(variance) + _LOOK_MISFIT * unlike
+        return self.away_m(place) ** 2 / variance + 2 * math.log(variance) + _LOOK_MISFIT * self.unlike(place)
 
     def correct(self, place: "_Place") -> None:
         """Correct the prediction with a sighting."""
         (position, both, velocity), noise, was = self.variance, place.noise_m2, self.state
-        self.look = updated(self.look, place.sighting.look)
+        self._update_look(place)
         dx, dy = place.x_m - was.x_m, place.y_m - was.y_m
         if dx * dx + dy * dy > _SURPRISE * 2 * (position + noise):
             # The larger variances let this sighting move the estimate most of the way.
@@ -117,6 +132,12 @@ class _Object:
         self.variance = (position * (1 - gain), both * (1 - gain), velocity - gain_velocity * both)
         self.state = Target(was.x_m + gain * dx, was.y_m + gain * dy, was.vx_mps + gain_velocity * dx,
                             was.vy_mps + gain_velocity * dy, 0, was.sightings + 1)
+
+    def _update_look(self, place: "_Place") -> None:
+        """Update the look. Another one is that of an object in front, until it stays: then it is the light."""
+        look, is_alike = place.sighting.look, self.unlike(place) < OTHER
+        if look is not None and (is_alike or self._unlike_us > _MEMORY_US):
+            self.look, self._unlike_us = updated(self.look, look) if is_alike else look, 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,9 +184,10 @@ class Track:
             self._forget_hidden()
         fits = self._fits(places)
         in_doubt = self._in_doubt(self._followed, fits) if self._followed else set()
-        for one, place in fits.items():
-            if one not in in_doubt:
-                one.correct(self._inexact(place) if self._is_in_line(one, pose) else place)
+        sure = {one: place for one, place in fits.items() if one not in in_doubt}
+        for one, place in [(one, self._inexact(place) if self._is_in_line(one, pose) else place)
+                           for one, place in sure.items()]:
+            one.correct(place)
         if self._followed is None:
             seen = self._start(dt_s, places, fits)
         else:
@@ -185,12 +207,12 @@ class Track:
         return [self._followed, *self._others] if self._followed else self._others
 
     def _fits(self, places: list[_Place]) -> dict[_Object, _Place]:
-        """Assign places to objects: first to the target and its rivals, then to the others; the best fit first."""
+        """Assign places to objects: first to the target and those beside it; the best fit that looks alike first."""
         fits, apart_m = dict[_Object, _Place](), self._config.apart_m
         for is_first in (True, False):
-            objects = [one for one in self._objects() if (one is self._followed or one.is_rival) == is_first]
+            objects = [one for one in self._objects() if (one is self._followed or one.was_beside) == is_first]
             pairs = [(one, place) for one in objects for place in places if self._is_near(one, place)]
-            for one, place in sorted(pairs, key=lambda pair: pair[0].misfit(pair[1])):
+            for one, place in sorted(pairs, key=lambda pair: (pair[0].unlike(pair[1]) >= OTHER, pair[0].misfit(pair[1]))):
                 if one not in fits and all(_apart_m(place, taken) > apart_m for taken in fits.values()):
                     fits[one] = place
         return fits
@@ -198,8 +220,8 @@ class Track:
     def _is_near(self, one: _Object, place: _Place) -> bool:
         # The gate grows while an object is hidden, because its position becomes less certain. Its look does not.
         gate_m = self._config.gate_m + self._config.gate_growth_mps * one.state.unseen_us / 1e6
-        is_alike = one.state.unseen_us <= _BRIEFLY_US or difference(one.look, place.sighting.look) < OTHER
-        return is_alike and one.away_m(place) < gate_m
+        is_there = one.state.unseen_us <= _BRIEFLY_US and one.away_m(place) < self._config.apart_m
+        return one.away_m(place) < gate_m and (is_there or one.unlike(place) < OTHER)
 
     def _is_in_line(self, one: _Object, pose: Pose) -> bool:
         """Return True if an object hides a part of another one, or is hidden by it."""
@@ -242,9 +264,9 @@ class Track:
     def _end(self, followed: _Object) -> None:
         """End the track of a target that was hidden or in doubt for too long."""
         # After doubt, the lost target may be the other object.
-        followed.is_rival = self._unsure_us > _DOUBT_US
-        if followed.is_rival or followed.state.unseen_us > self._config.give_up_s * 1e6:
-            self._others += [followed] if followed.is_rival else []
+        followed.was_beside = self._unsure_us > _DOUBT_US
+        if followed.was_beside or followed.state.unseen_us > self._config.give_up_s * 1e6:
+            self._others += [followed] if followed.was_beside else []
             self._lost_look = followed.look
             self._followed, self._unsure_us = None, 0
 
@@ -254,7 +276,7 @@ class Track:
         self._others = [one for one in self._others if one is not self._followed and not one.is_forgotten
                         and not (target and _apart_m(one.state, target.state) < apart_m)]
         for one in self._others:
-            one.is_rival |= target is not None and one in fits and one.is_known
+            one.was_beside |= target is not None and one in fits
         for place in places:
             is_apart = all(one.away_m(place) > apart_m for one in self._objects())
             if is_apart and place not in fits.values() and len(self._others) < _MAX_OTHERS:

@@ -9,7 +9,7 @@ import pytest
 
 from sightline.vision_side.config import TrackConfig
 from sightline.vision_side.detect.port import Detection
-from sightline.vision_side.tracking.appearance import OTHER
+from sightline.vision_side.tracking.appearance import OTHER, difference
 from sightline.vision_side.tracking.locate import Sighting
 from sightline.vision_side.tracking.track import Target, Track, _are_in_line, from_odometry, to_odometry
 
@@ -240,13 +240,19 @@ def steps_until(track, happens, *places, most=100):
     return next(number for number in range(1, most) if happens(track.step(DT_S, HERE, [at(*one) for one in places])))
 
 
-@pytest.mark.parametrize(("frames", "is_other"), [(4, False), (5, True)])
-def test_object_that_was_seen_beside_the_target_five_times_is_not_the_target(frames, is_other):
+@pytest.mark.parametrize(("frames", "is_other"), [(1, False), (2, True), (5, True)])
+def test_sighting_of_an_object_that_was_seen_beside_the_target_again_is_not_of_the_target(frames, is_other):
     track = started(*[TARGET] * 3)
     for _ in range(frames):
         track.step(DT_S, HERE, [at(*TARGET), at(2.0, 0.2)])
     seen = track.step(DT_S, HERE, [at(2.0, 0.2)])
     assert (seen is None) == is_other and track.target.unseen_us == is_other * 100_000
+
+
+def test_object_that_was_seen_twice_beside_the_target_and_then_alone_is_not_followed_after_the_loss():
+    track = beside((2.0, 0.9), frames=2, give_up_s=0.4)
+    assert steps_until(track, lambda _: track.target is None, (2.0, 0.9)) == 5
+    assert steps_until(track, lambda seen: seen, (2.0, 0.9)) == 31
 
 
 def test_object_that_appears_while_the_target_is_hidden_may_be_the_target():
@@ -337,15 +343,46 @@ def test_object_that_looks_as_the_lost_target_is_followed_and_not_the_best_one()
     assert track.step(DT_S, HERE, places) is places[1]
 
 
-@pytest.mark.parametrize(("unlike", "hidden", "is_target"), [
-    (1.0, 2, True), (1.0, 3, False), (OTHER + 0.01, 3, False), (OTHER - 0.01, 3, True), (0.0, 8, True),
-])
-def test_object_of_another_look_is_not_the_target_that_was_hidden_for_300_ms(unlike, hidden, is_target):
+@pytest.mark.parametrize(("unlike", "hidden", "off_m", "is_target"), [
+    (1.0, 0, 0.149, True), (1.0, 0, 0.151, False), (1.0, 2, 0.149, True), (1.0, 2, 0.3, False), (1.0, 3, 0.0, False),
+    (OTHER + 0.01, 0, 0.3, False), (OTHER - 0.01, 0, 0.3, True), (OTHER + 0.01, 3, 0.0, False),
+    (OTHER - 0.01, 3, 0.3, True), (0.0, 8, 0.3, True),
+])  # fmt: skip
+def test_object_of_another_look_is_the_target_only_at_its_place_and_within_300_ms(unlike, hidden, off_m, is_target):
     track = Track(TrackConfig())
     track.step(DT_S, HERE, [at(*TARGET, look=look(0.0))])
     for _ in range(hidden):
         assert track.step(DT_S, HERE, []) is None
-    assert (track.step(DT_S, HERE, [at(2.0, 0.3, look=look(unlike))]) is not None) == is_target
+    assert (track.step(DT_S, HERE, [at(2.0, off_m, look=look(unlike))]) is not None) == is_target
+
+
+def test_object_that_looks_as_the_target_did_comes_before_one_of_another_look_at_its_place():
+    track = Track(TrackConfig())
+    for _ in range(6):
+        track.step(DT_S, HERE, [at(*TARGET, look=look(0.0))])
+    for _ in range(20):
+        assert track.step(DT_S, HERE, [at(1.9, 0.0, look=look(0.8))]) is not None
+    places = [at(1.9, 0.0, look=look(0.8)), at(1.9, 0.3, look=look(0.3))]
+    assert track.step(DT_S, HERE, places) is places[1]
+
+
+@pytest.mark.parametrize(("steps", "seen"), [(30, "old"), (31, "new")])
+@pytest.mark.parametrize("between", [None, look(0.8)])
+def test_another_look_at_the_place_of_the_target_is_its_own_after_three_seconds(steps, seen, between):
+    """A frame without a look changes nothing."""
+    track = Track(TrackConfig())
+    track.step(DT_S, HERE, [at(*TARGET, look=look(0.0))])
+    for number in range(steps):
+        assert track.step(DT_S, HERE, [at(*TARGET, look=between if number < steps - 1 else look(0.8))]) is not None
+    places = {"old": at(2.0, 0.2, look=look(0.0)), "new": at(2.0, -0.2, look=look(0.8))}
+    assert track.step(DT_S, HERE, list(places.values())) is places[seen]
+
+
+def test_three_seconds_of_another_look_count_from_the_last_frame_with_the_own_one():
+    track = Track(TrackConfig())
+    for number in range(60):
+        track.step(DT_S, HERE, [at(*TARGET, look=look(0.0 if number in (0, 25) else 0.8))])
+        assert difference(track._followed.look, look(0.8)) == pytest.approx(0.8 if number < 56 else 0.0, abs=1e-6)
 
 
 def test_look_of_the_target_follows_the_light():
