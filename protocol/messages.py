@@ -408,7 +408,9 @@ class ReportedTarget(WireModel):
 
     label: Label = Field(description="what it is, as the detector names it")
     score: float = Field(ge=0, le=1, description="how sure the detector is")
-    track: Counter | None = Field(default=None, description="the detector's number for an object that it follows")
+    track: Counter | None = Field(
+        default=None, description="number of the frame from which on the mission follows it; null without a track"
+    )
     bearing_rad: Number | None = Field(default=None, description="from the optical axis of the camera, left positive")
     distance_m: float | None = Field(default=None, ge=0, le=1e6, description="distance of the target")
     cx_px: Number = Field(description="center, from the left")

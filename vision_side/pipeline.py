@@ -51,6 +51,7 @@ class Observation:
         distance_m: distance of the target, m.
         note: the rest of the line.
         done: True after the end of the mission.
+        track: number of the track that the mission follows.
     """
 
     phase: str
@@ -60,6 +61,7 @@ class Observation:
     distance_m: float | None = None
     note: str = ""
     done: bool = False
+    track: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,7 +305,8 @@ def _is_scaled(former: CameraModel, camera: CameraModel) -> bool:
 
 
 def _seen(plan: Plan, detections: tuple[Detection, ...]) -> Observation:
-    return Observation(plan.phase, detections, plan.target, plan.bearing_rad, plan.distance_m, plan.note, plan.done)
+    return Observation(plan.phase, detections, plan.target, plan.bearing_rad, plan.distance_m, plan.note, plan.done,
+                       plan.track.number if plan.track else None)
 
 
 class FrameLoss:

@@ -72,7 +72,8 @@ class Follow:
         self._camera = view.camera
         places, gap_s = self._places(view), self._gap_s(view)
         self._hear(view)
-        seen = self._track.step(gap_s, view.header.pose, self._sightings(places, view, gap_s))
+        seen = self._track.step(gap_s, view.header.pose, self._sightings(places, view, gap_s),
+                                view.header.seq)
         plan = self._act(view, seen)
         self._motion_predictor.sent(view.header.t_us, plan.twist)
         return plan
@@ -150,7 +151,7 @@ class Follow:
         twist = self._steer_to(target, header, view.dt_s)
         phase = "tracking" if seen else "coasting"
         box = seen.detection if seen else None
-        return Plan(twist, phase, target=box, bearing_rad=bearing_rad, distance_m=math.hypot(x, y))
+        return Plan(twist, phase, target=box, bearing_rad=bearing_rad, distance_m=math.hypot(x, y), track=target)
 
     def _steer_to(self, target: Target, header: FrameHeader, dt_s: float) -> Twist:
         latency_s = self._motion_predictor.latency_s

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sightline.protocol.messages import CameraModel, FrameHeader, Twist
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.port import Detection
+from sightline.vision_side.tracking.track import Target
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,7 @@ class Plan:
         target: the detection that it follows, if any.
         bearing_rad: bearing of the target, rad, left positive.
         distance_m: distance of the target, m.
+        track: the object that it follows, also while it is hidden, in the odometry frame.
     """
 
     twist: Twist
@@ -83,6 +85,7 @@ class Plan:
     target: Detection | None = None
     bearing_rad: float | None = None
     distance_m: float | None = None
+    track: Target | None = None
 
 
 class Mission(Protocol):

@@ -14,6 +14,7 @@ from sightline.protocol.messages import STILL, CameraModel, Twist
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.registry import MissionSpec
+from sightline.vision_side.tracking.track import Target
 
 SETTLE_S: Final = 1.0
 """A robot that still moves after this long is not moved by us; the new mission begins all the same."""
@@ -23,7 +24,7 @@ MAX_COMMAND: Final = 1000.0
 """m/s and rad/s; beyond it a mission computes nonsense, and its text might not fit a twist's 64 bytes."""
 _TYPES: Final[dict[str, type | UnionType]] = {
     "twist": Twist, "phase": str, "note": str, "target": Detection | None,
-    "bearing_rad": Real | None, "distance_m": Real | None,
+    "bearing_rad": Real | None, "distance_m": Real | None, "track": Target | None,
 }  # fmt: skip
 
 

@@ -114,7 +114,7 @@ def reported_target(seen: Observation, camera: CameraModel | None) -> ReportedTa
     center_px = (circle.cx_px, circle.cy_px) if circle else ((one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2)
     try:
         return ReportedTarget(
-            label=one.label, score=one.score, track=one.track_id, bearing_rad=seen.bearing_rad,
+            label=one.label, score=one.score, track=seen.track, bearing_rad=seen.bearing_rad,
             distance_m=seen.distance_m, cx_px=center_px[0], cy_px=center_px[1],
             radius_px=circle.radius_px if circle else None, width_px=camera.width_px, height_px=camera.height_px,
         )

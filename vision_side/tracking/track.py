@@ -59,6 +59,8 @@ class Target:
     vy_mps: float
     unseen_us: int
     sightings: int
+    number: int = 0
+    """Of the frame from which on it is followed; another object, or the same one again, has another number."""
 
     def after(self, dt_s: float) -> tuple[float, float]:
         """Return the position that is expected `dt_s` later."""
@@ -88,7 +90,8 @@ class _Object:
         self.variance = (position + dt_s * (2 * both + dt_s * velocity) + power * dt_s**2 / 3,
                          both + dt_s * velocity + power * dt_s / 2, velocity + power)
         was = self.state
-        self.state = Target(*was.after(dt_s), was.vx_mps, was.vy_mps, was.unseen_us + round(dt_s * 1e6), was.sightings)
+        self.state = Target(*was.after(dt_s), was.vx_mps, was.vy_mps, was.unseen_us + round(dt_s * 1e6), was.sightings,
+                            was.number)
         self._unlike_us += round(dt_s * 1e6)
 
     @property
@@ -119,6 +122,10 @@ class _Object:
         variance = self.variance[0] + min(max(place.noise_m2, _LEAST_NOISE_M2), _MOST_NOISE_M2)
         return self.away_m(place) ** 2 / variance + 2 * math.log(variance) + _LOOK_MISFIT * self.unlike(place)
 
+    def rank(self, place: "_Place") -> tuple[bool, float]:
+        """Return less for a sighting that fits better: one of another look comes last."""
+        return self.unlike(place) >= OTHER, self.misfit(place)
+
     def correct(self, place: "_Place") -> None:
         """Correct the prediction with a sighting."""
         (position, both, velocity), noise, was = self.variance, place.noise_m2, self.state
@@ -131,7 +138,7 @@ class _Object:
         gain, gain_velocity = position / (position + noise), both / (position + noise)
         self.variance = (position * (1 - gain), both * (1 - gain), velocity - gain_velocity * both)
         self.state = Target(was.x_m + gain * dx, was.y_m + gain * dy, was.vx_mps + gain_velocity * dx,
-                            was.vy_mps + gain_velocity * dy, 0, was.sightings + 1)
+                            was.vy_mps + gain_velocity * dy, 0, was.sightings + 1, was.number)
 
     def _update_look(self, place: "_Place") -> None:
         """Update the look. Another one is that of an object in front, until it stays: then it is the light."""
@@ -166,13 +173,14 @@ class Track:
         """Return the state of the target."""
         return self._followed.state if self._followed else None
 
-    def step(self, dt_s: float, pose: Pose, sightings: Sequence[Sighting]) -> Sighting | None:
+    def step(self, dt_s: float, pose: Pose, sightings: Sequence[Sighting], number: int = 0) -> Sighting | None:
         """Advance the track and correct it with the newest sightings.
 
         Args:
             dt_s: time since the last frame.
             pose: odometry at capture, m, m, rad.
             sightings: candidates, best first. The best one starts a track; the one that fits best continues it.
+            number: number of this frame.
 
         Returns:
             The sighting of the target, or None if it is hidden or in doubt.
@@ -189,7 +197,7 @@ class Track:
                            for one, place in sure.items()]:
             one.correct(place)
         if self._followed is None:
-            seen = self._start(dt_s, places, fits)
+            seen = self._start(dt_s, places, fits, number)
         else:
             seen = None if in_doubt else fits.get(self._followed)
             self._unsure_us = self._unsure_us + round(dt_s * 1e6) if in_doubt else 0
@@ -212,7 +220,7 @@ class Track:
         for is_first in (True, False):
             objects = [one for one in self._objects() if (one is self._followed or one.was_beside) == is_first]
             pairs = [(one, place) for one in objects for place in places if self._is_near(one, place)]
-            for one, place in sorted(pairs, key=lambda pair: (pair[0].unlike(pair[1]) >= OTHER, pair[0].misfit(pair[1]))):
+            for one, place in sorted(pairs, key=lambda pair: pair[0].rank(pair[1])):
                 if one not in fits and all(_apart_m(place, taken) > apart_m for taken in fits.values()):
                     fits[one] = place
         return fits
@@ -248,7 +256,9 @@ class Track:
         worse = sum(thief.misfit(place) - owner.misfit(place) for place, owner, thief in exchanged)
         return bool(exchanged) and worse < _ODDS and all(self._is_near(thief, place) for place, _, thief in exchanged)
 
-    def _start(self, dt_s: float, places: list[_Place], fits: dict[_Object, _Place]) -> _Place | None:
+    def _start(
+        self, dt_s: float, places: list[_Place], fits: dict[_Object, _Place], number: int
+    ) -> _Place | None:
         """Follow the best sighting; for a while none of a rival of the last target, and none that looks other."""
         self._unsure_us += round(dt_s * 1e6)
         if self._unsure_us <= _MEMORY_US:
@@ -259,6 +269,7 @@ class Track:
         if chosen is not None:
             known = next((one for one, place in fits.items() if place is chosen), None)
             self._followed, self._unsure_us = known or self._new(chosen), 0
+            self._followed.state = replace(self._followed.state, number=number)
         return chosen
 
     def _end(self, followed: _Object) -> None:

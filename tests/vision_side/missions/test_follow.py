@@ -205,10 +205,11 @@ def test_look_is_computed_where_it_matters(monkeypatch):
 
 def test_plan_names_the_target_its_bearing_and_its_distance_from_the_lens():
     mission, ball = follow_of(), at(1.3, 0.85)
-    plan = mission.step(view(ball, pose=(2.0, 1.0, math.pi / 2)))
+    plan = mission.step(view(ball, pose=(2.0, 1.0, math.pi / 2), seq=7))
     assert plan == Plan(
         COMMANDED, "tracking", target=ball, bearing_rad=pytest.approx(math.atan2(0.9, 1.2)),
         distance_m=pytest.approx(1.5),
+        track=Target(pytest.approx(2.0 - 0.85), pytest.approx(1.0 + 1.3), 0.0, 0.0, 0, 1, number=7),
     )  # fmt: skip
     plan = mission.step(view(pose=(2.0, 1.0, math.pi / 2)))
     assert (plan.twist, plan.phase, plan.target) == (COMMANDED, "coasting", None)

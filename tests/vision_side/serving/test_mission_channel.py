@@ -216,10 +216,10 @@ def test_reports_with_a_target_come_ten_times_a_second():
     ({}, (120.0, 70.0), 20.0), ({"circle": None}, (120.0, 60.0), None),
 ])
 def test_report_names_the_target_its_place_and_the_size_of_the_image(changes, center_px, radius_px):
-    seen = Observation("tracking", target=replace(TARGET, **changes), bearing_rad=-0.1, distance_m=0.8)
+    seen = Observation("tracking", target=replace(TARGET, **changes), bearing_rad=-0.1, distance_m=0.8, track=12)
     target = reported_target(seen, MODEL)
     assert (target.cx_px, target.cy_px) == center_px and target.radius_px == radius_px
-    assert (target.label, target.score, target.track) == ("ball", 0.9, 7)
+    assert (target.label, target.score, target.track) == ("ball", 0.9, 12)
     assert (target.bearing_rad, target.distance_m) == (-0.1, 0.8)
     assert (target.width_px, target.height_px) == (MODEL.width_px, MODEL.height_px)
 
@@ -251,7 +251,7 @@ def test_vision_service_reports_the_target_in_the_image_of_its_frame():
     header, report = decode(DetectionsHeader, newest.header), decode(MissionReport, newest.payload)
     assert report.target.bearing_rad == pytest.approx(math.atan2(0.2, 1.0), abs=0.02)
     assert report.target.distance_m == pytest.approx(math.hypot(0.2, 1.0), abs=0.1)
-    assert header.echo.seq == 1 and report.target.width_px == MODEL.width_px
+    assert header.echo.seq == report.target.track == 1 and report.target.width_px == MODEL.width_px
 
 
 def test_report_contains_the_mission_text_on_one_bounded_line():

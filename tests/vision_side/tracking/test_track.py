@@ -119,6 +119,15 @@ def test_new_track_stands_still_where_it_was_seen():
     assert track.target == Target(1.0, 0.2, 0.0, 0.0, 0, 1)
 
 
+def test_number_of_the_target_is_that_of_the_frame_in_which_it_was_chosen():
+    track, numbers = Track(TrackConfig(give_up_s=0.25)), []
+    shown = [[], [(1.0, 0.0)], [(1.0, 0.0), (2.0, 0.9)], [], [], [], [(2.0, 0.9)], [(2.0, 0.9), (1.0, 0.0)]]
+    for number, places in enumerate(shown, 5):
+        track.step(DT_S, HERE, [at(*one) for one in places], number)
+        numbers.append(track.target and track.target.number)
+    assert numbers == [None, 6, 6, 6, 6, None, 11, 11]
+
+
 def test_sightings_are_counted_and_the_time_without_one_is_measured():
     track = started((1.0, 0.0), (1.0, 0.0))
     assert (track.target.sightings, track.target.unseen_us) == (2, 0)
