@@ -20,8 +20,10 @@ from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionR
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.registry import mission_spec
+from sightline.vision_side.missions.switch import MissionSwitch
 from sightline.vision_side.pipeline import Frame, FrameLoss, Observation, Pipeline, PipelineAnswer, answer_header
-from tests.fixtures.vision.vision import Rig, camera, eight, jpeg_of, scene
+from sightline.vision_side.tracking.track import from_odometry
+from tests.fixtures.vision.vision import Rig, ball_about_lens, camera, eight, jpeg_of, scene
 
 MODEL = camera()
 BALL = jpeg_of(scene(MODEL, 1.0, 0.2, shaded=True))
@@ -79,24 +81,53 @@ class NotedDetector:
 
     def __init__(self, found: list[tuple[Detection, ...]]) -> None:
         self.expected: list[tuple[float, float] | None] = []
-        self._found = found
+        self.found = found
 
     def detect(self, frames: list[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         (frame,) = frames
         self.expected.append(frame.expected_px)
-        return [result_of(frame, self._found[len(self.expected) - 1], Maker("noted", "", ""))]
+        return [result_of(frame, self.found[len(self.expected) - 1], Maker("noted", "", ""))]
 
 
 def test_a_target_is_expected_for_half_a_second_where_it_was_last_seen() -> None:
-    ball, other = (Detection(x, 100.0, x + 40.0, 140.0, 0.9, "ball") for x in (100.0, 104.0))
-    found = [(ball,), (other,), *[()] * 17]
+    ball = Detection(100.0, 100.0, 140.0, 140.0, 0.9, "ball")
+    found = [(ball,), (ball,), *[()] * 17]
     noted = NotedDetector(found)
     one = Pipeline(VisionConfig(), MODEL, noted)
     for seq in range(1, len(found) + 1):
         one.step(Frame(header(seq), EMPTY))
-    last = (124.0, 120.0)
-    assert noted.expected[:3] == [None, (120.0, 120.0), last]
-    assert noted.expected[3:17] == [last] * 14 and noted.expected[17:] == [None] * 2  # 15 frames are 0.5 s
+    assert noted.expected[0] is None and noted.expected[17:] == [None] * 2  # 15 frames are 0.5 s
+    assert all(place == pytest.approx((120.0, 120.0), abs=1.0) for place in noted.expected[1:17])
+
+
+def test_a_target_without_a_track_is_expected_where_it_was_last_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = Detection(100.0, 100.0, 140.0, 140.0, 0.9, "ball")
+    noted = NotedDetector([(ball,), ()])
+    one = Pipeline(VisionConfig(), MODEL, noted)
+    monkeypatch.setattr(MissionSwitch, "step", lambda *_: Plan(STILL, "there", target=ball))
+    for seq in (1, 2):
+        one.step(Frame(header(seq).model_copy(update={"pose": (0.0, 0.0, 0.1 * seq)}), EMPTY))
+    assert noted.expected == [None, (120.0, 120.0)]
+
+
+@pytest.mark.parametrize("frame_us", [FRAME_US, 10 * FRAME_US])
+@pytest.mark.parametrize("rate_rad_s", [1.5, -1.5])
+def test_a_target_is_expected_where_it_is_for_a_robot_that_turns(frame_us: int, rate_rad_s: float) -> None:
+    """The ball moves too, at 0.1 m/s. The last two images do not show it."""
+    noted, true_px = NotedDetector([]), list[float]()
+    one = Pipeline(VisionConfig(), MODEL, noted)
+    for seq in range(1, 11):
+        # A turn in the last three frames only, so that the ball stays in view.
+        t_s, pose = seq * frame_us / 1e6, (0.1, 0.0, rate_rad_s * max(0, seq - 8) * frame_us / 1e6)
+        right, _, ahead = ball_about_lens(MODEL, *from_odometry(pose, 2.0, 0.1 * t_s))
+        middle, half = MODEL.cx_px + MODEL.fx_px * right / ahead, MODEL.fx_px * 0.1 / ahead
+        ball = Detection(middle - half, 120.0 - half, middle + half, 120.0 + half, 0.9, "ball")
+        noted.found.append((ball,) if seq < 9 else ())
+        true_px.append(middle)
+        one.step(Frame(header(seq, t_us=round(t_s * 1e6)).model_copy(update={"pose": pose}), EMPTY))
+    assert all(place is not None and abs(place[0] - true) < 1 for place, true in
+               zip(noted.expected[5:9], true_px[5:9], strict=True))
+    assert noted.expected[9] is None if frame_us > FRAME_US else abs(noted.expected[9][0] - true_px[9]) < 1
 
 
 def test_a_new_session_and_another_camera_expect_no_target() -> None:
@@ -108,7 +139,7 @@ def test_a_new_session_and_another_camera_expect_no_target() -> None:
     one.set_camera(MODEL.model_copy(update={"fx_px": 300.0}))
     one.step(Frame(header(3, "1111aaaa"), EMPTY))
     one.step(Frame(header(4, "1111aaaa"), EMPTY))
-    assert noted.expected == [None, None, None, (120.0, 120.0)]
+    assert noted.expected == [None, None, None, pytest.approx((120.0, 120.0), abs=1.0)]
 
 
 @pytest.mark.parametrize(("change", "is_same_lens"), [

@@ -106,6 +106,30 @@ def points_ahead(outline_px: NDArray[np.float64], camera: CameraModel) -> NDArra
     return points
 
 
+def place_px(x_m: float, y_m: float, was_px: tuple[float, float], camera: CameraModel) -> tuple[float, float] | None:
+    """Return the place in the image of an object over the floor.
+
+    Args:
+        x_m: forward of the midpoint of the axle.
+        y_m: left of it.
+        was_px: its place in an earlier image. In this one its ray slopes as much.
+        camera: model of this image.
+
+    Returns:
+        Its place, or None for an object that is not in front of the camera.
+    """
+    down = float(points_ahead(np.array([was_px]), camera)[1, 0])
+    forward, ahead_m = math.cos(camera.pitch_rad) + down * math.sin(camera.pitch_rad), x_m - camera.x_m
+    if not (ahead_m > 0 and forward > 0):  # or not a number
+        return None
+    right = (camera.y_m - y_m) / ahead_m * forward
+    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]])
+    none = np.zeros(3)
+    points, _ = cv2.projectPoints(np.array([[right, down, 1.0]]), none, none, matrix, _opencv_distortion(camera))
+    column, row = points.ravel().tolist()
+    return (column, row) if math.isfinite(column) and math.isfinite(row) else None
+
+
 @lru_cache(maxsize=64)
 def _pinhole(cx_px: float, cy_px: float, fx_px: float, fy_px: float) -> tuple[Column, Column]:
     """Return principal point and focal lengths as columns."""

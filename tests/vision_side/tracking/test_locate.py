@@ -27,6 +27,7 @@ from sightline.vision_side.tracking.locate import (
     Sighting,
     locate_box,
     locate_sphere,
+    place_px,
     points_ahead,
 )
 
@@ -329,6 +330,25 @@ def test_box_behind_the_robot_is_not_located(pitch_rad, located):
     camera = CAMERA.model_copy(update={"pitch_rad": pitch_rad})
     box = boxed(300.0, 430.0, 360.0, 470.0)  # 0.524 down for each meter ahead
     assert (locate_box(box, camera, BoxesConfig(), 1.0) is not None) == located
+
+
+@pytest.mark.parametrize("distortion", [(), *DISTORTIONS])
+@pytest.mark.parametrize("pitch_rad", [0.0, 0.2, -0.3])
+def test_place_in_the_image_is_that_of_the_object_over_the_floor(pitch_rad, distortion):
+    """Before, it was elsewhere on a ray of the same slope."""
+    camera = CAMERA.model_copy(update={"pitch_rad": pitch_rad, "distortion": distortion})
+    was, now = pixels(np.array([[-0.4, 0.3, 1.0], [0.25, 0.3, 1.0]]), camera)
+    found = place_px(*place((0.5, 0.6, 2.0), camera), tuple(was), camera)
+    assert found == pytest.approx(tuple(now), abs=0.05)
+
+
+@pytest.mark.parametrize(("x_m", "y_m", "pitch_rad"), [
+    (0.1, 0.0, 0.0), (-1.0, 0.0, 0.0), (1.0, 0.0, -1.2), (math.nan, 0.0, 0.0), (1.0, math.nan, 0.0),
+    (1.0, math.inf, 0.0),
+])  # fmt: skip
+def test_object_that_is_not_in_front_of_the_camera_has_no_place_in_the_image(x_m, y_m, pitch_rad):
+    camera = CAMERA.model_copy(update={"pitch_rad": pitch_rad})
+    assert place_px(x_m, y_m, (330.0, 450.0), camera) is None
 
 
 # --- boxes of another service ------------------------------------------------------------------------------------
