@@ -431,6 +431,8 @@ FIGURES: Mapping[str, Figure] = {
     "distance_rms_m": Figure("m", "rms"),
     "lost_percent": Figure("%", "share", is_exact=True),
     "wrong_percent": Figure("%", "share", is_exact=True),
+    "lost_after_s": Figure("s", "extreme"),
+    "found_again_s": Figure("s", "extreme"),
     "wall_contacts": Figure("steps", "count", is_exact=True),
     "wall_contact_s": Figure("s", "count", is_exact=True),
     "target_contacts": Figure("steps", "count", is_exact=True),

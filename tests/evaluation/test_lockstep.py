@@ -37,6 +37,14 @@ def test_every_scenario_holds_its_figures(name, seconds):
     assert [check for check in checks_of(load_scenario(name), result, 50) if not check.ok] == []
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "seconds"), [("legs-crowd", 27.0), ("three-boxes", 15.0)])
+def test_target_that_others_hide_holds_its_figures(name, seconds):
+    """Two humans cross before 27 s. The ball passes a box before 15 s."""
+    _, result = run(name, 103, Conditions(latency_ms=50, loss=0.1), seconds)
+    assert [check for check in checks_of(load_scenario(name), result, 50) if not check.ok] == []
+
+
 def test_with_400_ms_the_robot_stands_still():
     result, figures = run("eight", 104, Conditions(latency_ms=400, loss=0.1), 3.0)
     assert all(check.ok for check in checks_of(load_scenario("eight"), figures, 400))

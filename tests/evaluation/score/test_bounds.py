@@ -22,6 +22,7 @@ from sightline.evaluation.score.figures import (
     commanded_m,
     figures_of,
     goal_figures,
+    identity_figures,
     legs_figures,
     light_figures,
     median_and_worst,
@@ -121,6 +122,10 @@ def test_second_begins_after_the_first_accepted_twist(accepted_us, begin):
     assert acquired(samples(90), accepted_us) == begin
 
 
+UNKNOWN = dict.fromkeys(("wrong_percent", "lost_after_s", "found_again_s"))
+"""Figures of the frames that the mission answered, without such frames."""
+
+
 # --- the figures of following ------------------------------------------------------------------------------------
 
 
@@ -138,7 +143,7 @@ def test_figures_of_a_run_with_numbers():
     assert result.lost_percent == result.unseen_percent == pytest.approx(100 * 25 / 102)
     assert (result.wall_contacts, result.target_contacts) == (101, 202)
     assert result.travelled_m == pytest.approx(101 * 0.05) and result.seconds == pytest.approx(2.02)
-    figures = {"wall_contact_s": pytest.approx(0.404), "commanded_m": 0.0, "wrong_percent": None}
+    figures = {"wall_contact_s": pytest.approx(0.404), "commanded_m": 0.0, **UNKNOWN}
     assert result.figures == figures and STEP_S == 0.004
 
 
@@ -232,7 +237,7 @@ def test_scenario_decides_which_figures_a_run_has():
     run = RunRecord(samples(5, light=lambda _: "red", past_line_m=lambda _: -1.0, walls=lambda at: 7 + at,
                             passes=lambda at: 3 + 2 * at),
                     wheels=[RimSpeeds(START_US, 0.5, 0.0)])
-    common = {"wall_contact_s", "commanded_m", "wrong_percent"}
+    common = {"wall_contact_s", "commanded_m", *UNKNOWN}
     found = {name: figures_of(scenario_of(**changes), run, run.samples) for name, changes in (
         ("sphere", {}), ("legs", {"shape": "legs"}), ("goals", {"goals_m": ((9.0, 9.0),)}),
         ("light", {"light": object()}), ("path", {"things": (object(), OnPath.model_construct())}),
@@ -241,7 +246,7 @@ def test_scenario_decides_which_figures_a_run_has():
     assert set(found["sphere"]) == set(found["things"]) == common
     assert set(found["path"]) == common | {"least_passes"} and found["path"]["least_passes"] == 8
     assert found["sphere"] == {"wall_contact_s": pytest.approx(0.016), "commanded_m": pytest.approx(0.5 * 0.08),
-                               "wrong_percent": None}
+                               **UNKNOWN}
     assert set(found["legs"]) == common | {"least_distance_m", "most_distance_m", "least_ever_m"}
     assert set(found["goals"]) == common | {"reached_s", "least_clearance_m", "least_around_deg", "given_up_s"}
     assert set(found["light"]) == common | {
@@ -267,6 +272,19 @@ def test_target_reported_at_the_very_distance_is_not_wrong():
     for distance_m, wrong_percent in ((0.3, 0.0), (0.3001, 100.0)):
         said = [(START_US, "tracking", "", 0.0, distance_m)]
         assert scored(run, scenario_of(stand_off_m=0.0), said=said).figures["wrong_percent"] == wrong_percent
+
+
+@pytest.mark.parametrize(("rows", "lost_after_s", "found_again_s"), [
+    ("tt", 0.0, 0.0), ("tttwt", 0.1, 0.1), ("twwtwt", 0.2, 0.2), ("twtwww", 0.2, 0.2), ("tccct", 0.0, 0.3),
+    ("tccwwct", 0.2, 0.5), ("thhht", 0.0, 0.0), ("thhccwt", 0.1, 0.3), ("tchct", 0.0, 0.1), ("w", 0.0, 0.0),
+])  # fmt: skip
+def test_longest_times_on_another_object_and_without_the_target_in_view(rows, lost_after_s, found_again_s):
+    """Frames 0.1 s apart: tracking, wrong, coasting with the target in view, or with it hidden."""
+    run = samples(60, visible=lambda at: rows[min(at // 5, len(rows) - 1)] != "h" or at > 50)
+    said = [(START_US + 100_000 * at, "tracking" if row in "tw" else "coasting", "", 1.0 if row == "w" else 0.0, 0.8)
+            for at, row in enumerate(rows)]
+    figures = identity_figures(run, [AnsweredFrame(*one) for one in said])
+    assert (figures["lost_after_s"], figures["found_again_s"]) == pytest.approx((lost_after_s, found_again_s))
 
 
 def test_answered_frame_has_what_the_mission_reported():
