@@ -181,7 +181,8 @@ def figures_of(scenario: Scenario, run: RunRecord, followed: Sequence[Truth]) ->
     figures: Figures = {
         "wall_contact_s": (samples[-1].wall_contacts - samples[0].wall_contacts) * STEP_S,
         "commanded_m": commanded_m(run.wheels, samples[0].t_us, samples[-1].t_us),
-    } | identity_figures(followed, run.said)
+        **identity_figures(followed, run.said),
+    }
     if any(isinstance(thing, OnPath) for thing in scenario.things):
         figures["least_passes"] = samples[-1].passes - samples[0].passes
     if scenario.target.shape == "legs":
@@ -205,25 +206,27 @@ def commanded_m(wheels: Sequence[RimSpeeds], begin_us: int, end_us: int) -> floa
 def identity_figures(followed: Sequence[Truth], said: Sequence[AnsweredFrame]) -> Figures:
     """Return how the mission followed another object, and the target again, in the frames since the acquisition."""
     times_us = [truth.t_us for truth in followed]
-    frames = [one for one in said if times_us and one.t_us >= times_us[0]]
-    truths = [followed[bisect_right(times_us, one.t_us) - 1] for one in frames]
-    wrong = [_is_wrong(truth, one) for truth, one in zip(truths, frames, strict=True)]
-    missed = [truth.visible and (is_wrong or one.phase != "tracking")
-              for truth, one, is_wrong in zip(truths, frames, wrong, strict=True)]
+    wrong, missed = list[tuple[int, bool]](), list[tuple[int, bool]]()
+    for one in said:
+        if times_us and one.t_us >= times_us[0]:
+            truth = followed[bisect_right(times_us, one.t_us) - 1]
+            is_wrong = _is_wrong(truth, one)
+            wrong.append((one.t_us, is_wrong))
+            missed.append((one.t_us, truth.visible and (is_wrong or one.phase != "tracking")))
     return {
-        "wrong_percent": 100 * sum(wrong) / len(frames) if frames else None,
-        "lost_after_s": _longest_s(frames, wrong), "found_again_s": _longest_s(frames, missed),
+        "wrong_percent": 100 * sum(is_wrong for _, is_wrong in wrong) / len(wrong) if wrong else None,
+        "lost_after_s": _longest_s(wrong), "found_again_s": _longest_s(missed),
     }
 
 
-def _longest_s(frames: Sequence[AnsweredFrame], flags: Sequence[bool]) -> float | None:
+def _longest_s(flags: Sequence[tuple[int, bool]]) -> float | None:
     """Return the longest time from a frame with a true flag to the next one with a false flag, or to the last frame."""
     longest_us, begin_us = 0, None
-    for one, flag in zip(frames, flags, strict=True):
-        begin_us = one.t_us if flag and begin_us is None else begin_us
-        longest_us = max(longest_us, one.t_us - begin_us) if begin_us is not None else longest_us
+    for t_us, flag in flags:
+        begin_us = t_us if begin_us is None else begin_us
+        longest_us = max(longest_us, t_us - begin_us)
         begin_us = begin_us if flag else None
-    return longest_us / 1e6 if frames else None
+    return longest_us / 1e6 if flags else None
 
 
 def _is_wrong(truth: Truth, one: AnsweredFrame) -> bool:

@@ -118,18 +118,18 @@ class Follow:
         """Return the places within the range, with the look of each object where it may matter."""
         most_m = self._config.target.max_range_m
         near = [one for one in places if one and one.x_m**2 + one.y_m**2 <= most_m**2]
-        needed = len(near) > 1 or not view.header.seq % _LOOKS_EACH or not self._are_expected(near, view, gap_s)
-        if view.picture is None or not self.has_look or not needed:
+        is_alone = len(near) == 1 and self._is_expected(near[0], view, gap_s)
+        if view.picture is None or not self.has_look or (is_alone and view.header.seq % _LOOKS_EACH):
             return near
         return [replace(one, look=look_of(view.picture, one.detection)) for one in near]
 
-    def _are_expected(self, near: list[Sighting], view: View, gap_s: float) -> bool:
-        """Return True if the target was in the last frame, and each place is where it should be by now."""
-        target, apart_m = self._track.target, self._config.track.apart_m
+    def _is_expected(self, one: Sighting, view: View, gap_s: float) -> bool:
+        """Return True if the target was in the last frame, and `one` is where it should be by now."""
+        target = self._track.target
         if target is None or target.unseen_us:
             return False
-        expected = from_odometry(view.header.pose, *target.after(gap_s))
-        return all(math.dist((one.x_m, one.y_m), expected) < apart_m for one in near)
+        x, y = from_odometry(view.header.pose, *target.after(gap_s))
+        return math.hypot(one.x_m - x, one.y_m - y) < self._config.track.apart_m
 
     def _expected_m(self, pose: Pose) -> float:
         """Return the assumed distance of a box without a known size, in m: its last one, or the stand-off."""

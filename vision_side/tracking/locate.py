@@ -118,16 +118,16 @@ def place_px(x_m: float, y_m: float, was_px: tuple[float, float], camera: Camera
     Returns:
         Its place, or None for an object that is not in front of the camera.
     """
-    down = float(points_ahead(np.array([was_px]), camera)[1, 0])
+    _, (down,) = points_ahead(np.array([was_px]), camera)[:2].tolist()
     forward, ahead_m = math.cos(camera.pitch_rad) + down * math.sin(camera.pitch_rad), x_m - camera.x_m
     if not (ahead_m > 0 and forward > 0):  # or not a number
         return None
     right = (camera.y_m - y_m) / ahead_m * forward
-    matrix = np.array([[camera.fx_px, 0, camera.cx_px], [0, camera.fy_px, camera.cy_px], [0, 0, 1.0]])
     none = np.zeros(3)
-    points, _ = cv2.projectPoints(np.array([[right, down, 1.0]]), none, none, matrix, _opencv_distortion(camera))
-    column, row = points.ravel().tolist()
-    return (column, row) if math.isfinite(column) and math.isfinite(row) else None
+    points, _ = cv2.projectPoints(np.array([[right, down, 1.0]]), none, none, np.eye(3), _opencv_distortion(camera))
+    across, below = points.ravel().tolist()
+    x_px, y_px = camera.cx_px + camera.fx_px * across, camera.cy_px + camera.fy_px * below
+    return (x_px, y_px) if math.isfinite(x_px + y_px) else None
 
 
 @lru_cache(maxsize=64)

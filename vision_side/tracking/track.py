@@ -90,9 +90,9 @@ class _Object:
         self.variance = (position + dt_s * (2 * both + dt_s * velocity) + power * dt_s**2 / 3,
                          both + dt_s * velocity + power * dt_s / 2, velocity + power)
         was = self.state
-        self.state = Target(*was.after(dt_s), was.vx_mps, was.vy_mps, was.unseen_us + round(dt_s * 1e6), was.sightings,
-                            was.number)
-        self._unlike_us += round(dt_s * 1e6)
+        dt_us = round(dt_s * 1e6)
+        self.state = Target(*was.after(dt_s), was.vx_mps, was.vy_mps, was.unseen_us + dt_us, was.sightings, was.number)
+        self._unlike_us += dt_us
 
     @property
     def is_known(self) -> bool:

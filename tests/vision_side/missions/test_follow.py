@@ -191,13 +191,15 @@ def test_look_is_computed_where_it_matters(monkeypatch):
     looks = []
     monkeypatch.setattr(module, "look_of", lambda _picture, one: looks.append(one) or np.eye(64, dtype=np.float32)[0])
     follow, counts = follow_of(), []
-    frames = [((1.5,), 1), ((1.5,), 2), ((1.5, 2.0), 3), ((1.5,), 8), ((1.5,), 9), ((), 10), ((1.5,), 11), ((1.5,), 12)]
+    frames = [((1.5,), 1), ((1.5,), 2), ((1.5, 2.0), 3), ((1.5,), 8), ((1.5,), 9), ((), 10), ((1.5,), 11), ((1.5,), 12),
+              ((1.5, 1.55), 13), ((1.5,), 14), ((1.8,), 15)]
     for places, seq in frames:
         follow.step(view(*map(ball, places), seq=seq))
         counts.append(len(looks))
-    assert counts == [1, 1, 3, 4, 4, 4, 5, 5], "at the start, of several, each eighth frame, after a frame without"
+    assert counts[:8] == [1, 1, 3, 4, 4, 4, 5, 5], "at the start, of several, each eighth frame, after a frame without"
+    assert counts[8:] == [7, 7, 8], "of two at one place, and further than 0.15 m from the expected place"
     follow.step(view(ball(1.5), ball(2.0), picture=None))
-    assert len(looks) == 5, "boxes of another service come without pixels"
+    assert len(looks) == 8, "boxes of another service come without pixels"
 
 
 # --- the plan ----------------------------------------------------------------------------------------------------

@@ -398,6 +398,7 @@ def test_look_of_the_target_follows_the_light():
     track = Track(TrackConfig(give_up_s=0.4))
     for number in range(40):
         assert track.step(DT_S, HERE, [at(*TARGET, look=look(number / 40))]) is not None
+    assert 0.001 < difference(track._followed.look, look(39 / 40)) < OTHER, "more slowly"
     steps_until(track, lambda _: track.target is None)
     assert track.step(DT_S, HERE, [at(*TARGET, look=look(0.0))]) is None
     assert track.step(DT_S, HERE, [at(*TARGET, look=look(1.0))]) is not None
