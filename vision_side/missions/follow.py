@@ -128,8 +128,8 @@ class Follow:
         target = self._track.target
         if target is None or target.unseen_us:
             return False
-        x, y = from_odometry(view.header.pose, *target.after(gap_s))
-        return math.hypot(one.x_m - x, one.y_m - y) < self._config.track.apart_m
+        expected = from_odometry(view.header.pose, *target.after(gap_s))
+        return math.dist((one.x_m, one.y_m), expected) < self._config.track.apart_m
 
     def _expected_m(self, pose: Pose) -> float:
         """Return the assumed distance of a box without a known size, in m: its last one, or the stand-off."""
