@@ -25,7 +25,8 @@ from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import SightlineError, WireError
 from sightline.protocol.messages import DetectionsHeader, FrameHeader, Stamp, State, Status
 from sightline.protocol.transports.link import Link, LinkRules, Message
-from sightline.protocol.transports.zenoh.link import ZenohLink
+from sightline.protocol.transports.tokens import RobotToken
+from sightline.protocol.transports.zenoh.link import ZenohLink, declare_token
 from sightline.protocol.transports.zenoh.session import open_session
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector, Maker, result_of
@@ -313,6 +314,7 @@ def measure_streams(endpoint: str, folder: Path, plan: StreamPlan) -> Load:
         links = [ZenohLink(session, LinkRules(f"s{index}", "robot"), shared=True) for index in range(plan.streams)]
         for link in links:
             ending.callback(link.close)
+            ending.callback(declare_token(session, RobotToken(link.robot)))  # services that share find it by this
         services = [_Service(plan, endpoint, folder / f"detector-{index}.log", ending)
                     for index in range(plan.services)]
         robots = _Streams(links, jpeg)

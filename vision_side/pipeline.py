@@ -183,9 +183,9 @@ class Pipeline:
         if self._mission_switch.set_camera(camera, is_scaled=is_scaled) or not is_scaled:
             self.restart_clock()
         elif self._seen_at is not None:
-            t_us, x_px, y_px = self._seen_at
+            t_us, (x_px, y_px) = self._seen_at
             across, down = camera.width_px / former.width_px, camera.height_px / former.height_px
-            self._seen_at = (t_us, x_px * across, y_px * down)
+            self._seen_at = t_us, (x_px * across, y_px * down)
 
     def fits(self, jpeg: bytes) -> bool:
         """Return True if an image has the size of the newest camera model. Does not decode."""

@@ -90,7 +90,7 @@ def test_busy_port_is_reported_with_its_owner(tmp_path):
 
 
 @pytest.mark.slow
-def test_vision_service_is_measured_and_ready_with_and_without_a_robot(tmp_path):
+def test_vision_service_is_measured_and_ready_while_its_link_is_open(tmp_path):
     port = free_port()
     with RobotProcess(tmp_path) as robot:
         robot.wait_until_on()
@@ -106,7 +106,7 @@ def test_vision_service_is_measured_and_ready_with_and_without_a_robot(tmp_path)
             assert until(lambda: _samples(port)["sightline_vision_compute_seconds", "r1"] > 0)
             robot.process.terminate()
             assert until(lambda: _samples(port)["sightline_vision_hears", "r1"] == 0, 15)
-            assert _ready(port) == 200
+            assert _ready(port) == 503, "the robot was its link"
         finally:
             vision.terminate()
             assert vision.wait(20) == 0
