@@ -199,7 +199,8 @@ PROCESS_CASES: Final = (
                   _SCRIPT, blind=True, again=True, short=name == "driver_kill", alone=name == "driver_loop")
         for name, what, number in (
             ("driver_kill", "SIGKILL", signal.SIGKILL), ("driver_pause", "SIGSTOP", signal.SIGSTOP),
-            ("driver_segfault", "segmentation fault", signal.SIGSEGV), ("driver_loop", "endless loop", LOOP),
+            ("driver_segfault", "segmentation fault", signal.SIGSEGV),
+            ("driver_loop", "endless loop on the core of the guardian", LOOP),
         )
     ),
     FaultCase("guardian.kill", "guardian: SIGKILL", _kill_guardian, _SCRIPT, blind=True, also="driver process ends"),

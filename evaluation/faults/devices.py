@@ -4,6 +4,7 @@ Every image that was spoiled is noted in `camera.ledger` beside it, every failur
 """
 
 import ctypes
+import os
 import signal
 import time
 from collections.abc import Callable
@@ -131,6 +132,10 @@ FAULTS: Final[dict[str, Callable[[Picture, Picture], Picture | None]]] = {
     "resized": _resized, "hangs": lambda now, _last: now,
 }
 def _loop(_number: int, _frame: FrameType | None) -> None:
+    # On a core of its own the guardian would need no higher priority than this loop.
+    core = {min(os.sched_getaffinity(0))}
+    for process in (0, os.getppid()):
+        os.sched_setaffinity(process, core)
     while True:
         pass
 
