@@ -191,6 +191,8 @@ def query_presence(session: zenoh.Session, timeout_s: float = REPLY_TIMEOUT_S) -
     replies = session.get(
         PRESENCE_PATTERN, zenoh.handlers.FifoChannel(MAX_PEERS), target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s,
+        # By default a router waits until each peer has room for the query: a peer that hangs would stop all others.
+        congestion_control=zenoh.CongestionControl.DROP,
     )
     # A broken or hostile peer may reply with anything, also more than once. Such replies do not count.
     for reply in replies:

@@ -1,8 +1,10 @@
 """Presence: the form of an answer, robot ids in use, and the peers that are listed at a real router."""
 
 import time
+from types import SimpleNamespace
 
 import pytest
+import zenoh
 
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.client.discovery import as_object, lines, shared_robots
@@ -23,6 +25,7 @@ from sightline.protocol.transports.zenoh.presence import (
     best_round_trips,
     parse_presence_reply,
     presence_key,
+    query_presence,
     robot_with_same_id,
 )
 from sightline.protocol.transports.zenoh.session import open_session
@@ -243,3 +246,11 @@ def test_empty_router_is_reported(router, capsys):
 def test_endpoint_of_one_robot_differs_from_a_router(capsys):
     assert cli.run(["robots", "--connect", "ws://127.0.0.1:9090"]) == 2
     assert "sightline status --connect ws://127.0.0.1:9090" in capsys.readouterr().err
+
+
+def test_no_query_of_presence_waits_for_a_peer_that_hangs():
+    """A router that waits for the room of one peer passes no message of others: robots stood for 2 to 5 s."""
+    noted = []
+    session = SimpleNamespace(get=lambda *_, **options: noted.append(options) or ())
+    assert query_presence(session) == []
+    assert [one["congestion_control"] for one in noted] == [zenoh.CongestionControl.DROP]
