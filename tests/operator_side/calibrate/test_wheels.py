@@ -184,7 +184,7 @@ def test_killed_during_a_turn_leaves_zero_and_restarts_nothing(tmp_path, opened)
     os.kill(driver_of(terminal.process.pid), signal.SIGKILL)
     assert terminal.process.wait(3) == 3
     assert commanded(log)[-1] == (0.0, 0.0)
-    assert "not started again: the motors are at zero" in terminal.text()
+    assert terminal.shows("not started again: the motors are at zero"), terminal.text()
 
 
 def test_a_drive_is_calibrated_at_a_terminal(tmp_path, opened, monkeypatch):
