@@ -59,9 +59,7 @@ class Lease:
         while self._ended and now_us - next(iter(self._ended.values())) >= self.life_us:
             self._ended.popitem(last=False)
         # Others can compute the token of a driver from its proofs. A human must not be kept out by that.
-        if not self._ended or who.source in HUMANS:
-            return False
-        return any(token in self._ended for token in tokens_of(proof.proof))
+        return who.source not in HUMANS and any(token in self._ended for token in tokens_of(proof.proof))
 
     def may_take(self, who: Holder, now_us: int, proof: Proof = NO_PROOF) -> bool:
         """Return True if `who` holds the lease, outranks the holder or succeeds it, or if the lease is free."""

@@ -149,7 +149,7 @@ def test_five_restarts_within_a_minute_are_permitted():
 
 @pytest.mark.parametrize(("code", "end_signal", "expected"), [
     (0, None, 0), (0, 15, 0), (4, None, 4), (-9, None, None), (-11, None, None), (-1, None, None),
-    (-9, 15, 143), (-9, 2, 130),
+    (-9, 15, 143), (-9, 2, 130), (-1, 15, 143),
 ])  # fmt: skip
 def test_exit_codes_are_forwarded_and_a_killed_driver_starts_again(code, end_signal, expected):
     assert exit_code_after(code, end_signal, was_running=False) == expected

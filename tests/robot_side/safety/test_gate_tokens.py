@@ -85,6 +85,16 @@ def test_a_token_that_follows_from_another_one_is_not_of_its_driver():
     assert driver.withdraw()
 
 
+def test_a_driver_whose_token_overtook_its_first_command_reads_why_it_is_rejected():
+    rig = Rig(auto_arm=True)
+    driver = Driver(rig)
+    driver.declare()
+    driver.withdraw()
+    result = driver.drive()
+    assert (result.reason, result.detail) == (RejectReason.NOT_HOLDER, "the token of this vision just ended")
+    assert rig.gate.holder(rig.now_us) is None
+
+
 def test_the_last_command_drives_on_after_the_token_until_it_is_too_old():
     rig, driver = driven()
     driver.drive(600)

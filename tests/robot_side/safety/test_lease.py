@@ -217,6 +217,14 @@ def test_ended_tokens_are_bounded_and_the_newest_count():
     assert lease.may_take(drivers[-1].who, 1_000, drivers[-1].proof) and not lease._ended
 
 
+def test_each_ended_token_counts_for_its_own_time():
+    lease, early, late = Lease(1_000, 400), Vision(2), Vision(3)
+    for driver, at_us in ((early, 0), (late, 900)):
+        lease.add_token(driver.token)
+        lease.end_token(driver.token, at_us)
+    assert lease.may_take(early.who, 1_000, early.proof) and not lease.may_take(late.who, 1_000, late.proof)
+
+
 def test_token_that_was_never_there_keeps_no_driver_out():
     lease, second = Lease(1_000, 400), Vision(2)
     lease.end_token(second.token, 0)
