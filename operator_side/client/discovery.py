@@ -14,8 +14,8 @@ from sightline.protocol.errors import ConfigError, LinkError, SightlineError, Wi
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, parse_zenoh_endpoint
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.security import ROBOT_ROLE
-from sightline.protocol.transports.tokens import DriverToken, RobotToken, Token, VisionToken
-from sightline.protocol.transports.zenoh.discovery import MAX_ROBOTS, Discovered, discover, find_listeners
+from sightline.protocol.transports.tokens import MAX_ROBOTS, DriverToken, RobotToken, Token, VisionToken
+from sightline.protocol.transports.zenoh.discovery import Discovered, discover, find_listeners
 from sightline.protocol.transports.zenoh.presence import MAX_PEERS, PeerInfo
 
 _ROLE_WIDTH = 9

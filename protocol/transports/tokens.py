@@ -19,6 +19,9 @@ ROBOT_KIND, VISION_KIND, DRIVER_KIND, DETECTOR_KIND = "robot", "vision", "driver
 ALL_TOKENS: Final = f"{PREFIX}/**"
 LEAST_WEIGHT, MOST_WEIGHT = 0.01, 1000.0
 
+# Security limits: robots and vision services of a site whose tokens one peer stores.
+MAX_ROBOTS: Final = 10_000
+MAX_SERVICES: Final = 256
 _WEIGHT: Final = r"\d{1,4}(?:\.\d{1,3})?"
 # Exact: a peer may declare a token with a wildcard, which names no robot and no service.
 _KEYS: Final = re.compile(

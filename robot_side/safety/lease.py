@@ -36,7 +36,7 @@ class Lease:
     """The token of the holder, "" without one. Its end is the end of the lease."""
     _tokens: OrderedDict[str, None] = field(default_factory=OrderedDict)
     _ended: OrderedDict[str, int] = field(default_factory=OrderedDict)
-    """Tokens that ended within the life of a lease, and when."""
+    """The newest tokens that ended, and when."""
     _fenced: OrderedDict[Holder, None] = field(default_factory=OrderedDict)
     """Sessions whose token ended while they held the lease, or that were succeeded. A late command never drives."""
     _known: OrderedDict[Holder, str] = field(default_factory=OrderedDict)
@@ -56,10 +56,9 @@ class Lease:
         A command that comes later than the life of a lease is too old. Until then no other driver may succeed a session
         without a token.
         """
-        while self._ended and now_us - next(iter(self._ended.values())) >= self.life_us:
-            self._ended.popitem(last=False)
         # Others can compute the token of a driver from its proofs. A human must not be kept out by that.
-        return who.source not in HUMANS and any(token in self._ended for token in tokens_of(proof.proof))
+        return who.source not in HUMANS and any(
+            now_us - self._ended[token] < self.life_us for token in tokens_of(proof.proof) if token in self._ended)
 
     def may_take(self, who: Holder, now_us: int, proof: Proof = NO_PROOF) -> bool:
         """Return True if `who` holds the lease, outranks the holder or succeeds it, or if the lease is free."""

@@ -13,7 +13,7 @@ from enum import Enum
 from fnmatch import fnmatchcase
 from typing import Final
 
-from sightline.protocol.transports.tokens import DetectorToken
+from sightline.protocol.transports.tokens import MAX_ROBOTS, DetectorToken
 from sightline.vision_side.serving.assignment import ranked
 
 MAX_SERVICES: Final = 64
@@ -22,8 +22,6 @@ MAX_KEPT_TOKENS: Final = 1_000
 """Security limit: tokens that are stored. After a flood of more, the caller watches all that are present once more."""
 RECALL_US: Final = 5_000_000
 """Time in which the second watch has reported the tokens of before, also on a busy machine."""
-MAX_ROBOTS: Final = 10_000
-"""Security limit: robots that are known. After a flood of more, the caller watches all tokens once more."""
 LEFT_US: Final = 10_000_000
 """Time without its token after which a robot has left. Its link, or that of this service, may be back before."""
 _STANDING_BY: Final = 2
@@ -69,7 +67,7 @@ class _Robot:
 
 
 class RobotTokens:
-    """The robots that have a token, or had one a moment ago."""
+    """The robots that have a token, or had one a moment ago. After a flood, the caller watches all once more."""
 
     def __init__(self, pattern: str, before: Iterable[str] = (), now_us: int = 0) -> None:
         """Create it. The robots in `before` leave unless their token is reported once more.

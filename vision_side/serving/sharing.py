@@ -19,7 +19,14 @@ from typing import Final
 
 from sightline.protocol.errors import RejectReason
 from sightline.protocol.messages import State, Status
-from sightline.protocol.transports.tokens import DriverToken, RobotToken, Token, VisionToken
+from sightline.protocol.transports.tokens import (
+    MAX_ROBOTS,
+    MAX_SERVICES,
+    DriverToken,
+    RobotToken,
+    Token,
+    VisionToken,
+)
 from sightline.vision_side.serving.assignment import assign, ranked
 
 SILENT_US: Final = 380_000
@@ -55,8 +62,8 @@ counts as ended. A robot tries to connect once a second, or more often."""
 SERVICE_RETURNS_US: Final = 300_000
 """The same for tokens of services and drivers. A service may have died with its router, and its robots stand. One that
 returns later gets its robots back. As long, nothing is claimed: the token of a driver may follow that of its robot."""
-MAX_ROBOTS, MAX_SERVICES, MAX_DRIVERS = 10_000, 256, 16
-"""Security limits: robots, services, and drivers of one robot. Further tokens count when there is room for them."""
+MAX_DRIVERS: Final = 16
+"""Security limit: drivers of one robot. Further tokens, as those of robots and services, count when there is room."""
 MAX_OWN: Final = 2 * MAX_ROBOTS
 """Newest tokens of this service that are stored."""
 _UNKNOWN: Final = -1

@@ -17,6 +17,8 @@ from sightline.protocol.transports.link import LinkRules, Message
 from sightline.protocol.transports.security import RoleKeys, load_role_keys
 from sightline.protocol.transports.tokens import (
     ALL_TOKENS,
+    MAX_ROBOTS,
+    MAX_SERVICES,
     AnyToken,
     DetectorToken,
     DriverToken,
@@ -43,8 +45,6 @@ _BETWEEN_QUERIES_S: Final = 0.05
 
 # Security limits: no more answers and tokens than this are kept.
 MAX_LISTENERS: Final = 64
-MAX_ROBOTS: Final = 10_000
-MAX_SERVICES: Final = 256
 _MOST: Final[dict[type[AnyToken], int]] = {RobotToken: MAX_ROBOTS, DriverToken: MAX_ROBOTS, VisionToken: MAX_SERVICES}
 
 
