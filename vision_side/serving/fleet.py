@@ -449,7 +449,7 @@ class SharedFleet(Fleet):
         shared = self.sharing.robots.get(robot)
         part = shared.part if shared else SharingPart.NONE
         is_about_to_drive = self.sharing.is_about_to_drive(robot, now_us)
-        if part is not SharingPart.DRIVE and not (is_about_to_drive and service.is_standby):
+        if part is not SharingPart.DRIVE and not is_about_to_drive:
             service.rest()
         if is_about_to_drive:
             service.listen()  # before the token, so that the former driver leaves when this one has frames

@@ -3,7 +3,7 @@
     tokens of robots and services -> assignment -> owner and two standbys of each robot
     part      subscribes to           its token of a driver   left when
     STANDBY   camera model, status    no                      the robot gets other choices, and its driver works
-    CLAIM     frames too              yes                     no other driver is left, or it is silent
+    CLAIM     frames too              yes                     no other driver is left, or one is silent or newer
     DRIVE     the same                yes                     a better choice claims it, or another one keeps the lease
 
 The owner claims; the former driver sees the token and leaves; then the owner drives, first by the newest frame. A claim
@@ -130,10 +130,11 @@ class SharedRobot:
         """Return True if its statuses show no driver at work."""
         return self.status_us - self.active_us >= SILENT_US
 
-    @property
-    def is_kept(self) -> bool:
-        """Return True if this service drives beside a driver that has the lease, e.g. for a mission, and keeps it."""
-        return not self.has_held and self.is_not_mine and bool(self.others)
+    def is_kept(self, now_us: int) -> bool:
+        """Return True if another driver, which appeared after this one, keeps the robot and may ignore its token."""
+        if self.part is SharingPart.DRIVE:
+            return not self.has_held and self.is_not_mine and bool(self.others)
+        return self.driver_us >= self.changed_us and now_us - self.changed_us >= BETWEEN_CHANGES_US
 
     @property
     def is_not_mine(self) -> bool:
@@ -341,9 +342,11 @@ class Sharing:
         changed = {}
         for name, robot in self.robots.items():
             before = robot.part
-            # Without another driver, a claim becomes the drive in one step.
+            # Without another driver, a claim becomes the drive in one step. A repeated claim needs a new token.
             while (part := self._next_part(name, robot, now_us)) is not robot.part:
                 self._change(robot, part, now_us)
+                if part is SharingPart.STANDBY:
+                    break
             if part is not before:
                 changed[name] = part
         return changed
@@ -367,8 +370,7 @@ class Sharing:
         watches = not self._is_leaving and (robot.has_left or self._is_choice(name))
         beside = SharingPart.STANDBY if watches else SharingPart.NONE
         if robot.part in (SharingPart.CLAIM, SharingPart.DRIVE):
-            kept = SharingPart.CLAIM if robot.is_kept else robot.part
-            return beside if self._must_leave(name, robot) else kept
+            return beside if self._must_leave(name, robot) or robot.is_kept(now_us) else robot.part
         may_claim = not self._is_leaving and now_us - self._up_us >= SERVICE_RETURNS_US
         return SharingPart.CLAIM if may_claim and self._is_next(name, robot, now_us) else beside
 

@@ -112,15 +112,20 @@ def test_robot_that_is_named_gets_a_new_session_of_the_same_service(monkeypatch,
     assert site.fleet.services["r0"] is before and before.sender is not sender and not before.is_standby
 
 
-def test_a_driver_that_gives_up_receives_frames_for_its_claim_and_answers_none(monkeypatch):
+def test_a_driver_that_gives_up_claims_with_a_new_token_and_receives_frames_for_a_second(monkeypatch):
     site = Site(monkeypatch, 1)
     service, robot = site.fleet.services["r0"], site.fleet.sharing.robots["r0"]
+    first = service.sender
     assert not service.is_standby
     site.note(DriverToken("r0", "b", "0" * 32), True)
     robot.mine_us, robot.status_us, robot.active_us, robot.has_held = 0, site.now_us, site.now_us, False
     site.turn()
+    assert robot.part is SharingPart.STANDBY and service.is_standby and not service._is_subscribed
+    assert "r0" not in site.fleet._withdraw
+    site.turn(125, ms=10)
     assert robot.part is SharingPart.CLAIM and service.is_standby and service._is_subscribed
-    site.turn(120, ms=10)
+    assert service.sender is not first and "r0" in site.fleet._withdraw
+    site.turn(100, ms=10)
     assert robot.part is SharingPart.CLAIM and not service._is_subscribed
     site.note(DriverToken("r0", "b", "0" * 32), False)
     site.fleet._bell.clear()

@@ -446,7 +446,7 @@ def test_a_robot_that_must_not_move_changes_no_service(state):
     assert {token for token in site.present if isinstance(token, DriverToken)} == claims
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", [*range(60), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(60, 300))])
 def test_after_any_events_the_owners_drive(seed):
     site, chance = Site(robots(8), SERVICES, seed), Random(seed)
     for number in range(8):
