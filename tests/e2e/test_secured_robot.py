@@ -2,20 +2,23 @@
 
 import re
 import secrets
+import sys
 import time
 from pathlib import Path
 
 import pytest
 
+from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.operator_side.setup import keys
-from sightline.protocol.channels import FRAME, TWIST
+from sightline.protocol.channels import FRAME, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import LinkError
-from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, LeaseHolder
+from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, LeaseHolder, State, Status
 from sightline.protocol.proof import ProofChain
-from sightline.protocol.transports.zenoh.link import open_zenoh
-from tests.fixtures.commands import run, sightline
-from tests.fixtures.links import until
+from sightline.protocol.transports.tokens import DriverToken
+from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
+from tests.fixtures.commands import run, service, sightline
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
@@ -66,6 +69,45 @@ def test_second_connection_of_the_same_role_does_not_drive_by_a_copied_identity(
         assert status.holder == LeaseHolder.of("vision", vision.session)
         assert all(left >= 0.0 for _, left, _ in robot.motor_rows()), "no motor log line is caused by the copy"
         assert driving(robot)
+
+
+@pytest.fixture
+def shared_robot(tmp_path):
+    """A robot that a `vision --share` drives through a router, that router's endpoint, and the keys."""
+    folder, endpoint, pictures = str(tmp_path / "keys"), free_endpoint("tls/"), tmp_path / "ball"
+    keys.make(tmp_path / "keys", [])
+    pictures.mkdir()
+    write_pictures(pictures, 160, 120)
+    camera = {"kind": "folder", "options": {"path": str(pictures)}}
+    program, where = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"], ["--secure", folder]
+    with service([*program, "router", "--listen", endpoint, *where], " on ", tmp_path, START_S), \
+         RobotProcess(tmp_path, listen=[], connect=[endpoint], secure=folder, camera=camera) as robot, \
+         service([*program, "vision", "--share", "--connect", endpoint, *where], "drives it", tmp_path, START_S):
+        yield robot, endpoint, folder
+
+
+@pytest.mark.slow
+def test_second_connection_that_declares_and_withdraws_the_token_of_the_driver_changes_no_lease(shared_robot):
+    robot, endpoint, folder = shared_robot
+    statuses, tokens = [], set()
+    with open_fleet("*", connect=[endpoint], role="vision", by_status=False, secure=folder) as second, \
+         open_zenoh("r1", connect=[endpoint], role="viewer", secure=folder) as viewer:
+        second.watch_tokens(lambda token, _: tokens.add(token))
+        viewer.subscribe(STATUS, lambda message: statuses.append(decode(Status, message.payload, 4096)))
+        assert driving(robot, 1.0), robot.output()
+        assert until(lambda: len(statuses) > 3 and statuses[-1].state is State.ACTIVE)
+        (token,) = (one for one in tokens if isinstance(one, DriverToken))
+        began, rows = len(statuses) - 1, len(robot.motor_rows())
+        for _ in range(100):
+            second.declare_token(token)()
+        declared = len(statuses)
+        assert until(lambda: len(statuses) >= declared + 10)
+    seen = statuses[began:]
+    assert {one.state for one in seen} == {State.ACTIVE}
+    assert len({one.holder for one in seen}) == 1 and seen[0].holder.source == "vision"
+    assert seen[-1].accepted - seen[0].accepted >= len(seen), "it drives on, at more than 10 commands a second"
+    assert all(left or right for _, left, right in robot.motor_rows()[rows:])
+    assert [one for one in tokens if isinstance(one, DriverToken)] == [token], "the driver kept its session"
 
 
 @pytest.mark.parametrize("role", ["viewer", "operator"])
