@@ -22,6 +22,8 @@ LEAST_WEIGHT, MOST_WEIGHT = 0.01, 1000.0
 # Security limits: robots and vision services of a site whose tokens one peer stores.
 MAX_ROBOTS: Final = 10_000
 MAX_SERVICES: Final = 256
+RECALL_US: Final = 5_000_000
+"""Time in which a second watch has reported the tokens of before, also on a busy machine."""
 _WEIGHT: Final = r"\d{1,4}(?:\.\d{1,3})?"
 # Exact: a peer may declare a token with a wildcard, which names no robot and no service.
 _KEYS: Final = re.compile(
@@ -127,3 +129,42 @@ def parse_token(key: str) -> AnyToken | None:
     if parts["group"]:
         return DetectorToken(parts["group"], weight, parts["session"], parts["pattern"].translate(_FROM_KEY))
     return VisionToken(parts["name"], weight, parts["instance"])
+
+
+class SecondWatch:
+    """Which tokens count that a second watch reports, after a flood in which some of the first one found no room.
+
+    Zenoh may report a token there after the first watch reported its end. `on_end` and `counts` from any thread.
+    """
+
+    def __init__(self, most_ends: int) -> None:
+        """Create it. `most_ends` is a security limit: ends that are stored."""
+        self._most_ends, self._until_us = most_ends, 0
+        self._ended: set[AnyToken] | None = None
+
+    def begin(self, now_us: int) -> None:
+        """Note that the second watch begins."""
+        self._until_us, self._ended = now_us + RECALL_US, set()
+
+    def end(self) -> None:
+        """Count nothing more that it reports."""
+        self._ended = None
+
+    def is_on(self, now_us: int) -> bool:
+        """Return True while it reports the tokens of before."""
+        if now_us >= self._until_us:
+            self._ended = None
+        return self._ended is not None
+
+    def on_end(self, token: AnyToken) -> bool:
+        """Note that the first watch reported the end of a token. Returns False without room for it."""
+        ended = self._ended
+        if ended is None or len(ended) >= self._most_ends:
+            return ended is None
+        ended.add(token)
+        return True
+
+    def counts(self, token: AnyToken) -> bool:
+        """Return True if a token that the second watch reports is there."""
+        ended = self._ended
+        return ended is not None and token not in ended

@@ -13,15 +13,13 @@ from enum import Enum
 from fnmatch import fnmatchcase
 from typing import Final
 
-from sightline.protocol.transports.tokens import MAX_ROBOTS, DetectorToken
+from sightline.protocol.transports.tokens import MAX_ROBOTS, DetectorToken, SecondWatch
 from sightline.vision_side.serving.assignment import ranked
 
 MAX_SERVICES: Final = 64
 """Security limit: with more services, each one serves every robot."""
 MAX_KEPT_TOKENS: Final = 1_000
 """Security limit: tokens that are stored. After a flood of more, the caller watches all that are present once more."""
-RECALL_US: Final = 5_000_000
-"""Time in which the second watch has reported the tokens of before, also on a busy machine."""
 LEFT_US: Final = 10_000_000
 """Time without its token after which a robot has left. Its link, or that of this service, may be back before."""
 _STANDING_BY: Final = 2
@@ -113,9 +111,7 @@ class Assignment:
         self._unanswered_us = max(UNANSWERED_US, 2 * deadline_us)
         self._tokens: set[DetectorToken] = set()
         self._left_out = self._changed = False
-        self._ended: set[DetectorToken] | None = None
-        """Tokens that ended since the second watch began, while it reports those of before; else None."""
-        self._recall_us = 0
+        self._second_watch = SecondWatch(MAX_KEPT_TOKENS)
         self._answered_us: dict[str, int] = {}
         """Time of the newest answer of each other service, to any robot."""
         self._services = {own.session: own}
@@ -125,31 +121,26 @@ class Assignment:
         """Note a token that appeared or ended. It counts from the next `update` on."""
         if not is_present:
             self._tokens.discard(token)
-            self._note_end(token)
+            if not self._second_watch.on_end(token):  # what it reports may have ended
+                self._second_watch.end()
+                self._left_out = True
         elif len(self._tokens) < MAX_KEPT_TOKENS:
             self._tokens.add(token)
         else:
             self._left_out |= token not in self._tokens
         self._changed = True
 
-    def _note_end(self, token: DetectorToken) -> None:
-        if self._ended is not None and len(self._ended) < MAX_KEPT_TOKENS:
-            self._ended.add(token)
-        elif self._ended is not None:  # what the second watch reports may have ended
-            self._ended, self._left_out = None, True
-
     def needs_tokens(self, now_us: int) -> bool:
         """Return True, once, if there is room for tokens that were left out: the caller watches them once more."""
-        if self._ended is not None and now_us - self._recall_us >= RECALL_US:
-            self._ended = None
-        if self._ended is not None or not self._left_out or len(self._tokens) > MAX_SERVICES:
+        if self._second_watch.is_on(now_us) or not self._left_out or len(self._tokens) > MAX_SERVICES:
             return False
-        self._left_out, self._ended, self._recall_us = False, set(), now_us
+        self._left_out = False
+        self._second_watch.begin(now_us)
         return True
 
     def on_recalled(self, token: DetectorToken) -> None:
-        """Note a token of the second watch. Zenoh may report it after the first watch reported its end."""
-        if self._ended is not None and token not in self._ended:
+        """Note a token of the second watch."""
+        if self._second_watch.counts(token):
             self.on_token(token, True)
 
     def update(self, now_us: int) -> bool:

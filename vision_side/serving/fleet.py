@@ -21,7 +21,7 @@ from sightline.protocol.errors import ConfigError, LinkError, WireError
 from sightline.protocol.log import report_fault
 from sightline.protocol.messages import LeaseHolder, Stamp, Status
 from sightline.protocol.transports.link import FleetLink, LatestSlot, Link, LinkWrapper, Message
-from sightline.protocol.transports.tokens import DriverToken, RobotToken, Token, VisionToken
+from sightline.protocol.transports.tokens import DriverToken, RobotToken, SecondWatch, Token, VisionToken
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector
 from sightline.vision_side.detect.port import Detector
@@ -241,8 +241,6 @@ _LOOKS_EVERY_S, _TOKENS_COME_S = 60.0, 2.0
 _MAX_REPORTED = 256  # security limit: such robots that are reported
 _HANDS_OVER_WITHIN_S = 0.6
 _MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn, and ends that do not count yet
-_RECALL_US = 5_000_000
-"""Time in which a second watch has reported the tokens of before, also on a busy machine."""
 
 
 class SharedFleet(Fleet):
@@ -257,10 +255,9 @@ class SharedFleet(Fleet):
         """Each with its presence and the time when that was noted."""
         self._ends_us: dict[Token, int] = {}
         """Tokens that ended and whose end does not count yet: when they ended."""
-        self._newest_end_us = self._heard_us = self._recall_us = 0
-        self._end_recall: Callable[[], None] = lambda: None
-        self._ended_meanwhile: set[Token] | None = None
-        """Tokens that ended during the second watch; None without one."""
+        self._newest_end_us = self._heard_us = 0
+        self._second_watch = SecondWatch(_MAX_TOKENS)
+        self._end_second_watch: Callable[[], None] | None = None
         self._is_up, self._losses = True, fleet_link.losses
         self._statuses: dict[str, LatestSlot[Message]] = {}
         self._withdraw: dict[str, Callable[[], None]] = {}
@@ -389,24 +386,23 @@ class SharedFleet(Fleet):
 
     def _note(self, token: Token, is_present: bool) -> None:
         robot = token.robot if isinstance(token, RobotToken | DriverToken) else ""
-        if not is_present and (ended := self._ended_meanwhile) is not None and len(ended) < _MAX_TOKENS:
-            ended.add(token)
+        if not is_present:
+            self._second_watch.on_end(token)
         if not robot or fnmatchcase(robot, self._config.robot):
             self._tokens.append((token, is_present, monotonic_us()))
             self._bell.set()
 
     def _recall_tokens(self, now_us: int) -> None:
         """Watch the tokens once more, for a while, when there is room for those that did not count."""
-        if self._ended_meanwhile is not None and now_us - self._recall_us >= _RECALL_US:
-            self._end_recall()
-            self._ended_meanwhile = None
-        if self._ended_meanwhile is None and self.sharing.needs_tokens():
-            self._ended_meanwhile, self._recall_us = set(), now_us
-            self._end_recall = self._fleet_link.watch_tokens(self._note_recalled)
+        if self._end_second_watch is not None and not self._second_watch.is_on(now_us):
+            self._end_second_watch()
+            self._end_second_watch = None
+        if self._end_second_watch is None and self.sharing.needs_tokens():
+            self._second_watch.begin(now_us)
+            self._end_second_watch = self._fleet_link.watch_tokens(self._note_recalled)
 
     def _note_recalled(self, token: Token, is_present: bool) -> None:
-        # Zenoh may report a token after the first watch reported its end.
-        if is_present and token not in (self._ended_meanwhile or ()):
+        if is_present and self._second_watch.counts(token):
             self._note(token, True)
 
     def _wait(self) -> None:

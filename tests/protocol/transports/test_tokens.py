@@ -3,9 +3,11 @@
 import pytest
 
 from sightline.protocol.transports.tokens import (
+    RECALL_US,
     DetectorToken,
     DriverToken,
     RobotToken,
+    SecondWatch,
     VisionToken,
     detectors_of,
     drivers_of,
@@ -65,3 +67,12 @@ def test_pattern_of_the_drivers_of_a_robot():
 
 def test_pattern_of_the_detectors_of_a_group():
     assert detectors_of("0a1b2c3d") == "sightline-token/detector/0a1b2c3d/*/*/*"
+
+
+def test_a_second_watch_counts_for_a_while_what_has_not_ended_and_stores_a_bounded_number_of_ends():
+    watch, (first, second, third) = SecondWatch(1), map(RobotToken, "abc")
+    assert watch.on_end(first) and not watch.is_on(0) and not watch.counts(second), "it has not begun"
+    watch.begin(7)
+    assert watch.on_end(second) and not watch.on_end(third)
+    assert watch.is_on(6 + RECALL_US) and [*map(watch.counts, (first, second, third))] == [True, False, True]
+    assert not watch.is_on(7 + RECALL_US) and not watch.counts(first)

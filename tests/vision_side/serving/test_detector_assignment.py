@@ -4,14 +4,13 @@ from collections import Counter
 
 import pytest
 
-from sightline.protocol.transports.tokens import DetectorToken
+from sightline.protocol.transports.tokens import RECALL_US, DetectorToken
 from sightline.vision_side.serving.assignment import ranked
 from sightline.vision_side.serving.detector_sharing import (
     LEFT_US,
     MAX_KEPT_TOKENS,
     MAX_ROBOTS,
     MAX_SERVICES,
-    RECALL_US,
     SILENT_US,
     UNANSWERED_US,
     Assignment,
