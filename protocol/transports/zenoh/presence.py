@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 PRESENCE_PATTERN: Final = f"{PRESENCE_PREFIX}/**"
 MAX_BYTES: Final = 512
-# Security limit: stored replies of one query.
-MAX_PEERS: Final = 256
+# Security limit: stored replies of one query, those of two full routers.
+MAX_PEERS: Final = 2048
 # The first reply also contains the time to set up its route. The best of a few replies shows the link alone.
 QUERY_ROUNDS: Final = 3
 

@@ -125,7 +125,7 @@ def test_robots_beyond_the_limit_of_peers_have_no_version_and_a_line_names_the_l
     assert len(list(lines(Discovered({}, peers[:-1], robots)))) == MAX_PEERS + 1
     said = list(lines(Discovered({}, peers, robots)))
     assert len(said) == MAX_PEERS + 2 and f"robot     r{MAX_PEERS}: no status  (no version reported)" in said
-    assert said[-1] == "256 peers are listed, which is the limit; versions of other robots are not known"
+    assert said[-1] == f"{MAX_PEERS} peers are listed, which is the limit; versions of other robots are not known"
 
 
 def test_all_robots_of_a_large_site_are_found_by_status_and_token():

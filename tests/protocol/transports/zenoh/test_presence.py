@@ -22,13 +22,15 @@ from sightline.protocol.transports.zenoh.presence import (
     MAX_PEERS,
     PeerInfo,
     Presence,
+    PresenceAnnouncer,
     best_round_trips,
     parse_presence_reply,
     presence_key,
     query_presence,
     robot_with_same_id,
 )
-from sightline.protocol.transports.zenoh.session import open_session
+from sightline.protocol.transports.zenoh.session import MAX_ROUTER_SESSIONS, open_session
+from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 
 ROBOT = Presence(role="robot", robot="r1", session="0000abcd", software="sightline 9", host="shed", up_us=5_000_000)
@@ -124,6 +126,14 @@ def router():
     session = open_session([endpoint], (), 5.0)
     yield endpoint
     session.close()
+
+
+def test_every_robot_of_a_site_with_300_answers(router):
+    with open_session((), [router], 5.0) as robots, open_session((), [router], 5.0) as asking:
+        for number in range(300):
+            PresenceAnnouncer("robot", f"r{number}", f"{number:08x}").answer_in(robots)
+        assert until(lambda: len({one.presence.robot for one in query_presence(asking, 5.0)}) == 300, 20)
+    assert MAX_PEERS >= 2 * MAX_ROUTER_SESSIONS
 
 
 def test_every_peer_at_a_router_is_listed_within_two_seconds(router):
