@@ -1,5 +1,7 @@
 """Vision services that share robots over real Zenoh sessions; the robots have their real gate."""
 
+import json
+import resource
 import subprocess
 import sys
 import threading
@@ -8,6 +10,7 @@ from contextlib import ExitStack, closing, contextmanager
 import pytest
 
 from sightline.benchmarks.loop.pictures import write_pictures
+from sightline.benchmarks.network import gated_robots
 from sightline.benchmarks.network.gated_robots import GatedRobot
 from sightline.benchmarks.network.robots import Settings, play
 from sightline.protocol.channels import FRAME
@@ -16,13 +19,14 @@ from sightline.protocol.transports.zenoh.link import ZenohFleet, open_fleet, ope
 from sightline.protocol.transports.zenoh.presence import PresenceAnnouncer
 from sightline.protocol.transports.zenoh.session import open_session
 from sightline.robot_side.safety.limits import SafetyConfig
-from sightline.vision_side.config import ShareConfig, VisionConfig
+from sightline.vision_side.config import DetectorConfig, ShareConfig, VisionConfig
 from sightline.vision_side.serving import fleet as fleet_module
 from sightline.vision_side.serving import sharing
 from sightline.vision_side.serving.assignment import assign
 from sightline.vision_side.serving.fleet import SharedFleet
 from sightline.vision_side.serving.service import Service
-from tests.fixtures.links import until
+from tests.fixtures.commands import service as running
+from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint
 
 pytestmark = pytest.mark.waits
@@ -31,10 +35,10 @@ pytestmark = pytest.mark.waits
 class Vision:
     """A service that shares, in a thread of this process."""
 
-    def __init__(self, name, endpoint):
+    def __init__(self, name, endpoint, **settings):
         self.name, self.lines = name, []
         self.link = open_fleet("r*", connect=[endpoint], role="vision", by_status=False)
-        config = VisionConfig(robot="r*", connect=(endpoint,), share=ShareConfig(enabled=True, name=name))
+        config = VisionConfig(robot="r*", connect=(endpoint,), share=ShareConfig(enabled=True, name=name), **settings)
         self.fleet, self._ending = SharedFleet(config, self.link, self.lines.append), threading.Event()
         self._thread = threading.Thread(target=self.fleet.serve, args=(self._ending,), daemon=True)
         self._thread.start()
@@ -153,6 +157,29 @@ def test_a_service_that_comes_takes_robots_and_withdraws_no_command(site):
     assert drives_on(robots, monotonic_us())
     assert sum(len(vision.driving) for vision in visions) == len(robots)
     assert withdrawn(robots, since_us) == []
+
+
+@pytest.mark.slow
+def test_200_robots_at_one_router_are_all_served_and_none_is_forgotten(tmp_path):
+    """At 5 fps, each with its session. Two cores are too slow for young commands of all, so answers count."""
+    write_pictures(tmp_path, 160, 120)
+    endpoint, notes, (soft, hard) = free_endpoint(), tmp_path / "notes", resource.getrlimit(resource.RLIMIT_NOFILE)
+    settings = Settings(endpoint=endpoint, robots=200, fps=5, pictures=tmp_path, notes=notes, seed=1)
+    router = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "router", "--listen", endpoint]
+    robots = [sys.executable, "-P", "-m", gated_robots.__name__, settings.model_dump_json()]
+    with ExitStack() as at_end:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+        at_end.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        at_end.enter_context(running(router, " on ", tmp_path, START_S))
+        vision = Vision("a", endpoint, detector=DetectorConfig(kind="hsv"))
+        at_end.callback(vision.end)
+        at_end.enter_context(running(robots, "playing 200 robots", tmp_path, 2 * START_S))
+        for least in (5, 10):
+            assert until(lambda least=least: sum(
+                one.answered >= least for one in vision.fleet.services.copy().values()) == 200, 120)
+            assert len(vision.driving) == 200
+        assert [line for line in vision.lines if "left" in line or "failed" in line] == []
+    assert all(one["answers"] >= 5 for one in json.loads(notes.read_text()).values())
 
 
 def may_claim_again(visions):
