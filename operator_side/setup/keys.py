@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sightline.protocol.errors import ConfigError
-from sightline.protocol.transports.security import ROLES
+from sightline.protocol.transports.security import CERTIFICATES, ROUTER_ROLE
 from sightline.protocol.transports.stop_port import STOP_SECRET_FILE
 
 if TYPE_CHECKING:
@@ -63,11 +63,11 @@ def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
                            "key_agreement", "encipher_only", "decipher_only"), False)
     builder = builder.add_extension(x509.KeyUsage(key_cert_sign=True, crl_sign=True, **usage), True)
     files = _write(folder, _pair("ca", key, _signed(builder, key)))
-    return files + [file for role in (*ROLES, STOP) for file in add(folder, role, hosts, days)]
+    return files + [file for role in (*CERTIFICATES, STOP) for file in add(folder, role, hosts, days)]
 
 
 def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
-    """Create a new certificate and WebSocket token of `role`, signed by the authority in `folder`.
+    """Create a new certificate of `role`, signed by the authority in `folder`.
 
     `STOP` is not a role: it creates the STOP secret. Without `hosts` a certificate keeps those of the present one.
 
@@ -77,8 +77,8 @@ def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> li
     """
     if role == STOP:
         return _write_secret(folder)
-    if role not in ROLES:
-        raise ConfigError(f"unknown role '{role}'; expected {', '.join(ROLES)}, or {STOP} for the STOP secret")
+    if role not in CERTIFICATES:
+        raise ConfigError(f"unknown role '{role}'; expected {', '.join(CERTIFICATES)}, or {STOP} for the STOP secret")
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID as Usage
@@ -95,7 +95,8 @@ def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> li
         .add_extension(x509.ExtendedKeyUsage([Usage.SERVER_AUTH, Usage.CLIENT_AUTH]), False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.public_key()), False)
     )
-    return _write(folder, {**_pair(role, key, _signed(builder, authority)), f"{role}.token": _random()})
+    token = {} if role == ROUTER_ROLE else {f"{role}.token": _random()}
+    return _write(folder, {**_pair(role, key, _signed(builder, authority)), **token})
 
 
 def look(folder: Path) -> list[Certificate]:
@@ -211,8 +212,8 @@ def _read(file: Path) -> Certificate:
         read = x509.load_pem_x509_certificate(file.read_bytes())
     except (OSError, ValueError):
         # The present addresses are not known, and new keys of all roles are not needed for one of them.
-        repair = (f"replace it with: sightline keys add {file.parent} {file.stem} --host HOST" if file.stem in ROLES
-                  else f"create new ones with: sightline keys init {file.parent}-new")
+        repair = (f"replace it with: sightline keys add {file.parent} {file.stem} --host HOST"
+                  if file.stem in CERTIFICATES else f"create new ones with: sightline keys init {file.parent}-new")
         raise ConfigError(f"invalid certificate {file}; {repair}") from None
     names = read.extensions
     try:

@@ -30,6 +30,9 @@ from sightline.protocol.transports.tokens import PREFIX as TOKEN_PREFIX
 
 ROBOT_ROLE: Final = "robot"
 ROLES: Final = (ROBOT_ROLE, *SOURCES_OF_ROLE)
+# A router passes on the messages of all roles to another one. It has no token: WebSocket has no routers.
+ROUTER_ROLE: Final = "router"
+CERTIFICATES: Final = (*ROLES, ROUTER_ROLE)
 # Prefix of the keys of presence (`transports/zenoh/presence.py`), next to `sightline/`, the prefix of channels.
 PRESENCE_PREFIX: Final = "sightline-presence"
 _TLS: Final = ("tls", "quic")
@@ -37,8 +40,8 @@ _TLS: Final = ("tls", "quic")
 
 def certificate_role(source: str) -> str:
     """Return the certificate of a link with role `source`. An unknown role uses that of a viewer."""
-    if source == ROBOT_ROLE:
-        return ROBOT_ROLE
+    if source in (ROBOT_ROLE, ROUTER_ROLE):
+        return source
     return next((role for role, sources in SOURCES_OF_ROLE.items() if source in sources), "viewer")
 
 
@@ -70,13 +73,13 @@ class RoleKeys:
 
     def access_section(self) -> dict[str, Any]:
         """Return Zenoh's `access_control`: each role may publish and receive only its own channels, at every hop."""
-        rules = {role: list(_rules(role)) for role in ROLES}
+        rules = {**{role: list(_rules(role)) for role in ROLES}, ROUTER_ROLE: _ROUTER_RULES}
         return {
             "enabled": True,
             "default_permission": "deny",
             "rules": [rule for of_role in rules.values() for rule in of_role],
-            "subjects": [{"id": role, "cert_common_names": [role]} for role in ROLES],
-            "policies": [{"subjects": [role], "rules": [rule["id"] for rule in rules[role]]} for role in ROLES],
+            "subjects": [{"id": role, "cert_common_names": [role]} for role in rules],
+            "policies": [{"subjects": [role], "rules": [rule["id"] for rule in rules[role]]} for role in rules],
         }
 
 
@@ -87,6 +90,15 @@ def size_limit_section() -> list[dict[str, Any]]:
          "size_limit": MAX_HEADER_BYTES + channel.max_payload_bytes}
         for channel in CHANNELS.values()
     ]
+
+
+_ROUTER_RULES: Final = [{
+    "id": "router passes on", "permission": "allow", "flows": ["ingress", "egress"],
+    "messages": ["put", "declare_subscriber", "query", "declare_queryable", "reply", "liveliness_token",
+                 "liveliness_query", "declare_liveliness_subscriber"],
+    "key_exprs": [f"{KEY_PREFIX}/**", f"{PRESENCE_PREFIX}/**", ALL_TOKENS],
+}]
+"""Each of two linked routers has checked the role of the peer that a message comes from."""
 
 
 def load_role_keys(folder: str, source: str) -> RoleKeys | None:
@@ -107,8 +119,8 @@ def load_role_keys(folder: str, source: str) -> RoleKeys | None:
     role, folder = certificate_role(source), str(home_path(folder))
     missing = [name for name in ("ca.pem", f"{role}.pem", f"{role}.key") if not (Path(folder) / name).is_file()]
     if missing:
-        raise ConfigError(f"{missing[0]} is missing in {folder}: create keys with `sightline keys init`, and copy "
-                          f"ca.pem, {role}.pem and {role}.key to this machine")
+        raise ConfigError(f"{missing[0]} is missing in {folder}: create keys with `sightline keys init` or "
+                          f"`keys add KEYS {role}`, and copy ca.pem, {role}.pem and {role}.key to this machine")
     return RoleKeys(folder, role)
 
 

@@ -321,7 +321,7 @@ def test_page_creates_the_secrets_with_the_files_that_each_container_reads():
         return {"ca.pem", f"{name}.pem", f"{name}.key"}
 
     assert created == {"sightline-keys-vision": role("vision"),
-                       "sightline-keys-router": role("robot") | role("viewer") | {"stop.secret"}}
+                       "sightline-keys-router": role("router") | role("viewer") | {"stop.secret"}}
     mounted = {name: [one["secret"]["secretName"] for one in pod["volumes"] if "secret" in one]
                for name, pod in workloads(SETS["secure"]).items()}
     assert mounted == {"router": ["sightline-keys-router"], "vision": ["sightline-keys-vision"]}

@@ -25,6 +25,7 @@ from sightline.protocol.channels import (
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.diagnosis import diagnose_tls
 from sightline.protocol.transports.security import (
+    CERTIFICATES,
     ROLES,
     certificate_role,
     load_role_keys,
@@ -32,8 +33,9 @@ from sightline.protocol.transports.security import (
     may_subscribe,
     read_tokens,
 )
+from sightline.protocol.transports.tokens import RobotToken
 from sightline.protocol.transports.zenoh.discovery import discover
-from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.protocol.transports.zenoh.link import open_fleet, open_zenoh
 from sightline.protocol.transports.zenoh.session import MAX_MESSAGE_BYTES, open_session
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint, free_port
@@ -82,8 +84,8 @@ def test_message_toward_the_robot_reaches_only_the_robot():
 
 
 def test_a_role_that_is_invalid_is_a_viewer():
-    assert [certificate_role(name) for name in ("vision", "teleop", "operator", "robot", "detector", "guest", "")] == [
-        "vision", "operator", "operator", "robot", "detector", "viewer", "viewer",
+    assert [certificate_role(name) for name in ("vision", "teleop", "operator", "robot", "router", "guest", "")] == [
+        "vision", "operator", "operator", "robot", "router", "viewer", "viewer",
     ]  # fmt: skip
 
 
@@ -114,7 +116,7 @@ def test_listener_drops_a_message_over_the_bound_of_its_channel(folder, endpoint
     """At a router, so that it crosses no robot's radio; what is just within it passes."""
     heard = []
     with (
-        closing(open_session([endpoint], (), 5.0, load_role_keys(str(folder), "robot"))),
+        closing(open_session([endpoint], (), 5.0, load_role_keys(str(folder), "router"))),
         open_session((), [endpoint], 5.0, load_role_keys(str(folder), "robot")) as robot,
         open_session((), [endpoint], 5.0, load_role_keys(str(folder), "vision")) as vision,
     ):
@@ -130,6 +132,27 @@ def test_listener_drops_a_message_over_the_bound_of_its_channel(folder, endpoint
         put(MAX_MESSAGE_BYTES // 2)
         assert until(lambda: put(bound) or bound in heard), "a full link drops a message"
         assert set(heard) - {1} == {bound}
+
+
+def test_two_linked_routers_pass_on_what_each_role_may(folder, endpoint):
+    """The robot is at one router, its drivers at the other one."""
+    other, heard, tokens, secure = free_endpoint("tls/"), [], set(), str(folder)
+    router = load_role_keys(secure, "router")
+    with (
+        closing(open_session([endpoint], (), 5.0, router)),
+        closing(open_session([other], [endpoint], 5.0, router)),
+        open_zenoh("r1", connect=[endpoint], role="robot", secure=secure) as robot,
+        open_zenoh("r1", connect=[other], role="vision", secure=secure) as vision,
+        open_zenoh("r1", connect=[other], role="viewer", secure=secure) as viewer,
+        open_fleet("*", connect=[other], role="vision", by_status=False, secure=secure) as fleet,
+    ):
+        frames = vision.latest(FRAME)
+        robot.subscribe(TWIST, lambda message: heard.append(message.source))
+        fleet.watch_tokens(lambda token, _present: tokens.add(token))
+        assert until(lambda: (robot.publish(FRAME, b"{}", b"jpeg"), frames.take(0.01))[1])
+        assert until(lambda: [peer.publish(TWIST, b"{}", b"0|0") for peer in (viewer, vision)] and len(heard) > 1)
+        assert until(lambda: fleet.find_robots() == {"r1"} and RobotToken("r1") in tokens)
+    assert set(heard) == {"vision"}
 
 
 def says_all(peer):
@@ -230,7 +253,7 @@ def test_robots_are_listed_over_a_secured_link(folder, endpoint, role, tmp_path)
 
 def test_keys_are_for_their_owner_only_and_never_overwritten(folder):
     kept = [file for file in folder.iterdir() if file.suffix in (".key", ".token")]
-    assert len(kept) == 1 + 2 * len(ROLES)
+    assert len(kept) == 1 + len(CERTIFICATES) + len(ROLES)
     assert all(file.stat().st_mode & 0o077 == 0 for file in kept)
     with pytest.raises(ConfigError, match="already has keys"):
         keys.make(folder, [])
@@ -246,7 +269,7 @@ def test_new_token_differs_and_has_its_role(broken):
 
 def test_certificates_are_listed_with_hosts_and_expiry(folder):
     shown = {certificate.role: certificate for certificate in keys.look(folder)}
-    assert set(shown) == {"sightline authority", *ROLES}
+    assert set(shown) == {"sightline authority", *CERTIFICATES}
     assert shown["robot"].hosts == ("localhost", "127.0.0.1", "robot.local")
 
 
