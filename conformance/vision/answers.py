@@ -63,10 +63,11 @@ def every_frame_is_answered(_bench: Bench, robot: RobotPlayed) -> None:
 
 @SUITE.should("V-FRAM-02", "7.1 Answers", met)
 def one_answer(bench: Bench, robot: RobotPlayed) -> None:
-    """A frame is answered by a twist or by an ack, not by both."""
+    """A frame that a twist answered is not acknowledged as well."""
     for sent in robot.film("centre", 5, 100_000):
-        kinds = {one.is_twist for one in robot.answers_to(sent)}
-        bench.expect(len(kinds) < 2, f"frame {sent.seq} got a twist and an ack")
+        # An ack before its twist is how a peer answers that steers by this frame later.
+        kinds = [one.is_twist for one in robot.answers_to(sent)]
+        bench.expect(kinds == sorted(kinds), f"frame {sent.seq} got an ack after its twist")
 
 
 @SUITE.must("V-FRAM-03", "7.1 Answers")

@@ -152,7 +152,8 @@ class SteersLater(VirtualVision):
 
 
 LATER = [case for case in VIRTUAL
-         if case.id in ("V-FRAM-14", "V-GRAM-01", "V-CAUS-09", "V-STAT-01", "V-STEER-01", "V-HOST-33", "V-LIM-41")]
+         if case.id in ("V-FRAM-02", "V-FRAM-14", "V-GRAM-01", "V-CAUS-09", "V-STAT-01", "V-STEER-01", "V-HOST-33",
+                        "V-LIM-41")]
 
 
 @pytest.mark.parametrize("look_us", [60_000, 150_000])
