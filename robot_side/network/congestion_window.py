@@ -163,7 +163,10 @@ class CongestionWindow:
         kept = round(self.frames * own_us / max(1, self._waited_us()))
         if kept < self.frames:
             held = now_us - self._changed_at_us >= _HELD_US and self._since_change >= _HELD_ANSWERS
-            self._pause_us = _FIRST_PAUSE_US if held else min(2 * self._pause_us, _LONGEST_PAUSE_US)
+            if held:
+                self._pause_us = _FIRST_PAUSE_US
+            elif now_us >= self._grow_at_us:  # within a pause these are frames of the attempt before it
+                self._pause_us = min(2 * self._pause_us, _LONGEST_PAUSE_US)
             self._grow_at_us = now_us + self._pause_us
             self._failed = True
             self._note_rate(full, own_us, now_us)

@@ -9,6 +9,8 @@ from sightline.conformance.robot.cases import CASES, prepare
 from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import ConfigError
+from sightline.robot_side.network.core import NetworkCore
+from sightline.robot_side.network.stream import StreamConfig
 from tests.conformance.clauses import clauses
 from tests.conformance.robot import reference
 from tests.conformance.robot.broken import arming as broken_arming
@@ -114,6 +116,17 @@ def test_robot_with_any_camera_fails_no_case(monkeypatch, fps):
     monkeypatch.setattr(reference, "CAMERA_US", 1e6 / fps)
     results = {case.id: result_of(case) for case in VIRTUAL}
     assert {name: one.reason for name, one in results.items() if one.outcome is Outcome.FAILED} == {}
+
+
+@pytest.mark.parametrize("fps", [120, 240])
+def test_robot_with_a_fast_camera_widens_its_window_on_a_long_link(monkeypatch, fps):
+    monkeypatch.setattr(reference, "CAMERA_US", 1e6 / fps)
+
+    def streams_all(robot):
+        robot.sending = NetworkCore(StreamConfig(max_fps=fps), "00000001", 0, robot.config.max_frame_bytes)
+
+    result = result_of(CASES_BY_ID["R-FLOW-07"], streams_all)
+    assert result.outcome is Outcome.PASSED, result.reason
 
 
 def test_robot_that_counts_no_twist_of_a_second_driver_fails():

@@ -128,6 +128,8 @@ def test_first_answers_at_the_very_start_of_the_clock_count():
     window.alone(after_us=0)
     window.alone(after_us=0)
     assert window.frames == 2
+    window.narrowed(after_us=0)
+    assert window.widens_after(1_000_000), "twice the first pause"
 
 
 @pytest.mark.parametrize(("own_us", "frames"), [
@@ -335,6 +337,17 @@ def test_pause_doubles_with_each_queue_up_to_four_seconds():
     for pause_us in (1_000_000, 2_000_000, 4_000_000, 4_000_000):
         window.narrowed()
         assert window.widens_after(pause_us)
+
+
+def test_queue_that_drains_within_a_pause_is_of_the_attempt_before_it():
+    """The pause begins again, and does not double. A link that has become longer keeps its frames for as long."""
+    window = two_in_flight()
+    window.narrowed()
+    for _ in range(4):
+        window.answer(10 * FAR_US)
+    assert window.widens_after(1_000_000)
+    window.narrowed()
+    assert window.widens_after(2_000_000), "a new attempt"
 
 
 def test_window_widens_by_one_after_a_queue():
