@@ -253,6 +253,8 @@ TIMES_FLOOR: Final = 1.5
 BEHIND_ZENOH_MS: Final = 0.3
 MOST_WAIT_MS: Final = 5.0
 """Of a command for `drive.set`, from its validation."""
+KNOWN_WAIT_SHARE: Final = 0.9
+"""Of the captured images: so many commands must have a known wait. Of two between two headers only one is known."""
 CPU_MS: Final = 1.5
 """Per image: of all processes of the robot, and of vision."""
 CPU_OVER_FLOOR_MS: Final = 0.6
@@ -278,8 +280,8 @@ _PARTS: Final = 5
 class LoopFigures:
     """One contestant. `answered_percent` is of the images that the camera offers, `accepted_percent` of the captured
     ones. Sightline captures only with credit, most rivals capture each image. Times are from capture to the result,
-    `validated_ms` (median) to the validation of the services; `most_wait_ms` is the longest time between the two. None
-    without an answer.
+    `validated_ms` (median) to the validation of the services; `most_wait_ms` is the longest time between the two of so
+    many `commands`. None without an answer.
 
     `first_ms` and `last_ms` are medians of the first and the last ten seconds, or fifths of a shorter time; `cpu_ms` is
     per answered image and process, `memory_mb` the high-water mark, `bytes_per_picture` what went over the sockets,
@@ -288,6 +290,7 @@ class LoopFigures:
 
     name: str
     captured: int
+    commands: int
     fps: float
     answered_percent: float
     accepted_percent: float
@@ -330,6 +333,7 @@ def figures_of(sample: LoopSample, setting: LoopSetting) -> LoopFigures:
     return LoopFigures(
         name=sample.name,
         captured=course.captured,
+        commands=len(ages_ms),
         fps=fps,
         answered_percent=100 * fps / setting.fps,
         accepted_percent=course.answered_percent,
@@ -396,6 +400,7 @@ def _unloaded(ours: LoopFigures, floor: LoopFigures, rivals: Sequence[LoopFigure
     if best_ms is not None:
         yield at_most("p50 behind the fastest over Zenoh", _over(ours.p50_ms, best_ms), "ms", BEHIND_ZENOH_MS)
     yield at_most("longest wait for the wheels", ours.most_wait_ms, "ms", MOST_WAIT_MS)
+    yield at_least("commands with a known wait", ours.commands, "", KNOWN_WAIT_SHARE * ours.captured)
     yield at_most("not accepted", 100 - ours.accepted_percent, "%", 100 - ANSWERED_PERCENT)
     vision_ms = ours.cpu_ms["vision"]
     yield at_most("robot CPU", sum(ours.cpu_ms.values()) - vision_ms, "ms", CPU_MS)

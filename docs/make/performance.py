@@ -74,6 +74,14 @@ SECTIONS: Final = (
         since="2026-11-26",
     ),
     Section(
+        "demo-loss",
+        "A lossy link in real time",
+        "One minute of `sightline demo`: a fifth of the messages is lost on each leg, with 50 ms of latency. Loss must "
+        "not stop the robot more than once. *Holds* counts the HOLDs in the log of the robot after its first motion.",
+        ("demo", "--loss", "0.2", "--latency-ms", "50", "--seconds", "60"),
+        since="2026-11-28",
+    ),
+    Section(
         "killed",
         "Killed at speed",
         "The vision service and the network process, killed with -9 while driving at 0.3 m/s or more, ten times "
@@ -111,6 +119,13 @@ SECTIONS: Final = (
         "The same with `sightline.v1` between robot and vision.",
         ("bench", "loop", "--transport", "websocket", "--seconds", "15"),
         "loop-websocket.png",
+        since="2026-11-28",
+    ),
+    Section(
+        "loop-wait",
+        "Five thousand commands",
+        "The longest time from the validation of a command to its `drive.set`: no command waits for a tick.",
+        ("bench", "loop", "--peers", "none", "--seconds", "168"),
         since="2026-11-28",
     ),
     Section(

@@ -8,6 +8,7 @@ import pytest
 
 from docs.make import performance as report
 from docs.make.performance import SECTIONS, noted, sections_named, write_report
+from sightline.evaluation.demo.report import HOLDS_A_MINUTE, HOLDS_LATENCY_MS, HOLDS_LOSS
 from sightline.operator_side.cli.commands import app
 from sightline.protocol.errors import ConfigError
 
@@ -44,6 +45,18 @@ def test_names_are_unique_and_every_section_is_a_command_that_exists():
         with pytest.raises(SystemExit) as left:
             command([*section.arguments, "--help"], prog_name="sightline")
         assert left.value.code in (0, None), section.name
+
+
+def test_page_counts_the_holds_of_a_minute_with_the_most_loss():
+    command, *options = NAMED["demo-loss"].arguments
+    assert command == "demo"
+    assert dict(zip(options[::2], map(float, options[1::2]), strict=True)) == {
+        "--loss": HOLDS_LOSS, "--latency-ms": HOLDS_LATENCY_MS, "--seconds": 60 / HOLDS_A_MINUTE}
+
+
+def test_page_has_the_longest_wait_of_five_thousand_commands():
+    wait = NAMED["loop-wait"].arguments
+    assert wait[:2] == ("bench", "loop") and 30 * int(wait[wait.index("--seconds") + 1]) >= 5_000
 
 
 def test_only_the_chosen_section_is_measured_and_the_rest_of_the_page_stays(tmp_path, commands):

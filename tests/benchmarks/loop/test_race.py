@@ -3,7 +3,7 @@
 import json
 import time
 from dataclasses import replace
-from itertools import cycle
+from itertools import cycle, pairwise
 from pathlib import Path
 
 import pytest
@@ -139,6 +139,26 @@ def test_wheels_count_from_the_line_that_carries_the_new_command(turned, late_ms
         speed = seq + 1.0
     ages = list(wheel_ages(headers, changes_us(lines)))
     assert [round((age.age_us - age.validated_us) / MS) for age in ages[1:]] == late_ms
+
+
+@pytest.mark.parametrize(("tick_us", "ok"), [(1, True), (20 * MS, False)])
+def test_driver_whose_commands_wait_for_its_tick_fails(tick_us, ok):
+    """900 commands that arrive at any phase of the tick; a driver that wakes for a command has a tick of 1 us."""
+    rows = header_rows(900)
+    validated_us = [t_us + latency_us for (_, t_us, _), (_, _, latency_us) in pairwise(rows)]
+    sets_us = [-(-at_us // tick_us) * tick_us for at_us in validated_us]
+    course = course_of_headers(rows, list(statuses(rows)), sets_us, 0, rows[-1][1] + 1, copies=1.0)
+    ours = replace(sample(OURS, []), course=course, seconds=30.0)
+    found = judged(**{FLOOR: sample(FLOOR, [2.0] * 900), OURS: ours})
+    assert found["longest wait for the wheels"] is ok
+    assert found["commands with a known wait"]
+
+
+@pytest.mark.parametrize(("known", "ok"), [(90, True), (89, False)])
+def test_longest_wait_of_few_commands_does_not_count(known, ok):
+    ours = sample(OURS, [1.5] * known)
+    ours = replace(ours, course=replace(ours.course, captured=100))
+    assert judged(**{FLOOR: sample(FLOOR, [1.0] * 100), OURS: ours})["commands with a known wait"] is ok
 
 
 @pytest.mark.parametrize(("radius", "ages"), [(1.0, 99), (0.0, 0)])
