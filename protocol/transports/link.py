@@ -217,6 +217,8 @@ class Link(Closing):
     """The channels of one robot on one transport. A callback runs on a transport thread and only stores the message."""
 
     robot: str
+    is_routed = False
+    """True if the peers of this end receive each other's messages without it."""
 
     @property
     @abstractmethod

@@ -162,7 +162,10 @@ class Relay:
         for channel in CHANNELS.values():
             if channel.passed_on and not channel.while_watched:
                 for near in self._links:
-                    self._begin(channel, near)
+                    # A WebSocket end passes on what it subscribes to. Zenoh does it without this process, and a
+                    # subscription here would make a vision service send the boxes of each frame.
+                    if self._others(near) or not near.is_routed:
+                        self._begin(channel, near)
 
     def look(self) -> None:
         """Start or stop the channels that need a viewer. One thread calls it a few times a second."""

@@ -99,6 +99,8 @@ def _parts(sample: zenoh.Sample) -> tuple[bytes, bytes]:
 class ZenohLink(BaseLink):
     """A `Link` over one Zenoh session. It does not receive its own publications."""
 
+    is_routed = True
+
     def __init__(self, session: zenoh.Session, rules: LinkRules, shared: bool = False) -> None:
         """Use an open `session`. The end of the link closes it, unless it is `shared` with other links."""
         super().__init__(rules)

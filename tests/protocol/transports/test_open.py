@@ -5,11 +5,11 @@ import socket
 
 import pytest
 
-from sightline.protocol.channels import FRAME, STATUS, TWIST
+from sightline.protocol.channels import DETECTIONS, FRAME, STATUS, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports import open as open_module
 from sightline.protocol.transports.link import LinkWrapper
-from sightline.protocol.transports.open import LinkGroup, open_link
+from sightline.protocol.transports.open import LinkGroup, Relay, open_link
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint
 
@@ -77,3 +77,19 @@ def test_open_that_is_answered_soon_logs_nothing(caplog):
     with open_link("r1", listen=[endpoint], role="robot"), open_link("r1", connect=[endpoint], role="operator"):
         pass
     assert not caplog.messages
+
+
+@pytest.mark.parametrize(("scheme", "at_once"), [("tcp/", False), ("ws://", True)])
+def test_robot_of_one_transport_wants_boxes_only_where_it_passes_them_on_itself(scheme, at_once):
+    endpoint = free_endpoint(scheme)
+    with (open_link("r1", listen=[endpoint], role="robot") as robot,
+          open_link("r1", connect=[endpoint], role="vision") as vision,
+          open_link("r1", connect=[endpoint], role="viewer") as viewer):
+        Relay(robot)
+        robot.subscribe(TWIST, lambda _: None)
+        vision.has_listener(DETECTIONS)  # Zenoh answers this question before the next one
+        assert until(lambda: vision.has_listener(TWIST))
+        assert vision.has_listener(DETECTIONS) is at_once
+        received = viewer.latest(DETECTIONS)
+        assert until(lambda: vision.has_listener(DETECTIONS))
+        assert until(lambda: vision.publish(DETECTIONS, b"{}", b"{}") and received.take(0.2) is not None)
