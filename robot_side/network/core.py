@@ -65,6 +65,10 @@ class NetworkCore:
         """Return the time in us after which `may_capture` can change without an answer."""
         return self._stream.wait_us(now_us)
 
+    def early_us(self, now_us: int) -> int:
+        """Return the time in us until the next frame is due. Until then no answer changes `may_capture`."""
+        return self._stream.early_us(now_us)
+
     def on_camera(self, picture: Picture, now_us: int) -> tuple[FrameHeader, Message] | None:
         """Make the frame of an image.
 

@@ -135,15 +135,19 @@ class NetworkProcess:
             self._link.publish(message.channel, message.header, message.payload)
 
     def _may_capture(self) -> bool:
-        """Return True if the camera may capture now. Otherwise wait briefly for credit."""
+        """Return True if the camera may capture now. Otherwise wait briefly, for credit once a frame is due."""
         listening = self._link.has_listener(FRAME)
         with self._lock:
             due = self._network_core.may_capture(monotonic_us(), listening)
             nap_s = self._network_core.wait_us(monotonic_us()) / 1e6
+            early_s = self._network_core.early_us(monotonic_us()) / 1e6
         if not due:
             self._no_image_since_us = 0
             longest_s = _LONGEST_NAP_S if monotonic_us() > self._awake_until_us else _SHORT_NAP_S
-            self._credit.wait(min(nap_s, longest_s) if listening and nap_s > 0 else longest_s)
+            if listening and early_s > 0:
+                time.sleep(min(early_s, longest_s))  # on most links the answer comes now, and would wake for nothing
+            else:
+                self._credit.wait(min(nap_s, longest_s) if listening and nap_s > 0 else longest_s)
             self._credit.clear()
         return due
 

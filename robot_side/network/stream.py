@@ -166,6 +166,10 @@ class Stream:
         blocked_until_us = min(self._in_flight.values(), default=0) if not self._has_credit else 0
         return max(0, max(self._next_us, blocked_until_us) - now_us)
 
+    def early_us(self, now_us: int) -> int:
+        """Return the time in us until the interval is over. Until then no answer permits a frame."""
+        return max(0, self._next_us - now_us)
+
     def on_sent(self, seq: int, t_us: int, now_us: int, size_bytes: int = 0) -> None:
         """Note a sent frame.
 

@@ -166,10 +166,10 @@ def test_first_frame_may_leave_at_the_start_of_the_clock():
 def test_next_frame_is_due_nine_tenths_of_an_interval_after_the_capture():
     stream = stream_of(frames=3)
     stream.on_sent(0, 5_000, 20_000)
-    assert stream.wait_us(21_000) == 5_000 + DUE_US - 21_000
+    assert stream.wait_us(21_000) == stream.early_us(21_000) == 5_000 + DUE_US - 21_000
     assert credit(stream, 5_000 + DUE_US - 1) is False
     assert credit(stream, 5_000 + DUE_US) is True
-    assert stream.wait_us(5_000 + DUE_US) == stream.wait_us(50_000) == 0
+    assert stream.wait_us(5_000 + DUE_US) == stream.wait_us(50_000) == stream.early_us(50_000) == 0
 
 
 def test_as_many_frames_are_in_flight_as_the_window_allows():

@@ -14,6 +14,7 @@ from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHe
 from sightline.protocol.transports.link import Message
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.network import process as network_process
 from sightline.robot_side.network.process import NetworkProcess
 from sightline.robot_side.pipe import KEYS, DriverEnd, NetworkEnd, NetworkSetup
 from sightline.robot_side.ports import Picture
@@ -130,6 +131,10 @@ class LockedCore:
         self._note("wait_us")
         return 0
 
+    def early_us(self, now_us):
+        self._note("early_us")
+        return 0
+
     def on_camera(self, picture, now_us):
         self._note("on_camera")
 
@@ -160,7 +165,7 @@ def commanded(process):
 
 @pytest.mark.parametrize(("act", "names"), [
     (commanded, {"on_command_ack"}), (answered, {"on_ack"}), (lambda process: process._report(1), {"status"}),
-    (lambda process: process._stream_one(), {"may_capture", "wait_us", "on_camera", "announce_camera"}),
+    (lambda process: process._stream_one(), {"may_capture", "wait_us", "early_us", "on_camera", "announce_camera"}),
 ])  # fmt: skip
 def test_each_use_of_the_credit_holds_the_lock(process, act, names):
     """Three threads use it: the camera loop, the driver's packets and the link's callbacks."""
@@ -168,6 +173,21 @@ def test_each_use_of_the_credit_holds_the_lock(process, act, names):
     act(process)
     assert core.locked == dict.fromkeys(names, True)
     assert not process._lock.locked(), "and gives it back"
+
+
+@pytest.mark.parametrize(("now_us", "slept_s", "waited_s"), [
+    (1_001_000, [0.028_999], []), (1_029_998, [0.000_001], []), (1_029_999, [], [0.091_001]),
+])
+def test_camera_loop_wakes_for_an_answer_only_once_a_frame_is_due(process, monkeypatch, now_us, slept_s, waited_s):
+    """Nine tenths of 33.3 ms after the capture. The first credit returns after 120 ms."""
+    clock, slept, waited = [1_001_000], [], []
+    monkeypatch.setattr(network_process, "monotonic_us", lambda: clock[0])
+    monkeypatch.setattr(network_process.time, "sleep", lambda seconds: slept.append(round(seconds, 6)))
+    monkeypatch.setattr(process._credit, "wait", lambda seconds: waited.append(round(seconds, 6)))
+    process._stream_one()
+    clock[0] = now_us
+    process._stream_one()
+    assert (slept, waited) == (slept_s, waited_s)
 
 
 @pytest.mark.parametrize("number", KEYS)
