@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # Linux's lists of TCP sockets.
 TABLES: Final = Path("/proc/net")
+TCP_IPV4: Final = ("tcp",)
+_TCP: Final = (*TCP_IPV4, "tcp6")
 _LISTEN: Final = "0A"
 
 
@@ -64,15 +66,19 @@ def unresolved_host(hosts: Iterable[str]) -> str:
 OWN_HOST: Final = "127.0.0.1"
 
 
-def connection_ends(ports: Collection[int]) -> dict[tuple[str, str], str]:
+def connection_ends(ports: Collection[int], tables: Sequence[str] = _TCP) -> dict[tuple[str, str], str]:
     """List the TCP connections to `ports` of this machine, including those that are closing.
+
+    Args:
+        ports: local ports.
+        tables: `TCP_IPV4` if only IPv4 sockets listen on them. To read a table takes several ms, also an empty one.
 
     Returns:
         Both ends of each connection, as in the table, and its remote host, which is `OWN_HOST` for this machine at
         any address of its own.
     """
     # The kernel writes the table in pieces, so a row can come twice while other sockets open and close.
-    return {(row[1], row[2]): _remote_host(row) for row in _rows(ports) if row[3] != _LISTEN}
+    return {(row[1], row[2]): _remote_host(row) for row in _rows(ports, tables) if row[3] != _LISTEN}
 
 
 _OPENED: Final = {"snmp": "PassiveOpens", "netstat": "TCPDeferAcceptDrop"}
@@ -124,10 +130,10 @@ def listening_inodes(ports: Collection[int]) -> set[str]:
     return {row[9] for row in _rows(ports) if row[3] == _LISTEN}
 
 
-def _rows(ports: Collection[int]) -> Iterator[list[str]]:
-    """Yield the rows of the table whose local port is one of `ports`. Other rows of a long table cost no memory."""
+def _rows(ports: Collection[int], tables: Sequence[str] = _TCP) -> Iterator[list[str]]:
+    """Yield the rows of the tables whose local port is one of `ports`. Other rows of a long table cost no memory."""
     endings = tuple(f":{port:04X}" for port in ports)
-    for name in ("tcp", "tcp6"):
+    for name in tables:
         with suppress(OSError), (TABLES / name).open(encoding="ascii") as table:  # another system, or no IPv6
             for line in table:
                 if line.split(None, 2)[1].endswith(endings):

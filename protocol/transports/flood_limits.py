@@ -14,6 +14,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -21,6 +22,7 @@ from sightline.protocol.clock import heartbeat_us
 from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.diagnosis import (
     OWN_HOST,
+    TCP_IPV4,
     connection_ends,
     listening_inodes,
     opened_connections,
@@ -115,12 +117,15 @@ def note_accepted(host: str) -> None:
 @contextmanager
 def limit_floods(listen: Sequence[str], report: Callable[[str], None]) -> Iterator[None]:
     """Limit and report floods of connections to `listen` until the end of the `with`."""
-    ports = {_port(endpoint) for endpoint in listen}
+    ports = {_address(endpoint)[1] for endpoint in listen}
+    read = partial(connection_ends, ports)
+    if all(_is_ipv4(_address(endpoint)[0]) for endpoint in listen):
+        read = partial(connection_ends, ports, TCP_IPV4)
     # WebSocket ends a silent connection after 2 s itself (clause 14.4); one that the kernel holds back would stay open.
-    zenoh_ports = {_port(endpoint) for endpoint in listen if "://" not in endpoint}
+    zenoh_ports = {_address(endpoint)[1] for endpoint in listen if "://" not in endpoint}
     ending = threading.Event()
     if ports:
-        arguments = (ports, zenoh_ports, report, ending)
+        arguments = (ports, zenoh_ports, read, report, ending)
         threading.Thread(target=_watch, args=arguments, name="floods", daemon=True).start()
     try:
         yield
@@ -128,18 +133,30 @@ def limit_floods(listen: Sequence[str], report: Callable[[str], None]) -> Iterat
         ending.set()
 
 
-def _port(endpoint: str) -> int:
-    return parse_websocket_endpoint(endpoint).port if "://" in endpoint else parse_zenoh_endpoint(endpoint)[2]
+def _address(endpoint: str) -> tuple[str, int]:
+    if "://" in endpoint:
+        return parse_websocket_endpoint(endpoint)[1:3]
+    return parse_zenoh_endpoint(endpoint)[1:]
 
 
-def _watch(ports: set[int], zenoh_ports: set[int], report: Callable[[str], None], ending: threading.Event) -> None:
+def _is_ipv4(host: str) -> bool:
+    """Return True for an address of IPv4. A name may have one of IPv6 as well."""
+    with suppress(ValueError):
+        return ipaddress.ip_address(host).version == 4
+    return False
+
+
+def _watch(
+    ports: set[int], zenoh_ports: set[int], read: Callable[[], dict[tuple[str, str], str]],
+    report: Callable[[str], None], ending: threading.Event,
+) -> None:
     detector, limiter, blocked, silent = FloodDetector(), RepeatLimiter(), list[str](), set[Peer]()
     deferred, floods, opened, read_us = 0, list[Flood](), None, 0
     while not ending.wait(_CHECK_S):
         if deferred < len(zenoh_ports):  # a link opens its ports some time after this thread begins
             deferred = _defer(_listeners(zenoh_ports))
         now_us = heartbeat_us()
-        # Without a new connection there is hardly a new flood, and the table takes 3 ms to read.
+        # Without a new connection there is hardly a new flood, and a table takes 3 to 5 ms to read.
         opened_before, opened = opened, opened_connections()
         is_quiet = opened is not None and opened == opened_before and not floods and not blocked
         if is_quiet and now_us - read_us < _QUIET_US:
@@ -148,7 +165,7 @@ def _watch(ports: set[int], zenoh_ports: set[int], report: Callable[[str], None]
         # A connection that comes between these two lines is not counted, which a flood does not need.
         accepted = dict(_accepted)
         _accepted.clear()
-        floods = detector.sample(connection_ends(ports), now_us, accepted)
+        floods = detector.sample(read(), now_us, accepted)
         # Before the report, so that what the log states is true.
         if detector.blocked(now_us) != blocked:
             blocked = detector.blocked(now_us)

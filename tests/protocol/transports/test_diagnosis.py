@@ -64,7 +64,7 @@ def test_count_of_another_system_is_unknown(monkeypatch, tmp_path, text):
 def test_the_table_is_read_only_after_a_new_connection(monkeypatch):
     opened, reads = [0], []
     monkeypatch.setattr(flood_limits, "opened_connections", lambda: opened[0])
-    monkeypatch.setattr(flood_limits, "connection_ends", lambda _ports: reads.append(1) or {})
+    monkeypatch.setattr(flood_limits, "connection_ends", lambda *_: reads.append(1) or {})
     monkeypatch.setattr(flood_limits, "_CHECK_S", 0.01)
     monkeypatch.setattr(flood_limits, "_QUIET_US", 3_600_000_000)
     with limit_floods([f"ws://127.0.0.1:{free_port()}"], lambda _line: None):
@@ -75,6 +75,24 @@ def test_the_table_is_read_only_after_a_new_connection(monkeypatch):
         assert until(lambda: len(reads) == 4)
         monkeypatch.setattr(flood_limits, "_QUIET_US", 500_000)
         assert until(lambda: len(reads) >= 5), "and from time to time"
+
+
+@pytest.mark.parametrize(("listen", "tables"), [
+    (["tcp/0.0.0.0:7447", "ws://127.0.0.1:9090"], ["tcp"]), (["tcp/0.0.0.0:7447", "ws://[::1]:9090"], ["tcp", "tcp6"]),
+    (["tcp/[::]:7447"], ["tcp", "tcp6"]), (["tls/robot.local:7447"], ["tcp", "tcp6"]),
+])  # fmt: skip
+def test_table_of_ipv6_is_read_only_for_an_end_that_may_have_such_an_address(monkeypatch, tmp_path, listen, tables):
+    row = _ROWS.format(local="0100007F:1D17", remote="0200007F:C001", state="01")
+    (tmp_path / "tcp").write_text(row)
+    (tmp_path / "tcp6").write_text(row.replace("C001", "C002"))
+    monkeypatch.setattr(diagnosis, "TABLES", tmp_path)
+    monkeypatch.setattr(flood_limits, "_CHECK_S", 0.01)
+    monkeypatch.setattr(flood_limits, "_defer", len)
+    seen = []
+    monkeypatch.setattr(flood_limits.FloodDetector, "sample", lambda _self, ends, *_: seen.append(ends) or [])
+    with limit_floods(listen, lambda _line: None):
+        assert until(lambda: seen)
+    assert len(seen[0]) == len(tables)
 
 
 def test_a_flood_of_connections_is_reported_once_with_its_address():
