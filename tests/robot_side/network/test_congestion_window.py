@@ -350,6 +350,16 @@ def test_queue_that_drains_within_a_pause_is_of_the_attempt_before_it():
     assert window.widens_after(2_000_000), "a new attempt"
 
 
+def test_pause_is_short_again_after_a_width_that_held():
+    window = two_in_flight()
+    window.narrowed()
+    assert window.widens_after(1_000_000)
+    for _ in range(12):
+        window.alone(after_us=100_000)
+    window.narrowed()
+    assert window.widens_after(500_000)
+
+
 def test_window_widens_by_one_after_a_queue():
     window = two_in_flight(delay_us=400_000, most=12)
     for _ in range(2):
