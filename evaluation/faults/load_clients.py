@@ -10,6 +10,7 @@ import itertools
 import os
 import secrets
 import socket
+import ssl
 import sys
 import threading
 import time
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from sightline.protocol.transports.websocket.connection import Connection
 
 ADMITTED: Final = "admitted"
+ANSWERED: Final = "answered"
 SEEN: Final = "seen"
 READY: Final = "all have knocked"
 VIEWERS: Final = 100
@@ -110,9 +112,10 @@ def _begin(host: str, port: int) -> socket.socket:
     return one
 
 
-def _is_open(one: socket.socket) -> bool:
+def _is_open(one: socket.socket, on_data: Callable[[], None] = lambda: None) -> bool:
     try:
         if one.recv(4096):
+            on_data()
             return True
     except BlockingIOError:
         return True
@@ -151,18 +154,28 @@ def connect_often(endpoint: str, ledger: EventLog, rate_hz: int) -> None:
         time.sleep(max(0.0, started_s + count / rate_hz - time.monotonic()))
 
 
-def leave_half_open(endpoint: str, ledger: EventLog) -> None:
-    """Open connections, send nothing, and open again what the other end closes."""
+def client_hello() -> bytes:
+    """Return the first message of a TLS handshake."""
+    received, sent = ssl.MemoryBIO(), ssl.MemoryBIO()
+    with suppress(ssl.SSLWantReadError):
+        ssl.create_default_context().wrap_bio(received, sent, server_hostname="localhost").do_handshake()
+    return sent.read()
+
+
+def leave_half_open(endpoint: str, ledger: EventLog, first: bytes = b"") -> None:
+    """Open connections, send no more than `first`, and open again what the other end closes."""
     begun: list[socket.socket] = []
     is_reported = False
     while True:
-        begun = [one for one in begun if _is_open(one)]
+        begun = [one for one in begun if _is_open(one, partial(ledger.note, ANSWERED))]
         with suppress(OSError):
             while len(begun) < HALF_OPEN:
                 one = socket.socket()
                 one.setblocking(False)
                 one.connect_ex(_place(endpoint))
                 begun.append(one)
+                if first:
+                    one.send(first)
                 ledger.note(INJECTED)
         if not is_reported:
             is_reported = True
@@ -185,6 +198,10 @@ def open_sessions(endpoint: str, ledger: EventLog) -> None:
 
 
 HUGE_BYTES: Final = 1_000_000
+PUBLISHED_HZ: Final = 10_000
+PUBLISHED_EACH: Final = 1000
+"""Small twists for each event in the ledger."""
+_PUBLISHED_AT_ONCE: Final = 50
 
 
 def publish_much(endpoint: str, ledger: EventLog) -> None:
@@ -193,14 +210,14 @@ def publish_much(endpoint: str, ledger: EventLog) -> None:
 
     with open_session((), [endpoint], 5.0) as session:
         print(READY, flush=True)
-        started_s, count = time.monotonic(), 0
-        while True:
-            session.put("sightline/r1/twist/vision", b"0.5|0.0", attachment=b"{" * 100)
-            count += 1
-            if count % 1000 == 0:
+        started_s = time.monotonic()
+        for count in itertools.count(_PUBLISHED_AT_ONCE, _PUBLISHED_AT_ONCE):
+            for _ in range(_PUBLISHED_AT_ONCE):
+                session.put("sightline/r1/twist/vision", b"0.5|0.0", attachment=b"{" * 100)
+            if count % PUBLISHED_EACH == 0:
                 session.put("sightline/r1/twist/vision", bytes(HUGE_BYTES), attachment=b"{" * 100)
                 ledger.note(INJECTED)
-            time.sleep(max(0.0, started_s + count / 10_000 - time.monotonic()))
+            time.sleep(max(0.0, started_s + count / PUBLISHED_HZ - time.monotonic()))
 
 
 # Invalid STOP datagrams, as fast as this process can send.
@@ -255,6 +272,7 @@ _KINDS: Final[dict[str, Callable[[str, EventLog], None]]] = {
     "connect_25": partial(connect_often, rate_hz=FEW_HZ),
     "connect_500": partial(connect_often, rate_hz=MANY_HZ),
     "half_open": leave_half_open,
+    "handshake": lambda endpoint, ledger: leave_half_open(endpoint, ledger, client_hello()),
     "sessions": open_sessions,
     "publisher": publish_much,
     "garbage": send_garbage,

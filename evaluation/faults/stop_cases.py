@@ -4,13 +4,14 @@ import resource
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults.devices import MODE
-from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, ZERO_MS, measure_stop, wheel_mps
+from sightline.evaluation.faults.evidence import INJECTED, MEMORY_MB, ZERO_MS, SentCommand, measure_stop, wheel_mps
 from sightline.evaluation.faults.fixture import (
     KEPT_MPS,
     ROBOT,
@@ -20,18 +21,30 @@ from sightline.evaluation.faults.fixture import (
     busy_processes,
     moving_stop,
 )
-from sightline.evaluation.faults.load_clients import FEW_HZ, HALF_OPEN, MANY_HZ, READY, SESSIONS, STOPS
+from sightline.evaluation.faults.load_clients import (
+    ANSWERED,
+    FEW_HZ,
+    HALF_OPEN,
+    MANY_HZ,
+    PUBLISHED_EACH,
+    PUBLISHED_HZ,
+    READY,
+    SESSIONS,
+    STOPS,
+)
 from sightline.evaluation.faults.peer import LEGACY_LIBRARIES
 from sightline.evaluation.faults.runner import FaultCase, Injected
 from sightline.evaluation.processes import children_of
 from sightline.protocol.clock import monotonic_us
+from sightline.protocol.errors import LinkError
 from sightline.robot_side.safety.limits import SafetyConfig
 
 AT_WORK_S: Final = 3.0
 AFTER_S: Final = (2.0, 20.0, 80.0)
-"""Times after the end of a flood at which STOP must work, too. The first one is in the short set."""
+"""Times after the end of a flood at which STOP must work, too."""
 READY_S: Final = 30.0
-_REPORTED: Final = ("connect_25", "half_open")
+_HALF_OPEN: Final = ("half_open", "handshake")
+_REPORTED: Final = ("connect_25", *_HALF_OPEN)
 """Floods that exceed the limits of one address. The others stay below, in number and in rate. Connections to plain TCP
 that end within a millisecond leave nothing to count, so `connect_500` is reported on WebSocket only."""
 
@@ -47,11 +60,27 @@ def _flood(rig: RobotFixture, kind: str, after_s: float | None = None) -> Inject
         rig.watch(after_s)
     count = len(rig.noted("crowd", INJECTED))
     at_us, checks = rig.stop_by_operator(moving=True)
+    return Injected(count, at_us, checks=(*checks, *_load_checks(rig, kind)))
+
+
+PUBLISHED_LEAST_HZ: Final = 0.9 * PUBLISHED_HZ
+
+
+def _load_checks(rig: RobotFixture, kind: str) -> Iterator[Check]:
+    """Check that the flood was what its row states, and that the log has one line of it."""
+    if kind == "publisher":
+        yield at_least("published", _rate_hz(rig.noted("crowd", INJECTED)), "1/s", PUBLISHED_LEAST_HZ)
+    if kind == "handshake":
+        yield at_least("handshakes answered", len(rig.noted("crowd", ANSWERED)), "", 1)
     if kind in _REPORTED or (kind == "connect_500" and rig.web_endpoint):
         log = rig.processes.log("router" if rig.setup.routed else "robot").read_text("utf-8")
-        checks += at_least("reported", "connections from" in log, "", 1), at_most(
-            "lines of the flood", log.count("connections from"), "", 1)
-    return Injected(count, at_us, checks=checks)
+        yield at_least("reported", "connections from" in log, "", 1)
+        yield at_most("lines of the flood", log.count("connections from"), "", 1)
+
+
+def _rate_hz(noted: Sequence[SentCommand]) -> float:
+    """Return the rate that the publisher reached from its first to its last event."""
+    return (len(noted) - 1) * PUBLISHED_EACH / (noted[-1].t_us - noted[0].t_us) * 1e6 if len(noted) > 1 else 0.0
 
 
 def _garbage(rig: RobotFixture) -> Injected:
@@ -65,7 +94,7 @@ def _garbage(rig: RobotFixture) -> Injected:
     at_us, checks = rig.stop_by_operator(moving=True)
     rig.processes.wait_line("crowd", "datagrams a second", READY_S)
     rate_hz = float(rig.processes.log("crowd").read_text("utf-8").rpartition(READY)[2].split()[0])
-    log = rig.processes.log("robot").read_text("utf-8")
+    log = rig.processes.log("router" if rig.setup.routed else "robot").read_text("utf-8")
     counted = sum(reason in log for reason in ("MALFORMED", "OTHER_ROBOT", "WRONG_KEY"))
     return Injected(1, at_us, checks=(
         *checks, at_least("speed kept before it", slowest_mps, "m/s", KEPT_MPS), at_least("sent", rate_hz, "1/s", 1000),
@@ -213,6 +242,25 @@ def _stop_legacy(rig: RobotFixture) -> Injected:
     return Injected(1, at_us, checks=stopped)
 
 
+CUT_ITS_POWER: Final = "cut its power by hand"
+
+
+def _stop_offline(rig: RobotFixture) -> Injected:
+    """Run `sightline stop` while the legacy robot applies nothing, as without Wi-Fi. It cannot stop, and no line may
+    state that it did."""
+    at_us = monotonic_us()
+    rig.processes.signal("robot", signal.SIGSTOP)
+    rig.processes.start("stop", ["stop", ROBOT, "--connect", rig.endpoint])
+    code = rig.processes.exit_code("stop", STOP_ENDS_S)
+    printed = rig.processes.log("stop").read_text("utf-8")
+    return Injected(1, at_us, checks=(
+        at_least("speed that the robot keeps", wheel_mps(rig.motors()[-1]), "m/s", rig.setup.kept_mps),
+        at_least(f"exit code {LinkError.exit_code}", code == LinkError.exit_code, "", 1),
+        at_least("line to cut its power", CUT_ITS_POWER in printed, "", 1),
+        at_most("line that it stopped", "stopped" in printed.lower(), "", 0),
+    ))
+
+
 _FORMATS: Final = {
     "bar": "", "dashed": "?dashed", "swapped": "?dashed&swapped", "nonnegative": "?dashed&nonnegative",
     "boxes": "?boxes",
@@ -223,13 +271,18 @@ _LEGACY: Final = (
      f"zero <= {DISARM_ZERO_MS:g} ms after the start of disarm; exit codes 0"),
     ("stop", "STOP by a new operator", _stop_legacy, "exit code 0"),
 )
-LEGACY_CASES: Final = tuple(
-    FaultCase(f"legacy.{action}_{form}", f"legacy robot ({library}), texts {form}: {what}", inject,
-              Setup("vision", library, legacy=query), blind=True, stops=action != "disarm", also=demanded,
-              alone=action == "disarm")
-    for row, (action, what, inject, demanded) in enumerate(_LEGACY)
-    for column, (form, query) in enumerate(_FORMATS.items())
-    for library in [tuple(LEGACY_LIBRARIES)[(row + column) % len(LEGACY_LIBRARIES)]]
+LEGACY_CASES: Final = (
+    *(
+        FaultCase(f"legacy.{action}_{form}", f"legacy robot ({library}), texts {form}: {what}", inject,
+                  Setup("vision", library, legacy=query), blind=True, stops=action != "disarm", also=demanded,
+                  alone=action == "disarm")
+        for row, (action, what, inject, demanded) in enumerate(_LEGACY)
+        for column, (form, query) in enumerate(_FORMATS.items())
+        for library in [tuple(LEGACY_LIBRARIES)[(row + column) % len(LEGACY_LIBRARIES)]]
+    ),
+    FaultCase("legacy.stop_offline", "legacy robot out of reach: the command `sightline stop`", _stop_offline,
+              Setup("vision", "SimpleWebSocketServer", legacy=""), blind=True, stops=False,
+              also=f"exit code {LinkError.exit_code}, the line \"{CUT_ITS_POWER}\", never \"stopped\""),
 )
 
 
@@ -238,6 +291,7 @@ _TURNING_MPS: Final = 0.07
 _FLOODS: Final = {
     "tls25": ("connect_25", f"{FEW_HZ} connections a second without keys", True),
     "tls_half": ("half_open", f"{HALF_OPEN} half-open connections without keys", True),
+    "tls_hello": ("handshake", f"{HALF_OPEN} TLS handshakes that stall after their first message, without keys", True),
     "tcp500": ("connect_500", f"{MANY_HZ} connections a second", False),
     "tcp_half": ("half_open", f"{HALF_OPEN} half-open connections", False),
     "sessions": ("sessions", f"{SESSIONS} more sessions", False),
@@ -256,16 +310,16 @@ def _flood_case(name: str, *, routed: bool = False, after_s: float | None = None
     return FaultCase(
         f"flood.{name}{ending}", f"flood: {what}{where}; STOP by a new operator{when}",
         partial(_flood, kind=kind, after_s=after_s), Setup(secure=secured, routed=routed, web=name == "web500"),
-        blind=True, memory_mb=HALF_OPEN_MB if kind == "half_open" else MEMORY_MB,
-        also=_DEMANDED + (f"; memory <= {HALF_OPEN_MB:g} MB" if kind == "half_open" else ""),
-        short=ending == "" and name in ("tls25", "tcp500"), alone=True,
+        blind=True, memory_mb=HALF_OPEN_MB if kind in _HALF_OPEN else MEMORY_MB,
+        also=_DEMANDED + (f"; memory <= {HALF_OPEN_MB:g} MB" if kind in _HALF_OPEN else ""),
+        short=ending == "" and name in ("tls25", "tcp500"), alone=after_s is None,
     )
 
 
 STOP_CASES: Final = (
     *(_flood_case(name, routed=routed) for routed in (False, True) for name in _FLOODS
       if not (routed and name == "web500")),
-    *(_flood_case("tls_half", after_s=after_s) for after_s in AFTER_S),
+    *(_flood_case(name, after_s=after_s) for name in _FLOODS for after_s in AFTER_S),
     FaultCase("guest.one_image", "guests: one command on one image for 4 s, ahead and turning; then STOP", _guests,
               Setup("guest", guests=True), blind=True, also=f"zero <= {_GUEST.guest_unchanged_ms / 1000:g} s and "
               f"{_GUEST.guest_unchanged_m:g} m, plus braking; {_DEMANDED}"),
@@ -282,11 +336,15 @@ STOP_CASES: Final = (
     FaultCase("stop.no_descriptors", "STOP by a new operator: the robot has no file descriptor left", _no_descriptors,
               Setup(), blind=True, also=_DEMANDED),
     FaultCase("stop.publisher", "STOP by a new operator: twists at 10 kHz and of 1 MB, with malformed attachments",
-              partial(_flood, kind="publisher"), Setup(), blind=True, also=_DEMANDED, alone=True),
-    FaultCase(
-        "stop.garbage", "STOP port: datagrams of 0 to 2000 bytes, for another robot and with a wrong HMAC, as fast as "
-        "possible for 10 s (secured); then STOP", _garbage, Setup(secure=True), blind=True,
-        also=f"no effect but a count; {_DEMANDED}", alone=True,
+              partial(_flood, kind="publisher"), Setup(), blind=True, alone=True,
+              also=f"at least {PUBLISHED_LEAST_HZ:g} twists a second; {_DEMANDED}"),
+    *(
+        FaultCase(
+            f"stop.garbage{ending}", f"STOP port{where}: datagrams of 0 to 2000 bytes, for another robot and with a "
+            "wrong HMAC, as fast as possible for 10 s (secured); then STOP", _garbage,
+            Setup(secure=True, routed=bool(ending)), blind=True, also=f"no effect but a count; {_DEMANDED}", alone=True,
+        )
+        for ending, where in (("", ""), ("_router", " of a router"))
     ),
     FaultCase(
         "stop.replayed", "STOP port: datagrams of an earlier start and of another robot, replayed (secured); then STOP",

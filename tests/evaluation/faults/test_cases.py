@@ -6,6 +6,7 @@ The short set is marked `slow`, the rest `long`.
 import json
 import math
 import re
+import ssl
 from collections import Counter
 from datetime import UTC, date, datetime
 from types import SimpleNamespace
@@ -38,6 +39,7 @@ from sightline.evaluation.faults.evidence import (
     stop_checks,
 )
 from sightline.evaluation.faults.fixture import ROBOT
+from sightline.evaluation.faults.load_clients import client_hello
 from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED, read_recording
 from sightline.evaluation.faults.report import passed, run_line, to_dict
 from sightline.evaluation.faults.runner import FaultOutcome, Injected, run_case, watched_us
@@ -308,6 +310,29 @@ def test_typed_stop_has_the_bounds_of_its_speed(monkeypatch, row, falls_ms, zero
     monkeypatch.setattr(stop_cases, "subprocess", SimpleNamespace(run=lambda *_, **__: SimpleNamespace(returncode=0)))
     rig = SimpleNamespace(endpoint="", setup=case.setup, motors=lambda: log(speeds), watch=lambda seconds: None)
     assert all(check.ok for check in case.inject(rig).checks) is ok
+
+
+@pytest.mark.parametrize(("each_us", "ok"), [(100_000, True), (110_000, True), (130_000, False), (10**6, False)])
+def test_publisher_that_is_slower_than_its_row_states_fails(each_us, ok):
+    noted = [SentCommand(number * each_us, 0) for number in range(30)]
+    for events, is_ok in ((noted, ok), (noted[:1], False), ([], False)):
+        rig = SimpleNamespace(noted=lambda *_, events=events: events, web_endpoint="")
+        assert [check.ok for check in stop_cases._load_checks(rig, "publisher")] == [is_ok]
+
+
+def test_stop_is_sent_during_each_flood_and_at_several_times_after_its_end():
+    rows = {row.id for row in CASES if row.id.startswith("flood.")}
+    floods = {row for row in rows if "_router" not in row and "_after" not in row}
+    assert {f"flood.{kind}" for kind in ("tls25", "tls_half", "tls_hello", "tcp500", "tcp_half", "sessions")} < floods
+    assert {f"{flood}_after{after_s}" for flood in floods for after_s in (2, 20, 80)} < rows
+
+
+def test_stalled_handshake_begins_one():
+    server = ssl.MemoryBIO()
+    server.write(client_hello())
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    with pytest.raises(ssl.SSLError, match="NO_SHARED_CIPHER"):  # it has no certificate, but read the whole message
+        context.wrap_bio(server, ssl.MemoryBIO(), server_side=True).do_handshake()
 
 
 # --- services that share robots ----------------------------------------------------------------------------------
