@@ -36,6 +36,7 @@ def commands(group=None, path=()):
             yield (*path, name), command
 
 
+PROJECT = Path(__file__).parents[3] / "pyproject.toml"
 COMMANDS = dict(commands())
 COMMANDS_AND_GROUPS = typer.main.get_command(table.app).commands
 
@@ -147,6 +148,26 @@ def test_completion_of_the_shell_offers_commands_and_options():
 
     assert set(offered("sightline st")) == {"status", "stop"}
     assert "--version" in offered("sightline --")
+
+
+_INTERRUPTED = """
+import signal, sys
+from importlib import import_module
+def interrupt(event, arguments):
+    if event == "import" and arguments[0] == moment:
+        signal.raise_signal(signal.SIGINT)
+module, name, moment, *sys.argv[1:] = sys.argv[1:]
+sys.addaudithook(interrupt)
+sys.exit(getattr(import_module(module), name)())
+"""
+
+
+@pytest.mark.parametrize("moment", ["sightline.operator_side.cli.app", "sightline.protocol.errors", "typer"])
+def test_interrupt_while_the_command_is_imported_prints_no_traceback(moment):
+    scripts = tomllib.loads(PROJECT.read_text("utf-8"))["project"]["scripts"]
+    command = [sys.executable, "-P", "-c", _INTERRUPTED, *scripts["sightline"].split(":"), moment, "status"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (cli.INTERRUPTED, "", "")
 
 
 @pytest.mark.parametrize(
