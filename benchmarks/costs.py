@@ -1,5 +1,6 @@
-"""Measure the time to encode a message and to validate a command. Shell (a clock)."""
+"""Measure the time to encode a message, and to validate a command and its proof. Shell (a clock)."""
 
+import secrets
 import statistics
 import time
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from typing import Final
 from sightline.evaluation.checks import Check, at_most
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader, Twist
+from sightline.protocol.proof import MAX_LOST, ProofChain, continues
 from sightline.protocol.text import format_twist, parse_twist
 from sightline.robot_side.safety.gate import SafetyGate
 from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
@@ -51,7 +53,7 @@ def _answer() -> None:
     parse_twist(format_twist(_TWIST))
 
 
-def _median_us(call: Callable[[], None]) -> float:
+def _median_us(call: Callable[[], object]) -> float:
     rounds = []
     for _ in range(_ROUNDS):
         begin_ns = time.perf_counter_ns()
@@ -84,3 +86,15 @@ def measure_gate(commands: int = 5_000) -> float:
     if gate.accepted < commands - 10:
         raise RuntimeError(f"only {gate.accepted} of {commands} commands were accepted: {gate.counters}")
     return median(took_us)
+
+
+PROOF_BOUND_US: Final = 100.0
+
+
+def measure_proof() -> float:
+    """Median microseconds to check the proof of a command, after as many lost commands as may be lost in a row."""
+    chain = ProofChain(secrets.token_bytes)
+    last, *_, newest = [chain.next() for _ in range(MAX_LOST + 1)]
+    if not continues(newest.proof, last):
+        raise RuntimeError(f"a proof after {MAX_LOST} hashes was rejected")
+    return _median_us(lambda: continues(newest.proof, last))

@@ -89,7 +89,11 @@ SECTIONS: Final = (
         ("faults", "--only", "vision.kill", "--only", "network.kill", "--only", "vision.restart", "--repeat", "10"),
         since="2026-11-28",
     ),
-    Section("gate", "Gate", "One command validated and one step decided.", ("bench", "gate")),
+    Section(
+        "gate", "Gate",
+        "One command validated and one step decided, and the proof of a command after 63 lost ones: the most hashes.",
+        ("bench", "gate"),
+    ),
     Section("messages", "Messages", "Encode and decode, hot.", ("bench", "codec")),
     Section(
         "vision",

@@ -44,11 +44,14 @@ def codec(*, as_json: Json = False) -> int:
 
 
 def gate(*, as_json: Json = False) -> int:
-    """Measure the gate: one command and one step"""
-    from sightline.benchmarks.costs import GATE_BOUND_US, measure_gate
+    """Measure the gate: one command, one step, one proof"""
+    from sightline.benchmarks.costs import GATE_BOUND_US, PROOF_BOUND_US, measure_gate, measure_proof
     from sightline.evaluation.checks import at_most
 
-    return _print_checks([at_most("offer and step", measure_gate(), "us", GATE_BOUND_US)], as_json)
+    return _print_checks([
+        at_most("offer and step", measure_gate(), "us", GATE_BOUND_US),
+        at_most("proof, most hashes", measure_proof(), "us", PROOF_BOUND_US),
+    ], as_json)
 
 
 def pipeline(*, as_json: Json = False) -> int:

@@ -4,6 +4,7 @@ from random import Random
 
 import pytest
 
+from sightline.protocol import proof as proof_module
 from sightline.protocol.proof import ELEMENT_BYTES, MAX_LOST, NO_PROOF, Proof, ProofChain, continues, session_digest
 
 
@@ -19,6 +20,18 @@ def test_next_proof_continues_after_at_most_63_lost_commands(lost, accepted):
         proofs.next()
     assert continues(proofs.next().proof, last) is accepted
     assert MAX_LOST == 64
+
+
+@pytest.mark.parametrize(("lost", "hashes"), [(0, 1), (63, MAX_LOST), (64, MAX_LOST), (500, MAX_LOST)])
+def test_proof_costs_a_hash_for_each_lost_command_and_never_more_than_the_limit(monkeypatch, lost, hashes):
+    proofs, counted, hashed = chain(), [], proof_module._hashed
+    last = proofs.next()
+    for _ in range(lost):
+        proofs.next()
+    newest = proofs.next().proof
+    monkeypatch.setattr(proof_module, "_hashed", lambda element: counted.append(element) or hashed(element))
+    continues(newest, last)
+    assert len(counted) == hashes
 
 
 def test_revealed_proof_continues_nothing():
