@@ -111,8 +111,17 @@ def send_stop(robot: str | None, connect: list[str] | None, secure: str, as_json
 
     target = target_of(robot or None, connect, secure)  # a script's unset variable must not prevent a STOP
     _warn(str(target))
-    is_stored = stop_robot(target.robot, target.connect, target.secure, stop_secret_of(target, _warn), on_slow,
-                           thread_name=ABANDONED_THREAD)
+    lacks: list[str] = []
+    secret_file = stop_secret_of(target, lacks.append)
+    try:
+        is_stored = stop_robot(target.robot, target.connect, target.secure, secret_file, on_slow,
+                               thread_name=ABANDONED_THREAD)
+    except SightlineError as error:
+        lacks = [line for line in lacks if line != str(error)]  # keys that the link cannot read either
+        raise
+    finally:
+        for line in lacks:
+            _warn(line)
     if not is_stored:
         _warn(f"STOP of {target.robot} is not on its disk, so that a restart ends it; is the disk full?")
     done = {"robot": target.robot, "ok": True, "state": "STOPPED", "detail": "wheels at zero"}

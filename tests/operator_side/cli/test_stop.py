@@ -3,11 +3,12 @@
 import threading
 from pathlib import Path
 from random import Random
+from unittest.mock import Mock
 
 import pytest
 
 from sightline.operator_side.cli import app as cli
-from sightline.protocol.errors import LinkError
+from sightline.protocol.errors import LinkError, home_path
 
 WORDS = ("r1", "r2", "--json", "--connect", "--connect=tcp/10.0.0.1:7447", "tcp/10.0.0.2:7447", "--secure",
          "--secure=k", "--connect=", "--", "-h", "--jso", "-1", "", "=", "stop")  # fmt: skip
@@ -58,6 +59,25 @@ def test_empty_robot_id_stops_the_default_robot(stopped):
 def test_keys_in_an_unknown_home_do_not_prevent_a_stop(stopped, capsys):
     assert cli.run(["stop", "--secure", "~no-user/x"]) == 0 and len(stopped) == 1
     assert "no home folder for '~no-user' in ~no-user/x; write the whole path" in capsys.readouterr().err
+
+
+def test_keys_in_an_unknown_home_are_named_once(stopped, monkeypatch, capsys):
+    def stop_robot(_robot, _connect, secure, *_given, **_options):
+        home_path(secure)  # as the link does
+
+    monkeypatch.setattr(cli, "stop_robot", stop_robot)
+    assert cli.run(["stop", "--secure", "~no-user/x"]) == 2
+    shown, *others = capsys.readouterr().err.splitlines()
+    assert shown == "robot r1 at tls/127.0.0.1:7447 (from default)"
+    assert others == ["error: no home folder for '~no-user' in ~no-user/x; write the whole path"]
+
+
+@pytest.mark.parametrize("is_stopped", [True, False])
+def test_missing_secret_is_named_whether_the_robot_stops_or_not(stopped, monkeypatch, capsys, tmp_path, is_stopped):
+    if not is_stopped:
+        monkeypatch.setattr(cli, "stop_robot", Mock(side_effect=LinkError("no answer")))
+    assert cli.run(["stop", "--secure", str(tmp_path)]) == (0 if is_stopped else LinkError.exit_code)
+    assert capsys.readouterr().err.count("stop.secret is missing") == 1
 
 
 @pytest.mark.parametrize("output", ["stdout", "stderr"])
