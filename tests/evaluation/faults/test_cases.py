@@ -320,6 +320,20 @@ def test_publisher_that_is_slower_than_its_row_states_fails(each_us, ok):
         assert [check.ok for check in stop_cases._load_checks(rig, "publisher")] == [is_ok]
 
 
+@pytest.mark.parametrize(("row", "least"), [
+    ("flood.tls25", 60), ("flood.tcp500", 1200), ("flood.tcp_half_after20", 700), ("flood.sessions_router", 63)])
+def test_flood_that_is_weaker_than_its_row_states_fails(monkeypatch, row, least):
+    monkeypatch.setattr(stop_cases, "_load_checks", lambda *_: ())
+    nothing = SimpleNamespace(wait_line=lambda *_: None, kill=lambda *_: None)
+    for count, is_ok in ((least, True), (least - 1, False)):
+        rig = SimpleNamespace(
+            prepare_operator=lambda: None, start_crowd=lambda *_: None, processes=nothing, watch=lambda _: None,
+            noted=lambda *_, count=count: [None] * count, stop_by_operator=lambda **_: (0, ()), web_endpoint="",
+            endpoint="")
+        [case] = chosen([row], short=False)
+        assert [check.ok for check in case.inject(rig).checks] == [is_ok]
+
+
 def test_stop_is_sent_during_each_flood_and_at_several_times_after_its_end():
     rows = {row.id for row in CASES if row.id.startswith("flood.")}
     floods = {row for row in rows if "_router" not in row and "_after" not in row}
