@@ -55,6 +55,7 @@ GROUPS: Final = {
     "RECO": "reconnect",
     "SOCK": "websocket",
     "STEER": "steering",
+    "REP": "reports",
     "CODEC": "codec",
 }
 """Code in an id -> the group's name, as `--group` takes it."""

@@ -3,7 +3,7 @@
 from typing import Final
 
 from sightline.conformance.case import Bench, Case
-from sightline.conformance.vision import answers, causality, flow, hostile, websocket
+from sightline.conformance.vision import answers, causality, flow, hostile, reports, websocket
 from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed
 
 _FIRST_US: Final = 20_000_000
@@ -11,7 +11,7 @@ _FIRST_US: Final = 20_000_000
 _AGAIN_US: Final = 3_000_000
 """One that lost its robot in the last case tries again every second."""
 _EVERY_US: Final = 100_000
-_PARTS: Final = (answers, causality, flow, hostile, websocket)
+_PARTS: Final = (answers, causality, flow, reports, hostile, websocket)
 
 CASES: Final[tuple[Case, ...]] = tuple(case for part in _PARTS for case in part.SUITE.cases)
 

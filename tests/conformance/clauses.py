@@ -32,7 +32,6 @@ UNTESTED = {
         "for a vision service that knows missions, which is optional; tests/vision_side/missions/test_registry.py",
     "18.2 Freshness": "as 18.1",
     "18.3 Switching": "as 18.1",
-    "18.4 Report": "as 18.1",
     "19.1 Overlay and preview":
         "for a vision service that draws for viewers, which is optional; tests/vision_side/test_viewing.py",
     "19.2 Only while watched": "as 19.1",

@@ -343,7 +343,7 @@ class Service:
 
     def _note_silence(self, now_s: float) -> None:
         if now_s - self._heard_s > _NO_FRAMES_S:
-            self._mission_channel.report(now_s, self._acknowledge(NO_FRAMES), None)
+            self._mission_channel.report(self._now_us() / 1e6, self._acknowledge(NO_FRAMES), None)
         if now_s - self._heard_s > _SILENCE_S:
             self._robot_session = ""
             self._log_change("link", f"no frames from robot {self._config.robot} at {endpoints_text(self._config)}; is "
@@ -406,7 +406,7 @@ class Service:
             self.skipped[answer.skipped] += 1
         self._publish(header, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._report_phase(answer)
-        self._mission_channel.report(time.monotonic(), answer, header, self._pipeline.camera)
+        self._mission_channel.report(self._now_us() / 1e6, answer, header, self._pipeline.camera)
         if not self._is_legacy:
             self._viewing.publish_detections(header, answer, started_ns)
         self._viewing.show(header, answer, self._pipeline.camera, started_ns=started_ns, jpeg=message.payload)
@@ -603,7 +603,7 @@ class BoxesService(Service):
         if self._pipeline is None or (self._is_legacy and not self._pipeline.fits(message.payload)):
             self._find_camera(message.payload)
         elif time.monotonic() - self._boxes_heard_s > _BOXES_SILENCE_S:
-            self._mission_channel.report(time.monotonic(), self._acknowledge(_NO_BOXES), header)
+            self._mission_channel.report(self._now_us() / 1e6, self._acknowledge(_NO_BOXES), header)
             source = self._config.boxes.source
             self._log_change("boxes", f"frames come, but no boxes from {source}; does its detector run?")
 
@@ -628,7 +628,7 @@ class BoxesService(Service):
             return
         self._publish(frame, answer, (time.perf_counter_ns() - started_ns) // 1000)
         self._report_phase(answer)
-        self._mission_channel.report(time.monotonic(), answer, frame, self._camera)
+        self._mission_channel.report(self._now_us() / 1e6, answer, frame, self._camera)
         self._viewing.show(frame, answer, self._camera, started_ns=started_ns)
 
     def _remember_replaced(self) -> None:

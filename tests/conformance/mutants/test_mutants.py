@@ -16,8 +16,10 @@ MUTANTS, PROBLEMS = peers.table()
 PYTHON = ("robot", "vision")
 JAVASCRIPT = ("javascript-robot", "javascript-vision")
 VIRTUAL = (*PYTHON, *JAVASCRIPT)
-NOT_APPLICABLE = {"javascript-robot": {"R-FRAM-11", *(f"R-LEASE-{number}" for number in range(21, 28))}}
-"""Cases that a peer's choices leave nothing to test in: the JavaScript robot publishes no scan, and has no Zenoh."""
+NOT_APPLICABLE = {"javascript-robot": {"R-FRAM-11", *(f"R-LEASE-{number}" for number in range(21, 28))},
+                  "javascript-vision": {f"V-REP-0{number}" for number in range(1, 5)}}
+"""Cases that a peer's choices leave nothing to test in: the JavaScript robot publishes no scan, and has no Zenoh; the
+JavaScript vision service publishes no reports and no detections."""
 
 
 AT_ONCE = 8

@@ -1,10 +1,11 @@
-"""Broken vision services: queues, silences, losses, and robots in states they do not like. Pure."""
+"""Broken vision services: queues, silences, losses, reports, and robots in states they do not like. Pure."""
 
 import json
 from collections import deque
 
 from sightline.conformance.vision.flow import BROKEN_STATUS
-from sightline.protocol.channels import FRAME
+from sightline.protocol.channels import DETECTIONS, FRAME, REPORT
+from sightline.protocol.spec.message_cases import packed
 from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from tests.conformance.vision.broken import STANDING, BrokenVision, breaks
 from tests.conformance.vision.broken_answers import PerSession
@@ -253,3 +254,61 @@ class KeepsBack(BrokenVision):
             self.kept = None
 
 
+class Reporting(BrokenVision):
+    """Publishes reports and detections its own way."""
+
+    def __init__(self, network, robot="r1"):
+        super().__init__(network, robot)
+        self.send_out = self.link.publish
+        self.link.publish = self.publishes
+
+    def publishes(self, channel, header, payload, source=""):
+        changed = {REPORT: self.reports, DETECTIONS: self.finds}.get(channel)
+        fields = None if changed is None else changed(json.loads(payload))
+        if fields != {}:
+            self.send_out(channel, header, payload if fields is None else packed(fields), source)
+
+    def reports(self, fields):
+        """Return what it reports instead; an empty object for nothing."""
+        return fields
+
+    def finds(self, fields):
+        """Return the detections that it publishes instead."""
+        return fields
+
+
+@breaks("V-REP-01", "repeats its last report with each image")
+class Talkative(Reporting):
+    last = None
+
+    def publishes(self, channel, header, payload, source=""):
+        super().publishes(channel, header, payload, source)
+        if channel is REPORT:
+            self.last = (channel, header, payload, source)
+        elif self.last is not None:
+            self.send_out(*self.last)
+
+
+@breaks("V-REP-02", "reports a new phase 0.4 s late")
+class LatePhase(Reporting):
+    phase, changed_us = "", 0
+
+    def reports(self, fields):
+        if fields["phase"] != self.phase:
+            self.phase, self.changed_us = fields["phase"], self.now_us
+        return fields if self.now_us - self.changed_us >= 400_000 else {}
+
+
+@breaks("V-REP-03", "names its target in every fourth report")
+class SeldomNamed(Reporting):
+    count = 0
+
+    def reports(self, fields):
+        self.count += 1
+        return fields | ({"target": None} if self.count % 4 else {})
+
+
+@breaks("V-REP-04", "finds each object twice, with one number")
+class Doubled(Reporting):
+    def finds(self, fields):
+        return fields | {"boxes": [box | {"track": 1} for box in fields["boxes"] * 2]}

@@ -1,0 +1,140 @@
+"""Cases about reports and detections: how often, the followed target, and the result for each image. Pure.
+
+Both are optional. A service that publishes none leaves nothing to test here.
+"""
+
+import math
+from typing import Final
+
+from sightline.conformance.case import NOT_DRIVING, Bench, Model, Received, Suite
+from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed, Sent, met
+from sightline.conformance.vision.images import CAMERA as LENS
+from sightline.protocol.channels import DETECTIONS, REPORT
+from sightline.protocol.messages import Detections, DetectionsHeader, MissionReport, ReportedTarget
+
+SUITE = Suite("V")
+_EVERY_US: Final = 50_000
+_SECOND: Final = 20
+_PERIOD_US: Final = 750_000
+"""Twice a second, and the time of a slow image."""
+_MOST_PER_S: Final = 12
+"""Ten, and two that a link brings closer together."""
+_TARGETS_PER_S: Final = 5
+"""Of ten: each comes with an answer, so a service at 20 images per second may wait for the next one."""
+_AT_ONCE_US: Final = 300_000
+_TARGET_RADIUS_PX: Final = 20.0
+_NEAR_PX: Final = 8.0
+_NEAR_RAD: Final = 0.05
+
+
+def _parsed(bench: Bench, received: list[Received], model: type[Model]) -> list[tuple[Received, Model]]:
+    """Return each message with its payload. An invalid one fails the case."""
+    parsed = [(one, one.payload(model)) for one in received]
+    for one, payload in parsed:
+        bench.expect(payload is not None, f"an invalid {one.message.channel.name}: {one.message.payload[:160]!r}")
+    return [(one, payload) for one, payload in parsed if payload is not None]
+
+
+def _reports(bench: Bench, since: int) -> list[tuple[Received, MissionReport]]:
+    found = _parsed(bench, bench.received(REPORT, since), MissionReport)
+    bench.need(found or bench.newest(REPORT), "it publishes no reports")
+    return found
+
+
+def _cites(received: Received, sent: Sent) -> bool:
+    header = received.header(DetectionsHeader)
+    if header is None or header.echo is None:
+        return False
+    echo = header.echo
+    return (echo.session, echo.seq, echo.t_us) == (sent.session, sent.seq, sent.t_us)
+
+
+@SUITE.should("V-REP-01", "18.4 Report", met)
+def rate(bench: Bench, robot: RobotPlayed) -> None:
+    """While frames come, reports come twice a second, and at most ten times."""
+    mark, began_us = bench.mark(), bench.now_us
+    robot.film("absent", 3 * _SECOND, _EVERY_US)
+    robot.film("centre", 2 * _SECOND, _EVERY_US)
+    times_us = [one.at_us for one, _ in _reports(bench, mark)]
+    gap_us = max(after - before for before, after in zip([began_us, *times_us], [*times_us, bench.now_us], strict=True))
+    bench.expect(gap_us <= _PERIOD_US, f"{gap_us / 1e6:.2f} s passed between two reports")
+    most = max(sum(0 <= other - one < 1_000_000 for other in times_us) for one in times_us)
+    bench.expect(most <= _MOST_PER_S, f"{most} reports came within a second")
+
+
+@SUITE.should("V-REP-02", "18.4 Report", met)
+def at_once(bench: Bench, robot: RobotPlayed) -> None:
+    """A change of the phase is reported at once, also right after another report."""
+    robot.film("absent", 2 * _SECOND, _EVERY_US)
+    mark = bench.mark()
+    for _ in range(_SECOND):
+        if _reports(bench, mark):
+            break
+        robot.film("absent", 1, _EVERY_US)
+    bench.expect(_reports(bench, mark), "no report came for a second")
+    phase = _reports(bench, mark)[-1][1].phase
+    robot.answer_to(robot.frame("centre"))
+    shown_us, mark = bench.now_us, bench.mark()
+    robot.film("centre", _SECOND, _EVERY_US)
+    changed = [one.at_us for one, report in _reports(bench, mark) if report.phase != phase]
+    bench.need(changed, "its phase does not depend on whether a yellow ball is there")
+    took_us = changed[0] - shown_us
+    bench.expect(took_us <= _AT_ONCE_US, f"the change was reported after {took_us / 1e6:.2f} s")
+
+
+def _film_target(bench: Bench, name: str, side: int) -> tuple[RobotPlayed, list[Sent]]:
+    """Return a new robot and its frames of a target. Not applicable to a service that does not turn to it."""
+    robot = RobotPlayed(bench)
+    sent = robot.film(name, 2 * _SECOND, _EVERY_US)
+    robot.is_driven(sent[-1])
+    robot.stop()
+    twists = robot.twists()
+    bench.need(twists and twists[-1].speeds[1] * side > 0, "it does not follow the yellow ball")
+    return robot, sent
+
+
+@SUITE.should("V-REP-03", "18.4 Report")
+def target(bench: Bench) -> None:
+    """While it follows the ball, it names it ten times a second: what and where it is in the image of the echo."""
+    for name, x_px in (("left", 104), ("right", 216)):
+        mark = bench.mark()
+        side = 1 if x_px < LENS.cx_px else -1
+        _robot, sent = _film_target(bench, name, side)
+        newer = [(one, report) for one, report in _reports(bench, mark) if any(_cites(one, frame) for frame in sent)]
+        named = [report.target for _, report in newer if report.target is not None]
+        least = _TARGETS_PER_S * (sent[-1].at_us - sent[0].at_us) / 1e6 - 1
+        bench.expect(len(named) >= least, f"{len(named)} of {len(newer)} reports in {len(sent)} images name the target")
+        bench.expect(newer[-1][1].detector, "no report names the detector")
+        bench.expect(len({one.track for one in named}) == 1, "`track` changes while it follows one ball")
+        for one in named:
+            _expect_place(bench, one, x_px)
+
+
+def _expect_place(bench: Bench, one: ReportedTarget, x_px: int) -> None:
+    size = one.width_px, one.height_px
+    bench.expect(size == (LENS.width_px, LENS.height_px), f"the image is {size[0]}x{size[1]} in the report")
+    bench.expect(abs(one.cx_px - x_px) <= _NEAR_PX, f"the center is at {one.cx_px:g} px, not at {x_px} px")
+    radius_px, bearing_rad = one.radius_px, one.bearing_rad
+    bench.expect(radius_px is None or abs(radius_px - _TARGET_RADIUS_PX) <= _NEAR_PX, f"the radius is {radius_px} px")
+    expected_rad = math.atan((LENS.cx_px - x_px) / LENS.fx_px)
+    bench.expect(bearing_rad is None or abs(bearing_rad - expected_rad) <= _NEAR_RAD,
+                 f"the bearing is {bearing_rad} rad, not {expected_rad:.2f} rad")
+
+
+@SUITE.should("V-REP-04", "18.4 Report", met)
+def detections(bench: Bench, robot: RobotPlayed) -> None:
+    """The detections of each image that it drives by come once while the kit subscribes, no `track` twice in one."""
+    mark = bench.mark()
+    sent = robot.film("left", _SECOND, _EVERY_US)
+    robot.is_driven(sent[-1])
+    driven = [one for one in sent if robot.twists_to(one)]
+    bench.need(driven, NOT_DRIVING)
+    bench.wait(lambda: any(_cites(one, driven[-1]) for one in bench.received(DETECTIONS, mark)), ANSWER_US)
+    found = _parsed(bench, bench.received(DETECTIONS, mark), Detections)
+    bench.need(found or bench.newest(DETECTIONS), "it publishes no detections")
+    for frame in driven:
+        count = sum(_cites(one, frame) for one, _ in found)
+        bench.expect(count == 1, f"{count} messages with detections cite frame {frame.seq}")
+    for _, one in found:
+        tracks = [box.track for box in one.boxes if box.track is not None]
+        bench.expect(len(tracks) == len(set(tracks)), f"two boxes of one image have one `track`: {tracks}")
