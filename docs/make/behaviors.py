@@ -1,6 +1,7 @@
 """Write docs/reference/results/behaviors.md: every scenario with its baseline, in figures and pictures. Shell.
 
     python -m docs.make.behaviors --seeds 201,202,203,204,205,206
+    python -m docs.make.behaviors --only three-balls,Light      # these parts again; the others keep their last run
 """
 
 import argparse
@@ -9,6 +10,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, as_completed
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -98,6 +100,42 @@ ROWS: Final = (
     Row("thymio"), Row("thymio-box"), Row("thymio-slalom"), Row("thymio-trap"), Row("thymio-closed"),
     Row("thymio", "goto-baseline"), Row("thymio-trap", "goto-baseline"),
     Row("occluder"),
+)  # fmt: skip
+
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Some figures of scenarios in several looks, by the detector that a user has without a choice."""
+
+    title: str
+    summary: str
+    scenarios: tuple[str, ...]
+    looks: tuple[str, ...]
+    figures: tuple[str, ...]
+    seeds: tuple[int, ...]
+
+    def cases(self, scenario: str, look: str) -> list[ScoreCase]:
+        """Return the runs of one line."""
+        return [ScoreCase(scenario, LATENCY_MS, LOSS, seed, None, look=look) for seed in self.seeds]
+
+    def lines(self) -> Iterator[tuple[str, str]]:
+        """Yield scenario and look of each line."""
+        return product(self.scenarios, self.looks)
+
+
+_CROSSED: Final = ("three-balls", "three-boxes", "legs-crowd")
+_IDENTITY: Final = ("wrong_percent", "lost_after_s", "found_again_s")
+_IDENTITY_SEEDS: Final = tuple(range(401, 421))
+TABLES: Final = (
+    Table("Identity", "Others like the target cross before and behind it. The share of the time in which the robot "
+          "follows another object,\nthe longest time until it stops to, and the longest time until it follows the "
+          "target again that is in view.", _CROSSED, ("plain",), _IDENTITY, _IDENTITY_SEEDS),
+    Table("Identity in the real look", "The same with the look `real`.", _CROSSED, ("real",), _IDENTITY,
+          _IDENTITY_SEEDS),
+    Table("Light", "The ball on a circle under other lamps, in a fifth of the light and with 0.3 of the saturation.",
+          ("circle",), ("tungsten", "fluorescent", "dark", "pale"), ("bearing_rms_deg", "lost_percent"),
+          (201, 202, 203, 204, 205, 206)),
 )  # fmt: skip
 
 CHARACTER: Final = {
@@ -233,6 +271,7 @@ def _plot(axes: "Axes", runs: Sequence[SpeedRun], label: str, values: Sequence[S
 
 Results = Mapping[ScoreCase, Score]
 SPEEDS: Final = "thymio-speeds.png"
+NOT_MEASURED: Final = "not measured"
 _ALSO_OF_BASELINES: Final = ("unseen_percent", "target_contacts")
 _UNITS: Final = {**{name: figure.unit for name, figure in FIGURES.items()}, "unseen_percent": "%"}
 _IN_LIGHT: Final = ("wrong_states_percent", "crossed_on_red", "crossed_late", "least_crossings", "start_s")
@@ -243,6 +282,50 @@ def picture_name(case: ScoreCase) -> str:
     return "-".join(part for part in (case.scenario, case.robot and f"on-{case.robot}", case.mission) if part) + ".png"
 
 
+def table_lines(table: Table, results: Results) -> Iterator[str]:
+    """Yield the section of `table`: the worst start of each line, and the bound."""
+    names = f"{table.seeds[0]} to {table.seeds[-1]}"
+    yield f"## {table.title}\n"
+    yield f"{table.summary}\nThe worst of {len(table.seeds)} starts (seeds {names}) with the default detector.\n"
+    yield f"| scenario | look | {' | '.join(table.figures)} | |\n|---|---|{'---:|' * len(table.figures)}---|"
+    for scenario, look in table.lines():
+        runs = [results[case] for case in table.cases(scenario, look) if case in results]
+        checks = [_table_checks(table, scenario, run) for run in runs]
+        cells = " | ".join(f"{_worst(runs, name)} (bound {_bound(scenario, name)})" for name in table.figures)
+        ok = all(check.ok for same in checks for check in same)
+        yield f"| {scenario} | {look} | {cells} | {'ok' if runs and ok else '**not kept**' if runs else NOT_MEASURED} |"
+    yield ""
+
+
+def _table_checks(table: Table, scenario: str, run: Score) -> list[Check]:
+    return [check for check in checks_of(load_scenario(scenario), run, LATENCY_MS) if check.name in table.figures]
+
+
+def _bound(scenario: str, name: str) -> str:
+    return _figure(load_scenario(scenario).bounds[name], _UNITS[name])
+
+
+def _worst(runs: Sequence[Score], name: str) -> str:
+    return _figure(median_and_worst(runs, name)[1], _UNITS[name]) if runs else NOT_MEASURED
+
+
+def merged(old: str, new: str) -> str:
+    """Return page `old` with the sections and the lines of the overview of `new`, in the order of a whole page."""
+    (head, lines, sections), (_, newer_lines, newer) = _parts(old), _parts(new)
+    lines, sections = lines | newer_lines, sections | newer
+    titles = [*(row.title for row in ROWS), *(table.title for table in TABLES)]
+    overview = [lines[title.replace("`", "")] for title in titles if title.replace("`", "") in lines]
+    return "\n".join([head, *overview, "", *(sections[title] for title in titles if title in sections)])
+
+
+def _parts(page: str) -> tuple[str, dict[str, str], dict[str, str]]:
+    """Return what is before the lines of the overview, these lines and the sections, by title."""
+    head, *sections = page.split("\n## ")
+    begin, *lines = head.rstrip("\n").split("\n| [")
+    by_title = {section.partition("\n")[0]: f"## {section}".rstrip("\n") + "\n" for section in sections}
+    return begin, {line.partition("]")[0]: f"| [{line}" for line in lines}, by_title
+
+
 def kept(row: Row, results: Results, seeds: Sequence[int]) -> bool:
     """Return True if every run kept every bound. A baseline has no bounds."""
     return bool(row.baseline) or all(
@@ -251,7 +334,8 @@ def kept(row: Row, results: Results, seeds: Sequence[int]) -> bool:
 
 
 def page_lines(
-    rows: Sequence[Row], results: Results, seeds: Sequence[int], folder: str, speeds: Sequence[SpeedRun]
+    rows: Sequence[Row], results: Results, seeds: Sequence[int], folder: str, speeds: Sequence[SpeedRun],
+    *, tables: Sequence[Table] = (),
 ) -> Iterator[str]:
     """The page, block by block; pictures lie in `folder`."""
     names = ",".join(map(str, seeds))
@@ -267,13 +351,16 @@ def page_lines(
         f"Written by `python -m docs.make.behaviors --seeds {names}`. Watch one with `sightline demo\n"
         "--scenario NAME`, score one with `sightline score --scenario NAME`. Times count from the start. Shares and "
         "errors count from the\nfirst acquisition to the end. A `least_` figure must not fall below its bound, the "
-        "others must not exceed it. Contacts are\nphysics steps of 4 ms.\n"
+        "others must not exceed it. Contacts are\nphysics steps of 4 ms. `--only NAME` runs a scenario or the "
+        "section NAME again.\n"
     )
     yield from _overview(rows, results, seeds)
     for row in rows:
         yield from (_baseline if row.baseline else _behavior)(row, results, seeds, folder)
         if row == Row("thymio") and speeds:
             yield from _speeds(speeds, folder)
+    for table in tables:
+        yield from table_lines(table, results)
 
 
 def _overview(rows: Sequence[Row], results: Results, seeds: Sequence[int]) -> Iterator[str]:
@@ -397,30 +484,42 @@ def _figure(value: float | None, unit: str) -> str:
 # An image is of the first seed. The page names the command that wrote it; no figure in it is typed by hand.
 
 
-def write_page(page: Path, seeds: Sequence[int], jobs: int, rows: Sequence[Row] = ROWS) -> bool:
-    """Run all rows and write `page`, and its pictures into a folder beside it. True if every bound was kept."""
-    wanted = list(dict.fromkeys(case for row in rows for case in row.all_cases(seeds)))
+def write_page(
+    page: Path, seeds: Sequence[int], jobs: int, rows: Sequence[Row] = ROWS, tables: Sequence[Table] = (),
+    *, only: bool = False,
+) -> bool:
+    """Run `rows` and `tables` and write `page`, and its pictures into a folder beside it. True if every bound was kept.
+
+    With `only` the page keeps its other parts.
+    """
+    wanted = list(dict.fromkeys((
+        *(case for row in rows for case in row.all_cases(seeds)),
+        *(case for table in tables for line in table.lines() for case in table.cases(*line)),
+    )))
     wishes = speed_cases(seeds[0]) if any(row.scenario == "thymio" for row in rows) else []
     pictures = page.parent / page.stem
     pictures.mkdir(parents=True, exist_ok=True)
+    shown = {case: pictures / picture_name(case) for row in rows for case in row.cases(seeds[:1])}
+    results, speeds = _run_all(wanted, wishes, shown, jobs)
+    if speeds:
+        plot_speeds(pictures / SPEEDS, speeds)
+    text = "\n".join(page_lines(rows, results, seeds, pictures.name, speeds, tables=tables)) + "\n"
+    page.write_text(merged(page.read_text("utf-8"), text) if only else text, "utf-8")
+    return all(kept(row, results, seeds) for row in rows) and "**not kept**" not in text
+
+
+def _run_all(
+    wanted: Sequence[ScoreCase], wishes: Sequence[SpeedCase], shown: Mapping[ScoreCase, Path], jobs: int
+) -> tuple[Results, list[SpeedRun]]:
+    """Return the scores of `wanted` and the drives of `wishes`. Each run of `shown` leaves its picture."""
     with progress_bar(len(wanted) + len(wishes)) as advance, worker_pool(jobs) as pool:
-        runs = {pool.submit(_run, case, _picture(pictures, case, seeds)): case for case in wanted}
+        runs = {pool.submit(_run, case, shown.get(case)): case for case in wanted}
         drives = [pool.submit(speed_run, wish) for wish in wishes]
         everything: list[Future[Any]] = [*runs, *drives]
         for future in as_completed(everything):
             future.result()  # a run that failed ends the others here
             advance()
-    results = {case: run.result() for run, case in runs.items()}
-    speeds = [drive.result() for drive in drives]
-    if speeds:
-        plot_speeds(pictures / SPEEDS, speeds)
-    page.write_text("\n".join(page_lines(rows, results, seeds, pictures.name, speeds)) + "\n", "utf-8")
-    return all(kept(row, results, seeds) for row in rows)
-
-
-def _picture(folder: Path, case: ScoreCase, seeds: Sequence[int]) -> Path | None:
-    """Return the path of the image of this run; only the first seed's run in the scenario's own light has one."""
-    return folder / picture_name(case) if case.seed == seeds[0] and case.look is None else None
+    return {case: run.result() for run, case in runs.items()}, [drive.result() for drive in drives]
 
 
 def _run(case: ScoreCase, picture: Path | None) -> Score:
@@ -437,8 +536,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--seeds", default="201,202,203,204,205,206", help="separated by commas")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at once")
+    parser.add_argument("--only", default="", help="scenarios and titles of tables, separated by commas")
     given = parser.parse_args()
-    return 0 if write_page(PAGE, [int(seed) for seed in given.seeds.split(",")], given.jobs) else 5
+    names = given.only.split(",") if given.only else []
+    rows = [row for row in ROWS if not names or row.scenario in names]
+    tables = [table for table in TABLES if not names or table.title in names]
+    if set(names) - {row.scenario for row in rows} - {table.title for table in tables}:
+        parser.error(f"--only {given.only}: a name is not of this page")
+    seeds = [int(seed) for seed in given.seeds.split(",")]
+    return 0 if write_page(PAGE, seeds, given.jobs, rows, tables, only=bool(names)) else 5
 
 
 if __name__ == "__main__":

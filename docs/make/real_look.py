@@ -1,11 +1,13 @@
 """Write docs/reference/results/real-look.md: every scenario with the look `real`, and how fast it is drawn. Shell.
 
     python -m docs.make.real_look --seeds 301,302,303
+    python -m docs.make.real_look --only legs-crowd,three-balls      # these again; the others keep their last run
 """
 
 import argparse
 import os
 import platform
+import re
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -28,11 +30,13 @@ LATENCY_MS, LOSS = 50.0, 0.1
 LEARNED, COLOR = "onnx", "hsv"
 LEAST_PER_S: Final = 30.0
 """Images that must be drawn in a second, 320x240."""
-SHOWN: Final = ("circle", "walls", "traffic-light", "legs-crowd")
+TIMED: Final = ("circle", "walls", "traffic-light", "legs-crowd")
+SHOWN: Final = (*TIMED, "legs")
 _IMAGES: Final = 300  # drawn for each time; a quick machine needs 3 s
 _STEPS: Final = 8  # of the world between two of them, about 30 images per second of its time
 _SHOWN_SEED: Final = 301
-_SHOWN_AFTER_S: Final = 2.0
+_SHOWN_AFTER_S: Final = 1.0
+_TIMES: Final = "## Time to draw"
 
 
 # --- speed ------------------------------------------------------------------------------------------------------------
@@ -99,7 +103,7 @@ def wanted_cases(names: Sequence[str], seeds: Sequence[int]) -> list[ScoreCase]:
     """Return the runs with the look of each scenario and with `LOOK`, and those of the learned detector for balls."""
     own = [replace(case, detector=color_detector(case.scenario)) for look in (None, LOOK)
            for case in cases(names, seeds, [LATENCY_MS], [LOSS], None, look=look)]
-    balls = [name for name in names if load_scenario(name).target.shape == "ball"]
+    balls = [name for name in names if load_scenario(name).target.shape == "ball" and color_detector(name)]
     return own + (cases(balls, seeds, [LATENCY_MS], [LOSS], None, look=LOOK, detector=LEARNED) if balls else [])
 
 
@@ -121,9 +125,10 @@ def color_detector(name: str) -> str | None:
 
 
 def page_lines(
-    wanted: Sequence[ScoreCase], scored: Sequence[ScoredFigure], draws: Sequence[DrawTime], command: str
+    wanted: Sequence[ScoreCase], scored: Sequence[ScoredFigure], draws: Sequence[DrawTime], command: str,
+    older: str = "",
 ) -> Iterator[str]:
-    """Yield the page, block by block."""
+    """Yield the page, block by block. Rows of other scenarios, and times without `draws`, are those of page `older`."""
     seeds = list(dict.fromkeys(case.seed for case in wanted))
     yield "# The look real\n"
     yield (
@@ -134,12 +139,21 @@ def page_lines(
     yield (
         f"In lockstep on {len(seeds)} starts (seeds {', '.join(map(str, seeds))}), +{LATENCY_MS:g} ms latency, "
         f"{LOSS:.0%} loss on each leg. The worst start counts.\n"
-        f"Written by `{command}`. One scenario: `sightline score\n--scenario circle --look {LOOK}`.\n"
+        f"Written by `{command}`; `--only NAME` runs a scenario\nagain. One scenario: `sightline score "
+        f"--scenario circle --look {LOOK}`.\n"
     )
     yield f"![the camera's images in {', '.join(SHOWN)}](real-look/images.jpg)\n"
-    yield from _summary(wanted, scored)
-    yield from _table(wanted, scored)
-    yield from _draw_lines(draws)
+    again = {case.scenario for case in wanted}
+    rows = [row for row in rows_of(older) if row[0] not in again] + _rows(wanted, scored)
+    yield from _summary(rows)
+    yield from _table(sorted(rows, key=lambda row: row[0]))
+    yield from _draw_lines(draws) if draws else [_TIMES + older.partition(_TIMES)[2].rstrip("\n")]
+
+
+def rows_of(page: str) -> list[list[str]]:
+    """Return the cells of the rows of scenarios."""
+    lines = re.findall(r"^\| (\S+ \| (?:`|none:).*) \|$", page, re.MULTILINE)
+    return [[cell.strip() for cell in line.split("|")] for line in lines]
 
 
 def _groups(wanted: Sequence[ScoreCase]) -> list[ScoreCase]:
@@ -152,28 +166,30 @@ def _detector(case: ScoreCase) -> str:
     return f"`{case.detector}`" if case.detector else own_detector(case.scenario)
 
 
-def _summary(wanted: Sequence[ScoreCase], scored: Sequence[ScoredFigure]) -> Iterator[str]:
+def _summary(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     yield "| detector | scenarios | within all bounds |\n|---|---:|---:|"
-    groups = _groups(wanted)
-    for detector in dict.fromkeys(map(_detector, groups)):
-        own = [case for case in groups if _detector(case) == detector]
-        good = sum(_result(case, scored) == "ok" for case in own)
-        yield f"| {detector} | {len(own)} | {good} |"
+    for detector in sorted({row[1] for row in rows}):
+        results = [row[3] for row in rows if row[1] == detector]
+        yield f"| {detector} | {len(results)} | {results.count('ok')} |"
     yield ""
 
 
-def _table(wanted: Sequence[ScoreCase], scored: Sequence[ScoredFigure]) -> Iterator[str]:
+def _rows(wanted: Sequence[ScoreCase], scored: Sequence[ScoredFigure]) -> list[list[str]]:
+    return [
+        [case.scenario, _detector(case), "" if case.detector == LEARNED else _result(replace(case, look=None), scored),
+         _result(case, scored), "; ".join(_broken(one) for one in scored if one.group == case.group and not one.ok)]
+        for case in _groups(wanted)
+    ]
+
+
+def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     yield (
         "`own look` is the result of the same starts with the look of the scenario itself: what fails there, too, is "
         "not an effect of the\nlook. A `least_` figure must not fall below its bound, the others must not exceed it.\n"
     )
     yield (f"| scenario | detector | own look | {LOOK} | figures outside their bounds with {LOOK}: worst start, median "
            "(bound) |\n|---|---|---|---|---|")
-    for case in sorted(_groups(wanted), key=lambda one: one.scenario):
-        figures = [one for one in scored if one.group == case.group]
-        broken = "; ".join(_broken(one) for one in figures if not one.ok)
-        own = "" if case.detector == LEARNED else _result(replace(case, look=None), scored)
-        yield f"| {case.scenario} | {_detector(case)} | {own} | {_result(case, scored)} | {broken} |"
+    yield from (f"| {' | '.join(row)} |" for row in rows)
     yield ""
 
 
@@ -193,7 +209,7 @@ def _broken(one: ScoredFigure) -> str:
 def _draw_lines(draws: Sequence[DrawTime]) -> Iterator[str]:
     slowest = min((one for one in draws if one.look == LOOK), key=lambda one: one.per_s)
     result = "ok" if slowest.per_s >= LEAST_PER_S else "**too slow**"
-    yield "## Time to draw\n"
+    yield f"{_TIMES}\n"
     yield (
         f"Robot `raspberry`, 320x240, driving a curve, {_IMAGES} images each with their JPEG, one process on "
         f"{platform.machine()} with\n{os.cpu_count()} cores. "
@@ -204,9 +220,12 @@ def _draw_lines(draws: Sequence[DrawTime]) -> Iterator[str]:
         yield f"| {one.scenario} | {one.look} | {one.p50_ms:.1f} ms | {one.p99_ms:.1f} ms | {one.per_s:.0f} |"
 
 
-def write_page(page: Path, names: Sequence[str], seeds: Sequence[int], jobs: int) -> bool:
-    """Measure, run and write `page`. Returns True if the images are drawn fast enough; a score may be anything."""
-    draws = [draw_time(name, look) for name in SHOWN for look in (LOOK, "plain")]
+def write_page(page: Path, names: Sequence[str], seeds: Sequence[int], jobs: int, *, only: bool = False) -> bool:
+    """Measure, run and write `page`. Returns True if the images are drawn fast enough; a score may be anything.
+
+    With `only` the page keeps its other rows and its times.
+    """
+    draws = [] if only else [draw_time(name, look) for name in TIMED for look in (LOOK, "plain")]
     wanted = wanted_cases(names, seeds)
     folder = page.parent / page.stem
     folder.mkdir(parents=True, exist_ok=True)
@@ -214,7 +233,8 @@ def write_page(page: Path, names: Sequence[str], seeds: Sequence[int], jobs: int
     with progress_bar(len(wanted)) as advance:
         report = run_cases(wanted, jobs, lambda _case: advance())
     command = f"python -m docs.make.real_look --seeds {','.join(map(str, seeds))}"
-    page.write_text("\n".join(page_lines(wanted, report.judged, draws, command)) + "\n", "utf-8")
+    older = page.read_text("utf-8") if only else ""
+    page.write_text("\n".join(page_lines(wanted, report.judged, draws, command, older)) + "\n", "utf-8")
     return all(one.per_s >= LEAST_PER_S for one in draws)
 
 
@@ -223,9 +243,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--seeds", default="301,302,303", help="separated by commas")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at once")
+    parser.add_argument("--only", default="", help="scenarios, separated by commas")
     given = parser.parse_args()
-    seeds = [int(seed) for seed in given.seeds.split(",")]
-    return 0 if write_page(PAGE, scenario_names(), seeds, given.jobs) else 5
+    seeds, names = [int(seed) for seed in given.seeds.split(",")], given.only.split(",") if given.only else []
+    return 0 if write_page(PAGE, names or scenario_names(), seeds, given.jobs, only=bool(names)) else 5
 
 
 if __name__ == "__main__":

@@ -11,16 +11,20 @@ from docs.make.behaviors import (
     GOALS_M,
     LAWS,
     LOOKS,
+    NOT_MEASURED,
     ROWS,
+    TABLES,
     Row,
     SpeedCase,
     free_way,
     kept,
+    merged,
     page_lines,
     picture_name,
     speed_cases,
     speed_run,
     speeds_of,
+    table_lines,
     write_page,
 )
 from sightline.evaluation.plots import plot_run
@@ -86,6 +90,43 @@ def test_every_behavior_and_every_baseline_has_its_row():
     assert {row.baseline for row in ROWS if row.baseline} == set(CHARACTER)
     assert all(CHARACTER.values())
     assert LOOKS == ("dim", "bright", "warm", "desaturated", "quality30")
+
+
+def test_identity_is_measured_on_twenty_starts_in_both_looks_and_the_circle_in_four_lights():
+    plain, real, light = TABLES
+    assert len(set(plain.seeds)) == len(set(real.seeds)) == 20
+    crossed = {name for name in scenario_names() if "found_again_s" in load_scenario(name).bounds}
+    assert {*plain.lines(), *real.lines()} == {(name, look) for name in crossed for look in ("plain", "real")}
+    assert plain.figures == real.figures == ("wrong_percent", "lost_after_s", "found_again_s")
+    assert [look for _, look in light.lines()] == ["tungsten", "fluorescent", "dark", "pale"]
+    assert {case.detector for table in TABLES for line in table.lines() for case in table.cases(*line)} == {None}
+
+
+def test_line_of_a_table_is_of_the_worst_start_against_the_bound():
+    light = replace(TABLES[2], seeds=SEEDS)
+    results = {case: GOOD for look in ("dark", "pale") for case in light.cases("circle", look)}
+    results[light.cases("circle", "pale")[1]] = replace(GOOD, bearing_rms_deg=1.01)
+    text = "\n".join(table_lines(light, results))
+    assert "| circle | dark | 0.2 deg (bound 1 deg) | 0 % (bound 0 %) | ok |" in text
+    assert "| circle | pale | 1.01 deg (bound 1 deg) | 0 % (bound 0 %) | **not kept** |" in text
+    assert f"| circle | tungsten | {NOT_MEASURED} (bound 1 deg) | {NOT_MEASURED} (bound 0 %) | {NOT_MEASURED} |" in text
+
+
+def test_parts_that_run_again_replace_their_lines_and_no_others():
+    good, bad = (page_of([Row("ball"), Row("blocks")], one) for one in (GOOD, replace(GOOD, lost_percent=1.0)))
+    again = page_of([Row("blocks")], replace(GOOD, lost_percent=1.0))
+    text = merged(good, again)
+    assert text == good.replace(good.partition("| [blocks]")[2].partition("\n")[0],
+                                bad.partition("| [blocks]")[2].partition("\n")[0]).replace(
+        good.partition("## blocks")[2], bad.partition("## blocks")[2])
+    assert merged(good, good) == good
+    lines = page_of([], GOOD, tables=TABLES[2:])
+    assert merged(good, lines) == good + "\n## Light" + lines.partition("\n## Light")[2]
+
+
+def page_of(rows, result, tables=()):
+    results = dict.fromkeys((case for row in rows for case in row.all_cases(SEEDS)), result)
+    return "\n".join(page_lines(rows, results, SEEDS, "pictures", [], tables=tables))
 
 
 # --- speed and acceleration --------------------------------------------------------------------------------------

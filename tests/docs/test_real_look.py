@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from docs.make.real_look import PAGE, DrawTime, own_detector, page_lines, wanted_cases
+from docs.make.real_look import LEARNED, PAGE, DrawTime, own_detector, page_lines, rows_of, wanted_cases
 from sightline.evaluation.score.runs import ScoredFigure
-from sightline.sim.scenario import Look, look_named, scenario_names
+from sightline.sim.scenario import Look, load_scenario, look_named, scenario_names
 
 DRAWS = (
     DrawTime("circle", "real", 10.0, 15.0), DrawTime("walls", "real", 40.0, 50.0), DrawTime("walls", "plain", 3.0, 4.0),
@@ -31,7 +31,7 @@ def test_page_runs_every_scenario_with_its_own_detector_and_balls_with_the_learn
         assert own == set(scenario_names())
     learned = {case.scenario for case in wanted if case.detector == "onnx"}
     assert {"circle", "walls", "chaser"} <= learned
-    assert not learned & {"blocks", "legs", "traffic-light", "thymio"}
+    assert not learned & {"blocks", "legs", "traffic-light", "thymio", "three-boxes"}
     assert {case.seed for case in wanted} == {1, 2}
 
 
@@ -59,6 +59,26 @@ def test_page_names_its_command_its_seeds_and_the_slowest_scenario():
     text = page(["circle"], figures("circle", ok=True))
     assert f"`{COMMAND}`" in text and "(seeds 1, 2)" in text
     assert "draws 25 images per second (at least 30): **too slow**" in text
+
+
+def test_scenario_that_runs_again_replaces_its_rows_and_keeps_the_others():
+    before = page(["circle", "legs"], [*figures("circle", ok=False), *figures("legs", ok=True, detector="")])
+    again = wanted_cases(["circle"], [1, 2])
+    text = "\n".join(page_lines(again, figures("circle", ok=True), [], COMMAND, before))
+    after = page(["circle", "legs"], [*figures("circle", ok=True), *figures("legs", ok=True, detector="")])
+    assert text == after and text != before
+
+
+def test_page_has_every_row_with_the_bounds_of_its_scenario():
+    rows = rows_of(PAGE.read_text())
+    cases = [case for case in wanted_cases(scenario_names(), [1]) if case.look == "real"]
+    expected = {(case.scenario, f"`{LEARNED}`" if case.detector == LEARNED else own_detector(case.scenario))
+                for case in cases}
+    assert {(row[0], row[1]) for row in rows} == expected and len(rows) == len(expected)
+    for scenario, *_, outside in rows:
+        bounds = load_scenario(scenario).bounds
+        for name, bound in re.findall(r"(\w+) \S+, \S+ \((\S+) ?\S*\)", outside):
+            assert float(bound) == pytest.approx(bounds[name], rel=0.01), scenario
 
 
 @pytest.mark.parametrize(("name", "expected"), [

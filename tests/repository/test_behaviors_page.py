@@ -3,14 +3,16 @@
 import re
 from pathlib import Path
 
-from docs.make.behaviors import CHARACTER, LATENCY_MS, LOOKS, LOSS, ROWS
+from docs.make.behaviors import CHARACTER, LATENCY_MS, LOOKS, LOSS, NOT_MEASURED, ROWS, TABLES
+from sightline.evaluation.checks import number
+from sightline.sim.scenario import FIGURES, load_scenario
 
 DOCS = Path(__file__).parent.parent.parent / "docs" / "reference" / "results"
 PAGE = (DOCS / "behaviors.md").read_text()
 
 
 def test_the_page_has_every_row_and_its_picture():
-    assert re.findall(r"^## (.*)$", PAGE, re.MULTILINE) == [row.title for row in ROWS]
+    assert re.findall(r"^## (.*)$", PAGE, re.MULTILINE) == [one.title for one in (*ROWS, *TABLES)]
     shown = re.findall(r"!\[[^]]*\]\(([^)]+)\)", PAGE)
     assert len(shown) == len(ROWS) + 1 and all((DOCS / name).is_file() for name in shown)
     assert {path.name for path in (DOCS / "behaviors").iterdir()} == {Path(name).name for name in shown}
@@ -18,6 +20,35 @@ def test_the_page_has_every_row_and_its_picture():
 
 NOT_KEPT = {"traffic-light: quality30"}
 """From one start of six the lit lamp is not read for 1.6 s at the line. Whatever else is not kept is news."""
+
+UNMEASURED = {"legs-crowd", "three-balls", "three-boxes", "Identity", "Identity in the real look", "Light"}
+"""Parts with figures that are not measured yet: `python -m docs.make.behaviors --only NAME`."""
+
+
+def part_of(title):
+    return next(part for part in PAGE.split("\n## ") if part.startswith(f"{title}\n"))
+
+
+def bound_text(name, bound):
+    return f"{number(bound)} {FIGURES[name].unit}"
+
+
+def test_page_has_every_figure_with_its_bound():
+    for row in (row for row in ROWS if not row.baseline):
+        line = r"^\| (\w+) \| [^|]+ \| [^|]+ \| ([^|]+) \| (?:ok|\*\*not kept\*\*|not measured) \|$"
+        found = re.findall(line, part_of(row.title), re.MULTILINE)
+        bounds = load_scenario(row.scenario).bounds
+        assert found == [(name, bound_text(name, bound)) for name, bound in bounds.items()], row.title
+
+
+def test_tables_have_every_line_with_the_bounds():
+    for table in TABLES:
+        lines = re.findall(r"^\| (\S+) \| (\S+) \| (.*) \| [^|]+ \|$", part_of(table.title), re.MULTILINE)
+        lines = [line for line in lines if line[0] != "scenario"]
+        assert [line[:2] for line in lines] == [*table.lines()]
+        for scenario, _, cells in lines:
+            bounds = load_scenario(scenario).bounds
+            assert re.findall(r"\(bound ([^)]+)\)", cells) == [bound_text(name, bounds[name]) for name in table.figures]
 
 
 def test_the_page_is_of_six_starts_and_bounds_were_kept_but_for_those_that_are_known():
@@ -27,6 +58,7 @@ def test_the_page_is_of_six_starts_and_bounds_were_kept_but_for_those_that_are_k
         title, rows = part.partition("\n")[0], part.splitlines()
         missed |= {f"{title}: {row.split('|')[1].strip()}" for row in rows if "**not kept**" in row}
     assert missed == NOT_KEPT
+    assert {one.title for one in (*ROWS, *TABLES) if NOT_MEASURED in part_of(one.title)} == UNMEASURED
     assert all(PAGE.count(f"\n| {look} | ") == 2 for look in LOOKS)
 
 
