@@ -116,7 +116,8 @@ def note_accepted(host: str) -> None:
 
 @contextmanager
 def limit_floods(listen: Sequence[str], report: Callable[[str], None]) -> Iterator[None]:
-    """Limit and report floods of connections to `listen` until the end of the `with`."""
+    """Limit and report floods of TCP connections to `listen` until the end of the `with`."""
+    listen = [endpoint for endpoint in listen if not endpoint.startswith(("quic/", "udp/"))]
     ports = {_address(endpoint)[1] for endpoint in listen}
     read = partial(connection_ends, ports)
     if all(_is_ipv4(_address(endpoint)[0]) for endpoint in listen):

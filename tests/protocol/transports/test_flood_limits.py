@@ -3,6 +3,7 @@
 import socket
 import subprocess
 import sys
+import threading
 import time
 from contextlib import ExitStack, closing, suppress
 
@@ -178,6 +179,11 @@ def test_a_listener_of_another_process_at_the_port_of_another_address_does_not_c
             with socket.create_server(("127.0.0.1", port)) as server:
                 assert until(lambda: is_deferred(server), 5.0)
         other.kill()
+
+
+def test_ports_without_tcp_are_not_watched():
+    with limit_floods(["udp/127.0.0.1:1", "quic/127.0.0.1:2"], lambda _line: None):
+        assert "floods" not in {thread.name for thread in threading.enumerate()}
 
 
 def test_a_connection_is_accepted_with_its_first_byte():
