@@ -57,7 +57,7 @@ class DecoderPool:
     def again(self, frame: DetectFrame, place: int = 0) -> DetectFrame:
         """Return the frame with a decoder of this place. It is valid until the next one of its robot and `place`."""
         copy = self.frame(frame.robot, frame.header, frame.jpeg, (frame.width_px, frame.height_px), place)
-        copy.goes_by, copy.expected_px = frame.goes_by, frame.expected_px
+        copy.goes_by, copy.expected_px, copy.looks_once = frame.goes_by, frame.expected_px, frame.looks_once
         return copy
 
     def frame(

@@ -115,7 +115,8 @@ def _any_label(_label: str) -> bool:
 class DetectFrame:
     """One frame for a detector: the received JPEG, and its pixels, decoded once for all detectors."""
 
-    __slots__ = ("_decoder", "_picture", "expected_px", "goes_by", "header", "height_px", "jpeg", "robot", "width_px")
+    __slots__ = ("_decoder", "_picture", "expected_px", "goes_by", "header", "height_px", "jpeg", "looks_once", "robot",
+                 "width_px")
 
     def __init__(
         self, robot: str, header: FrameHeader, jpeg: bytes, decoder: Decoder, picture: DecodedImage | None = None
@@ -138,6 +139,8 @@ class DetectFrame:
         self.goes_by: LabelTest = _any_label  # the pipeline sets the test of the robot's mission
         self.expected_px: tuple[float, float] | None = None
         """Where the followed target is expected, (x, y) in px of the encoded image; the pipeline sets it."""
+        self.looks_once = False
+        """True in a detector service: a second run would cost the other robots their time."""
 
     def picture(self) -> DecodedImage:
         """Decode the image at the first call.

@@ -602,7 +602,9 @@ class _BatchDecoder:
 
     def frame(self, robot: str, header: FrameHeader, jpeg: bytes, size_px: tuple[int, int]) -> DetectFrame:
         """Return a frame of this batch, not decoded yet."""
-        return self._pools[self._now].frame(robot, header, jpeg, size_px)
+        frame = self._pools[self._now].frame(robot, header, jpeg, size_px)
+        frame.looks_once = True
+        return frame
 
     def decode(self, frames: Sequence[QueuedFrame[DetectFrame]]) -> list[QueuedFrame[DetectFrame]]:
         """Decode all. Returns those whose image does not decode."""

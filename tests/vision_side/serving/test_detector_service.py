@@ -262,6 +262,7 @@ def test_pixels_of_a_batch_stay_while_the_next_one_is_decoded():
         frames[-1].picture()
         assert before is None or (frames[-2].picture().bgr == before).all()
     assert frames[0].picture().bgr is frames[2].picture().bgr, "two batches have pixels, and no more"
+    assert all(one.looks_once for one in frames), "a second run would delay the other robots"
 
 
 def test_two_batches_are_in_progress_and_a_slow_detector_gets_the_newest_frames():

@@ -27,11 +27,16 @@ def shipped():
     return build_detector("onnx", {}, VisionConfig(detector=DetectorConfig(kind="onnx", device="cpu")))
 
 
-def found(detector, model, jpeg, expected_px=None, goes_by=None):
+@pytest.fixture(scope="module")
+def one_look():
+    return build_detector("onnx", {"second_look": False}, VisionConfig(detector=DetectorConfig(device="cpu")))
+
+
+def found(detector, model, jpeg, expected_px=None, goes_by=None, *, looks_once=False):
     """The detections in one image."""
     size = (model.width_px, model.height_px)
     frame = DetectFrame("r1", FrameHeader(session="0000abcd", seq=1, t_us=1), jpeg, Decoder(*size, size[0] * size[1]))
-    frame.expected_px = expected_px
+    frame.expected_px, frame.looks_once = expected_px, looks_once
     if goes_by is not None:
         frame.goes_by = goes_by
     (result,) = detector.detect([frame], NO_DEADLINE)
@@ -40,12 +45,12 @@ def found(detector, model, jpeg, expected_px=None, goes_by=None):
 
 @pytest.mark.parametrize(("width_px", "height_px"), [(320, 240), (640, 480)])
 @pytest.mark.parametrize("aside_m", [-0.4, 0.1])
-def test_more_far_balls_are_found_where_they_are_expected(shipped, width_px, height_px, aside_m):
+def test_more_far_balls_are_found_where_they_are_expected(shipped, one_look, width_px, height_px, aside_m):
     model = camera(width_px, height_px)
     once = twice = 0
     for far_m in np.linspace(3.6, 6.0, 7):
         jpeg = jpeg_of(scene(model, far_m, aside_m, shaded=True))
-        once += len(found(shipped, model, jpeg))
+        once += len(found(one_look, model, jpeg))
         middle = width_px / 2 - model.fx_px * aside_m / far_m
         for one in found(shipped, model, jpeg, (middle, height_px * 0.52)):
             twice += 1
@@ -55,15 +60,40 @@ def test_more_far_balls_are_found_where_they_are_expected(shipped, width_px, hei
     assert once + 2 <= twice <= 7
 
 
-def test_a_second_look_is_without_effect_elsewhere_for_other_labels_and_where_it_is_off(shipped):
+def test_a_second_look_is_without_effect_elsewhere_for_other_labels_and_where_it_is_off(shipped, one_look):
     model = camera(320, 240)
     jpeg = jpeg_of(scene(model, FAR_M, ASIDE_M, shaded=True))
     assert len(found(shipped, model, jpeg, EXPECTED_PX)) == 1
-    assert found(shipped, model, jpeg) == ()
     assert found(shipped, model, jpeg_of(scene(model, FAR_M, 1.5, shaded=True)), (310.0, 120.0)) == ()
     assert found(shipped, model, jpeg, EXPECTED_PX, goes_by=lambda label: label == "legs") == ()
-    once = build_detector("onnx", {"second_look": False}, VisionConfig())
-    assert found(once, model, jpeg, EXPECTED_PX) == ()
+    assert found(one_look, model, jpeg) == found(one_look, model, jpeg, EXPECTED_PX) == ()
+
+
+@pytest.mark.parametrize(("first", "second", "score"), [
+    (0.24, None, None), (0.25, 0.66, 0.66), (0.49, 0.64, None), (0.5, None, 0.5)])
+def test_without_a_track_a_target_in_doubt_counts_if_it_is_surer_in_a_second_look(first, second, score):
+    detector = build_detector("onnx", {}, VisionConfig(detector=DetectorConfig(device="cpu")))
+    looks, box = [one for one in (first, second) if one is not None], np.float32([[100.0, 80.0, 160.0, 140.0]])
+    detector._engine.run = lambda _pixels: {
+        "boxes": box, "scores": np.float32([looks.pop(0)]), "labels": np.float32([0])}
+    gray = jpeg_of(np.full((240, 320, 3), 110, np.uint8))
+    counting = [round(one.score, 2) for one in found(detector, camera(320, 240), gray)]
+    assert counting == ([] if score is None else [score])
+    assert looks == []
+
+
+def test_without_a_track_only_a_target_in_doubt_gets_a_second_look(monkeypatch):
+    detector = build_detector("onnx", {}, VisionConfig(detector=DetectorConfig(device="cpu")))
+    boxes = np.float32([[10.0, 10.0, 40.0, 40.0], [100.0, 80.0, 160.0, 140.0], [230.0, 80.0, 290.0, 140.0]])
+    labels, places = np.float32([4, 0, 0]), []
+    detector._engine.run = lambda _pixels: {"boxes": boxes, "scores": np.float32([0.45, 0.4, 0.3]), "labels": labels}
+    monkeypatch.setattr("sightline.vision_side.detect.onnx.detector.tile_about",
+                        lambda picture, place_px: places.append(place_px) or tile_about(picture, place_px))
+    gray = jpeg_of(np.full((240, 320, 3), 110, np.uint8))
+    assert found(detector, camera(320, 240), gray, goes_by="ball".__eq__) == ()
+    assert places == [(130.0, 110.0)], "about the surest ball"
+    assert found(detector, camera(320, 240), gray, goes_by="light-red".__eq__) == () and len(places) == 1
+    assert found(detector, camera(320, 240), gray, looks_once=True) == () and len(places) == 1
 
 
 @pytest.mark.parametrize(("options", "bonus"), [({}, 0.15), ({"address": "rooms"}, 0.1), ({"second_bonus": 0.3}, 0.3)])

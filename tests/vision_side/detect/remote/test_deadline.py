@@ -144,10 +144,10 @@ def test_detector_on_its_own_thread_receives_what_the_mission_expects(by_deadlin
     received = []
     monkeypatch.setattr(held, "detect", lambda frames, _deadline_us: received.extend(frames) or [None])
     asked = frame(1)
-    asked.goes_by, asked.expected_px = "legs".__eq__, (12.0, 34.0)
+    asked.goes_by, asked.expected_px, asked.looks_once = "legs".__eq__, (12.0, 34.0), True
     by_deadline.detect([asked], within(2))
     (one,) = received
-    assert (one.goes_by, one.expected_px) == (asked.goes_by, asked.expected_px)
+    assert (one.goes_by, one.expected_px, one.looks_once) == (asked.goes_by, asked.expected_px, True)
 
 
 def test_many_robots_need_a_bounded_number_of_decoders():
