@@ -35,6 +35,7 @@ from sightline.vision_side.detect.onnx.tensors import (
     read_outputs,
     split_batch,
     tile_about,
+    vivid,
 )
 from sightline.vision_side.detect.plugin_calls import DetectorWrapper, notices_of
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
@@ -298,7 +299,7 @@ def _found(
     engine: ModelEngine, pictures: Sequence[DecodedImage], form: ModelFormat, min_score: float
 ) -> list[tuple[Detection, ...]]:
     """Return the detections of each image; more than one only where form and engine take them."""
-    fitted = [fit_picture(picture, form) for picture in pictures]
+    fitted = [fit_picture(vivid(picture), form) for picture in pictures]
     if len(fitted) == 1:
         each = [engine.run(fitted[0][0])]
     else:

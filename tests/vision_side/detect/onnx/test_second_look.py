@@ -8,7 +8,7 @@ import pytest
 from sightline.protocol.messages import FrameHeader
 from sightline.vision_side.config import DetectorConfig, VisionConfig
 from sightline.vision_side.decode import DecodedImage, Decoder
-from sightline.vision_side.detect.onnx.tensors import ImageTile, tile_about
+from sightline.vision_side.detect.onnx.tensors import ImageTile, tile_about, vivid
 from sightline.vision_side.detect.port import NO_DEADLINE, Circle, DetectFrame, Detection
 from sightline.vision_side.detect.registry import build_detector
 from tests.fixtures.vision.onnx import brightness_model
@@ -162,3 +162,13 @@ def test_a_model_of_any_size_looks_once(tmp_path, monkeypatch, size, runs):
     monkeypatch.setattr(detector._engine, "run", lambda pixels: seen.append(1) or run(pixels))
     found(detector, camera(320, 240), jpeg_of(scene(camera(320, 240), 1.0, 0.0)), (160.0, 120.0), lambda _: False)
     assert len(seen) == runs and detector._second_bonus == 0.0
+
+
+@pytest.mark.parametrize(("saturation", "more"), [(1.0, 1.0), (0.3, 3.3), (0.0, 1.0)])
+def test_only_a_pale_image_gets_the_usual_saturation_and_its_brightness_stays(saturation, more):
+    gray, color = np.full((240, 320, 3), 120.0), np.array([-6.0, 2.0, 4.0])
+    given = DecodedImage((gray + saturation * color).round().astype(np.uint8), 2)
+    shown = vivid(given)
+    assert shown.scale == 2 and (shown is given) == (more == 1.0)
+    was, now = (one.bgr[0, 0].astype(float) - 120 for one in (given, shown))
+    assert abs(now - more * was).max() <= 1.0
