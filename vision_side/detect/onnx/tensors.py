@@ -394,6 +394,11 @@ class ImageTile:
         width, height = self.size_px
         return one.x1_px > 1 and one.y1_px > 1 and one.x2_px < width - 1 and one.y2_px < height - 1
 
+    def holds(self, one: Detection) -> bool:
+        """Return True if `one`, in px of the whole image, is clear of the border of this tile."""
+        return self.shows_all(replace(one, x1_px=one.x1_px - self.left_px, y1_px=one.y1_px - self.top_px,
+                                      x2_px=one.x2_px - self.left_px, y2_px=one.y2_px - self.top_px))
+
     def in_image(self, one: Detection) -> Detection:
         """Return a detection in this tile in px of the whole image."""
         circle = one.circle and _moved(one.circle, np.array([-self.left_px, -self.top_px]), 1.0)
@@ -402,7 +407,7 @@ class ImageTile:
 
 
 def vivid(picture: DecodedImage) -> DecodedImage:
-    """Return a pale image with the usual saturation, which the models were trained on; any other image as it is."""
+    """Return a pale image with the usual saturation, as the shipped models know it; any other image as it is."""
     part = picture.bgr[::8, ::8].astype(np.int16)
     chroma = float((part.max(axis=2) - part.min(axis=2)).mean()) / max(1.0, float(part.mean()))
     if not _COLORLESS < chroma < _PALE:

@@ -70,7 +70,8 @@ def test_a_second_look_is_without_effect_elsewhere_for_other_labels_and_where_it
 
 
 @pytest.mark.parametrize(("first", "second", "score"), [
-    (0.24, None, None), (0.25, 0.66, 0.66), (0.49, 0.64, None), (0.5, None, 0.5)])
+    (0.24, None, None), (0.25, 0.61, 0.61), (0.49, 0.59, None), (0.5, 0.61, 0.61), (0.59, 0.59, None),
+    (0.6, None, 0.6)])
 def test_without_a_track_a_target_in_doubt_counts_if_it_is_surer_in_a_second_look(first, second, score):
     detector = build_detector("onnx", {}, VisionConfig(detector=DetectorConfig(device="cpu")))
     looks, box = [one for one in (first, second) if one is not None], np.float32([[100.0, 80.0, 160.0, 140.0]])
@@ -80,6 +81,15 @@ def test_without_a_track_a_target_in_doubt_counts_if_it_is_surer_in_a_second_loo
     counting = [round(one.score, 2) for one in found(detector, camera(320, 240), gray)]
     assert counting == ([] if score is None else [score])
     assert looks == []
+
+
+def test_without_a_track_a_target_that_is_not_whole_in_a_tile_counts_as_it_is():
+    detector = build_detector("onnx", {}, VisionConfig(detector=DetectorConfig(device="cpu")))
+    gray, corners = jpeg_of(np.full((240, 320, 3), 110, np.uint8)), [(0, 80, 60, 140), (20, 80, 260, 140)]
+    for box in corners:
+        detector._engine.run = lambda _pixels, box=box: {
+            "boxes": np.float32([box]), "scores": np.float32([0.55]), "labels": np.float32([0])}
+        assert [round(one.score, 2) for one in found(detector, camera(320, 240), gray)] == [0.55]
 
 
 def test_without_a_track_only_a_target_in_doubt_gets_a_second_look(monkeypatch):
