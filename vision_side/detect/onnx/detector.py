@@ -93,7 +93,7 @@ class OnnxDetector:
         """Things with these labels are round: their edge is looked for in the image."""
         second_look: bool = True
         """True to enlarge the part of the image where the followed target is expected, if nothing is found there,
-        and without such a target the part about the surest thing in doubt."""
+        and without such a target the part about the surest thing in doubt (models that come with Sightline)."""
         second_bonus: Annotated[float | None, Field(ge=0, le=1)] = None
         """Added to the score of a target in that part: where one is expected, a weaker sign is enough. None: 0.15
         for the model that comes with Sightline, 0.1 for `rooms`, 0 for others."""
@@ -115,7 +115,7 @@ class OnnxDetector:
         self._bonus = config.color_bonus
         given = config.second_bonus
         self._second_bonus = _SECOND_BONUS.get(path, 0.0) if given is None else given
-        self._needs_saturation = path in _SECOND_BONUS  # other models may have been trained on pale images
+        self._is_shipped = path in _SECOND_BONUS  # what a pale image and a doubt need is not known of others
         # A model of any size gets the image unscaled, and a part of it would be no larger.
         self._second_look = config.second_look and model.form.size is not None
         self._engine = model.engine
@@ -173,7 +173,8 @@ class OnnxDetector:
 
     def _detections(self, shown: Sequence[tuple[DetectFrame, DecodedImage]]) -> list[Sequence[Detection]]:
         self._colored = self._color if all(self._is_color_usable(picture) for _, picture in shown) else None
-        doubtful = max(_NOISE, self._min_score * _DOUBTFUL) if self._second_look else self._min_score
+        doubts = self._second_look and self._is_shipped
+        doubtful = max(_NOISE, self._min_score * _DOUBTFUL) if doubts else self._min_score
         together = self._look([frame for frame, _ in shown], [picture for _, picture in shown],
                               min(self._min_score, doubtful))
         if self._second_look:
@@ -196,7 +197,7 @@ class OnnxDetector:
         """Run the model. A target may have a score below `least` by `bonus`, and by that of the configured color."""
         color_bonus = self._bonus if self._colored else 0.0
         least_score = min(least, max(_NOISE, least - color_bonus - bonus))
-        if self._needs_saturation:
+        if self._is_shipped:
             pictures = [vivid(picture) for picture in pictures]
         together = _found(self._engine, pictures, self._form, least_score)
         return [self._with_bonus(*one, least, bonus) for one in zip(frames, pictures, together, strict=True)]
@@ -229,7 +230,7 @@ class OnnxDetector:
                 return found
             return self._with_tile(frame, tile, found, self._min_score, self._second_bonus)
         surest = next((one for one in seen if frame.goes_by(one.label)), None)
-        if frame.looks_once or surest is None or surest.score >= self._min_score + _SURE:
+        if not self._is_shipped or frame.looks_once or surest is None or surest.score >= self._min_score + _SURE:
             return found
         tile = tile_about(picture, ((surest.x1_px + surest.x2_px) / 2, (surest.y1_px + surest.y2_px) / 2))
         if not tile.holds(surest):
