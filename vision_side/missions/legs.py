@@ -92,23 +92,21 @@ class Legs(Follow):
         right_rad, left_rad = _span(one, self._camera)
         if left_rad <= right_rad:
             return None
-        bearing_rad = (right_rad + left_rad) / 2
-        legs_m = self._legs_m(about_lens, right_rad, left_rad, view)
-        range_m = float(np.mean(legs_m[:2])) + self._legs.leg_radius_m if legs_m else self._remembered_m(view)
+        # If one leg hides the other, or the scan missed both, the middle may be a quarter of a stride off.
+        bearing_rad, range_m, exactness = (right_rad + left_rad) / 2, self._remembered_m(view), 0.5
+        bearings_rad = np.arctan2(about_lens[:, 1], about_lens[:, 0])
+        inside = (bearings_rad >= right_rad - _SPAN_MARGIN_RAD) & (bearings_rad <= left_rad + _SPAN_MARGIN_RAD)
+        if inside.any():
+            away_m = np.hypot(*about_lens[inside].T)
+            expected_m = None if self._track.target is None else range_m - self._legs.leg_radius_m
+            legs = nearest_legs(about_lens[inside], away_m, self._legs.stride_m, expected_m)
+            range_m = float(np.mean(away_m[legs[:2]])) + self._legs.leg_radius_m
+            # Then the box also contains the human in between.
+            if away_m[legs[0]] > away_m.min():
+                bearing_rad = float(np.mean(bearings_rad[inside][legs[:2]]))
+            exactness = 1.0 if len(legs) > 1 else exactness
         x_m = self._camera.x_m + range_m * math.cos(bearing_rad)
-        # One leg hides the other, or the scan missed both: the middle may be a quarter of a stride further or nearer.
-        exactness = 1.0 if len(legs_m) > 1 else 0.5
         return Sighting(x_m, self._camera.y_m + range_m * math.sin(bearing_rad), one, exactness)
-
-    def _legs_m(self, about_lens: Points, right_rad: float, left_rad: float, view: View) -> list[float]:
-        """Return the ranges from the lens to the legs in the span, m, nearest first; empty without an echo."""
-        bearings = np.arctan2(about_lens[:, 1], about_lens[:, 0])
-        inside = (bearings >= right_rad - _SPAN_MARGIN_RAD) & (bearings <= left_rad + _SPAN_MARGIN_RAD)
-        away = np.hypot(about_lens[inside, 0], about_lens[inside, 1])
-        if not len(away):
-            return []
-        expected_m = None if self._track.target is None else self._remembered_m(view) - self._legs.leg_radius_m
-        return nearest_legs(about_lens[inside], away, self._legs.stride_m, expected_m)
 
     def _remembered_m(self, view: View) -> float:
         """Return the last known distance of the legs, for a box without an echo, in m."""
@@ -121,8 +119,8 @@ class Legs(Follow):
 
 def nearest_legs(
     points: Points, away_m: NDArray[np.float64], stride_m: float, expected_m: float | None = None
-) -> list[float]:
-    """Return the range of each leg's nearest echo, nearest first, within a stride of the nearest leg.
+) -> list[int]:
+    """Return the index of each leg's nearest echo, nearest first, within a stride of the nearest leg.
 
     `points` come in the order of the scan; a gap between two of them parts one leg from the next. Legs within half a
     stride of `expected_m` come before all others: who walks in between is nearer, but is not the one to follow.
@@ -130,10 +128,11 @@ def nearest_legs(
     is_first = np.hypot(*(points - np.roll(points, 1, axis=0)).T) > _GAP_M
     # Modulo, because a leg straight ahead is at both ends of a scan that begins there.
     legs = np.cumsum(is_first) % max(1, np.count_nonzero(is_first))
-    all_m = sorted(float(away_m[legs == leg].min()) for leg in np.unique(legs))
-    expected = [one for one in all_m if expected_m is not None and abs(one - expected_m) <= stride_m / 2]
-    nearest = expected or all_m
-    return [one for one in nearest if one <= nearest[0] + stride_m]
+    by_range = np.argsort(away_m, kind="stable")
+    every = [int(by_range[legs[by_range] == leg][0]) for leg in dict.fromkeys(legs[by_range].tolist())]
+    expected = [one for one in every if expected_m is not None and abs(away_m[one] - expected_m) <= stride_m / 2]
+    nearest = expected or every
+    return [one for one in nearest if away_m[one] <= away_m[nearest[0]] + stride_m]
 
 
 def _span(one: Detection, camera: CameraModel) -> tuple[float, float]:
