@@ -19,6 +19,7 @@ from typing import Final
 
 from sightline.evaluation.checks import number
 from sightline.evaluation.scenario_config import robot_of, vision_config
+from sightline.evaluation.score.figures import granted, is_within
 from sightline.evaluation.score.runs import ScoreCase, ScoredFigure, cases, run_cases
 from sightline.operator_side.terminal import progress_bar
 from sightline.sim.scenario import Scenario, load_scenario, look_named, scenario_names
@@ -28,6 +29,8 @@ PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "real-look.m
 LOOK: Final = "real"
 LATENCY_MS, LOSS = 50.0, 0.1
 LEARNED, COLOR = "onnx", "hsv"
+WIDER: Final = 1.5
+"""Times the bounds of the plain world: what is granted in this look."""
 LEAST_PER_S: Final = 30.0
 """Images that must be drawn in a second, 320x240."""
 TIMED: Final = ("circle", "walls", "traffic-light", "legs-crowd")
@@ -37,6 +40,7 @@ _STEPS: Final = 8  # of the world between two of them, about 30 images per secon
 _SHOWN_SEED: Final = 301
 _SHOWN_AFTER_S: Final = 1.0
 _TIMES: Final = "## Time to draw"
+_WITHIN: Final = f"within x {WIDER:g}"
 
 
 # --- speed ------------------------------------------------------------------------------------------------------------
@@ -167,10 +171,11 @@ def _detector(case: ScoreCase) -> str:
 
 
 def _summary(rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    yield "| detector | scenarios | within all bounds |\n|---|---:|---:|"
+    yield f"| detector | scenarios | within all bounds | within {WIDER:g} times the bounds |\n|---|---:|---:|---:|"
     for detector in sorted({row[1] for row in rows}):
         results = [row[3] for row in rows if row[1] == detector]
-        yield f"| {detector} | {len(results)} | {results.count('ok')} |"
+        kept = results.count("ok")
+        yield f"| {detector} | {len(results)} | {kept} | {kept + results.count(_WITHIN)} |"
     yield ""
 
 
@@ -186,6 +191,7 @@ def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     yield (
         "`own look` is the result of the same starts with the look of the scenario itself: what fails there, too, is "
         "not an effect of the\nlook. A `least_` figure must not fall below its bound, the others must not exceed it.\n"
+        "In `behind`, a ball of another color is in view first. Without a color set, each ball is a target.\n"
     )
     yield (f"| scenario | detector | own look | {LOOK} | figures outside their bounds with {LOOK}: worst start, median "
            "(bound) |\n|---|---|---|---|---|")
@@ -198,7 +204,10 @@ def _result(case: ScoreCase, scored: Sequence[ScoredFigure]) -> str:
     figures = [one for one in scored if one.group == case.group]
     if not figures:
         return "not evaluated"
-    return "ok" if all(one.ok for one in figures) else "**fails**"
+    if all(one.ok for one in figures):
+        return "ok"
+    is_near = all(is_within(one.name, one.worst, granted(one.name, one.bound, WIDER)) for one in figures)
+    return _WITHIN if is_near else "**fails**"
 
 
 def _broken(one: ScoredFigure) -> str:

@@ -371,10 +371,11 @@ def bounds_of(scenario: Scenario, latency_ms: float = 0.0) -> Mapping[str, float
 def checks_of(scenario: Scenario, result: Score, latency_ms: float = 0.0, factor: float = 1.0) -> list[Check]:
     """Hold `result` against the bounds of `scenario`, each times `factor` but for those that leave no room."""
     bounds = bounds_of(scenario, latency_ms)
-    return [_check(name, result, _granted(name, bound, factor)) for name, bound in bounds.items()]
+    return [_check(name, result, granted(name, bound, factor)) for name, bound in bounds.items()]
 
 
-def _granted(name: str, bound: float, factor: float) -> float:
+def granted(name: str, bound: float, factor: float) -> float:
+    """Return `bound` with that much room; a figure that leaves no room gets none."""
     if FIGURES[name].is_exact:
         return bound
     return bound / factor if name.startswith(AT_LEAST) else bound * factor
@@ -382,11 +383,12 @@ def _granted(name: str, bound: float, factor: float) -> float:
 
 def _check(name: str, result: Score, bound: float) -> Check:
     value = result.figure(name)
-    return Check(name, value, FIGURES[name].unit, bound, value is not None and _is_within(name, value, bound))
+    return Check(name, value, FIGURES[name].unit, bound, is_within(name, value, bound))
 
 
-def _is_within(name: str, value: float, bound: float) -> bool:
-    return value >= bound if name.startswith(AT_LEAST) else value <= bound
+def is_within(name: str, value: float | None, bound: float) -> bool:
+    """Return True if a figure keeps its bound. One without a value does not."""
+    return value is not None and (value >= bound if name.startswith(AT_LEAST) else value <= bound)
 
 
 def broken(scenario: Scenario, so_far: Score, seconds: float) -> list[str]:
@@ -405,4 +407,4 @@ def _is_beyond_repair(name: str, bound: float, so_far: Score, seconds: float) ->
         share = min(1.0, (so_far.seconds - begin_s) / max(seconds - begin_s, 1e-9))
         # The best rest of the run has no error at all.
         value *= share if course == "share" else math.sqrt(share)
-    return not _is_within(name, value, bound)
+    return not is_within(name, value, bound)

@@ -41,7 +41,23 @@ def test_failed_figure_is_printed_with_worst_median_and_bound():
     own, learned = rows["| circle", "`hsv`"], rows["| circle", "`onnx`"]
     assert "| not evaluated | **fails** | bearing_rms_deg 5.25, 0.5 (1 deg); acquired_s never, 0.5 (30 s) |" in own
     assert "|  | ok |  |" in learned
-    assert "| `hsv` | 1 | 0 |" in text and "| `onnx` | 1 | 1 |" in text
+    assert "| `hsv` | 1 | 0 | 0 |" in text and "| `onnx` | 1 | 1 | 1 |" in text
+
+
+@pytest.mark.parametrize(("worst", "result"), [
+    (1.0, "ok"), (1.4, "within x 1.5"), (1.6, "**fails**"), (None, "**fails**"),
+])
+def test_half_as_much_again_is_granted_in_this_look(worst, result):
+    ok = result == "ok"
+    scored = [ScoredFigure("circle real hsv +50 ms 10% loss", "bearing_rms_deg", 0.5, worst, "deg", 1.0, ok)]
+    text = page(["circle"], scored)
+    assert f"| circle | `hsv` | not evaluated | {result} |" in text
+    assert f"| `hsv` | 1 | {int(ok)} | {int('fails' not in result)} |" in text
+
+
+def test_a_figure_that_leaves_no_room_gets_none():
+    scored = [ScoredFigure("circle real hsv +50 ms 10% loss", "wall_contacts", 0.0, 1, "", 0.0, False)]
+    assert "| not evaluated | **fails** |" in page(["circle"], scored)
 
 
 def test_what_fails_without_the_look_too_is_visible():
