@@ -364,7 +364,7 @@ def teleop(
         pad = Gamepad(gamepad) if gamepad else None
         if pad is not None:
             ending.callback(pad.close)
-        secret_file = stop_secret_of(target, partial(typer.echo, err=True))
         link = ending.enter_context(_link(target, ROLE))
+        secret_file = stop_secret_of(target, partial(typer.echo, err=True))
         steered = Teleop(session, Speeds(linear, angular), layout)
         Cockpit(link, steered, lambda: StopSender(target.robot, target.connect, secret_file), pad).run()

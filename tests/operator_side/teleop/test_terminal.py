@@ -276,6 +276,7 @@ def test_teleop_without_a_terminal_is_one_line(capsys, monkeypatch, closed):
     (("teleop", "r1", "--connect", "tcp/127.0.0.1:1"), 4, "no answer from tcp/127.0.0.1:1"),
     (("teleop", "a/b"), 2, "'a/b'"), (("teleop", "--linear", "9"), 2, "--linear"),
     (("teleop", "--gamepad", "/dev/null"), (2, 3), "gamepad"),
+    (("teleop", "r1", "--connect", "tls/127.0.0.1:1", "--secure", "~no-user/x"), 2, "no home folder for '~no-user'"),
 ])  # fmt: skip
 def test_mistake_in_a_terminal_is_one_line(arguments, code, expected):
     terminal = Terminal(*arguments)
