@@ -191,7 +191,6 @@ def _table(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     yield (
         "`own look` is the result of the same starts with the look of the scenario itself: what fails there, too, is "
         "not an effect of the\nlook. A `least_` figure must not fall below its bound, the others must not exceed it.\n"
-        "In `behind`, a ball of another color is in view first. Without a color set, each ball is a target.\n"
     )
     yield (f"| scenario | detector | own look | {LOOK} | figures outside their bounds with {LOOK}: worst start, median "
            "(bound) |\n|---|---|---|---|---|")
