@@ -323,9 +323,8 @@ def _flood_case(name: str, *, routed: bool = False, after_s: float | None = None
 
 
 STOP_CASES: Final = (
-    *(_flood_case(name, routed=routed) for routed in (False, True) for name in _FLOODS
-      if not (routed and name == "web500")),
-    *(_flood_case(name, after_s=after_s) for name in _FLOODS for after_s in AFTER_S),
+    *(_flood_case(name, routed=routed, after_s=after_s) for after_s in (None, *AFTER_S) for routed in (False, True)
+      for name in _FLOODS if not (routed and name == "web500")),
     FaultCase("guest.one_image", "guests: one command on one image for 4 s, ahead and turning; then STOP", _guests,
               Setup("guest", guests=True), blind=True, also=f"zero <= {_GUEST.guest_unchanged_ms / 1000:g} s and "
               f"{_GUEST.guest_unchanged_m:g} m, plus braking; {_DEMANDED}"),
