@@ -199,7 +199,8 @@ class Driver:
         self._is_waiting_logged = False
         self._ending_since_us: int | None = None
         self._guardian = guardian
-        self._ticked_us = 0
+        self._commanded_us = 0
+        """Time of the last tick for a command."""
         self._speeds_are_set = False
         self._scan_layout: tuple[float, ...] = ()
         self._command_acks: list[ipc.CommandAck] = []
@@ -221,13 +222,13 @@ class Driver:
         self._ending_since_us = self._ending_since_us or monotonic_us()
 
     def loop(self) -> int:
-        """Tick at absolute 20 ms deadlines, and for a command once MIN_TICK_US have passed since the last tick."""
+        """Tick at absolute 20 ms deadlines, and when a command arrives, for commands each MIN_TICK_US at most."""
         self._log_missing()
         # Deadlines have the clock of heartbeats: a robot that slept is not late.
         deadline_us = heartbeat_us()
         is_pending = False
         while not self._ended():
-            self._wait(min(deadline_us, self._ticked_us + MIN_TICK_US) if is_pending else deadline_us)
+            self._wait(min(deadline_us, self._commanded_us + MIN_TICK_US) if is_pending else deadline_us)
             arrived = self._drain()
             is_pending |= arrived
             now_us = heartbeat_us()
@@ -236,7 +237,8 @@ class Driver:
                 deadline_us = max(deadline_us + TICK_US, now_us)
                 self._tick(monotonic_us(), punctual=True)
                 is_pending = False
-            elif is_pending and now_us - self._ticked_us >= MIN_TICK_US:
+            elif is_pending and now_us - self._commanded_us >= MIN_TICK_US:
+                self._commanded_us = now_us
                 self._tick(monotonic_us(), punctual=False)
                 is_pending = False
             elif arrived:
@@ -283,7 +285,6 @@ class Driver:
             self._ending_since_us = self._ending_since_us or monotonic_us()
 
     def _tick(self, now_us: int, *, punctual: bool) -> None:
-        self._ticked_us = heartbeat_us()
         self._move()
         self._answer()
         if punctual:

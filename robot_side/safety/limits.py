@@ -12,7 +12,8 @@ from sightline.robot_side.safety.battery import BatteryLimits
 
 # The driver's period: 50 Hz.
 TICK_US = 20_000
-# Shortest period. The driver also ticks when a command arrives; a flood of commands must not flood the motors.
+# Shortest time between two ticks for commands. The driver also ticks when a command arrives; a flood of commands must
+# not flood the motors.
 MIN_TICK_US = 2_000
 STOP_TIME_BOUND_US = 700_000
 STOP_DISTANCE_BOUND_M = 0.25

@@ -12,7 +12,7 @@ from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver import process
 from sightline.robot_side.driver.process import Driver
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
-from sightline.robot_side.safety.limits import MIN_TICK_US
+from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
 
 
 class VirtualLoop:
@@ -138,3 +138,8 @@ def test_no_command_waits_for_a_tick_that_it_does_not_need(run, seed):
     waits_us = [next(tick for tick in ticks_us[bisect_left(ticks_us, at - started_us):]) - (at - started_us)
                 for at in arrived_us]
     assert len(waits_us) == 1_701 and max(waits_us) <= MIN_TICK_US
+    alone = [wait_us for wait_us, (before, at) in zip(waits_us[1:], pairwise(arrived_us), strict=True)
+             if at - before >= 2 * MIN_TICK_US]
+    assert len(alone) > 700 and max(alone) == 0, "a tick in time holds up no command"
+    for_commands_us = [tick_us for tick_us in ticks_us if tick_us % TICK_US]
+    assert min(after - before for before, after in pairwise(for_commands_us)) >= MIN_TICK_US
