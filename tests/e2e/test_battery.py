@@ -96,6 +96,7 @@ def test_battery_that_raises_returns_nan_or_hangs_slows_the_robot_and_delays_not
             silent = (State.DEGRADED, "the battery is silent; half speed", None)
             assert until(lambda: (got := vision.status()) and (got.state, got.reason, got.battery_v) == silent, 15)
             assert until(lambda: robot.speed() == pytest.approx(HALF_RAD_S, rel=0.01))
+            assert until(lambda: robot.output().count("Traceback") == 2, 15), "the second read comes a second later"
         began_s = time.monotonic()
         robot.process.terminate()
         assert robot.process.wait(5) == 0 and time.monotonic() - began_s < 4
