@@ -206,7 +206,7 @@ def _result(case: ScoreCase, scored: Sequence[ScoredFigure]) -> str:
     if all(one.ok for one in figures):
         return "ok"
     is_near = all(is_within(one.name, one.worst, granted(one.name, one.bound, WIDER)) for one in figures)
-    return _WITHIN if is_near else "**fails**"
+    return _WITHIN if is_near and case.look == LOOK else "**fails**"
 
 
 def _broken(one: ScoredFigure) -> str:

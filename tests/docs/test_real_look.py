@@ -55,6 +55,11 @@ def test_half_as_much_again_is_granted_in_this_look(worst, result):
     assert f"| `hsv` | 1 | {int(ok)} | {int('fails' not in result)} |" in text
 
 
+def test_own_look_gets_no_more_than_its_bounds():
+    scored = [ScoredFigure("circle hsv +50 ms 10% loss", "bearing_rms_deg", 0.5, 1.4, "deg", 1.0, False)]
+    assert "| circle | `hsv` | **fails** | not evaluated |" in page(["circle"], scored)
+
+
 def test_a_figure_that_leaves_no_room_gets_none():
     scored = [ScoredFigure("circle real hsv +50 ms 10% loss", "wall_contacts", 0.0, 1, "", 0.0, False)]
     assert "| not evaluated | **fails** |" in page(["circle"], scored)
