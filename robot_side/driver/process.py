@@ -222,7 +222,7 @@ class Driver:
         self._ending_since_us = self._ending_since_us or monotonic_us()
 
     def loop(self) -> int:
-        """Tick at absolute 20 ms deadlines, and when a command arrives, for commands each MIN_TICK_US at most."""
+        """Tick at absolute 20 ms deadlines, and when a command arrives, at most once in MIN_TICK_US for commands."""
         self._log_missing()
         # Deadlines have the clock of heartbeats: a robot that slept is not late.
         deadline_us = heartbeat_us()

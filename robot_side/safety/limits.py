@@ -204,8 +204,8 @@ class StopBound:
 def stop_bound(config: SafetyConfig) -> StopBound:
     """Compute the stop that `config` implies with its own ramp, for the worst case, a command on a frame of age zero.
 
-    The driver steps the ramp once a tick, and down to every MIN_TICK_US while commands arrive. The worse of both
-    counts: the ramp is slower in short steps.
+    The driver steps the ramp each TICK_US, and between these down to each MIN_TICK_US while commands arrive. The worse
+    of both counts: the ramp is slower in short steps.
     """
     long, short = _stop(config, TICK_US), _stop(config, MIN_TICK_US)
     return StopBound(

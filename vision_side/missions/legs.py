@@ -123,13 +123,13 @@ def nearest_legs(
     """Return the index of each leg's nearest echo, nearest first, within a stride of the nearest leg.
 
     `points` come in the order of the scan; a gap between two of them parts one leg from the next. Legs within half a
-    stride of `expected_m` come before all others: who walks in between is nearer, but is not the one to follow.
+    stride of `expected_m` come before all others: a human in between is nearer, but is not the one to follow.
     """
     is_first = np.hypot(*(points - np.roll(points, 1, axis=0)).T) > _GAP_M
     # Modulo, because a leg straight ahead is at both ends of a scan that begins there.
     legs = np.cumsum(is_first) % max(1, np.count_nonzero(is_first))
     by_range = np.argsort(away_m, kind="stable")
-    every = [int(by_range[legs[by_range] == leg][0]) for leg in dict.fromkeys(legs[by_range].tolist())]
+    every = by_range[np.sort(np.unique(legs[by_range], return_index=True)[1])].tolist()
     expected = [one for one in every if expected_m is not None and abs(away_m[one] - expected_m) <= stride_m / 2]
     nearest = expected or every
     return [one for one in nearest if away_m[one] <= away_m[nearest[0]] + stride_m]

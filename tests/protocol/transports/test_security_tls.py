@@ -32,7 +32,7 @@ def folder_of(path, authority=AUTHORITY, host="127.0.0.1"):
     return str(path)
 
 
-def stranger_of(endpoint, folder):
+def client_of(endpoint, folder):
     """A client of another library that reads only on request.
 
     `websockets.sync` reads in a thread of its own, also while another writes. OpenSSL forbids that for one connection,
@@ -84,7 +84,7 @@ def test_tls_client_that_never_reads_stays_and_delays_no_peer(secured, monkeypat
     for module in (server, peer):  # a busy machine makes a slow client
         monkeypatch.setattr(module, "OPEN_S", 10.0)
     robot, endpoint, folder = secured
-    stalled = stranger_of(endpoint, folder)
+    stalled = client_of(endpoint, folder)
     with open_websocket("r1", connect=endpoint, role="vision", secure=folder) as vision:
         frames = vision.latest(FRAME)
         stalled.send('{"robot":"r1","session":"0000beef","wants":["frame"]}')
@@ -146,7 +146,7 @@ def test_slow_handshake_ends_at_its_deadline(secured):
 
 def test_other_library_connects_over_tls_with_its_token(secured):
     _, endpoint, folder = secured
-    stranger = stranger_of(endpoint, folder)
+    stranger = client_of(endpoint, folder)
     stranger.send('{"robot":"r1","session":"0000beef"}')
     assert '"robot":"r1"' in stranger.recv()
     stranger.close()
