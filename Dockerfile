@@ -5,7 +5,7 @@
 FROM python:3.11-slim-bookworm AS service
 RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin sightline \
  && install -d -m 0700 -o sightline -g sightline /run/sightline /var/lib/sightline \
-                      /keys /keys/site /keys/robot /keys/vision /keys/operator
+                      /keys /keys/site /keys/router /keys/robot /keys/vision /keys/operator
 ENV PATH=/opt/sightline/bin:$PATH PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \
     SIGHTLINE_ROBOT__STATE_DIR=/var/lib/sightline
 USER sightline

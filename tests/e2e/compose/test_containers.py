@@ -93,11 +93,12 @@ def test_robot_image_has_no_heavy_package(running):
 
 def test_each_role_has_only_its_own_keys(running):
     only(running, "secure")
-    held = {"secure-robot": "robot", "secure-router": "robot", "secure-vision": "vision", "secure-status": "operator"}
+    held = {"secure-router": "router", "secure-robot": "robot", "secure-vision": "vision", "secure-status": "operator"}
     for service, role in held.items():
         files = running.inside(service, "sh", "-c", "cd /keys; find . -type f").split()
         names = {"ca.pem", *(f"{one}.{kind}" for one in (role, "viewer") for kind in ("key", "pem", "token"))}
-        names |= {"stop.secret"} if role in ("robot", "operator") else set()
+        names -= {"router.token"}  # a router serves no WebSocket
+        names |= set() if role == "vision" else {"stop.secret"}
         assert {file.rpartition("/")[2] for file in files} == names
 
 

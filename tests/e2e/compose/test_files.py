@@ -16,9 +16,11 @@ from typer.main import get_command
 
 from sightline.operator_side.cli.commands import app
 from sightline.operator_side.config.loading import load_service
+from sightline.operator_side.setup.keys import make
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import encode
 from sightline.protocol.messages import Status
+from sightline.protocol.transports.security import load_role_keys
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.robot_side.driver.process import _SHUTDOWN_US
 from sightline.robot_side.pipe import _END_S
@@ -230,6 +232,28 @@ def test_every_link_of_the_secure_profile_is_secured():
         assert name in ("sim", "keys") or ("--secure" in text and "tls/" in text), name
         own = {volume.split(":")[0] for volume in SERVICES[name].get("volumes", ()) if volume.startswith("keys-")}
         assert name == "keys" or "keys-site" not in own, f"{name} holds the authority's key"
+
+
+@pytest.mark.parametrize("missing", ["*", "router.*", "stop.secret"], ids=["all", "router", "secret"])
+def test_each_secured_service_finds_its_keys(missing, tmp_path):
+    site = tmp_path / "site"
+    (script,) = SERVICES["keys"]["command"]
+    script = script.replace("$$", "$").replace("/keys/", f"{tmp_path}/").replace(
+        "sightline keys", f"{sys.executable} -P -m sightline.operator_side.cli.app keys")
+    for volume, where in mounts("keys").items():
+        assert where == "/keys/" + volume.removeprefix("keys-")
+        (tmp_path / volume.removeprefix("keys-")).mkdir()
+    make(site, ["secure-router"])
+    for file in site.glob(missing):
+        file.unlink()
+    assert ask("sh", "-euc", script).returncode == 0
+    for name in next(one for one in PROFILES if one.name == "secure").services:
+        found = re.search(r"--secure[ =](/keys/\w+)", " ".join(SERVICES[name]["command"]))
+        if name not in ("keys", "sim"):
+            role = {"status": "operator"}.get(name.removeprefix("secure-"), name.removeprefix("secure-"))
+            assert found[1] in mounts(name).values()
+            assert load_role_keys(found[1].replace("/keys", str(tmp_path)), role).role == role
+            assert (tmp_path / role / "stop.secret").exists() == (role != "vision")
 
 
 # --- what must hold for each ------------------------------------------------------------------------------------------
