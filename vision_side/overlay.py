@@ -85,7 +85,7 @@ def raw_px(target: Detection) -> Point:
     """Return the center of the circle, else of the box."""
     if target.circle is not None:
         return target.circle.cx_px, target.circle.cy_px
-    return (target.x1_px + target.x2_px) / 2, (target.y1_px + target.y2_px) / 2
+    return target.center_px
 
 
 def radius_px(target: Detection) -> float:

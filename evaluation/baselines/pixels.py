@@ -34,7 +34,7 @@ def _blob(one: Detection) -> Blob:
         radius = one.circle.radius_px
         return Blob(one, one.circle.cx_px, radius, math.pi * radius * radius)
     width, height = one.x2_px - one.x1_px, one.y2_px - one.y1_px
-    return Blob(one, (one.x1_px + one.x2_px) / 2, max(width, height) / 2, width * height)
+    return Blob(one, one.center_px[0], max(width, height) / 2, width * height)
 
 
 # Band steering, a baseline: one of three fixed twists, by where the target is and how large it looks. Pure.

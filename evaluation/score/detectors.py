@@ -72,12 +72,12 @@ def _off_px(one: Detection, ball: LabelledBox) -> float | None:
     x, y = (ball.whole[0] + ball.whole[2]) / 2, (ball.whole[1] + ball.whole[3]) / 2
     if one.circle is not None:
         return math.hypot(one.circle.cx_px - x, one.circle.cy_px - y)
-    return math.hypot((one.x1_px + one.x2_px) / 2 - x, (one.y1_px + one.y2_px) / 2 - y)
+    return math.dist(one.center_px, (x, y))
 
 
 def _is_on_another(one: Detection, scene: Scene) -> bool:
     """Return True if its center is in the box of another object."""
-    x, y = (one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2
+    x, y = one.center_px
     others = [*scene.others, *(truth.box for truth in scene.truths if truth.label != "ball")]
     return any(box[0] <= x <= box[2] and box[1] <= y <= box[3] for box in others)
 

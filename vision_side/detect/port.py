@@ -103,6 +103,11 @@ class Detection:
     outline_px: NDArray[np.float64] | None = field(default=None, compare=False, repr=False)
     track_id: int | None = None
 
+    @property
+    def center_px(self) -> tuple[float, float]:
+        """Return the center of the box, (x, y)."""
+        return (self.x1_px + self.x2_px) / 2, (self.y1_px + self.y2_px) / 2
+
 
 LabelTest = Callable[[str], bool]
 """Returns True if a mission may use detections with this label."""

@@ -82,7 +82,8 @@ def _surest(result: DetectionResult, goes_by: LabelTest) -> Detection | None:
 def _where(one: Detection | None) -> str:
     if one is None:
         return "nothing"
-    return f"{one.label} at ({(one.x1_px + one.x2_px) / 2:.0f}, {(one.y1_px + one.y2_px) / 2:.0f})"
+    x, y = one.center_px
+    return f"{one.label} at ({x:.0f}, {y:.0f})"
 
 
 # A second detector beside the driving one: it looks at the same frames and never steers. Shell. It has a thread and a

@@ -164,7 +164,7 @@ class BoxLightReader:
     def read(self, picture: DecodedImage, not_these: Iterable[Detection] = ()) -> list[DetectedLight]:
         """Return every box of one of the three colors, largest first, without `not_these`."""
         codes = cv2.cvtColor(balanced(picture.bgr), cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
-        others = [_middle(one) for one in not_these]
+        others = [one.center_px for one in not_these]
         lights = [light for colour, table in self._tables.items()
                   for light in self._boxes(codes, colour, table, picture)]
         own = [one for one in lights if not any(_holds(one.box, spot) for spot in others)]
@@ -229,10 +229,6 @@ def _is(bgr: NDArray[np.float64], one: HsvRange) -> bool:
 def _detection(box: Box, scale: int, label: str) -> Detection:
     left, top, right, bottom = (side * scale for side in box)
     return Detection(left, top, right, bottom, 1.0, label)
-
-
-def _middle(one: Detection) -> tuple[float, float]:
-    return (one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2
 
 
 def _holds(box: Detection, spot: tuple[float, float]) -> bool:

@@ -290,6 +290,6 @@ class TrafficLightBoxes(TrafficLight):
 
 def _inside(one: Detection, box: Detection) -> bool:
     """Return True if the center of a detection is in the box of a light."""
-    x, y = (one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2
+    x, y = one.center_px
     return (box.x1_px - _OUTER_PX <= x <= box.x2_px + _OUTER_PX
             and box.y1_px - _OUTER_PX <= y <= box.y2_px + _OUTER_PX)

@@ -111,7 +111,7 @@ def reported_target(seen: Observation, camera: CameraModel | None) -> ReportedTa
     if one is None or camera is None:
         return None
     circle = one.circle
-    center_px = (circle.cx_px, circle.cy_px) if circle else ((one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2)
+    center_px = (circle.cx_px, circle.cy_px) if circle else one.center_px
     try:
         return ReportedTarget(
             label=one.label, score=one.score, track=seen.track, bearing_rad=seen.bearing_rad,

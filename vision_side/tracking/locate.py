@@ -195,7 +195,7 @@ def _tangent_center(
 
 def _box_outline(detection: Detection, camera: CameraModel) -> NDArray[np.float64]:
     """Return the ellipse in a detector's box, without the points at the border of the image."""
-    cx, cy = (detection.x1_px + detection.x2_px) / 2, (detection.y1_px + detection.y2_px) / 2
+    cx, cy = detection.center_px
     half_width, half_height = (detection.x2_px - detection.x1_px) / 2, (detection.y2_px - detection.y1_px) / 2
     points = np.column_stack([cx + half_width * np.cos(_BOX_ANGLES), cy + half_height * np.sin(_BOX_ANGLES)])
     x, y = points.T
@@ -295,7 +295,7 @@ def locate_box(one: Detection, camera: CameraModel, config: BoxesConfig, otherwi
 
 def _edges(one: Detection, camera: CameraModel) -> list[list[float]]:
     """Return the rays (right, down, at 1 m) of the centers of the left, right, top and bottom edges."""
-    x, y = (one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2
+    x, y = one.center_px
     pixels = np.array([[one.x1_px, y], [one.x2_px, y], [x, one.y1_px], [x, one.y2_px]])
     rays: list[list[float]] = points_ahead(pixels, camera)[:2].T.tolist()
     return rays

@@ -269,7 +269,7 @@ def _circle(one: Detection) -> Circle:
     if one.circle is not None:
         return one.circle
     width, height = one.x2_px - one.x1_px, one.y2_px - one.y1_px
-    return Circle((one.x1_px + one.x2_px) / 2, (one.y1_px + one.y2_px) / 2, min(width, height) / 2)
+    return Circle(*one.center_px, min(width, height) / 2)
 
 
 def _cut(low_px: float, high_px: float, scale: int, size: int) -> slice:

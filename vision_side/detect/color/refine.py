@@ -93,6 +93,6 @@ def _ellipse(part: NDArray[np.uint8], box: NDArray[np.float64], share: float) ->
 def _fits(circle: Circle, one: Detection) -> bool:
     """Return True if the circle belongs to the object in the model's box."""
     radius = max(one.x2_px - one.x1_px, one.y2_px - one.y1_px) / 2
-    limit = _OFF * radius
-    return (abs(circle.cx_px - (one.x1_px + one.x2_px) / 2) <= limit
-            and abs(circle.cy_px - (one.y1_px + one.y2_px) / 2) <= limit and abs(circle.radius_px - radius) <= limit)
+    x, y = one.center_px
+    away_px = max(abs(circle.cx_px - x), abs(circle.cy_px - y), abs(circle.radius_px - radius))
+    return away_px <= _OFF * radius

@@ -386,8 +386,8 @@ class ImageTile:
     def shows_middle(self, one: Detection) -> bool:
         """Return True if the middle of `one`, in px of the whole image, is inside."""
         width, height = self.size_px
-        x, y = (one.x1_px + one.x2_px) / 2 - self.left_px, (one.y1_px + one.y2_px) / 2 - self.top_px
-        return 0 <= x < width and 0 <= y < height
+        x, y = one.center_px
+        return 0 <= x - self.left_px < width and 0 <= y - self.top_px < height
 
     def shows_all(self, one: Detection) -> bool:
         """Return True if `one`, in px of this tile, is clear of its border: it may go on beyond."""
