@@ -59,7 +59,7 @@ def image_of(picture: PhotoPicture, subject: Subject) -> Any:
     from sightline.vision_side.decode import Decoder
 
     bgr = simplejpeg.decode_jpeg(picture.jpeg, "BGR")
-    answer = answer_of(subject.detector, picture.number, picture.jpeg, Decoder(320, 240, 320 * 240), 1)
+    answer = answer_of(subject, picture.number, picture.jpeg, Decoder(320, 240, 320 * 240), 1)
     found = best_ball(answer, subject.balls)
     boxes = [(picture.ball.box, _GREEN)] if picture.ball else []
     boxes += [((found.x1_px, found.y1_px, found.x2_px, found.y2_px), _RED)] if found else []

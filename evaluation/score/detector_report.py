@@ -27,7 +27,14 @@ from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.plugin_calls import checked_results as checked_answers
 from sightline.vision_side.detect.plugin_calls import close_detector, notices_of
-from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, Detection, DetectionResult, Detector
+from sightline.vision_side.detect.port import (
+    NO_DEADLINE,
+    DetectFrame,
+    Detection,
+    DetectionResult,
+    Detector,
+    is_followable,
+)
 from sightline.vision_side.detect.registry import build_detector, check_takes_pictures
 
 _FRAME_US: Final = 33_333
@@ -45,8 +52,17 @@ class Subject:
 
     name: str
     detector: Detector
-    balls: tuple[str, ...] = BALL_LABELS
-    """What it may call a ball."""
+    label: str = ""
+    """The one that the vision service is configured to follow; empty for any."""
+
+    @property
+    def balls(self) -> tuple[str, ...]:
+        """What it may call a ball."""
+        return (*BALL_LABELS, self.label) if self.label else BALL_LABELS
+
+    def follows(self, label: str) -> bool:
+        """Return True for a label that the mission `follow` goes by."""
+        return is_followable(label, self.label)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,12 +112,11 @@ def subjects(
     missing package, and HardwareError for a missing device.
     """
     settings, given, asked = config or VisionConfig(), options or {}, list[Subject]()
-    balls = (*BALL_LABELS, settings.target.label) if settings.target.label else BALL_LABELS
     with ExitStack() as ending:
         ending.callback(close_subjects, asked)
         for name in dict.fromkeys(names):
             check_takes_pictures(name)
-            asked.append(Subject(name, build_detector(name, given.get(name, {}), settings), balls))
+            asked.append(Subject(name, build_detector(name, given.get(name, {}), settings), settings.target.label))
         ending.pop_all()
     return asked
 
@@ -114,26 +129,34 @@ def close_subjects(asked: Sequence[Subject]) -> None:
 
 
 def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks: int) -> Iterable[ScoredScene]:
-    """Each scene of the column in turn, in front of every subject, `looks` times in a row: some have to make sure."""
+    """Each scene of the column in turn, in front of every subject, `looks` times in a row: some have to make sure.
+
+    A mission follows the ball, except in scenes of lights and legs.
+    """
     decoder = Decoder(WIDTH_PX, HEIGHT_PX, WIDTH_PX * HEIGHT_PX)
     with SceneRenderer() as renderer:
         for seed in seeds:
             scene = renderer.scene(seed, column)
             jpeg = as_seen(scene)
-            said = [answer_of(one.detector, seed, jpeg, decoder, looks) for one in asked]
+            said = [answer_of(one, seed, jpeg, decoder, looks, follows=column is not THINGS) for one in asked]
             yield ScoredScene(scene, jpeg, tuple(one if isinstance(one, DetectionResult) else None for one in said),
                        tuple(one if isinstance(one, str) else "" for one in said))
 
 
-def answer_of(detector: Detector, seed: int, jpeg: bytes, decoder: Decoder, looks: int,
-              *, expected_px: tuple[float, float] | None = None) -> DetectionResult | str:
-    """Return the answer of the last call, in a session of its own, or the cause of a missing one."""
+def answer_of(subject: Subject, seed: int, jpeg: bytes, decoder: Decoder, looks: int, *, follows: bool = True,
+              expected_px: tuple[float, float] | None = None) -> DetectionResult | str:
+    """Return the answer of the last call, in a session of its own, or the cause of a missing one.
+
+    With `follows` a mission goes by what the subject follows, as in the vision service, otherwise by each label.
+    """
     result: DetectionResult | str = ""
     for look in range(looks):
         header = FrameHeader(session=f"{seed:08x}", seq=look, t_us=(1 + look) * _FRAME_US)
         frame = DetectFrame(_ROBOT, header, jpeg, decoder)
         frame.expected_px = expected_px
-        (result,) = checked_answers(detector, [frame], NO_DEADLINE)
+        if follows:
+            frame.goes_by = subject.follows
+        (result,) = checked_answers(subject.detector, [frame], NO_DEADLINE)
     return result
 
 

@@ -147,7 +147,7 @@ def score_photos(asked: Sequence[Subject], photographs: Sequence[Photograph], ea
     found = {one.name: PhotoFigures({kind: BallTally() for kind in kinds}, BallTally(), BallTally()) for one in asked}
     for picture in photo_pictures(photographs, each, seed, kinds, column):
         for one in asked:
-            answer = answer_of(one.detector, picture.number, picture.jpeg, decoder, looks,
+            answer = answer_of(one, picture.number, picture.jpeg, decoder, looks,
                                expected_px=_expected(picture) if tracked else None)
             _count(found[one.name], picture, best_ball(answer, one.balls))
             if isinstance(answer, str):

@@ -251,3 +251,16 @@ def test_a_device_is_for_those_that_can_have_one(capsys):
 def test_bench_takes_an_option_of_a_section_too(capsys):
     assert cli.run(["bench", "detector", "hsv", "--frames", "30", "--set", "hsv.max_contours=0"]) == 2
     assert "option 'hsv.max_contours': Input" in capsys.readouterr().err
+
+
+def test_a_mission_follows_the_ball_except_in_scenes_of_lights_and_legs(eyes, monkeypatch):
+    seen = {}
+    real = score_scenes_file.checked_answers
+
+    def noted(detector, frames, deadline_us):
+        seen.setdefault(frames[0].goes_by("legs"), []).append(frames[0].goes_by("ball"))
+        return real(detector, frames, deadline_us)
+
+    monkeypatch.setattr(score_scenes_file, "checked_answers", noted)
+    score_scenes(subjects([NAME]), 2, columns=["nominal"])
+    assert seen == {False: [True] * 2, True: [True] * 5}

@@ -112,6 +112,19 @@ def test_a_tracked_ball_is_expected_near_its_place(boxes):
     assert set(places.values()) == {None}
 
 
+@pytest.mark.parametrize(("label", "followed"), [("", ["ball", "cup"]), ("cup", ["cup"])])
+def test_a_mission_follows_the_ball(boxes, label, followed):
+    seen = set()
+
+    class NotedDetector(KnowingDetector):
+        def detect(self, frames, deadline_us):
+            seen.add(tuple(name for name in ("ball", "legs", "light-red", "cup") if frames[0].goes_by(name)))
+            return super().detect(frames, deadline_us)
+
+    score_photos([Subject("x", NotedDetector(boxes, lambda box: box), label)], photographs(), 1, 1)
+    assert seen == {tuple(followed)}
+
+
 def test_the_interval_is_wilsons():
     assert wilson(0, 0) == (0.0, 1.0)
     low, high = wilson(3, 100)
