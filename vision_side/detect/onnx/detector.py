@@ -6,7 +6,8 @@ image was compared. Models of other frameworks are subclasses that open another 
 """
 
 import hashlib
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -39,17 +40,16 @@ from sightline.vision_side.detect.onnx.tensors import (
     vivid,
 )
 from sightline.vision_side.detect.plugin_calls import DetectorWrapper, notices_of
-from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker
+from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Maker, corners, overlap
 from sightline.vision_side.detect.timing import timed_together
 
 _MODELS: Final = Path(__file__).parent.parent.parent / "models"
 SHIPPED: Final = _MODELS / "sightline.onnx"
 NANODET: Final = _MODELS / "nanodet.onnx"
 ROOMS: Final = _MODELS / "rooms.onnx"
-_SECOND_BONUS: Final = {SHIPPED: 0.15, ROOMS: 0.1}
-"""Chosen on 60 photographs without a ball that neither trained the models nor score them. In 180 views, where a track
-expects a ball, `onnx` has no false one with up to 0.2; `rooms` has 2 % with 0.1 and 9 % with 0.2. With 0.2 the bearing
-of `onnx` is worse beside boxes of the ball's color (the scenario three-boxes, look real)."""
+_EXPECTED_BONUS: Final = {SHIPPED: 0.35, ROOMS: 0.2}
+_EXPECTED_WITHIN: Final = 0.1
+"""Of the image's width: how far from where a track expects the target its bonus falls to 0."""
 _DOUBTFUL: Final = 0.5
 """Share of the least score from which on a thing gets a second look where no track expects one."""
 _SURE: Final = 0.1
@@ -57,6 +57,8 @@ _SURE: Final = 0.1
 scenes a column of those that choose thresholds, false alarms and hits then are 0.5 and 85 % (one look: 3.5 and 80 %)
 beside boxes of the ball's color, and 3.5 and 63 % (3.5 and 65 %) in "all at once"."""
 HASH_DIGITS: Final = 16
+_SAME: Final = 0.3
+"""Overlap from which on boxes of two looks are of one thing."""
 MAX_BYTES: Final = 2**31
 """A protocol buffer can be no larger."""
 _WARM_UP: Final = 3
@@ -66,6 +68,8 @@ _NOISE: Final = 0.05
 _NAME_LENGTH: Final = 48
 _MAX_BATCH: Final = 32
 """Images in one run: bounds a GPU's memory."""
+_Place = tuple[float, float]
+"""x, y in px of the encoded image."""
 
 
 class OnnxDetector:
@@ -76,7 +80,7 @@ class OnnxDetector:
     class Config(Settings):
         """The model, its device, and which of its answers count."""
 
-        renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color"}
+        renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color", "second_bonus": "expected_bonus"}
         address: str = ""
         """The file; empty for the model that comes with Sightline, `rooms` for its model trained over photographs,
         `nanodet` for that of people and COCO."""
@@ -94,9 +98,10 @@ class OnnxDetector:
         second_look: bool = True
         """True to enlarge the part of the image where the followed target is expected, if nothing is found there,
         and without such a target the part about the surest thing in doubt (models that come with Sightline)."""
-        second_bonus: Annotated[float | None, Field(ge=0, le=1)] = None
-        """Added to the score of a target in that part: where one is expected, a weaker sign is enough. None: 0.15
-        for the model that comes with Sightline, 0.1 for `rooms`, 0 for others."""
+        expected_bonus: Annotated[float | None, Field(ge=0, le=1)] = None
+        """Added to the score of a target where one is expected, for a weaker sign is enough there, and less and less
+        up to a tenth of the image's width beside. None: 0.35 for the model that comes with Sightline, 0.2 for `rooms`,
+        0 for others."""
         hsv: HsvConfig = HsvConfig()
         color_bonus: Annotated[float, Field(ge=0, le=1)] = 0.3
         """Where `hsv.ranges` differs from the default: added to the score of a target of that color."""
@@ -113,11 +118,12 @@ class OnnxDetector:
         self._colored = self._color
         """The color that counts in the images at hand."""
         self._bonus = config.color_bonus
-        given = config.second_bonus
-        self._second_bonus = _SECOND_BONUS.get(path, 0.0) if given is None else given
-        self._is_shipped = path in _SECOND_BONUS  # what a pale image and a doubt need is not known of others
+        given = config.expected_bonus
+        self._expected_bonus = _EXPECTED_BONUS.get(path, 0.0) if given is None else given
+        self._is_shipped = path in _EXPECTED_BONUS  # what a pale image and a doubt need is not known of others
         # A model of any size gets the image unscaled, and a part of it would be no larger.
         self._second_look = config.second_look and model.form.size is not None
+        self._looks_at_doubts = self._second_look and self._is_shipped
         self._engine = model.engine
         self._notices = [f"{path.name} runs on {self._engine.device}: {self._engine.note}"] if self._engine.note else []
         self.maker = Maker(f"{self.kind}:{path.name}"[:_NAME_LENGTH], model.digest, self._engine.device)
@@ -173,14 +179,18 @@ class OnnxDetector:
 
     def _detections(self, shown: Sequence[tuple[DetectFrame, DecodedImage]]) -> list[Sequence[Detection]]:
         self._colored = self._color if all(self._is_color_usable(picture) for _, picture in shown) else None
-        doubts = self._second_look and self._is_shipped
-        doubtful = max(_NOISE, self._min_score * _DOUBTFUL) if doubts else self._min_score
-        together = self._look([frame for frame, _ in shown], [picture for _, picture in shown],
-                              min(self._min_score, doubtful))
-        if self._second_look:
-            together = [self._with_second_look(*one, found) for one, found in zip(shown, together, strict=True)]
-        return [tuple(refined(picture, one) if one.label in self._refine else one for one in found)
+        doubtful = max(_NOISE, self._min_score * _DOUBTFUL) if self._looks_at_doubts else self._min_score
+        frames, pictures = [frame for frame, _ in shown], [picture for _, picture in shown]
+        places = [frame.expected_px for frame in frames]
+        together = self._look(frames, pictures, places, min(self._min_score, doubtful))
+        together = [self._counted(*one, found) for one, found in zip(shown, together, strict=True)]
+        return [tuple(self._finished(picture, one) for one in found)
                 for (_, picture), found in zip(shown, together, strict=True)]
+
+    def _finished(self, picture: DecodedImage, one: Detection) -> Detection:
+        """Refine a round thing. One that counts only where it is expected has the least score that counts."""
+        one = refined(picture, one) if one.label in self._refine else one
+        return one if one.score >= self._min_score else replace(one, score=self._min_score)
 
     def _is_color_usable(self, picture: DecodedImage) -> bool:
         """Return False if the color marks the floor: all that stands there would get its bonus."""
@@ -192,59 +202,91 @@ class OnnxDetector:
         return not self._color_check.is_flooded
 
     def _look(
-        self, frames: Sequence[DetectFrame], pictures: Sequence[DecodedImage], least: float, bonus: float = 0.0
+        self, frames: Sequence[DetectFrame], pictures: Sequence[DecodedImage], places: Sequence[_Place | None],
+        least: float,
     ) -> list[tuple[Detection, ...]]:
-        """Run the model. A target may have a score below `least` by `bonus`, and by that of the configured color."""
+        """Run the model. Return what has the score `least` with the bonuses of a target, surest first.
+
+        `places` are those of the pictures where the target is expected; its bonus there is not in the score.
+        """
         color_bonus = self._bonus if self._colored else 0.0
-        least_score = min(least, max(_NOISE, least - color_bonus - bonus))
+        expected_bonus = 0.0 if places.count(None) == len(places) else self._expected_bonus
+        least_score = min(least, max(_NOISE, least - color_bonus - expected_bonus))
         if self._is_shipped:
             pictures = [vivid(picture) for picture in pictures]
         together = _found(self._engine, pictures, self._form, least_score)
-        return [self._with_bonus(*one, least, bonus) for one in zip(frames, pictures, together, strict=True)]
+        return [self._counting(*one, least) for one in zip(frames, pictures, places, together, strict=True)]
 
-    def _with_bonus(
-        self, frame: DetectFrame, picture: DecodedImage, found: tuple[Detection, ...], least: float, bonus: float
+    def _counting(
+        self, frame: DetectFrame, picture: DecodedImage, place: _Place | None, found: tuple[Detection, ...],
+        least: float,
     ) -> tuple[Detection, ...]:
-        def raised(one: Detection) -> Detection:
-            if not frame.goes_by(one.label):
-                return one
-            more = self._bonus if self._colored is not None and self._colored.has_color(picture, one) else 0.0
-            return replace(one, score=min(1.0, one.score + bonus + more))
+        colored = [self._with_color(picture, one) if frame.goes_by(one.label) else one for one in found]
+        return tuple(one for one in self._surest_first(frame, place, colored)
+                     if self._sureness(frame, place, one) >= least)
 
-        if self._colored is None and not bonus:
-            return found
-        counting = (one for one in map(raised, found) if one.score >= least)
-        return tuple(sorted(counting, key=lambda one: -one.score))
+    def _with_color(self, picture: DecodedImage, one: Detection) -> Detection:
+        """Add its bonus to the score of a target of the configured color."""
+        if self._colored is None or not self._colored.has_color(picture, one):
+            return one
+        return replace(one, score=min(1.0, one.score + self._bonus))
 
-    def _with_second_look(
+    def _surest_first(
+        self, frame: DetectFrame, place: _Place | None, found: Iterable[Detection]
+    ) -> tuple[Detection, ...]:
+        return tuple(sorted(found, key=lambda one: -self._sureness(frame, place, one)))
+
+    def _sureness(self, frame: DetectFrame, place: _Place | None, one: Detection) -> float:
+        """Return the score, with the bonus of a target near the place where it is expected."""
+        return one.score + self._expected_bonus * _nearness(frame, place, one)
+
+    def _counted(
         self, frame: DetectFrame, picture: DecodedImage, seen: tuple[Detection, ...]
     ) -> tuple[Detection, ...]:
-        """Look again, enlarged, where the target is expected, if the first look has found no target there.
+        """Return what counts, surest first.
 
-        Without a track, look at the surest target, if it is in doubt and whole in that part: it must be surer there.
+        Where the target is expected, look again, enlarged, if the first look shows no sure target there. What counts
+        only by the bonus of the place counts as the enlarged part shows it, or else as the first look does.
         """
-        found = tuple(one for one in seen if one.score >= self._min_score)
-        if frame.expected_px is not None:
-            tile = tile_about(picture, frame.expected_px)
-            if any(frame.goes_by(one.label) and tile.shows_middle(one) for one in found):
-                return found
-            return self._with_tile(frame, tile, found, self._min_score, self._second_bonus)
+        found, place = tuple(one for one in seen if one.score >= self._min_score), frame.expected_px
+        if place is None:
+            return self._without_doubt(frame, picture, seen, found)
+        if self._second_look and not _is_any_near(frame, found):
+            found = self._with_tile(frame, tile_about(picture, place), found, self._min_score)
+        if not _is_any_near(frame, found):
+            weak = [one for one in seen if one.score < self._min_score <= self._sureness(frame, place, one)]
+            found = self._surest_first(frame, place, (*found, *weak))
+        return tuple(one for one in found if not self._is_doubtful(frame, one))
+
+    def _is_doubtful(self, frame: DetectFrame, one: Detection) -> bool:
+        """Return True for a target that is not sure, elsewhere than it is expected."""
+        return (self._looks_at_doubts and frame.goes_by(one.label) and one.score < self._min_score + _SURE
+                and not _nearness(frame, frame.expected_px, one))
+
+    def _without_doubt(
+        self, frame: DetectFrame, picture: DecodedImage, seen: tuple[Detection, ...], found: tuple[Detection, ...]
+    ) -> tuple[Detection, ...]:
+        """Look again at the surest target, if it is in doubt and whole in the enlarged part: it must be surer there."""
         surest = next((one for one in seen if frame.goes_by(one.label)), None)
-        if not self._is_shipped or frame.looks_once or surest is None or surest.score >= self._min_score + _SURE:
+        if surest is None or frame.looks_once or not self._is_doubtful(frame, surest):
             return found
-        tile = tile_about(picture, ((surest.x1_px + surest.x2_px) / 2, (surest.y1_px + surest.y2_px) / 2))
+        tile = tile_about(picture, surest.center_px)
         if not tile.holds(surest):
             return found
         others = tuple(one for one in found if not frame.goes_by(one.label))
-        return self._with_tile(frame, tile, others, self._min_score + _SURE, 0.0)
+        return self._with_tile(frame, tile, others, self._min_score + _SURE)
 
     def _with_tile(
-        self, frame: DetectFrame, tile: ImageTile, found: tuple[Detection, ...], least: float, bonus: float
+        self, frame: DetectFrame, tile: ImageTile, found: tuple[Detection, ...], least: float
     ) -> tuple[Detection, ...]:
-        """Return `found` and the targets in the tile."""
-        (more,) = self._look([frame], [tile.picture], least, bonus)
-        targets = [tile.in_image(one) for one in more if frame.goes_by(one.label) and tile.shows_all(one)]
-        return tuple(sorted((*found, *targets), key=lambda one: -one.score)[:MAX_DETECTED_BOXES])
+        """Return `found` and the other targets in the tile."""
+        place = frame.expected_px
+        in_tile = place and (place[0] - tile.left_px, place[1] - tile.top_px)
+        (more,) = self._look([frame], [tile.picture], [in_tile], least)
+        targets = (tile.in_image(one) for one in more if frame.goes_by(one.label) and tile.shows_all(one))
+        known = [corners(one) for one in found if frame.goes_by(one.label)]
+        new = [one for one in targets if all(overlap(corners(one), box) < _SAME for box in known)]
+        return self._surest_first(frame, place, (*found, *new))[:MAX_DETECTED_BOXES]
 
     def _warm_up(self, model: "LoadedModel", config: Config) -> None:
         """Run the model on the test image and compare the answer with the metadata, or with the CPU."""
@@ -283,6 +325,18 @@ class LoadedModel:
     def labels(self) -> tuple[str, ...]:
         """All labels that it can give; empty where it has only numbers."""
         return self.form.labels
+
+
+def _nearness(frame: DetectFrame, place: _Place | None, one: Detection) -> float:
+    """Return 1 for a target at the place where it is expected, 0 from `_EXPECTED_WITHIN` on and without a place."""
+    if place is None or not frame.goes_by(one.label):
+        return 0.0
+    share = math.dist(one.center_px, place) / (_EXPECTED_WITHIN * frame.width_px)
+    return max(0.0, 1.0 - share * share)
+
+
+def _is_any_near(frame: DetectFrame, found: Iterable[Detection]) -> bool:
+    return any(_nearness(frame, frame.expected_px, one) for one in found)
 
 
 def read_onnx_model(config: OnnxDetector.Config) -> LoadedModel:

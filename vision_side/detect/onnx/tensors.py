@@ -383,12 +383,6 @@ class ImageTile:
         rows, columns = self.picture.bgr.shape[:2]
         return int(columns) * self.picture.scale, int(rows) * self.picture.scale
 
-    def shows_middle(self, one: Detection) -> bool:
-        """Return True if the middle of `one`, in px of the whole image, is inside."""
-        width, height = self.size_px
-        x, y = one.center_px
-        return 0 <= x - self.left_px < width and 0 <= y - self.top_px < height
-
     def shows_all(self, one: Detection) -> bool:
         """Return True if `one`, in px of this tile, is clear of its border: it may go on beyond."""
         width, height = self.size_px

@@ -66,7 +66,7 @@ def test_a_second_look_is_without_effect_elsewhere_for_other_labels_and_where_it
     assert len(found(shipped, model, jpeg, EXPECTED_PX)) == 1
     assert found(shipped, model, jpeg_of(scene(model, FAR_M, 1.5, shaded=True)), (310.0, 120.0)) == ()
     assert found(shipped, model, jpeg, EXPECTED_PX, goes_by=lambda label: label == "legs") == ()
-    assert found(one_look, model, jpeg) == found(one_look, model, jpeg, EXPECTED_PX) == ()
+    assert found(one_look, model, jpeg) == ()
 
 
 @pytest.mark.parametrize(("first", "second", "score"), [
@@ -106,18 +106,84 @@ def test_without_a_track_only_a_target_in_doubt_gets_a_second_look(monkeypatch):
     assert found(detector, camera(320, 240), gray, looks_once=True) == () and len(places) == 1
 
 
-@pytest.mark.parametrize(("options", "bonus"), [({}, 0.15), ({"address": "rooms"}, 0.1), ({"second_bonus": 0.3}, 0.3)])
-def test_a_weaker_sign_is_enough_where_the_target_is_expected(options, bonus):
-    detector = build_detector("onnx", options, VisionConfig(detector=DetectorConfig(device="cpu")))
-    looks, box = [], np.float32([[100.0, 80.0, 160.0, 140.0]])
-    detector._engine.run = lambda _pixels: {
-        "boxes": box, "scores": np.float32([looks.pop(0)]), "labels": np.float32([0])}
-    gray = jpeg_of(np.full((240, 320, 3), 110, np.uint8))
-    for first, second, score in ((0.49, 0.51 - bonus, 0.51), (0.49, 0.49 - bonus, None), (0.6, None, 0.6)):
-        looks += [first] if second is None else [first, second]
-        assert [round(one.score, 2) for one in found(detector, camera(320, 240), gray, (160.0, 120.0))] == (
-            [] if score is None else [score])
-        assert looks == []
+def stub(*looks, options=None):
+    """A detector whose model gives in turn each of `looks`, the boxes as ((x, y), score), squares of 60 px."""
+    detector = build_detector("onnx", options or {}, VisionConfig(detector=DetectorConfig(device="cpu")))
+    waiting = [*looks]
+
+    def run(_pixels):
+        boxes = waiting.pop(0)
+        corners = [[x - 30.0, y - 30.0, x + 30.0, y + 30.0] for (x, y), _ in boxes]
+        return {"boxes": np.float32(corners).reshape(-1, 4), "scores": np.float32([score for _, score in boxes]),
+                "labels": np.zeros(len(boxes), np.float32)}
+
+    detector._engine.run = run
+    return detector, waiting
+
+
+GRAY = jpeg_of(np.full((240, 320, 3), 110, np.uint8))
+PLACE = (160.0, 120.0)
+
+
+@pytest.mark.parametrize(("options", "bonus"), [
+    ({}, 0.35), ({"address": "rooms"}, 0.2), ({"expected_bonus": 0.3}, 0.3), ({"second_bonus": 0.1}, 0.1)])
+@pytest.mark.parametrize("away_px", [0.0, 10.0, 20.0, 28.0])
+def test_a_weaker_sign_is_enough_near_the_place_where_the_target_is_expected(options, bonus, away_px):
+    needed = 0.5 - bonus * (1 - (away_px / 32) ** 2)
+    where = (PLACE[0] + 0.6 * away_px, PLACE[1] - 0.8 * away_px)
+    detector, waiting = stub([(where, needed + 0.005)], [], [(where, needed - 0.005)], [], options=options)
+    (one,) = found(detector, camera(320, 240), GRAY, PLACE)
+    assert one.center_px == pytest.approx(where, abs=0.01)
+    assert one.score == 0.5 and len(waiting) == 2
+    assert found(detector, camera(320, 240), GRAY, PLACE) == ()
+    assert waiting == []
+
+
+def test_the_enlarged_part_decides_where_and_how_large_a_weak_target_is():
+    detector, waiting = stub([((155.0, 120.0), 0.45)], [((160.0 + 8 * 320 / 192, 120.0), 0.4)])
+    (one,) = found(detector, camera(320, 240), GRAY, PLACE)
+    assert one.center_px == pytest.approx((168.0, 120.0), abs=0.1) and waiting == []
+    assert one.x2_px - one.x1_px == pytest.approx(36.0, abs=0.1)
+
+
+def test_without_a_second_look_a_weaker_sign_counts_too():
+    detector, waiting = stub([(PLACE, 0.2), ((240.0, 120.0), 0.45)], [(PLACE, 0.2)], options={"second_look": False})
+    assert [one.center_px for one in found(detector, camera(320, 240), GRAY, PLACE)] == [PLACE]
+    assert found(detector, camera(320, 240), GRAY) == () and waiting == []
+
+
+@pytest.mark.parametrize(("away_px", "score"), [(0.0, 0.16), (30.0, 0.46), (33.0, 0.61)])
+def test_the_enlarged_part_shows_a_weaker_sign_too(away_px, score):
+    # The middle of the part is its place, and all is 320/192 as large.
+    second = (160.0 + away_px * 320 / 192, 120.0)
+    for more, count in ((0.0, 1), (-0.02, 0)):
+        detector, waiting = stub([], [(second, score + more)])
+        seen = found(detector, camera(320, 240), GRAY, PLACE)
+        assert [one.center_px for one in seen] == [pytest.approx((160.0 + away_px, 120.0), abs=0.1)] * count
+        assert [one.score for one in seen] == [pytest.approx(max(0.5, score))] * count and waiting == []
+
+
+def test_the_place_gives_no_bonus_to_other_labels_and_without_a_track():
+    detector, waiting = stub([(PLACE, 0.45)], [(PLACE, 0.45)], [(PLACE, 0.45)], [])
+    assert found(detector, camera(320, 240), GRAY, PLACE, "legs".__eq__) == ()
+    assert found(detector, camera(320, 240), GRAY) == () and waiting == []
+
+
+@pytest.mark.parametrize(("score", "counts"), [(0.55, False), (0.59, False), (0.61, True)])
+def test_elsewhere_than_expected_a_target_in_doubt_does_not_count(score, counts):
+    elsewhere = (100.0, 120.0)
+    for looks in (([(PLACE, 0.8), (elsewhere, score)],), ([(elsewhere, score)], [])):
+        detector, waiting = stub(*looks)
+        seen = [one.center_px for one in found(detector, camera(320, 240), GRAY, PLACE)]
+        assert waiting == [] and (elsewhere in seen) == counts
+
+
+def test_a_target_elsewhere_stops_no_second_look_and_is_reported_once_after_the_expected_one():
+    elsewhere, in_tile = (200.0, 120.0), [(160.0, 120.0), (160.0 + 40 * 320 / 192, 120.0)]
+    detector, waiting = stub([(elsewhere, 0.65)], [(in_tile[0], 0.4), (in_tile[1], 0.9)])
+    seen = found(detector, camera(320, 240), GRAY, PLACE)
+    assert waiting == []
+    assert [(round(one.center_px[0]), round(one.score, 2)) for one in seen] == [(160, 0.5), (200, 0.65)]
 
 
 def test_a_target_that_the_first_look_finds_costs_no_second_look(shipped, monkeypatch):
@@ -142,8 +208,6 @@ def test_a_tile_is_inside_the_image(scale, place):
     height, width = tile.picture.bgr.shape[:2]
     assert (width * scale, height * scale) == tile.size_px == (192, 144)
     assert np.array_equal(tile.picture.bgr, bgr[top : top + height, left : left + width])
-    if 0 <= place[0] < 320 and 0 <= place[1] < 240:
-        assert tile.shows_middle(Detection(place[0] - 2, place[1] - 2, place[0] + 2, place[1] + 2, 1.0, "ball"))
 
 
 def test_an_image_of_one_pixel_has_a_tile():
@@ -159,9 +223,6 @@ def test_a_detection_in_a_tile_has_its_place_in_the_image_and_is_left_out_at_the
     assert tile.shows_all(inside)
     for box in ((0.5, 20.0, 30.0, 50.0), (10.0, 0.0, 30.0, 50.0), (10.0, 20.0, 191.5, 50.0), (10.0, 20.0, 30.0, 144.0)):
         assert not tile.shows_all(Detection(*box, 0.7, "ball"))
-    assert tile.shows_middle(Detection(40.0, 60.0, 40.0, 60.0, 1.0, "ball"))
-    for middle in ((39.0, 70.0), (232.0, 70.0), (50.0, 59.0), (50.0, 204.0)):
-        assert not tile.shows_middle(Detection(*middle, *middle, 1.0, "ball"))
 
 
 @pytest.mark.parametrize(("size", "runs"), [((240, 320), 2), ((None, None), 1)])
@@ -171,7 +232,7 @@ def test_a_model_of_any_size_looks_once(tmp_path, monkeypatch, size, runs):
     seen, run = [], detector._engine.run
     monkeypatch.setattr(detector._engine, "run", lambda pixels: seen.append(1) or run(pixels))
     found(detector, camera(320, 240), jpeg_of(scene(camera(320, 240), 1.0, 0.0)), (160.0, 120.0), lambda _: False)
-    assert len(seen) == runs and detector._second_bonus == 0.0
+    assert len(seen) == runs and detector._expected_bonus == 0.0
 
 
 @pytest.mark.parametrize(("saturation", "more"), [(1.0, 1.0), (0.3, 3.3), (0.0, 1.0)])
