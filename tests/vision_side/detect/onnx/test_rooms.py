@@ -22,8 +22,9 @@ def test_the_card_is_of_this_file_and_names_its_photographs():
     assert all(row[2] in ("CC0-1.0", "MIT", "BSD-2-Clause", "CC-BY-4.0") for row in rows)
 
 
-@pytest.mark.parametrize(("each", "seed"), [(4, 4), pytest.param(20, 3, marks=pytest.mark.slow)])
-def test_more_balls_in_photographs_than_the_default_finds_with_few_false_ones(each, seed):
-    report = score_photos(subjects(["onnx", "onnx:rooms"]), read_photographs(SHIPPED)[::3], each, seed, kinds=HARD)
+@pytest.mark.parametrize(("step", "each", "seed"), [(8, 5, 5), pytest.param(3, 20, 3, marks=pytest.mark.slow)])
+def test_more_balls_in_photographs_than_the_default_finds_with_few_false_ones(step, each, seed):
+    photographs = read_photographs(SHIPPED)[::step]
+    report = score_photos(subjects(["onnx", "onnx:rooms"]), photographs, each, seed, kinds=HARD)
     plain, rooms = (sum(report.figures[name].kinds[kind].hit for kind in HARD) for name in ("onnx", "onnx:rooms"))
-    assert rooms >= plain + 3 and report.figures["onnx:rooms"].false_alarms <= 1
+    assert rooms >= plain + 3 and report.figures["onnx:rooms"].false_alarms <= 0.09 * len(photographs)

@@ -126,7 +126,7 @@ PLACE = (160.0, 120.0)
 
 
 @pytest.mark.parametrize(("options", "bonus"), [
-    ({}, 0.35), ({"address": "rooms"}, 0.2), ({"expected_bonus": 0.3}, 0.3), ({"second_bonus": 0.1}, 0.1)])
+    ({}, 0.3), ({"address": "rooms"}, 0.2), ({"expected_bonus": 0.4}, 0.4), ({"second_bonus": 0.1}, 0.1)])
 @pytest.mark.parametrize("away_px", [0.0, 10.0, 20.0, 28.0])
 def test_a_weaker_sign_is_enough_near_the_place_where_the_target_is_expected(options, bonus, away_px):
     needed = 0.5 - bonus * (1 - (away_px / 32) ** 2)
@@ -152,7 +152,7 @@ def test_without_a_second_look_a_weaker_sign_counts_too():
     assert found(detector, camera(320, 240), GRAY) == () and waiting == []
 
 
-@pytest.mark.parametrize(("away_px", "score"), [(0.0, 0.16), (30.0, 0.46), (33.0, 0.61)])
+@pytest.mark.parametrize(("away_px", "score"), [(0.0, 0.21), (30.0, 0.47), (33.0, 0.61)])
 def test_the_enlarged_part_shows_a_weaker_sign_too(away_px, score):
     # The middle of the part is its place, and all is 320/192 as large.
     second = (160.0 + away_px * 320 / 192, 120.0)
