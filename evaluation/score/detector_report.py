@@ -57,11 +57,11 @@ class Subject:
 
     @property
     def balls(self) -> tuple[str, ...]:
-        """What it may call a ball."""
+        """Labels that it may give a ball."""
         return (*BALL_LABELS, self.label) if self.label else BALL_LABELS
 
     def follows(self, label: str) -> bool:
-        """Return True for a label that the mission `follow` goes by."""
+        """Return True for a label that the mission `follow` uses."""
         return is_followable(label, self.label)
 
 
@@ -147,7 +147,7 @@ def answer_of(subject: Subject, seed: int, jpeg: bytes, decoder: Decoder, looks:
               expected_px: tuple[float, float] | None = None) -> DetectionResult | str:
     """Return the answer of the last call, in a session of its own, or the cause of a missing one.
 
-    With `follows` a mission goes by what the subject follows, as in the vision service, otherwise by each label.
+    With `follows` a mission uses what the subject follows, as in the vision service, otherwise each label.
     """
     result: DetectionResult | str = ""
     for look in range(looks):
