@@ -107,15 +107,15 @@ def test_without_a_track_only_a_target_in_doubt_gets_a_second_look(monkeypatch):
 
 
 def stub(*looks, options=None):
-    """A detector whose model gives in turn each of `looks`, the boxes as ((x, y), score), squares of 60 px."""
+    """A detector whose model gives in turn each of `looks`: ((x, y), score, label number or 0), squares of 60 px."""
     detector = build_detector("onnx", options or {}, VisionConfig(detector=DetectorConfig(device="cpu")))
     waiting = [*looks]
 
     def run(_pixels):
         boxes = waiting.pop(0)
-        corners = [[x - 30.0, y - 30.0, x + 30.0, y + 30.0] for (x, y), _ in boxes]
-        return {"boxes": np.float32(corners).reshape(-1, 4), "scores": np.float32([score for _, score in boxes]),
-                "labels": np.zeros(len(boxes), np.float32)}
+        corners = [[x - 30.0, y - 30.0, x + 30.0, y + 30.0] for (x, y), *_ in boxes]
+        return {"boxes": np.float32(corners).reshape(-1, 4), "scores": np.float32([one[1] for one in boxes]),
+                "labels": np.float32([one[2] if len(one) > 2 else 0 for one in boxes])}
 
     detector._engine.run = run
     return detector, waiting
@@ -167,6 +167,12 @@ def test_the_place_gives_no_bonus_to_other_labels_and_without_a_track():
     detector, waiting = stub([(PLACE, 0.45)], [(PLACE, 0.45)], [(PLACE, 0.45)], [])
     assert found(detector, camera(320, 240), GRAY, PLACE, "legs".__eq__) == ()
     assert found(detector, camera(320, 240), GRAY) == () and waiting == []
+
+
+def test_a_thing_of_another_label_hides_no_target_from_the_second_look():
+    detector, waiting = stub([(PLACE, 0.9, 4)], [(PLACE, 0.4)])
+    seen = found(detector, camera(320, 240), GRAY, PLACE, "ball".__eq__)
+    assert [(one.label, one.score) for one in seen] == [("legs", pytest.approx(0.9)), ("ball", 0.5)] and waiting == []
 
 
 @pytest.mark.parametrize(("score", "counts"), [(0.55, False), (0.59, False), (0.61, True)])
