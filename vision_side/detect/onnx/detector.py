@@ -49,7 +49,7 @@ NANODET: Final = _MODELS / "nanodet.onnx"
 ROOMS: Final = _MODELS / "rooms.onnx"
 _EXPECTED_BONUS: Final = {SHIPPED: 0.3, ROOMS: 0.2}
 """Chosen on 502 photographs of BSDS500 with a random place each, which nothing else uses, and on three-boxes in the
-look real: with 0.35 one of 20 starts followed a box of the ball's color, with 0.3 none of 50."""
+look real: with 0.35 one of the first 5 starts lost the ball beside the boxes, with 0.3 none of 50."""
 _EXPECTED_WITHIN: Final = 0.1
 """Of the image's width: how far from where a track expects the target its bonus falls to 0."""
 _DOUBTFUL: Final = 0.5
