@@ -82,7 +82,7 @@ class OnnxDetector:
     class Config(Settings):
         """The model, its device, and which of its answers count."""
 
-        renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color", "second_bonus": "expected_bonus"}
+        renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color"}
         address: str = ""
         """The file; empty for the model that comes with Sightline, `rooms` for its model trained over photographs,
         `nanodet` for that of people and COCO."""
@@ -207,45 +207,39 @@ class OnnxDetector:
         self, frames: Sequence[DetectFrame], pictures: Sequence[DecodedImage], places: Sequence[_Place | None],
         least: float,
     ) -> list[tuple[Detection, ...]]:
-        """Run the model. Return what has the score `least` with the bonuses of a target, surest first.
+        """Run the model. Return what has the score `least` with the bonuses of a target, best first.
 
         `places` are those of the pictures where the target is expected; its bonus there is not in the score.
         """
         color_bonus = self._bonus if self._colored else 0.0
-        expected_bonus = 0.0 if places.count(None) == len(places) else self._expected_bonus
+        expected_bonus = self._expected_bonus if any(places) else 0.0
         least_score = min(least, max(_NOISE, least - color_bonus - expected_bonus))
         if self._is_shipped:
             pictures = [vivid(picture) for picture in pictures]
         together = _found(self._engine, pictures, self._form, least_score)
-        return [self._counting(*one, least) for one in zip(frames, pictures, places, together, strict=True)]
+        colored = [[self._with_color(frame, picture, one) for one in found]
+                   for frame, picture, found in zip(frames, pictures, together, strict=True)]
+        return [self._best_first(frame, place, found, least)
+                for frame, place, found in zip(frames, places, colored, strict=True)]
 
-    def _counting(
-        self, frame: DetectFrame, picture: DecodedImage, place: _Place | None, found: tuple[Detection, ...],
-        least: float,
-    ) -> tuple[Detection, ...]:
-        colored = [self._with_color(picture, one) if frame.goes_by(one.label) else one for one in found]
-        return tuple(one for one in self._surest_first(frame, place, colored)
-                     if self._sureness(frame, place, one) >= least)
-
-    def _with_color(self, picture: DecodedImage, one: Detection) -> Detection:
+    def _with_color(self, frame: DetectFrame, picture: DecodedImage, one: Detection) -> Detection:
         """Add its bonus to the score of a target of the configured color."""
-        if self._colored is None or not self._colored.has_color(picture, one):
+        if self._colored is None or not frame.goes_by(one.label) or not self._colored.has_color(picture, one):
             return one
         return replace(one, score=min(1.0, one.score + self._bonus))
 
-    def _surest_first(
-        self, frame: DetectFrame, place: _Place | None, found: Iterable[Detection]
+    def _best_first(
+        self, frame: DetectFrame, place: _Place | None, found: Iterable[Detection], least: float = 0.0
     ) -> tuple[Detection, ...]:
-        return tuple(sorted(found, key=lambda one: -self._sureness(frame, place, one)))
-
-    def _sureness(self, frame: DetectFrame, place: _Place | None, one: Detection) -> float:
-        """Return the score, with the bonus of a target near the place where it is expected."""
-        return one.score + self._expected_bonus * _nearness(frame, place, one)
+        """Sort by the score with the bonus of a target near `place`. Leave out what has less than `least`."""
+        raised = [(one.score + self._expected_bonus * _nearness(frame, place, one), one) for one in found]
+        best = sorted((pair for pair in raised if pair[0] >= least), key=lambda pair: -pair[0])
+        return tuple(one for _, one in best[:MAX_DETECTED_BOXES])
 
     def _counted(
         self, frame: DetectFrame, picture: DecodedImage, seen: tuple[Detection, ...]
     ) -> tuple[Detection, ...]:
-        """Return what counts, surest first.
+        """Return what counts, best first.
 
         Where the target is expected, look again, enlarged, if the first look shows no sure target there. What counts
         only by the bonus of the place counts as the enlarged part shows it, or else as the first look does.
@@ -256,8 +250,8 @@ class OnnxDetector:
         if self._second_look and not _is_any_near(frame, found):
             found = self._with_tile(frame, tile_about(picture, place), found, self._min_score)
         if not _is_any_near(frame, found):
-            weak = [one for one in seen if one.score < self._min_score <= self._sureness(frame, place, one)]
-            found = self._surest_first(frame, place, (*found, *weak))
+            weak = (one for one in seen if one.score < self._min_score)
+            found = self._best_first(frame, place, (*found, *weak), self._min_score)
         return tuple(one for one in found if not self._is_doubtful(frame, one))
 
     def _is_doubtful(self, frame: DetectFrame, one: Detection) -> bool:
@@ -288,7 +282,7 @@ class OnnxDetector:
         targets = (tile.in_image(one) for one in more if frame.goes_by(one.label) and tile.shows_all(one))
         known = [corners(one) for one in found if frame.goes_by(one.label)]
         new = [one for one in targets if all(overlap(corners(one), box) < _SAME for box in known)]
-        return self._surest_first(frame, place, (*found, *new))[:MAX_DETECTED_BOXES]
+        return self._best_first(frame, place, (*found, *new))
 
     def _warm_up(self, model: "LoadedModel", config: Config) -> None:
         """Run the model on the test image and compare the answer with the metadata, or with the CPU."""

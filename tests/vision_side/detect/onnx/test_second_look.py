@@ -126,7 +126,7 @@ PLACE = (160.0, 120.0)
 
 
 @pytest.mark.parametrize(("options", "bonus"), [
-    ({}, 0.3), ({"address": "rooms"}, 0.2), ({"expected_bonus": 0.4}, 0.4), ({"second_bonus": 0.1}, 0.1)])
+    ({}, 0.3), ({"address": "rooms"}, 0.2), ({"expected_bonus": 0.4}, 0.4)])
 @pytest.mark.parametrize("away_px", [0.0, 10.0, 20.0, 28.0])
 def test_a_weaker_sign_is_enough_near_the_place_where_the_target_is_expected(options, bonus, away_px):
     needed = 0.5 - bonus * (1 - (away_px / 32) ** 2)
@@ -173,6 +173,15 @@ def test_a_thing_of_another_label_hides_no_target_from_the_second_look():
     detector, waiting = stub([(PLACE, 0.9, 4)], [(PLACE, 0.4)])
     seen = found(detector, camera(320, 240), GRAY, PLACE, "ball".__eq__)
     assert [(one.label, one.score) for one in seen] == [("legs", pytest.approx(0.9)), ("ball", 0.5)] and waiting == []
+
+
+def test_both_looks_together_show_no_more_boxes_than_a_message_may_have():
+    # 40 things elsewhere and 20 weak targets; the enlarged part shows 30 sure ones, none near the place.
+    corners = [(20.0 + 7 * (one % 40), 20.0 + 200 * (one // 40)) for one in range(40)]
+    first = [(corner, 0.9, 4) for corner in corners] + [((150.0 + one, 110.0), 0.3) for one in range(20)]
+    detector, waiting = stub(first, [((40.0 + 8 * one, 40.0), 0.9) for one in range(30)])
+    seen = found(detector, camera(320, 240), GRAY, PLACE, "ball".__eq__)
+    assert waiting == [] and len(seen) == 64
 
 
 @pytest.mark.parametrize(("score", "counts"), [(0.55, False), (0.59, False), (0.61, True)])
