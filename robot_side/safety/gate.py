@@ -53,7 +53,7 @@ def _shown(holder: Holder | None) -> str:
 
 
 class SafetyGate:
-    """The only path from a command to the wheels. The caller steps it at 50 Hz.
+    """The only path from a command to the wheels. The caller steps it at least 50 times a second.
 
     Args:
         config: limits and times.

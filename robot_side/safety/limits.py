@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from sightline.protocol.messages import STILL, Twist
 from sightline.robot_side.safety.battery import BatteryLimits
 
-# The driver's period: 50 Hz.
+# Longest time between two ticks of the driver.
 TICK_US = 20_000
 # Shortest time between two ticks for commands. The driver also ticks when a command arrives; a flood of commands must
 # not flood the motors.

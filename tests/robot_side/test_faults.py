@@ -67,7 +67,7 @@ def status_of(made):
     made._driver_core._due_us.clear()
     sent = []
     made.driver_end.send = sent.append
-    made._tick(10**9, punctual=True)
+    made._tick(10**9)
     messages = [ipc.unpack_message(packet) for packet in sent if ipc.packet_kind(packet) is ipc.PacketKind.PUBLISH]
     return decode(Status, next(one.payload for one in messages if one.channel is STATUS), 4096)
 
@@ -75,8 +75,8 @@ def status_of(made):
 def test_exceptions_of_drive_and_range_sensor_are_in_the_status(driver, caplog, monkeypatch):  # noqa: F811
     monkeypatch.setattr(driver.driver_end, "keep_alive", lambda *_: None)
     BrokenDrive.fails, BrokenDrive.told = RuntimeError("no such motor"), (0.0, 0.0)
-    driver._tick(20_000, punctual=False)
-    driver._tick(40_000, punctual=False)
+    driver._tick(20_000)
+    driver._tick(40_000)
     BrokenDrive.fails = None
 
     class Ranges:

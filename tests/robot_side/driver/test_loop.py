@@ -63,8 +63,8 @@ def run(tmp_path, monkeypatch):
         monkeypatch.setattr(driver, "_on_packet", lambda _packet: True)
         started_us, tick = loop.now_us, driver._tick
 
-        def counted(now_us, *, punctual):
-            tick(now_us, punctual=punctual)
+        def counted(now_us):
+            tick(now_us)
             if loop.now_us - started_us >= seconds * 1e6:
                 driver._on_signal(signal.SIGTERM, None)
 
@@ -114,12 +114,9 @@ def test_robot_that_slept_for_an_hour_is_not_late(run):
     assert loop.core.tick_late_max_us == 3_000
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_no_command_waits_for_a_tick_that_it_does_not_need(run, seed):
-    random = Random(seed)
-    loop = VirtualLoop(late_us=0)
-    arrivals_us = iter(accumulate([random.choice((200, 1_500, 9_000, 40_000)) for _ in range(1_700)],
-                                  initial=loop.now_us + 500))
+def commanded(loop, gaps_us):
+    """Let commands arrive so long after each other, the first one after 500 us. Returns the times of those so far."""
+    arrivals_us = iter(accumulate(gaps_us, initial=loop.now_us + 500))
     arrived_us = []
     loop.next_us = next(arrivals_us)
 
@@ -133,7 +130,15 @@ def test_no_command_waits_for_a_tick_that_it_does_not_need(run, seed):
             yield b"a command"
 
     loop.select, loop.packets = select, packets
+    return arrived_us
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_command_waits_for_a_tick_that_it_does_not_need(run, seed):
+    random = Random(seed)
+    loop = VirtualLoop(late_us=0)
     started_us = loop.now_us
+    arrived_us = commanded(loop, [random.choice((200, 1_500, 9_000, 40_000)) for _ in range(1_700)])
     ticks_us = run(loop, seconds=25.0)
     waits_us = [next(tick for tick in ticks_us[bisect_left(ticks_us, at - started_us):]) - (at - started_us)
                 for at in arrived_us]
@@ -141,5 +146,19 @@ def test_no_command_waits_for_a_tick_that_it_does_not_need(run, seed):
     alone = [wait_us for wait_us, (before, at) in zip(waits_us[1:], pairwise(arrived_us), strict=True)
              if at - before >= 2 * MIN_TICK_US]
     assert len(alone) > 700 and max(alone) == 0, "a tick in time holds up no command"
-    for_commands_us = [tick_us for tick_us in ticks_us if tick_us % TICK_US]
-    assert min(after - before for before, after in pairwise(for_commands_us)) >= MIN_TICK_US
+    gaps_us = [after - before for before, after in pairwise(ticks_us)]
+    assert max(gaps_us) == TICK_US, "with commands or without"
+    after_short_us = [before for before, gap_us in pairwise(gaps_us) if gap_us < MIN_TICK_US]
+    assert set(after_short_us) <= {TICK_US}, "commands come at most once in that time"
+
+
+@pytest.mark.parametrize("gap_us", [33_333, 25_000, 66_667])
+def test_commands_at_the_rate_of_images_meet_no_tick(run, gap_us):
+    """The tick before is as long ago as the gap leaves, and what a tick does beside has long ended."""
+    loop = VirtualLoop(late_us=0)
+    started_us = loop.now_us
+    arrived_us = commanded(loop, [gap_us] * 60)
+    ticks_us = run(loop, seconds=1.4)
+    for at_us in (one - started_us for one in arrived_us[1:]):
+        place = bisect_left(ticks_us, at_us)
+        assert ticks_us[place] == at_us and at_us - ticks_us[place - 1] == gap_us % TICK_US

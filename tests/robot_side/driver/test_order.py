@@ -128,16 +128,18 @@ def test_frame_permitted_by_a_result_carries_its_latency(driver, ends, monkeypat
     driver._driver_core.gate.arms_itself = False
     told = []
     monkeypatch.setattr(driver.driver_end, "send_aside", lambda packet: told.append(ipc.unpack_motion(packet)))
-    monkeypatch.setattr(driver.driver_end, "send", lambda packet: told.append(ipc.unpack_command_ack(packet)))
+    monkeypatch.setattr(driver.driver_end, "send", told.append)
     driver._driver_core.gate.latency_us = None
     monkeypatch.setattr("sightline.robot_side.driver.process.monotonic_us", lambda: T_US + 4_000)
     _arm(driver)
     parent.send_aside(ipc.pack_issued(SEQ, T_US, 0))
     parent.forward(answer(driver._driver_core.session))
     assert driver._drain()
-    driver._tick(T_US + 4_000, punctual=False)
-    motion, judged = told
+    driver._tick(T_US + 4_000)
+    motion, judged, *published = told
+    judged = ipc.unpack_command_ack(judged)
     assert motion.latency_us == 4_000 and judged.seq == SEQ and judged.compute_us == 900
+    assert {ipc.packet_kind(packet) for packet in published} == {ipc.PacketKind.PUBLISH}, "it waits for no message"
 
 
 def test_command_result_is_sent_before_the_next_tick(driver, ends):

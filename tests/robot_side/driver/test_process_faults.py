@@ -79,10 +79,10 @@ def driver(tmp_path):
 )
 def test_a_reading_that_is_not_a_number_stops_the_robot_not_the_loop(driver, reading):
     BrokenDrive.reading = WheelAngles(0.0, 0.0, 0)
-    driver._tick(20_000, punctual=False)
+    driver._tick(20_000)
     BrokenDrive.reading = reading
     for tick in range(5):
-        driver._tick(1_000_000 + tick * 20_000, punctual=False)
+        driver._tick(1_000_000 + tick * 20_000)
         list(driver._driver_core.messages(1_000_000 + tick * 20_000))
     assert BrokenDrive.told == (0.0, 0.0)
 
@@ -91,7 +91,7 @@ def test_a_gate_that_cannot_be_stepped_is_a_fault_with_the_wheels_at_zero(driver
     """Neither with the sensors nor without: nothing that it holds may end the loop."""
     driver._driver_core.gate.applied = Twist(linear_mps=0.3, angular_rad_s=0.0)
     driver._driver_core.gate._ramp.force(driver._driver_core.gate.applied)
-    driver._tick(20_000, punctual=False)
+    driver._tick(20_000)
     assert BrokenDrive.told != (0.0, 0.0)
 
     def breaks(*_):
@@ -99,18 +99,18 @@ def test_a_gate_that_cannot_be_stepped_is_a_fault_with_the_wheels_at_zero(driver
 
     with monkeypatch.context() as broken:
         broken.setattr(driver._driver_core, "tick", breaks)
-        driver._tick(40_000, punctual=False)
+        driver._tick(40_000)
         assert BrokenDrive.told == (0.0, 0.0)
         assert driver._driver_core.gate.state == "FAULT" and "no such twist" in driver._driver_core.gate.reason
-    driver._tick(60_000, punctual=False)
+    driver._tick(60_000)
     assert BrokenDrive.told == (0.0, 0.0), "it does not take up the speed of before"
 
 
 @pytest.mark.parametrize("error", [OSError("unplugged"), ValueError("what"), RuntimeError()])
 def test_a_drive_that_raises_anything_is_a_fault(driver, error):
-    driver._tick(20_000, punctual=False)
+    driver._tick(20_000)
     BrokenDrive.fails = error
-    driver._tick(40_000, punctual=False)
+    driver._tick(40_000)
     assert driver._driver_core.gate.state == "FAULT" and not driver._speeds_are_set
 
 
