@@ -12,12 +12,13 @@ import onnx
 from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 
-from sightline.sim.scenes.model import HEIGHT_PX, LABELS, WIDTH_PX
+from sightline.sim.scenes.model import LABELS
 from sightline.training.network import (
     BRIGHTNESS,
     COLORS,
     DARKEST,
     GEOMETRY,
+    INPUT_PX,
     LOOKED_AT,
     OUTPUTS,
     SIZE_PX,
@@ -27,6 +28,7 @@ from sightline.training.network import (
     network,
 )
 
+WIDTH_PX, HEIGHT_PX = INPUT_PX
 OPSET: Final = 17
 IR_VERSION: Final = 8
 """The version that runtimes of opset 17 read."""

@@ -1,7 +1,7 @@
 """The network as one table, from which the PyTorch module and the ONNX graph are made. Pure.
 
 A heat map of where the middles of things are, one for each label, and for each cell how far off the middle is and how
-large the thing. Depthwise layers carry the width; 240 rows halve evenly four times, so no layer pads.
+large the thing. Depthwise layers carry the width; 288 rows halve evenly four times, so no layer pads.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,9 @@ import numpy.typing as npt
 
 from sightline.sim.scenes.model import LABELS
 
+INPUT_PX: Final = (384, 288)
+"""Width and height of the input: images of 320x240 are enlarged, which finds more small balls at as many false ones,
+for half again the time. Decision 14; `sightline.onnx` is from before and has 320x240."""
 STRIDE: Final = 4
 """Pixels to one cell of the heat map, each way."""
 SIZE_PX: Final = 16.0

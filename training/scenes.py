@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import simplejpeg
@@ -38,7 +39,7 @@ from sightline.sim.scenes.model import (
 from sightline.sim.scenes.photos import photo_scene
 from sightline.sim.scenes.plan import with_defects
 from sightline.sim.scenes.render import SceneRenderer
-from sightline.training.network import GEOMETRY, SIZE_PX, STRIDE, TAUGHT
+from sightline.training.network import GEOMETRY, INPUT_PX, SIZE_PX, STRIDE, TAUGHT
 from sightline.training.schedule import SceneRange
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.onnx.detector import digest_of
@@ -255,9 +256,15 @@ def _draw(pictures: Path, source: SceneSource, numbers: Sequence[int]) -> tuple[
 # Scenes into what the network learns from: a spoiled cut-out, and the heat maps that it should give. Pure.
 
 
-CUT_PX: Final = (192, 160)
-"""Width and height of the cut-outs that most of the training sees: less than half the time of a whole image."""
-WHOLE_PX: Final = (WIDTH_PX, HEIGHT_PX)
+CUT_PX: Final = (192, 144)
+"""Width and height of the cut-outs that most of the training sees, of the network's input: a quarter of the time of a
+whole image."""
+WHOLE_PX: Final = INPUT_PX
+_ENLARGED: Final = WHOLE_PX[0] / WIDTH_PX
+_SECOND_LOOK: Final = 2.0
+"""How much larger the network sees the part of an image that gets a second look ..."""
+_LIKE_IT: Final = 0.25
+"""... and the share of the cut-outs over photographs that it sees as large."""
 _LEAST_LEFT: Final = 0.4  # of an object's box after the cut; with less left it is neither right nor wrong
 _NEW: Final = 0.5  # of the samples of a harder round: drawn from the scenes that it adds alone
 _AROUND_OTHERS: Final = 0.3  # of those samples: cut around distractors, where others are around objects
@@ -299,13 +306,16 @@ def sample(
         number, around, column = _photo(draw, scenes)
     else:
         number, around, column = (_harder if shown.harder else _plain)(draw, scenes, shown)
-    left, top = _cut(draw, around, size_px)
-    rgb = scenes.pictures[number][top : top + size_px[1], left : left + size_px[0]]
+    enlarged = _SECOND_LOOK if is_photo and draw.random() < _LIKE_IT else _ENLARGED
+    cut_px = round(size_px[0] / enlarged), round(size_px[1] / enlarged)
+    corner = left, top = _cut(draw, around, cut_px)
+    rgb = scenes.pictures[number][top : top + cut_px[1], left : left + cut_px[0]]
     mirrored = bool(draw.random() < 0.5)
     picture = np.ascontiguousarray(rgb[:, ::-1] if mirrored else rgb)
     bgr = simplejpeg.decode_jpeg(with_defects(picture, column, draw), "BGR")
-    moved = [(one, _moved(one.box, left, top, size_px, mirrored)) for one in scenes.truths[number]]
-    unclear, others = ([_moved(one, left, top, size_px, mirrored) for one in boxes]
+    bgr = cv2.resize(bgr, size_px, interpolation=cv2.INTER_LINEAR)  # as `fit_picture` does
+    moved = [(one, _moved(one.box, corner, cut_px, enlarged, mirrored)) for one in scenes.truths[number]]
+    unclear, others = ([_moved(one, corner, cut_px, enlarged, mirrored) for one in boxes]
                        for boxes in (scenes.unclear[number], scenes.others[number]))
     known = (_IN_PHOTOS if is_photo else _ALL_KNOWN).copy()
     return _wanted(np.ascontiguousarray(bgr.transpose(2, 0, 1)), moved, unclear, others, known)
@@ -345,9 +355,10 @@ def _cut(draw: Random, boxes: list[Box], size_px: tuple[int, int]) -> tuple[int,
     return corner[0], corner[1]
 
 
-def _moved(box: Box, left: int, top: int, size_px: tuple[int, int], mirrored: bool) -> Box:
-    x1, y1, x2, y2 = box[0] - left, box[1] - top, box[2] - left, box[3] - top
-    return (size_px[0] - x2, y1, size_px[0] - x1, y2) if mirrored else (x1, y1, x2, y2)
+def _moved(box: Box, corner: tuple[int, int], cut_px: tuple[int, int], enlarged: float, mirrored: bool) -> Box:
+    x1, y1, x2, y2 = box[0] - corner[0], box[1] - corner[1], box[2] - corner[0], box[3] - corner[1]
+    x1, x2 = (cut_px[0] - x2, cut_px[0] - x1) if mirrored else (x1, x2)
+    return x1 * enlarged, y1 * enlarged, x2 * enlarged, y2 * enlarged
 
 
 def _wanted(image: npt.NDArray[np.uint8], objects: list[tuple[LabelledBox, Box]], unclear: list[Box],

@@ -24,20 +24,10 @@ from sightline.evaluation.score.detector_report import (
     shown,
 )
 from sightline.evaluation.score.detectors import FrameResult, LabelMatches
-from sightline.sim.scenes.model import (
-    COLUMNS,
-    HARDER_FROM,
-    HEIGHT_PX,
-    LABELS,
-    LATER_FROM,
-    THINGS,
-    VALIDATED_FROM,
-    WIDTH_PX,
-    Column,
-)
+from sightline.sim.scenes.model import COLUMNS, HARDER_FROM, LABELS, LATER_FROM, THINGS, VALIDATED_FROM, Column
 from sightline.sim.scenes.textures import JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED
 from sightline.training.export import MOST_BOXES, OPSET, onnx_bytes
-from sightline.training.network import Weights
+from sightline.training.network import INPUT_PX, Weights
 from sightline.training.scenes import SceneSource
 from sightline.training.schedule import LEAST_SHARE, START_SHARE, WHOLE_FROM, Training
 from sightline.vision_side.config import VisionConfig
@@ -120,7 +110,7 @@ def card_text(card: Card) -> str:
 
 def _input() -> list[str]:
     return [
-        f"- `image`: uint8 (1, {HEIGHT_PX}, {WIDTH_PX}, 3), BGR.",
+        f"- `image`: uint8 (1, {INPUT_PX[1]}, {INPUT_PX[0]}, 3), BGR.",
         f"- `boxes` ({MOST_BOXES}, 4): x1, y1, x2, y2 in pixels of the input; `scores` ({MOST_BOXES}); `labels` "
         f"({MOST_BOXES}), indices into the metadata's `labels`.",
         "- Overlaps are removed and boxes decoded inside; a box that a better one covers has the score 0.",

@@ -14,6 +14,10 @@ from sightline.sim.scenes.sprites import Array, Sprite, SpriteLight, any_light, 
 Picture = npt.NDArray[np.uint8]
 
 BALL_PX: Final = (9.0, 110.0)
+_SMALL: Final = 0.4
+"""Share of the balls that are at most ..."""
+_SMALL_PX: Final = 28.0
+"""... so wide: those are missed most."""
 _WITHOUT_BALL: Final = 0.3
 _MOST_THINGS: Final = 4
 _LEAST_SHARE: Final = 0.35
@@ -64,6 +68,8 @@ Laid = tuple[Array, Box, float]
 def _laid(canvas: Array, draw: Random, is_ball: bool) -> Laid:
     """Lay a ball or a thing over the canvas."""
     low, high = BALL_PX
+    if is_ball and draw.random() < _SMALL:
+        high = _SMALL_PX
     width_px = math.exp(draw.uniform(math.log(low), math.log(high)))
     x = draw.uniform(-0.1 * width_px, WIDTH_PX + 0.1 * width_px)
     y = HEIGHT_PX * (1 - draw.uniform(0, 1) ** 1.3) + draw.uniform(-0.2, 0.1) * width_px

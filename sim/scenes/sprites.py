@@ -225,7 +225,7 @@ def _marble(draw: Random, at: Array) -> Array:
 
 _DESIGNS: Final[tuple[Callable[[Random, Array], Array], ...]] = (
     _plain, _tennis, _basketball, _football, _panels, _stripes, _patches, _marble)
-_WEIGHTS: Final = (0.48, 0.10, 0.09, 0.09, 0.10, 0.06, 0.04, 0.04)
+_WEIGHTS: Final = (0.42, 0.14, 0.10, 0.12, 0.09, 0.05, 0.04, 0.04)
 
 
 # --- other things --------------------------------------------------------------------------------------------------

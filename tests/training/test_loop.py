@@ -23,7 +23,7 @@ from sightline.training import loop as train_run
 from sightline.training.export import onnx_bytes, weights_in
 from sightline.training.loop import TorchNetwork, begin_from, blended, folded, train
 from sightline.training.network import AGAINST, OUTPUTS, Layer, network
-from sightline.training.scenes import CUT_PX, DrawnScenes
+from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes
 from sightline.training.schedule import Training
 from sightline.vision_side.detect.onnx.detector import SHIPPED
 from tests.training.fixture import weights
@@ -136,7 +136,7 @@ def test_graph_and_module_give_equal_outputs(tmp_path):
         for _ in range(3):  # so that the normalisation has something to fold in
             network(torch.randint(0, 256, (2, 3, HEIGHT_PX, WIDTH_PX), dtype=torch.uint8))
     network.eval()
-    image = np.random.default_rng(4).integers(0, 256, (1, HEIGHT_PX, WIDTH_PX, 3), dtype=np.uint8)
+    image = np.random.default_rng(4).integers(0, 256, (1, *WHOLE_PX[::-1], 3), dtype=np.uint8)
     with torch.no_grad():
         heat = network(torch.from_numpy(image).permute(0, 3, 1, 2))[0]
         heat[0] -= AGAINST * heat[OUTPUTS]  # what looks like something else looks less like a ball
@@ -178,7 +178,7 @@ def test_a_larger_networks_file_gives_the_layers_that_are_left(monkeypatch):
 def test_a_training_from_a_model_ends_with_a_share_of_its_weights():
     start = {"a": np.float32([[1.0, 2.0]]), "b": np.float32([8.0])}
     ended = blended(start, {"a": np.float32([[3.0, -2.0]]), "b": np.float32([8.0])})
-    assert ended["a"] == pytest.approx(np.array([[2.0, 0.0]])) and ended["b"] == pytest.approx(8.0)
+    assert ended["a"] == pytest.approx(np.array([[2.6, -1.2]])) and ended["b"] == pytest.approx(8.0)
     assert {one.dtype for one in ended.values()} == {np.dtype(np.float32)}
 
 

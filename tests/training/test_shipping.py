@@ -65,7 +65,7 @@ def test_the_card_names_the_photographs_and_every_option(tmp_path):
     assert ("sightline train --scenes 9 --every 5 --photos PHOTOS --over-photos 40 --steps 1 --steps 3 --rate 0.006 "
             "--batch 32 --seed 1 --device cuda --jobs 1 --validated 5 --start MODEL`") in card
     assert "seeds 0 to 40, one in 5" in card and f"40 scenes over the {FEWEST} photographs" in card
-    assert "The weights are 0.5 of those trained and 0.5 of MODEL's" in card
+    assert "The weights are 0.8 of those trained and 0.2 of MODEL's" in card
     assert "what MODEL takes for a ball" in card and "and drawn balls over photographs" in card
     plain = card_text(Card(Training((1,)), SceneSource(9), "cpu", (0.5,) * 5, 1, 1, "", 5, report))
     assert "photographs" not in plain and "--every" not in plain and "seeds 0 to 8," in plain
