@@ -107,14 +107,16 @@ def test_without_a_track_only_a_target_in_doubt_gets_a_second_look(monkeypatch):
 
 
 def stub(*looks, options=None):
-    """A detector whose model gives in turn each of `looks`: ((x, y), score, label number or 0), squares of 60 px."""
+    """A detector whose model gives in turn each of `looks`: ((x, y), score, label number or 0), squares of 60 px of
+    an image of 320x240."""
     detector = build_detector("onnx", options or {}, VisionConfig(detector=DetectorConfig(device="cpu")))
     waiting = [*looks]
 
     def run(_pixels):
         boxes = waiting.pop(0)
         corners = [[x - 30.0, y - 30.0, x + 30.0, y + 30.0] for (x, y), *_ in boxes]
-        return {"boxes": np.float32(corners).reshape(-1, 4), "scores": np.float32([one[1] for one in boxes]),
+        scale = detector._form.size[1] / 320
+        return {"boxes": scale * np.float32(corners).reshape(-1, 4), "scores": np.float32([one[1] for one in boxes]),
                 "labels": np.float32([one[2] if len(one) > 2 else 0 for one in boxes])}
 
     detector._engine.run = run
