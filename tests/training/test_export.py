@@ -137,7 +137,7 @@ def test_a_round_of_harder_pictures_has_more_clear_ones_and_more_bad_ones():
 
     def kinds(which):
         pictures = [sample(scenes, which, (1, 0, place), WHOLE_PX).image.astype(int) for place in range(150)]
-        sharp = [np.abs(np.diff(one.mean(0))).max() > 60 for one in pictures]
+        sharp = [np.abs(np.diff(one.mean(0))).max() > 60 * WIDTH_PX / WHOLE_PX[0] for one in pictures]
         bright = [one.mean() > 100 for one in pictures]
         both = list(zip(sharp, bright, strict=True))
         return both.count((True, True)), both.count((False, False))

@@ -25,7 +25,7 @@ def test_a_seed_always_gives_the_same_scene():
 
 
 def test_scenes_show_balls_of_all_sizes_and_some_none():
-    scenes = [photo_scene(photographs(), seed) for seed in range(28)]
+    scenes = [photo_scene(photographs(), seed) for seed in range(70)]
     truths = [one for scene in scenes for one in scene.truths]
     assert {one.label for one in truths} == {"ball"} and all(one.seen >= 1 - MOST_HIDDEN for one in truths)
     sizes = [max(one.box[2] - one.box[0], one.box[3] - one.box[1]) for one in truths]
