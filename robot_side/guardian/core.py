@@ -23,7 +23,7 @@ FAILED: Final = b"f"
 PERIOD_US: Final = 100_000
 """Between two looks at a driver: each wakes the guardian, and the end of a driver wakes it without a look."""
 LATE_US: Final = 25_000
-"""Silence of a driver that is late, and then the time between two looks; the loop sends a heartbeat at least every 20 ms."""
+"""Silence of a driver that is late, and then the time between two looks; the loop sends a heartbeat within 20 ms."""
 HUNG_US: Final = 200_000
 """Silence in the driver's own time after which it counts as hung."""
 STARVED_US: Final = 500_000
