@@ -44,7 +44,7 @@ from sightline.training.schedule import SceneRange
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.onnx.detector import digest_of
 from sightline.vision_side.detect.onnx.engine import open_engine
-from sightline.vision_side.detect.onnx.tensors import fit_picture, model_format, read_outputs
+from sightline.vision_side.detect.onnx.tensors import TILE_SHARE, fit_picture, model_format, read_outputs
 from sightline.vision_side.detect.port import corners, overlap
 
 _SLICE: Final = 100
@@ -261,10 +261,10 @@ CUT_PX: Final = (192, 144)
 whole image."""
 WHOLE_PX: Final = INPUT_PX
 _ENLARGED: Final = WHOLE_PX[0] / WIDTH_PX
-_SECOND_LOOK: Final = 2.0
-"""How much larger the network sees the part of an image that gets a second look ..."""
-_LIKE_IT: Final = 0.25
-"""... and the share of the cut-outs over photographs that it sees as large."""
+_ENLARGED_AGAIN: Final = _ENLARGED / TILE_SHARE
+"""In a second look."""
+_AS_AGAIN: Final = 0.25
+"""Share of the cut-outs over photographs that are as large as in a second look."""
 _LEAST_LEFT: Final = 0.4  # of an object's box after the cut; with less left it is neither right nor wrong
 _NEW: Final = 0.5  # of the samples of a harder round: drawn from the scenes that it adds alone
 _AROUND_OTHERS: Final = 0.3  # of those samples: cut around distractors, where others are around objects
@@ -306,7 +306,7 @@ def sample(
         number, around, column = _photo(draw, scenes)
     else:
         number, around, column = (_harder if shown.harder else _plain)(draw, scenes, shown)
-    enlarged = _SECOND_LOOK if is_photo and draw.random() < _LIKE_IT else _ENLARGED
+    enlarged = _ENLARGED_AGAIN if is_photo and draw.random() < _AS_AGAIN else _ENLARGED
     cut_px = round(size_px[0] / enlarged), round(size_px[1] / enlarged)
     corner = left, top = _cut(draw, around, cut_px)
     rgb = scenes.pictures[number][top : top + cut_px[1], left : left + cut_px[0]]

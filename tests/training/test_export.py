@@ -243,6 +243,28 @@ def test_scenes_over_photographs_are_half_of_what_is_shown(tmp_path, photographs
     assert all(one.known.tolist() == [1, 0, 0, 0, 0, 1] for one in over_photos)  # balls and other things only
 
 
+def test_a_quarter_of_what_is_over_photographs_is_as_large_as_in_a_second_look(monkeypatch):
+    picture = np.full((2, HEIGHT_PX, WIDTH_PX, 3), 40, np.uint8)
+    picture[:, 100:120, 150:170] = 220
+    ball = LabelledBox("ball", (150.0, 100.0, 170.0, 120.0), 1.0)
+    scenes = DrawnScenes(picture, ((), (ball,)), ((), ()), ((), ()), 1)
+    cuts, cut = [], module._cut
+    monkeypatch.setattr(module, "_cut", lambda draw, boxes, size_px: cuts.append(size_px) or cut(draw, boxes, size_px))
+    over_photos, whole = [], 0
+    for one in (sample(scenes, SceneRange(0, 1), (4, 0, place), CUT_PX) for place in range(400)):
+        over_photos += [cuts[-1]] * (not one.known.all())
+        for _, row, column in np.argwhere(one.heat[:1] == 1.0):
+            left, top, right, bottom = (round(edge) for edge in decoded(one, row, column))
+            if left < 8 or top < 1 or right > CUT_PX[0] - 1 or bottom > CUT_PX[1] - 1:
+                continue
+            assert (right - left) / 20 == CUT_PX[0] / cuts[-1][0]
+            inside, beside = (one.image[:, top:bottom, first:last].mean() for first, last in ((left, right), (0, left)))
+            assert inside > beside + 15, "the box is where the picture has it"
+            whole += 1
+    assert whole > 60 and set(over_photos) == {(160, 120), (96, 72)} and set(cuts) == set(over_photos)
+    assert 0.15 < over_photos.count((96, 72)) / len(over_photos) < 0.35
+
+
 def test_false_balls_of_a_model_become_other_things():
     ball, other, hidden = (10.0, 10.0, 50.0, 50.0), (200.0, 100.0, 240.0, 140.0), (100.0, 150.0, 140.0, 190.0)
     rgb = np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8)
