@@ -1,7 +1,7 @@
 """Settings, samples, figures and bounds of a race. Pure."""
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -189,6 +189,15 @@ def changes_us(rows: Sequence[WheelCommand]) -> list[int]:
     return [row.t_us for before, row in pairwise(rows) if row[1:] != before[1:]]
 
 
+def repeats_us(commands: Sequence[tuple[int, str]]) -> set[int]:
+    """Return the times of the images whose command equals the one before.
+
+    `commands` are (time of the image, `linear|angular`), in order. A repeated command sets the speeds that the wheels
+    have, so that no line of the motor log shows when: the next change is that of the next command.
+    """
+    return {t_us for (_, before), (t_us, command) in pairwise(commands) if command == before}
+
+
 class WheelAge(NamedTuple):
     """Age of the image of an accepted command, at `drive.set` and at the validation."""
 
@@ -215,14 +224,15 @@ def wheel_ages(headers: Sequence[Header], sets_us: Sequence[int]) -> Iterator[Wh
 
 def course_of_headers(
     headers: Sequence[Header], accepted: Sequence[Accepted], sets_us: Sequence[int], begin_us: int, end_us: int,
-    *, copies: float,
+    *, copies: float, repeated_us: Container[int] = (),
 ) -> Course:
     """Return the course of the services: ages at the wheels, and the driver's count of accepted commands.
 
-    The vision service sent `copies` commands for each image, on average.
+    The vision service sent `copies` commands for each image, on average. The ages of `repeated_us` are unknown.
     """
     inside = [header for header in headers if begin_us <= header[1] < end_us]
-    ages = [age for age in wheel_ages(headers, sets_us) if begin_us <= age.set_us < end_us]
+    ages = [age for age in wheel_ages(headers, sets_us)
+            if begin_us <= age.set_us < end_us and age.set_us - age.age_us not in repeated_us]
     if not ages or not inside:
         return Course(0, 0.0, ())
     lag_us = round(median(age.validated_us for age in ages))
@@ -254,7 +264,8 @@ BEHIND_ZENOH_MS: Final = 0.3
 MOST_WAIT_MS: Final = 5.0
 """Of a command for `drive.set`, from its validation."""
 KNOWN_WAIT_SHARE: Final = 0.9
-"""Of the captured images: so many commands must have a known wait. Of two between two headers only one is known."""
+"""Of the captured images: so many commands must have a known wait. Of two between two headers only one is known; of one
+that repeats the command before, none."""
 CPU_MS: Final = 1.5
 """Per image: of all processes of the robot, and of vision."""
 CPU_OVER_FLOOR_MS: Final = 0.6

@@ -15,6 +15,7 @@ from sightline.benchmarks.loop.figures import (
     changes_us,
     course_of_headers,
     read_wheel_commands,
+    repeats_us,
 )
 from sightline.evaluation.processes import Processes, free_port
 from sightline.protocol.channels import STATUS
@@ -51,7 +52,8 @@ class Ours:
         noted = json.loads(self.tally.read_text())
         headers = [(seq, t_us, latency_us) for seq, t_us, latency_us in noted["headers"]]
         sets_us = changes_us(read_wheel_commands(self.wheels.read_text("ascii")))
-        return course_of_headers(headers, self.accepted, sets_us, begin_us, end_us, copies=noted["copies"])
+        return course_of_headers(headers, self.accepted, sets_us, begin_us, end_us, copies=noted["copies"],
+                                 repeated_us=repeats_us(noted["commands"]))
 
 
 def endpoint_of(transport: str, port: int) -> str:

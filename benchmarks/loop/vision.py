@@ -22,7 +22,7 @@ from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.port import DetectFrame, DetectionResult, Detector
 from sightline.vision_side.detect.registry import configured_detector
-from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline
+from sightline.vision_side.pipeline import SOURCE, Frame, Pipeline, PipelineAnswer
 from sightline.vision_side.serving.service import Service
 
 
@@ -113,7 +113,7 @@ def _step_ms(eyes: PipelineVision, pictures: Path) -> float:
     return median(took_ms)
 
 
-# The vision service with a tap: it records the frame headers, and may be slow. Shell.  `python -m
+# The vision service with a tap: it records frame headers and commands, and may be slow. Shell.  `python -m
 # sightline.benchmarks.loop.vision SETTINGS`. The service is `sightline.vision_side.serving.service.Service` as it is;
 # the tap costs an append per frame, and only a detector made slow is put into its pipeline.
 
@@ -126,19 +126,26 @@ def _say(line: str) -> None:
 
 
 class TappedService(Service):
-    """Remembers the header of every frame it was given."""
+    """Remembers the header of every frame it was given, and its own commands."""
 
     def __init__(self, config: VisionConfig, link: Link, delay_ms: float, busy_ms: float) -> None:
         super().__init__(config, link, _say, delayed_detector(config, delay_ms, busy_ms))
         self.headers: list[bytes] = []
+        self.commands: list[tuple[int, str]] = []
 
     def _frame(self, message: Message, started_ns: int) -> None:
         self.headers.append(message.header)
         super()._frame(message, started_ns)
 
+    def _publish(self, header: FrameHeader, answer: PipelineAnswer, compute_us: int) -> None:
+        super()._publish(header, answer, compute_us)
+        if answer.twist is not None:
+            self.commands.append((header.t_us, format_twist(answer.twist).decode()))
+
 
 def main(settings: dict[str, object]) -> None:
-    """Serve until SIGTERM, then write the headers as (seq, t_us, latency_us), and the commands sent per image."""
+    """Serve until SIGTERM. Then write headers as (seq, t_us, latency_us), commands as (time of the image, text), and
+    the number of these that were sent per image."""
     config = contestant_config(robot=settings["robot"], connect=settings["connect"])
     ending = threading.Event()
     with open_link(config.robot, connect=config.connect, role=SOURCE) as link:
@@ -150,7 +157,8 @@ def main(settings: dict[str, object]) -> None:
     headers = [decode(FrameHeader, header, MAX_HEADER_BYTES) for header in service.headers]
     rows = [(header.seq, header.t_us, header.latency_us) for header in headers]
     copies = max(1, service.sender.twists) / max(1, service.steered)
-    Path(str(settings["tally"])).write_text(json.dumps({"headers": rows, "copies": copies}))
+    noted = {"headers": rows, "copies": copies, "commands": service.commands}
+    Path(str(settings["tally"])).write_text(json.dumps(noted))
 
 
 if __name__ == "__main__":

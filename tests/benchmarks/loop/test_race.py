@@ -30,6 +30,7 @@ from sightline.benchmarks.loop.figures import (
     loop_checks,
     peers_of,
     percentile,
+    repeats_us,
     size_of,
     wheel_ages,
 )
@@ -141,6 +142,22 @@ def test_wheels_count_from_the_line_that_carries_the_new_command(turned, late_ms
     assert [round((age.age_us - age.validated_us) / MS) for age in ages[1:]] == late_ms
 
 
+@given(st.lists(st.integers(0, 2), min_size=3, max_size=40), st.sampled_from([400, 7 * MS]))
+def test_wait_of_a_command_that_repeats_the_one_before_is_unknown(numbers, wait_us):
+    """No line of the motor log shows it: the next change is that of a later command. All others have their own wait."""
+    commands = [(seq * 33 * MS, f"0.5000|{number}.0000") for seq, number in enumerate([*numbers, 3])]
+    headers = [(0, 0, None), *((seq + 1, (seq + 1) * 33 * MS, 3 * MS + seq) for seq in range(len(commands)))]
+    lines = [WheelCommand(-1, -1.0, 0.0)]
+    for seq, (t_us, text) in enumerate(commands):
+        lines.append(WheelCommand(t_us + 3 * MS + seq + wait_us, float(text.partition("|")[2]), 0.0))
+    course = course_of_headers(headers, [], changes_us(lines), 0, headers[-1][1], copies=1.0,
+                               repeated_us=repeats_us(commands))
+    waits_us = [age_us - validated_us for (_, age_us), validated_us in
+                zip(course.ages_us, course.validated_us, strict=True)]
+    repeats = sum(one[1] == other[1] for one, other in pairwise(commands))
+    assert waits_us == [wait_us] * (len(commands) - repeats)
+
+
 @pytest.mark.parametrize(("tick_us", "ok"), [(1, True), (20 * MS, False)])
 def test_driver_whose_commands_wait_for_its_tick_fails(tick_us, ok):
     """900 commands that arrive at any phase of the tick; a driver that wakes for a command has a tick of 1 us."""
@@ -165,7 +182,7 @@ def test_longest_wait_of_few_commands_does_not_count(known, ok):
 def test_dead_wheels_have_no_course(tmp_path, radius, ages):
     rows = header_rows(100)
     ours = Ours({}, (), "", tmp_path / "tally", tmp_path / "wheels", list(statuses(rows)))
-    ours.tally.write_text(json.dumps({"headers": rows, "copies": 1.0}))
+    ours.tally.write_text(json.dumps({"headers": rows, "copies": 1.0, "commands": []}))
     ours.wheels.write_text("".join(f"{t_us},{radius * t_us},0.0\n" for t_us in SETS_US))
     assert len(ours.course(0, rows[-1][1] + 1).ages_us) == ages
 
