@@ -194,7 +194,7 @@ def detectors(
     ] = None,
     *,
     frames: Annotated[
-        int | None, typer.Option(min=1, max=100_000, help="Scenes in each column [default: 100; with --demand 500].")
+        int | None, typer.Option(min=1, max=100_000, help="Scenes in each column [default: 100; with --demand 1000].")
     ] = None,
     seeds: Annotated[int, typer.Option(min=0, max=10**9, metavar="FROM", help="Seed of the first scene.")] = FROM,
     column: Annotated[str, typer.Option(help=_COLUMN)] = "all",
