@@ -14,7 +14,7 @@ from sightline.sim.scenes.model import LABELS
 
 INPUT_PX: Final = (384, 288)
 """Width and height of the input: images of 320x240 are enlarged, which finds more small balls at as many false ones,
-for 1.4 times the time. Decision 14; `sightline.onnx` is from before and has 320x240."""
+for 1.4 times the time. Decision 14."""
 STRIDE: Final = 4
 """Pixels to one cell of the heat map, each way."""
 SIZE_PX: Final = 16.0

@@ -53,7 +53,7 @@ Metrics = Annotated[
 ]
 _REMOTE = ("zenoh", "boxes")
 _RECOMMENDED = (
-    ("balls, legs and traffic lights", "onnx; for balls in real rooms, onnx:rooms"),
+    ("balls, legs and traffic lights", "onnx"),
     ("people and the other 79 labels of COCO", "onnx:nanodet"),
     ("an exported YOLO or another ONNX file", "onnx:FILE"),
     ("a PyTorch model", "torch:FILE, or torch:package.module:Class"),

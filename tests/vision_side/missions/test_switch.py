@@ -123,7 +123,7 @@ def test_a_mission_that_cannot_even_begin_is_over():
 # --- in the pipeline -------------------------------------------------------------------------------------------------
 
 
-BALL = jpeg_of(scene(CAMERA, 1.0, 0.2))
+BALL = jpeg_of(scene(CAMERA, 1.0, 0.2, shaded=True))
 LARGE = jpeg_of(np.full((480, 640, 3), 140, np.uint8))
 
 

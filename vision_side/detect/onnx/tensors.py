@@ -367,6 +367,8 @@ _USUAL, _PALE, _COLORLESS = 0.077, 0.04, 0.005
 _MOST_VIVID = 3.3
 TILE_SHARE: Final = 0.6
 """Of the image's sides: the sides of a tile."""
+_SMALL_SHARE: Final = 24 / 320
+"""Of the image's width: a narrower thing in doubt is enlarged. A wider one gains nothing by that."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,6 +378,8 @@ class ImageTile:
     picture: DecodedImage
     left_px: int
     top_px: int
+    is_mirrored: bool = False
+    """Left and right are swapped in it, which must then show the whole image."""
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -386,7 +390,8 @@ class ImageTile:
     def shows_all(self, one: Detection) -> bool:
         """Return True if `one`, in px of this tile, is clear of its border: it may go on beyond."""
         width, height = self.size_px
-        return one.x1_px > 1 and one.y1_px > 1 and one.x2_px < width - 1 and one.y2_px < height - 1
+        is_clear = one.x1_px > 1 and one.y1_px > 1 and one.x2_px < width - 1 and one.y2_px < height - 1
+        return is_clear or self.is_mirrored
 
     def holds(self, one: Detection) -> bool:
         """Return True if `one`, in px of the whole image, is clear of the border of this tile."""
@@ -395,6 +400,10 @@ class ImageTile:
 
     def in_image(self, one: Detection) -> Detection:
         """Return a detection in this tile in px of the whole image."""
+        if self.is_mirrored:
+            width = self.size_px[0]
+            circle = one.circle and replace(one.circle, cx_px=width - one.circle.cx_px)
+            return replace(one, x1_px=width - one.x2_px, x2_px=width - one.x1_px, circle=circle)
         circle = one.circle and _moved(one.circle, np.array([-self.left_px, -self.top_px]), 1.0)
         return replace(one, x1_px=one.x1_px + self.left_px, y1_px=one.y1_px + self.top_px,
                        x2_px=one.x2_px + self.left_px, y2_px=one.y2_px + self.top_px, circle=circle)
@@ -419,3 +428,11 @@ def tile_about(picture: DecodedImage, place_px: tuple[float, float]) -> ImageTil
     top = min(max(0, round(place_px[1] / picture.scale - height / 2)), rows - height)
     part = np.ascontiguousarray(picture.bgr[top : top + height, left : left + width])
     return ImageTile(DecodedImage(part, picture.scale), left * picture.scale, top * picture.scale)
+
+
+def view_again(picture: DecodedImage, one: Detection) -> ImageTile:
+    """Return an image in which a thing in doubt looks different: a small one is enlarged, another one mirrored."""
+    tile = tile_about(picture, one.center_px)
+    if (one.x2_px - one.x1_px) < _SMALL_SHARE * picture.bgr.shape[1] * picture.scale and tile.holds(one):
+        return tile
+    return ImageTile(DecodedImage(np.ascontiguousarray(picture.bgr[:, ::-1]), picture.scale), 0, 0, is_mirrored=True)

@@ -36,7 +36,7 @@ def found(one, jpeg, answers=None, wanted="", expected_px=None):
     frame.goes_by, frame.expected_px = lambda label: is_followable(label, wanted), expected_px
     if answers is not None:
         boxes, scores, labels = (np.array(part, np.float32) for part in zip(*answers, strict=True))
-        one._engine.run = lambda _pixels: {"boxes": boxes, "scores": scores, "labels": labels}
+        one._engine.run = lambda _pixels: {"boxes": boxes * one._form.size[1] / 320, "scores": scores, "labels": labels}
     (result,) = one.detect([frame], NO_DEADLINE)
     return [(each.label, round(each.x1_px), round(each.score, 2)) for each in result.detections]
 
@@ -70,7 +70,7 @@ def test_the_second_look_has_the_bonus_too():
     colored = detector(refine=[], second_look=True)
     looks = iter([0.1, 0.4])
     colored._engine.run = lambda _pixels: {
-        "boxes": np.float32([[100, 80, 160, 140]]), "scores": np.float32([next(looks)]), "labels": np.float32([BALL])}
+        "boxes": np.float32([[120, 96, 192, 168]]), "scores": np.float32([next(looks)]), "labels": np.float32([BALL])}
     image = np.full((240, 320, 3), 110, np.uint8)
     image[80:160, 110:190] = (30, 210, 230)
     assert found(colored, jpeg_of(image), expected_px=(160.0, 120.0)) == [("ball", 124, 0.7)]
