@@ -101,6 +101,7 @@ SECTIONS: Final = (
         "`Pipeline.step` with decoding, and the network of the learned detector: hot, one thread. Medians count. The "
         "best round of a dozen frames is the time while a shared machine is least disturbed.",
         ("bench", "pipeline"),
+        since="2026-11-30",
     ),
     Section(
         "loop",
@@ -130,7 +131,7 @@ SECTIONS: Final = (
         "Five thousand commands",
         "The longest time from the validation of a command to its `drive.set`: no command waits for a tick.",
         ("bench", "loop", "--peers", "none", "--seconds", "168"),
-        since="2026-11-28",
+        since="2026-11-29",
     ),
     Section(
         "loop-slow",
