@@ -240,8 +240,7 @@ def scene_result(result: DetectionResult | None, scene: Scene, balls: Sequence[s
 
 
 FRAMES: Final = 1000
-"""A fifth shows no ball. In 100 of those, a detector with 2 % of false alarms exceeds 5 % once in 65 times, and one
-with 8 % stays within it once in five or six; in 200 once in 395, and once in 14."""
+"""A fifth shows no ball. Decision 14 has the reason for the number."""
 LEAST_HITS: Final = {
     "nominal": 0.85, "same-colour boxes": 0.78, "changed light": 0.80, "blur": 0.75, "quality 30": 0.78,
     "all at once": 0.68,

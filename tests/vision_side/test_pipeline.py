@@ -231,7 +231,7 @@ def test_a_new_robot_session_starts_from_nothing() -> None:
     assert again == pipeline().step(Frame(header(1, "0000beef"), BALL))
 
 
-@settings(max_examples=30)
+@settings(max_examples=40)
 @given(pictures=st.lists(st.one_of(st.binary(max_size=300), st.sampled_from([BALL, EMPTY, BALL[:500]])), max_size=12),
        times=st.lists(st.integers(0, 2**53 - 1), min_size=12, max_size=12))
 def test_any_bytes_and_any_times_are_answered(pictures: list[bytes], times: list[int]) -> None:

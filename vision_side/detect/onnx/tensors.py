@@ -368,7 +368,7 @@ _MOST_VIVID = 3.3
 TILE_SHARE: Final = 0.6
 """Of the image's sides: the sides of a tile."""
 _SMALL_SHARE: Final = 24 / 320
-"""Of the image's width: a narrower thing in doubt is enlarged. A wider one gains nothing by that."""
+"""Of the image's width: a narrower thing in doubt is enlarged. Decision 14 compares it with other rules."""
 
 
 @dataclass(frozen=True, slots=True)

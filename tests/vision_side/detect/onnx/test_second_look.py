@@ -120,6 +120,12 @@ def test_without_a_track_the_second_look_counts_for_each_target_with_its_own_sco
         ("legs", 40, 0.8), ("ball", 270, 0.6), ("ball", 50, 0.56)], "nothing of the second look alone"
 
 
+@pytest.mark.parametrize(("again", "count"), [(1, 1), (3, 0)])
+def test_a_light_of_another_state_in_the_second_look_is_another_thing(again, count):
+    detector, waiting = stub([(PLACE, 0.6, 1)], [(PLACE, 0.9, again)])
+    assert len(found(detector, camera(320, 240), GRAY)) == count and waiting == []
+
+
 @pytest.mark.parametrize(("where", "width_px"), [((3.0, 90.0), 12.0), ((30.0, 110.0), 60.0), ((160.0, 60.0), 240.0)])
 def test_a_target_at_the_border_and_a_large_one_are_mirrored_for_the_second_look(where, width_px):
     detector, waiting = stub([(where, 0.6, 0, width_px)], [((320 - where[0], where[1]), 0.6, 0, width_px)])
