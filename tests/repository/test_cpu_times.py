@@ -62,10 +62,22 @@ def test_where_it_is_not_demanded_the_slowest_are_only_named(tmp_path):
     assert slowest.count("test_it.py::") == 4 and "test_only_waits" not in slowest
 
 
+def _a_little():
+    sum(range(100))
+
+
+def _a_process():
+    subprocess.run([sys.executable, "-S", "-c", "sum(range(100_000))"], check=True)
+
+
 def test_a_slower_machine_has_a_higher_bound(monkeypatch):
     from tests.fixtures import cpu_times
 
     assert slowness() >= 1.0
+    works = {_a_little: 60.0, _a_process: 0.0001}  # slow at one kind of work only, first or last
+    for either in (works, dict(reversed(works.items()))):
+        monkeypatch.setattr(cpu_times, "REFERENCE_S", either)
+        assert slowness() > 10
     monkeypatch.setenv("TESTS_DEMAND", "cpu")
     item = type("Item", (), {"nodeid": "x", "get_closest_marker": lambda self, name: None})()
     monkeypatch.setattr(cpu_times, "slowness", lambda: 1.9)
