@@ -158,12 +158,17 @@ class Setup:
         """Install the locked packages and Sightline itself, editable, and compile the tests once."""
         with tempfile.TemporaryDirectory(prefix="sightline-") as folder:
             pinned = list(entries(without(self.lock.read_text(), "pybullet") if wheel else self.lock.read_text()))
-            parts = [Path(folder) / f"part{number}.txt" for number in range(PIPS)]
-            for number, part in enumerate(parts):
-                part.write_text("".join(pinned[number::PIPS]))
-            self.phase("installing packages", *(
+            # By itself, because one pip must not replace it while another one builds a package with it.
+            first = [entry for entry in pinned if name_of(entry) == "setuptools"]
+            others = [entry for entry in pinned if entry not in first]
+            parts = [Path(folder) / f"part{number}.txt" for number in range(1 + PIPS)]
+            for part, chosen in zip(parts, (first, *(others[number::PIPS] for number in range(PIPS))), strict=True):
+                part.write_text("".join(chosen))
+            setuptools, *pips = (
                 self.pip_command("install", "--require-hashes", "--no-deps", "--no-compile", "-r", part)
-                for part in parts), progress=self.installed)
+                for part in parts)
+            self.phase("installing setuptools", setuptools)
+            self.phase("installing packages", *pips, progress=self.installed)
             if wheel:
                 self.pip("installing PyBullet", "install", "--no-deps", "--no-index", "--no-compile", wheel)
             # Metadata and build files of the package belong to neither the checkout nor an earlier build.

@@ -153,6 +153,17 @@ def test_environment_is_set_up_once(stored, venv, calls):
     assert set_up("test", venv).returncode == 0 and (venv / ".test").exists()
 
 
+def test_no_pip_replaces_setuptools_while_another_one_runs(stored, venv, tmp_path, monkeypatch):
+    """A pip that builds a package in that moment fails: setuptools is not available in the build environment."""
+    seen = tmp_path / "seen"
+    note = f"if grep -q ^setuptools== $last; then kind=setuptools; fi; echo ${{kind:-others}} >> {seen}; sleep 0.3"
+    monkeypatch.setenv("FAKE_PIP", f"for last; do :; done; {note}; echo end >> {seen}")
+    assert set_up("test", venv).returncode == 0
+    text = seen.read_text().split()
+    assert text[:2] == ["setuptools", "end"] and "setuptools" not in text[2:]
+    assert text[2:6] == ["others", "others", "end", "end"]
+
+
 def test_a_copy_of_sightline_is_replaced_by_the_folder_itself(stored, venv, calls):
     """`pip install '.[metrics]'` in this environment makes a copy, which changes no stamp."""
     assert set_up("demo", venv).returncode == 0
@@ -180,13 +191,13 @@ def test_interrupted_set_up_leaves_no_stamp_and_no_process(stored, venv, calls, 
 @pytest.mark.parametrize(("output", "expected"), [
     ("ERROR: Could not install packages due to an OSError: [Errno 28] No space left on device", "the disk is full; "),
     ("ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM THE REQUIREMENTS FILE.", "does not match its hash"),
-    ("ERROR: Something else\\n\\n[notice] a new release of pip", "installing packages: Something else; full output"),
+    ("ERROR: Something else\\n\\n[notice] a new release of pip", "installing setuptools: Something else; full output"),
 ])
 def test_failed_pip_gives_one_line_and_no_stamp(stored, venv, monkeypatch, output, expected):
     monkeypatch.setenv("FAKE_PIP", f"printf '{output}'; exit 1")
     done = set_up("demo", venv)
     (line,) = done.stderr.splitlines()
-    assert done.returncode == 2 and line.startswith("error: installing packages: ") and expected in line
+    assert done.returncode == 2 and line.startswith("error: installing setuptools: ") and expected in line
     assert line.endswith(f"full output in {venv}/setup.log")
     assert output.split("\\n")[0] in (venv / "setup.log").read_text() and not (venv / ".demo").exists()
 
@@ -244,7 +255,7 @@ def test_compiled_pybullet_is_stored_and_used_again(environment, venv, tmp_path,
     monkeypatch.setenv("FAKE_PIP", copy)
     environment.Setup("test", venv).run()
     parts = [path.read_text() for path in tmp_path.glob("part*.txt")]
-    assert len(parts) == 2 and "pybullet" not in "".join(parts)
+    assert len(parts) == 3 and "pybullet" not in "".join(parts)
     entries = [entry for part in parts for entry in environment.entries(part)]
     assert sorted(entries) == sorted(environment.entries(environment.without(ALL.read_text(), "pybullet")))
     text = calls.read_text()
