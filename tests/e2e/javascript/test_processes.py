@@ -55,6 +55,7 @@ def our_vision(tmp_path):
 def test_our_vision_and_operator_drive_and_stop_the_javascript_robot(tmp_path, our_vision):
     with JsRobot(tmp_path) as robot:
         our_vision(robot)
+        assert until(lambda: status(robot)["refused"].get("DISARMED"), START_S), "vision sends commands"
         armed = sightline("arm", "js1", "--connect", robot.endpoint)
         assert "armed" in armed
         assert robot.says(r"ACTIVE \(driving\)")
