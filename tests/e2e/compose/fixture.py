@@ -24,12 +24,20 @@ DEFAULT = "plain"
 IMAGES = {service["image"]: name for name, service in reversed(SERVICES.items())}
 """Every image, and the first service that is made of it."""
 
+# A simulation that is behind the clock gives old images, and its robot stands: only then, not for another cause.
 _TRUTH = """
+from sightline.protocol.clock import monotonic_us
 from sightline.sim.bus import TruthReader
-reader = TruthReader("/run/sightline")
-for _ in range(250):
+reader, rows = TruthReader("/run/sightline"), []
+for _ in range(3000):
     truth = reader.read(1.0)
-    print(truth.bearing_rad, truth.distance_m, truth.linear_mps)
+    if monotonic_us() - truth.t_us > 300_000:
+        rows.clear()
+    rows.append((truth.bearing_rad, truth.distance_m, truth.linear_mps))
+    if len(rows) == 400:
+        break
+for row in rows[-250:]:
+    print(*row)
 """
 
 
@@ -141,9 +149,9 @@ class Containers:
             self._containers = {line.split()[0]: line.split()[1] for line in listed.stdout.splitlines()}
         return self._containers[service]
 
-    def inside(self, service: str, *command: str) -> str:
+    def inside(self, service: str, *command: str, timeout_s: float = 30.0) -> str:
         """Return the output of a command inside a service's container."""
-        done = ask("docker", "exec", self.container(service), *command)
+        done = ask("docker", "exec", self.container(service), *command, timeout_s=timeout_s)
         assert done.returncode == 0, done.stderr
         return done.stdout
 
@@ -160,8 +168,9 @@ class Containers:
         return until(lambda: self.state(robot) in ("ACTIVE", "DEGRADED"), 40)
 
     def truth(self, sim: str) -> list[list[float]]:
-        """Five seconds of the world's own account: bearing, distance, the robot's speed."""
-        lines = self.inside(sim, "python", "-c", _TRUTH).splitlines()
+        """The world's own account: bearing, distance, the robot's speed in the last five of the first eight seconds
+        in which the simulation keeps up with the clock. Waits a minute for them."""
+        lines = self.inside(sim, "python", "-c", _TRUTH, timeout_s=90.0).splitlines()
         return [[float(word) for word in line.split()] for line in lines]
 
     def replicas(self, service: str) -> list[str]:
