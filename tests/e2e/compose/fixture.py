@@ -24,7 +24,7 @@ DEFAULT = "plain"
 IMAGES = {service["image"]: name for name, service in reversed(SERVICES.items())}
 """Every image, and the first service that is made of it."""
 
-# A simulation that is behind the clock gives old images, and its robot stands: only then, not for another cause.
+# The images of a simulation that is behind the clock are old, so its robot must stand: those seconds do not count.
 _TRUTH = """
 from sightline.protocol.clock import monotonic_us
 from sightline.sim.bus import TruthReader
@@ -36,7 +36,7 @@ for _ in range(3000):
     rows.append((truth.bearing_rad, truth.distance_m, truth.linear_mps))
     if len(rows) == 400:
         break
-for row in rows[-250:]:
+for row in rows[150:400]:
     print(*row)
 """
 
