@@ -20,9 +20,9 @@ export const DRAWN_CAMERA = Object.freeze({
   z_m: CAMERA_HEIGHT_M, calibrated: true,
 });
 
-/** Where the ball is: it goes round the place where the robot started, once in 40 s. */
+/** Where the ball is: it swings in front of the place where the robot started, and in its sight, once in 20 s. */
 export function ballAt(t_us) {
-  const angle_rad = (t_us / 40e6) * 2 * Math.PI;
+  const angle_rad = 0.5 * Math.sin((t_us / 20e6) * 2 * Math.PI);
   return { x_m: 1.5 * Math.cos(angle_rad), y_m: 1.5 * Math.sin(angle_rad) };
 }
 

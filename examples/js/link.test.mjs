@@ -9,8 +9,8 @@ import { Outbox, PeerError, helloText, messageBound, pack, packRaw, readHello, u
 import { FrameReader, OPCODE, closePayload, encodeFrame } from "./rfc6455.mjs";
 import { Robot } from "./robot.mjs";
 import { Stream } from "./stream.mjs";
-import { Vision } from "./vision.mjs";
-import { DRAWN_CAMERA, drawPicture } from "./drawing.mjs";
+import { Vision, findTarget } from "./vision.mjs";
+import { DRAWN_CAMERA, ballAt, drawPicture } from "./drawing.mjs";
 import { decodeDc } from "./jpeg_dc.mjs";
 import { admissionProblem } from "./websocket.mjs";
 
@@ -244,6 +244,13 @@ test("a bad picture is acknowledged, a newer frame replaces one that waits", asy
   await working;
   assert.deepEqual(sent.map(([, seq]) => seq), [1, 2, 4]);
   assert.equal(eyes.skipped.OUT_OF_ORDER, 1);
+});
+
+test("the drawn ball is in sight of a robot that stands, at any time", () => {
+  for (let t_us = 0; t_us < 40e6; t_us += 700e3) {
+    const { width, height, scale, rgb } = decodeDc(drawPicture({ x_m: 0, y_m: 0, yaw_rad: 0 }, ballAt(t_us)));
+    assert.notEqual(findTarget({ width, height, scale, data: rgb, channels: 3 }), null, `after ${t_us / 1e6} s`);
+  }
 });
 
 test("a JPEG cut anywhere is refused, not decoded", () => {
