@@ -12,9 +12,11 @@ from hypothesis import settings
 
 from sightline.protocol import log
 from tests.fixtures import own_process
-from tests.fixtures.cpu_times import CpuTimes
+from tests.fixtures.cpu_times import CpuTimes, slowness
 
 SECOND_TIER = Path(__file__).with_name("second_tier.txt")
+_SLOW = 1.5
+"""A machine that needs this many times the CPU time of the reference is slow."""
 
 # A test that measures no time has no bound on it: other processes of the machine would decide.
 settings.register_profile("tests", deadline=None)
@@ -47,8 +49,12 @@ def pytest_collection():
 
 
 def pytest_xdist_auto_num_workers(config):
-    """Three workers for each processor, since most tests wait; fewer where tests start several processes."""
-    of_each = {"slow": 2, "long": 1}.get(config.option.markexpr.partition(" ")[0], 3)
+    """Three workers for each processor, since most tests wait; fewer where tests start several processes.
+
+    On a slow machine two tests of several processes that share a processor make one another miss what is real time.
+    """
+    tier = config.option.markexpr.partition(" ")[0]
+    of_each = {"slow": 1 if tier == "slow" and slowness() >= _SLOW else 2, "long": 1}.get(tier, 3)
     return of_each * len(os.sched_getaffinity(0))
 
 
