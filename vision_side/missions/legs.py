@@ -1,7 +1,7 @@
 """Mission `legs`: follow two legs that walk, by boxes of legs and a lidar. Pure.
 
-A box around both legs gives the direction. The lidar echoes within its span give the distance, at the center between
-the legs, which moves steadily while the legs swing. All further steps are those of `follow`.
+The lidar echoes within the span of a box around both legs give the place of each leg. The robot follows the middle
+between them, which moves steadily while the legs swing. All further steps are those of `follow`.
 """
 
 import math
@@ -93,20 +93,22 @@ class Legs(Follow):
         if left_rad <= right_rad:
             return None
         # If one leg hides the other, or the scan missed both, the middle may be a quarter of a stride off.
-        bearing_rad, range_m, exactness = (right_rad + left_rad) / 2, self._remembered_m(view), 0.5
+        radius_m, exactness = self._legs.leg_radius_m, 0.5
+        centers_rad, centers_m = np.array([(right_rad + left_rad) / 2]), np.array([self._remembered_m(view)])
         bearings_rad = np.arctan2(about_lens[:, 1], about_lens[:, 0])
         inside = (bearings_rad >= right_rad - _SPAN_MARGIN_RAD) & (bearings_rad <= left_rad + _SPAN_MARGIN_RAD)
         if inside.any():
             away_m = np.hypot(*about_lens[inside].T)
-            expected_m = None if self._track.target is None else range_m - self._legs.leg_radius_m
-            legs = nearest_legs(about_lens[inside], away_m, self._legs.stride_m, expected_m)
-            range_m = float(np.mean(away_m[legs[:2]])) + self._legs.leg_radius_m
-            # Then the box also contains the human in between.
-            if away_m[legs[0]] > away_m.min():
-                bearing_rad = float(np.mean(bearings_rad[inside][legs[:2]]))
+            expected_m = None if self._track.target is None else float(centers_m[0]) - radius_m
+            legs = nearest_legs(about_lens[inside], away_m, self._legs.stride_m, expected_m)[:2]
+            centers_m = away_m[legs] + radius_m
+            # The nearer leg reaches further to its side of the box, so the middle of the box sways with each step; and
+            # the box contains a human in between, too.
+            if len(legs) > 1 or away_m[legs[0]] > away_m.min():
+                centers_rad = np.array([_middle_rad(about_lens[inside], leg, 2 * radius_m) for leg in legs])
             exactness = 1.0 if len(legs) > 1 else exactness
-        x_m = self._camera.x_m + range_m * math.cos(bearing_rad)
-        return Sighting(x_m, self._camera.y_m + range_m * math.sin(bearing_rad), one, exactness)
+        x_m, y_m = float(np.mean(centers_m * np.cos(centers_rad))), float(np.mean(centers_m * np.sin(centers_rad)))
+        return Sighting(self._camera.x_m + x_m, self._camera.y_m + y_m, one, exactness)
 
     def _remembered_m(self, view: View) -> float:
         """Return the last known distance of the legs, for a box without an echo, in m."""
@@ -133,6 +135,12 @@ def nearest_legs(
     expected = [one for one in every if expected_m is not None and abs(away_m[one] - expected_m) <= stride_m / 2]
     nearest = expected or every
     return [one for one in nearest if away_m[one] <= away_m[nearest[0]] + stride_m]
+
+
+def _middle_rad(points: Points, leg: int, width_m: float) -> float:
+    """Return the bearing of the middle of the echoes of one leg, of which `leg` is one."""
+    x_m, y_m = points[np.hypot(*(points - points[leg]).T) <= width_m].mean(axis=0)
+    return math.atan2(y_m, x_m)
 
 
 def _span(one: Detection, camera: CameraModel) -> tuple[float, float]:

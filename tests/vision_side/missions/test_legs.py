@@ -3,6 +3,7 @@
 import math
 import random
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,7 +84,7 @@ def errors(run: list[Row], walk: Walk, from_s: float) -> tuple[float, float, flo
 def test_walking_legs_are_followed_at_eight_tenths_of_a_meter(speed_mps: float, seed: int) -> None:
     run = follow(circle(speed_mps), speed_mps, 20, seed)
     bearing_deg, least_m, most_m = errors(run, circle(speed_mps), 4.0)
-    assert bearing_deg < 3
+    assert bearing_deg < 1  # the middle of the box alone sways by 1.2 to 1.6
     assert least_m > 0.7 and most_m < 1.0
     assert all(row.plan is None or row.plan.phase != "lost" for row in run)
 
@@ -116,14 +117,24 @@ def view(boxes: tuple[Detection, ...], scan: RangeScan | None, t_us: int = 0) ->
 
 @pytest.mark.parametrize("bearing_deg", [-24, -12, 0, 7, 24])
 @pytest.mark.parametrize("away_m", [0.6, 1.2, 3.0])
-def test_the_field_is_symmetric_and_metric(bearing_deg: float, away_m: float) -> None:
+@pytest.mark.parametrize("way_m", [0.0, 0.125, 0.25])
+def test_the_field_is_symmetric_and_metric_at_each_step(bearing_deg: float, away_m: float, way_m: float) -> None:
     x = LENS.x_m + away_m * math.cos(math.radians(bearing_deg))
     y = away_m * math.sin(math.radians(bearing_deg))
-    posts = legs_of((x, y, math.radians(bearing_deg)), 0.125)
+    posts = legs_of((x, y, math.radians(bearing_deg)), way_m)
     plan = Legs(Legs.Config(), LENS).step(view(box_of(posts, (0, 0, 0)), scan_of(Course(posts=posts))))
     assert plan.bearing_rad is not None and plan.distance_m is not None
-    assert math.degrees(plan.bearing_rad) == pytest.approx(bearing_deg, abs=1.0)
+    assert math.degrees(plan.bearing_rad) == pytest.approx(bearing_deg, abs=0.3)
     assert plan.distance_m == pytest.approx(away_m, abs=0.04)
+
+
+@pytest.mark.parametrize("way_m", [0.0, 0.125, 0.25])
+def test_a_box_around_the_whole_human_gives_the_middle_of_the_legs(way_m: float) -> None:
+    posts = legs_of((LENS.x_m + 1.2, 0.0, 0.0), way_m)
+    (legs,) = box_of(posts, (0, 0, 0))
+    human = replace(legs, x1_px=legs.x1_px - 15, x2_px=legs.x2_px + 15)
+    bearing_rad = Legs(Legs.Config(), LENS).step(view((human,), scan_of(Course(posts=posts)))).bearing_rad
+    assert bearing_rad is not None and math.degrees(bearing_rad) == pytest.approx(0.0, abs=0.3)
 
 
 def test_legs_are_distinguished_by_the_gap_between_them() -> None:
