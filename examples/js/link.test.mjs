@@ -18,7 +18,7 @@ const bytes = (text) => new TextEncoder().encode(text);
 const text = (data) => new TextDecoder().decode(data);
 const MASK = Uint8Array.from([1, 2, 3, 250]);
 const closes = (code, act) => assert.throws(act, (error) => error instanceof PeerError && error.code === code);
-const decoded = (jpeg) => ({ ...decodeDc(jpeg), data: decodeDc(jpeg).rgb, channels: 3 });
+const decoded = (jpeg, picture = decodeDc(jpeg)) => ({ ...picture, data: picture.rgb, channels: 3 });
 const server = (maxBytes = 1024) => new FrameReader({ masked: true, maxBytes });
 
 for (const size of [0, 1, 125, 126, 127, 65_535, 65_536]) {

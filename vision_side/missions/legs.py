@@ -98,14 +98,15 @@ class Legs(Follow):
         bearings_rad = np.arctan2(about_lens[:, 1], about_lens[:, 0])
         inside = (bearings_rad >= right_rad - _SPAN_MARGIN_RAD) & (bearings_rad <= left_rad + _SPAN_MARGIN_RAD)
         if inside.any():
-            away_m = np.hypot(*about_lens[inside].T)
+            near = about_lens[inside]
+            away_m = np.hypot(*near.T)
             expected_m = None if self._track.target is None else float(centers_m[0]) - radius_m
-            legs = nearest_legs(about_lens[inside], away_m, self._legs.stride_m, expected_m)[:2]
+            legs = nearest_legs(near, away_m, self._legs.stride_m, expected_m)[:2]
             centers_m = away_m[legs] + radius_m
             # The nearer leg reaches further to its side of the box, so the middle of the box sways with each step; and
             # the box contains a human in between, too.
             if len(legs) > 1 or away_m[legs[0]] > away_m.min():
-                centers_rad = np.array([_middle_rad(about_lens[inside], leg, 2 * radius_m) for leg in legs])
+                centers_rad = np.array([_middle_rad(near, leg, 2 * radius_m) for leg in legs])
             exactness = 1.0 if len(legs) > 1 else exactness
         x_m, y_m = float(np.mean(centers_m * np.cos(centers_rad))), float(np.mean(centers_m * np.sin(centers_rad)))
         return Sighting(self._camera.x_m + x_m, self._camera.y_m + y_m, one, exactness)

@@ -34,7 +34,7 @@ for _ in range(3000):
     truth = reader.read(1.0)
     if monotonic_us() - truth.t_us > 100_000:
         rows.clear()
-    rows.append((truth.bearing_rad, truth.distance_m, truth.linear_mps, truth.angular_rad_s))
+    rows.append((truth.bearing_rad, truth.distance_m, truth.linear_mps))
     if len(rows) == 400:
         break
 for row in rows[150:400]:
@@ -169,8 +169,8 @@ class Containers:
         return until(lambda: self.state(robot) in ("ACTIVE", "DEGRADED"), 40)
 
     def truth(self, sim: str) -> list[list[float]]:
-        """The world's own account: bearing, distance, the robot's speed and turn rate in the last five of the first
-        eight seconds in which the simulation keeps up with the clock. Waits a minute for them."""
+        """The world's own account: bearing, distance, the robot's speed in the last five of the first eight seconds
+        in which the simulation keeps up with the clock. Waits a minute for them."""
         lines = self.inside(sim, "python", "-c", _TRUTH, timeout_s=90.0).splitlines()
         return [[float(word) for word in line.split()] for line in lines]
 

@@ -5,7 +5,6 @@ Run by `pytest -m compose`; needs an engine. docs/how-to/containers.md and .ci/e
 
 import base64
 import json
-import statistics
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -62,12 +61,10 @@ def test_every_robot_follows_its_ball(running):
         worlds = list(together.map(running.truth, sims))
     for rows in worlds:
         assert len(rows) == 250
-        bearings, distances, speeds, rates = ([abs(one) for one in column] for column in zip(*rows, strict=True))
-        assert max(bearings) < profile.max_bearing_rad
-        assert min(distances) > 0.6 and max(distances) < 1.0
-        # A robot that has stood is within the ball's circle, and turns more than it drives.
-        moving = sum(mps > 0.05 or rad_s > 0.1 for mps, rad_s in zip(speeds, rates, strict=True))
-        assert moving > 200, (statistics.mean(speeds), statistics.mean(rates), statistics.mean(distances))
+        assert max(abs(bearing_rad) for bearing_rad, _, _ in rows) < profile.max_bearing_rad
+        assert all(0.6 < distance_m < 1.0 for _, distance_m, _ in rows)
+        # Backwards too: a ball that comes round to a robot that has stood drives it before itself.
+        assert sum(abs(linear_mps) > 0.05 for *_, linear_mps in rows) > 200, rows[::50]
 
 
 def test_every_container_reports_healthy(running):
