@@ -82,7 +82,6 @@ class SafetyGate:
         self.counters: Counter[str] = Counter()
         self.accepted = 0
         self.last_rejection: LastRejection | None = None
-        self.latency_us: int | None = None
         self.state = State.STOPPED if stopped else State.DISARMED
         self.reason = "STOP was set before the restart" if stopped else "not armed"
         self.applied = STILL
@@ -194,8 +193,6 @@ class SafetyGate:
         if age_us is None:
             self._repeats.add(twist, now_us)
         self._command = AcceptedCommand(limited, now_us - (age_us or 0), now_us, life_ms * 1000, age_us is not None)
-        if not guest:
-            self.latency_us = age_us
 
     # --- the wheels ----------------------------------------------------------------------------------------------
 
@@ -399,6 +396,12 @@ class SafetyGate:
     def holder(self, now_us: int) -> Holder | None:
         """Return the driver that holds the lease now, or None."""
         return self._lease.live_holder(now_us)
+
+    @property
+    def latency_us(self) -> int | None:
+        """Return the time in us from capture to acceptance of the current command, or None if it cites no frame."""
+        command = self._command
+        return command.arrival_us - command.echo_us if command is not None and command.cites_frame else None
 
     def frame_age_us(self, now_us: int) -> int | None:
         """Return the age in us of the frame behind the current command, or None if the command cites no frame."""

@@ -212,10 +212,12 @@ def test_motion_stays_within_the_numbers_of_the_wire(pose, moving, expected):
     class Odometer:
         pass
 
-    core = core_of()
+    core = armed(core_of(**AUTO))
+    core.tick(NOW_US, None, None)
     core.odometer = Odometer()
     core.odometer.pose, core.odometer.moving = pose, moving
-    core.gate.latency_us = 84_000
+    core.on_issued(9, NOW_US - 84_000, 9)
+    core.on_twist(twist(number=9, seq=9, t_us=NOW_US - 84_000), NOW_US)
     assert core.motion() == RobotMotion(*expected, (0.0, 0.0), 84_000)
 
 

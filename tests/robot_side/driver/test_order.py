@@ -129,7 +129,7 @@ def test_frame_permitted_by_a_result_carries_its_latency(driver, ends, monkeypat
     told = []
     monkeypatch.setattr(driver.driver_end, "send_aside", lambda packet: told.append(ipc.unpack_motion(packet)))
     monkeypatch.setattr(driver.driver_end, "send", told.append)
-    driver._driver_core.gate.latency_us = None
+    assert driver._driver_core.gate.latency_us is None
     monkeypatch.setattr("sightline.robot_side.driver.process.monotonic_us", lambda: T_US + 4_000)
     _arm(driver)
     parent.send_aside(ipc.pack_issued(SEQ, T_US, 0))

@@ -239,6 +239,16 @@ def test_a_guest_has_no_latency():
     assert rig.gate.latency_us is None
 
 
+@pytest.mark.parametrize("end", ["stop", "disarm", "fault"])
+def test_a_robot_without_a_command_in_force_has_no_latency(end):
+    rig = driving()
+    rig.offer(age_ms=12)
+    assert rig.gate.latency_us == 12_000
+    getattr(rig.gate, end)("tested")
+    assert rig.gate.latency_us is None and rig.offer(age_ms=13).reason is not None
+    assert rig.gate.latency_us is None, "a rejected command has none"
+
+
 def test_without_a_header_no_frame_age_is_shown():
     rig = guest_driving(40)
     assert rig.gate.frame_age_us(rig.now_us) is None
