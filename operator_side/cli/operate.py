@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sightline.protocol.transports.link import Link
 
 _PERIOD_S: Final = 0.25
-_REPORT_S: Final = 0.8  # the vision service reports twice a second; while it drives, `status` waits for a report
+_REPORT_S: Final = 0.8  # the vision service reports twice a second; `status` waits for a report where one may come
 
 
 def register(app: typer.Typer) -> None:
@@ -88,9 +88,9 @@ def status(
         if watch:
             return follow_status(missions, verbose=verbose, as_json=as_json)
         state = missions.operator.wait_report().status
-        is_seen_to = state.holder is not None and state.holder.source == "vision"
-        # In HOLD the driver may be a vision service whose detector raises, so that it sends no command.
-        report = missions.newest(_REPORT_S if is_seen_to or state.state is State.HOLD else 0.0)
+        # Images leave only if a vision service or a viewer takes them. In HOLD the camera may be gone.
+        is_seen_to = state.holder is not None or state.stream.fps > 0 or state.state is State.HOLD
+        report = missions.newest(_REPORT_S if is_seen_to else 0.0)
         if as_json:
             typer.echo(_status_json(target.robot, state, report))
         else:

@@ -4,13 +4,14 @@ import json
 import subprocess
 import sys
 import threading
+from contextlib import contextmanager
 
 import pytest
 
 from sightline.operator_side.cli.operate import _status_block
-from sightline.protocol.channels import STATUS
+from sightline.protocol.channels import REPORT, STATUS
 from sightline.protocol.codec import encode
-from sightline.protocol.messages import MissionReport, Stamp, State, Status, StreamStatus
+from sightline.protocol.messages import DetectionsHeader, Echo, MissionReport, Stamp, State, Status, StreamStatus
 from sightline.protocol.transports.open import open_link
 from tests.fixtures.commands import run
 from tests.fixtures.links import until
@@ -21,21 +22,32 @@ from tests.fixtures.terminal import Terminal
 @pytest.fixture
 def endpoint():
     """The address of a robot that publishes its status at 20 Hz."""
-    ending, address = threading.Event(), free_endpoint()
+    with open_link("r1", listen=[address := free_endpoint()]) as robot, repeated(robot, STATUS, Status(
+        state=State.STOPPED, reason="test", stream=StreamStatus(fps=30.0)
+    ), 0.05):
+        yield address
+
+
+@contextmanager
+def repeated(link, channel, payload, period_s):
+    """Publish a payload again and again."""
+    ending = threading.Event()
 
     def publish():
         seq = 0
-        while not ending.wait(0.05):
+        while not ending.wait(period_s):
             seq += 1
-            robot.publish(STATUS, encode(Stamp(session="0000abcd", seq=seq, t_us=seq)),
-                          encode(Status(state=State.STOPPED, reason="test")))
+            stamp = Stamp(session="0000abcd", seq=seq, t_us=seq)
+            header = stamp if channel is STATUS else DetectionsHeader(
+                source="vision", session="0000abcd", seq=seq, echo=Echo(channel="frame", **stamp.model_dump(exclude={"v"}))
+            )
+            link.publish(channel, encode(header), encode(payload), "" if channel is STATUS else "vision")
 
-    with open_link("r1", listen=[address]) as robot:
-        thread = threading.Thread(target=publish, daemon=True)
-        thread.start()
-        yield address
-        ending.set()
-        thread.join()
+    thread = threading.Thread(target=publish, daemon=True)
+    thread.start()
+    yield
+    ending.set()
+    thread.join()
 
 
 def test_status_is_short_and_verbose_shows_every_field(capsys, endpoint):
@@ -44,6 +56,14 @@ def test_status_is_short_and_verbose_shows_every_field(capsys, endpoint):
     assert "state     STOPPED: test\n" in short and "next      sightline reset r1\n" in short
     code, full, _ = run(capsys, "status", "--verbose", "--connect", endpoint)
     assert "network restarts" in full and len(full.splitlines()) > len(short.splitlines())
+
+
+def test_status_shows_the_mission_of_a_stopped_robot_at_each_call(capsys, endpoint):
+    report = MissionReport(mission="follow", phase="tracking", detector="onnx")
+    with open_link("r1", connect=[endpoint], role="vision") as vision, repeated(vision, REPORT, report, 0.5):
+        for _ in range(3):
+            code, told, _ = run(capsys, "status", "--json", "--connect", endpoint)
+            assert code == 0 and json.loads(told)["mission"]["mission"] == "follow"
 
 
 @pytest.mark.parametrize("verbose", [False, True])
