@@ -108,7 +108,11 @@ class BusConnection:
             raise self._lost() from None
         if not size:
             raise self._lost()
-        return bytes(memoryview(self._buffer)[:size])
+        message = bytes(memoryview(self._buffer)[:size])
+        if message == MOTION_BUSY:  # the last message: the simulation has closed this connection
+            self.close()
+            raise HardwareError(f"another process owns the simulated motors in {self._dir}; end it")
+        return message
 
     def newest(self) -> bytes | None:
         """The newest waiting message; older ones are dropped."""
@@ -219,8 +223,6 @@ class SimDrive:
         Call it at 20 Hz or more. After a longer pause the first reading is old, see its `t_us`.
         """
         message = self._connection.newest()
-        if message == MOTION_BUSY:
-            raise HardwareError("another process owns the simulated motors; end it")
         if message is not None:
             self._angles = WheelAngles(*MOTION_ANGLES.unpack(message))
         return self._angles

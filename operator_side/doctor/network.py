@@ -17,7 +17,6 @@ from sightline.protocol.channels import FRAME
 from sightline.protocol.errors import SightlineError
 from sightline.protocol.messages import Status
 from sightline.protocol.transports import endpoints
-from sightline.protocol.transports import endpoints as websocket_endpoints
 from sightline.protocol.transports.link import Link
 from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.security import ROBOT_ROLE
@@ -28,7 +27,6 @@ ROLE = "doctor"
 ARP_TABLE = Path("/proc/net/arp")
 _ARP_COMPLETE = 0x2
 _SCOUT_S = 0.5
-_OVER_UDP = ("udp", "quic")
 _PROBES = 40
 _PATIENCE_S = 2.0
 _LISTEN_S = 3.0
@@ -44,7 +42,7 @@ _UNREACHED = {
 def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
     """Yield the findings about the link to `endpoint`, and about the stream of a robot there."""
     transport, host, port = _address(endpoint)
-    if transport not in _OVER_UDP:
+    if transport not in endpoints.OVER_UDP:
         knocks_ms, why = _probe(host, port)
         if why:
             yield Finding("reach", False, f"{host}:{port} does not answer", why)
@@ -55,7 +53,7 @@ def findings(endpoint: str, robot: str, secure: str) -> Iterator[Finding]:
     try:
         role = viewer_role(secure) if secure else ROLE  # an operator's keys may acknowledge frames
         with open_link(robot, connect=[endpoint], role=role, secure=secure) as link:
-            if transport in _OVER_UDP:
+            if transport in endpoints.OVER_UDP:
                 yield from _round_trip(_answer_ms(link), "queries")
             yield from _peers(link, robot)
             yield from _robot(link, robot, FrameViewer(link, role, secure))
@@ -72,7 +70,7 @@ def _no_link(error: SightlineError, endpoint: str) -> Finding:
     scheme, is_web, _ = endpoint.partition("://")
     there = f"{scheme}{is_web}" if is_web else f"{transport}/"
     fix = f"there: sightline robot --listen {there}0.0.0.0:{port}"
-    if transport not in _OVER_UDP:
+    if transport not in endpoints.OVER_UDP:
         fix += "; what listens on the port now is something else"
     return Finding("link", False, found.value, fix)
 
@@ -121,7 +119,7 @@ def _peers(link: Link, robot: str) -> Iterator[Finding]:
 def _address(endpoint: str) -> tuple[str, str, int]:
     """Return transport, host and port. Raises ConfigError for an invalid endpoint."""
     if "://" in endpoint:
-        web = websocket_endpoints.parse_websocket_endpoint(endpoint)
+        web = endpoints.parse_websocket_endpoint(endpoint)
         return "ws", web.host, web.port
     return endpoints.parse_zenoh_endpoint(endpoint)
 

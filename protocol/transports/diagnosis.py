@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import os
 import socket
@@ -10,7 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from sightline.protocol.transports.endpoints import parse_zenoh_endpoint
+from sightline.protocol.errors import LinkError
+from sightline.protocol.transports.endpoints import OVER_UDP, parse_websocket_endpoint, parse_zenoh_endpoint
 from sightline.protocol.transports.security import RoleKeys
 
 if TYPE_CHECKING:
@@ -34,6 +36,30 @@ def port_owner(port: int) -> str:
     """
     sockets = {f"socket:[{row[9]}]" for row in _rows({port}) if row[3] == _LISTEN}
     return process_with_open(sockets) if sockets else ""
+
+
+def port_in_use(endpoint: str, port: int) -> LinkError:
+    """Return the error of an endpoint whose port another process has."""
+    owner = port_owner(port) or "another process"
+    return LinkError(f"cannot listen on {endpoint}: port {port} is in use by {owner}; end it or choose another port")
+
+
+def check_ports(endpoints: Iterable[str]) -> None:
+    """Raise LinkError if another process has the TCP port of an endpoint. Other trouble shows when it is opened."""
+    for endpoint in endpoints:
+        if "://" in endpoint:
+            _, host, port, *_ = parse_websocket_endpoint(endpoint)
+        else:
+            transport, host, port = parse_zenoh_endpoint(endpoint)
+            if transport in OVER_UDP:
+                continue
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as tried:
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                tried.bind((host, port))
+            except (OSError, UnicodeError) as error:
+                if getattr(error, "errno", None) == errno.EADDRINUSE:
+                    raise port_in_use(endpoint, port) from None
 
 
 def process_with_open(files: Collection[str], besides: int = 0) -> str:

@@ -21,6 +21,7 @@ _ZENOH_ENDPOINT = re.compile(
     r"(tcp|tls|quic|udp|ws)/(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]]+):([0-9]{1,5})(\?[^#\s]*)?(#\S*)?"
 )
 _BUFFERED = ("tcp", "tls")
+OVER_UDP: Final = ("udp", "quic")
 
 
 def check_robot_id(robot: str) -> str:

@@ -31,6 +31,7 @@ from sightline.protocol.log import (
     start_log_thread,
 )
 from sightline.protocol.messages import State, StreamStatus
+from sightline.protocol.transports.diagnosis import check_ports
 from sightline.protocol.transports.endpoints import check_robot_id
 from sightline.protocol.transports.stop_port import read_packets, send_packet
 from sightline.robot_side import pipe as ipc
@@ -90,6 +91,8 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         reader = BatteryReader(BATTERIES.build(config.battery)) if config.battery else None
         if reader is not None:
             ending.callback(reader.close)
+        if guardian is None or not guardian.is_restart:
+            check_ports(config.listen)  # before the first tick: a robot that has them may have the motors too
         threading.stack_size(_STACK_BYTES)
         start_log_thread()
         driver = Driver(config, drive, ranges, reader, guardian)

@@ -166,6 +166,18 @@ def test_motors_latch_and_the_log_outlives_killed_clients_and_a_killed_simulatio
     assert second[4] > 8.0 > first[4]
 
 
+def test_second_owner_of_the_motors_is_told_so_and_moves_nothing(sim):
+    owner, second = SimDrive(sim.config()), SimDrive(sim.config())
+    owner.set(1.0, 2.0)
+    eventually(sim.rows)
+    second.set(3.0, 4.0)
+    assert select.select([second._connection.open()], [], [], 5)[0]
+    time.sleep(0.1)  # the end of the connection is there too
+    with pytest.raises(HardwareError, match=f"^another process owns the simulated motors in {sim.socket_dir}; end it$"):
+        second.wheels()
+    assert [row[1:3] for row in sim.rows()] == [[1.0, 2.0]]
+
+
 def test_wheels_that_roll_out_have_lines_unless_a_driver_owns_them(sim):
     drive = SimDrive(sim.config())
     drive.set(8.0, 8.0)

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 from sightline.protocol.channels import FRAME, REQUEST, TWIST
 from sightline.protocol.errors import LinkError
 from sightline.protocol.messages import GUEST
-from sightline.protocol.transports.diagnosis import port_owner
+from sightline.protocol.transports.diagnosis import port_in_use
 from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES, WebSocketEndpoint, host_problem, origin_problem
 from sightline.protocol.transports.flood_limits import note_accepted
 from sightline.protocol.transports.security import (
@@ -133,9 +133,7 @@ def listening_socket(endpoint: WebSocketEndpoint) -> socket.socket:
 
 def _cannot_listen(endpoint: WebSocketEndpoint, error: OSError) -> LinkError:
     if error.errno == errno.EADDRINUSE:
-        owner = port_owner(endpoint.port) or "another process"
-        fix = f"port {endpoint.port} is in use by {owner}; end it or choose another port"
-        return LinkError(f"cannot listen on {endpoint.text}: {fix}")
+        return port_in_use(endpoint.text, endpoint.port)
     # create_server adds its arguments to strerror. An unknown host name has a negative errno.
     cause = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror
     return LinkError(

@@ -17,9 +17,10 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError, install_command
-from sightline.protocol.transports.diagnosis import diagnose_tls, own_sockets, port_owner, unresolved_host
+from sightline.protocol.transports.diagnosis import diagnose_tls, own_sockets, port_in_use, unresolved_host
 from sightline.protocol.transports.endpoints import (
     MULTICAST_PORT,
+    OVER_UDP,
     parse_zenoh_endpoint,
     uses_discovery,
     with_send_buffer,
@@ -65,7 +66,6 @@ HANDSHAKE_OF_SEVERAL_MS: Final = 800
 MAX_SESSIONS: Final = 64
 # Sessions at a router.
 MAX_ROUTER_SESSIONS: Final = 1000
-_OVER_UDP: Final = ("udp", "quic")
 _PROBE_TIMEOUT_S: Final = 0.3
 # Fixed in Zenoh for TCP and TLS. Nothing else in a process of ours sets it.
 _LINGERS_S: Final = 10
@@ -230,7 +230,7 @@ def _error_of(
         )
     where = next((endpoint for endpoint in listen if endpoint.partition("#")[0] in text), " or ".join(listen))
     if "in use" in text:
-        return _port_in_use(where)
+        return port_in_use(where, parse_zenoh_endpoint(where)[2])
     cause = re.split(r" at /|\(os error", text.rpartition("[")[2])[0].rpartition(": ")[2].strip(" .]")
     return LinkError(f"cannot listen on {where}: {cause}; use an address of this machine, e.g. tcp/127.0.0.1:7447")
 
@@ -238,15 +238,8 @@ def _error_of(
 def _is_open(endpoint: str) -> bool:
     transport, host, port = parse_zenoh_endpoint(endpoint)
     try:
-        if transport not in _OVER_UDP:
+        if transport not in OVER_UDP:
             socket.create_connection((host, port), _PROBE_TIMEOUT_S).close()
     except OSError:
         return False
-    return transport not in _OVER_UDP
-
-
-def _port_in_use(endpoint: str) -> LinkError:
-    port = parse_zenoh_endpoint(endpoint)[2]
-    owner = port_owner(port)
-    by = f" by {owner}" if owner else " by another process"
-    return LinkError(f"cannot listen on {endpoint}: port {port} is in use{by}; end it or choose another port")
+    return transport not in OVER_UDP

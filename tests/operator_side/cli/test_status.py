@@ -38,10 +38,10 @@ def repeated(link, channel, payload, period_s):
         while not ending.wait(period_s):
             seq += 1
             stamp = Stamp(session="0000abcd", seq=seq, t_us=seq)
-            header = stamp if channel is STATUS else DetectionsHeader(
-                source="vision", session="0000abcd", seq=seq, echo=Echo(channel="frame", **stamp.model_dump(exclude={"v"}))
-            )
-            link.publish(channel, encode(header), encode(payload), "" if channel is STATUS else "vision")
+            echo = Echo(channel="frame", session=stamp.session, seq=seq, t_us=seq)
+            of_vision = DetectionsHeader(source="vision", session="0000abcd", seq=seq, echo=echo)
+            header, source = (of_vision, "vision") if channel is REPORT else (stamp, "")
+            link.publish(channel, encode(header), encode(payload), source)
 
     thread = threading.Thread(target=publish, daemon=True)
     thread.start()
