@@ -443,13 +443,23 @@ def _lose_camera(rig: RobotFixture, mode: str) -> Injected:
 
 def _fail_drive(rig: RobotFixture) -> Injected:
     """The drive plug-in raises at each tick: zero at once, and FAULT until an operator resets it."""
-    at_us = rig.fail_drive()
+    at_us = rig.fail_drive("wheels")
     rig.watch(BAD_S)
     status, times = rig.status(), rig.injected("drive")
     return Injected(times, at_us, checks=(
         at_least("counted in status", status["faults"].get("drive", 0), "", TICKS_OF_A_SECOND),
         at_least("state FAULT", status["state"] == "FAULT", "", 1),
         *_one_traceback(rig, f"error drive raised ArithmeticError: {DRIVE_ERROR}\nTraceback "),
+    ))
+
+
+def _refuse_speeds(rig: RobotFixture) -> Injected:
+    """The drive takes no more speeds, neither zero: the guardian stops the wheels, and a new driver process waits."""
+    at_us = rig.fail_drive("set")
+    rig.watch(BAD_S)
+    zeroed = rig.logged("the driver process was killed: its drive took no speeds for 100 ms")
+    return Injected(rig.injected("drive"), at_us, checks=(
+        at_least("ended by the guardian", zeroed, "", 1), at_most("no more", zeroed, "", 1),
     ))
 
 
@@ -628,6 +638,10 @@ OPERATOR_CASES: Final = (
     FaultCase(
         "drive.raises", "drive: the plug-in raises an exception", _fail_drive, _SCRIPT, blind=True, short=True,
         also="FAULT, counted in status, one traceback in the log",
+    ),
+    FaultCase(
+        "drive.refuses", "drive: the plug-in takes no more speeds", _refuse_speeds, _SCRIPT, blind=True, short=True,
+        also="ended by the guardian once",
     ),
     FaultCase(
         "disk.full", "robot: its disk is full; 3 s later vision: SIGKILL", _fill_disk, _SCRIPT,

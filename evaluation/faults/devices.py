@@ -21,9 +21,9 @@ from sightline.sim.bus import SimCamera, SimDrive, SimSocketConfig
 MODE: Final = "camera.mode"
 EVENTS: Final = "camera.ledger"
 DRIVE_MODE: Final = "drive.mode"
-"""While this file exists, the drive raises an exception of its own instead of reading its encoders."""
+"""While this file exists, the method of the drive that it names raises an exception of its own."""
 DRIVE_EVENTS: Final = "drive.ledger"
-DRIVE_ERROR: Final = "no encoder (injected by the bench)"
+DRIVE_ERROR: Final = "no answer (injected by the bench)"
 GIL_HELD_S: Final = 1
 SLOW_S: Final = 0.2
 LOOP: Final = signal.SIGUSR2
@@ -76,7 +76,7 @@ class FaultyCamera:
 
 
 class FaultyDrive(SimDrive):
-    """The simulated wheels. They raise while the file DRIVE_MODE exists. The signal LOOP begins an endless loop."""
+    """The simulated wheels. They raise as the file DRIVE_MODE says. The signal LOOP begins an endless loop."""
 
     class Config(SimSocketConfig):
         """`folder` holds the mode and the ledger."""
@@ -88,13 +88,21 @@ class FaultyDrive(SimDrive):
         self._mode, self._ledger = config.folder / DRIVE_MODE, EventLog(config.folder / DRIVE_EVENTS)
         signal.signal(LOOP, _loop)
 
+    def set(self, left_rad_s: float, right_rad_s: float) -> None:
+        """Give wheel speeds, see `Drive`."""
+        self._fail("set")
+        super().set(left_rad_s, right_rad_s)
+
     def wheels(self) -> WheelAngles | None:
         """Read the encoders, see `Drive`."""
         angles = super().wheels()
-        if self._mode.exists():
+        self._fail("wheels")
+        return angles
+
+    def _fail(self, method: str) -> None:
+        if self._mode.exists() and self._mode.read_text("ascii") == method:
             self._ledger.note(INJECTED)
             raise ArithmeticError(DRIVE_ERROR)
-        return angles
 
 
 def _hold_gil(now: Picture, _last: Picture) -> Picture:

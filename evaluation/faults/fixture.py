@@ -414,10 +414,10 @@ class RobotFixture:
         new.replace(self.folder / devices.MODE)
         return at_us
 
-    def fail_drive(self) -> int:
-        """Let the drive raise from the next tick on. Returns the time of the change."""
+    def fail_drive(self, method: str) -> int:
+        """Let a method of the drive raise from the next tick on. Returns the time of the change."""
         at_us = monotonic_us()
-        (self.folder / devices.DRIVE_MODE).touch()
+        (self.folder / devices.DRIVE_MODE).write_text(method, "ascii")
         return at_us
 
     def signal_network(self, number: signal.Signals) -> int:

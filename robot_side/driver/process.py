@@ -45,7 +45,7 @@ from sightline.robot_side.driver.supervision import (
     limit_core_dump,
     request_real_time,
 )
-from sightline.robot_side.guardian.core import AT_REST, ENDING, FAILED, MOVING
+from sightline.robot_side.guardian.core import AT_REST, ENDING, FAILED, LOST, MOVING, REFUSES_US
 from sightline.robot_side.guardian.start import GuardianEnd, zero_of
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
@@ -205,6 +205,8 @@ class Driver:
         self._commanded_us = 0
         """Time of the last tick for a command."""
         self._speeds_are_set = False
+        self._refuses_since_us = 0
+        """Time since which the drive takes no speeds; 0 if it took the last ones."""
         self._scan_layout: tuple[float, ...] = ()
         self._command_acks: list[ipc.CommandAck] = []
         self._rejection_limiter = RepeatLimiter()
@@ -278,6 +280,13 @@ class Driver:
     def _is_at_rest(self) -> bool:
         return self._driver_core.at_rest and self._speeds_are_set
 
+    def _heartbeat(self) -> bytes:
+        """Return what the guardian must know of the wheels."""
+        refuses = self._refuses_since_us and heartbeat_us() - self._refuses_since_us >= REFUSES_US
+        if refuses and not self._driver_core.at_rest:
+            return LOST
+        return AT_REST if self._is_at_rest else MOVING
+
     def _wait(self, deadline_us: int) -> None:
         timeout_s = max(0, deadline_us - heartbeat_us()) / 1e6
         readable = [self.driver_end.socket] if self.driver_end.socket else []
@@ -297,7 +306,7 @@ class Driver:
         self._driver_core.faults = faults() + self._faults_of_network
         self._driver_core.latch_failed = self.latch_writer.failed
         if self._guardian is not None:
-            self._guardian.beat(AT_REST if self._is_at_rest else MOVING)
+            self._guardian.beat(self._heartbeat())
         for message in self._driver_core.messages(now_us):
             self.driver_end.send(ipc.pack_message(ipc.PacketKind.PUBLISH, message))
         self.driver_end.keep_alive(heartbeat_us(), self._driver_core.gate.issued.last_seq("frame") + 1)
@@ -326,7 +335,7 @@ class Driver:
         wheels: WheelAngles | None = None
         scan: Ranges | None = None
         self._speeds_are_set = False
-        part = "drive"
+        before, part = self._driver_core.gate.applied, "drive"
         try:
             wheels = self._drive.wheels()
             part = "range sensor"
@@ -342,8 +351,10 @@ class Driver:
             speeds = self._without_sensors()
         try:
             self._drive.set(*speeds)
-            self._speeds_are_set = True
+            self._speeds_are_set, self._refuses_since_us = True, 0
         except PLUGIN_ERRORS as error:
+            self._driver_core.gate.keep_applied(before)
+            self._refuses_since_us = self._refuses_since_us or heartbeat_us()
             self._fault("drive", error)
 
     def _fault(self, part: str, error: BaseException) -> None:

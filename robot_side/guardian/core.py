@@ -11,6 +11,8 @@ AT_REST: Final = b"0"
 """Heartbeat of a loop whose wheels are at zero."""
 MOVING: Final = b"1"
 """Heartbeat of a loop whose wheels turn."""
+LOST: Final = b"l"
+"""Heartbeat of a loop whose wheels turn while its drive takes no speeds, so only the guardian can stop them."""
 IDLE: Final = b"i"
 """The wheels are at zero, and the next heartbeat may take as long as an operator thinks."""
 WATCHED: Final = b"w"
@@ -26,6 +28,8 @@ LATE_US: Final = 25_000
 """Silence of a driver that is late, and then the time between two looks; the loop sends a heartbeat within 20 ms."""
 HUNG_US: Final = 200_000
 """Silence in the driver's own time after which it counts as hung."""
+REFUSES_US: Final = 100_000
+"""Time in which a drive takes no speeds after which turning wheels count as out of control."""
 STARVED_US: Final = 500_000
 """Silence of a driver without a processor after which moving wheels are stopped: zero follows within 700 ms."""
 STARTS_WITHIN_US: Final = 30_000_000
@@ -70,7 +74,7 @@ class HeartbeatMonitor:
     @property
     def is_running(self) -> bool:
         """Return True if the loop has not announced its end. A process that is gone then did not end in order."""
-        return self._last in (AT_REST, MOVING)
+        return self._last in (AT_REST, MOVING, LOST)
 
     @property
     def is_late(self) -> bool:
@@ -101,6 +105,8 @@ class HeartbeatMonitor:
     def _reason(self) -> str:
         if self._last == IDLE:
             return ""
+        if self._last == LOST:
+            return f"its drive took no speeds for {REFUSES_US // 1000} ms"
         if not self._last:
             return "did not start within 30 s" if self._silence_us >= STARTS_WITHIN_US else ""
         if self._last == ENDING:

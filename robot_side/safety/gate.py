@@ -218,6 +218,12 @@ class SafetyGate:
         self.applied = twist
         return Decision(twist, self.state, self.reason)
 
+    def keep_applied(self, before: Twist) -> None:
+        """Note that the drive did not take the twist of the last step: the wheels may still turn as `before` it."""
+        # A failed attempt to leave zero may have reached one wheel of two.
+        if before != STILL:
+            self.applied = before
+
     def _guarded(self, guard: RangeGuard, twist: Twist, now_us: int) -> Twist:
         limited = guard.limit(twist, now_us)
         if limited != twist:

@@ -12,13 +12,22 @@ import pytest
 
 from sightline.protocol.config import Config
 from sightline.protocol.errors import HardwareError
-from sightline.protocol.messages import Twist
+from sightline.protocol.messages import STILL, Twist
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from sightline.robot_side.driver.process import Driver, run
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, IGNORED_SIGNALS
-from sightline.robot_side.guardian.core import ENDING, FAILED, WATCHED, needs_zero, unpack_beat
+from sightline.robot_side.guardian.core import (
+    AT_REST,
+    ENDING,
+    FAILED,
+    LOST,
+    MOVING,
+    WATCHED,
+    needs_zero,
+    unpack_beat,
+)
 from sightline.robot_side.guardian.start import GuardianEnd
 from sightline.robot_side.ports import WheelAngles
 from sightline.robot_side.safety.limits import SafetyConfig
@@ -112,6 +121,54 @@ def test_a_drive_that_raises_anything_is_a_fault(driver, error):
     BrokenDrive.fails = error
     driver._tick(40_000)
     assert driver._driver_core.gate.state == "FAULT" and not driver._speeds_are_set
+
+
+def test_speeds_that_the_drive_did_not_take_are_not_shown_as_applied(driver, monkeypatch):
+    """Neither STOP nor reset may count on a zero that never reached the motors."""
+    gate, times_us = driver._driver_core.gate, iter(range(1_000_000, 4_000_000, 20_000))
+    monkeypatch.setattr("sightline.robot_side.driver.process.monotonic_us", lambda: next(times_us))
+    moving = gate.applied = Twist(linear_mps=0.3, angular_rad_s=0.0)
+    gate._ramp.force(moving)
+    driver._move()
+    assert gate.applied.linear_mps > 0
+    given, BrokenDrive.fails, BrokenDrive.told = gate.applied, OSError("unplugged"), (0.0, 0.0)
+    gate.stop()
+    for _ in range(100):
+        driver._move()
+        assert gate.applied == given and not driver._is_at_rest
+    assert driver._driver_core.status(3_000_000).applied == (given.linear_mps, given.angular_rad_s)
+    BrokenDrive.fails = None
+    driver._move()
+    assert gate.applied == STILL and driver._is_at_rest
+
+
+@pytest.mark.parametrize(("speed_mps", "expected"), [(0.3, LOST), (0.0, MOVING)])
+def test_guardian_learns_of_a_drive_that_takes_no_speeds_for_100_ms_while_the_wheels_turn(
+    driver, monkeypatch, speed_mps, expected
+):
+    now_us = [1_000_000]
+    monkeypatch.setattr("sightline.robot_side.driver.process.heartbeat_us", lambda: now_us[0])
+    driver._driver_core.gate.applied = Twist(linear_mps=speed_mps, angular_rad_s=0.0)
+    BrokenDrive.fails, BrokenDrive.told = OSError("unplugged"), (0.0, 0.0)
+    told = []
+    for _ in range(6):
+        driver._tick(now_us[0])
+        told.append(driver._heartbeat())
+        now_us[0] += 20_000
+    assert told == [MOVING] * 5 + [expected]
+    BrokenDrive.fails = None
+    driver._tick(now_us[0])
+    assert driver._heartbeat() == AT_REST
+
+
+def test_first_speeds_may_have_reached_a_drive_that_raised(driver):
+    gate = driver._driver_core.gate
+    driver._tick(20_000)
+    assert gate.applied == STILL
+    BrokenDrive.fails = OSError("one wheel of two")
+    gate._ramp.force(Twist(linear_mps=0.3, angular_rad_s=0.0))
+    driver._tick(40_000)
+    assert gate.applied.linear_mps > 0
 
 
 @pytest.mark.parametrize("packet", [b"\xff", b"\x01", b"\x02", b"\x03{", bytes([ipc.PacketKind.RAW]) + b"x" * 40])

@@ -10,6 +10,7 @@ from sightline.robot_side.guardian.core import (
     HUNG_US,
     IDLE,
     LATE_US,
+    LOST,
     MAX_RESTARTS,
     MOVING,
     PERIOD_US,
@@ -98,6 +99,11 @@ def test_driver_whose_drive_did_not_take_zero_is_killed_at_once():
     assert beaten(FAILED).drive_failed and not beaten(ENDING).drive_failed
 
 
+def test_driver_whose_drive_takes_no_speeds_while_the_wheels_turn_is_killed_at_once():
+    assert beaten(LOST).look(1_000_000) == "its drive took no speeds for 100 ms"
+    assert not beaten(LOST).drive_failed, "a new driver process starts"
+
+
 def test_limits_are_exact():
     for monitor, limit_us in ((HeartbeatMonitor(0), STARTS_WITHIN_US), (beaten(MOVING, 0), HUNG_US)):
         assert silence_us(monitor, 0, limit_us=limit_us - LATE_US)[0] is None
@@ -112,7 +118,7 @@ def test_driver_that_falls_asleep_while_it_waits_for_a_processor_is_hung():
 
 
 def test_heartbeats_are_bytes_that_differ():
-    assert (AT_REST, MOVING, IDLE, ENDING, FAILED, WATCHED) == (b"0", b"1", b"i", b"e", b"f", b"w")
+    assert (AT_REST, MOVING, LOST, IDLE, ENDING, FAILED, WATCHED) == (b"0", b"1", b"l", b"i", b"e", b"f", b"w")
     assert RESTART_WINDOW_US == 60_000_000
     assert pack_beat(MOVING, 1) == b"1\x01" + bytes(7)
     assert unpack_beat(pack_beat(MOVING, 2**40 + 3)) == (MOVING, 2**40 + 3)
@@ -172,7 +178,7 @@ def test_motors_are_set_to_zero_unless_the_driver_did_it(code, was_ready, expect
 
 
 @pytest.mark.parametrize(("kind", "is_running"), [
-    (AT_REST, True), (MOVING, True), (IDLE, False), (ENDING, False), (FAILED, False),
+    (AT_REST, True), (MOVING, True), (LOST, True), (IDLE, False), (ENDING, False), (FAILED, False),
 ])
 def test_loop_runs_until_it_announces_its_end(kind, is_running):
     assert beaten(kind).is_running is is_running and not HeartbeatMonitor(0).is_running

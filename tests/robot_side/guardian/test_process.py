@@ -66,7 +66,7 @@ def check_stop(robot, fault):
     assert stop_s <= BOUND_S and stop_m <= BOUND_M
 
 
-@pytest.mark.parametrize("name", ["SIGKILL", "SIGSTOP", "SIGSEGV", "exit 0", "exit 1"])
+@pytest.mark.parametrize("name", ["SIGKILL", "SIGSTOP", "SIGSEGV", "exit 0", "exit 1", "refuses"])
 def test_dead_or_stopped_driver_leaves_the_wheels_at_zero_and_a_new_one_starts(dying, name):
     robot, vision, fault = dying(name, safety={"auto_arm": False})
     robot.wait_until_on()
