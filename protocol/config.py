@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 
-from sightline.protocol.errors import ConfigError
-from sightline.protocol.log import report_ending
+from sightline.protocol.errors import ConfigError, SightlineError
+from sightline.protocol.log import error_text, report_ending
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -186,7 +186,9 @@ def _why(error: BaseException, kind: str) -> str:
         named = next(filter(None, map(_OLD_MODULE.search, (*_lines(error.__traceback__), kind))), None)
         if named is not None:
             return f"{named[1]} is now sightline.{named[1]}; use that name"
-    return (str(error) or type(error).__name__)[:_LONGEST_DETAIL]
+    text = error_text(error)
+    is_named = isinstance(error, ImportError | AttributeError | SightlineError)
+    return (text if is_named else f"{type(error).__name__}: {text}")[:_LONGEST_DETAIL]
 
 
 def _lines(trace: TracebackType | None) -> list[str]:

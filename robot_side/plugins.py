@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
-from sightline.protocol.config import PluginRegistry
+from sightline.protocol.config import PLUGIN_ERRORS, PluginRegistry
+from sightline.protocol.errors import ConfigError, HardwareError, SightlineError
+from sightline.protocol.log import error_text, report_ending
 from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.ports import Battery, Camera, Drive, RangeSensor
 
@@ -23,16 +25,39 @@ class DeviceGroup(Generic[Port]):
 
         Raises:
             ConfigError: for an unknown kind (nearest named), a missing package or a wrong option.
-            HardwareError: as the device itself does.
+            HardwareError: as the device itself does, and for any other exception of it.
         """
         plugin, config = self.load(choice)
-        device: Port = plugin(config)
+        try:
+            device: Port = plugin(config)
+        except SightlineError:
+            raise
+        except PLUGIN_ERRORS as error:
+            raise self.failed(choice, error) from None
         return device
 
+    def failed(self, choice: PluginChoice, error: BaseException) -> HardwareError:
+        """Report an exception of the device that ends the program, and return its error."""
+        report_ending(self.noun, error)
+        return HardwareError(f"{self.noun} {choice.kind!r} raised {type(error).__name__}: {error_text(error)}")
+
+    @property
+    def methods(self) -> list[str]:
+        """List the methods that a device must have, without `zero` of a drive, which its guardian checks."""
+        return [name for name, one in vars(self.port).items() if callable(one) and name[0] != "_" and name != "zero"]
+
+    @property
+    def noun(self) -> str:
+        """Return the name of this kind of device in texts."""
+        return self.key.replace("_", " ")
+
     def load(self, choice: PluginChoice) -> tuple[Any, Any]:
-        """Load the class and check its `Config`, without opening the device. Raises ConfigError."""
-        registry = PluginRegistry(self.key.replace("_", " "), self.entry_points)
+        """Load the class, check its methods and its `Config`, without opening the device. Raises ConfigError."""
+        registry = PluginRegistry(self.noun, self.entry_points)
         plugin = registry.load(choice.kind)
+        for name in self.methods:
+            if not callable(getattr(plugin, name, None)):
+                raise ConfigError(f"{self.noun} {choice.kind!r} has no method {name}(): docs/how-to/add-a-device.md")
         return plugin, registry.settings(choice.kind, plugin, choice.options)
 
 

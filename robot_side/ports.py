@@ -8,9 +8,10 @@ contains the fix.
 from __future__ import annotations
 
 import array
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Final, Protocol, runtime_checkable
 
 from sightline.protocol.jpeg import JpegSize
 from sightline.protocol.messages import CameraModel
@@ -29,6 +30,21 @@ class Picture:
     jpeg: bytes
     t_us: int
     scale_percent: int = 100
+
+
+def check_image(camera: Camera, picture: object) -> None:
+    """Raise TypeError or ValueError, with what is wrong, for an image or attributes that no `Camera` may have."""
+    if not isinstance(picture, Picture):
+        raise TypeError(f"read() returned {type(picture).__name__}; expected Picture or None")
+    for name, value, kind in (
+        ("Picture.jpeg", picture.jpeg, bytes), ("Picture.t_us", picture.t_us, int),
+        ("Picture.scale_percent", picture.scale_percent, int), ("model", camera.model, CameraModel),
+        ("live", camera.live, bool),
+    ):
+        if not isinstance(value, kind):
+            raise TypeError(f"{name} is {type(value).__name__}; expected {kind.__name__}")
+    if not 1 <= picture.scale_percent <= 100:
+        raise ValueError(f"Picture.scale_percent is {picture.scale_percent}; expected 1 to 100")
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +84,8 @@ class Ranges:
         angle_increment_rad: angle between two rays, rad.
         range_min_m: smallest distance that the sensor measures, m.
         range_max_m: largest distance that the sensor measures, m.
-        ranges_m: one distance per ray, m.
+        ranges_m: one distance per ray, m; at most MAX_RAYS. A scan of over 4096 rays limits the speed, and is too long
+            to be published.
     """
 
     t_us: int
@@ -77,6 +94,23 @@ class Ranges:
     range_min_m: float
     range_max_m: float
     ranges_m: array.array[float]
+
+
+MAX_RAYS: Final = 16_384
+"""Of a scan: more of them would hold up the control loop."""
+
+
+def check_scan(scan: object) -> None:
+    """Raise TypeError or ValueError, with what is wrong, for what no `RangeSensor` may return."""
+    if not isinstance(scan, Ranges):
+        raise TypeError(f"read() returned {type(scan).__name__}; expected Ranges or None")
+    if not isinstance(scan.t_us, int):
+        raise TypeError(f"Ranges.t_us is {type(scan.t_us).__name__}; expected int")
+    for name in ("angle_min_rad", "angle_increment_rad", "range_min_m", "range_max_m"):
+        if math.isnan(getattr(scan, name)):
+            raise ValueError(f"Ranges.{name} is nan")
+    if len(scan.ranges_m) > MAX_RAYS:
+        raise ValueError(f"a scan of {len(scan.ranges_m)} rays; at most {MAX_RAYS}")
 
 
 class Camera(Protocol):

@@ -392,10 +392,13 @@ def check(service: ServiceName, file: File = None, profile: Profile = None, sets
 def _check_names(config: BaseModel) -> None:
     """Check that devices, scenario, robot, detectors and missions exist, with their options. Opens no device."""
     if isinstance(config, RobotConfig):
+        from sightline.robot_side.guardian.start import zero_of
+
         for group in DEVICE_GROUPS:
             choice = config.devices[group.key]
             if choice is not None:
                 group.load(choice)
+        zero_of(config)
     if isinstance(config, SimConfig):
         load_robot(config.robot or load_scenario(config.scenario).robot)
     if isinstance(config, VisionConfig):

@@ -23,9 +23,7 @@ from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, RejectReason, SightlineError, WireError
 from sightline.protocol.log import (
     RepeatLimiter,
-    error_text,
     faults,
-    report_ending,
     report_fault,
     start_log,
     start_log_thread,
@@ -50,7 +48,7 @@ from sightline.robot_side.guardian.start import GuardianEnd, zero_of
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.plugins import BATTERIES, DRIVES, RANGE_SENSORS
-from sightline.robot_side.ports import Battery, Drive, Ranges, RangeSensor, WheelAngles
+from sightline.robot_side.ports import Battery, Drive, Ranges, RangeSensor, WheelAngles, check_scan
 from sightline.robot_side.safety.battery import BatteryLevel
 from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
 from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
@@ -83,10 +81,10 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
     limit_core_dump()
     with ExitStack() as last, ExitStack() as ending:
         drive = DRIVES.build(config.motors)
-        ending.callback(drive.close)
+        ending.callback(_close, "drive", drive)
         ranges = RANGE_SENSORS.build(config.ranging) if config.ranging else None
         if ranges is not None:
-            ending.callback(ranges.close)
+            ending.callback(_close, "range sensor", ranges)
         threading.stack_size(_PLUGIN_STACK_BYTES)
         reader = BatteryReader(BATTERIES.build(config.battery)) if config.battery else None
         if reader is not None:
@@ -106,6 +104,14 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         # Last in, first to run: however the loop ends, the motors are set to zero. An error makes the guardian do it.
         ending.callback(_end, config, drive, guardian)
         return driver.loop()
+
+
+def _close(part: str, device: Drive | RangeSensor | Battery) -> None:
+    """Close a device. The motors are at zero, so its exception is only reported."""
+    try:
+        device.close()
+    except PLUGIN_ERRORS as error:
+        report_fault(part, error)
 
 
 def zero_motors(config: RobotConfig) -> int:
@@ -135,8 +141,7 @@ def _zero(config: RobotConfig, set_to_zero: Callable[[], None]) -> None:
     except SightlineError:
         raise
     except PLUGIN_ERRORS as error:
-        report_ending("drive", error)
-        what = f"drive '{config.drive.kind}' raised {type(error).__name__}: {error_text(error)}"
+        what = DRIVES.failed(config.drive, error)
         raise HardwareError(f"motors NOT set to zero: {what}; switch off their supply") from None
 
 
@@ -160,10 +165,7 @@ class BatteryReader:
         try:
             self._read_until_closing()
         finally:
-            try:
-                self._battery.close()
-            except PLUGIN_ERRORS as error:
-                report_fault("battery", error)
+            _close("battery", self._battery)
 
     def _read_until_closing(self) -> None:
         while not self._closing.is_set():
@@ -373,6 +375,7 @@ class Driver:
         scan = self._ranges.read() if self._ranges else None
         if scan is None:
             return None
+        check_scan(scan)
         scan_layout = (scan.angle_min_rad, scan.angle_increment_rad, scan.range_min_m, float(len(scan.ranges_m)))
         if scan_layout != self._scan_layout:
             check_blind_zone(self._driver_core.config.guard, scan)

@@ -39,6 +39,10 @@ ENDS_WITHIN_US: Final = 7_000_000
 MAX_RESTARTS: Final = 5
 RESTART_WINDOW_US: Final = 60_000_000
 
+_OUT_OF_CONTROL: Final = {
+    LOST: f"its drive took no speeds for {REFUSES_US // 1000} ms",
+    FAILED: "its drive did not take zero at the end",
+}
 _LONGEST_STEP_US: Final = PERIOD_US + LATE_US  # of one look: more of it is the lateness of the guardian
 
 
@@ -100,13 +104,11 @@ class HeartbeatMonitor:
             self._own_us += step_us
         else:
             self._own_us += min(step_us, run_us - before_us)
-        return "its drive did not take zero at the end" if self.drive_failed else self._reason()
+        return _OUT_OF_CONTROL.get(self._last) or self._reason()
 
     def _reason(self) -> str:
         if self._last == IDLE:
             return ""
-        if self._last == LOST:
-            return f"its drive took no speeds for {REFUSES_US // 1000} ms"
         if not self._last:
             return "did not start within 30 s" if self._silence_us >= STARTS_WITHIN_US else ""
         if self._last == ENDING:

@@ -40,8 +40,8 @@ class NetworkCore:
     def __init__(self, config: StreamConfig, session: str, first_seq: int, max_frame_bytes: int) -> None:
         self.motion = RobotMotion()
         self._rejected_pictures = 0
-        self._time_fault = ""
-        """Why the newest image was rejected, if its capture time is in the future."""
+        self.image_fault = ""
+        """Why the newest image was rejected."""
         self._stream = Stream(config)
         self._session = session
         self._seq = first_seq
@@ -80,10 +80,8 @@ class NetworkCore:
             Header and message, or None for an image that is too large, not newer than the last, or in the future. It is
             counted.
         """
-        # The frames after one of the future would not be newer, until that time.
-        ahead_s = (picture.t_us - now_us) / 1e6
-        self._time_fault = f"image is {ahead_s:.3f} s in the future" if ahead_s > 0 else ""
-        if self._time_fault or picture.t_us <= self._last_t_us or len(picture.jpeg) > self._max_frame_bytes:
+        self.image_fault = self._fault_of(picture, now_us)
+        if self.image_fault:
             self._rejected_pictures += 1
             return None
         self._last_t_us = picture.t_us
@@ -94,6 +92,17 @@ class NetworkCore:
         self._frame_times.pop(self._seq - _KEPT_FRAMES, None)
         self._seq += 1
         return header, Message(FRAME, "", encode(header), picture.jpeg)
+
+    def _fault_of(self, picture: Picture, now_us: int) -> str:
+        """Return why an image cannot be sent, or ""."""
+        if picture.t_us > now_us:  # the frames after it would not be newer, until that time
+            return f"image is {(picture.t_us - now_us) / 1e6:.3f} s in the future"
+        if picture.t_us <= self._last_t_us:
+            return "the time of the image is not after that of the one before"
+        size_bytes = len(picture.jpeg)
+        if size_bytes > self._max_frame_bytes:
+            return f"image of {size_bytes} bytes; at most {self._max_frame_bytes} (max_frame_bytes)"
+        return ""
 
     def _header(self, t_us: int) -> FrameHeader:
         motion = self.motion
@@ -187,7 +196,7 @@ class NetworkCore:
             missed_captures=missed_captures,
             quality_percent=self._applied.quality_percent,
             scale_percent=self._applied.scale_percent,
-            camera_fault=(camera_fault or self._time_fault)[:200],
+            camera_fault=(camera_fault or self.image_fault)[:200],
         )
 
 

@@ -20,7 +20,7 @@ from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, SightlineError, WireError
-from sightline.protocol.log import count_fault, error_line, error_text, faults, report_fault, start_log
+from sightline.protocol.log import RepeatLimiter, count_fault, error_line, error_text, faults, report_fault, start_log
 from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
@@ -29,7 +29,7 @@ from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.network.core import NetworkCore
 from sightline.robot_side.pipe import CAMERA_EXIT, KEYS, NetworkEnd, NetworkSetup
 from sightline.robot_side.plugins import CAMERAS
-from sightline.robot_side.ports import Camera, Picture
+from sightline.robot_side.ports import Camera, Picture, check_image
 
 _log: Final = logging.getLogger(__name__)
 
@@ -95,6 +95,7 @@ class NetworkProcess:
         self._tokens: dict[str, bool] = {}
         """Tokens of drivers, and whether they are present, that found no room in the pipe. Their end ends a lease."""
         self._faults_reported: Counter[str] = Counter()
+        self._rejection_limiter = RepeatLimiter()
         self._rejected_acks: Counter[str] = Counter()
         self._rejected_reported: Counter[str] = Counter()
         self.running = True
@@ -127,12 +128,17 @@ class NetworkProcess:
         if camera is not None:
             self._link.publish(camera.channel, camera.header, camera.payload)
         if picture is None or sent is None:
+            self._log_rejected(picture)
             return
         header, message = sent
         # The driver process must know a frame before a peer can answer it.
         fingerprint = zlib.crc32(picture.jpeg) if self.camera and self.camera.live else 0
         if self._network_end.send_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
             self._link.publish(message.channel, message.header, message.payload)
+
+    def _log_rejected(self, picture: Picture | None) -> None:
+        if picture is not None and (count := self._rejection_limiter.due("image", monotonic_us())):
+            _log.warning("camera: %s (%d times)", self._network_core.image_fault, count)
 
     def _may_capture(self) -> bool:
         """Return True if the camera may capture now. Otherwise wait briefly, for credit once a frame is due."""
@@ -159,6 +165,8 @@ class NetworkProcess:
                 self.camera = CAMERAS.build(self._setup.config.camera)
             self._network_core.adapt(self.camera)
             picture = self.camera.read(_CAMERA_TIMEOUT_S)
+            if picture is not None:
+                check_image(self.camera, picture)
         except PLUGIN_ERRORS as error:
             self._on_camera_error(error)
             return None

@@ -68,8 +68,8 @@ def test_other_missing_module_is_named(folder):
 
 
 def test_plug_in_that_exits_on_import_does_not_end_the_service(folder):
-    (folder / "leaves.py").write_text("import sys\nsys.exit('bye')\n")
-    with pytest.raises(ConfigError, match="'leaves:Camera' cannot be loaded: bye"):
+    (folder / "leaves.py").write_text("import sys\nsys.exit('bye\\nnow')\n")
+    with pytest.raises(ConfigError, match=r"'leaves:Camera' cannot be loaded: SystemExit: bye now$"):
         CAMERAS.load("leaves:Camera")
 
 

@@ -3,16 +3,21 @@
 `python -m tests.robot_side.test_plugins` writes the page's table.
 """
 
+import array
 import inspect
+import math
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from sightline.protocol.config import PluginRegistry
-from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.plugins import DEVICE_GROUPS
+from sightline.protocol.config import Config, PluginRegistry
+from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.robot_side.config import PluginChoice, RobotConfig
+from sightline.robot_side.plugins import BATTERIES, DEVICE_GROUPS, DRIVES
+from sightline.robot_side.ports import Ranges, check_scan
 
 ROOT = Path(__file__).parent.parent.parent
 ENTRY_POINTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
@@ -30,11 +35,56 @@ def test_the_table_the_configuration_and_the_entry_points_name_the_same_groups()
 
 @pytest.mark.parametrize("group", DEVICE_GROUPS, ids=lambda group: group.key)
 def test_each_built_in_device_implements_its_port(group):
-    demanded = {name for name, value in vars(group.port).items() if callable(value) and not name.startswith("_")}
+    demanded = {*group.methods, *(["zero"] if group is DRIVES else [])}
     assert demanded >= {"close"}
     for kind in ENTRY_POINTS[group.entry_points]:
         plugin = PluginRegistry(group.key, group.entry_points).load(kind)
         assert [name for name in sorted(demanded) if not callable(getattr(plugin, name, None))] == [], kind
+
+
+class OddDevice:
+    """Raises what `raises` says."""
+
+    class Config(Config):
+        raises: str = ""
+
+    def __init__(self, config):
+        raise {"": ValueError("no\n\x1bport"), "exit": SystemExit(0)}[config.raises]
+
+    def read(self):
+        pass
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize(("raises", "text"), [("", "ValueError: no ?port"), ("exit", "SystemExit: 0")])
+def test_exception_of_a_device_at_its_start_is_one_line_that_names_it(raises, text):
+    choice = PluginChoice(kind=f"{__name__}:OddDevice", options={"raises": raises})
+    with pytest.raises(HardwareError) as caught:
+        BATTERIES.build(choice)
+    assert str(caught.value) == f"battery '{choice.kind}' raised {text}"
+
+
+def test_device_without_a_method_of_its_port_is_rejected_before_it_is_opened():
+    choice = PluginChoice(kind=f"{__name__}:OddDevice")
+    with pytest.raises(ConfigError, match=rf"^drive '{choice.kind}' has no method set\(\): docs/how-to"):
+        DRIVES.build(choice)
+
+
+SCAN = Ranges(1, 0.0, 0.1, 0.05, 8.0, array.array("f", [1.0]))
+
+
+@pytest.mark.parametrize(("scan", "text"), [
+    (None, r"read\(\) returned NoneType"), (replace(SCAN, t_us=1.5), "Ranges.t_us is float"),
+    (replace(SCAN, range_max_m=math.nan), "Ranges.range_max_m is nan"),
+    (replace(SCAN, angle_min_rad=math.nan), "Ranges.angle_min_rad is nan"),
+    (replace(SCAN, ranges_m=array.array("f", [1.0]) * 16_385), "a scan of 16385 rays; at most 16384"),
+])
+def test_wrong_scan_is_named(scan, text):
+    with pytest.raises((TypeError, ValueError), match=text):
+        check_scan(scan)
+    check_scan(replace(SCAN, ranges_m=array.array("f", [1.0]) * 16_384))
 
 
 def page_with_table(text: str) -> str:

@@ -117,6 +117,8 @@ class LockedCore:
         self.motion = ipc.RobotMotion()
         self.locked = {}
 
+    image_fault = ""
+
     def _note(self, name):
         self.locked[name] = self._process._lock.locked()
 
@@ -173,6 +175,33 @@ def test_each_use_of_the_credit_holds_the_lock(process, act, names):
     act(process)
     assert core.locked == dict.fromkeys(names, True)
     assert not process._lock.locked(), "and gives it back"
+
+
+@pytest.mark.parametrize(("change", "fault"), [
+    ({"read": lambda _: b"jpeg"}, "read() returned bytes; expected Picture or None"),
+    ({"read": lambda _: Picture(memoryview(b"jpeg"), 1)}, "Picture.jpeg is memoryview; expected bytes"),
+    ({"read": lambda _: Picture("jpeg", 1)}, "Picture.jpeg is str; expected bytes"),
+    ({"read": lambda _: Picture(b"jpeg", 1.5)}, "Picture.t_us is float; expected int"),
+    ({"read": lambda _: Picture(b"jpeg", 1, 0)}, "Picture.scale_percent is 0; expected 1 to 100"),
+    ({"read": lambda _: Picture(b"jpeg", 1, 50.0)}, "Picture.scale_percent is float; expected int"),
+    ({"model": None}, "model is NoneType; expected CameraModel"),
+    ({"live": None}, "live is NoneType; expected bool"),
+    ({"read": lambda _: Picture(b"jpeg" * 200_000, 1)}, "image of 800000 bytes; at most 400000 (max_frame_bytes)"),
+    ({"read": lambda _: Picture(b"jpeg", -1)}, "the time of the image is not after that of the one before"),
+])
+def test_wrong_image_is_a_fault_of_the_camera_and_ends_nothing(process, link, monkeypatch, caplog, change, fault):
+    monkeypatch.setattr(network_process, "_CAMERA_RETRY_S", 0.0)
+    for name, value in change.items():
+        setattr(process.camera, name, value)
+    process._stream_one()
+    process._stream_one()
+    status = process._network_core.status(1, camera_fault=process._camera_fault)
+    assert (status.camera_fault, FRAME in link.published) == (fault, False)
+    assert sum(fault in line for line in caplog.messages) <= 2 and "camera" in caplog.text
+    for name in change:
+        delattr(process.camera, name)
+    process._stream_one()
+    assert FRAME in link.published and not process._network_core.image_fault
 
 
 @pytest.mark.parametrize(("now_us", "slept_s", "waited_s"), [
