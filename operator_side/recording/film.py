@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -90,9 +91,11 @@ class Film:
 
     def close(self) -> None:
         """Write the rest of the encoder's data and the index."""
-        if self._stream is not None:
-            self._container.mux(self._stream.encode(None))
-        self._container.close()
+        try:
+            if self._stream is not None:
+                self._container.mux(self._stream.encode(None))
+        finally:
+            self._container.close()
 
     def __enter__(self) -> Self:
         return self
@@ -100,7 +103,10 @@ class Film:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+        else:  # after a write that failed, FFmpeg crashes if it is to write the rest
+            self._container.close()
 
     def _opened(self, picture: Image) -> Any:
         stream = self._container.add_stream("libx264", rate=self._fps)
@@ -171,7 +177,7 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
     unfinished = path.with_name(f".{path.name}.part.mp4")
     size = (0, 0)
     try:
-        with writes(path), Film(unfinished, _FPS) as made, suppress(KeyboardInterrupt):
+        with writes(path), Film(unfinished, _FPS) as made, _ends_with_ctrl_c(made):
             ends_s = 0.0  # counted from the first image
             while (shot := _wanted(pictures, wanted, ends_s or time.monotonic() + PATIENCE_S)) is not None:
                 if made.since_first_s(shot.t_us) > seconds:
@@ -187,6 +193,16 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
         return Captured(path, made.frames, made.seconds, *size)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def _ends_with_ctrl_c(made: Film) -> Iterator[None]:
+    """Ctrl-C ends the film. Before its first image it ends the command."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not made.frames:
+            raise
 
 
 def _wanted(pictures: Pictures, wanted: Channel, ends_s: float) -> Shot | None:

@@ -28,20 +28,39 @@ class Played:
 
 
 @contextmanager
-def full_disk() -> Iterator[None]:
-    """Let no file grow beyond 1000 bytes."""
+def full_disk(room_bytes: int = 1000) -> Iterator[None]:
+    """Let no file grow beyond that."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room_bytes, before[1]))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-def test_video_on_a_full_disk_is_reported(tmp_path: Path) -> None:
-    with full_disk(), pytest.raises(ConfigError, match=f"cannot write {tmp_path}/run.mp4: File too large; "):
+@pytest.mark.parametrize("room_bytes", [0, 1, 1000, 4000])
+def test_video_on_a_full_disk_is_reported(tmp_path: Path, room_bytes: int) -> None:
+    with full_disk(room_bytes), pytest.raises(ConfigError, match=f"cannot write {tmp_path}/run.mp4: File too large; "):
         film(Played(), tmp_path / "run.mp4", FRAME, 0.9)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_ends_a_film_and_before_its_first_image_the_command(tmp_path: Path) -> None:
+    class Interrupted(Played):
+        left = 0
+
+        def take(self, seconds: float) -> Shot:
+            self.left -= 1
+            if self.left < 0:
+                raise KeyboardInterrupt
+            return super().take(seconds)
+
+    with pytest.raises(KeyboardInterrupt):
+        film(Interrupted(), tmp_path / "run.mp4", FRAME, 0.9)
+    assert list(tmp_path.iterdir()) == []
+    pictures = Interrupted()
+    pictures.left = 2
+    assert film(pictures, tmp_path / "run.mp4", FRAME, 0.9).frames == 2
 
 
 def test_snapshot_on_a_full_disk_is_reported(tmp_path: Path) -> None:
