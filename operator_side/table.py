@@ -6,9 +6,11 @@ The width of the terminal changes nothing, so that a script reads the same lines
 import os
 import re
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import zip_longest
 from typing import Final, TextIO
+
+from sightline.protocol.log import printable
 
 _GREEN, _YELLOW, _RED = "32", "33", "31"
 _COLORS: Final = {
@@ -33,8 +35,13 @@ def print_table(rows: Iterable[Sequence[str]]) -> None:
 
 def print_block(lines: Iterable[str]) -> None:
     """Print lines on stdout, with colors for states on a terminal."""
-    text = "\n".join(lines)
+    text = "\n".join(clean(lines))
     print(colored(text) if uses_color(sys.stdout) else text, flush=True)
+
+
+def clean(lines: Iterable[str]) -> Iterator[str]:
+    """Yield lines without letters that control a terminal: a peer may have written a part of them."""
+    return (printable(part) for line in lines for part in line.splitlines() or [""])
 
 
 def colored(text: str) -> str:

@@ -17,6 +17,7 @@ from sightline.operator_side.client.status import counts_text
 from sightline.protocol.channels import MISSION, REPORT
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.errors import ConfigError, LinkError, WireError
+from sightline.protocol.log import printable
 from sightline.protocol.messages import (
     MAX_OPTIONS,
     MAX_WAYPOINT_M,
@@ -230,8 +231,8 @@ def request_of(number: int, name: str, waypoints: Waypoints, options: Mapping[st
 
 def mission_line(report: MissionReport) -> str:
     """Format mission, phase and note as one line."""
-    return "".join([f"{report.mission}: {report.phase}", f"; {report.note}" if report.note else "",
-                    " (over)" if report.done else ""])
+    return printable("".join([f"{report.mission}: {report.phase}", f"; {report.note}" if report.note else "",
+                              " (over)" if report.done else ""]))
 
 
 def mission_lines(report: MissionReport) -> Iterator[str]:

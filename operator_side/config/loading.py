@@ -98,7 +98,7 @@ def load(
     for one in (
         *implied,
         *_from_profile(service, profile),
-        *(_from_file(file, file) if file else ()),
+        *(_from_file(file, file) if file is not None else ()),
         *_from_environment(service, environ),
         *(_from_set(text) for text in sets),
         *_from_options(options or {}),
@@ -130,6 +130,8 @@ def _from_profile(service: str, profile: str | None) -> Iterable[Given]:
 
 
 def _from_file(file: str, origin: str) -> Iterable[Given]:
+    if not file:
+        raise ConfigError("the name of the configuration file is empty; name a TOML file, or leave out --config")
     try:
         table = tomllib.loads(home_path(file).read_text("utf-8"))
     except OSError as error:

@@ -4,7 +4,9 @@ import io
 
 import pytest
 
-from sightline.operator_side.table import colored, print_table, table_lines, uses_color
+from sightline.operator_side.client.missions import mission_line
+from sightline.operator_side.table import colored, print_block, print_table, table_lines, uses_color
+from sightline.protocol.messages import MissionReport
 
 
 class Terminal(io.StringIO):
@@ -32,6 +34,13 @@ def test_colors_need_a_terminal_and_no_no_color(monkeypatch, environ, expected):
     assert uses_color(Terminal()) is expected
     assert uses_color(io.StringIO()) is False
     assert uses_color(None) is False, "the output is closed"
+
+
+def test_text_of_a_peer_cannot_control_the_terminal(capsys):
+    print_block(["mission   a: \x1b[31mred\nline", "", "µ 中文"])
+    assert capsys.readouterr().out == "mission   a: ?[31mred\nline\n\nµ 中文\n"
+    report = MissionReport(mission="a", phase="\x1b[2Jgone\r", note="b\x07")
+    assert mission_line(report) == "a: ?[2Jgone?; b?"
 
 
 def test_states_are_colored_and_other_words_are_not():

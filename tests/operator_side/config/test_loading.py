@@ -127,6 +127,12 @@ def test_a_bad_file_is_named(tmp_path, text, expected):
     assert expected in one_line(error)
 
 
+def test_an_empty_file_name_is_not_the_defaults():
+    """A script's variable that is not set must not start another robot."""
+    with pytest.raises(ConfigError, match="the name of the configuration file is empty"):
+        load("robot", file="", environ={})
+
+
 def test_text_that_looks_like_a_number_is_text_where_text_belongs():
     loaded = load("robot", sets=["robot=7"], environ={"SIGHTLINE_ROBOT__LISTEN": "tcp/127.0.0.1:1,tcp/127.0.0.1:2"})
     assert loaded.config.robot == "7"
