@@ -234,9 +234,25 @@ def diagnose_tls(endpoint: str, secured: RoleKeys | None) -> str:
         return "a tls/ endpoint needs keys; pass --secure DIR"
     import ssl
 
+    if problem := keys_problem(secured):
+        return problem
     context = ssl.create_default_context(cafile=f"{secured.folder}/ca.pem")
     context.load_cert_chain(f"{secured.folder}/{secured.role}.pem", f"{secured.folder}/{secured.role}.key")
     return _try_handshake(host, port, context)
+
+
+def keys_problem(secured: RoleKeys) -> str:
+    """Return what is wrong with the files of this end, or "" if they can be read and belong together."""
+    import ssl
+
+    try:
+        named = "ca.pem is damaged"
+        context = ssl.create_default_context(cafile=f"{secured.folder}/ca.pem")
+        named = f"{secured.role}.pem or {secured.role}.key is damaged, or they do not belong together"
+        context.load_cert_chain(f"{secured.folder}/{secured.role}.pem", f"{secured.folder}/{secured.role}.key")
+    except OSError:  # also those of ssl
+        return f"{named} in {secured.folder}; copy the files of {secured.role} again from where they were made"
+    return ""
 
 
 def _speaks_tls(host: str, port: int) -> bool:

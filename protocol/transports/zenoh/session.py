@@ -17,7 +17,13 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from sightline.protocol.errors import ConfigError, LinkError, SightlineError, install_command
-from sightline.protocol.transports.diagnosis import diagnose_tls, own_sockets, port_in_use, unresolved_host
+from sightline.protocol.transports.diagnosis import (
+    diagnose_tls,
+    keys_problem,
+    own_sockets,
+    port_in_use,
+    unresolved_host,
+)
 from sightline.protocol.transports.endpoints import (
     MULTICAST_PORT,
     OVER_UDP,
@@ -231,6 +237,8 @@ def _error_of(
     where = next((endpoint for endpoint in listen if endpoint.partition("#")[0] in text), " or ".join(listen))
     if "in use" in text:
         return port_in_use(where, parse_zenoh_endpoint(where)[2])
+    if secured is not None and (problem := keys_problem(secured)):
+        return LinkError(f"cannot listen on {where}: {problem}")
     cause = re.split(r" at /|\(os error", text.rpartition("[")[2])[0].rpartition(": ")[2].strip(" .]")
     return LinkError(f"cannot listen on {where}: {cause}; use an address of this machine, e.g. tcp/127.0.0.1:7447")
 

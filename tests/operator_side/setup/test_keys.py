@@ -5,8 +5,12 @@ import errno
 import pytest
 
 from sightline.operator_side.setup import keys
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.diagnosis import diagnose_tls, keys_problem
+from sightline.protocol.transports.open import open_link
+from sightline.protocol.transports.security import RoleKeys
 from sightline.protocol.transports.stop_port import stop_secret_file
+from tests.fixtures.ports import free_port
 
 
 def test_a_new_folder_has_a_secret_that_only_its_owner_reads(tmp_path):
@@ -31,6 +35,22 @@ def test_a_folder_without_keys_gets_no_secret(tmp_path):
     with pytest.raises(ConfigError, match="sightline keys init"):
         keys.add(tmp_path, "stop", [])
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("damage", "problem"), [
+    (lambda folder: (folder / "robot.key").write_text("x"), "robot.pem or robot.key is damaged, or"),
+    (lambda folder: (folder / "vision.pem").rename(folder / "robot.pem"), "robot.pem or robot.key is damaged, or"),
+    (lambda folder: (folder / "ca.pem").write_text(""), "ca.pem is damaged in "),
+])
+def test_damaged_or_mixed_files_are_named_at_both_ends_of_a_link(tmp_path, damage, problem):
+    keys.make(tmp_path, [])
+    own = RoleKeys(str(tmp_path), "robot")
+    assert keys_problem(own) == ""
+    damage(tmp_path)
+    assert keys_problem(own).startswith(problem) and diagnose_tls("tls/127.0.0.1:9", own) == keys_problem(own)
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    with pytest.raises(LinkError, match=f"^cannot listen on {endpoint}: {problem}"):
+        open_link("r1", listen=[endpoint], role="robot", secure=str(tmp_path)).__enter__()
 
 
 @pytest.mark.parametrize("host", ["300.1.1.1", "192.168.1", "robot local", "robot/1"])
