@@ -1,6 +1,7 @@
 """Runs the vision service as a process: opens the link, serves one robot or a fleet, ends on a signal. Shell."""
 
 import logging
+import os
 import signal
 import threading
 import time
@@ -26,17 +27,34 @@ _log: Final = logging.getLogger(__name__)
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 
 
+ENDS_WITHIN_S: Final = 5.0
+"""Longest end after a signal. A detector or mission that hangs would never end."""
+
+
+def _end_hanging(number: int) -> None:
+    _log.error("vision: the detector or mission does not return; ended by force")
+    logging.shutdown()
+    os._exit(128 + number)
+
+
 @contextmanager
 def ends_on_signal(ending: threading.Event) -> Iterator[None]:
-    """SIGTERM and SIGINT set `ending` while inside."""
+    """SIGTERM and SIGINT set `ending` while inside. A process that is still there ENDS_WITHIN_S later is ended."""
+    timers: list[threading.Timer] = []
 
-    def end(_number: int, _frame: FrameType | None) -> None:
+    def end(number: int, _frame: FrameType | None) -> None:
         ending.set()
+        timer = threading.Timer(ENDS_WITHIN_S, _end_hanging, [number])
+        timer.daemon = True
+        timer.start()
+        timers.append(timer)
 
     before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         yield
     finally:
+        for timer in timers:
+            timer.cancel()
         for number, handler in before.items():
             signal.signal(number, handler)
 

@@ -489,3 +489,25 @@ def test_service_of_one_robot_that_connects_is_open_with_a_session():
         found = [states[0].is_open()]
         link.close()
         assert [*found, states[0].is_open()] == is_open
+
+
+@pytest.mark.parametrize("hangs", [True, False])
+def test_service_whose_detector_or_mission_hangs_is_ended_after_its_time(hangs):
+    code = (
+        "import sys, threading, time\n"
+        "from sightline.protocol.log import start_log\n"
+        "from sightline.vision_side.serving import process\n"
+        "start_log(None, 'vision')\n"
+        "process.ENDS_WITHIN_S, ending = 0.2, threading.Event()\n"
+        "with process.ends_on_signal(ending):\n"
+        "    print('on', flush=True)\n"
+        f"    time.sleep(30) if {hangs} else ending.wait(30)\n"
+        "time.sleep(0.4)\n"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert started.stdout.readline() == "on\n"
+    started.send_signal(signal.SIGTERM)
+    _, told = started.communicate(timeout=20)
+    assert (started.returncode, "does not return; ended by force" in told) == ((143, True) if hangs else (0, False))
