@@ -242,7 +242,7 @@ def scene_result(result: DetectionResult | None, scene: Scene, balls: Sequence[s
 FRAMES: Final = 1000
 """A fifth shows no ball. Decision 14 has the reason for the number."""
 LEAST_HITS: Final = {
-    "nominal": 0.85, "same-colour boxes": 0.78, "changed light": 0.80, "blur": 0.75, "quality 30": 0.78,
+    "nominal": 0.85, "same-color boxes": 0.78, "changed light": 0.80, "blur": 0.75, "quality 30": 0.78,
     "all at once": 0.68,
 }
 MOST_WRONG: Final = 0.05

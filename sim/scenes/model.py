@@ -65,7 +65,7 @@ _HARD: Final = {"same_colour_boxes": 1.0, "blurred": 1.0, "quality": (30, 30), *
 
 COLUMNS: Final = {one.name: one for one in (
     Column("nominal"),
-    Column("same-colour boxes", same_colour_boxes=1.0),
+    Column("same-color boxes", same_colour_boxes=1.0),
     Column("changed light", **_LIGHT),  # type: ignore[arg-type]
     Column("blur", blurred=1.0),
     Column("quality 30", quality=(30, 30)),

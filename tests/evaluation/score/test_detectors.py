@@ -153,13 +153,13 @@ def test_command_line_starts_at_the_first_scored_seed():
 
 def test_detectors_are_scored_on_the_same_pictures():
     asked = subjects(["hsv", "adaptive"])
-    report = score_scenes(asked, 10, looks=4, columns=["nominal", "same-colour boxes"])
-    assert set(report.columns) == {"nominal", "same-colour boxes"}
+    report = score_scenes(asked, 10, looks=4, columns=["nominal", "same-color boxes"])
+    assert set(report.columns) == {"nominal", "same-color boxes"}
     hsv = report.columns["nominal"]["hsv"]
     assert (hsv.frames, hsv.balls) == (10, 8) and hsv.hits >= 0.25 and hsv.compute_p50_us
     assert report.columns["nominal"]["adaptive"].hits > 0  # four looks are enough to be sure
     assert report.made_by["hsv"]["device"] == "cpu"
-    assert "same-colour boxes" in text(report) and markdown(report).count("| nominal |") == 2
+    assert "same-color boxes" in text(report) and markdown(report).count("| nominal |") == 2
 
 
 def test_the_command_gives_json(capsys):

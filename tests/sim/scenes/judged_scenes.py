@@ -17,7 +17,7 @@ from sightline.sim.scenes.plan import as_seen
 from sightline.sim.scenes.render import SceneRenderer
 
 FILE = Path(__file__).parent.parent.parent / "judged_scenes.json"
-PINNED = [(COLUMNS["nominal"], 1), (COLUMNS["same-colour boxes"], 212), (COLUMNS["all at once"], 333), (THINGS, 1204)]
+PINNED = [(COLUMNS["nominal"], 1), (COLUMNS["same-color boxes"], 212), (COLUMNS["all at once"], 333), (THINGS, 1204)]
 """Columns, with the distance above the first scored seed; together they contain every scored family of textures."""
 ACROSS, DOWN = 16, 12
 MOST_PX, MOST_LEVELS = 1.01, 2

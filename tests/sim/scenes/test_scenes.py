@@ -122,7 +122,7 @@ def test_what_is_trained_last_has_more_boxes_of_the_balls_colour_and_more_legs()
 
 
 def test_columns_match_their_names():
-    boxes = judged_plans(COLUMNS["same-colour boxes"])
+    boxes = judged_plans(COLUMNS["same-color boxes"])
     for plan in boxes:
         near = [one for one in plan.solids if one.shape == "box"]
         alike = [one for one in near if max(one.colour[:2]) > 0.6 and one.colour[2] < 0.45]
@@ -144,7 +144,7 @@ def test_each_fifth_scored_scene_has_no_ball():
 def test_boxes_are_exact_and_no_ball_is_hidden_too_far(renderer):
     whole = hidden = 0
     for seed in range(JUDGED_FROM, JUDGED_FROM + 60):
-        scene = renderer.scene(seed, COLUMNS["same-colour boxes"])
+        scene = renderer.scene(seed, COLUMNS["same-color boxes"])
         assert sum(one.label == "ball" for one in scene.truths) == (seed % 5 != 0), "an answer is not a false alarm"
         assert sum(one.is_like_ball for one in scene.plan.solids) == 2, "the column is named for them"
         for one in scene.truths:
