@@ -27,6 +27,15 @@ class HsvRange(Config):
     value_low: Fraction = 0.15
     value_high: Fraction = 1.0
 
+    @model_validator(mode="after")
+    def _is_not_empty(self) -> Self:
+        """Reject a range that no pixel is in: only hues wrap around."""
+        for name in ("saturation", "value"):
+            low, high = getattr(self, f"{name}_low"), getattr(self, f"{name}_high")
+            if low > high:
+                raise ValueError(f"{name}_low {low:g} is above {name}_high {high:g}; exchange them")
+        return self
+
 
 class HsvConfig(Config):
     """The color detector."""

@@ -2,11 +2,12 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from numbers import Real
-from typing import Any, Final
+from operator import index
+from typing import Any, Final, SupportsIndex
 
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import ConfigError, SightlineError
@@ -106,8 +107,11 @@ def notices_of(detector: Any) -> list[str]:
 
 def labels_of(detector: Any) -> Sequence[str]:
     """Return all labels that a detector can give; empty where they are unknown."""
-    labels: Sequence[str] = getattr(detector, "labels", ())
-    return labels
+    with plugin_guard("the detector's labels"):
+        labels: object = getattr(detector, "labels", ())
+        if isinstance(labels, str) or not isinstance(labels, Iterable):
+            raise TypeError(f"{labels!r} is not a sequence of texts")
+        return tuple(map(str, labels))
 
 
 def maker_of(detector: Any) -> Maker | None:
@@ -232,6 +236,8 @@ def _validated(one: Detection, width_px: int, height_px: int) -> Detection | Non
     wrong = annotation_problem(one)
     if wrong:
         raise ValueError(wrong)
+    if one.track_id is not None:  # of any kind of integer, e.g. NumPy's
+        one = replace(one, track_id=index(one.track_id))
     return clipped(one, width_px, height_px)
 
 
@@ -241,8 +247,9 @@ def annotation_problem(one: Detection) -> str:
         return f"invalid label {one.label[:20]!r}, {len(one.label)} characters: not 1 to {LONGEST_LABEL} printable ones"
     if one.circle is not None and not _is_circle(one.circle):
         return f"a circle at ({one.circle.cx_px:g}, {one.circle.cy_px:g}) with a radius of {one.circle.radius_px:g}"
-    if one.track_id is not None and not 0 <= one.track_id <= MAX_INTEGER:
-        return f"a track number {one.track_id}"[:_LONGEST_WHY]
+    track_id: object = one.track_id
+    if track_id is not None and not (isinstance(track_id, SupportsIndex) and 0 <= index(track_id) <= MAX_INTEGER):
+        return f"a track number {track_id}; expected an integer from 0"[:_LONGEST_WHY]
     return ""
 
 

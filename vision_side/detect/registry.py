@@ -14,7 +14,7 @@ from sightline.protocol.config import PluginRegistry, config_model, warn_renamed
 from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
-from sightline.vision_side.detect.plugin_calls import OLD_NOTICES, plugin_guard
+from sightline.vision_side.detect.plugin_calls import OLD_NOTICES, labels_of, plugin_guard
 from sightline.vision_side.detect.port import Detector, NoDetector
 from sightline.vision_side.detect.remote.client import EXAMPLES
 from sightline.vision_side.missions.registry import MissionSpec, check_missions, configured_mission
@@ -56,7 +56,7 @@ def configured_detector(config: VisionConfig) -> Detector:
 def _built(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Detector:
     """Create one of the configured detectors. Raises ConfigError, also for a label in use that it never gives."""
     detector = build_detector(kind, options, config)
-    _check_used_labels(kind, getattr(detector, "labels", ()), config)
+    _check_used_labels(kind, labels_of(detector), config)
     return detector
 
 
@@ -111,7 +111,7 @@ def waits_for_service(config: VisionConfig) -> bool:
 def _check_fallback(config: VisionConfig) -> None:
     """Raise ConfigError for a fallback that may itself be late or gone."""
     kind = config.detector.fallback
-    if kind and getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False):
+    if kind and (kind == BOXES or getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False)):
         raise ConfigError(f"detector.fallback {kind!r} is remote; choose a local detector, e.g. hsv")
 
 

@@ -7,12 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import FrameHeader
-from sightline.vision_side.config import DetectorConfig, VisionConfig
+from sightline.vision_side.config import DetectorConfig, HsvRange, VisionConfig
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.color.detectors import Adaptive, Hsv
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
@@ -119,6 +120,20 @@ def test_hsv_takes_the_section_of_its_name_with_its_options_over_it() -> None:
     settings = VisionConfig.model_validate({"hsv": {"min_radius_px": 9.0}})
     made = build_detector("hsv", {"hsv": {"max_contours": 2}}, settings)
     assert (made._hsv_detector._config.min_radius_px, made._hsv_detector._config.max_contours) == (9.0, 2)
+
+
+def test_boxes_of_another_service_cannot_be_the_fallback() -> None:
+    for check in (check_vision, configured_detector):
+        with pytest.raises(ConfigError, match=r"^detector\.fallback 'boxes' is remote; choose a local detector"):
+            check(VisionConfig.model_validate({"detector": {"kind": "hsv", "fallback": "boxes"}}))
+
+
+@pytest.mark.parametrize("name", ["saturation", "value"])
+def test_color_range_that_no_pixel_is_in_is_rejected(name: str) -> None:
+    one = {"hue_low_deg": 300, "hue_high_deg": 20, f"{name}_low": 0.9, f"{name}_high": 0.1}
+    with pytest.raises(ValidationError, match=f"{name}_low 0.9 is above {name}_high 0.1; exchange them"):
+        HsvRange.model_validate(one)
+    HsvRange.model_validate(one | {f"{name}_high": 0.9})
 
 
 def test_wrappers_are_built_from_the_inside_out() -> None:

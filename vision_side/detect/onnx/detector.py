@@ -122,7 +122,8 @@ class OnnxDetector:
         self._colored = self._color
         """The color that counts in the images at hand."""
         self._bonus = config.color_bonus
-        self._is_shipped = path == SHIPPED  # what a pale image and a doubt need is not known of others
+        # What a pale image and a doubt need is not known of other models.
+        self._is_shipped = model.digest == shipped_digest()
         own_bonus, given = _EXPECTED_BONUS if self._is_shipped else 0.0, config.expected_bonus
         self._expected_bonus = own_bonus if given is None else given
         # A model of any size gets the image unscaled, and a part of it would be no larger.
@@ -446,7 +447,11 @@ def _bytes_of(path: Path) -> bytes:
 def _least(given: float | None, header: OnnxHeader) -> float:
     if given is not None:
         return given
-    least = float(header.metadata.get("min_score", DEFAULT_MIN_SCORE))
+    text = header.metadata.get("min_score", DEFAULT_MIN_SCORE)
+    try:
+        least = float(text)
+    except ValueError:
+        raise ValueError(f"min_score of its metadata is {text!r}; expected 0 to 1") from None
     if not 0 <= least <= 1:
         raise ValueError(f"invalid min_score {least:g} in its metadata: not between 0 and 1")
     return least

@@ -89,6 +89,8 @@ def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelF
     if one.shape[0] not in (1, None):
         raise ValueError(f"it takes {one.shape[0]} images in one batch; export it for 1, or for any number")
     rows, columns = one.shape[1:3] if rows_first and not floats else one.shape[2:4]
+    if bool(rows) != bool(columns):
+        raise ValueError(f"its input is {_shape_text(one)}; export it with both H and W fixed, or with both open")
     size = (rows, columns) if rows and columns else None
     labels = named_labels(names) or own_labels(header.metadata)
     kind, classes, masks = _kind(header.outputs, labels)

@@ -62,6 +62,14 @@ def test_model_with_other_outputs_is_rejected(shapes: list, words: str) -> None:
         form_of(*shapes)
 
 
+@pytest.mark.parametrize("shape", [(1, 3, None, 320), (1, 3, 320, None)])
+def test_model_with_one_open_side_is_rejected(shape: tuple[int | None, ...]) -> None:
+    """Its warm-up may have the right size, and an image of the robot another one."""
+    header = OnnxHeader((Tensor("images", "float32", shape),), (Tensor("output0", "float32", (1, 84, 8400)),), {})
+    with pytest.raises(ValueError, match="export it with both H and W fixed, or with both open"):
+        model_format(header, (), "auto")
+
+
 def test_number_of_names_must_match_the_classes() -> None:
     for shape in ((1, 84, 8400), (1, 25200, 85)):
         with pytest.raises(ValueError, match="80 classes and 2 names"):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sightline.protocol.errors import HardwareError
+from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.onnx import detector as onnx_detector
 from sightline.vision_side.detect.onnx.self_test import golden_picture, golden_text
@@ -83,6 +83,21 @@ def test_a_golden_output_is_of_the_models_own_labels_and_least_score(tmp_path: P
     wrong = golden_text([Detection(1, 1, 9, 9, 0.99, "ball")])
     with pytest.raises(HardwareError, match="ball at"):
         detector(brightness_model(tmp_path / "w.onnx", BOXES, [0, 1], golden=wrong), names=("a", "b"))
+
+
+@pytest.mark.skipif(not onnx_detector.SHIPPED.is_file(), reason="no shipped model; run the tests in a whole clone")
+def test_copy_of_the_model_that_comes_along_looks_again_as_it_does(tmp_path: Path) -> None:
+    copy = tmp_path / "mine.onnx"
+    copy.write_bytes(onnx_detector.SHIPPED.read_bytes())
+    one, other = (detector(path) for path in (onnx_detector.SHIPPED, copy))
+    assert one._looks_at_doubts and other._looks_at_doubts and one._expected_bonus == other._expected_bonus > 0
+    assert not detector(brightness_model(tmp_path / "m.onnx", BOXES, [0, 1]))._looks_at_doubts
+
+
+def test_least_score_of_the_metadata_that_is_not_a_number_is_named(tmp_path: Path) -> None:
+    path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1], min_score="abc")
+    with pytest.raises(ConfigError, match="min_score of its metadata is 'abc'; expected 0 to 1"):
+        detector(path)
 
 
 @pytest.mark.skipif(not onnx_detector.SHIPPED.is_file(), reason="no shipped model; run the tests in a whole clone")
