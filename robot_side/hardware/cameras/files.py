@@ -11,6 +11,7 @@ from pydantic import Field
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError, WireError, home_path, install_command
 from sightline.protocol.jpeg import JpegSize, read_jpeg_size
+from sightline.protocol.messages import LEAST_SIDE_PX, MOST_SIDE_PX
 from sightline.robot_side.hardware.cameras.lens import LensConfig, camera_model
 from sightline.robot_side.hardware.cameras.timing import FrameTimer
 from sightline.robot_side.ports import Picture, scaled_quality, scaled_size
@@ -32,7 +33,7 @@ class FolderCamera:
 
     def __init__(self, config: FolderCameraConfig) -> None:
         paths = jpegs_in(config.path)
-        self._pictures = [path.read_bytes() for path in paths]
+        self._pictures = [_bytes_of(path) for path in paths]
         sizes = {jpeg_size(path, jpeg) for path, jpeg in zip(paths, self._pictures, strict=True)}
         if len({(size.width_px, size.height_px) for size in sizes}) > 1:
             raise HardwareError(f"the images in {config.path} differ in size; name a folder with one size")
@@ -59,12 +60,24 @@ def jpegs_in(folder: Path) -> list[Path]:
     return paths
 
 
+def _bytes_of(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise HardwareError(f"image {path} cannot be read: {error.strerror}; remove it from the folder") from None
+
+
 def jpeg_size(path: Path, jpeg: bytes) -> JpegSize:
     """Return the size of `jpeg`, read from `path`. Raises HardwareError if it is not a plain JPEG."""
     try:
-        return read_jpeg_size(jpeg)
+        size = read_jpeg_size(jpeg)
     except WireError as error:
         raise HardwareError(f"{path}: {error.detail}; remove it or convert it to a plain JPEG") from None
+    for side_px in (size.width_px, size.height_px):
+        if not LEAST_SIDE_PX <= side_px <= MOST_SIDE_PX:
+            raise HardwareError(f"{path} has {size.width_px}x{size.height_px} pixels; expected {LEAST_SIDE_PX} to "
+                                f"{MOST_SIDE_PX} a side")
+    return size
 
 
 # A camera that shows one JPEG for ever, paced. Shell (a file and a clock).

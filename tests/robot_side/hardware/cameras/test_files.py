@@ -4,6 +4,7 @@ import subprocess
 import sys
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -110,7 +111,18 @@ def test_images_of_several_sizes_are_rejected(tmp_path):
         FolderCamera(FolderCamera.Config(path=tmp_path))
 
 
-@pytest.mark.parametrize(("content", "said"), [(None, "cannot be read"), (b"GIF89a", "not a JPEG")])
+def test_folder_with_an_image_that_cannot_be_read_is_reported(tmp_path):
+    for name, make in (("folder", Path.mkdir), ("link", lambda path: path.symlink_to("nowhere"))):
+        (tmp_path / name).mkdir()
+        make(tmp_path / name / "a.jpg")
+        with pytest.raises(HardwareError, match=r"/a\.jpg cannot be read: .*; remove it from the folder"):
+            FolderCamera(FolderCamera.Config(path=tmp_path / name))
+
+
+@pytest.mark.parametrize(("content", "said"), [
+    (None, "cannot be read"), (b"GIF89a", "not a JPEG"), (jpeg(15, 48), "has 15x48 pixels; expected 16 to 8192 a side"),
+    (jpeg(48, 8), "has 48x8 pixels; expected"),
+])
 def test_a_still_that_is_invalid_is_reported(tmp_path, content, said):
     if content is not None:
         (tmp_path / "a.jpg").write_bytes(content)
