@@ -99,10 +99,11 @@ def option_rows(command: click.Command) -> Iterator[str]:
         if getattr(parameter, "hidden", False):
             continue
         names = ", ".join(f"`{name}`" for name in parameter.opts + parameter.secondary_opts)
-        if isinstance(parameter, click.Argument):
-            names = f"`{(parameter.name or '').upper()}`"
+        if parameter.param_type_name == "argument":
+            pieces = " ".join(parameter.get_usage_pieces(click.Context(command)))
+            names = f"`{re.sub(r'[][{}]', '', pieces).rstrip('.').strip().replace('|', ' or ')}`"
         default = parameter.default
-        shown = "" if default in (None, False, "", (), []) or callable(default) else f"`{default}`"
+        shown = "" if default in (None, "", (), []) or default is False or callable(default) else f"`{default}`"
         yield f"| {names} | {shown} | {cell(help_text)} |"
 
 

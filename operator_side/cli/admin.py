@@ -141,7 +141,7 @@ def _keys() -> ModuleType:
 def init(folder: Folder, host: Hosts = None, days: Days = 825) -> None:
     """Create an authority and the certificates of all roles
 
-    The roles are robot, vision, operator, detector and viewer.
+    The roles are robot, vision, operator, detector, viewer and router.
     """
     made = _keys()
     for file in made.make(home_path(folder), host or [], days):
@@ -156,7 +156,9 @@ def init(folder: Folder, host: Hosts = None, days: Days = 825) -> None:
 
 def add(
     folder: Folder,
-    role: Annotated[str, typer.Argument(metavar="ROLE", help="robot, vision, operator, detector or viewer, or stop.")],
+    role: Annotated[
+        str, typer.Argument(metavar="ROLE", help="robot, vision, operator, detector, viewer, router or stop.")
+    ],
     host: Hosts = None,
     days: Days = 825,
 ) -> None:

@@ -418,7 +418,7 @@ def robot(
         )
         ending.enter_context(bench)
         if not side.is_there(bench):
-            raise LinkError(f"no status from robot '{robot}' at {endpoint}; check --robot")
+            raise LinkError(f"no status from robot '{robot}' at {endpoint}; check --robot, or publish status")
         _use_motor_log(bench, motor_log)
         show_result = ending.enter_context(run.shown(len(left), "robot", endpoint))
         results = run_cases(left, bench, side.prepare, show_result, TRIES)

@@ -81,7 +81,8 @@ def sim(
         str | None, typer.Option(help="A name from `sightline scenarios`, or a .toml file [default: circle].")
     ] = None,
     robot_model: Annotated[
-        str | None, typer.Option(help="raspberry, gazebo-raspi, thymio, chaser, or a .toml [default: of the scenario].")
+        str | None,
+        typer.Option(help="raspberry, gazebo-raspi, thymio, chaser, chaser-small, or a .toml [default: scenario's]."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the start and the noise.")] = None,
     motor_log: Annotated[
