@@ -152,7 +152,7 @@ CHARACTER: Final = {
         "swings from edge to edge of the image, and out of it.",
     "goto-baseline": "Its sensors reach 0.2 m. It arrives at up to 0.5 m/s and turns by the clock. With this delay it "
         "is so near when it turns that the range guard lets no corner approach. It never drives back, and cannot "
-        "report that the way is closed. Without delay it drives around the cylinder.",
+        "report that the way is closed. Without delay it drives around the cylinder of `thymio`.",
 }
 """The character of each legacy controller, and the reason of its failures."""
 

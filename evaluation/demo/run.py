@@ -190,7 +190,9 @@ def arm_robot(operator: Operator, processes: Processes) -> None:
         if reply.ok:
             return
         if time.monotonic() > deadline_s:
-            raise CheckError(f"the robot would not be armed: {reply.detail}")
+            raise CheckError(
+                f"the robot would not be armed: {reply.detail}; see vision.log in the run folder for the cause"
+            )
 
 
 def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthReader, block: LiveBlock) -> None:

@@ -76,7 +76,7 @@ class FaultyCamera:
 
 
 class FaultyDrive(SimDrive):
-    """The simulated wheels. They raise as the file DRIVE_MODE says. The signal LOOP begins an endless loop."""
+    """The simulated wheels. They raise as in the file DRIVE_MODE. The signal LOOP begins an endless loop."""
 
     class Config(SimSocketConfig):
         """`folder` holds the mode and the ledger."""

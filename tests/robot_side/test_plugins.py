@@ -43,7 +43,7 @@ def test_each_built_in_device_implements_its_port(group):
 
 
 class OddDevice:
-    """Raises what `raises` says."""
+    """Raises as configured."""
 
     class Config(Config):
         raises: str = ""

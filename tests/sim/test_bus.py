@@ -166,7 +166,7 @@ def test_motors_latch_and_the_log_outlives_killed_clients_and_a_killed_simulatio
     assert second[4] > 8.0 > first[4]
 
 
-def test_second_owner_of_the_motors_is_told_so_and_moves_nothing(sim):
+def test_second_owner_of_the_motors_is_reported_and_moves_nothing(sim):
     owner, second = SimDrive(sim.config()), SimDrive(sim.config())
     owner.set(1.0, 2.0)
     eventually(sim.rows)
