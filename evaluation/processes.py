@@ -246,9 +246,10 @@ def _command(pid: int) -> bytes:
 
 
 def last_line(log: Path) -> str:
-    """Return the last line of a log, without time, level and `error: `."""
+    """Return the error that ended a process, or else the last line of its log, without time, level and `error: `."""
     lines = [line for line in log.read_text("utf-8", "replace").splitlines() if line.strip()]
-    return _MARK.sub("", lines[-1]) if lines else "nothing"
+    errors = [line for line in lines if line.startswith("error: ")]  # a traceback may follow
+    return _MARK.sub("", (errors or lines)[-1]) if lines else "nothing"
 
 
 def free_port() -> int:

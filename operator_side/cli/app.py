@@ -170,10 +170,10 @@ def _unexpected(error: Exception, arguments: Sequence[str]) -> int:
         return _print_error(line, getattr(error, "exit_code", USAGE))
     if os.environ.get("SIGHTLINE_DEBUG") == "1":
         raise error
-    from sightline.protocol.log import report_ending
+    from sightline.protocol.log import error_text, report_ending
 
     report_ending("program", error)
-    where = f"{type(error).__name__}: {' '.join(str(error).split())}"
+    where = f"{type(error).__name__}: {error_text(error)}"
     return _print_error(f"unexpected {where}; SIGHTLINE_DEBUG=1 shows where, please report it", UNEXPECTED)
 
 

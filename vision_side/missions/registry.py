@@ -114,4 +114,7 @@ def mission_spec(kind: str, options: Mapping[str, Any], config: VisionConfig) ->
     Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option.
     """
     plugin = REGISTRY.load(kind)
-    return MissionSpec(kind, plugin, REGISTRY.settings(kind, plugin, shared_options(plugin, options, config)))
+    spec = MissionSpec(kind, plugin, REGISTRY.settings(kind, plugin, shared_options(plugin, options, config)))
+    if not callable(getattr(plugin, "step", None)):
+        raise ConfigError(f"mission {kind!r} has no method step(): docs/how-to/write-a-mission.md")
+    return spec

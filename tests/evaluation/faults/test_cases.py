@@ -515,7 +515,7 @@ def by_tier(rows):
     machine, the sampler of a row's stop stalled three times in a row."""
     costly = {"command.flood", "command.heartbeat", "command.replay", "camera.frozen", "stop.driving", "wire.cut3",
               "end.sigterm", "network.kill", "network.gil", "vision.hangs", "vision.kill", "flood.tls25",
-              "flood.tcp500", "camera.hangs", "drive.raises", "guardian.driver_kill"}
+              "flood.tcp500", "camera.hangs", "drive.raises", "drive.refuses", "guardian.driver_kill"}
     assert costly <= {row.id for row in rows}
     return [pytest.param(row, marks=pytest.mark.alone if row.id in costly else (), id=row.id) for row in rows]
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
+from sightline.protocol.config import Config as Settings
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import STILL, CameraModel, FrameHeader, MissionRequest
 from sightline.vision_side.config import VisionConfig
@@ -65,6 +66,13 @@ def test_contract_finds_each_broken_promise():
         check_mission(mission_spec(f"{__name__}:Unscaled", {}, CONFIG))
 
 
+class Stepless:
+    """Written from memory."""
+
+    class Config(Settings):
+        """Nothing to set."""
+
+
 # --- choosing --------------------------------------------------------------------------------------------------------
 
 
@@ -73,6 +81,7 @@ def test_contract_finds_each_broken_promise():
     ("os:nothing", {}, "cannot be loaded"),
     ("no_such_package:Name", {}, "cannot be loaded: No module named"),
     ("math:pi", {}, "no pydantic model called Config"),
+    (f"{__name__}:Stepless", {}, "has no method step(): docs/how-to/write-a-mission.md"),
     ("band", {"centre_shere": 0.1}, "unknown option 'centre_shere'; it takes"),
     ("band", {"centre_share": 3}, "option 'centre_share': Input should be less than or equal to 1"),
     ("band", {"centre_share": float("nan")}, "centre_share"),
