@@ -299,7 +299,8 @@ class OnnxDetector:
                 on_cpu = self.read_model(config.model_copy(update={"device": "cpu"})).engine
                 expected = list(_found(on_cpu, [picture], form, least)[0])
         except Exception as error:  # whatever an engine raises
-            raise ConfigError(f"model {path} does not run: {' '.join(str(error).split())}"[:200]) from None
+            why = " ".join(str(error).split())[:160]
+            raise ConfigError(f"model {path} does not run: {why}; see docs/how-to/detectors.md") from None
         wrong = difference(expected, found, least) if expected is not None else ""
         if wrong:
             where = f"{self._engine.device} ({self._engine.name})"

@@ -27,7 +27,13 @@ _BEHIND: Final = {"tensorrt": ("tensorrt", "cuda", "cpu"), "cuda": ("cuda", "cpu
 """Providers that a session for a device may fall back on for single operations."""
 _FIX: Final = ("install onnxruntime-gpu in place of onnxruntime (never both), see that `nvidia-smi` shows the GPU, or "
                "take --device auto")
-_NO_MODEL: Final = re.compile("INVALID_PROTOBUF|No graph was found")
+_USUAL_REASONS: Final = (
+    ("INVALID_PROTOBUF|No graph was found", "it is not an ONNX file, or truncated; fetch it again"),
+    ("IR version|[Oo]pset", "it is newer than this ONNX Runtime; export it with opset 17, or update onnxruntime"),
+    ("not a registered function/op|No Op registered", "ONNX Runtime lacks one of its operators; export it without"),
+    ("[Ee]xternal data|external tensors", "its weights are in a file of their own; put that file beside it"),
+)
+"""Patterns in the errors of ONNX Runtime, and what they mean."""
 _ERRORS_ONLY: Final = 3
 _LONGEST: Final = 200
 
@@ -109,7 +115,7 @@ def _unfit(path: Path, error: Exception) -> str:
     if head == b"PK" or head[:1] == b"\x80":
         return "it is a file of PyTorch, not of ONNX; export it to ONNX, or use --detector torch:FILE"
     text = " ".join(str(error).split())
-    return "it is not an ONNX file, or truncated; fetch it again" if _NO_MODEL.search(text) else text
+    return next((reason for pattern, reason in _USUAL_REASONS if re.search(pattern, text)), text)
 
 
 class Engine:

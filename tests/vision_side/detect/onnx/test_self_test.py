@@ -4,6 +4,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import onnx
 import pytest
 
 from sightline.protocol.errors import ConfigError, HardwareError
@@ -83,6 +84,21 @@ def test_a_golden_output_is_of_the_models_own_labels_and_least_score(tmp_path: P
     wrong = golden_text([Detection(1, 1, 9, 9, 0.99, "ball")])
     with pytest.raises(HardwareError, match="ball at"):
         detector(brightness_model(tmp_path / "w.onnx", BOXES, [0, 1], golden=wrong), names=("a", "b"))
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda one: setattr(one, "ir_version", 99), "it is newer than this ONNX Runtime; export it with opset 17"),
+    (lambda one: setattr(one.opset_import[0], "version", 99), "it is newer than this ONNX Runtime"),
+    (lambda one: setattr(one.graph.node[0], "op_type", "Own"), "ONNX Runtime lacks one of its operators"),
+    (lambda one: setattr(one.graph.initializer[0], "data_location", 1), "its weights are in a file of their own"),
+])
+def test_model_that_this_runtime_cannot_open_has_the_reason_and_the_fix(tmp_path: Path, change, words: str) -> None:
+    path = brightness_model(tmp_path / "m.onnx", BOXES, [0, 1])
+    one = onnx.load(path)
+    change(one)
+    path.write_bytes(one.SerializeToString())
+    with pytest.raises(ConfigError, match=f"cannot be opened: {words}"):
+        detector(path)
 
 
 @pytest.mark.skipif(not onnx_detector.SHIPPED.is_file(), reason="no shipped model; run the tests in a whole clone")
