@@ -18,6 +18,7 @@ from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import print_table
 from sightline.operator_side.terminal import progress_bar
 from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.log import error_text
 from sightline.training.schedule import Training
 
 if TYPE_CHECKING:
@@ -466,8 +467,8 @@ def _begun(model: Path) -> "tuple[Weights, str]":
         return weights_in(data), hashlib.sha256(data).hexdigest()
     except OSError as error:
         raise ConfigError(f"--start {model}: {error.strerror or error}") from None
-    except ValueError as error:
-        raise ConfigError(f"--start {model}: {error}; name a model from `sightline train`") from None
+    except Exception as error:  # onnx raises errors of its own for a model of another form
+        raise ConfigError(f"--start {model}: {error_text(error)}; name a model from `sightline train`") from None
 
 
 def _sharing(batch: int, processes: int) -> int:
