@@ -3,6 +3,7 @@
 import logging
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -27,36 +28,43 @@ _log: Final = logging.getLogger(__name__)
 _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 
 
-ENDS_WITHIN_S: Final = 5.0
-"""Longest end after a signal. A detector or mission that hangs would never end."""
-
-
-def _end_hanging(number: int) -> None:
-    _log.error("vision: the detector or mission does not return; ended by force")
-    logging.shutdown()
-    os._exit(128 + number)
+ENDS_WITHIN_S: Final = 3.0
+"""Longest end after a signal: before systemd and containers kill the process without a line (4 s)."""
 
 
 @contextmanager
 def ends_on_signal(ending: threading.Event) -> Iterator[None]:
     """SIGTERM and SIGINT set `ending` while inside. A process that is still there ENDS_WITHIN_S later is ended."""
-    timers: list[threading.Timer] = []
 
-    def end(number: int, _frame: FrameType | None) -> None:
+    def end(_number: int, _frame: FrameType | None) -> None:
         ending.set()
-        timer = threading.Timer(ENDS_WITHIN_S, _end_hanging, [number])
-        timer.daemon = True
-        timer.start()
-        timers.append(timer)
 
+    # Python calls a handler only between two steps of this thread, which may hang in native code. The number of the
+    # signal is written to the socket in any case.
+    signals, written = socket.socketpair()
+    written.setblocking(False)
+    left = threading.Event()
+    threading.Thread(target=_end_hanging, args=(signals, left), name="end", daemon=True).start()
     before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
+    before_fd = signal.set_wakeup_fd(written.fileno(), warn_on_full_buffer=False)
     try:
         yield
     finally:
-        for timer in timers:
-            timer.cancel()
+        signal.set_wakeup_fd(before_fd)
         for number, handler in before.items():
             signal.signal(number, handler)
+        left.set()
+        written.close()
+
+
+def _end_hanging(signals: socket.socket, left: threading.Event) -> None:
+    """Wait for a signal, and end this process if it does not leave `ends_on_signal` in time."""
+    with signals:
+        number = signals.recv(1)
+    if number and not left.wait(ENDS_WITHIN_S):
+        _log.error("a detector or mission does not return; ended by force")
+        logging.shutdown()
+        os._exit(128 + number[0])
 
 
 def run(config: VisionConfig, observe: Observe | None = None) -> int:

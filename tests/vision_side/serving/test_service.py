@@ -491,17 +491,21 @@ def test_service_of_one_robot_that_connects_is_open_with_a_session():
         assert [*found, states[0].is_open()] == is_open
 
 
-@pytest.mark.parametrize("hangs", [True, False])
-def test_service_whose_detector_or_mission_hangs_is_ended_after_its_time(hangs):
+_LOCKED = "mutex = (ctypes.c_char * 64)(); [ctypes.CDLL(None).pthread_mutex_lock(mutex) for _ in range(2)]"
+"""Native code that never returns, and lets no handler of a signal run."""
+
+
+@pytest.mark.parametrize(("work", "hangs"), [("time.sleep(30)", True), (_LOCKED, True), ("ending.wait(30)", False)])
+def test_service_whose_detector_or_mission_hangs_is_ended_after_its_time(work, hangs):
     code = (
-        "import sys, threading, time\n"
+        "import ctypes, sys, threading, time\n"
         "from sightline.protocol.log import start_log\n"
         "from sightline.vision_side.serving import process\n"
         "start_log(None, 'vision')\n"
         "process.ENDS_WITHIN_S, ending = 0.2, threading.Event()\n"
         "with process.ends_on_signal(ending):\n"
         "    print('on', flush=True)\n"
-        f"    time.sleep(30) if {hangs} else ending.wait(30)\n"
+        f"    {work}\n"
         "time.sleep(0.4)\n"
     )
     started = subprocess.Popen(
