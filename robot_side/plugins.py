@@ -20,11 +20,15 @@ class DeviceGroup(Generic[Port]):
     port: type[Any]
     entry_points: str
 
-    def build(self, choice: PluginChoice) -> Port:
+    def build(self, choice: PluginChoice, *, is_last: bool = True) -> Port:
         """Create the device that `choice` names.
 
+        Args:
+            choice: kind and options.
+            is_last: True if an exception of the device ends the program, so that its traceback is logged here.
+
         Raises:
-            ConfigError: for an unknown kind (nearest named), a missing package or a wrong option.
+            ConfigError: for an unknown kind (nearest named), a missing package, method or wrong option.
             HardwareError: as the device itself does, and for any other exception of it.
         """
         plugin, config = self.load(choice)
@@ -33,18 +37,23 @@ class DeviceGroup(Generic[Port]):
         except SightlineError:
             raise
         except PLUGIN_ERRORS as error:
-            raise self.failed(choice, error) from None
+            if is_last:
+                report_ending(self.noun, error)
+            raise self.failed(choice, error) from error
+        for name in self.methods:
+            if not callable(getattr(device, name, None)):
+                raise ConfigError(f"{self.noun} {choice.kind!r} has no method {name}(): docs/how-to/add-a-device.md")
         return device
 
     def failed(self, choice: PluginChoice, error: BaseException) -> HardwareError:
-        """Report an exception of the device that ends the program, and return its error."""
-        report_ending(self.noun, error)
+        """Return the error for an exception of the device."""
         return HardwareError(f"{self.noun} {choice.kind!r} raised {type(error).__name__}: {error_text(error)}")
 
     @property
     def methods(self) -> list[str]:
-        """List the methods that a device must have, without `zero` of a drive, which its guardian checks."""
-        return [name for name, one in vars(self.port).items() if callable(one) and name[0] != "_" and name != "zero"]
+        """List the methods that a device must have. The guardian of a drive checks `zero`."""
+        names = (name for name, one in vars(self.port).items() if callable(one) and name[0] != "_")
+        return [name for name in names if name not in ("zero", "close")]
 
     @property
     def noun(self) -> str:
@@ -52,12 +61,9 @@ class DeviceGroup(Generic[Port]):
         return self.key.replace("_", " ")
 
     def load(self, choice: PluginChoice) -> tuple[Any, Any]:
-        """Load the class, check its methods and its `Config`, without opening the device. Raises ConfigError."""
+        """Load the class and check its `Config`, without opening the device. Raises ConfigError."""
         registry = PluginRegistry(self.noun, self.entry_points)
         plugin = registry.load(choice.kind)
-        for name in self.methods:
-            if not callable(getattr(plugin, name, None)):
-                raise ConfigError(f"{self.noun} {choice.kind!r} has no method {name}(): docs/how-to/add-a-device.md")
         return plugin, registry.settings(choice.kind, plugin, choice.options)
 
 

@@ -37,12 +37,12 @@ def check_image(camera: Camera, picture: object) -> None:
     if not isinstance(picture, Picture):
         raise TypeError(f"read() returned {type(picture).__name__}; expected Picture or None")
     for name, value, kind in (
-        ("Picture.jpeg", picture.jpeg, bytes), ("Picture.t_us", picture.t_us, int),
+        ("Picture.jpeg", picture.jpeg, bytes | bytearray), ("Picture.t_us", picture.t_us, int),
         ("Picture.scale_percent", picture.scale_percent, int), ("model", camera.model, CameraModel),
-        ("live", camera.live, bool),
+        ("live", camera.live, object),
     ):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name} is {type(value).__name__}; expected {kind.__name__}")
+        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+            raise TypeError(f"{name} is {type(value).__name__}; expected {getattr(kind, '__name__', kind)}")
     if not 1 <= picture.scale_percent <= 100:
         raise ValueError(f"Picture.scale_percent is {picture.scale_percent}; expected 1 to 100")
 

@@ -10,11 +10,11 @@ import struct
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from functools import partial
 from types import FrameType
-from typing import Final
+from typing import Any, Final
 
 from sightline.protocol.channels import REQUEST, TWIST
 from sightline.protocol.clock import heartbeat_us, monotonic_us
@@ -24,6 +24,7 @@ from sightline.protocol.errors import HardwareError, RejectReason, SightlineErro
 from sightline.protocol.log import (
     RepeatLimiter,
     faults,
+    report_ending,
     report_fault,
     start_log,
     start_log_thread,
@@ -33,7 +34,7 @@ from sightline.protocol.transports.diagnosis import check_ports
 from sightline.protocol.transports.endpoints import check_robot_id
 from sightline.protocol.transports.stop_port import read_packets, send_packet
 from sightline.robot_side import pipe as ipc
-from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
 from sightline.robot_side.driver.supervision import (
@@ -67,6 +68,7 @@ _MAX_CONFIG_BYTES = 1 << 20
 _STACK_BYTES, _PLUGIN_STACK_BYTES = 256 * 1024, 1024 * 1024
 _BATTERY_PERIOD_S = 1.0
 _STOP_REPORT_US = 100_000
+_REOPENS_US = 1_000_000
 _INVALID: Final = (ValueError, KeyError, struct.error, WireError)
 """Raised for a packet of a broken process, which is restarted."""
 
@@ -79,8 +81,11 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
     """
     check_robot_id(config.robot)
     limit_core_dump()
+    is_restart = guardian is not None and guardian.is_restart
+    if not is_restart:
+        check_ports(config.listen)  # before the devices: a robot that has the ports may have them too
     with ExitStack() as last, ExitStack() as ending:
-        drive = DRIVES.build(config.motors)
+        drive: Drive = LostDrive(config.motors) if is_restart else DRIVES.build(config.motors)
         ending.callback(_close, "drive", drive)
         ranges = RANGE_SENSORS.build(config.ranging) if config.ranging else None
         if ranges is not None:
@@ -89,8 +94,6 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         reader = BatteryReader(BATTERIES.build(config.battery)) if config.battery else None
         if reader is not None:
             ending.callback(reader.close)
-        if guardian is None or not guardian.is_restart:
-            check_ports(config.listen)  # before the first tick: a robot that has them may have the motors too
         threading.stack_size(_STACK_BYTES)
         start_log_thread()
         driver = Driver(config, drive, ranges, reader, guardian)
@@ -104,6 +107,47 @@ def run(config: RobotConfig, guardian: GuardianEnd | None = None) -> int:
         # Last in, first to run: however the loop ends, the motors are set to zero. An error makes the guardian do it.
         ending.callback(_end, config, drive, guardian)
         return driver.loop()
+
+
+class LostDrive:
+    """The drive of a driver process that died. It is opened when it can be; until then an operator sees why not."""
+
+    def __init__(self, choice: PluginChoice) -> None:
+        self._choice = choice
+        self._drive: Drive | None = None
+        self._why, self._due_us = "", 0
+        with suppress(HardwareError):
+            self._opened()
+
+    def set(self, left_rad_s: float, right_rad_s: float) -> None:
+        """Give wheel speeds, see `Drive`."""
+        self._opened().set(left_rad_s, right_rad_s)
+
+    def wheels(self) -> WheelAngles | None:
+        """Read the encoders, see `Drive`."""
+        return self._opened().wheels()
+
+    @staticmethod
+    def zero(config: Mapping[str, Any]) -> None:
+        """The guardian calls that of the drive itself."""
+
+    def close(self) -> None:
+        """Close the drive, if it is open."""
+        if self._drive is not None:
+            self._drive.close()
+
+    def _opened(self) -> Drive:
+        """Return the drive. Raises HardwareError while it does not open; a try each second."""
+        if self._drive is None:
+            if heartbeat_us() < self._due_us:
+                raise HardwareError(self._why)
+            self._due_us = heartbeat_us() + _REOPENS_US
+            try:
+                self._drive = DRIVES.build(self._choice, is_last=False)
+            except HardwareError as error:
+                self._why = str(error)
+                raise
+        return self._drive
 
 
 def _close(part: str, device: Drive | RangeSensor | Battery) -> None:
@@ -141,6 +185,7 @@ def _zero(config: RobotConfig, set_to_zero: Callable[[], None]) -> None:
     except SightlineError:
         raise
     except PLUGIN_ERRORS as error:
+        report_ending("drive", error)
         what = DRIVES.failed(config.drive, error)
         raise HardwareError(f"motors NOT set to zero: {what}; switch off their supply") from None
 
@@ -286,7 +331,7 @@ class Driver:
         """Return what the guardian must know of the wheels."""
         refuses = self._refuses_since_us and heartbeat_us() - self._refuses_since_us >= REFUSES_US
         if refuses and not self._driver_core.at_rest:
-            return LOST
+            return LOST if self._ending_since_us is None else FAILED
         return AT_REST if self._is_at_rest else MOVING
 
     def _wait(self, deadline_us: int) -> None:

@@ -290,7 +290,7 @@ def _hang_up_of(beats: socket.socket) -> select.poll:
     """Return what waits for the end of the process at the other end, and not for its heartbeats."""
     beats.setblocking(False)
     hang_up = select.poll()
-    hang_up.register(beats, 0)
+    hang_up.register(beats, select.POLLRDHUP)
     return hang_up
 
 

@@ -24,7 +24,7 @@ from sightline.protocol.transports.stop_port import StopProcess, stop_secret_fil
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, GUARDIAN_PRIORITY, schedule_real_time
 from sightline.robot_side.guardian import stop_receiver
-from sightline.robot_side.guardian.core import LOST, STARTS_WITHIN_US, pack_beat
+from sightline.robot_side.guardian.core import FAILED, LOST, STARTS_WITHIN_US, pack_beat
 from sightline.robot_side.plugins import DRIVES
 
 _log: Final = logging.getLogger(__name__)
@@ -65,8 +65,8 @@ class GuardianEnd:
         """Send a heartbeat; never waits."""
         with suppress(OSError):
             self.heartbeats.send(pack_beat(kind, heartbeat_us()))
-            if kind == LOST:  # it is the last one; the end of this socket wakes the guardian, a heartbeat does not
-                self.heartbeats.shutdown(socket.SHUT_RDWR)
+            if kind in (LOST, FAILED):  # it is the last one; its end wakes the guardian, and a heartbeat does not
+                self.heartbeats.shutdown(socket.SHUT_WR)
 
     def is_gone(self) -> bool:
         """Return True if the guardian is dead."""

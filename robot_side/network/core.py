@@ -24,6 +24,7 @@ from sightline.robot_side.pipe import CommandAck, RobotMotion
 from sightline.robot_side.ports import Adjustable, Camera, Picture, scaled_model
 
 _CAMERA_PERIOD_US = 500_000
+_NOT_NEWER = "the time of the image is not after that of the one before"
 _KEPT_FRAMES = 256  # that an ack may cite, as many as the gate records
 
 
@@ -98,7 +99,7 @@ class NetworkCore:
         if picture.t_us > now_us:  # the frames after it would not be newer, until that time
             return f"image is {(picture.t_us - now_us) / 1e6:.3f} s in the future"
         if picture.t_us <= self._last_t_us:
-            return "the time of the image is not after that of the one before"
+            return _NOT_NEWER
         size_bytes = len(picture.jpeg)
         if size_bytes > self._max_frame_bytes:
             return f"image of {size_bytes} bytes; at most {self._max_frame_bytes} (max_frame_bytes)"
@@ -182,6 +183,8 @@ class NetworkCore:
             camera_fault: why no image comes.
         """
         stream = self._stream
+        # A camera may repeat single images while others leave.
+        is_shown = self.image_fault != _NOT_NEWER or not stream.fps(now_us)
         counted = sorted(((name, count) for name, count in (dropped or {}).items() if count), key=lambda item: -item[1])
         return StreamStatus(
             sent=stream.sent,
@@ -196,7 +199,7 @@ class NetworkCore:
             missed_captures=missed_captures,
             quality_percent=self._applied.quality_percent,
             scale_percent=self._applied.scale_percent,
-            camera_fault=(camera_fault or self.image_fault)[:200],
+            camera_fault=(camera_fault or self.image_fault * is_shown)[:200],
         )
 
 

@@ -21,6 +21,7 @@ from sightline.protocol.codec import encode
 from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, SightlineError, WireError
 from sightline.protocol.log import RepeatLimiter, count_fault, error_line, error_text, faults, report_fault, start_log
+from sightline.protocol.messages import CameraModel
 from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
@@ -123,7 +124,7 @@ class NetworkProcess:
         self._network_core.motion = self._network_end.motion(self._network_core.motion)
         with self._lock:
             sent = self._network_core.on_camera(picture, monotonic_us()) if picture else None
-            model = self.camera.model if self.camera else None
+            model = self._camera_model()
             camera = self._network_core.announce_camera(model, monotonic_us()) if model else None
         if camera is not None:
             self._link.publish(camera.channel, camera.header, camera.payload)
@@ -136,9 +137,18 @@ class NetworkProcess:
         if self._network_end.send_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
             self._link.publish(message.channel, message.header, message.payload)
 
+    def _camera_model(self) -> CameraModel | None:
+        """Return the model of the camera; None without a valid one, which `check_image` reports."""
+        try:
+            model: object = self.camera.model if self.camera else None
+        except PLUGIN_ERRORS:
+            return None
+        return model if isinstance(model, CameraModel) else None
+
     def _log_rejected(self, picture: Picture | None) -> None:
         if picture is not None and (count := self._rejection_limiter.due("image", monotonic_us())):
-            _log.warning("camera: %s (%d times)", self._network_core.image_fault, count)
+            often = f" ({count} times)" if count > 1 else ""
+            _log.warning("camera: %s%s", self._network_core.image_fault, often)
 
     def _may_capture(self) -> bool:
         """Return True if the camera may capture now. Otherwise wait briefly, for credit once a frame is due."""
@@ -162,7 +172,7 @@ class NetworkProcess:
         self._no_image_since_us = self._no_image_since_us or monotonic_us()
         try:
             if self.camera is None:
-                self.camera = CAMERAS.build(self._setup.config.camera)
+                self.camera = CAMERAS.build(self._setup.config.camera, is_last=False)
             self._network_core.adapt(self.camera)
             picture = self.camera.read(_CAMERA_TIMEOUT_S)
             if picture is not None:

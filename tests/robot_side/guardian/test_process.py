@@ -80,6 +80,33 @@ def test_dead_or_stopped_driver_leaves_the_wheels_at_zero_and_a_new_one_starts(d
     assert robot.speed() == 0.0
 
 
+def test_robot_whose_drive_is_gone_shows_why_and_drives_again_when_it_is_back(dying):
+    robot, vision, fault = dying("gone", safety={"auto_arm": False})
+    robot.wait_until_on()
+    arm(robot.endpoint)
+    robot.wait_until_on("a new driver process starts")
+    check_stop(robot, fault)
+    assert until(lambda: vision.status().state == "FAULT", START_S), robot.output()
+    assert "DyingLogDrive' raised OSError: unplugged" in vision.status().reason
+    fault.end()
+    with open_zenoh("r1", connect=[robot.endpoint], role="operator", timeout_s=START_S) as link:
+        operator = Operator(link)
+        time.sleep(1.2)
+        assert until(lambda: operator.request(Verb.RESET).ok and vision.status().state == "DISARMED", START_S)
+    arm(robot.endpoint)
+    assert driving(robot)
+    assert robot.process.poll() is None
+
+
+def test_drive_that_takes_no_speeds_while_the_robot_ends_is_set_to_zero_by_the_guardian(dying):
+    robot, _, fault = dying("refuses")
+    assert until(fault.has_come, START_S)
+    robot.process.terminate()
+    assert robot.process.wait(START_S) == 3, robot.output()
+    assert robot.motor_rows()[-1][1:] == (0.0, 0.0) and "a new driver process starts" not in robot.output()
+    assert "the guardian is gone" not in robot.output()
+
+
 def test_endless_loop_in_the_driver_is_ended_and_the_new_one_waits_for_an_operator(dying):
     robot, vision, fault = dying("loop")
     robot.wait_until_on("a new driver process starts")
