@@ -47,19 +47,23 @@ def port_in_use(endpoint: str, port: int) -> LinkError:
 def check_ports(endpoints: Iterable[str]) -> None:
     """Raise LinkError if another process has the TCP port of an endpoint. Other trouble shows when it is opened."""
     for endpoint in endpoints:
-        if "://" in endpoint:
+        is_websocket = "://" in endpoint
+        if is_websocket:
             _, host, port, *_ = parse_websocket_endpoint(endpoint)
         else:
             transport, host, port = parse_zenoh_endpoint(endpoint)
-            if transport in OVER_UDP:
+            if transport in OVER_UDP or "iface=" in endpoint:  # two interfaces may have one port
                 continue
-        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as tried:
-            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
+        try:
+            address = ipaddress.ip_address(host)  # a name may take seconds
+            with socket.socket(socket.AF_INET6 if address.version == 6 else socket.AF_INET) as tried:
+                tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                if address.version == 6 and is_websocket:
+                    tried.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
                 tried.bind((host, port))
-            except (OSError, UnicodeError) as error:
-                if getattr(error, "errno", None) == errno.EADDRINUSE:
-                    raise port_in_use(endpoint, port) from None
+        except (OSError, ValueError) as error:
+            if getattr(error, "errno", None) == errno.EADDRINUSE:
+                raise port_in_use(endpoint, port) from None
 
 
 def process_with_open(files: Collection[str], besides: int = 0) -> str:
@@ -232,27 +236,36 @@ def diagnose_tls(endpoint: str, secured: RoleKeys | None) -> str:
         return "it accepts only TLS; use tls/... and pass --secure DIR"
     if secured is None:
         return "a tls/ endpoint needs keys; pass --secure DIR"
-    import ssl
-
-    if problem := keys_problem(secured):
-        return problem
-    context = ssl.create_default_context(cafile=f"{secured.folder}/ca.pem")
-    context.load_cert_chain(f"{secured.folder}/{secured.role}.pem", f"{secured.folder}/{secured.role}.key")
-    return _try_handshake(host, port, context)
+    try:
+        return _try_handshake(host, port, _tls_context(secured))
+    except LinkError as error:
+        return str(error)
 
 
 def keys_problem(secured: RoleKeys) -> str:
     """Return what is wrong with the files of this end, or "" if they can be read and belong together."""
+    try:
+        _tls_context(secured)
+    except LinkError as error:
+        return str(error)
+    return ""
+
+
+def _tls_context(secured: RoleKeys) -> ssl.SSLContext:
+    """Load the files of this end. Raises LinkError."""
     import ssl
 
+    role, folder = secured.role, secured.folder
     try:
         named = "ca.pem is damaged"
-        context = ssl.create_default_context(cafile=f"{secured.folder}/ca.pem")
-        named = f"{secured.role}.pem or {secured.role}.key is damaged, or they do not belong together"
-        context.load_cert_chain(f"{secured.folder}/{secured.role}.pem", f"{secured.folder}/{secured.role}.key")
+        context = ssl.create_default_context(cafile=f"{folder}/ca.pem")
+        named = f"{role}.pem or {role}.key is damaged, or they do not belong together"
+        context.load_cert_chain(f"{folder}/{role}.pem", f"{folder}/{role}.key")
+    except PermissionError:
+        raise LinkError(f"this account may not read ca.pem, {role}.pem and {role}.key in {folder}") from None
     except OSError:  # also those of ssl
-        return f"{named} in {secured.folder}; copy the files of {secured.role} again from where they were made"
-    return ""
+        raise LinkError(f"{named} in {folder}; copy the files of {role} again from where they were made") from None
+    return context
 
 
 def _speaks_tls(host: str, port: int) -> bool:
