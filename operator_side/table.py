@@ -41,7 +41,7 @@ def print_block(lines: Iterable[str]) -> None:
 
 def clean(lines: Iterable[str]) -> Iterator[str]:
     """Yield lines without letters that control a terminal: a peer may have written a part of them."""
-    return (printable(part) for line in lines for part in line.splitlines() or [""])
+    return map(printable, lines)
 
 
 def colored(text: str) -> str:

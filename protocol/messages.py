@@ -75,7 +75,7 @@ class FrameHeader(Stamp):
         default=(0.0, 0.0), description="last given to the wheels, after every limit: linear, angular"
     )
     latency_us: Microseconds | None = Field(
-        default=None, description="from capture to acceptance of the command in force, on its clock; null without one"
+        default=None, description="from capture to acceptance of the last command since arming, on its clock; or null"
     )
 
 
@@ -279,7 +279,7 @@ class Status(WireModel):
         default=None, description="age of the frame behind the command in force; null without one"
     )
     latency_us: Microseconds | None = Field(
-        default=None, description="from capture to acceptance of the command in force, on its clock; null without one"
+        default=None, description="from capture to acceptance of the last command since arming, on its clock; or null"
     )
     accepted: Counter = Field(default=0, description="commands accepted since the start")
     refused: dict[str, Counter] = Field(default={}, description="rejections since the start, by reason")

@@ -33,7 +33,7 @@ class HsvRange(Config):
         for name in ("saturation", "value"):
             low, high = getattr(self, f"{name}_low"), getattr(self, f"{name}_high")
             if low > high:
-                raise ValueError(f"{name}_low {low:g} is above {name}_high {high:g}; exchange them")
+                raise ValueError(f"{name}_low {low:g} is above {name}_high {high:g}; set both")
         return self
 
 

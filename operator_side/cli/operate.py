@@ -19,6 +19,7 @@ from sightline.operator_side.client.status import reply_line, short_lines, statu
 from sightline.operator_side.config.context import RobotAddress, stop_secret_of, target_of
 from sightline.operator_side.table import print_block
 from sightline.protocol.errors import ConfigError, LinkError, home_path
+from sightline.protocol.log import printable
 from sightline.protocol.messages import MissionReport, Reply, State, Status, Verb
 from sightline.protocol.transports.open import open_link
 
@@ -61,7 +62,7 @@ def robots(
     target = target_of(None, connect, secure)
     places = None if target.origin == "default" else target.connect
     found = discover_all(places, seconds, target.secure)
-    typer.echo(json.dumps(found.as_object()) if as_json else "\n".join(found.lines()))
+    typer.echo(json.dumps(found.as_object()) if as_json else "\n".join(map(printable, found.lines())))
     return 0
 
 
@@ -186,7 +187,7 @@ def _print_reply(operator: Operator, verb: Verb, reply: Reply, as_json: bool) ->
         typer.echo(json.dumps({"robot": robot, "ok": reply.ok, "state": reply.state, "detail": reply.detail}))
     else:
         driver = operator.report.status.holder if operator.report else None
-        line = reply_line(robot, verb, reply, driver.source if driver else "")
+        line = printable(reply_line(robot, verb, reply, driver.source if driver else ""))
         typer.echo(line if reply.ok else f"error: {line}", err=not reply.ok)
     return 0 if reply.ok else CHECK_FAILED
 
@@ -318,11 +319,11 @@ def _print_report(robot: str, report: MissionReport, as_json: bool, *, is_answer
         ok = not refused and not cannot(report)
         typer.echo(json.dumps({"robot": robot, "ok": ok, **report.model_dump(mode="json")}))
     elif refused:
-        typer.echo(f"error: the vision service of {robot} rejected the request: {refused}", err=True)
+        typer.echo(f"error: the vision service of {robot} rejected the request: {printable(refused)}", err=True)
     else:
         typer.echo(f"{robot}: {mission_line(report)}")
         if not is_answer and report.detector:
-            typer.echo(f"detector: {detector_line(report)}")
+            typer.echo(f"detector: {printable(detector_line(report))}")
     return CHECK_FAILED if refused else 0
 
 

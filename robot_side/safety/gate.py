@@ -405,7 +405,7 @@ class SafetyGate:
 
     @property
     def latency_us(self) -> int | None:
-        """Return the time in us from capture to acceptance of the current command, or None if it cites no frame."""
+        """Return the time in us from capture to acceptance of the last command, or None if it cites no frame."""
         command = self._command
         return command.arrival_us - command.echo_us if command is not None and command.cites_frame else None
 

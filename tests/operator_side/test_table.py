@@ -38,7 +38,7 @@ def test_colors_need_a_terminal_and_no_no_color(monkeypatch, environ, expected):
 
 def test_text_of_a_peer_cannot_control_the_terminal(capsys):
     print_block(["mission   a: \x1b[31mred\nline", "", "µ 中文"])
-    assert capsys.readouterr().out == "mission   a: ?[31mred\nline\n\nµ 中文\n"
+    assert capsys.readouterr().out == "mission   a: ?[31mred?line\n\nµ 中文\n"
     report = MissionReport(mission="a", phase="\x1b[2Jgone\r", note="b\x07")
     assert mission_line(report) == "a: ?[2Jgone?; b?"
 

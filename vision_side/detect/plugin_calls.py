@@ -108,7 +108,7 @@ def notices_of(detector: Any) -> list[str]:
 def labels_of(detector: Any) -> Sequence[str]:
     """Return all labels that a detector can give; empty where they are unknown."""
     with plugin_guard("the detector's labels"):
-        labels: object = getattr(detector, "labels", ())
+        labels: object = getattr(detector, "labels", None) or ()
         if isinstance(labels, str) or not isinstance(labels, Iterable):
             raise TypeError(f"{labels!r} is not a sequence of texts")
         return tuple(map(str, labels))

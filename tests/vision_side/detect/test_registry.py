@@ -131,7 +131,7 @@ def test_boxes_of_another_service_cannot_be_the_fallback() -> None:
 @pytest.mark.parametrize("name", ["saturation", "value"])
 def test_color_range_that_no_pixel_is_in_is_rejected(name: str) -> None:
     one = {"hue_low_deg": 300, "hue_high_deg": 20, f"{name}_low": 0.9, f"{name}_high": 0.1}
-    with pytest.raises(ValidationError, match=f"{name}_low 0.9 is above {name}_high 0.1; exchange them"):
+    with pytest.raises(ValidationError, match=f"{name}_low 0.9 is above {name}_high 0.1; set both"):
         HsvRange.model_validate(one)
     HsvRange.model_validate(one | {f"{name}_high": 0.9})
 

@@ -123,7 +123,7 @@ class OnnxDetector:
         """The color that counts in the images at hand."""
         self._bonus = config.color_bonus
         # What a pale image and a doubt need is not known of other models.
-        self._is_shipped = model.digest == shipped_digest()
+        self._is_shipped = model.digest == shipped_digest() != ""
         own_bonus, given = _EXPECTED_BONUS if self._is_shipped else 0.0, config.expected_bonus
         self._expected_bonus = own_bonus if given is None else given
         # A model of any size gets the image unscaled, and a part of it would be no larger.
