@@ -52,6 +52,7 @@ class StopSender:
         self._robot, self._secret = robot, read_secret(secret_file)
         self._requests: list[StopRequests] = []
         """One for each address: two hosts of one name have challenges of their own."""
+        self._answered_s = 0.0
         self._ending = threading.Event()
         self._sent, self._latched = threading.Event(), threading.Event()
         # One for each name: it may take seconds until a name server answers.
@@ -89,6 +90,11 @@ class StopSender:
     def is_stopped(self) -> bool:
         """Return True once the robot has applied this STOP and its wheels are at zero."""
         return any(one.is_stopped for one in self._requests)
+
+    @property
+    def denies_zero(self) -> bool:
+        """Return True if the robot answers that its wheels are not at zero, whatever the status on its link shows."""
+        return self.is_latched and not self.is_stopped and time.monotonic() - self._answered_s < _ANSWERED_S
 
     @property
     def is_stored(self) -> bool:
@@ -130,8 +136,11 @@ class StopSender:
                 with suppress(OSError):
                     data, place = one.recvfrom(DATAGRAM_BYTES + 1)
                     requests = senders[one][1]
+                    before = requests.answer
                     if requests.on_datagram(data):
                         self._send(one, place, requests)
+                    if requests.answer is not before:
+                        self._answered_s = time.monotonic()
                     if requests.is_latched:
                         self._latched.set()
 
@@ -216,7 +225,7 @@ def _wait(robot: str, sender: StopSender, link: _LinkStop, on_slow: Callable[[],
     while (now_s := time.monotonic()) - began_s < timeout_s:
         if sender.is_stored:
             return True
-        if sender.is_stopped or link.status is not None:
+        if sender.is_stopped or (link.status is not None and not sender.denies_zero):
             stopped_s = stopped_s or now_s
             has_report = sender.is_answered and not sender.lacks_secret
             if not has_report or now_s - stopped_s > _STORED_S:

@@ -399,8 +399,9 @@ class Driver:
         try:
             self._drive.set(*speeds)
             self._speeds_are_set, self._refuses_since_us = True, 0
+            self._driver_core.gate.note_drive(before, is_taken=True)
         except PLUGIN_ERRORS as error:
-            self._driver_core.gate.keep_applied(before)
+            self._driver_core.gate.note_drive(before, is_taken=False)
             self._refuses_since_us = self._refuses_since_us or heartbeat_us()
             self._fault("drive", error)
 

@@ -13,9 +13,10 @@ import select
 import signal
 import socket
 import sys
+import threading
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Any, Final
 
@@ -50,7 +51,7 @@ _log: Final = logging.getLogger("sightline.guardian")
 _HARDWARE_EXIT: Final = 3
 _SET_CHILD_SUBREAPER: Final = 36
 _WATCHDOG_PERIOD_US: Final = 100_000
-_ZERO_TRIES, _ZERO_RETRY_S = 5, 0.1
+_ZERO_TRIES, _ZERO_RETRY_S, _ZERO_HANGS_S = 5, 0.1, 2.0
 _BEATS_PER_LOOK: Final = 64
 _ORPHANS_END_US: Final = 1_000_000
 _NOT_COVERED: Final = (
@@ -94,6 +95,8 @@ class Guardian:
         self._status: int | None = None
         self._reason = ""
         """Why the driver process was killed, "" if it ended by itself."""
+        self._zero_failed: BaseException | None = None
+        """Why the motors could not be set to zero after the last driver process."""
         self._monitor = HeartbeatMonitor(heartbeat_us())
         self._budget = RestartBudget()
         self._end_signal: int | None = None
@@ -114,33 +117,37 @@ class Guardian:
             code = os.waitstatus_to_exitcode(self._watch())
             if self._monitor.drive_failed:  # the same whether the driver process was killed or quicker
                 code = _HARDWARE_EXIT
-            error = self._set_to_zero() if self._needs_zero(code) else None
-            self._log_end(code, error)  # after zero: the thread that writes the log has no real-time priority
+            needs_zero_now = self._needs_zero(code)
+            self._zero_failed = self._set_to_zero() if needs_zero_now else None
+            self._log_end(code, was_zeroed=needs_zero_now)  # after zero: its thread has no real-time priority
             self._kill_orphans()
             exit_code = exit_code_after(code, self._end_signal, was_running=self._monitor.is_running)
             if exit_code is not None:
                 return exit_code
+            motors = "the motors are at zero" if self._zero_failed is None else "the motors are NOT at zero"
             if self._setup["driver"] is None:
-                return self._give_up("the motors are at zero")
+                return self._give_up(motors)
             if not self._budget.take(heartbeat_us()):
-                return self._give_up("5 restarts within 60 s; the motors stay at zero; look for the cause above")
+                return self._give_up(f"5 restarts within 60 s; {motors}; look for the cause above")
             self._start_driver()
 
-    def _log_end(self, code: int, error: Exception | None) -> None:
+    def _log_end(self, code: int, *, was_zeroed: bool) -> None:
         if self._reason:
             self._say(f"the driver process was killed: {self._reason}")
         elif code < 0:
             self._say(f"the driver process was ended by signal {-code}")
         elif self._monitor.is_running:
             self._say(f"the driver process ended by itself with code {code}; did a plug-in end it?")
-        if error is not None:
+        if (error := self._zero_failed) is not None:
             _log.error("robot %s: motors NOT set to zero: %s: %s; switch off their supply",
                        self._setup["robot"], type(error).__name__, error, exc_info=error)
-        elif self._needs_zero(code):
+        elif was_zeroed:
             self._say("the motors are set to zero")
 
     def _needs_zero(self, code: int) -> bool:
-        return needs_zero(code, was_ready=self._monitor.is_ready, was_running=self._monitor.is_running)
+        """Return True if the wheels may turn, maybe since an earlier process. One that ends with 0 stopped them."""
+        is_needed = needs_zero(code, was_ready=self._monitor.is_ready, was_running=self._monitor.is_running)
+        return is_needed or (self._zero_failed is not None and code != 0)
 
     def _give_up(self, why: str) -> int:
         _log.error("robot %s: the driver process is not started again: %s", self._setup["robot"], why)
@@ -166,7 +173,8 @@ class Guardian:
                 self._reason = "did not end when requested" if self._monitor.is_ready else "ended before its start"
             if self._reason:
                 os.kill(self._driver_pid, signal.SIGKILL)
-                return os.waitpid(self._driver_pid, 0)[1]
+                with without_real_time():
+                    return os.waitpid(self._driver_pid, 0)[1]
             if not is_open:
                 time.sleep(0.001)
             self._keep_receiver()
@@ -212,18 +220,27 @@ class Guardian:
         if os.environ.get("WATCHDOG_USEC") and watchdog_us:
             self._systemd.notify(f"WATCHDOG_USEC={watchdog_us}")
 
-    def _set_to_zero(self) -> Exception | None:
+    def _set_to_zero(self) -> BaseException | None:
         """Call `zero` of the drive. Returns why it failed, after several tries: a dying owner may hold the device."""
-        failed: Exception | None = None
         for _ in range(_ZERO_TRIES):
-            try:
-                self._zero(self._zero_config)
+            failed: list[BaseException] = []
+            calling = threading.Thread(target=self._call_zero, args=(failed,), name="zero", daemon=True)
+            calling.start()
+            calling.join(_ZERO_HANGS_S)
+            if calling.is_alive():
+                return TimeoutError(f"zero() does not return for {_ZERO_HANGS_S:g} s")
+            if not failed:
                 return None
-            except Exception as error:  # foreign code
-                failed = error
-                self._kill_orphans()
-                time.sleep(_ZERO_RETRY_S)
-        return failed
+            self._kill_orphans()
+            time.sleep(_ZERO_RETRY_S)
+        return failed[0]
+
+    def _call_zero(self, failed: list[BaseException]) -> None:
+        schedule_real_time(GUARDIAN_PRIORITY)
+        try:
+            self._zero(self._zero_config)
+        except (Exception, SystemExit) as error:  # foreign code
+            failed.append(error)
 
     def _start_driver(self) -> None:
         self._permit_silence(STARTS_WITHIN_US)
@@ -260,10 +277,10 @@ class Guardian:
 
     def _reap(self) -> None:
         with suppress(ChildProcessError):
-            while True:
-                pid, status = os.waitpid(-1, os.WNOHANG)
-                if not pid:
-                    return
+            # A look with real-time priority first: without it, a driver process in an endless loop would hold us up.
+            while os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None:
+                with without_real_time():
+                    pid, status = os.waitpid(-1, os.WNOHANG)
                 if pid == self._driver_pid:
                     self._status = status
                 elif self._receiver is not None and pid == self._receiver.pid:
@@ -284,6 +301,22 @@ class Guardian:
 
     def _say(self, line: str) -> None:
         _log.info("robot %s: %s", self._setup["robot"], line)
+
+
+@contextmanager
+def without_real_time() -> Iterator[None]:
+    """Reap a child without real-time priority.
+
+    In `wait4`, Linux may turn until the last thread of the child has left `/proc`, where `run_us_of` looked at it. With
+    one processor and a lower priority that thread would never run again.
+    """
+    policy = os.sched_getscheduler(0)
+    os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+    try:
+        yield
+    finally:
+        if policy != os.SCHED_OTHER | os.SCHED_RESET_ON_FORK:
+            schedule_real_time(GUARDIAN_PRIORITY)
 
 
 def _hang_up_of(beats: socket.socket) -> select.poll:

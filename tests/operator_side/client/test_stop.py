@@ -132,6 +132,14 @@ def test_an_answered_datagram_needs_no_link(robot, link, port, busy):
     assert stop(port) and not link.begun_s
 
 
+def test_status_of_the_link_does_not_overrule_a_robot_whose_wheels_are_not_at_zero(robot, link, port, busy):
+    """The commanded zero may never have reached the motors."""
+    robot(turns_s=60.0)
+    link.status = STOPPED
+    with pytest.raises(LinkError, match="did not confirm STOP within 2 s; cut its power by hand"):
+        stop(port, timeout_s=2.0)
+
+
 @pytest.mark.alone
 def test_an_answer_without_wheels_at_zero_opens_the_link_after_a_second(robot, link, port, busy):
     one = robot(turns_s=2.0)

@@ -11,8 +11,8 @@ from contextlib import suppress
 import pytest
 
 from sightline.protocol.config import Config
-from sightline.protocol.errors import HardwareError
-from sightline.protocol.messages import STILL, Twist
+from sightline.protocol.errors import HardwareError, WireError
+from sightline.protocol.messages import STILL, Holder, Twist
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.persistence import LatchWriter, StopLatch
@@ -137,6 +137,10 @@ def test_speeds_that_the_drive_did_not_take_are_not_shown_as_applied(driver, mon
         driver._move()
         assert gate.applied == given and not driver._is_at_rest
     assert driver._driver_core.status(3_000_000).applied == (given.linear_mps, given.angular_rad_s)
+    gate.applied = STILL
+    with pytest.raises(WireError, match="the drive takes no speeds"):
+        gate.reset(Holder(source="operator", session="0000000c"), 3_000_000)
+    gate.applied = given
     BrokenDrive.fails = None
     driver._move()
     assert gate.applied == STILL and driver._is_at_rest

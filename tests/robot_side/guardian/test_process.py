@@ -51,10 +51,12 @@ def dying(tmp_path, monkeypatch):
     """Start a robot whose drive has a fault, and wait for it; return the robot and the fault."""
     with ExitStack() as ending:
 
-        def start(name, **changes):
+        def start(name, kind="DyingLogDrive", on_one_processor=False, **changes):
             fault = DriveFault(monkeypatch, tmp_path, name)
-            drive = {"kind": "tests.fixtures.dying:DyingLogDrive", "options": {"path": str(tmp_path / "drive.csv")}}
-            robot = ending.enter_context(RobotProcess(tmp_path, drive=drive, **changes))
+            drive = {"kind": f"tests.fixtures.dying:{kind}", "options": {"path": str(tmp_path / "drive.csv")}}
+            robot = RobotProcess(tmp_path, drive=drive, **changes)
+            robot._entry = ["taskset", "-c", str(min(os.sched_getaffinity(0)))] if on_one_processor else robot._entry
+            ending.enter_context(robot)
             vision = ending.enter_context(Vision(robot.endpoint))
             return robot, vision, fault
 
@@ -78,6 +80,31 @@ def test_dead_or_stopped_driver_leaves_the_wheels_at_zero_and_a_new_one_starts(d
     assert vision.status().state == "DISARMED"
     assert robot.driver_pid() != driver
     assert robot.speed() == 0.0
+
+
+@pytest.mark.parametrize("name", ["SIGSTOP", "loop"])
+def test_one_processor_is_enough_to_stop_the_wheels_of_a_hung_driver(dying, name):
+    """With real-time priority the guardian reaped it forever: a thread of the dead process needed the processor."""
+    robot, _, fault = dying(name, on_one_processor=True)
+    assert until(fault.has_come, START_S)
+    assert until(lambda: robot.speed() == 0.0, 3), robot.output()
+    robot.wait_until_on("a new driver process starts")
+
+
+@pytest.mark.parametrize(("how", "why"), [
+    ("exit", "SystemExit: 0"), ("raise", "OSError: no device"), ("hang", "TimeoutError: zero() does not return"),
+])
+def test_zero_that_fails_is_reported_and_the_next_driver_stops_the_wheels(dying, how, why):
+    robot, _, fault = dying("SIGKILL", kind="StubbornLogDrive", safety={"auto_arm": False})
+    fault.zero_fails(how)
+    robot.wait_until_on()
+    arm(robot.endpoint)
+    robot.wait_until_on(f"motors NOT set to zero: {why}")
+    robot.wait_until_on("a new driver process starts")
+    assert until(lambda: robot.speed() == 0.0, START_S), "its first tick"
+    fault.zero_fails("")
+    robot.process.terminate()
+    assert robot.process.wait(START_S) == 0 and robot.output().count("NOT set to zero") == 1
 
 
 def test_robot_whose_drive_is_gone_shows_why_and_drives_again_when_it_is_back(dying):
@@ -162,7 +189,7 @@ def test_sixth_death_within_a_minute_ends_the_robot(tmp_path):
             assert until(lambda n=count: robot.output().count("a new driver process starts") == n, START_S)
             os.kill(robot.driver_pid(), signal.SIGKILL)
         assert robot.process.wait(START_S) == 3
-        assert "5 restarts within 60 s; the motors stay at zero" in robot.output()
+        assert "5 restarts within 60 s; the motors are at zero" in robot.output()
         assert robot.motor_rows()[-1][1:] == (0.0, 0.0)
 
 
