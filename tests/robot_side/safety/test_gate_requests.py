@@ -3,7 +3,7 @@
 import pytest
 
 from sightline.protocol.errors import RejectReason, WireError
-from sightline.protocol.messages import STILL, Echo, Request, RequestHeader, Verb
+from sightline.protocol.messages import STILL, Echo, Request, RequestHeader, Twist, Verb
 from sightline.protocol.proof import session_digest
 from sightline.robot_side.safety.gate import SafetyGate
 from sightline.robot_side.safety.limits import SafetyConfig
@@ -305,3 +305,35 @@ def test_repeated_drive_failure_does_not_prevent_a_reset():
         rig.gate.fault("broken")
         assert rig.gate.state is state
         assert rig.gate.request(*asked, rig.now_us) == "reset; arm to drive"
+
+
+# --- a drive that takes no speeds --------------------------------------------------------------------------------
+
+
+SLOW, FAST = Twist(linear_mps=0.1, angular_rad_s=0.0), Twist(linear_mps=0.3, angular_rad_s=0.2)
+
+
+@pytest.mark.parametrize(("before", "attempted", "applied"), [
+    (SLOW, STILL, SLOW), (SLOW, FAST, SLOW), (STILL, FAST, FAST), (STILL, STILL, STILL),
+])
+def test_wheels_turn_as_before_where_the_drive_took_nothing(before, attempted, applied):
+    """From zero, a failed attempt may have reached one wheel of two."""
+    gate = Rig().gate
+    gate.applied = attempted
+    gate.note_drive(before, is_taken=True)
+    assert gate.applied == attempted
+    gate.note_drive(before, is_taken=False)
+    assert gate.applied == applied
+
+
+def test_reset_needs_a_drive_that_took_zero():
+    rig = Rig()
+    rig.gate.stop()
+    rig.gate.note_drive(STILL, is_taken=False)
+    with pytest.raises(WireError) as caught:
+        rig.request(Verb.RESET)
+    assert (caught.value.reason, caught.value.detail) == (
+        RejectReason.NOT_ALLOWED, "the drive takes no speeds; see its error in the robot's log"
+    )
+    rig.gate.note_drive(STILL, is_taken=True)
+    assert rig.request(Verb.RESET) == "reset; arm to drive"
