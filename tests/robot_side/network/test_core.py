@@ -82,6 +82,16 @@ def test_image_of_the_future_is_counted_and_named_and_the_stream_goes_on():
     assert core.status(now_us).refused_pictures == 1
 
 
+def test_time_that_a_camera_repeats_is_shown_once_no_frame_leaves():
+    core = core_of()
+    assert core.on_camera(Picture(b"", 1_000), 1_000) is not None
+    assert core.on_camera(Picture(b"", 1_000), 2_000) is None
+    fault = "the time of the image is not after that of the one before"
+    assert core.image_fault == fault and core.status(1_001_000).camera_fault == ""
+    assert core.status(1_001_001).camera_fault == fault and core.status(1_001_001).refused_pictures == 1
+    assert core.on_camera(Picture(b"", 1_001), 1_002_000) is not None and core.image_fault == ""
+
+
 @pytest.mark.parametrize(("t_us", "leaves"), [(1_000, True), (1_001, False)])
 def test_image_that_was_captured_after_now_is_of_the_future(t_us, leaves):
     core = core_of()
