@@ -6,7 +6,7 @@ The width of the terminal changes nothing, so that a script reads the same lines
 import os
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 from typing import Final, TextIO
 
@@ -35,13 +35,8 @@ def print_table(rows: Iterable[Sequence[str]]) -> None:
 
 def print_block(lines: Iterable[str]) -> None:
     """Print lines on stdout, with colors for states on a terminal."""
-    text = "\n".join(clean(lines))
+    text = "\n".join(map(printable, lines))  # a peer may have written a part of them
     print(colored(text) if uses_color(sys.stdout) else text, flush=True)
-
-
-def clean(lines: Iterable[str]) -> Iterator[str]:
-    """Yield lines without letters that control a terminal: a peer may have written a part of them."""
-    return map(printable, lines)
 
 
 def colored(text: str) -> str:

@@ -12,7 +12,8 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
-from sightline.operator_side.table import clean, colored, uses_color
+from sightline.operator_side.table import colored, uses_color
+from sightline.protocol.log import printable
 
 _REFRESH_S: Final = 0.2
 _PLAIN_S: Final = 1.0
@@ -37,7 +38,7 @@ class LiveBlock:
         if time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + (_PLAIN_S if self._live is None else _REFRESH_S)
-        lines = list(clean(lines))
+        lines = [printable(line) for line in lines]
         if self._live is not None:
             self._live.update(self._text("\n".join(lines)), refresh=True)
         elif self._is_progress:

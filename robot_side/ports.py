@@ -39,7 +39,7 @@ def check_image(camera: Camera, picture: object) -> None:
     for name, value, kind in (
         ("Picture.jpeg", picture.jpeg, bytes | bytearray), ("Picture.t_us", picture.t_us, int),
         ("Picture.scale_percent", picture.scale_percent, int), ("model", camera.model, CameraModel),
-        ("live", camera.live, object),
+        ("live", camera.live, object),  # anything, but it must be there
     ):
         if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
             raise TypeError(f"{name} is {type(value).__name__}; expected {getattr(kind, '__name__', kind)}")

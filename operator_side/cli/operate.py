@@ -323,7 +323,7 @@ def _print_report(robot: str, report: MissionReport, as_json: bool, *, is_answer
     else:
         typer.echo(f"{robot}: {mission_line(report)}")
         if not is_answer and report.detector:
-            typer.echo(f"detector: {printable(detector_line(report))}")
+            typer.echo(f"detector: {detector_line(report)}")
     return CHECK_FAILED if refused else 0
 
 

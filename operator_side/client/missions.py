@@ -255,7 +255,7 @@ def detector_line(report: MissionReport) -> str:
     """Format the detector, its device, model and time per image."""
     parts = [report.detector, f"on {report.device}" if report.device else "", f"model {report.model}" if report.model
              else "", f"{report.inference_us / 1000:.1f} ms per image" if report.inference_us is not None else ""]
-    return ", ".join(part for part in parts if part)
+    return printable(", ".join(part for part in parts if part))
 
 
 def cannot(report: MissionReport) -> bool:

@@ -310,12 +310,14 @@ def without_real_time() -> Iterator[None]:
     In `wait4`, Linux may turn until the last thread of the child has left `/proc`, where `run_us_of` looked at it. With
     one processor and a lower priority that thread would never run again.
     """
-    policy = os.sched_getscheduler(0)
-    os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+    is_real_time = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+    if is_real_time:
+        with suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
     try:
         yield
     finally:
-        if policy != os.SCHED_OTHER | os.SCHED_RESET_ON_FORK:
+        if is_real_time:
             schedule_real_time(GUARDIAN_PRIORITY)
 
 

@@ -128,8 +128,10 @@ class NetworkProcess:
             camera = self._network_core.announce_camera(model, monotonic_us()) if model else None
         if camera is not None:
             self._link.publish(camera.channel, camera.header, camera.payload)
-        if picture is None or sent is None:
-            self._log_rejected(picture)
+        if picture is None:
+            return
+        if sent is None:
+            self._log_rejected()
             return
         header, message = sent
         # The driver process must know a frame before a peer can answer it.
@@ -145,8 +147,8 @@ class NetworkProcess:
             return None
         return model if isinstance(model, CameraModel) else None
 
-    def _log_rejected(self, picture: Picture | None) -> None:
-        if picture is not None and (count := self._rejection_limiter.due("image", monotonic_us())):
+    def _log_rejected(self) -> None:
+        if (count := self._rejection_limiter.due("image", monotonic_us())):
             often = f" ({count} times)" if count > 1 else ""
             _log.warning("camera: %s%s", self._network_core.image_fault, often)
 

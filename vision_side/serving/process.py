@@ -59,12 +59,12 @@ def ends_on_signal(ending: threading.Event) -> Iterator[None]:
 
 def _end_hanging(signals: socket.socket, left: threading.Event) -> None:
     """Wait for a signal, and end this process if it does not leave `ends_on_signal` in time."""
-    with signals:
+    with signals:  # open until the end: a second signal is written to it, too
         number = signals.recv(1)
-    if number and not left.wait(ENDS_WITHIN_S):
-        _log.error("a detector or mission does not return; ended by force")
-        logging.shutdown()
-        os._exit(128 + number[0])
+        if number and not left.wait(ENDS_WITHIN_S):
+            _log.error("a detector or mission does not return; ended by force")
+            logging.shutdown()
+            os._exit(128 + number[0])
 
 
 def run(config: VisionConfig, observe: Observe | None = None) -> int:

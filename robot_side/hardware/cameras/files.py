@@ -33,7 +33,7 @@ class FolderCamera:
 
     def __init__(self, config: FolderCameraConfig) -> None:
         paths = jpegs_in(config.path)
-        self._pictures = [_bytes_of(path) for path in paths]
+        self._pictures = [_bytes_of(path, "remove it from the folder") for path in paths]
         sizes = {jpeg_size(path, jpeg) for path, jpeg in zip(paths, self._pictures, strict=True)}
         if len({(size.width_px, size.height_px) for size in sizes}) > 1:
             raise HardwareError(f"the images in {config.path} differ in size; name a folder with one size")
@@ -60,11 +60,11 @@ def jpegs_in(folder: Path) -> list[Path]:
     return paths
 
 
-def _bytes_of(path: Path) -> bytes:
+def _bytes_of(path: Path, fix: str) -> bytes:
     try:
-        return path.read_bytes()
+        return home_path(path).read_bytes()
     except OSError as error:
-        raise HardwareError(f"image {path} cannot be read: {error.strerror}; remove it from the folder") from None
+        raise HardwareError(f"image {path} cannot be read: {error.strerror}; {fix}") from None
 
 
 def jpeg_size(path: Path, jpeg: bytes) -> JpegSize:
@@ -97,12 +97,7 @@ class StillCamera:
     live = False
 
     def __init__(self, config: StillCameraConfig) -> None:
-        try:
-            self._jpeg = home_path(config.path).read_bytes()
-        except OSError as error:
-            raise HardwareError(
-                f"image {config.path} cannot be read: {error.strerror}; set camera.options.path to a .jpg"
-            ) from None
+        self._jpeg = _bytes_of(config.path, "set camera.options.path to a .jpg")
         self.model = camera_model(config, jpeg_size(config.path, self._jpeg))
         self._pace = FrameTimer(config.fps)
 

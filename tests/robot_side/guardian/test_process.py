@@ -118,7 +118,6 @@ def test_robot_whose_drive_is_gone_shows_why_and_drives_again_when_it_is_back(dy
     fault.end()
     with open_zenoh("r1", connect=[robot.endpoint], role="operator", timeout_s=START_S) as link:
         operator = Operator(link)
-        time.sleep(1.2)
         assert until(lambda: operator.request(Verb.RESET).ok and vision.status().state == "DISARMED", START_S)
     arm(robot.endpoint)
     assert driving(robot)

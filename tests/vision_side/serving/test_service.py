@@ -512,6 +512,9 @@ def test_service_whose_detector_or_mission_hangs_is_ended_after_its_time(work, h
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     assert started.stdout.readline() == "on\n"
-    started.send_signal(signal.SIGTERM)
+    for number in [signal.SIGTERM, *[signal.SIGINT] * hangs]:  # Ctrl-C in a terminal and the end of `demo` send two
+        started.send_signal(number)
+        time.sleep(0.05)
     _, told = started.communicate(timeout=20)
+    assert "Exception ignored" not in told
     assert (started.returncode, "does not return; ended by force" in told) == ((143, True) if hangs else (0, False))
