@@ -54,7 +54,7 @@ class WheelAngles:
     Args:
         left_rad: angle of the left wheel since the start, rad.
         right_rad: angle of the right wheel since the start, rad.
-        t_us: time of the reading, us.
+        t_us: time of the reading, us. A reading with the time of the last one, or an older one, is ignored.
     """
 
     left_rad: float

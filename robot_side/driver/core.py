@@ -39,7 +39,7 @@ _RETURNS_NO_CREDIT = (
     RejectReason.NOT_PROVEN,
 )  # fmt: skip
 
-
+_AHEAD_US = 1_000_000  # a reading of the wheels with a later time comes from another clock: no later one would be newer
 _WIRE_LIMIT = 1e6  # of every number on the wire: an encoder that wraps around must not end anything
 
 
@@ -143,8 +143,14 @@ class DriverCore:
     # --- what leaves ---------------------------------------------------------------------------------------------
 
     def tick(self, now_us: int, wheels: WheelAngles | None, scan: Ranges | None) -> tuple[float, float]:
-        """Read the sensors' news, step the gate, and return (left, right) rad/s for the motors."""
+        """Read the sensors' news, step the gate, and return (left, right) rad/s for the motors.
+
+        Raises:
+            ValueError: an angle is not finite, or its time is in the future.
+        """
         if wheels is not None:
+            if wheels.t_us > now_us + _AHEAD_US:
+                raise ValueError(f"WheelAngles.t_us is {(wheels.t_us - now_us) / 1e6:.3g} s ahead; take the robot's clock")
             self.odometer.update(wheels)
         if scan is not None:
             self._on_scan(scan, now_us)

@@ -3,6 +3,7 @@
 import array
 import math
 from collections import Counter
+from contextlib import nullcontext
 from random import Random
 
 import pytest
@@ -295,6 +296,16 @@ def test_status_and_odometry_leave_at_once_and_then_at_their_periods(channel, pe
             )  # fmt: skip
             assert message.source == ""
     assert times_us == [offsets_us[number] for number in (0, 2, 3, 5, 6, 7, 8)], "after a stall one more at once"
+
+
+@pytest.mark.parametrize(("ahead_us", "is_wrong"), [(0, False), (1_000_000, False), (1_000_001, True), (10**15, True)])
+def test_wheel_angles_of_another_clock_are_named(ahead_us, is_wrong):
+    core = core_of()
+    with pytest.raises(ValueError, match=r"WheelAngles\.t_us is 1.* s ahead") if is_wrong else nullcontext():
+        core.tick(NOW_US, WheelAngles(0.0, 0.0, NOW_US + ahead_us), None)
+    for step in range(2):
+        core.tick(NOW_US + 2_000_000, WheelAngles(step, step, NOW_US + 1_500_000 + step), None)
+    assert core.motion().pose[0] > 0
 
 
 def test_odometry_is_the_motion():
