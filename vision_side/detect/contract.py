@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from sightline.protocol.config import PLUGIN_ERRORS
+from sightline.protocol.log import report_fault
 from sightline.protocol.messages import MAX_DETECTED_BOXES, FrameHeader
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.onnx.self_test import difference
@@ -63,7 +64,7 @@ def check_detector(make: Make, seed: int = 1) -> list[PromiseResult]:
         try:
             wrong = check(detector, make, seed)
         except PLUGIN_ERRORS as error:  # it promised not to
-            wrong = f"it raises {type(error).__name__}: {' '.join(str(error).split())}"[:160]
+            wrong = f"it raises {type(error).__name__}: {report_fault('detector', error)}"[:160]
         finally:
             close_detector(detector)
         verdicts.append(PromiseResult(check.__name__.removeprefix("_keeps_"), promise, wrong))

@@ -1,5 +1,6 @@
 """The contract kit: our own detectors keep every promise, and each broken one is found out by the promise it breaks."""
 
+import traceback
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -168,3 +169,9 @@ class Halved(Broken):
 )
 def test_broken_detector_fails_the_promise_that_it_breaks(broken: type[Broken], promise: str) -> None:
     assert promise in {one.name for one in check_detector(broken, 3) if one.wrong}
+
+
+def test_author_sees_the_line_that_raises(caplog) -> None:
+    check_detector(Raising, 3)
+    (raised,) = [record.exc_info[2] for record in caplog.records]
+    assert "one.picture()" in [frame.line for frame in traceback.extract_tb(raised)]
