@@ -20,6 +20,7 @@ from sightline.operator_side.teleop.gamepad import Gamepad, PadKey
 from sightline.protocol.channels import FRAME, REPLY, STATUS, Channel
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import ConfigError, HardwareError, LinkError, SightlineError
+from sightline.protocol.log import printable
 from sightline.protocol.messages import LeaseHolder, Status
 from sightline.protocol.transports.link import LatestSlot, Link, Message
 
@@ -41,7 +42,7 @@ def _lines(robot: str, teleop: Teleop, now_us: int) -> tuple[str, str]:
         return f"{robot}: {teleop.note or 'no status yet'}", ""
     silent_us = now_us - teleop.received_us
     if silent_us > _SILENT_US:
-        return f"{robot}: no status for {silent_us / 1e6:.0f} s; without commands the robot stops", ""
+        return f"{robot}: no status for {silent_us / 1e6:.0f} s; without commands the robot stops", teleop.note
     status, speeds = teleop.report.status, teleop.speeds
     no_frame = "" if teleop.has_frame else "no image yet, and each command must cite one; check the camera"
     first = (f"{robot} {status.state}: {status.reason}", no_frame, teleop.note)
@@ -53,6 +54,7 @@ def _lines(robot: str, teleop: Teleop, now_us: int) -> tuple[str, str]:
 
 
 def _cut(line: str, width: int) -> str:
+    line = printable(line)
     return line if len(line) <= width else line[: max(0, width - 1)] + "…"
 
 
@@ -78,7 +80,7 @@ _LEAVE_S: Final = 0.25
 _PROVE_STOP_S: Final = 1.5
 """A STOP that nothing has proven is repeated for this time after the end."""
 _LEAVE_PERIOD_S: Final = 0.03
-_ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)  # suspended, it would hear no STOP
 
 
 def check_terminal() -> None:
@@ -131,8 +133,8 @@ class Cockpit:
         Raises:
             LinkError: the operator sent STOP, and nothing proves it.
         """
-        with _signals(self._end), _cbreak(sys.stdin.fileno()):
-            _print(self._teleop.layout.help)
+        with _signals(self._end), _cbreak(sys.stdin.fileno()), _screen() as self._print:
+            self._print(self._teleop.layout.help)
             try:
                 while not self._ended:
                     self._turn()
@@ -140,7 +142,7 @@ class Cockpit:
                 self._leave()
                 if self._stop_sender is not None:
                     self._stop_sender.close()
-                _print("\n\n")
+                self._print("\n\n")
                 if self._teleop.is_stopping:  # this matters more than an error that ended the drive
                     raise LinkError(f"robot '{self._link.robot}' did not confirm STOP; cut its power by hand")
 
@@ -210,7 +212,7 @@ class Cockpit:
             self._shown_us = now_us
             width = shutil.get_terminal_size().columns
             first, second = live_lines(self._link.robot, self._teleop, width - 1, now_us)
-            _print(f"\r\x1b[K{first}\n\x1b[K{second}\r\x1b[1A")  # and back up, to redraw both in place
+            self._print(f"\r\x1b[K{first}\n\x1b[K{second}\r\x1b[1A")  # and back up, to redraw both in place
 
     def _leave(self) -> None:
         """Command zero and release the lease, until the robot confirms it and STOP, or a short time is over."""
@@ -230,24 +232,37 @@ def _drain(pipe: int) -> None:
         os.read(pipe, 4096)
 
 
-def _print(text: str) -> None:
-    """Write to the terminal, unless it is gone or blocked: neither may delay a command."""
-    terminal = sys.stdout.fileno()
-    with suppress(OSError):
-        if select.select([], [terminal], [], 0)[1]:
-            os.write(terminal, text.encode())
+@contextmanager
+def _screen() -> Iterator[Callable[[str], None]]:
+    """Yield a function that writes to the terminal, unless it is gone or full: neither may delay a command.
+
+    The terminal is opened again, since other programs share the mode of its first descriptor.
+    """
+    screen = os.open(os.ttyname(sys.stdout.fileno()), os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+
+    def write(text: str) -> None:
+        with suppress(OSError):
+            os.write(screen, text.encode())
+
+    try:
+        yield write
+    finally:
+        os.close(screen)
 
 
 @contextmanager
 def _cbreak(terminal: int) -> Iterator[None]:
-    """Read keys immediately and without echo; Ctrl-C stays a signal. Restores the terminal at the end."""
+    """Read keys immediately and without echo; Ctrl-C stays a signal. Restores the terminal at the end.
+
+    Keys pressed before count as little as those after: nothing was on the screen yet, and the shell must not get them.
+    """
     before = termios.tcgetattr(terminal)
-    tty.setcbreak(terminal, termios.TCSANOW)
+    tty.setcbreak(terminal, termios.TCSAFLUSH)
     try:
         yield
     finally:
         with suppress(termios.error):
-            termios.tcsetattr(terminal, termios.TCSANOW, before)
+            termios.tcsetattr(terminal, termios.TCSAFLUSH, before)
 
 
 @contextmanager

@@ -32,6 +32,12 @@ def test_lines_show_state_reason_driver_and_fit_the_width():
     assert "vision drives" in shown(vision_drives(), 200)
 
 
+def test_text_of_a_robot_does_not_control_the_terminal():
+    rig = TeleopRig()
+    rig.teleop.note = "\x1b]0;mine\x07"
+    assert shown(rig, 80) == "r1: ?]0;mine?\n"
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_help_names_every_key_and_fits_eighty_columns(layout):
     layout = LAYOUTS[layout]
@@ -50,6 +56,9 @@ def test_silent_robot_is_not_shown_with_its_old_state():
     rig.connected = False
     rig.run(2.0)
     assert shown(rig, 200).startswith("r1: no status for 2 s")
+    rig.hold("\n")
+    rig.run(0.3)
+    assert shown(rig, 200).endswith("\nSTOP is not confirmed, repeating")
     rig.connected = True
     rig.run(0.5)
     assert shown(rig, 200).startswith("r1 ")

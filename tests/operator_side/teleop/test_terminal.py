@@ -1,12 +1,13 @@
 """`sightline teleop` in a real pseudo-terminal, with a real robot over real Zenoh and fingers that repeat a key."""
 
+import itertools
 import os
 import pty
 import signal
 import statistics
 import threading
 import time
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 
 import pytest
 
@@ -141,7 +142,7 @@ def test_a_key_moves_the_wheels_soon_and_its_release_is_a_zero_command_soon(seat
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("how", ["the terminal is closed", "SIGHUP", "SIGTERM", "Ctrl-C", "Ctrl-D", "q"])
+@pytest.mark.parametrize("how", ["the terminal is closed", "SIGHUP", "SIGTERM", "Ctrl-C", "Ctrl-Z", "Ctrl-D", "q"])
 def test_any_end_stops_the_wheels_soon_and_releases_the_robot(seat, how):
     seat.sit()
     seat.fingers.press("w")
@@ -154,7 +155,7 @@ def test_any_end_stops_the_wheels_soon_and_releases_the_robot(seat, how):
     elif how.startswith("SIG"):
         seat.terminal.process.send_signal(getattr(signal, how))
     else:
-        seat.terminal.types({"Ctrl-C": "\x03", "Ctrl-D": "\x04", "q": "q"}[how])
+        seat.terminal.types({"Ctrl-C": "\x03", "Ctrl-Z": "\x1a", "Ctrl-D": "\x04", "q": "q"}[how])
     assert seat.terminal.process.wait(5) == 0, seat.terminal.text()
     assert until(lambda: seat.robot.speed() == 0, 2)
     assert until(lambda: "released control" in seat.robot.output(), 2), "immediately, not at the end of its lease"
@@ -238,6 +239,56 @@ def test_terminal_shows_keys_and_robot(seat):
     assert "Traceback" not in seat.terminal.text()
 
 
+@contextmanager
+def pty_of(monkeypatch):
+    """Yield the outer end of a pseudo-terminal that is this process's stdin and stdout."""
+    master, slave = pty.openpty()
+    with os.fdopen(master, "r+b", 0) as fingers, os.fdopen(slave, "r+b", 0) as screen:
+        monkeypatch.setattr("sys.stdin", screen)
+        monkeypatch.setattr("sys.stdout", screen)
+        yield fingers
+
+
+def types_at_help(fingers, keys):
+    """Type `keys` as soon as the terminal shows the help, on a thread."""
+    def types():
+        while b"drive" not in fingers.read(4096):
+            pass
+        fingers.write(keys)
+
+    threading.Thread(target=types, daemon=True).start()
+
+
+def test_keys_typed_before_the_help_is_shown_do_nothing(monkeypatch):
+    network, teleop = MemoryNetwork(), Teleop("0000000a", Speeds(0.2, 1.0))
+    taken = []
+    monkeypatch.setattr(teleop, "on_keys", lambda keys, now_us: taken.append(keys))
+    with pty_of(monkeypatch) as fingers:
+        fingers.write(b"w\n\n")
+        types_at_help(fingers, b"\x04")
+        Cockpit(network.link("r1", role="teleop"), teleop, lambda: None).run()
+    assert taken == ["\x04"]
+
+
+def test_full_terminal_delays_no_key(monkeypatch):
+    """Of any width: where the last bytes end decides whether a terminal that is not read calls itself writable."""
+    network, teleop = MemoryNetwork(), Teleop("0000000a", Speeds(0.2, 1.0))
+    monkeypatch.setattr(terminal, "_SHOW_US", 0)
+    monkeypatch.setattr(terminal, "_TICK_S", 0)
+    for width in range(40, 60):
+        monkeypatch.setattr(terminal.shutil, "get_terminal_size", lambda width=width: os.terminal_size((width, 24)))
+        with pty_of(monkeypatch) as fingers:
+            turns = itertools.count()
+
+            def messages(_now_us, turns=turns, fingers=fingers):
+                if next(turns) == 1000:
+                    fingers.write(b"\x04")
+                return ()
+
+            monkeypatch.setattr(teleop, "messages", messages)
+            Cockpit(network.link("r1", role="teleop"), teleop, lambda: None).run()
+
+
 @pytest.mark.parametrize("secret_file", ["", "missing.secret"])
 def test_quitting_without_proof_of_stop_repeats_it_and_is_an_error(monkeypatch, tmp_path, secret_file):
     """Also where no datagram can be sent, since the STOP secret was removed after the start."""
@@ -247,11 +298,8 @@ def test_quitting_without_proof_of_stop_repeats_it_and_is_an_error(monkeypatch, 
     network, teleop = MemoryNetwork(), Teleop("0000000a", Speeds(0.2, 1.0))
     link, robot, requests = network.link("r1", role="teleop"), network.link("r1"), []
     robot.subscribe(REQUEST, requests.append)
-    master, slave = pty.openpty()
-    with os.fdopen(master, "wb", 0) as fingers, os.fdopen(slave, "r+b", 0) as screen:
-        monkeypatch.setattr("sys.stdin", screen)
-        monkeypatch.setattr("sys.stdout", screen)
-        fingers.write(b"\nq")
+    with pty_of(monkeypatch) as fingers:
+        types_at_help(fingers, b"\nq")
         with pytest.raises(LinkError, match="robot 'r1' did not confirm STOP; cut its power by hand"):
             Cockpit(link, teleop, lambda: StopSender("r1", ["tcp/127.0.0.1:1"], secret_file)).run()
     network.advance(1)
