@@ -20,18 +20,19 @@ _PLAIN_S: Final = 1.0
 
 
 class LiveBlock:
-    """Shows lines in place: `with LiveBlock() as live: live.show(lines)`. Without one, prints them once a second.
+    """Shows lines in place: `with LiveBlock() as live: live.show(lines)`. Without a terminal that can, prints them once a second.
 
     Args:
         is_progress: write to stderr, since stdout is for the result; remove the block at the end, and print one line
-            each time without a terminal.
+            each time where it cannot be redrawn.
     """
 
     def __init__(self, is_progress: bool = False) -> None:
         console = Console(stderr=is_progress)
         self._stream = sys.stderr if is_progress else sys.stdout
         self._is_progress, self._due_s = is_progress, 0.0
-        self._live = Live(console=console, auto_refresh=False, transient=is_progress) if console.is_terminal else None
+        redraws = console.is_terminal and not console.is_dumb_terminal
+        self._live = Live(console=console, auto_refresh=False, transient=is_progress) if redraws else None
 
     def show(self, lines: Sequence[str]) -> None:
         """Show the newest lines; more frequent calls are skipped."""

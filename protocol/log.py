@@ -255,7 +255,8 @@ def faults() -> Counter[str]:
 def error_line(text: str) -> str:
     """Return the last line of a program that ends with an error, in the form of its log."""
     record = logging.makeLogRecord({"msg": text, "levelno": logging.ERROR, "levelname": "ERROR"})
-    return _HANDLER.format(record) if isinstance(_HANDLER.formatter, JsonFormatter) else f"error: {text}"
+    return _HANDLER.format(record) if isinstance(_HANDLER.formatter, JsonFormatter) else (
+        "error: " + "\n".join(map(printable, text.split("\n"))))
 
 
 _FIRST_PERIOD_US: Final = 1_000_000

@@ -281,9 +281,12 @@ def goto(
         report = missions.request("goto", waypoints, options)
         if report.refused or not wait:
             return _print_report(target.robot, report, as_json, is_answer=True)
+        _print_obstacle(missions)
+        shown = ""
         for report in missions.follow():
-            if not as_json and not report.done:
-                typer.echo(f"{target.robot}: {mission_line(report)}")
+            before, shown = shown, mission_line(report)
+            if not as_json and not report.done and shown != before:
+                typer.echo(f"{target.robot}: {shown}")
         code = _print_report(target.robot, report, as_json, is_answer=True)
         return CHECK_FAILED if cannot(report) else code
 
@@ -300,6 +303,15 @@ def _waypoints(numbers: list[str], file: Path | None) -> "Waypoints":
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "not a text file"
         raise ConfigError(f"cannot read {file}: {why}; name a file with one waypoint X Y per line") from None
+
+
+def _print_obstacle(missions: "MissionClient") -> None:
+    """Name the command without which the robot does not drive."""
+    from sightline.operator_side.client.status import next_step
+
+    robot, report = missions.operator.robot, missions.operator.report
+    if report and (command := next_step(robot, report.status)):
+        typer.echo(f"{robot} is {report.status.state} ({report.status.reason}); to drive, run `{command}`", err=True)
 
 
 @contextmanager

@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from sightline.operator_side.client.pictures import FrameViewer
-from sightline.protocol.channels import FRAME, JPEG, SCAN, TWIST, Channel
+from sightline.protocol.channels import FRAME, JPEG, REPORT, SCAN, TWIST, Channel
 from sightline.protocol.codec import decode, decode_ranges
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.log import printable
 from sightline.protocol.messages import DetectionsHeader, MissionReport, WireModel
 from sightline.protocol.text import parse_twist
 from sightline.protocol.transports.link import LatestSlot, Link, Message
@@ -147,7 +148,7 @@ def _scan_text(ranges_m: list[float | None]) -> str:
 
 def _words(values: Mapping[str, Any]) -> str:
     """Format as `name=value`, without empty values."""
-    return " ".join(f"{name}={_word(value)}" for name, value in values.items()
+    return " ".join(f"{printable(name)}={_word(value)}" for name, value in values.items()
                     if name not in _LEFT_OUT and value not in _EMPTY)
 
 
@@ -178,7 +179,8 @@ def target_object(message: Message) -> dict[str, Any]:
     `t_us` is the capture time of its image, on the robot's clock.
     """
     try:
-        header, report = decode(DetectionsHeader, message.header), decode(MissionReport, message.payload)
+        header = decode(DetectionsHeader, message.header)
+        report = decode(MissionReport, message.payload, REPORT.max_payload_bytes)
     except WireError as error:
         return dict.fromkeys(TARGET_COLUMNS) | {"phase": f"invalid report: {error}"}
     target = _plain(report.target) if report.target else {}
@@ -190,11 +192,11 @@ def target_object(message: Message) -> dict[str, Any]:
 def target_line(target: Mapping[str, Any]) -> str:
     """Format a target as one line."""
     if target["label"] is None:
-        return f"no target ({target['phase']})"
+        return f"no target ({printable(target['phase'])})"
     bearing = "" if target["bearing_rad"] is None else f"{math.degrees(target['bearing_rad']):+6.1f} deg  "
     distance = "" if target["distance_m"] is None else f"{target['distance_m']:5.2f} m  "
     radius = "" if target["radius_px"] is None else f", radius {target['radius_px']:.1f}"
     place = f"{target['cx_px']:.0f},{target['cy_px']:.0f} px"
     size = f"{target['width_px']}x{target['height_px']}"
-    return (f"{bearing}{distance}{target['label']} {target['score']:.2f} at {place}{radius} of {size} "
-            f"({target['phase']})")
+    return printable(f"{bearing}{distance}{target['label']} {target['score']:.2f} at {place}{radius} of {size} "
+                     f"({target['phase']})")

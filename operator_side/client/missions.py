@@ -218,6 +218,9 @@ def request_of(number: int, name: str, waypoints: Waypoints, options: Mapping[st
         if first["loc"][0] == "name":
             raise ConfigError(f"invalid mission '{name}': expected lower-case letters, digits and '-'; give your own "
                               "class (package.module:Name) to `sightline vision --mission`") from None
+        if first["loc"][0] == "waypoints":
+            raise ConfigError(f"invalid waypoints: expected at most {MAX_WAYPOINTS} pairs (x, y), each number "
+                              f"{-MAX_WAYPOINT_M:g} to {MAX_WAYPOINT_M:g} m") from None
         where = ".".join(str(part) for part in first["loc"][1:2])
         raise ConfigError(f"invalid option '{where}': expected true, false, a number or a short text, at most "
                           f"{MAX_OPTIONS} options") from None

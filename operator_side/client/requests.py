@@ -46,7 +46,10 @@ def read_report(message: Message) -> StatusReport:
 
 
 class Operator:
-    """Sends an operator's requests to one robot. Every wait is bounded and raises LinkError without an answer."""
+    """Sends an operator's requests to one robot. Every wait is bounded and raises LinkError without an answer.
+
+    Several threads may use it.
+    """
 
     def __init__(self, link: Link) -> None:
         """Subscribe to the status and the replies of the robot.
@@ -58,7 +61,7 @@ class Operator:
         self._session = secrets.token_hex(4)
         self._digest = session_digest(SOURCE, self._session)
         self._seq = self._id = 0
-        self._changed = threading.Condition()
+        self._changed, self._sending = threading.Condition(), threading.Lock()
         self._report: StatusReport | None = None
         self._reports = 0
         self._version_trouble = ""
@@ -118,13 +121,12 @@ class Operator:
 
     def _request(self, verb: Verb, cited: StatusReport | None, timeout_s: float) -> Reply:
         """Repeats cite the same status, so that a STOP in between wins."""
-        self._id += 1
-        deadline_s = time.monotonic() + timeout_s
+        number, deadline_s = self._new_id(), time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
-            self._send(verb, cited)
+            self._send(number, verb, cited)
             with self._changed:
-                if self._changed.wait_for(lambda: self._id in self._replies, REPEAT_S):
-                    return self._replies[self._id]
+                if self._changed.wait_for(lambda: number in self._replies, REPEAT_S):
+                    return self._replies[number]
         raise LinkError(f"no answer from robot '{self.robot}' to {verb} after {timeout_s:g} s; repeat the command")
 
     def arm(self, patience_s: float = 5.0) -> Reply:
@@ -190,12 +192,11 @@ class Operator:
         Raises:
             LinkError: at `timeout_s`; the robot may still move.
         """
-        self._id += 1
-        started_s = time.monotonic()
+        number, started_s = self._new_id(), time.monotonic()
         # The stored status may be from before a reset by another operator, on a link that is dead now.
         seen, warned = self._reports, False
         while time.monotonic() - started_s < timeout_s and not is_proven():
-            self._send(Verb.STOP, None)
+            self._send(number, Verb.STOP, None)
             with self._changed:
                 if self._changed.wait_for(lambda: self._reports > seen and self._is_stopped(), STOP_PERIOD_S):
                     assert self._report is not None
@@ -216,12 +217,18 @@ class Operator:
     def _is_stopped(self) -> bool:
         return self._has_state_stopped() and self._report is not None and self._report.status.applied == (0.0, 0.0)
 
-    def _send(self, verb: Verb, report: StatusReport | None) -> None:
+    def _new_id(self) -> int:
+        with self._changed:  # a program may disarm in one thread while another one arms
+            self._id += 1
+            return self._id
+
+    def _send(self, number: int, verb: Verb, report: StatusReport | None) -> None:
         """Publish a request. Next: `robot_side/pipe.py`: `NetworkEnd.forward`."""
-        self._seq += 1
         echo = None if report is None else Echo.of(report.stamp)
-        header = RequestHeader(source=SOURCE, session=self._session, seq=self._seq, echo=echo)
-        self._link.publish(REQUEST, encode(header), encode(Request(id=self._id, verb=verb)), SOURCE)
+        with self._sending:  # one thread after the other, for the robot rejects a number that is lower than the last
+            self._seq += 1
+            header = RequestHeader(source=SOURCE, session=self._session, seq=self._seq, echo=echo)
+            self._link.publish(REQUEST, encode(header), encode(Request(id=number, verb=verb)), SOURCE)
 
     # --- on the transport's thread: store and return -------------------------------------------------------------
 

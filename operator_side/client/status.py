@@ -52,11 +52,11 @@ def short_lines(robot: str, status: Status) -> Iterator[str]:
     yield from fault_lines(status)
     if status.battery_v is not None:
         yield f"battery   {status.battery_v:.2f} V"
-    if next_step := _next_step(robot, status):
-        yield f"next      {next_step}"
+    if command := next_step(robot, status):
+        yield f"next      {command}"
 
 
-def _next_step(robot: str, status: Status) -> str:
+def next_step(robot: str, status: Status) -> str:
     """Return the command with which an operator continues, or ""."""
     if status.state in (State.STOPPED, State.FAULT):
         return f"sightline reset {robot}"

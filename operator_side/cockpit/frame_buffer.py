@@ -67,7 +67,7 @@ class FrameBuffer:
     def next(self, after: int, timeout_s: float = WAIT_S) -> Numbered | None:
         """Wait for an image with a number above `after`; return the newest, or None at `timeout_s`."""
         with self._changed:
-            after = after if after <= self._number else 0  # a page of an earlier run
+            after = after if 0 <= after <= self._number else 0  # a page of an earlier run
             self._wanted, self._requested_s = max(self._wanted, after), time.monotonic()
             self._changed.notify_all()
             self._changed.wait_for(lambda: self._number > after, timeout_s)

@@ -16,7 +16,7 @@ from importlib.resources import files
 from pathlib import Path
 from socketserver import ThreadingMixIn
 from typing import Any, Final
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import parse_qsl
 
 from sightline.protocol.errors import LinkError, SightlineError
 from sightline.protocol.log import report_fault
@@ -154,13 +154,13 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True  # the body, if any, is not read
             self._send(rejection)
             return
-        target = urlsplit(self.path)
-        route = self.routes.get(f"{method} {target.path}")
+        path, _, query = self.path.partition("?")
+        route = self.routes.get(f"{method} {path}")
         body = self.rfile.read(int(self.headers.get("Content-Length") or 0))
         if route is None:
             self._send(as_json({"error": "unknown page"}, 404))
         else:
-            self._send(_answered(route, target.query, body))
+            self._send(_answered(route, query, body))
 
     def _rejection(self, method: str) -> HttpAnswer | None:
         host = self.headers.get("Host", "")

@@ -6,6 +6,7 @@
 
 const OLD_MS = 500; // what is older than this must not look like the present
 const STATE_MS = 250;
+const OLD_STATE_MS = 1000; // ten times the period of a robot's status
 const AGE_MS = 100;
 const RETRY_MS = 500;
 const part = (id) => document.getElementById(id);
@@ -63,10 +64,10 @@ function showState({ robot, online, state, reason, lines }) {
 async function showStates() {
   for (;;) {
     try {
-      showState(await (await fetch("state")).json());
-    } catch {
+      showState(await (await fetch("state", { signal: AbortSignal.timeout(OLD_STATE_MS) })).json());
+    } catch (error) {
       showState({ state: "", reason: "", lines: [] }); // the last state is over
-      report("`sightline watch` has ended");
+      report(`\`sightline watch\` ${error.name === "TimeoutError" ? "does not answer" : "has ended"}`);
     }
     await pause(STATE_MS);
   }

@@ -75,9 +75,11 @@ def test_accepted_messages_of_the_specification_are_shown(case):
 
 
 def test_message_of_a_peer_cannot_control_the_terminal():
-    payload = packed({"state": "HOLD", "reason": "\x1b[2J\x07 gone\u202e"})
+    payload = packed({"state": "HOLD", "reason": "\x1b[2J\x07 gone\u202e", "refused": {"\x1b]0;mine\x07": 3}})
     line = message_line(Message(STATUS, "", packed(USUAL["status"][1]), payload))
-    assert line.isprintable() and "gone" in line
+    assert line.isprintable() and "gone" in line and "mine" in line
+    assert target_line(target_of(label="\x9b2J")).isprintable()
+    assert target_line(target_object(usual("report", payload=packed(REPORT | {"phase": "\x1b[2J"})))).isprintable()
 
 
 @given(st.sampled_from(list(CHANNELS.values())), st.binary(max_size=80), st.binary(max_size=80))
@@ -139,6 +141,11 @@ def test_target_has_every_column_and_the_time_of_its_image():
 ])
 def test_target_is_one_line(changes, line):
     assert target_line(target_of(**changes)) == line
+
+
+def test_target_of_a_report_of_the_longest_texts_is_read():
+    texts = {"refused": "r" * 200, "note": "n" * 200}
+    assert target_object(usual("report", payload=packed(REPORT | {"target": TARGET} | texts)))["label"] == "ball"
 
 
 def test_missing_target_and_invalid_report_are_lines_too():

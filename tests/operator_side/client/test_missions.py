@@ -73,6 +73,12 @@ def test_request_that_the_protocol_does_not_permit_is_rejected(name, options, wo
         request_of(1, name, (), options)
 
 
+@pytest.mark.parametrize("wrong", [[(float("nan"), 1.0)], [(1e9, 0.0)], (1, 2), [(1.0,)], [(0.0, 0.0)] * 65])
+def test_waypoints_that_the_protocol_does_not_permit_are_named(wrong):
+    with pytest.raises(ConfigError, match=r"invalid waypoints: expected at most 64 pairs \(x, y\), each number -"):
+        request_of(1, "goto", wrong, {})
+
+
 def test_report_is_formatted_as_text():
     report = MissionReport(mission="goto", phase="driving", note="reached 1 of 2", detector="hsv", device="cpu")
     assert mission_line(report) == "goto: driving; reached 1 of 2" and not cannot(report)

@@ -82,6 +82,23 @@ def test_stop_that_is_answered_is_not_slow():
         assert robot.operator.wait_report() and robot.operator.stop(lambda: pytest.fail("300 ms")).state == "STOPPED"
 
 
+def test_threads_that_share_an_operator_get_the_replies_to_their_own_requests():
+    with PumpedRobot() as robot:
+        rejected, states = [], []
+
+        def disarm():
+            for _ in range(20):
+                reply = robot.operator.request(Verb.DISARM)
+                rejected.extend([] if reply.ok else [reply.detail])
+
+        other = threading.Thread(target=disarm)
+        other.start()
+        while other.is_alive():
+            states.append(robot.operator.request(Verb.ACQUIRE).detail)
+        other.join()
+        assert states and rejected == [], "disarming is always granted"
+
+
 def test_arm_waits_for_valid_commands_and_reports_the_missing_condition():
     with PumpedRobot(drives=False) as robot:
         reply = robot.operator.arm(patience_s=0.05)

@@ -97,12 +97,17 @@ def test_invalid_request_gets_an_error_and_the_next_is_served(port):
         assert (answer.status, said) == (200, b"3")
 
 
-def test_invalid_requests_do_not_end_the_server(port):
-    for noise in (b"\0" * 100 + b"\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 300 + b"\r\n", b""):
+def test_invalid_requests_neither_end_the_server_nor_count_as_its_faults(port):
+    before = faults()
+    for noise in (b"\0" * 100 + b"\r\n\r\n", b"GET http://[ HTTP/1.1\r\nHost: localhost\r\n\r\n",
+                  b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * 300 + b"\r\n", b""):
         with socket.create_connection(("127.0.0.1", port), 5) as stranger:
             stranger.sendall(noise)
+    with asked(port, "GET", "http://[") as (answer, _):
+        assert answer.status == 404
     with asked(port, "GET", "/echo") as (answer, _):
         assert answer.status == 200
+    assert faults() == before
 
 
 @pytest.mark.waits

@@ -39,7 +39,12 @@ globalThis.setInterval = () => 0;
 globalThis.setTimeout = (next) => setImmediate(next);
 const state = { robot: "r1", online: true, state: "ACTIVE", reason: "drives", lines: [["wheels", "+0.40 m/s"]] };
 let states = 0;
-globalThis.fetch = async (path) => {
+AbortSignal.timeout = (time_ms) => {
+  const limit = new AbortController();
+  if (time_ms <= 1000) setImmediate(() => limit.abort(new DOMException("too late", "TimeoutError")));
+  return limit.signal;
+};
+globalThis.fetch = async (path, { signal } = {}) => {
   if (path !== "state") return new Promise(() => undefined);
   if ((states += 1) > 2) {
     const { link, state, reason, lines } = parts;
@@ -47,14 +52,16 @@ globalThis.fetch = async (path) => {
     console.log(JSON.stringify([...texts, lines.children]));
     process.exit(0);
   }
-  if (states === 2) throw new TypeError("the server has ended");
+  if (states === 2 && process.argv[2] === "has ended") throw new TypeError("no connection");
+  if (states === 2) return new Promise((_, fail) => signal.addEventListener("abort", () => fail(signal.reason)));
   return { json: async () => state };
 };
 await import(process.argv[1]);
 """
 
 
-def test_page_shows_no_state_after_the_command_ended():
-    command = [node(), "--input-type=module", "-e", ENDING_SCRIPT, (PAGES / "watch.mjs").as_uri()]
+@pytest.mark.parametrize("end", ["has ended", "does not answer"])
+def test_page_shows_no_state_after_the_command_ended_or_hangs(end):
+    command = [node(), "--input-type=module", "-e", ENDING_SCRIPT, (PAGES / "watch.mjs").as_uri(), end]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
-    assert json.loads(done.stdout) == ["`sightline watch` has ended", "", "", "", []], done.stderr
+    assert json.loads(done.stdout) == [f"`sightline watch` {end}", "", "", "", []], done.stderr
