@@ -20,7 +20,7 @@ _PLAIN_S: Final = 1.0
 
 
 class LiveBlock:
-    """Shows lines in place: `with LiveBlock() as live: live.show(lines)`. Without a terminal that can, prints them once a second.
+    """Shows lines in place: `with LiveBlock() as live: live.show(lines)`. Where none can be, prints them once a second.
 
     Args:
         is_progress: write to stderr, since stdout is for the result; remove the block at the end, and print one line

@@ -30,7 +30,10 @@ def lines(found: Discovered) -> Iterator[str]:
         services = f"; {_services(*shared[robot])}" if robot in shared else ""
         yield f"{ROBOT_ROLE:{_ROLE_WIDTH}} {state}{_about(robots.get(robot))}{services}"
     for peer in peers:
-        if peer.presence.role != ROBOT_ROLE:
+        name = peer.presence.robot
+        if peer.presence.role == ROBOT_ROLE and peer is not robots[name]:
+            yield f"{ROBOT_ROLE:{_ROLE_WIDTH}} {name}: a second robot has this id{_about(peer)}; end one of them"
+        elif peer.presence.role != ROBOT_ROLE:
             yield f"{peer.presence.role:{_ROLE_WIDTH}} of {peer.presence.robot}{_about(peer)}"
     if len(peers) >= MAX_PEERS:
         yield f"{MAX_PEERS} peers are listed, which is the limit; versions of other robots are not known"

@@ -4,6 +4,7 @@
         Operator(link).arm()
 """
 
+import math
 import secrets
 import threading
 import time
@@ -24,6 +25,7 @@ SOURCE: Final = "operator"
 REPEAT_S: Final = 0.2
 STOP_PERIOD_S: Final = 0.05
 _KEPT_REPLIES = 64
+_RECENT_S: Final = 0.5  # five periods of a robot's status
 _CITES_STATUS = (Verb.ARM, Verb.RESET, Verb.ACQUIRE)
 """Requests that permit motion must cite a status younger than two seconds; requests that end it need not."""
 
@@ -63,6 +65,9 @@ class Operator:
         self._seq = self._id = 0
         self._changed, self._sending = threading.Condition(), threading.Lock()
         self._report: StatusReport | None = None
+        self._recent: dict[str, tuple[float, Status]] = {}
+        """Newest status of each session, and its time: a second one is a restart, or another robot of this id."""
+        self._twin_s = -math.inf
         self._reports = 0
         self._version_trouble = ""
         self._replies: OrderedDict[int, Reply] = OrderedDict()
@@ -126,8 +131,13 @@ class Operator:
             self._send(number, verb, cited)
             with self._changed:
                 if self._changed.wait_for(lambda: number in self._replies, REPEAT_S):
-                    return self._replies[number]
+                    return self._checked(self._replies[number])
         raise LinkError(f"no answer from robot '{self.robot}' to {verb} after {timeout_s:g} s; repeat the command")
+
+    def _checked(self, reply: Reply) -> Reply:
+        if not reply.ok and time.monotonic() - self._twin_s < _RECENT_S:
+            raise LinkError(f"two robots have the id '{self.robot}'; end one of them, `sightline robots` lists both")
+        return reply
 
     def arm(self, patience_s: float = 5.0) -> Reply:
         """Request arming. Repeat it while a condition is missing (valid commands, wheels at zero).
@@ -142,7 +152,7 @@ class Operator:
             The last reply. `ok` is False if the robot did not arm.
 
         Raises:
-            LinkError: no answer from the robot.
+            LinkError: no answer from the robot, or two robots of this id.
         """
         deadline_s = time.monotonic() + patience_s
         first = seen = self.wait_report()
@@ -212,10 +222,10 @@ class Operator:
         )
 
     def _has_state_stopped(self) -> bool:
-        return self._report is not None and self._report.status.state is State.STOPPED
+        return all(status.state is State.STOPPED for _, status in self._recent.values())
 
     def _is_stopped(self) -> bool:
-        return self._has_state_stopped() and self._report is not None and self._report.status.applied == (0.0, 0.0)
+        return self._has_state_stopped() and all(one.applied == (0.0, 0.0) for _, one in self._recent.values())
 
     def _new_id(self) -> int:
         with self._changed:  # a program may disarm in one thread while another one arms
@@ -242,9 +252,17 @@ class Operator:
                     self._changed.notify_all()
             return
         with self._changed:
+            self._note(report)
             self._report = report
             self._reports += 1
             self._changed.notify_all()
+
+    def _note(self, report: StatusReport) -> None:
+        now_s, session = time.monotonic(), report.stamp.session
+        self._recent = {one: known for one, known in self._recent.items() if now_s - known[0] < _RECENT_S}
+        if session in self._recent and self._report is not None and self._report.stamp.session != session:
+            self._twin_s = now_s  # it came back after another one
+        self._recent[session] = now_s, report.status
 
     def _on_reply(self, message: Message) -> None:
         try:

@@ -124,6 +124,9 @@ def _hmac(head: bytes, secret: bytes) -> bytes:
 
 
 _UNANSWERED: Final = 5
+_RECENT: Final = 25
+"""Datagrams, half a second of them: a receiver that has answered none of these is gone."""
+_MAX_RECEIVERS: Final = 8
 """After this many STOPs without an answer, the receiver may have started again, with another challenge."""
 
 
@@ -140,20 +143,19 @@ class StopRequests:
         """
         self.answer: StopDatagram | None = None
         """Newest answer."""
+        self._receivers: dict[bytes, tuple[StopDatagram, int | None]] = {}
+        """By challenge, the newest answer and the number of this STOP: what is applied must be that or a later one."""
         self._robot, self._secret = robot, secret
         self._first = self._next = counter
-        self._challenge = NO_CHALLENGE
         self._unanswered = 0
-        self._since: int | None = None
-        """Number of this STOP at the receiver: what it has applied must be this one or a later one."""
 
     def datagrams(self) -> list[bytes]:
         """Return what to send now: a STOP, and with a secret the request for the challenge while it is not known."""
-        challenges = {self._challenge}
-        if self._secret and self._unanswered >= _UNANSWERED:
-            challenges.add(NO_CHALLENGE)
+        challenges = sorted(self._live(), key=lambda challenge: -self._receivers[challenge][0].counter)
+        if not challenges or (self._secret and self._unanswered >= _UNANSWERED):
+            challenges.insert(0, NO_CHALLENGE)
         self._unanswered += 1
-        return [self._pack(challenge) for challenge in sorted(challenges)]
+        return [self._pack(challenge) for challenge in challenges]
 
     def _pack(self, challenge: bytes) -> bytes:
         self._next += 1
@@ -173,31 +175,38 @@ class StopRequests:
         if one.kind is not Kind.ANSWER or one.robot != self._robot or not self._first < one.counter <= self._next:
             return False
         self._unanswered = 0
-        # Another challenge is another start of the receiver, whose numbers cannot be compared with those before.
-        is_new = one.challenge != self._challenge
-        if is_new:
-            self._challenge, self._since = one.challenge, None
+        # Another challenge is another start of the receiver, or a second robot of this id: its numbers are its own.
+        self._receivers = self._live()
+        is_new = one.challenge not in self._receivers
+        if is_new and len(self._receivers) >= _MAX_RECEIVERS:
+            return False
+        since = None if is_new else self._receivers[one.challenge][1]
         # An answer to a request for the challenge has no number: it was not counted as a STOP.
         if one.received:
-            self._since = min(one.received, self._since or one.received)
-        self.answer = one
+            since = min(one.received, since or one.received)
+        self.answer, self._receivers[one.challenge] = one, (one, since)
         return is_new and bool(self._secret)
+
+    def _live(self) -> dict[bytes, tuple[StopDatagram, int | None]]:
+        """Return the receivers that have answered one of the last datagrams, or else the last one that answered."""
+        return {challenge: known for challenge, known in self._receivers.items()
+                if known[0] is self.answer or known[0].counter > self._next - _RECENT}
 
     @property
     def is_latched(self) -> bool:
         """Return True once the robot has applied this STOP. Its wheels may still turn."""
-        one = self.answer
-        return one is not None and self._since is not None and one.applied >= self._since and one.state == STOPPED
+        return self.answer is not None and all(
+            since is not None and one.applied >= since and one.state == STOPPED for one, since in self._live().values())
 
     @property
     def is_stopped(self) -> bool:
         """Return True once the robot has applied this STOP and its wheels are at zero."""
-        return self.is_latched and self.answer is not None and self.answer.at_rest
+        return self.is_latched and all(one.at_rest for one, _ in self._live().values())
 
     @property
     def is_stored(self) -> bool:
         """Return True if the STOP is on the disk of the robot, too."""
-        return self.is_stopped and self.answer is not None and self.answer.stored
+        return self.is_stopped and all(one.stored for one, _ in self._live().values())
 
     @property
     def lacks_secret(self) -> bool:

@@ -149,8 +149,8 @@ class DriverCore:
             ValueError: an angle is not finite, or its time is in the future.
         """
         if wheels is not None:
-            if wheels.t_us > now_us + _AHEAD_US:
-                raise ValueError(f"WheelAngles.t_us is {(wheels.t_us - now_us) / 1e6:.3g} s ahead; take the robot's clock")
+            if (ahead_us := wheels.t_us - now_us) > _AHEAD_US:
+                raise ValueError(f"WheelAngles.t_us is {ahead_us / 1e6:.3g} s ahead; take the robot's clock")
             self.odometer.update(wheels)
         if scan is not None:
             self._on_scan(scan, now_us)

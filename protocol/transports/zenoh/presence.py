@@ -111,13 +111,14 @@ def _order(peer: PeerInfo) -> tuple[int, str, str, str]:
 def robot_with_same_id(own: Presence, answers: Iterable[PeerInfo]) -> Presence | None:
     """Return the robot that had the id of `own` first, or None.
 
-    Of two robots with the same id, the one that has run longer stays.
+    Of two robots with the same id, the one that has run longer stays. `own` is that of the moment of the query, and the
+    others' answers are half a round trip younger.
     """
     # The same session is the same robot, seen through an earlier process.
     for peer in answers:
         other = peer.presence
         if other.role == ROBOT_ROLE and other.robot == own.robot and other.session != own.session \
-                and other.up_us > own.up_us:
+                and other.up_us > own.up_us + peer.round_trip_us // 2:
             return other
     return None
 
@@ -130,6 +131,8 @@ def robot_with_same_id(own: Presence, answers: Iterable[PeerInfo]) -> Presence |
 
 # A peer without a reply by then counts as absent.
 REPLY_TIMEOUT_S: Final = 0.5
+# Longer, for a link of a long delay: the first reply takes several round trips. It ends as soon as all have replied.
+_CLAIM_TIMEOUT_S: Final = 2.0
 # Pause before the second query. A robot that has just ended no longer replies then.
 _SECOND_LOOK_S: Final = 1.0
 _HOST_CHARACTERS: Final = 64
@@ -170,10 +173,10 @@ class PresenceAnnouncer:
 
     def claim(self, session: zenoh.Session) -> None:
         """Raise LinkError if another robot on this network has this id. It queries twice before."""
-        other = robot_with_same_id(self.now(), query_presence(session))
+        other = robot_with_same_id(self.now(), query_presence(session, _CLAIM_TIMEOUT_S))
         if other is not None:
             time.sleep(_SECOND_LOOK_S)
-            other = robot_with_same_id(self.now(), query_presence(session))
+            other = robot_with_same_id(self.now(), query_presence(session, _CLAIM_TIMEOUT_S))
         if other is None:
             return
         raise LinkError(

@@ -10,7 +10,7 @@ from sightline.operator_side.client.status import reply_line, short_lines, statu
 from sightline.protocol.channels import REQUEST, STATUS, TWIST
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError
-from sightline.protocol.messages import AnswerHeader, Echo, LeaseHolder, Reply, State, Status, Verb
+from sightline.protocol.messages import AnswerHeader, Echo, LeaseHolder, Reply, Stamp, State, Status, Verb
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.memory import MemoryNetwork
 from sightline.robot_side.config import PluginChoice, RobotConfig
@@ -97,6 +97,30 @@ def test_threads_that_share_an_operator_get_the_replies_to_their_own_requests():
             states.append(robot.operator.request(Verb.ACQUIRE).detail)
         other.join()
         assert states and rejected == [], "disarming is always granted"
+
+
+def test_of_two_robots_of_one_id_both_must_confirm_a_stop():
+    with PumpedRobot() as robot:
+        other, ending, shown = robot.network.link("r1"), threading.Event(), {"state": "ACTIVE", "applied": (0.3, 0.0)}
+
+        def publish():
+            while not ending.wait(0.005):
+                other.publish(STATUS, encode(Stamp(session="0000000b", seq=1, t_us=robot.now_us)),
+                              encode(Status.model_validate(shown | {"reason": "drives"})))
+
+        threading.Thread(target=publish, daemon=True).start()
+        while robot.operator.wait_report().stamp.session != "0000000b":
+            pass
+        with pytest.raises(LinkError, match="did not confirm STOP"):
+            robot.operator.stop(lambda: None, 0.3)
+        with pytest.raises(LinkError, match="two robots have the id 'r1'; end one of them"):
+            robot.operator.arm(0.1)
+        shown.update(state="STOPPED")
+        with pytest.raises(LinkError, match="did not confirm STOP"):
+            robot.operator.stop(lambda: None, 0.3)
+        shown.update(applied=(0.0, 0.0))
+        assert robot.operator.stop(lambda: None)
+        ending.set()
 
 
 def test_arm_waits_for_valid_commands_and_reports_the_missing_condition():

@@ -177,6 +177,27 @@ def test_a_number_of_an_earlier_receiver_proves_nothing():
     assert not requests.is_stopped
 
 
+@pytest.mark.parametrize("secret", [b"", SECRET])
+@pytest.mark.parametrize("standing_first", [False, True])
+def test_of_two_robots_of_one_id_both_must_stop(secret, standing_first):
+    """One stands, the other one drives: each answers for itself, and has numbers and a challenge of its own."""
+    requests, order = StopRequests("r1", secret, 100), (LATER, CHALLENGE) if standing_first else (CHALLENGE, LATER)
+    for turn in range(40):
+        sent = requests.datagrams()
+        for challenge in order:
+            known = [one for one in sent if unpack_stop(one).challenge == challenge] or sent[:1]
+            is_stopped = challenge == LATER or turn > 30
+            requests.on_datagram(answer(known[0], secret, challenge=challenge, received=turn + 5, applied=turn + 5,
+                                        at_rest=is_stopped))
+        assert requests.is_stopped == requests.is_stored == (turn > 30)
+        assert requests.is_latched
+    requests.on_datagram(answer(sent[0], secret, challenge=LATER, received=99, applied=99, at_rest=False))
+    assert not requests.is_stopped
+    for _ in range(30):  # and then it is switched off
+        requests.on_datagram(answer(requests.datagrams()[0], secret, received=99, applied=99))
+    assert requests.is_stopped
+
+
 def test_a_receiver_that_needs_the_secret_is_noticed():
     requests = StopRequests("r1", b"", 100)
     requests.on_datagram(answer(requests.datagrams()[0], keyed=True, state=0))

@@ -1,6 +1,7 @@
 """Presence: the form of an answer, robot ids in use, and the peers that are listed at a real router."""
 
 import time
+from random import Random
 from types import SimpleNamespace
 
 import pytest
@@ -84,19 +85,29 @@ def test_id_belongs_to_the_robot_that_has_run_longer(other, is_taken):
     assert (taken is not None) is is_taken
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_of_two_robots_that_start_together_one_stays(seed):
+    random = Random(seed)
+    delay_us, ages_us = random.randrange(200_000), [random.randrange(1_000_000) for _ in range(2)]
+    robots = [_peer(session=f"0000000{at}", up_us=age_us).presence for at, age_us in enumerate(ages_us)]
+    late = [_peer(one, 2 * delay_us, up_us=one.up_us + delay_us) for one in robots]
+    assert [robot_with_same_id(robots[at], [late[1 - at]]) is None for at in range(2)].count(True) == 1
+
+
 def test_operator_reads_state_version_machine_and_round_trip():
     status = encode(Status(state=State.DISARMED, reason="waiting"))
     heard = {"r1": Message(STATUS, "", encode(Stamp(session="0000abcd", seq=1, t_us=1)), status),
              "js9": Message(STATUS, "", b"{", b"")}
-    peers = [_peer(), _peer(role="vision", session="00000002", robot="r*")]
+    peers = [_peer(session="00000009"), _peer(), _peer(role="vision", session="00000002", robot="r*")]
     assert list(lines(Discovered(heard, peers))) == [
         "robot     js9: invalid status: Stamp: Invalid JSON: EOF while parsing an object at line 1 column 1"
         "  (no version reported)",
         "robot     r1: DISARMED (waiting)  sightline 9 on shed, round trip 2.0 ms",
+        "robot     r1: a second robot has this id  sightline 9 on shed, round trip 2.0 ms; end one of them",
         "vision    of r*  sightline 9 on shed, round trip 2.0 ms",
     ]
     whole = as_object(Discovered(heard, peers))
-    assert [row["role"] for row in whole["peers"]] == ["robot", "vision"]
+    assert [row["role"] for row in whole["peers"]] == ["robot", "robot", "vision"]
     assert whole["peers"][0]["round_trip_ms"] == 2.0 and "error" in whole["robots"][0]
 
 
