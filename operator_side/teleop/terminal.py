@@ -80,7 +80,7 @@ _LEAVE_S: Final = 0.25
 _PROVE_STOP_S: Final = 1.5
 """A STOP that nothing has proven is repeated for this time after the end."""
 _LEAVE_PERIOD_S: Final = 0.03
-_ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)  # suspended, it would hear no STOP
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP)  # suspended, it would read no STOP key
 
 
 def check_terminal() -> None:

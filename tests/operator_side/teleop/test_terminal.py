@@ -271,7 +271,7 @@ def test_keys_typed_before_the_help_is_shown_do_nothing(monkeypatch):
 
 
 def test_full_terminal_delays_no_key(monkeypatch):
-    """Of any width: where the last bytes end decides whether a terminal that is not read calls itself writable."""
+    """Try many widths: where the last bytes end decides whether a terminal that is not read calls itself writable."""
     network, teleop = MemoryNetwork(), Teleop("0000000a", Speeds(0.2, 1.0))
     monkeypatch.setattr(terminal, "_SHOW_US", 0)
     monkeypatch.setattr(terminal, "_TICK_S", 0)
