@@ -112,10 +112,15 @@ def send_stop(robot: str | None, connect: list[str] | None, secure: str, as_json
     target = target_of(robot or None, connect, secure)  # a script's unset variable must not prevent a STOP
     _warn(str(target))
     lacks: list[str] = []
+
+    def on_other_secret() -> None:
+        lacks.append(f"{secret_file} is not the STOP secret of {target.robot}, so that datagrams did not stop it; "
+                     "copy that of the robot's keys")
+
     secret_file = stop_secret_of(target, lacks.append)
     try:
         is_stored = stop_robot(target.robot, target.connect, target.secure, secret_file, on_slow,
-                               thread_name=ABANDONED_THREAD)
+                               on_other_secret=on_other_secret, thread_name=ABANDONED_THREAD)
     except SightlineError as error:
         lacks = [line for line in lacks if line != str(error)]  # keys that the link cannot read either
         raise

@@ -106,6 +106,11 @@ class StopSender:
         """Return True if the robot accepts only datagrams that are signed with its STOP secret."""
         return any(one.lacks_secret for one in self._requests)
 
+    @property
+    def has_other_secret(self) -> bool:
+        """Return True if a robot answered with the HMAC of another STOP secret."""
+        return any(one.has_other_secret for one in self._requests)
+
     def _run(self, address: tuple[str, int]) -> None:
         while not (places := _resolve(address)):
             self._sent.set()  # there is nothing to wait for
@@ -187,7 +192,7 @@ class _LinkStop(threading.Thread):
 
 def stop_robot(
     robot: str, connect: Sequence[str], secure: str, secret_file: str, on_slow: Callable[[], None], *,
-    timeout_s: float = 10.0, thread_name: str = "stop link",
+    on_other_secret: Callable[[], None] = lambda: None, timeout_s: float = 10.0, thread_name: str = "stop link",
 ) -> bool:
     """Stop a robot by datagrams, and by its link without an answer. Returns once it is STOPPED, its wheels at zero.
 
@@ -197,6 +202,7 @@ def stop_robot(
         secure: folder of keys, or "".
         secret_file: file of the STOP secret, or "".
         on_slow: called once if the robot has not shown STOPPED after 300 ms.
+        on_other_secret: called at the end if the STOP secret of the robot is another one.
         timeout_s: longest wait, s.
         thread_name: of the thread that opens the link. It may still run when this function returns.
 
@@ -213,6 +219,8 @@ def stop_robot(
         try:
             return _wait(robot, sender, link, on_slow, timeout_s)
         finally:
+            if sender.has_other_secret:
+                on_other_secret()
             link.ended.set()
             if link.is_alive():
                 link.join(_LINK_CLOSES_S)

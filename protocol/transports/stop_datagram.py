@@ -143,6 +143,8 @@ class StopRequests:
         """
         self.answer: StopDatagram | None = None
         """Newest answer."""
+        self.has_other_secret = False
+        """Whether an answer had the HMAC of another secret."""
         self._receivers: dict[bytes, tuple[StopDatagram, int | None]] = {}
         """By challenge, the newest answer and the number of this STOP: what is applied must be that or a later one."""
         self._robot, self._secret = robot, secret
@@ -168,11 +170,12 @@ class StopRequests:
         """
         try:
             one = unpack_stop(data)
+            if one.kind is not Kind.ANSWER or one.robot != self._robot or not self._first < one.counter <= self._next:
+                return False
             if self._secret:
                 check_hmac(data, self._secret)
-        except WireError:
-            return False
-        if one.kind is not Kind.ANSWER or one.robot != self._robot or not self._first < one.counter <= self._next:
+        except WireError as error:
+            self.has_other_secret |= error.reason is RejectReason.WRONG_KEY
             return False
         self._unanswered = 0
         # Another challenge is another start of the receiver, or a second robot of this id: its numbers are its own.

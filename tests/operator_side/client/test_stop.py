@@ -207,6 +207,15 @@ def test_keys_of_another_deployment_stop_nothing(robot, link, port, tmp_path):
     assert not one.stopped_s
 
 
+def test_another_secret_is_reported_although_the_link_stops_the_robot(robot, link, port, tmp_path):
+    (tmp_path / "stop.secret").write_text("a secret of another site\n")
+    robot(secret=b"a secret of this site")
+    link.status, reported = Status(state=State.STOPPED, reason="STOP"), []
+    assert stop_robot("r1", [f"tcp/127.0.0.1:{port - 1}"], "", str(tmp_path / "stop.secret"), lambda: None,
+                      on_other_secret=lambda: reported.append(1))
+    assert reported == [1]
+
+
 def test_a_missing_secret_is_named(robot, link, port):
     robot(secret=b"a secret of this site")
     with pytest.raises(LinkError, match=r"copy stop\.secret"):
