@@ -218,7 +218,8 @@ def test_page_shows_the_overlay_and_frames_without_it(tmp_path: Path) -> None:
         watch.process.send_signal(signal.SIGINT)
         assert watch.process.wait(10) == 0
         assert until(lambda: page.text("link") == "`sightline watch` has ended", 5.0)
-        assert page.run("document.getElementById('figure').className") == "old"
+        # The page may notice the end before its newest image is 500 ms old.
+        assert until(lambda: page.run("document.getElementById('figure').className") == "old", 1.0)
         assert page.errors == []
 
 
