@@ -184,6 +184,11 @@ class _LinkStop(threading.Thread):
             self.error = error
 
     @property
+    def has_report(self) -> bool:
+        """Return True if a status came."""
+        return self._operator is not None and self._operator.report is not None
+
+    @property
     def is_latched(self) -> bool:
         """Return True if the newest status shows STOPPED."""
         report = self._operator.report if self._operator else None
@@ -247,4 +252,6 @@ def _wait(robot: str, sender: StopSender, link: _LinkStop, on_slow: Callable[[],
             on_slow()
         time.sleep(DATAGRAM_PERIOD_S / 4)
     hint = "; copy stop.secret of the robot's keys to this machine" if sender.lacks_secret else ""
+    if not sender.is_answered and not link.has_report:
+        hint += f"; if '{robot}' is not its id, `sightline robots` lists the ids"
     raise LinkError(f"robot '{robot}' did not confirm STOP within {timeout_s:g} s; cut its power by hand{hint}")

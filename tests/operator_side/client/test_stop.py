@@ -193,6 +193,13 @@ def test_a_robot_that_goes_on_ends_in_an_error_and_a_warning(robot, link, port):
     assert slow == [1]
 
 
+def test_robot_of_another_id_is_not_stopped_and_the_fix_is_named(robot, link, port):
+    one = robot()
+    with pytest.raises(LinkError, match=r"cut its power by hand; if 'r7' is not its id, `sightline robots` lists"):
+        stop_robot("r7", [f"tcp/127.0.0.1:{port - 1}"], "", "", lambda: None, timeout_s=0.3)
+    assert one.reasons and set(one.reasons) == {RejectReason.OTHER_ROBOT} and not one.stopped_s
+
+
 def test_with_keys_the_secret_is_used(robot, link, port, tmp_path):
     (tmp_path / "stop.secret").write_text("a secret of this site\n")
     one = robot(secret=b"a secret of this site")
