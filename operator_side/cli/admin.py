@@ -5,6 +5,8 @@ import json
 import os
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from datetime import UTC, datetime
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -43,7 +45,7 @@ Hosts = Annotated[
     list[str] | None,
     typer.Option("--host", metavar="NAME", help="Name or address of a listening machine; repeatable."),
 ]
-Days = Annotated[int, typer.Option(min=1, max=825, help="Days that the certificates are valid.")]
+Days = Annotated[int, typer.Option(min=1, max=825, help="Days that a certificate of a role is valid.")]
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder of keys.")]
 
 
@@ -166,20 +168,26 @@ def add(
 
     Without --host it keeps its addresses. `stop` creates the secret of STOP datagrams.
     """
-    made = _keys()
+    made, role_file = _keys(), f"{role}.pem"
     for file in made.add(home_path(folder), role, host or [], days):
         print(f"wrote {file}")
+    with suppress(ConfigError):  # another certificate is damaged
+        for one in made.look(home_path(folder)):
+            if one.file.name == role_file and one.ends_with_authority:
+                print(f"{role_file} ends with its authority, on {one.ends:%Y-%m-%d}; for a longer time create new "
+                      f"keys: sightline keys init {folder}-new", file=sys.stderr)
 
 
 def show(folder: Folder, as_json: Json = False) -> None:
-    """Show role, hosts and expiry of each certificate"""
-    made = _keys()
+    """Show role, hosts and validity of each certificate"""
+    made, now = _keys(), datetime.now(UTC)
     found = made.look(home_path(folder))
     if as_json:
-        print(json.dumps([{"file": str(one.file), "role": one.role, "hosts": one.hosts,
-                           "ends": one.ends.isoformat()} for one in found]))
+        print(json.dumps([{"file": str(one.file), "role": one.role, "hosts": one.hosts, "problem": one.problem(now),
+                           "begins": one.begins.isoformat(), "ends": one.ends.isoformat()} for one in found]))
         return
-    print_table((one.file.name, one.role, f"until {one.ends:%Y-%m-%d}", ", ".join(one.hosts)) for one in found)
+    print_table((one.file.name, one.role, one.problem(now) or f"until {one.ends:%Y-%m-%d}", ", ".join(one.hosts))
+                for one in found)
 
 
 # --- `install` ---------------------------------------------------------------------------------------------------

@@ -187,8 +187,14 @@ def _certificates(folder: str) -> Iterator[Finding]:
         return
     now = datetime.datetime.now(datetime.UTC)
     for one in certificates:
-        renewal = f"sightline keys add {folder} {one.role}" if one.hosts else f"sightline keys init {folder}-new"
-        yield Finding(f"key {one.file.stem}", one.ends - now > _EXPIRES_SOON, f"until {one.ends:%Y-%m-%d}", renewal)
+        problem = one.problem(now)
+        fix = f"sightline keys add {folder} {one.role}"
+        if now < one.begins:
+            fix = "set the clock of this machine: sudo timedatectl set-ntp true"
+        elif one.ends_with_authority and not one.is_foreign:
+            fix = f"sightline keys init {folder}-new"
+        yield Finding(f"key {one.file.stem}", not problem and one.ends - now > _EXPIRES_SOON,
+                      problem or f"until {one.ends:%Y-%m-%d}", fix)
 
 
 def _output_of(*command: str) -> str:

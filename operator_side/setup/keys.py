@@ -25,7 +25,9 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey
 
 DAYS = 825
-"""The longest validity that common TLS stacks accept."""
+"""The longest validity of a role's certificate that common TLS stacks accept."""
+AUTHORITY_DAYS = 3650
+"""Long, so that the certificates can be renewed several times: each machine trusts this authority only."""
 STOP = "stop"
 """Name of the STOP secret beside the roles."""
 _TOKEN_BYTES = 24  # 192 bits, 32 letters
@@ -35,90 +37,122 @@ _BEGUN_EARLIER = datetime.timedelta(days=1)  # for machines whose clocks differ 
 
 @dataclass(frozen=True)
 class Certificate:
-    """The role, hosts and expiry of one certificate file."""
+    """The role, hosts and validity of one certificate file. It ends with its authority at the latest."""
 
     file: Path
     role: str
     hosts: tuple[str, ...]
+    begins: datetime.datetime
     ends: datetime.datetime
+    ends_with_authority: bool
+    is_foreign: bool = False
+    """The authority in the folder has not signed it."""
+
+    def problem(self, now: datetime.datetime) -> str:
+        """Return the reason why no peer accepts it now, or ""."""
+        if self.is_foreign:
+            return "of another authority than ca.pem"
+        if now < self.begins:
+            return f"not valid before {self.begins:%Y-%m-%d}, and the clock of this machine is at {now:%Y-%m-%d}"
+        return f"expired on {self.ends:%Y-%m-%d}" if self.ends < now else ""
 
 
 def make(folder: Path, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
-    """Create an authority and a certificate for each role, valid for `hosts` and loopback. Returns the files.
+    """Create an authority, and a certificate for each role, valid for `hosts` and loopback. Returns the files.
+
+    Args:
+        days: validity of the certificates; the authority has `AUTHORITY_DAYS`.
 
     Raises:
         ConfigError: the folder already has keys or cannot be written; nothing is changed.
     """
-    if (folder / "ca.pem").exists():
-        raise ConfigError(f"{folder} already has keys; choose another folder or delete this one")
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
 
     for host in hosts:
         _general_name(host)  # rejects an invalid host before anything is written
     key = ec.generate_private_key(ec.SECP256R1())
-    builder = _builder("sightline authority", "sightline authority", key, days)
+    builder = _builder("sightline authority", "sightline authority", key, _days_from_now(AUTHORITY_DAYS))
     builder = builder.add_extension(x509.BasicConstraints(True, 0), True)
     usage = dict.fromkeys(("digital_signature", "content_commitment", "key_encipherment", "data_encipherment",
                            "key_agreement", "encipher_only", "decipher_only"), False)
     builder = builder.add_extension(x509.KeyUsage(key_cert_sign=True, crl_sign=True, **usage), True)
-    files = _write(folder, _pair("ca", key, _signed(builder, key)))
-    return files + [file for role in (*CERTIFICATES, STOP) for file in add(folder, role, hosts, days)]
+    authority = _signed(builder, key)
+    files = {**_pair("ca", key, authority), STOP_SECRET_FILE: _random()}
+    for role in CERTIFICATES:
+        files |= _issued(role, hosts, days, key, authority)
+    if present := sorted(name for name in files if (folder / name).exists()):
+        raise ConfigError(f"{folder} already has keys ({present[0]}); choose another folder or delete this one")
+    return _write(folder, files)
 
 
 def add(folder: Path, role: str, hosts: Sequence[str], days: float = DAYS) -> list[Path]:
     """Create a new certificate of `role`, signed by the authority in `folder`.
 
-    `STOP` is not a role: it creates the STOP secret. Without `hosts` a certificate keeps those of the present one.
+    `STOP` is not a role: it creates the STOP secret. Without `hosts` a certificate keeps those of the present one. It
+    ends with its authority at the latest.
 
     Raises:
-        ConfigError: the role or a host is invalid, the key of the authority is missing, or the folder cannot be
-            written; nothing is changed.
+        ConfigError: the role or a host is invalid, the authority has expired or its files are missing or do not belong
+            together, or the folder cannot be written; nothing is changed.
     """
     if role == STOP:
         return _write_secret(folder)
     if role not in CERTIFICATES:
         raise ConfigError(f"unknown role '{role}'; expected {', '.join(CERTIFICATES)}, or {STOP} for the STOP secret")
+    (key, authority), present = _authority(folder), folder / f"{role}.pem"
+    if not hosts and present.exists():
+        hosts = _hosts(_load(present))
+    return _write(folder, _issued(role, hosts, days, key, authority))
+
+
+def _issued(
+    role: str, hosts: Sequence[str], days: float, authority_key: EllipticCurvePrivateKey, authority: x509.Certificate
+) -> dict[str, bytes]:
+    """Return the files of a new certificate of `role`."""
     from cryptography import x509
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.x509.oid import ExtendedKeyUsageOID as Usage
 
-    authority, present = _authority_key(folder), folder / f"{role}.pem"
-    if not hosts and present.exists():
-        hosts = _read(present).hosts
     key = ec.generate_private_key(ec.SECP256R1())
     names = [_general_name(host) for host in dict.fromkeys((*LOOPBACK, *hosts))]
     builder = (
-        _builder(role, "sightline authority", key, days)
+        _builder(role, "sightline authority", key, min(_days_from_now(days), authority.not_valid_after_utc))
         .add_extension(x509.BasicConstraints(False, None), True)
         .add_extension(x509.SubjectAlternativeName(names), False)
         .add_extension(x509.ExtendedKeyUsage([Usage.SERVER_AUTH, Usage.CLIENT_AUTH]), False)
-        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority.public_key()), False)
+        .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(authority_key.public_key()), False)
     )
     token = {} if role == ROUTER_ROLE else {f"{role}.token": _random()}
-    return _write(folder, {**_pair(role, key, _signed(builder, authority)), **token})
+    return {**_pair(role, key, _signed(builder, authority_key)), **token}
 
 
 def look(folder: Path) -> list[Certificate]:
     """Read the certificates in `folder`. Raises ConfigError without one or for an invalid one."""
-    found = [_read(file) for file in sorted(folder.glob("*.pem"))]
+    found = {file: _load(file) for file in sorted(folder.glob("*.pem"))}
     if not found:
         raise ConfigError(f"no certificates in {folder}; create them with: sightline keys init {folder}")
-    return found
+    return [_described(file, one, found.get(folder / "ca.pem", one)) for file, one in found.items()]
 
 
-def _builder(role: str, issuer: str, key: EllipticCurvePrivateKey, days: float) -> x509.CertificateBuilder:
+def _days_from_now(days: float) -> datetime.datetime:
+    # A certificate has whole seconds.
+    return (datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)).replace(microsecond=0)
+
+
+def _builder(
+    role: str, issuer: str, key: EllipticCurvePrivateKey, ends: datetime.datetime
+) -> x509.CertificateBuilder:
     from cryptography import x509
 
-    now = datetime.datetime.now(datetime.UTC)
     return (
         x509.CertificateBuilder()
         .subject_name(_name(role))
         .issuer_name(_name(issuer))
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - _BEGUN_EARLIER)
-        .not_valid_after(now + datetime.timedelta(days=days))
+        .not_valid_before(_days_from_now(0) - _BEGUN_EARLIER)
+        .not_valid_after(ends)
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), False)
     )
 
@@ -190,7 +224,8 @@ def _write(folder: Path, files: Mapping[str, bytes]) -> list[Path]:
     return list(parts)
 
 
-def _authority_key(folder: Path) -> EllipticCurvePrivateKey:
+def _authority(folder: Path) -> tuple[EllipticCurvePrivateKey, x509.Certificate]:
+    """Read the key and the certificate of the authority. Raises ConfigError unless it can sign certificates now."""
     from cryptography.hazmat.primitives.asymmetric.ec import EllipticCurvePrivateKey as Key
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
@@ -201,25 +236,50 @@ def _authority_key(folder: Path) -> EllipticCurvePrivateKey:
                           "`sightline keys init`") from None
     if not isinstance(key, Key):
         raise ConfigError(f"{folder}/ca.key has another kind of key; use the folder of `sightline keys init`")
-    return key
+    certificate = _load(folder / "ca.pem")
+    if certificate.public_key() != key.public_key():
+        raise ConfigError(f"ca.key and ca.pem in {folder} do not belong together; copy both from one "
+                          "`sightline keys init`")
+    if certificate.not_valid_after_utc < _days_from_now(0):
+        raise ConfigError(f"the authority in {folder} expired on {certificate.not_valid_after_utc:%Y-%m-%d}; create "
+                          f"new keys with: sightline keys init {folder}-new")
+    return key, certificate
 
 
-def _read(file: Path) -> Certificate:
+def _load(file: Path) -> x509.Certificate:
     from cryptography import x509
-    from cryptography.x509.oid import NameOID
 
     try:
-        read = x509.load_pem_x509_certificate(file.read_bytes())
+        return x509.load_pem_x509_certificate(file.read_bytes())
     except (OSError, ValueError):
         # The present addresses are not known, and new keys of all roles are not needed for one of them.
         repair = (f"replace it with: sightline keys add {file.parent} {file.stem} --host HOST"
                   if file.stem in CERTIFICATES else f"create new ones with: sightline keys init {file.parent}-new")
         raise ConfigError(f"invalid certificate {file}; {repair}") from None
-    names = read.extensions
+
+
+def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
+    from cryptography import x509
+
     try:
-        alternative = names.get_extension_for_class(x509.SubjectAlternativeName).value
-        hosts = tuple(str(name.value) for name in alternative)
+        alternative = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
-        hosts = ()
+        return ()
+    return tuple(str(name.value) for name in alternative)
+
+
+def _described(file: Path, read: x509.Certificate, authority: x509.Certificate) -> Certificate:
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.x509.oid import NameOID
+
     role = str(read.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
-    return Certificate(file, role, hosts, read.not_valid_after_utc)
+    ends = min(read.not_valid_after_utc, authority.not_valid_after_utc)
+    is_foreign = False
+    try:
+        read.verify_directly_issued_by(authority)
+    except InvalidSignature:
+        is_foreign = True
+    except (TypeError, ValueError):  # signed by an authority that `ca.pem` has signed
+        pass
+    return Certificate(file, role, _hosts(read), read.not_valid_before_utc, ends,
+                       ends == authority.not_valid_after_utc, is_foreign)

@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import re
+import shutil
 import socket
 import sys
 from dataclasses import replace
@@ -167,6 +168,29 @@ def test_certificates_near_expiry_are_reported_with_the_command(capsys, tmp_path
     assert checks["key robot"]["ok"] and checks["key ca"]["ok"]
     assert not checks["key vision"]["ok"]
     assert checks["key vision"]["fix"] == f"sightline keys add {tmp_path / 'k'} vision"
+
+
+@pytest.mark.parametrize(("name", "setting", "value", "fix"), [
+    ("DAYS", -0.5, "expired on 2", "sightline keys add {}/k robot"),
+    ("AUTHORITY_DAYS", -0.5, "expired on 2", "sightline keys init {}/k-new"),
+    ("AUTHORITY_DAYS", 20, "until 2", "sightline keys init {}/k-new"),
+    ("_BEGUN_EARLIER", machine.datetime.timedelta(days=-9), "not valid before 2", "set the clock of this machine:"),
+])
+def test_key_that_no_peer_accepts_is_reported_with_its_fix(capsys, monkeypatch, tmp_path, name, setting, value, fix):
+    monkeypatch.setattr(keys, name, setting)
+    keys.make(tmp_path / "k", [], days=keys.DAYS)
+    check = _checks(capsys, "--secure", str(tmp_path / "k"))["key robot"]
+    assert not check["ok"] and check["value"].startswith(value)
+    assert check["fix"].startswith(fix.format(tmp_path))
+
+
+def test_key_of_another_authority_is_reported(capsys, tmp_path):
+    keys.make(tmp_path / "other", [])
+    keys.make(tmp_path / "k", [])
+    shutil.copy(tmp_path / "other/robot.pem", tmp_path / "k")
+    checks = _checks(capsys, "--secure", str(tmp_path / "k"))
+    assert checks["key robot"]["value"].startswith("of another authority") and checks["key vision"]["ok"]
+    assert checks["key robot"]["fix"] == f"sightline keys add {tmp_path / 'k'} robot"
 
 
 def test_unreadable_certificates_are_reported_with_the_extra(capsys, tmp_path, monkeypatch):

@@ -1,9 +1,13 @@
 """The files of `sightline keys`: whole or unchanged, private, and the STOP secret is a file of its own."""
 
+import datetime
 import errno
+import json
+import shutil
 
 import pytest
 
+from sightline.operator_side.cli import app as cli
 from sightline.operator_side.setup import keys
 from sightline.protocol.errors import ConfigError, LinkError
 from sightline.protocol.transports.diagnosis import diagnose_tls, keys_problem
@@ -114,3 +118,94 @@ def test_damaged_certificate_of_the_authority_needs_a_new_folder(tmp_path):
     (tmp_path / "ca.pem").write_text("damaged")
     with pytest.raises(ConfigError, match=f"ca.pem; create new ones with: sightline keys init {tmp_path}-new$"):
         keys.look(tmp_path)
+
+
+def _days_left(folder):
+    now = datetime.datetime.now(datetime.UTC)
+    return {one.file.stem: (one.ends - now) / datetime.timedelta(days=1) for one in keys.look(folder)}
+
+
+def test_authority_outlives_its_certificates_so_that_they_can_be_renewed(tmp_path):
+    keys.make(tmp_path, [], days=10)
+    assert _days_left(tmp_path)["ca"] > 9 * 365
+    assert _days_left(tmp_path)["robot"] == pytest.approx(10, abs=0.1)
+    keys.add(tmp_path, "robot", [])
+    assert _days_left(tmp_path)["robot"] == pytest.approx(keys.DAYS, abs=0.1)
+
+
+def test_certificate_ends_with_its_authority_and_the_command_prints_that(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(keys, "AUTHORITY_DAYS", 30)
+    keys.make(tmp_path, [], days=10)
+    assert cli.run(["keys", "add", str(tmp_path), "vision", "--days", "20"]) == 0
+    assert capsys.readouterr().err == ""
+    assert cli.run(["keys", "add", str(tmp_path), "robot"]) == 0
+    printed = capsys.readouterr().err
+    assert "robot.pem ends with its authority, on 2" in printed and f"sightline keys init {tmp_path}-new" in printed
+    assert _days_left(tmp_path) == {
+        "ca": pytest.approx(30, abs=0.1), "robot": pytest.approx(30, abs=0.1), "vision": pytest.approx(20, abs=0.1),
+        **dict.fromkeys(("detector", "operator", "router", "viewer"), pytest.approx(10, abs=0.1)),
+    }  # fmt: skip
+    from cryptography import x509  # the file itself, not only what `look` makes of it
+
+    read = {name: x509.load_pem_x509_certificate((tmp_path / f"{name}.pem").read_bytes()) for name in ("ca", "robot")}
+    assert read["robot"].not_valid_after_utc == read["ca"].not_valid_after_utc
+
+
+def test_expired_authority_signs_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(keys, "AUTHORITY_DAYS", -0.5)
+    keys.make(tmp_path, [])
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(ConfigError, match=rf"expired on 2.*; create new keys with: sightline keys init {tmp_path}-new"):
+        keys.add(tmp_path, "robot", [])
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("left", ["ca.key", "ca.pem", "robot.key", "robot.pem", "robot.token", "stop.secret"])
+def test_new_authority_replaces_no_file_of_an_earlier_one(tmp_path, left):
+    keys.make(tmp_path / "earlier", [])
+    (tmp_path / "keys").mkdir()
+    shutil.copy(tmp_path / "earlier" / left, tmp_path / "keys")
+    with pytest.raises(ConfigError, match=rf"already has keys \({left}\)"):
+        keys.make(tmp_path / "keys", [])
+    assert [file.name for file in (tmp_path / "keys").iterdir()] == [left]
+
+
+def test_full_disk_leaves_no_half_of_a_new_authority(tmp_path, monkeypatch):
+    write_bytes = type(tmp_path).write_bytes
+
+    def on_a_full_disk(path, data):
+        if "viewer.pem" in path.name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write_bytes(path, data)
+
+    monkeypatch.setattr(type(tmp_path), "write_bytes", on_a_full_disk)
+    with pytest.raises(ConfigError, match="No space left on device"):
+        keys.make(tmp_path / "keys", [])
+    assert list((tmp_path / "keys").iterdir()) == []
+
+
+def test_key_of_another_authority_signs_nothing(tmp_path):
+    keys.make(tmp_path / "other", [])
+    keys.make(tmp_path / "keys", [])
+    shutil.copy(tmp_path / "other/ca.key", tmp_path / "keys")
+    before = (tmp_path / "keys/robot.pem").read_bytes()
+    with pytest.raises(ConfigError, match=r"ca\.key and ca\.pem in .*/keys do not belong together"):
+        keys.add(tmp_path / "keys", "robot", [])
+    assert (tmp_path / "keys/robot.pem").read_bytes() == before
+
+
+def test_certificate_that_no_peer_accepts_is_shown_with_the_reason(tmp_path, monkeypatch, capsys):
+    keys.make(tmp_path / "other", [])
+    keys.make(tmp_path / "keys", [])
+    shutil.copy(tmp_path / "other/viewer.pem", tmp_path / "keys")
+    keys.add(tmp_path / "keys", "vision", [], days=-0.5)
+    monkeypatch.setattr(keys, "_BEGUN_EARLIER", datetime.timedelta(days=-30))
+    keys.add(tmp_path / "keys", "robot", [], days=60)
+    assert cli.run(["keys", "show", str(tmp_path / "keys"), "--json"]) == 0
+    shown = {one["role"]: one["problem"] for one in json.loads(capsys.readouterr().out)}
+    assert shown.pop("robot").startswith("not valid before 2")
+    assert shown.pop("vision").startswith("expired on 2")
+    assert shown.pop("viewer") == "of another authority than ca.pem"
+    assert set(shown.values()) == {""}
+    assert cli.run(["keys", "show", str(tmp_path / "keys")]) == 0
+    assert "not valid before 2" in capsys.readouterr().out
