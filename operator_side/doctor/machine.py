@@ -23,6 +23,7 @@ from sightline.operator_side.preflight import needs
 from sightline.protocol import VERSION
 from sightline.protocol.errors import SightlineError
 from sightline.protocol.transports.diagnosis import listening_inodes, port_owner
+from sightline.protocol.transports.security import EXPIRES_SOON
 from sightline.protocol.transports.zenoh.session import MULTICAST_GROUP
 
 PORTS = {7447: "Zenoh", 9090: "sightline.v1", 9091: "the legacy protocol"}
@@ -32,7 +33,6 @@ CPUS = Path("/sys/devices/system/cpu")
 CGROUP = Path("/sys/fs/cgroup")
 PROC_STAT = Path("/proc/stat")
 INTERFACES = Path("/sys/class/net")
-_EXPIRES_SOON = datetime.timedelta(days=30)
 _EXTRAS = {"zenoh": "eclipse-zenoh", "websocket": "websockets", "vision": "opencv-python-headless", "sim": "pybullet"}
 
 
@@ -193,7 +193,7 @@ def _certificates(folder: str) -> Iterator[Finding]:
             fix = "set the clock of this machine: sudo timedatectl set-ntp true"
         elif one.ends_with_authority and not one.is_foreign:
             fix = f"sightline keys init {folder}-new"
-        yield Finding(f"key {one.file.stem}", not problem and one.ends - now > _EXPIRES_SOON,
+        yield Finding(f"key {one.file.stem}", not problem and one.ends - now > EXPIRES_SOON,
                       problem or f"until {one.ends:%Y-%m-%d}", fix)
 
 

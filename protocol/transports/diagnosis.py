@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import errno
 import ipaddress
 import os
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from sightline.protocol.errors import LinkError
 from sightline.protocol.transports.endpoints import OVER_UDP, parse_websocket_endpoint, parse_zenoh_endpoint
-from sightline.protocol.transports.security import RoleKeys
+from sightline.protocol.transports.security import RoleKeys, date_problem
 
 if TYPE_CHECKING:
     import ssl  # takes 4 MB, so functions import it when something is wrong
@@ -213,13 +214,19 @@ _TLS_TIMEOUT_S = 1.0
 _PLAIN = "it is a plain link, not TLS; pass --secure there too, or on neither end"
 _SILENT = ("it does not answer TLS; it is a plain link (pass --secure there too, or on neither end), or others flood "
            "it (see its log)")
+_EXPIRED = "its certificate has expired; make new keys there, or set the clock of this machine"
+_NOT_YET = "its certificate is not valid yet; set the clock of this machine"
+_CLOCK_THERE = ("the certificate of this end is valid here, but expired or not valid yet on the clock there; set the "
+                "clock there")
+_OF_CLOCKS = (_EXPIRED, _NOT_YET, _CLOCK_THERE)
 _CAUSES = (
-    ("certificate has expired", "its certificate has expired; make new keys there"),
+    ("certificate has expired", _EXPIRED),
+    ("certificate is not yet valid", _NOT_YET),
     ("Hostname mismatch", "its certificate names other hosts; sightline keys add DIR ROLE --host HOST"),
     ("IP address mismatch", "its certificate names other addresses; sightline keys add DIR ROLE --host ADDRESS"),
     ("CERTIFICATE_VERIFY_FAILED", "its certificate is of another authority; use keys of one `sightline keys init`"),
     ("ALERT_UNKNOWN_CA", "it does not know the authority of this certificate; use keys of one `sightline keys init`"),
-    ("ALERT_CERTIFICATE_EXPIRED", "the certificate of this end has expired; run `sightline keys add DIR ROLE`"),
+    ("ALERT_CERTIFICATE_EXPIRED", _CLOCK_THERE),
     ("ALERT_CERTIFICATE_REQUIRED", "it requires a certificate; pass --secure DIR"),
     ("ALERT_DECRYPT_ERROR", "it does not know our certificate's authority; use keys of one `sightline keys init`"),
     ("WRONG_VERSION_NUMBER", _PLAIN),
@@ -237,9 +244,13 @@ def diagnose_tls(endpoint: str, secured: RoleKeys | None) -> str:
     if secured is None:
         return "a tls/ endpoint needs keys; pass --secure DIR"
     try:
-        return _try_handshake(host, port, _tls_context(secured))
+        cause = _try_handshake(host, port, _tls_context(secured))
     except LinkError as error:
         return str(error)
+    if cause not in _OF_CLOCKS:
+        return cause
+    return (date_problem(secured.folder, secured.role, datetime.timedelta(0))
+            or f"{cause} (here it is {datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC)")
 
 
 def keys_problem(secured: RoleKeys) -> str:

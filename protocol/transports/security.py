@@ -6,10 +6,13 @@ to the denied peer. The listening end denies everything that is not listed here.
 
 from __future__ import annotations
 
+import datetime
 import hmac
 import ipaddress
 import re
-from collections.abc import Mapping, Sequence
+from binascii import a2b_base64
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -190,6 +193,69 @@ def _token_rows(role: str) -> list[tuple[str, str, list[str], list[str]]]:
         ("sees", "egress", ["liveliness_token"], [ALL_TOKENS]),
         ("is watched", "egress", ["liveliness_query", "declare_liveliness_subscriber"], [ALL_TOKENS]),
     ]
+
+
+# The dates of the certificates in a `--secure` folder. Shell (reads files). A robot has no `cryptography`, and `ssl`
+# takes 4 MB.
+
+
+EXPIRES_SOON: Final = datetime.timedelta(days=30)
+_SEQUENCE: Final = 0x30
+
+
+def date_problem(
+    folder: str, source: str, ahead: datetime.timedelta = EXPIRES_SOON, now: datetime.datetime | None = None
+) -> str:
+    """Return what is wrong with the dates of the certificates of a link, or "" without one or without a folder.
+
+    Args:
+        folder: folder from `sightline keys`, or "".
+        source: role of the link.
+        ahead: report a certificate that ends within this time, too.
+        now: time, or None for the clock of this machine.
+    """
+    role, now = certificate_role(source), now or datetime.datetime.now(datetime.UTC)
+    for what, name, repair in () if not folder else (
+        ("the authority of the keys", "ca.pem", "create new keys with `sightline keys init`"),
+        ("the certificate of this end", f"{role}.pem", f"run `sightline keys add DIR {role}` where ca.key is"),
+    ):
+        with suppress(OSError, ValueError, IndexError):  # a missing or damaged file is reported by the link itself
+            begins, ends = validity((home_path(folder) / name).read_text("ascii"))
+            if now < begins:
+                return (f"{what} is not valid before {begins:%Y-%m-%d} ({name}); set the clock of this machine (now "
+                        f"{now:%Y-%m-%d %H:%M} UTC)")
+            if ends < now + ahead:
+                how = "has expired" if ends < now else "ends soon"
+                return f"{what} {how} ({name}, {ends:%Y-%m-%d}); {repair}, and copy the new files to this machine"
+    return ""
+
+
+def validity(pem: str) -> tuple[datetime.datetime, datetime.datetime]:
+    """Return the first and last moment of a certificate. Raises ValueError or IndexError for damaged text.
+
+    Source: RFC 5280, 4.1. The validity is the third sequence, after the algorithm and the issuer.
+    """
+    encoded = pem.partition("-----BEGIN CERTIFICATE-----")[2].partition("-----END")[0]
+    ((_, certificate),) = _elements(a2b_base64(encoded))
+    (_, signed), *_ = _elements(certificate)
+    begins, ends = _elements([content for tag, content in _elements(signed) if tag == _SEQUENCE][2])
+    return _time(begins[1].decode()), _time(ends[1].decode())
+
+
+def _elements(der: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield tag and content of each element."""
+    while der:
+        length, start = der[1], 2
+        if length > 0x7F:  # the number of bytes of the length
+            start += length & 0x7F
+            length = int.from_bytes(der[2:start])
+        yield der[0], der[start : start + length]
+        der = der[start + length :]
+
+
+def _time(text: str) -> datetime.datetime:
+    digits = text if len(text) > len("261130000000Z") else f"{'20' if text < '50' else '19'}{text}"
+    return datetime.datetime.fromisoformat(f"{digits[:8]}T{digits[8:]}")
 
 
 # The tokens of roles in a `--secure` folder, one file each: `vision.token`, `operator.token` ... Shell (reads files).

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
 FIRST_PAUSE_S: Final = 0.2
 LONGEST_PAUSE_S: Final = 1.0
 PAUSE_GROWTH: Final = 1.5
+_FIXES: Final = {
+    9: "set the clock of this machine",  # X509_V_ERR_CERT_NOT_YET_VALID
+    10: "make new keys, or set the clock of this machine",  # X509_V_ERR_CERT_HAS_EXPIRED
+}
 
 
 class Client:
@@ -97,7 +101,8 @@ class Client:
             self._turned_away(self._hangs_up(), False)
         except ssl.SSLError as error:
             why = getattr(error, "verify_message", "") or error.reason or type(error).__name__
-            self._turned_away(f"no TLS: {why}; use the ca.pem of its authority in --secure", True)
+            fix = _FIXES.get(getattr(error, "verify_code", 0), "use the ca.pem of its authority in --secure")
+            self._turned_away(f"no TLS: {why}; {fix}", True)
         except OSError:  # no listener, or no answer in time
             self.trouble = ""
         # A broken peer can make the library raise any error. This thread must continue.

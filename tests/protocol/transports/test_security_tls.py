@@ -1,5 +1,6 @@
 """`wss://` with real TLS: certificates of a private authority, and every peer that does not agree on them."""
 
+import datetime
 import socket
 import ssl
 import time
@@ -113,6 +114,23 @@ def test_a_certificate_of_another_host_is_rejected(tmp_path):
     with (
         open_websocket("r1", listen=endpoint, role="robot", secure=folder),
         pytest.raises(LinkError, match="no TLS: IP address mismatch"),
+    ):
+        open_websocket("r1", connect=endpoint, role="vision", secure=folder)
+
+
+@pytest.mark.parametrize(("days", "fix"), [
+    ((-9, -1), "certificate has expired; make new keys, or set the clock"),
+    ((1, 9), "certificate is not yet valid; set the clock of this machine"),
+])
+def test_certificate_that_is_not_valid_now_is_reported_with_its_fix(tmp_path, days, fix):
+    endpoint, folder = free_endpoint("wss://"), folder_of(tmp_path / "keys")
+    begins, ends = (datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=one) for one in days)
+    issued = AUTHORITY.issue_cert("127.0.0.1", not_before=begins, not_after=ends)
+    issued.private_key_pem.write_to_path(tmp_path / "keys/robot.key")
+    issued.cert_chain_pems[0].write_to_path(tmp_path / "keys/robot.pem")
+    with (
+        open_websocket("r1", listen=endpoint, role="robot", secure=folder),
+        pytest.raises(LinkError, match=f"no TLS: {fix}"),
     ):
         open_websocket("r1", connect=endpoint, role="vision", secure=folder)
 

@@ -1,5 +1,6 @@
 """Secured Zenoh links: permissions to send and receive, by certificate, and readable causes of a mismatch."""
 
+import datetime
 import socket
 import threading
 import time
@@ -23,6 +24,7 @@ from sightline.protocol.channels import (
     Direction,
 )
 from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports import diagnosis
 from sightline.protocol.transports.diagnosis import diagnose_tls
 from sightline.protocol.transports.security import (
     CERTIFICATES,
@@ -203,6 +205,25 @@ def test_an_expired_certificate_is_named(folder, endpoint, broken):
 def test_our_own_expired_certificate_is_named(folder, endpoint, broken):
     keys.add(broken, "vision", [], days=-0.5)
     assert "the certificate of this end has expired" in _refusal(endpoint, folder, broken)
+
+
+@pytest.mark.parametrize(("of_robot", "of_peer", "words"), [
+    ("now", "later", "the certificate of this end is not valid before 2"),
+    ("later", "now", "its certificate is not valid yet; set the clock of this machine (here it is 2"),
+    ("later", "later", "the certificate of this end is not valid before 2"),
+])
+def test_certificate_that_is_not_valid_yet_is_named(folder, endpoint, broken, monkeypatch, of_robot, of_peer, words):
+    monkeypatch.setattr(keys, "_BEGUN_EARLIER", datetime.timedelta(days=-30))
+    for role in ("robot", "vision"):
+        keys.add(broken, role, [], days=60)
+    folders = {"now": folder, "later": broken}
+    assert words in _refusal(endpoint, folders[of_robot], folders[of_peer])
+
+
+def test_certificate_that_only_the_clock_of_the_other_end_rejects_is_named(folder, endpoint, broken, monkeypatch):
+    keys.add(broken, "vision", [], days=-0.5)
+    monkeypatch.setattr(diagnosis, "date_problem", lambda *_: "")  # as if the clock there were ahead
+    assert "valid here, but expired or not valid yet on the clock there; set" in _refusal(endpoint, folder, broken)
 
 
 def test_a_certificate_of_another_host_is_named(folder, endpoint, broken, monkeypatch):
