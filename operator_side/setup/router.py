@@ -16,7 +16,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import RepeatLimiter
 from sightline.protocol.transports.endpoints import check_zenoh_endpoints, own_stop_addresses
 from sightline.protocol.transports.flood_limits import limit_floods
-from sightline.protocol.transports.security import ROUTER_ROLE, load_role_keys
+from sightline.protocol.transports.security import ROUTER_ROLE, date_problem, load_role_keys
 from sightline.protocol.transports.stop_port import StopProcess, read_packets, stop_secret_file
 from sightline.protocol.transports.zenoh.session import MAX_ROUTER_SESSIONS, close_without_waiting, open_session
 from sightline.robot_side.guardian import stop_forwarder
@@ -38,6 +38,8 @@ def run(listen: Sequence[str], connect: Sequence[str], secure: str) -> int:
     check_zenoh_endpoints(listen, connect)
     stop_addresses = own_stop_addresses(listen)
     secured = load_role_keys(secure, ROUTER_ROLE)
+    if problem := date_problem(secure, ROUTER_ROLE):
+        _log.warning("router: %s", problem)
     _raise_descriptor_limit()
     ending = threading.Event()
     with (

@@ -216,6 +216,7 @@ _SILENT = ("it does not answer TLS; it is a plain link (pass --secure there too,
            "it (see its log)")
 _EXPIRED = "its certificate has expired; make new keys there, or set the clock of this machine"
 _NOT_YET = "its certificate is not valid yet; set the clock of this machine"
+# Zenoh sends one alert for both.
 _CLOCK_THERE = ("the certificate of this end is valid here, but expired or not valid yet on the clock there; set the "
                 "clock there")
 _OF_CLOCKS = (_EXPIRED, _NOT_YET, _CLOCK_THERE)
@@ -249,6 +250,7 @@ def diagnose_tls(endpoint: str, secured: RoleKeys | None) -> str:
         return str(error)
     if cause not in _OF_CLOCKS:
         return cause
+    # The own files come first: a clock that is wrong here makes the files of both ends look wrong.
     return (date_problem(secured.folder, secured.role, datetime.timedelta(0))
             or f"{cause} (here it is {datetime.datetime.now(datetime.UTC):%Y-%m-%d %H:%M} UTC)")
 

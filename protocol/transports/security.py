@@ -219,7 +219,8 @@ def date_problem(
         ("the authority of the keys", "ca.pem", "create new keys with `sightline keys init`"),
         ("the certificate of this end", f"{role}.pem", f"run `sightline keys add DIR {role}` where ca.key is"),
     ):
-        with suppress(OSError, ValueError, IndexError):  # a missing or damaged file is reported by the link itself
+        # The link itself reports a missing or damaged file.
+        with suppress(OSError, ValueError, IndexError):
             begins, ends = validity((home_path(folder) / name).read_text("ascii"))
             if now < begins:
                 return (f"{what} is not valid before {begins:%Y-%m-%d} ({name}); set the clock of this machine (now "
@@ -246,7 +247,8 @@ def _elements(der: bytes) -> Iterator[tuple[int, bytes]]:
     """Yield tag and content of each element."""
     while der:
         length, start = der[1], 2
-        if length > 0x7F:  # the number of bytes of the length
+        # A long length: these seven bits are the number of its bytes.
+        if length > 0x7F:
             start += length & 0x7F
             length = int.from_bytes(der[2:start])
         yield der[0], der[start : start + length]
@@ -254,6 +256,7 @@ def _elements(der: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _time(text: str) -> datetime.datetime:
+    # The short form has two digits of a year from 1950 to 2049.
     digits = text if len(text) > len("261130000000Z") else f"{'20' if text < '50' else '19'}{text}"
     return datetime.datetime.fromisoformat(f"{digits[:8]}T{digits[8:]}")
 

@@ -25,6 +25,7 @@ from sightline.protocol.messages import CameraModel
 from sightline.protocol.transports.flood_limits import limit_floods
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import Relay, open_link
+from sightline.protocol.transports.security import ROBOT_ROLE, date_problem
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice
 from sightline.robot_side.network.core import NetworkCore
@@ -332,6 +333,8 @@ def _run(setup: NetworkSetup, driver: NetworkEnd) -> None:
         # After a restart the link comes first, so that a robot without a camera can be reached.
         camera = None if setup.is_restart else _open_camera(config.camera)
         ending.enter_context(limit_floods(config.doors, lambda line: _log.info("robot %s: %s", config.robot, line)))
+        if problem := date_problem(config.secure, ROBOT_ROLE):
+            _log.warning("robot %s: %s", config.robot, problem)
         link = ending.enter_context(
             open_link(
                 config.robot, listen=config.doors, connect=config.connect, role="robot", secure=config.secure,

@@ -14,6 +14,7 @@ from typing import Final
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
 from sightline.protocol.transports.link import Link
+from sightline.protocol.transports.security import date_problem
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.plugin_calls import close_detector
 from sightline.vision_side.detect.port import Detector
@@ -76,6 +77,8 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
 
     configured_mission(config)  # report an unknown mission before any endpoint is opened
     ending, detector = threading.Event(), configured_detector(config)
+    if problem := date_problem(config.secure, SOURCE):
+        _log.warning("vision: %s", problem)
     run_it = _run_fleet if set("*?") & set(config.robot) or config.share.enabled else _run_one
     try:
         with limit_floods(config.listen, lambda line: _log.info("vision: %s", line)):

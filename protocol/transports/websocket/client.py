@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 FIRST_PAUSE_S: Final = 0.2
 LONGEST_PAUSE_S: Final = 1.0
 PAUSE_GROWTH: Final = 1.5
+# By the code of OpenSSL.
 _FIXES: Final = {
     9: "set the clock of this machine",  # X509_V_ERR_CERT_NOT_YET_VALID
     10: "make new keys, or set the clock of this machine",  # X509_V_ERR_CERT_HAS_EXPIRED

@@ -4,16 +4,23 @@ import datetime
 import errno
 import json
 import shutil
+from contextlib import suppress
 
 import pytest
 
 from sightline.operator_side.cli import app as cli
-from sightline.operator_side.setup import keys
+from sightline.operator_side.setup import keys, router
 from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports import open as opening
 from sightline.protocol.transports.diagnosis import diagnose_tls, keys_problem
 from sightline.protocol.transports.open import open_link
-from sightline.protocol.transports.security import RoleKeys
+from sightline.protocol.transports.security import RoleKeys, date_problem, validity
 from sightline.protocol.transports.stop_port import stop_secret_file
+from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.network import process as robot_process
+from sightline.robot_side.pipe import NetworkSetup
+from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.serving import process as vision_process
 from tests.fixtures.ports import free_port
 
 
@@ -209,3 +216,64 @@ def test_certificate_that_no_peer_accepts_is_shown_with_the_reason(tmp_path, mon
     assert set(shown.values()) == {""}
     assert cli.run(["keys", "show", str(tmp_path / "keys")]) == 0
     assert "not valid before 2" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("days", [1, 20_000])  # to 2050 in the short form
+def test_dates_of_a_certificate_are_read_without_the_package_that_makes_it(tmp_path, monkeypatch, days):
+    monkeypatch.setattr(keys, "AUTHORITY_DAYS", 30_000)
+    keys.make(tmp_path, ["robot.local"], days)
+    robot = next(one for one in keys.look(tmp_path) if one.role == "robot")
+    text = robot.file.read_text("ascii")
+    assert validity(text) == (robot.begins, robot.ends) and (robot.ends.year > 2050) is (days > 1)
+    for end in range(0, len(text), 9):
+        with suppress(ValueError, IndexError):  # no other error for a truncated file
+            assert validity(text[:end]) == (robot.begins, robot.ends)
+
+
+@pytest.mark.parametrize(("days", "role", "problem"), [
+    (0, "robot", ""), (794, "robot", ""), (796, "robot", "the certificate of this end ends soon (robot.pem, 20"),
+    (826, "robot", "the certificate of this end has expired (robot.pem, 20"),
+    (826, "teleop", "the certificate of this end has expired (operator.pem, 20"),
+    (-2, "robot", "the authority of the keys is not valid before 20"),
+    (3640, "robot", "the authority of the keys ends soon (ca.pem, 20"),
+    (3651, "robot", "the authority of the keys has expired (ca.pem, 20"),
+])  # fmt: skip
+def test_dates_of_keys_are_reported_while_they_can_be_renewed(tmp_path, days, role, problem):
+    keys.make(tmp_path, [])
+    now = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
+    found = date_problem(str(tmp_path), role, now=now)
+    assert found.startswith(problem) and bool(found) is bool(problem)
+    assert date_problem("", role, now=now) == ""
+    for damaged in ("", "-----BEGIN CERTIFICATE-----\nMIIB\n-----END CERTIFICATE-----\n"):
+        for name in ("ca.pem", "robot.pem"):
+            (tmp_path / name).write_text(damaged)
+        assert date_problem(str(tmp_path), "robot", now=now) == "", "the link reports a damaged file"
+
+
+def _run_robot(config):
+    setup = NetworkSetup(config=RobotConfig(**config), session="0000beef", first_seq=1, is_restart=True)
+    robot_process._run(setup, None)
+
+
+@pytest.mark.parametrize(("run", "module", "name", "role"), [
+    (_run_robot, robot_process, "open_link", "robot"),
+    (lambda config: vision_process.run(VisionConfig(**config)), opening, "open_link", "vision"),
+    (lambda config: router.run(config["listen"], [], config["secure"]), router, "open_session", "router"),
+], ids=["robot", "vision", "router"])  # fmt: skip
+def test_service_whose_certificate_has_expired_warns_when_it_starts(
+    tmp_path, monkeypatch, caplog, run, module, name, role
+):
+    keys.make(tmp_path, [])
+    config = {"listen": [f"tls/127.0.0.1:{free_port()}"], "secure": str(tmp_path)}
+
+    def opens(*_arguments, **_options):
+        raise LinkError("opened")
+
+    monkeypatch.setattr(module, name, opens)
+    for days, expected in ((keys.DAYS, []), (-0.5, [f"the certificate of this end has expired ({role}.pem"])):
+        keys.add(tmp_path, role, [], days)
+        caplog.clear()
+        with pytest.raises(LinkError, match="opened"):
+            run(config)
+        warned = [one.getMessage() for one in caplog.records if one.levelname == "WARNING"]
+        assert [words in line for words, line in zip(expected, warned, strict=True)] == [True] * len(expected)
