@@ -83,11 +83,12 @@ Corners = NDArray[np.float32]
 def find_board(jpeg: bytes, board: Board) -> Corners | None:
     """Find the board's inner corners (N, 1, 2) in OpenCV's pixels; None unless the whole board is in the image."""
     try:
-        read_jpeg_size(jpeg, MAX_PIXELS)
+        size = read_jpeg_size(jpeg, MAX_PIXELS)
     except WireError:
         return None
-    gray = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if gray is None:
+    # The decoder of the vision service does not turn images by their EXIF data either.
+    gray = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if gray is None or gray.shape != (size.height_px, size.width_px):
         return None
     found, corners = cv2.findChessboardCornersSB(gray, (board.columns, board.rows), flags=cv2.CALIB_CB_ACCURACY)
     return np.asarray(corners, np.float32) if found else None

@@ -2,6 +2,7 @@
 
 import json
 import math
+import struct
 from functools import cache
 
 import cv2
@@ -112,6 +113,17 @@ def test_boards_that_do_not_fit_one_camera_are_rejected():
 @pytest.mark.parametrize("jpeg", [EMPTY, b"", b"\xff\xd8 no picture", EMPTY[:300]], ids=["empty", "none", "bad", "cut"])
 def test_image_without_a_board_gives_no_board(jpeg):
     assert find_board(jpeg, BOARD) is None
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+def test_image_with_an_orientation_is_measured_as_the_camera_took_it(orientation):
+    """The robot's decoder does not turn images, and the size of the model is that of the header."""
+    turning = struct.pack(">2sHIHHHIHHI", b"MM", 42, 8, 1, 0x112, 3, 1, orientation, 0, 0)
+    marked = b"\xff\xd8\xff\xe1" + struct.pack(">H", len(turning) + 8) + b"Exif\0\0" + turning + tilted_view(0)[2:]
+    upright = cv2.imdecode(np.frombuffer(marked, np.uint8), cv2.IMREAD_GRAYSCALE)
+    plain = cv2.imdecode(np.frombuffer(tilted_view(0), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert not np.array_equal(upright, plain), "the mark is read by decoders that turn images"
+    assert np.array_equal(find_board(marked, BOARD), corners_in(0))
 
 
 def test_the_same_view_is_taken_once():
