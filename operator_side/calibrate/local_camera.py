@@ -12,6 +12,11 @@ from sightline.robot_side.plugins import CAMERAS
 from sightline.robot_side.ports import Camera
 
 
+def camera_choice(kind: str, sets: Sequence[str]) -> PluginChoice:
+    """Return the plug-in `kind` with the options `sets`. Raises ConfigError for a text without `=`."""
+    return PluginChoice(kind=kind, options=options_of(sets, "--camera-set", "device=/dev/video2"))
+
+
 @contextmanager
 def local_camera(kind: str, sets: Sequence[str]) -> Iterator[Camera]:
     """Open the camera plug-in `kind` with the options `sets` (`key=value`); close it at the end.
@@ -20,8 +25,7 @@ def local_camera(kind: str, sets: Sequence[str]) -> Iterator[Camera]:
         ConfigError: the kind or an option is invalid.
         HardwareError: the camera is missing.
     """
-    options = options_of(sets, "--camera-set", "device=/dev/video2")
-    camera = CAMERAS.build(PluginChoice(kind=kind, options=options))
+    camera = CAMERAS.build(camera_choice(kind, sets))
     try:
         yield camera
     finally:

@@ -21,7 +21,9 @@ from typing import Final
 from sightline.operator_side.doctor.finding import Finding, trouble
 from sightline.operator_side.preflight import needs
 from sightline.protocol import VERSION
-from sightline.protocol.errors import SightlineError
+from sightline.protocol.errors import SightlineError, WireError
+from sightline.protocol.jpeg import read_jpeg_size
+from sightline.protocol.messages import MOST_SIDE_PX
 from sightline.protocol.transports.diagnosis import listening_inodes, port_owner
 from sightline.protocol.transports.security import EXPIRES_SOON
 from sightline.protocol.transports.zenoh.session import MULTICAST_GROUP
@@ -281,20 +283,29 @@ def read_format(answer: bytes) -> str:
 
 
 def delivered(kind: str, sets: list[str]) -> Finding:
-    """Measure the rate that a camera delivers, or report its error."""
-    from sightline.operator_side.calibrate.local_camera import local_camera
+    """Measure the rate that a camera delivers of its option `fps`, if it has one, or report its error."""
+    from sightline.operator_side.calibrate.local_camera import camera_choice, local_camera
+    from sightline.robot_side.plugins import CAMERAS
 
+    stamps_us: list[int] = []
     try:
+        wanted = getattr(CAMERAS.load(camera_choice(kind, sets))[1], "fps", None) or 0.0
         with local_camera(kind, sets) as opened:
-            begun_s, stamps_us = time.monotonic(), []
+            begun_s = time.monotonic()
             while time.monotonic() - begun_s < _MEASURED_S:
-                picture = opened.read(0.5)
-                stamps_us += [picture.t_us] if picture else []
+                if picture := opened.read(0.5):
+                    read_jpeg_size(picture.jpeg, MOST_SIDE_PX**2)
+                    stamps_us.append(picture.t_us)
+    except WireError as error:
+        fix = "set its format to MJPG, or let its plug-in encode JPEG"
+        return Finding(f"camera {kind}", False, f"an image is not a valid JPEG: {error.detail}", fix)
     except SightlineError as error:
         return trouble(f"camera {kind}", error)
     if len(stamps_us) < 2:
         return Finding(f"camera {kind}", False, "no images", "connect it again, or end the program that uses it")
+    if stamps_us[-1] <= stamps_us[0]:
+        fix = "set Picture.t_us to the time of the exposure (monotonic_us)"
+        return Finding(f"camera {kind}", False, "the time of its images does not advance", fix)
     fps = (len(stamps_us) - 1) / (stamps_us[-1] - stamps_us[0]) * 1e6
-    wanted = next((float(one.partition("=")[2]) for one in sets if one.startswith("fps=")), 0.0)
     fix = "use more light (a camera exposes longer in the dark), a smaller size or another USB port"
     return Finding(f"camera {kind}", fps >= _ENOUGH * wanted, f"{fps:.1f}", fix, "fps", f"{wanted:g}")

@@ -18,11 +18,13 @@ from sightline.operator_side.doctor import machine as cameras
 from sightline.operator_side.doctor import network as between
 from sightline.operator_side.doctor.finding import Finding, as_object, histogram
 from sightline.operator_side.setup import keys
+from sightline.protocol.config import Config
 from sightline.protocol.errors import LinkError
 from sightline.protocol.transports import diagnosis
 from sightline.protocol.transports.diagnosis import port_owner
 from sightline.protocol.transports.zenoh.link import open_zenoh
 from sightline.robot_side.hardware.cameras.files import FolderCamera
+from sightline.robot_side.ports import Picture
 from tests.fixtures.links import START_S, until
 from tests.fixtures.ports import free_endpoint, free_port, port_of
 from tests.fixtures.robot_process import RobotProcess
@@ -277,6 +279,47 @@ def test_the_rate_that_a_camera_delivers_is_measured(capsys, monkeypatch):
     monkeypatch.setattr(FolderCamera, "read", stamped)
     check = _checks(capsys, "--camera", "folder", "--camera-set", "path=examples/pictures", "--camera-set", "fps=10")
     assert check["camera folder"]["ok"] and check["camera folder"]["value"] == 10.0
+
+
+class StampedCamera:
+    """Delivers an image per read, stamped `step_us` after the last one."""
+
+    model, live = None, True
+
+    class Config(Config):
+        step_us: int = 33_333
+        jpeg: str = "examples/pictures"
+        fps: float = 30.0
+
+    def __init__(self, config):
+        image = next(Path(config.jpeg).glob("*.jpg")).read_bytes() if config.jpeg else b"raw pixels"
+        self._images = (Picture(image, number * config.step_us) for number in itertools.count())
+
+    def read(self, timeout_s):
+        return next(self._images)
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize(("options", "ok", "value", "bound"), [
+    ([], True, 30.0, 30.0), (["step_us=454545"], False, 2.2, 30.0),  # the rate of its configuration, also by default
+    (["step_us=66666", "fps=0x0F"], True, 15.0, 15.0), (["step_us=66666", "fps =30"], False, 15.0, 30.0),
+    (["step_us=0"], False, "the time of its images does not advance", ""),
+    (["jpeg="], False, "an image is not a valid JPEG", ""),
+    (["step_us=-1"], False, "the time of its images does not advance", ""),
+])
+def test_camera_that_does_not_deliver_its_rate_is_reported(monkeypatch, options, ok, value, bound):
+    monkeypatch.setattr(cameras, "_MEASURED_S", 0.02)
+    found = cameras.delivered(f"{__name__}:StampedCamera", options)
+    check = found.check
+    assert (check["ok"], check["bound"]) == (ok, bound) and bool(check["fix"]) is not ok
+    assert check["value"].startswith(value) if isinstance(value, str) else check["value"] == value
+
+
+def test_invalid_rate_of_a_camera_is_an_error_of_its_configuration():
+    found = cameras.delivered("folder", ["path=examples/pictures", 'fps="fast"'])
+    assert found.ok is False and "fps" in found.value
 
 
 @pytest.mark.slow
