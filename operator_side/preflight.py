@@ -1,6 +1,7 @@
 """Checks of what a command needs: its extra is installed, and its result can be written. Shell (files)."""
 
 import os
+import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -56,3 +57,23 @@ def writes(path: Path, fix: str = "choose another file") -> Iterator[None]:
         yield
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror or error}; {fix}") from None
+
+
+def write_whole(path: Path, text: str, fix: str = "choose another file") -> None:
+    """Write a text file as a whole or not at all; a symbolic link stays one. Raises ConfigError.
+
+    What cannot be replaced, e.g. `/dev/stdout` or a file in a folder of another user, is written in place.
+    """
+    target = Path(os.path.realpath(path))
+    is_replaced = not target.exists() or (target.is_file() and os.access(target.parent, os.W_OK))
+    part = target.with_name(f".{target.name}.part") if is_replaced else target
+    with writes(path, fix):
+        try:
+            part.write_bytes(text.encode())
+            if is_replaced and target.exists():
+                shutil.copymode(target, part)
+            if is_replaced:
+                part.replace(target)
+        finally:
+            if is_replaced:
+                part.unlink(missing_ok=True)

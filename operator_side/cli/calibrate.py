@@ -36,7 +36,7 @@ from sightline.operator_side.client.pictures import Pictures, viewer_role
 from sightline.operator_side.config.context import RobotAddress, target_of
 from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.config.loading import load_service
-from sightline.operator_side.preflight import check_out_file, needs, writes
+from sightline.operator_side.preflight import check_out_file, needs, write_whole
 from sightline.protocol.channels import FRAME
 from sightline.protocol.errors import ConfigError, SightlineError, home_path
 from sightline.protocol.transports.open import open_link
@@ -99,8 +99,7 @@ def drive(
         _measure_rows(robot, duties, seconds, rows, confirmed=yes)
         text = _table(rows, seconds)
         table_of(text, "these measurements")  # nothing is written that cannot be read again
-        with writes(out, "choose another --out"):
-            out.write_text(text, "utf-8")
+        write_whole(out, text, "choose another --out")
     except (SightlineError, typer.Abort, KeyboardInterrupt):  # Abort: also the end of stdin
         if rows:
             typer.echo(f"not written; the measured table is:\n{_table(rows, seconds)}", err=True)
@@ -161,6 +160,7 @@ def _prompt(question: str) -> str:
 
 _BOARD = re.compile(r"([0-9]{1,2})x([0-9]{1,2})")
 _BALL_PICTURES = 20
+_FARTHEST_LENS_M = 100.0
 _MOST_IN_FOLDER = 100  # the whole folder, within limits: the time of the fit grows with every view
 
 Meters = Annotated[float | None, typer.Option(help="Position of the lens, from the center of the axle on the floor.")]
@@ -207,6 +207,7 @@ def camera(
     check_camera_sets(camera, camera_sets)
     wanted = _subject(board, square_m, ball_radius_m, distance_m)
     given = {"x_m": x_m, "y_m": y_m, "z_m": z_m, "pitch_rad": pitch_rad}
+    _check_mounting(given)
     with needs("vision"), ExitStack() as ending:
         source, mounted = _source(ending, pictures, (camera, camera_sets or []), (robot, connect, secure), seconds)
         mounting = _mounting(mounted, given)
@@ -260,6 +261,15 @@ def _source(
     return sources.robot_pictures(link, seconds, role, secure), mounted
 
 
+def _check_mounting(given: Mapping[str, float | None]) -> None:
+    """Raise ConfigError for a value that no model may have, before the measurement."""
+    for name, value in given.items():
+        bound, unit = (round(math.pi / 2, 3), "radians") if name == "pitch_rad" else (_FARTHEST_LENS_M, "meters")
+        if value is not None and not -bound <= value <= bound:
+            option = f"--{name.replace('_', '-')}"
+            raise ConfigError(f"invalid {option} {value:g}: expected {unit} from -{bound:g} to {bound:g}")
+
+
 def _mounting(known: dict[str, float], given: dict[str, float | None]) -> "Mounting":
     from sightline.operator_side.calibrate.camera import Mounting
 
@@ -301,8 +311,12 @@ def _write(path: Path, made: "Calibration") -> None:
     from sightline.operator_side.config.toml_text import toml_text
 
     head = f"# {made.used} of {made.given} images, {made.error:.2f} {made.error_unit}\n"
-    with writes(path, "choose another --out"):
-        path.write_text(head + toml_text(made.model.model_dump(mode="json")), "utf-8")
+    text = head + toml_text(made.model.model_dump(mode="json"))
+    try:
+        write_whole(path, text, "choose another --out")
+    except ConfigError:
+        typer.echo(f"not written; the measured model is:\n{text}", err=True)
+        raise
 
 
 def _hfov_deg(made: "Calibration") -> float:

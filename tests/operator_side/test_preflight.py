@@ -1,8 +1,11 @@
 """The place of a result is checked before the work; each problem is one line."""
 
+import os
+from pathlib import Path
+
 import pytest
 
-from sightline.operator_side.preflight import check_out_file
+from sightline.operator_side.preflight import check_out_file, write_whole
 from sightline.protocol.errors import ConfigError
 
 
@@ -31,3 +34,24 @@ def test_unwritable_file_is_reported(tmp_path, monkeypatch, name, words):
     monkeypatch.setattr("os.access", lambda path, mode: path != locked)
     with pytest.raises(ConfigError, match=words):
         check_out_file(tmp_path / name)
+
+
+def test_written_file_keeps_its_mode_and_a_link_to_it(tmp_path):
+    file, link = tmp_path / "real.toml", tmp_path / "link.toml"
+    link.symlink_to("real.toml")
+    write_whole(link, "new\r\n")
+    file.chmod(0o640)
+    write_whole(link, "newer\r\n")
+    assert link.is_symlink() and file.read_bytes() == b"newer\r\n" and file.stat().st_mode & 0o777 == 0o640
+    assert sorted(tmp_path.iterdir()) == [link, file]
+
+
+def test_device_is_written_and_not_replaced(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with os.fdopen(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)) as reader:
+        write_whole(pipe, "text")
+        assert reader.read() == "text" and pipe.is_fifo()
+    with pytest.raises(ConfigError, match="cannot write /dev/full: No space left on device; choose another file"):
+        write_whole(Path("/dev/full"), "text")
+    assert Path("/dev/full").is_char_device()

@@ -1,8 +1,10 @@
 """`sightline calibrate camera`: it recovers the model of a drawn camera and reports impossible measurements."""
 
+import errno
 import json
 import math
 import struct
+import tomllib
 from functools import cache
 
 import cv2
@@ -13,6 +15,7 @@ import typer
 from sightline.operator_side.calibrate.camera import (
     Ball,
     Board,
+    Calibration,
     Mounting,
     ball_finder,
     collect,
@@ -24,6 +27,7 @@ from sightline.operator_side.calibrate.camera import (
 from sightline.operator_side.cli import calibrate as cli_calibrate
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.jpeg import JpegSize
+from sightline.protocol.messages import CameraModel
 from sightline.robot_side.hardware.cameras.files import StillCamera
 from sightline.robot_side.hardware.cameras.lens import guessed_model, read_model
 from sightline.vision_side.config import HsvConfig
@@ -258,6 +262,35 @@ def test_bad_output_file_is_reported_before_the_measurement(tmp_path):
 def test_bad_usage_is_one_line(arguments, said):
     with pytest.raises(ConfigError, match=said):
         run(*arguments)
+
+
+@pytest.mark.parametrize(("option", "value", "words"), [
+    ("--x-m", "nan", "invalid --x-m nan: expected meters from -100 to 100"), ("--z-m", "inf", "invalid --z-m inf"),
+    ("--pitch-rad", "99", "invalid --pitch-rad 99: expected radians from -1.571 to 1.571"), ("--y-m", "-1e3", "--y-m"),
+])  # fmt: skip
+def test_impossible_mounting_is_reported_before_the_measurement(tmp_path, monkeypatch, option, value, words):
+    monkeypatch.setattr(cli_calibrate, "_source", lambda *_: pytest.fail("measured"))
+    with pytest.raises(ConfigError, match=words):
+        run("--pictures", tmp_path, "--out", tmp_path / "camera.toml", option, value)
+
+
+def test_model_that_cannot_be_written_is_printed_and_the_earlier_one_stays(tmp_path, monkeypatch, capsys):
+    pictures, out = folder(tmp_path, [EMPTY]), tmp_path / "camera.toml"
+    made = Calibration(TRUTH, 8, 9, 0.1, "px RMS")
+    monkeypatch.setattr(cli_calibrate, "_measure", lambda *_, **__: made)
+    out.write_text("earlier")
+    write_bytes = type(out).write_bytes
+
+    def on_a_full_disk(path, data):
+        write_bytes(path, data[:20])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(type(out), "write_bytes", on_a_full_disk)
+    with pytest.raises(ConfigError, match=f"cannot write {out}: No space left on device; choose another --out"):
+        run("--pictures", pictures, "--out", out)
+    printed = capsys.readouterr().err.partition("the measured model is:\n")[2]
+    assert CameraModel.model_validate_json(json.dumps(tomllib.loads(printed))) == TRUTH
+    assert out.read_text() == "earlier" and sorted(path.name for path in tmp_path.iterdir()) == ["00.jpg", out.name]
 
 
 def test_images_of_two_sizes_are_rejected(tmp_path):
