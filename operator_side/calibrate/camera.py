@@ -101,15 +101,17 @@ def is_new_view(corners: Corners, earlier: Sequence[Corners], size: JpegSize) ->
 
 
 def from_boards(
-    found: Sequence[Corners], board: Board, size: JpegSize, given: int, mounting: Mounting
+    found: Sequence[Corners], board: Board, size: JpegSize, given: int, mounting: Mounting, *, repeated: int = 0
 ) -> Calibration:
     """Fit focal length, center and distortion to `found`, the boards in `given` images of `size`.
+
+    `repeated` further images show a board in an earlier position. The length of the squares has no effect.
 
     Raises:
         ConfigError: too few boards or a poor fit; the error names the remedy.
     """
     if len(found) < MIN_BOARDS:
-        raise ConfigError(_too_few(len(found), given, board))
+        raise ConfigError(_too_few(len(found), repeated, given, board))
     pixels = (size.width_px, size.height_px)
     rms_px, matrix, distortion, turns, _, sigma, *_ = cv2.calibrateCameraExtended(
         [board.points_m()] * len(found), list(found), pixels, np.eye(3), np.zeros(5), flags=_FLAGS
@@ -119,13 +121,16 @@ def from_boards(
     return Calibration(model, len(found), given, float(rms_px), "px RMS")
 
 
-def _too_few(found: int, given: int, board: Board) -> str:
+def _too_few(found: int, repeated: int, given: int, board: Board) -> str:
     what = f"a chessboard of {board.columns} x {board.rows} inner corners"
     if not found:
         return (
             f"no board in {given} images: they must show {what} completely, flat and evenly lit; "
             "set --board to the number of inner corners"
         )
+    if repeated:
+        return (f"{what} is in {found + repeated} of {given} images, {repeated} of them repeat an earlier position, at "
+                f"least {MIN_BOARDS} different ones are necessary; move and tilt the board between images")
     return f"{what} is in {found} of {given} images, at least {MIN_BOARDS} are necessary; take more from other angles"
 
 
@@ -241,12 +246,13 @@ Found = TypeVar("Found")
 
 @dataclass(frozen=True, slots=True)
 class Collected(Generic[Found]):
-    """The results in `given` images of one size. Others of a live source were `skipped`."""
+    """The results in `given` images of one size, without `repeated` ones. Others of a live source were `skipped`."""
 
     size: JpegSize
     found: list[Found]
     given: int
     skipped: int
+    repeated: int = 0
 
 
 def folder_pictures(folder: Path) -> Iterator[bytes]:
@@ -324,7 +330,7 @@ def collect(
         ConfigError: there is no image, or unless `is_live`, one is damaged or of another size.
     """
     found: list[Found] = []
-    size, given, skipped = None, 0, 0
+    size, given, skipped, repeated = None, 0, 0, 0
     for jpeg in pictures:
         try:
             own = _size_of(jpeg, size, may_grow=is_live)
@@ -334,18 +340,20 @@ def collect(
             skipped += 1
             continue
         if size is None or own.width_px > size.width_px:
-            size, find, given, skipped = own, finder(own), 0, skipped + given
+            size, find, given, skipped, repeated = own, finder(own), 0, skipped + given, 0
             found.clear()
         given += 1
         one = find(jpeg)
-        if one is not None and is_new(one, found, size):
+        if one is not None and not is_new(one, found, size):
+            repeated += 1
+        elif one is not None:
             found.append(one)
             report(f"{len(found)} of {enough}")
         if len(found) >= enough:
             break
     if size is None:
         raise ConfigError("no image from the camera; run `sightline doctor --camera v4l2`")
-    return Collected(size, found, given, skipped)
+    return Collected(size, found, given, skipped, repeated)
 
 
 def _size_of(jpeg: bytes, size: JpegSize | None, *, may_grow: bool) -> JpegSize:

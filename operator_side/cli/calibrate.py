@@ -169,7 +169,7 @@ Meters = Annotated[float | None, typer.Option(help="Position of the lens, from t
 def register(app: typer.Typer) -> None:
     """Add the commands to `app`."""
     group = command_group("Measure a robot's camera or drive")
-    group.command(epilog="Example: sightline calibrate camera --camera v4l2 --square-m 0.025")(camera)
+    group.command(epilog="Example: sightline calibrate camera --camera v4l2 --board 9x6")(camera)
     group.command(epilog="Example: sightline calibrate drive --config raspberry-car.toml")(drive)
     app.add_typer(group, name="calibrate")
     app.command("pick-color", epilog="Example: sightline pick-color r1 --config vision.toml")(pick_color)
@@ -184,7 +184,7 @@ def camera(
     connect: ServiceConnect = None,
     secure: Secure = "",
     board: Annotated[str, typer.Option(metavar="CxR", help="Inner corners of the chessboard.")] = "9x6",
-    square_m: Annotated[float, typer.Option(min=0.001, max=1, help="Side of one square, meters.")] = 0.025,
+    square_m: Annotated[float, typer.Option(min=0.001, max=1, help="Ignored: it does not change the model.")] = 0.025,
     ball_radius_m: Annotated[float | None, typer.Option(min=0.005, max=2, help="Radius of a ball, meters.")] = None,
     distance_m: Annotated[float | None, typer.Option(min=0.1, max=20, help="Lens to ball on the floor.")] = None,
     config: Annotated[
@@ -293,7 +293,8 @@ def _measure(
         boards = collect(pictures, lambda _: lambda jpeg: calibrate.find_board(jpeg, wanted), calibrate.is_new_view,
                          views, report, is_live=is_live)
         _print_skipped(boards.skipped)
-        return calibrate.from_boards(boards.found, wanted, boards.size, boards.given, mounting)
+        return calibrate.from_boards(boards.found, wanted, boards.size, boards.given, mounting,
+                                     repeated=boards.repeated)
     hsv = _vision_config(config).hsv
     balls = collect(pictures, lambda size: calibrate.ball_finder(size, hsv), lambda *_: True, _BALL_PICTURES, _quiet,
                     is_live=is_live)

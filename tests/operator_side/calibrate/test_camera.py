@@ -5,6 +5,7 @@ import json
 import math
 import struct
 import tomllib
+from dataclasses import replace
 from functools import cache
 
 import cv2
@@ -133,7 +134,19 @@ def test_image_with_an_orientation_is_measured_as_the_camera_took_it(orientation
 def test_the_same_view_is_taken_once():
     pictures = [tilted_view(0)] * 5 + [tilted_view(1)]
     got = collect(iter(pictures), lambda _: lambda jpeg: find_board(jpeg, BOARD), is_new_view, 99, lambda _: None)
-    assert (len(got.found), got.given) == (2, 6)
+    assert (len(got.found), got.given, got.repeated) == (2, 6, 4)
+
+
+def test_boards_that_all_stand_in_one_place_are_reported_as_that(tmp_path):
+    pictures = folder(tmp_path, [tilted_view(0)] * 6)
+    with pytest.raises(ConfigError, match=r"7 x 5 inner corners is in 6 of 6 images, 5 of them repeat an ear"):
+        run("--pictures", pictures, "--board", "7x5", "--out", tmp_path / "camera.toml")
+
+
+def test_size_of_the_squares_has_no_effect():
+    boards = [replace(BOARD, square_m=square_m) for square_m in (0.01, 0.5)]
+    small, large = (from_boards(found(), board, SIZE, VIEWS, Mounting()).model for board in boards)
+    assert small.fx_px == pytest.approx(large.fx_px, rel=1e-4) and small.cx_px == pytest.approx(large.cx_px, abs=0.05)
 
 
 def test_damaged_and_scaled_images_of_a_live_source_are_skipped_and_counted():
