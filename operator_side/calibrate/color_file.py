@@ -4,6 +4,7 @@ tomlkit edits the text, since the standard library only reads TOML. Python's TOM
 it is as intended, nothing is changed.
 """
 
+import os
 import re
 import shutil
 import tomllib
@@ -82,16 +83,22 @@ def check_config(path: Path) -> None:
 
 
 def write_ranges(path: Path, ranges: Ranges) -> None:
-    """Set `hsv.ranges` in the file, or create it; it changes as a whole or not at all. Raises ConfigError."""
-    unfinished = path.with_name(f".{path.name}.part")
+    """Set `hsv.ranges` in the file, or create it; it changes as a whole or not at all. Raises ConfigError.
+
+    A symbolic link stays one, and the lines keep their ends.
+    """
+    target = Path(os.path.realpath(path))
+    unfinished = target.with_name(f".{target.name}.part")
     try:
-        before = path.read_text("utf-8") if path.exists() else ""
+        before = target.read_bytes().decode() if target.exists() else ""
         after = with_ranges(before, ranges)
-        unfinished.write_text(after, "utf-8")
-        if path.exists():
-            shutil.copymode(path, unfinished)
+        if "\r\n" in before and "\n" not in before.replace("\r\n", ""):
+            after = after.replace("\r\n", "\n").replace("\n", "\r\n")
+        unfinished.write_bytes(after.encode())
+        if target.exists():
+            shutil.copymode(target, unfinished)
         load_service("vision", file=str(unfinished), environ={})  # an invalid configuration is not written
-        unfinished.replace(path)
+        unfinished.replace(target)
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "not a text file"
         raise ConfigError(f"cannot write {path}: {why}; choose another file") from None

@@ -27,6 +27,7 @@ from sightline.operator_side.cockpit.frame_buffer import FrameBuffer
 from sightline.operator_side.cockpit.http_server import HttpAnswer, PageRequest, Route, as_json, page
 from sightline.operator_side.recording.film import jpeg_pixels
 from sightline.protocol.errors import ConfigError, LinkError, WireError
+from sightline.protocol.messages import LEAST_SIDE_PX
 from sightline.robot_side.hardware.cameras.files import quiet_videos
 
 MAX_FILE_BYTES: Final = 50_000_000
@@ -120,6 +121,9 @@ def of_picture(path: Path) -> list[Image]:
         picture = None
     if picture is None:
         raise ConfigError(f"invalid image {path}; use a PNG or JPEG")
+    if min(picture.shape[:2]) < LEAST_SIDE_PX:
+        size = f"{picture.shape[1]}x{picture.shape[0]}"
+        raise ConfigError(f"{path} has {size}, at least {LEAST_SIDE_PX} pixels a side; use a larger image")
     if picture.shape[0] * picture.shape[1] > MAX_PIXELS:
         size = f"{picture.shape[1]}x{picture.shape[0]}"
         raise ConfigError(f"{path} has {size}, at most {MAX_PIXELS // 1_000_000} megapixels; use a smaller image")

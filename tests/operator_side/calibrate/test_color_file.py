@@ -89,6 +89,25 @@ def test_vision_reads_the_written_ranges(tmp_path):
         check_config(tmp_path / "none" / "vision.toml")
 
 
+@pytest.mark.parametrize("before", ["", "robot = 'r1'", "robot = 'r1'\n", "robot = 'r1'\r\n[hsv]\n"])
+def test_file_whose_line_ends_are_not_those_of_windows_gets_none_of_them(tmp_path, before):
+    (tmp_path / "vision.toml").write_bytes(before.encode())
+    write_ranges(tmp_path / "vision.toml", YELLOW)
+    assert (tmp_path / "vision.toml").read_bytes().count(b"\r") == before.count("\r")
+
+
+def test_link_to_the_file_and_its_line_ends_stay(tmp_path):
+    file, link = tmp_path / "shared.toml", tmp_path / "vision.toml"
+    link.symlink_to(file.name)
+    before = b"# mine\r\n[hsv]\r\nshape = 'any'\r\n\r\n[target]\r\nradius_m = 0.05\r\n"
+    file.write_bytes(before)
+    write_ranges(link, YELLOW)
+    after = file.read_bytes()
+    assert link.is_symlink() and sorted(tmp_path.iterdir()) == [file, link]
+    assert after.count(b"\n") == after.count(b"\r\n") > before.count(b"\n")
+    assert [line for line in before.split(b"\r\n") if line not in after.split(b"\r\n")] == []
+
+
 # --- the command, without a browser --------------------------------------------------------------------------------
 
 
@@ -142,6 +161,7 @@ def test_libraries_print_nothing_about_an_invalid_video():
     ("r1 --picture ball.png --at 1,1", "ROBOT and --picture exclude each other"),
     ("--picture none.png --at 1,1", "cannot read none.png: No such file"),
     ("--picture vision.toml --at 1,1", "invalid image vision.toml"),
+    ("--picture tiny.png --at 0,0", "tiny.png has 20x2, at least 16 pixels a side"),
     ("--video none.mp4 --at 1,1", "is not a file; name a video"),
     ("--video vision.toml --at 1,1", "invalid video vision.toml"),
     ("--picture ball.png --json", "add --at X,Y"),
@@ -154,6 +174,7 @@ def test_libraries_print_nothing_about_an_invalid_video():
 def test_failed_pick_is_one_line_and_writes_nothing(there, capsys, arguments, words):
     (there / "vision.toml").write_text("")
     (there / "bad.toml").write_text("hvs = 1\n")
+    cv2.imwrite("tiny.png", np.full((2, 20, 3), (30, 200, 40), np.uint8))
     before = {one.name: one.read_bytes() for one in there.iterdir()}
     assert run(["pick-color", *arguments.split()]) == 2
     said = capsys.readouterr()
