@@ -223,9 +223,11 @@ def install(
             planned = units.with_state_in(planned, loaded.state_dir)
     if not yes:
         _show(planned, beside)
-        if service == "robot" and not file.exists():
-            typer.echo(f"{file} does not exist yet; with a gpio drive in it, a second file sets the pins low", err=True)
+        if not file.exists():
+            second = "; with a gpio drive in it, a second file sets the pins low" if service == "robot" else ""
+            typer.echo(f"{file} does not exist yet{second}; create it before --yes", err=True)
         return
+    units.check_user(runs_it)
     stale = units.drop_in_path(planned.path.parent)
     if service == "robot" and beside is None and units.take_away(stale):
         typer.echo(f"removed {stale}: the drive of this robot is not gpio")

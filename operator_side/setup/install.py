@@ -5,6 +5,7 @@ The units are readable files (`robot_side/systemd`, `vision_side/systemd`); only
 
 import grp
 import os
+import pwd
 import re
 import subprocess
 from contextlib import suppress
@@ -60,8 +61,8 @@ def plan(
     if instances is not None and not 1 <= instances <= MAX_INSTANCES:
         raise ConfigError(f"invalid --instances {instances}: expected 1 to {MAX_INSTANCES}")
     for what, text in (("program", str(program)), ("config", str(config)), ("user", user)):
-        if not text or any(letter.isspace() or letter in "%\"'\\" for letter in text):
-            raise ConfigError(f"invalid {what} '{text}' for a unit; remove spaces, quotes and %")
+        if not text or any(letter.isspace() or letter in "$%\"'\\" for letter in text):
+            raise ConfigError(f"invalid {what} '{text}' for a unit; remove spaces, quotes, $ and %")
     name = f"sightline-{service}{'' if instances is None else '@'}.service"
     units = (name,) if instances is None else tuple(name.replace("@", f"@{k}") for k in range(1, instances + 1))
     unit = files(f"sightline.{service}_side").joinpath("systemd", name).read_text()
@@ -69,6 +70,14 @@ def plan(
     if not re.fullmatch(NAME_PATTERN, f"{os.uname().nodename.partition('.')[0]}-{MAX_INSTANCES}"):
         unit = unit.replace(_NAME, "")  # the service makes one
     return InstallPlan(service, unit_dir / name, _fitted(unit, service, program, config), units)
+
+
+def check_user(user: str) -> None:
+    """Raise ConfigError for an account that this machine does not have: systemd starts no service for it."""
+    try:
+        pwd.getpwuid(int(user)) if user.isdigit() else pwd.getpwnam(user)
+    except (KeyError, ValueError, OverflowError):
+        raise ConfigError(f"unknown user '{user}'; create the account or name another one with --user") from None
 
 
 def with_state_in(planned: InstallPlan, folder: Path) -> InstallPlan:

@@ -11,6 +11,7 @@ from typer.main import get_command
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli.commands import app
 from sightline.operator_side.setup import install
+from sightline.operator_side.setup.install import check_user
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.config import PluginChoice, RobotConfig
 
@@ -55,6 +56,7 @@ def test_unit_zeroes_the_motors_after_every_end(tmp_path):
 @pytest.mark.parametrize(("service", "config", "user"), [
     ("sim", CONFIG, "pi"), ("robot", Path("/a b.toml"), "pi"), ("robot", CONFIG, ""), ("robot", CONFIG, "p%i"),
     ("vision", Path("/x\nUser=root"), "pi"),
+    ("robot", Path("/home/${HOME}/robot.toml"), "pi"), ("robot", CONFIG, "$USER"),
 ])  # fmt: skip
 def test_value_that_changes_the_unit_is_rejected(service, config, user, tmp_path):
     with pytest.raises(ConfigError):
@@ -163,7 +165,20 @@ def vision(monkeypatch, tmp_path):
 
     monkeypatch.setattr(install, "UNIT_DIR", units)
     monkeypatch.setattr(install, "_systemctl", systemctl)
+    monkeypatch.setattr(install, "check_user", lambda _user: None)
     return ["install", "vision", "--config", str(file), "--user", "pi"], units, calls
+
+
+@pytest.mark.parametrize(("user", "is_known"), [
+    ("root", True), ("0", True), ("no-such-user", False), ("4294967294", False), ("9" * 30, False)])
+def test_service_is_installed_only_for_an_account_of_this_machine(vision, capsys, monkeypatch, user, is_known):
+    monkeypatch.setattr(install, "check_user", check_user)
+    command, units, calls = vision
+    command = [*command[:-1], user]
+    assert cli.run(command) == 0, "a unit is shown for another machine, too"
+    assert cli.run([*command, "--yes"]) == (0 if is_known else 2)
+    assert (f"unknown user '{user}'; create the account" in capsys.readouterr().err) is not is_known
+    assert bool(calls) is (units / "sightline-vision.service").exists() is is_known
 
 
 def _instances(*numbers):
@@ -253,6 +268,7 @@ def car(monkeypatch, tmp_path):
     units.mkdir()
     monkeypatch.setattr(install, "UNIT_DIR", units)
     monkeypatch.setattr(install, "_systemctl", told.append)
+    monkeypatch.setattr(install, "check_user", lambda _user: None)
     return file, units, told
 
 
@@ -316,3 +332,5 @@ def test_missing_configuration_is_reported(car, capsys):
     file.unlink()
     assert cli.run(["install", "robot", "--config", str(file), "--user", "pi"]) == 0
     assert "does not exist yet; with a gpio drive" in capsys.readouterr().err
+    assert cli.run(["install", "vision", "--config", str(file), "--user", "pi"]) == 0
+    assert f"{file} does not exist yet; create it before --yes" in capsys.readouterr().err
