@@ -61,6 +61,9 @@ RECORDING: Final = "run.mcap"
 MOTOR_LOG: Final = "motors.csv"
 _MARKS: Final = ("sim.log", "sightline/sim.log")
 """Files of an earlier run and of an earlier story, which the next one in the same folder replaces."""
+_RESULTS: Final = ("score.json", "trajectory.png", "run.mp4", RECORDING, MOTOR_LOG, "robot.log", "vision.log",
+                   "labels.log")
+"""Files of an earlier run that the next one removes first: if it fails, they are not to pass for its own."""
 OTHER_FOLDER: Final = "free some space or pass another folder with --out"
 TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}", "legacy": "ws-legacy://127.0.0.1:{}"}
 """Endpoint of the vision service by transport. The operator and the recorder always use Zenoh."""
@@ -119,6 +122,9 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
     scenario = load_scenario(options.scenario)
     _check_vision(options, scenario)
     run = DemoRun(options, scenario, run_folder(options.out, f"{scenario.name}-{options.seed}"))
+    for file in map(run.folder.joinpath, _RESULTS):
+        with writes(file, OTHER_FOLDER):
+            file.unlink(missing_ok=True)
     with ExitStack() as ending:
         ending.enter_context(terminated_like_interrupted())
         processes = ending.enter_context(Processes(run.folder))
@@ -237,7 +243,8 @@ def _write_configuration(run: DemoRun, sockets: str) -> None:
             "motor_log": str(run.folder / MOTOR_LOG),
         },
         "robot": laid_over(robot_table(model), {
-            "robot": ROBOT, "state_dir": str(run.folder / "state"), "camera": device, "drive": device,
+            # Not in the run folder: a STOP ends with its robot, and the next run in that folder drives again.
+            "robot": ROBOT, "state_dir": str(Path(sockets) / "state"), "camera": device, "drive": device,
             "safety": {"guests": legacy},
         }),
         "vision": {

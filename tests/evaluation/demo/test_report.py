@@ -2,7 +2,9 @@
 
 import json
 import shutil
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -146,6 +148,30 @@ def test_configuration_that_cannot_be_written_is_reported(lights, tmp_path):
     (tmp_path / "robot.toml").mkdir()
     with pytest.raises(ConfigError, match=f"cannot write {tmp_path}/robot.toml: Is a directory; free some space"):
         demo_run._write_configuration(replace(lights, folder=tmp_path), "/tmp/sockets")
+
+
+def test_stop_of_a_run_does_not_outlast_it(lights, tmp_path):
+    demo_run._write_configuration(replace(lights, folder=tmp_path), "/tmp/sockets")
+    robot = tomllib.loads((tmp_path / "robot.toml").read_text())
+    assert Path(robot["state_dir"]).is_relative_to("/tmp/sockets"), "the processes remove it at their end"
+
+
+def test_run_that_fails_leaves_no_result_of_an_earlier_one(tmp_path, monkeypatch):
+    earlier = ("score.json", "trajectory.png", "run.mp4", RECORDING, MOTOR_LOG, "sim.log", "robot.log", "labels.log")
+    for name in (*earlier, "notes.txt"):
+        (tmp_path / name).touch()
+
+    def fail(*_given):
+        raise CheckError("the robot would not be armed")
+
+    monkeypatch.setattr(demo_run, "_drive", fail)
+    with pytest.raises(CheckError):
+        demo_run.run_demo(DemoOptions(out=tmp_path), print)
+    kept = sorted(path.name for path in tmp_path.iterdir())
+    assert kept == ["notes.txt", "sim.log"], "the log marks the folder as one of runs"
+    (tmp_path / "run.mp4").mkdir()
+    with pytest.raises(ConfigError, match=r"cannot write .*run.mp4: Is a directory; free some space"):
+        demo_run.run_demo(DemoOptions(out=tmp_path), print)
 
 
 def test_interrupt_before_the_first_sample_ends_the_demo(tmp_path, monkeypatch):
