@@ -59,7 +59,9 @@ def _typed(arguments: Sequence[str]) -> Any:
     try:
         with _connecting_printed() if "--json" not in arguments else nullcontext():
             return app(list(arguments), standalone_mode=False, prog_name="sightline")
-    except typer.Abort:
+    except typer.Abort as ending:
+        if isinstance(ending.__cause__, EOFError):  # of the program, e.g. an empty file, not the user's end of input
+            raise ending.__cause__ from None
         return INTERRUPTED
     except SystemExit as ending:
         if isinstance(ending.__context__, BrokenPipeError):  # which typer takes for an unexpected error

@@ -2,6 +2,7 @@
 
 import ast
 import importlib.metadata
+import io
 import json
 import math
 import os
@@ -285,6 +286,18 @@ def test_interrupted_faults_name_the_folder_of_their_logs(capsys, monkeypatch, t
     left = [str(folder) for folder in tmp_path.iterdir()]
     assert code == 130 and len(left) == has_logs and all(folder in err for folder in left)
     assert ("logs of failed and interrupted rows are in" in err) is has_logs
+
+
+def test_empty_file_that_a_command_reads_is_not_an_interrupt(capsys, monkeypatch):
+    def read(_pickled):
+        raise EOFError("Ran out of input")
+
+    monkeypatch.setattr("sightline.evaluation.faults.runner.run_cases", lambda *_given: read(b""))
+    code, _, err = run(capsys, "faults", "--only", "vision.kill")
+    assert code == cli.UNEXPECTED and err.splitlines()[-1].startswith("error: unexpected EOFError: Ran out of input;")
+    monkeypatch.setattr("sightline.evaluation.faults.runner.run_cases", lambda *_given: typer.confirm("go on"))
+    monkeypatch.setattr("sys.stdin", io.StringIO(""))
+    assert run(capsys, "faults", "--only", "vision.kill")[0] == cli.INTERRUPTED
 
 
 @pytest.mark.parametrize(("mission", "option"), [("follow", "target.label"), ("legs", "label")])
