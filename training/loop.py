@@ -1,6 +1,7 @@
 """The network in PyTorch and the training loop: batches, checkpoints, averaged weights. Shell (threads, files)."""
 
 import hashlib
+import io
 import json
 import os
 import signal
@@ -21,6 +22,7 @@ import torch
 from torch import nn
 
 from sightline.protocol.errors import ConfigError, HardwareError
+from sightline.protocol.log import error_text
 from sightline.sim.scenes.model import LABELS
 from sightline.training.export import shifted
 from sightline.training.network import (
@@ -159,6 +161,7 @@ _JOIN_TIMEOUT: Final = timedelta(minutes=3)
 CHECKPOINT: Final = "checkpoint.pt"
 _CHECKPOINT_EVERY: Final = 100
 _LOG_EVERY: Final = 50
+_LONGEST: Final = 160  # of an error of PyTorch
 
 
 def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
@@ -260,12 +263,17 @@ def _made_by(scenes: DrawnScenes, training: Training) -> str:
 
 
 def _checkpoint(path: Path, made_by: str, device: Any) -> dict[str, Any] | None:
-    """Read the checkpoint, if there is one. Raises ConfigError for a checkpoint of another training."""
+    """Read the checkpoint, if there is one. Raises ConfigError for one that is damaged or of another training."""
     if not path.exists():
         return None
-    kept: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
-    if kept["training"] != made_by:
-        raise ConfigError(f"{path} is of a training with other settings or scenes: {kept['training']}; remove it, "
+    try:
+        kept: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
+        training = kept["training"]
+    except Exception as error:  # PyTorch raises errors of many classes for a damaged file
+        raise ConfigError(f"checkpoint {path} cannot be read ({error_text(error)[:_LONGEST]}); remove it to train from "
+                          "the start, or name another --out") from None
+    if training != made_by:
+        raise ConfigError(f"{path} is of a training with other settings or scenes: {training}; remove it, "
                           "or name another --out")
     return kept
 
@@ -336,12 +344,21 @@ class _State:
         return torch.as_tensor(array).to(self._device, non_blocking=True)
 
     def save(self, path: Path, step: int) -> None:
-        """Written beside and moved, so that a cut leaves the one before."""
+        """Written beside and moved, so that a cut leaves the one before. Raises OSError, e.g. on a full disk."""
+        content = io.BytesIO()  # PyTorch would raise an error of its own for a full disk
         torch.save({
             "training": self._made_by, "step": step, "network": self.network.state_dict(),
             "average": self.average, "optimiser": self._optimizer.state_dict(), "schedule": self._schedule.state_dict(),
-        }, path.with_suffix(".part"))
-        path.with_suffix(".part").replace(path)
+        }, content)
+        part = path.with_suffix(".part")
+        try:
+            with part.open("wb") as file:
+                file.write(content.getbuffer())
+                file.flush()
+                os.fsync(file.fileno())  # else it may be empty after a power cut
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
 
     def load(self, path: Path) -> int:
         """Load a checkpoint. Returns the next step, 0 without one. Raises ConfigError for one of another training."""

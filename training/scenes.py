@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
@@ -204,10 +205,14 @@ def _check_photographs(folder: Path) -> None:
 
 def _would_be_the_same(pictures: Path, notes: Path, source: SceneSource) -> bool:
     """Check that they were drawn whole, as many, and as they would be now: the first of each kind are compared."""
-    rows = json.loads(notes.read_text("utf-8")) if notes.exists() and pictures.exists() else []
-    if len(rows) != source.total:
+    if not notes.exists() or not pictures.exists():
         return False
-    drawn = np.load(pictures, mmap_mode="r")
+    try:
+        rows, drawn = json.loads(notes.read_text("utf-8")), np.load(pictures, mmap_mode="r")
+    except (ValueError, EOFError):  # damaged, e.g. cut by a full disk
+        return False
+    if len(rows) != source.total or len(drawn) != source.total:
+        return False
 
     def is_current(number: int) -> bool:
         scene = source.drawn(renderer, number)
@@ -228,6 +233,7 @@ def _truth(one: list[Any]) -> LabelledBox:
 def _draw_all(pictures: Path, notes: Path, source: SceneSource, jobs: int, advance: Callable[[int], None]) -> None:
     shape = (source.total, HEIGHT_PX, WIDTH_PX, 3)
     np.lib.format.open_memmap(pictures, "w+", np.uint8, shape).flush()
+    _reserve(pictures)
     rows: list[dict[str, Any]] = [{} for _ in range(source.total)]
     with worker_pool(jobs) as pool:  # they write straight into the file
         waiting = [pool.submit(_draw, pictures, source, range(first, min(first + _SLICE, source.total)))
@@ -238,6 +244,18 @@ def _draw_all(pictures: Path, notes: Path, source: SceneSource, jobs: int, advan
             advance(len(drawn))
     notes.with_suffix(".part").write_text(json.dumps(rows), "utf-8")
     notes.with_suffix(".part").replace(notes)
+
+
+def _reserve(file: Path) -> None:
+    """Take the file's space now. Raises OSError on a full disk, where a worker would be killed as it writes."""
+    if not hasattr(os, "posix_fallocate"):  # macOS
+        return
+    try:
+        with file.open("r+b") as opened:
+            os.posix_fallocate(opened.fileno(), 0, file.stat().st_size)
+    except OSError:
+        file.unlink()
+        raise
 
 
 def _draw(pictures: Path, source: SceneSource, numbers: Sequence[int]) -> tuple[int, list[dict[str, Any]]]:

@@ -454,7 +454,7 @@ def train(
         out.mkdir(parents=True, exist_ok=True)
         model = run_training(options, _print_line, progress_bar)
     except OSError as error:
-        raise ConfigError(f"--out {out}: {error.strerror or error}") from None
+        raise ConfigError(f"--out {out}: {error.strerror or error}; free some space or name another folder") from None
     _print_line(f"{model}, {model.with_suffix('.md').name}: test it with `sightline score detectors onnx:{model}`")
 
 

@@ -1,6 +1,8 @@
 """Training without PyTorch: the network's table, what is learned from a scene, and the ONNX graph."""
 
+import errno
 import json
+import os
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
@@ -319,6 +321,34 @@ def test_scenes_are_drawn_again_for_other_notes_or_another_miner(tmp_path, photo
         stamps.append(drawn.stat().st_mtime_ns)
         assert again.others == first.others
     assert stamps[0] < stamps[1] < stamps[2] == stamps[3]
+
+
+@pytest.mark.usefixtures("no_simulator")
+@pytest.mark.parametrize("name", ["scenes.npy", "scenes.json"])
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.6])
+def test_damaged_scenes_are_drawn_again(name, share, tmp_path):
+    def draw():
+        return drawn_scenes(tmp_path, SceneSource(3), 1, lambda _: None)
+
+    first = draw().pictures.copy()
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / name).write_bytes(content[: int(share * len(content))])
+    assert np.array_equal(draw().pictures, first) and (tmp_path / name).read_bytes() == content
+
+
+@pytest.mark.usefixtures("no_simulator")
+def test_scenes_that_do_not_fit_on_the_disk_are_one_line(tmp_path, monkeypatch, capsys):
+    def full(_file, first, count):
+        assert first == 0 and count > 8 * HEIGHT_PX * WIDTH_PX * 3
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    demanded.module("torch", "train")
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    little = ["--scenes", "8", "--steps", "1", "--jobs", "1", "--validated", "5", "--scored", "5"]  # should it go on
+    assert cli.run(["train", "--out", str(tmp_path), *little]) == 2
+    error = capsys.readouterr().err.strip()
+    assert error == f"error: --out {tmp_path}: No space left on device; free some space or name another folder"
+    assert not list(tmp_path.iterdir())
 
 
 def test_digest_of_scenes_covers_all_boxes():

@@ -1,7 +1,9 @@
 """Training itself, where PyTorch is: it learns, goes on after a cut, and its weights mean the same in ONNX."""
 
+import errno
 import hashlib
 import multiprocessing
+import os
 
 import numpy as np
 import pytest
@@ -70,6 +72,36 @@ def test_interrupted_training_ends_with_the_same_result(tmp_path, monkeypatch):
     for others, again in ((scenes(), Training((5,), batch=2, seed=4)), (scenes(3), training)):
         with pytest.raises(ConfigError, match="other settings or scenes"):
             train(others, again, "cpu", cut, said.append)
+
+
+def state_of(training):
+    return train_run._State(scenes(), training, torch.device("cpu"))
+
+
+@pytest.mark.parametrize("damage", [
+    lambda content: b"", lambda content: content[: len(content) // 2], lambda content: content[:-30],
+    lambda content: b"no checkpoint" * 9, lambda content: bytes(len(content)),
+], ids=["empty", "half", "end", "text", "zeros"])  # fmt: skip
+def test_damaged_checkpoint_is_one_line(damage, tmp_path):
+    training, path = Training((1,), batch=2, seed=4), tmp_path / train_run.CHECKPOINT
+    state_of(training).save(path, 1)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(ConfigError, match=r"checkpoint .* cannot be read \(.*\); remove it") as told:
+        train(scenes(), training, "cpu", tmp_path, lambda _: None)
+    assert "\n" not in str(told.value)
+
+
+def test_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch):
+    def full(_file):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    training, path = Training((4,), batch=2, seed=4), tmp_path / train_run.CHECKPOINT
+    state = state_of(training)
+    state.save(path, 2)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        state.save(path, 4)
+    assert state.load(path) == 2 and list(tmp_path.iterdir()) == [path]
 
 
 def test_processes_that_feed_a_gpu_prepare_the_same_batches():
