@@ -6,10 +6,13 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Final
 
 from sightline.protocol.errors import ConfigError, install_command
 
 _PYBULLET_UP_TO = (3, 11)
+_LONGEST_NAME: Final = 240
+"""Bytes; of the 255 of a file system, since an unfinished file beside it has a longer name."""
 
 
 @contextmanager
@@ -38,6 +41,8 @@ def _advice(package: str, extra: str, version: tuple[int, int]) -> str:
 
 def check_out_file(path: Path) -> None:
     """Raise ConfigError if the file cannot be created or changed."""
+    if len(os.fsencode(path.name)) > _LONGEST_NAME:
+        raise ConfigError(f"cannot write {path}: its name has more than {_LONGEST_NAME} bytes; choose a shorter one")
     try:
         if not path.parent.is_dir():
             raise ConfigError(f"cannot write {path}: no folder {path.parent}; name a file in an existing folder")

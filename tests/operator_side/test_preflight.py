@@ -17,7 +17,8 @@ def test_a_file_that_can_be_written_passes(tmp_path):
 
 @pytest.mark.parametrize(("name", "words"), [
     ("none/x.toml", "no folder"), ("", "is a folder"), ("locked/x.toml", "cannot write"),
-    ("locked/inner/x.toml", "cannot write"),
+    ("locked/inner/x.toml", "cannot write"), ("x" * 246 + ".mp4", "240 bytes; choose a shorter"),
+    ("\u00e9" * 121, "240 bytes; choose a shorter"),
 ])  # fmt: skip
 def test_unwritable_file_is_reported(tmp_path, monkeypatch, name, words):
     locked = tmp_path / "locked"
