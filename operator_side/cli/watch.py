@@ -191,9 +191,13 @@ def capture(
             got = snapshot(pictures, path, wanted)
         else:
             got = film(pictures, path, wanted, _SECONDS if seconds is None else seconds)
+    if got.cut == "silent":
+        typer.echo(f"capture: no more images after {got.seconds:.1f} s, so the video is shorter than requested; run "
+                   f"`sightline status {robot}`", err=True)
     if as_json:
         typer.echo(json.dumps({"robot": robot, "file": str(path), "channel": wanted.name, "frames": got.frames,
-                               "seconds": round(got.seconds, 3), "width_px": got.width_px, "height_px": got.height_px}))
+                               "seconds": round(got.seconds, 3), "width_px": got.width_px, "height_px": got.height_px,
+                               "complete": not got.cut}))
         return
     length = f", {got.frames} images in {got.seconds:.1f} s" if path.suffix.lower() == ".mp4" else ""
     typer.echo(f"{path}: {wanted.name} of {robot}, {got.width_px}x{got.height_px}{length}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -9,8 +10,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from types import FrameType, TracebackType
+from typing import Any, Final, Literal, Self
 
 import cv2
 import numpy as np
@@ -64,6 +65,8 @@ class Film:
         self._stream: Any = None
         self._first_us = self._last_ticks = -1
         self.frames = 0
+        self.size_px = (0, 0)
+        """Width and height of the first image."""
 
     def add(self, picture: Image, t_us: int) -> bool:
         """Append an image (BGR). Returns False and skips it unless it is later than the last."""
@@ -111,6 +114,7 @@ class Film:
     def _opened(self, picture: Image) -> Any:
         stream = self._container.add_stream("libx264", rate=self._fps)
         height, width = picture.shape[:2]
+        self.size_px = (width, height)
         stream.width, stream.height = max(2, width - width % 2), max(2, height - height % 2)
         stream.pix_fmt = "yuv420p"  # every player shows it; it needs even sides
         stream.time_base = stream.codec_context.time_base = _TIME_BASE
@@ -134,6 +138,9 @@ VIDEO: Final = ".mp4"
 PATIENCE_S: Final = 5.0
 _WAIT_S: Final = 0.5
 _FPS: Final = 30
+_SHORT_S: Final = 1.0  # as long as the status of a robot may be missing
+Cut = Literal["", "interrupted", "silent"]
+"""Why a film is shorter than requested: the user ended it, or the images did."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +152,7 @@ class Captured:
     seconds: float
     width_px: int
     height_px: int
+    cut: Cut = ""
 
 
 def check_target(path: Path, seconds: float | None) -> None:
@@ -169,40 +177,65 @@ def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
 
 
 def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Captured:
-    """Write the images of `seconds`, or until Ctrl-C, to `path`. Raises LinkError if none arrives, ConfigError for a
-    path that cannot be written.
+    """Write the images of `seconds`, or until Ctrl-C, SIGTERM or SIGHUP, to `path`. Raises LinkError if none arrives,
+    ConfigError for a path that cannot be written.
 
     The capture times end it, so that a first image that comes late does not make the film longer.
     """
     unfinished = path.with_name(f".{path.name}.part.mp4")
-    size = (0, 0)
     try:
-        with writes(path), Film(unfinished, _FPS) as made, _ends_with_ctrl_c(made):
-            ends_s = 0.0  # counted from the first image
-            while (shot := _wanted(pictures, wanted, ends_s or time.monotonic() + PATIENCE_S)) is not None:
-                if made.since_first_s(shot.t_us) > seconds:
-                    break
-                ends_s = ends_s or time.monotonic() + seconds
-                size = size if any(size) else (shot.width_px, shot.height_px)
-                with suppress(WireError):  # an invalid image
-                    made.add(jpeg_pixels(shot.jpeg), shot.t_us)
-        if not made.frames:
-            raise LinkError(_silence(pictures, wanted))
-        with writes(path):
-            unfinished.replace(path)
-        return Captured(path, made.frames, made.seconds, *size)
+        with _terminated_like_ctrl_c():
+            with writes(path), Film(unfinished, _FPS) as made:
+                cut = _fill(made, pictures, wanted, seconds)
+            if not made.frames:
+                raise LinkError(_silence(pictures, wanted))
+            with writes(path):
+                unfinished.replace(path)
+        return Captured(path, made.frames, made.seconds, *made.size_px, cut)
     finally:
         unfinished.unlink(missing_ok=True)
 
 
-@contextmanager
-def _ends_with_ctrl_c(made: Film) -> Iterator[None]:
-    """Ctrl-C ends the film. Before its first image it ends the command."""
+def _fill(made: Film, pictures: Pictures, wanted: Channel, seconds: float) -> Cut:
+    """Add the images of `seconds`. Ctrl-C ends the film; before its first image it ends the command."""
+    session: str | None = None
+    offset_us, ends_s = 0, 0.0  # the end is counted from the first image
     try:
-        yield
+        while (shot := _wanted(pictures, wanted, ends_s or time.monotonic() + PATIENCE_S)) is not None:
+            now_s = time.monotonic()
+            ends_s = ends_s or now_s + seconds
+            if shot.session != session:  # the robot's clock may have begun again: this machine's bridges the gap
+                elapsed_s = max(now_s + seconds - ends_s, made.seconds + 0.001)
+                session, offset_us = shot.session, round(elapsed_s * 1e6) - shot.t_us
+            if made.since_first_s(shot.t_us + offset_us) > seconds:
+                return ""
+            with suppress(WireError):  # an invalid image
+                made.add(jpeg_pixels(shot.jpeg), shot.t_us + offset_us)
     except KeyboardInterrupt:
         if not made.frames:
             raise
+        return "interrupted"
+    return "silent" if seconds - made.seconds > _SHORT_S else ""
+
+
+@contextmanager
+def _terminated_like_ctrl_c() -> Iterator[None]:
+    """SIGTERM and SIGHUP become KeyboardInterrupt, and a further one is ignored: a closed terminal sends two."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        for number in before:
+            signal.signal(number, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    numbers = [one for one in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(one) is not signal.SIG_IGN]  # nohup
+    before = {number: signal.getsignal(number) for number in numbers}
+    try:
+        for number in numbers:
+            signal.signal(number, interrupt)
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _wanted(pictures: Pictures, wanted: Channel, ends_s: float) -> Shot | None:

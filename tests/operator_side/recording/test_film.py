@@ -1,18 +1,23 @@
-"""A film and a snapshot on a full disk: one line, and no unfinished file."""
+"""Films and snapshots: what ends them, and a full disk, which is one line and leaves no unfinished file."""
 
+import json
 import resource
+import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 import simplejpeg
 
+from sightline.operator_side.cli import watch
 from sightline.operator_side.client.pictures import Shot
-from sightline.operator_side.recording.film import film, snapshot
+from sightline.operator_side.recording.film import Captured, Cut, Film, film, snapshot
 from sightline.protocol.channels import FRAME
 from sightline.protocol.errors import ConfigError
+from tests.fixtures.commands import run
 
 NOISE = simplejpeg.encode_jpeg(np.random.default_rng(1).integers(0, 255, (120, 160, 3), np.uint8), 90)
 
@@ -61,6 +66,91 @@ def test_ctrl_c_ends_a_film_and_before_its_first_image_the_command(tmp_path: Pat
     pictures = Interrupted()
     pictures.left = 2
     assert film(pictures, tmp_path / "run.mp4", FRAME, 0.9).frames == 2
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_terminated_film_is_kept_as_after_ctrl_c(tmp_path: Path, number: signal.Signals) -> None:
+    class Terminated(Played):
+        def take(self, seconds: float) -> Shot:
+            shot = super().take(seconds)
+            if shot.seq > 3:
+                signal.raise_signal(number)
+            return shot
+
+    ended = []
+    close = Film.close
+
+    def closed(made: Film) -> None:
+        signal.raise_signal(number)  # a closed terminal sends it again
+        ended.append(made)
+        close(made)
+
+    before = signal.getsignal(number)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Film, "close", closed)
+        made = film(Terminated(), tmp_path / "run.mp4", FRAME, 0.9)
+    assert (made.frames, made.cut, len(ended)) == (3, "interrupted", 1)
+    assert [one.name for one in tmp_path.iterdir()] == ["run.mp4"] and signal.getsignal(number) is before
+
+
+def test_hangup_that_nohup_ignores_ends_no_film(tmp_path: Path) -> None:
+    class HungUp(Played):
+        def take(self, seconds: float) -> Shot:
+            signal.raise_signal(signal.SIGHUP)
+            return super().take(seconds)
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert film(HungUp(), tmp_path / "run.mp4", FRAME, 0.9).frames == 10
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+class Timed:
+    """Images every 100 ms of a clock that only they advance, of the sessions and times on the robot's clock."""
+
+    robot, is_online = "r1", True
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, shots: dict[int, tuple[str, int]]) -> None:
+        self.now_ms, self._shots = 0, shots
+        monkeypatch.setattr("time.monotonic", lambda: 7.0 + self.now_ms / 1000)
+
+    def take(self, _seconds: float) -> Shot | None:
+        self.now_ms += 100
+        session, t_ms = self._shots.get(self.now_ms, ("", 0))
+        return Shot(FRAME, NOISE, session, self.now_ms, t_ms * 1000, 160, 120) if session else None
+
+
+@pytest.mark.parametrize("begins_ms", [30, 10_000_000])
+def test_film_goes_on_after_a_restart_of_the_robots_clock(monkeypatch, tmp_path: Path, begins_ms: int) -> None:
+    before = {at: ("0000000a", 5_000_000 + at) for at in range(100, 1001, 100)}
+    after = {at: ("0000000b", begins_ms + at) for at in range(2000, 9001, 100)}
+    made = film(Timed(monkeypatch, before | after), tmp_path / "run.mp4", FRAME, 3.0)
+    assert made.frames == 10 + 12 and made.cut == "" and made.seconds == pytest.approx(3.0, abs=0.002)
+    with av.open(str(tmp_path / "run.mp4")) as opened:
+        times_s = [frame.time for frame in opened.decode(video=0)]
+    gaps_s = np.diff(times_s)
+    assert gaps_s.max() == pytest.approx(1.0, abs=0.002) and np.delete(gaps_s, 9) == pytest.approx(0.1, abs=0.002)
+
+
+@pytest.mark.parametrize(("last_ms", "cut"), [(1000, "silent"), (2300, "")])
+def test_film_whose_images_end_early_is_reported(monkeypatch, tmp_path: Path, last_ms: int, cut: str) -> None:
+    shots = {at: ("0000000a", at) for at in range(100, last_ms + 1, 100)}
+    made = film(Timed(monkeypatch, shots), tmp_path / "run.mp4", FRAME, 3.0)
+    assert (made.frames, made.cut) == (last_ms // 100, cut)
+
+
+@pytest.mark.parametrize(("cut", "lines"), [("", 0), ("interrupted", 0), ("silent", 1)])
+def test_capture_names_a_video_that_is_not_complete(monkeypatch, capsys, tmp_path: Path, cut: Cut, lines: int) -> None:
+    monkeypatch.setattr(watch, "open_link", lambda *_given, **_more: nullcontext())
+    monkeypatch.setattr(watch, "Pictures", lambda *_given: None)
+    monkeypatch.setattr("sightline.operator_side.recording.film.film",
+                        lambda _pictures, path, *_given: Captured(path, 20, 2.0, 160, 120, cut))
+    code, out, err = run(capsys, "capture", "r1", "--connect", "tcp/127.0.0.1:1", "--seconds", "8", "--json", "--out",
+                         str(tmp_path / "run.mp4"))
+    warnings = [line for line in err.splitlines() if "shorter than requested" in line]
+    assert code == 0 and json.loads(out)["complete"] is (cut == "") and len(warnings) == lines
+    assert all("after 2.0 s" in line for line in warnings)
 
 
 def test_snapshot_on_a_full_disk_is_reported(tmp_path: Path) -> None:
