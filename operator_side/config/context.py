@@ -125,8 +125,10 @@ def read_context(path: Path) -> Context | None:
     """Read the context file; None if it is missing. Raises ConfigError for a damaged or unreadable one."""
     import tomllib
 
+    from sightline.operator_side.config.toml_text import parse_toml
+
     try:
-        table = tomllib.loads(path.read_text("utf-8"))
+        table = parse_toml(path.read_text("utf-8-sig"))
     except FileNotFoundError:
         return None
     except OSError as error:

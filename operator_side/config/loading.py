@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from sightline.operator_side.config.context import CONNECT_VARIABLE
 from sightline.operator_side.config.errors import explain, is_known, known_keys, no_such_name
-from sightline.operator_side.config.toml_text import key_and_text, toml_value
+from sightline.operator_side.config.toml_text import key_and_text, parse_toml, toml_value
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError, home_path
 from sightline.protocol.log import LOG_FORMAT_VARIABLE
@@ -133,12 +133,12 @@ def _from_file(file: str, origin: str) -> Iterable[Given]:
     if not file:
         raise ConfigError("the name of the configuration file is empty; name a TOML file, or leave out --config")
     try:
-        table = tomllib.loads(home_path(file).read_text("utf-8"))
+        return [Given(key, value, origin)
+                for key, value in _leaves(parse_toml(home_path(file).read_text("utf-8-sig")))]
     except OSError as error:
         raise ConfigError(f"cannot read {file}: {error.strerror}; name a TOML file that you may read") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{file}: invalid TOML: {error}{_decimal_hint(file, error)}") from None
-    return [Given(key, value, origin) for key, value in _leaves(table)]
 
 
 def _decimal_hint(file: str, error: Exception) -> str:

@@ -23,10 +23,23 @@ def key_and_text(text: str, option: str, example: str) -> tuple[str, str]:
     return key.strip(), value
 
 
+def parse_toml(text: str) -> dict[str, Any]:
+    """Parse TOML. Raises tomllib.TOMLDecodeError, also for what Python cannot read or print again."""
+    try:
+        table = tomllib.loads(text)
+        json.dumps(table, default=str)  # a hexadecimal number may be too long to print
+        return table
+    except tomllib.TOMLDecodeError:
+        raise
+    except (ValueError, RecursionError):
+        limits = "a number has too many digits, or lists and tables are nested too deeply"
+        raise tomllib.TOMLDecodeError(limits) from None
+
+
 def toml_value(text: str) -> Any:
     """Read `text` as one TOML value; text that is not TOML is itself the value."""
     try:
-        table = tomllib.loads(f"value = {text}")
+        table = parse_toml(f"value = {text}")
     except tomllib.TOMLDecodeError:
         return text
     return table["value"] if len(table) == 1 else text

@@ -66,6 +66,7 @@ def test_default_address_with_keys_is_a_tls_address():
 @pytest.mark.parametrize(("text", "expected"), [
     ("connect = ", "invalid TOML"),
     ("\xff", "invalid TOML"),
+    ("connect = " + "[" * 5000, "nested too deeply"),
     ("robot = 'r1'", "connect is missing"),
     ("connect = 5", "invalid connect: expected text"),
     ("connect = 'here'", "'here'"),

@@ -116,7 +116,11 @@ def test_several_errors_are_shown_as_the_first_and_a_count(tmp_path):
     ("text", "expected"),
     [("= 1", "invalid TOML"), ("[safety]\nmax_linear_mps = -0,30 # slow", "; write -0.30 with a point"),
      ("[target]\nradius_m = 0.1", "is a configuration of `sightline vision`, not of `sightline robot`"),
-     ("[safety]\nmax_linear_mps = inf", "= inf: expected a finite number")],
+     ("[safety]\nmax_linear_mps = inf", "= inf: expected a finite number"),
+     ("[safety]\nmax_linear_mps = " + "9" * 5000, "invalid TOML: a number has too many digits"),
+     ("[safety]\nmax_linear_mps = 0x" + "f" * 5000, "invalid TOML: a number has too many digits"),
+     ("listen = " + "[" * 5000, "nested too deeply"),
+     ("camera" + ".options" * 5000 + " = 1", "invalid TOML")],
 )
 def test_a_bad_file_is_named(tmp_path, text, expected):
     path = tmp_path / "robot.toml"
@@ -125,6 +129,21 @@ def test_a_bad_file_is_named(tmp_path, text, expected):
         load("robot", file=str(path), environ={})
     assert one_line(error).startswith(str(path))
     assert expected in one_line(error)
+
+
+def test_byte_order_mark_of_a_windows_editor_is_not_part_of_the_file(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text("robot = 'r7'\n", "utf-8-sig")
+    assert load("robot", file=str(path), environ={}).config.robot == "r7"
+
+
+@pytest.mark.parametrize("value", ["9" * 5000, "[" * 5000, "0x" + "f" * 5000])
+def test_typed_value_that_is_too_much_for_toml_is_one_line(value):
+    for sets in ([f"safety.max_linear_mps={value}"], []):
+        environ = {} if sets else {"SIGHTLINE_ROBOT__SAFETY__MAX_LINEAR_MPS": value}
+        with pytest.raises(ConfigError) as error:
+            load("robot", environ=environ, sets=sets)
+        assert "a number" in one_line(error) and len(one_line(error)) < 300
 
 
 def test_an_empty_file_name_is_not_the_defaults():
