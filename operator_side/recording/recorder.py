@@ -2,7 +2,8 @@
 
 One MCAP channel per Sightline channel (and source: `twist/vision`), encoding `sightline.v1`: message data = header
 length (uint16, big-endian), header, payload, exactly as they came. `log_time` is when this end received it, for the
-robot's own clock is in the header. Opens in any MCAP tool; a file cut short by a kill reads up to the cut.
+robot's own clock is in the header. It never goes back: the wall clock is read once. Opens in any MCAP tool. A file cut
+short by a kill reads here up to the cut; for other tools, `mcap recover` writes its index.
 """
 
 import errno
@@ -77,6 +78,7 @@ class Recorder:
         """Number of messages that the disk was too slow for."""
         self.failed = ""
         """The error that ended the recording, or ""."""
+        self._since_ns = time.time_ns() - time.monotonic_ns()  # once: MCAP tools sort by time, and the wall clock steps
         self._closed = False
         self._ended = threading.Event()
         self._writing = threading.Thread(target=self._write_all, name="recorder", daemon=True)
@@ -93,7 +95,7 @@ class Recorder:
         if self._closed or self.failed:
             return
         try:
-            self._queue.put_nowait((time.time_ns(), message))
+            self._queue.put_nowait((self._since_ns + time.monotonic_ns(), message))
         except queue.Full:
             self.dropped += 1
 
@@ -208,7 +210,7 @@ def _reading(path: Path) -> Iterator[Any]:
         return
     except OSError as error:
         raise ConfigError(f"cannot read recording {path}: {error.strerror}") from None
-    except McapError as error:
+    except (McapError, ValueError, OverflowError, MemoryError) as error:  # a damaged length may be of any size
         raise ConfigError(f"invalid recording {path}: {type(error).__name__}") from None
 
 

@@ -93,6 +93,29 @@ def test_recording_cut_at_any_byte_reads_up_to_the_cut(tmp_path):
     assert counts == {0, 3}
 
 
+def test_step_of_the_wall_clock_moves_no_message(tmp_path, monkeypatch):
+    steps_s = iter([0, -3600, 7200, -1])
+    now_ns = time.time_ns()
+    monkeypatch.setattr("time.time_ns", lambda: now_ns + next(steps_s) * 10**9)
+    record(tmp_path / "run.mcap", [Message(FRAME, "", b"%d" % at, b"") for at in range(9)])
+    times_ns = [one.log_time_ns for one in read_recording(tmp_path / "run.mcap")]
+    assert len(times_ns) == 9 and times_ns == sorted(times_ns)
+    assert now_ns <= times_ns[0] and times_ns[-1] < now_ns + 60 * 10**9
+
+
+def test_recording_with_a_damaged_byte_reads_or_is_one_line(tmp_path):
+    path = tmp_path / "run.mcap"
+    record(path, [Message(FRAME, "", b"%d" % at, b"jpeg") for at in range(2)], scenario="circle")
+    content, outcomes = path.read_bytes(), set()
+    for at in range(len(content)):
+        path.write_bytes(content[:at] + bytes([content[at] ^ 0x80]) + content[at + 1 :])
+        try:
+            outcomes.add(len(list(read_recording(path))))
+        except ConfigError as error:
+            outcomes.add(str(error).partition(" /")[0])
+    assert {2, "invalid recording"} <= outcomes <= {0, 1, 2, "invalid recording"}
+
+
 def test_a_slow_disk_drops_and_counts_and_never_blocks_the_link(tmp_path):
     wire, gate = Wire(), threading.Event()
     recorder = Recorder(wire, tmp_path / "run.mcap", {}, [FRAME])
