@@ -33,6 +33,27 @@ def is_known(model: type[BaseModel], key: Key) -> bool:
     return is_known(inner, key[1:]) if inner else is_free_form(field.annotation)
 
 
+def wrong_type(model: type[BaseModel], key: Key, value: Any) -> str:
+    """Describe a value of a file that pydantic would convert to another type without a word: true to 1, 1 to true."""
+    wanted = _types_of(model, key)
+    if isinstance(value, bool):
+        is_wrong = bool not in wanted and bool(wanted & {int, float})
+    else:
+        is_wrong = wanted - {type(None)} == {bool}
+    return f" = {_shown(value)}: expected {allowed(model, key)}" if is_wrong else ""
+
+
+def _types_of(model: type[BaseModel], key: Key) -> set[Any]:
+    """Return the types of the value at `key`; none for an unknown key and for one of a free-form table."""
+    field = model.model_fields.get(getattr(model, "renamed_keys", {}).get(key[0], key[0]))
+    if field is None:
+        return set()
+    if len(key) == 1:
+        return set(get_args(field.annotation) or [field.annotation])
+    inner = table_of(field.annotation)
+    return _types_of(inner, key[1:]) if inner else set()
+
+
 def is_free_form(annotation: Any) -> bool:
     """Return whether a field is a table of a plug-in's own options."""
     return get_origin(annotation) is dict

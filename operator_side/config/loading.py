@@ -17,7 +17,7 @@ from typing import Any, Final
 from pydantic import ValidationError
 
 from sightline.operator_side.config.context import CONNECT_VARIABLE
-from sightline.operator_side.config.errors import explain, is_known, known_keys, no_such_name
+from sightline.operator_side.config.errors import explain, is_known, known_keys, no_such_name, wrong_type
 from sightline.operator_side.config.toml_text import key_and_text, parse_toml, toml_value
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError, home_path
@@ -236,6 +236,9 @@ def _as_list(value: Any) -> list[Any]:
 
 
 def _validated(model: type[Config], given: dict[Key, Given]) -> Config:
+    for key, one in given.items():
+        if one.text is None and (problem := wrong_type(model, key, one.value)):
+            raise ConfigError(_label(given, key) + problem)
     try:
         return model.model_validate(_tree(model, given))
     except ValidationError as error:

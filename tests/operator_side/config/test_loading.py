@@ -131,6 +131,38 @@ def test_a_bad_file_is_named(tmp_path, text, expected):
     assert expected in one_line(error)
 
 
+def value_at(key, config):
+    for name in key:
+        config = getattr(config, name, None)
+    return config
+
+
+@pytest.mark.parametrize("service", SERVICES)
+def test_truth_in_a_file_is_not_a_number_nor_the_reverse(tmp_path, service):
+    """Keys of every table; typed text has no types, so that 1 is true there."""
+    path, kinds = tmp_path / "x.toml", {bool: [], int: [], float: []}
+    for key in known_keys(model_of(service)):
+        kinds.get(type(value_at(key, model_of(service)())), []).append(key)
+    for kind, value, expected in ((bool, "1", "true or false"), (bool, "'true'", "true or false"),
+                                  (int, "true", "number"), (float, "false", "number")):
+        assert kinds[kind] or service == "sim"
+        for key in kinds[kind][:: 1 if kind is bool else 3]:  # the schema of an error takes 10 ms
+            path.write_text(f"{'.'.join(key)} = {value}\n")
+            with pytest.raises(ConfigError) as error:
+                load(service, file=str(path), environ={})
+            assert f"{path}: {'.'.join(key)} = {value}: expected" in one_line(error) and expected in one_line(error)
+    for key in kinds[bool]:
+        name = f"SIGHTLINE_{service}__{'__'.join(key)}".upper()
+        for source in ({"sets": [f"{'.'.join(key)}=1"], "environ": {}}, {"environ": {name: "1"}}):
+            assert value_at(key, load(service, **source).config) is True
+
+
+def test_whole_number_in_a_file_stays_a_number_with_a_point(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text("[wheels]\nmax_wheel_rad_s = 8\n")
+    assert load("robot", file=str(path), environ={}).config.wheels.max_wheel_rad_s == 8.0
+
+
 def test_byte_order_mark_of_a_windows_editor_is_not_part_of_the_file(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text("robot = 'r7'\n", "utf-8-sig")
