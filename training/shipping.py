@@ -203,13 +203,13 @@ _SLICE: Final = 100
 def written(path: Path, weights: Weights) -> None:
     """Write the ONNX file, with its answer to the test image in its metadata."""
     properties = {"min_score": str(COUNTS_FROM)}
-    path.write_bytes(onnx_bytes(weights, properties))
-    engine = open_engine(path, "cpu", 1)
+    beside = path.with_suffix(".part")  # the model of an earlier run stays until this one is whole
+    beside.write_bytes(onnx_bytes(weights, properties))
+    engine = open_engine(beside, "cpu", 1)
     form = model_format(engine.header, (), "auto")
     picture = DecodedImage(golden_picture(), 1)
     pixels, fitting = fit_picture(picture, form)
     found = read_outputs(engine.run(pixels), form, fitting, picture, COUNTS_FROM)
-    beside = path.with_suffix(".part")
     beside.write_bytes(onnx_bytes(weights, {**properties, KEY: golden_text(found)}))
     beside.replace(path)
 

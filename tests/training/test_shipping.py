@@ -54,6 +54,19 @@ def test_weights_become_a_file_with_thresholds_and_a_card_that_is_true_of_it(tmp
     assert digest in card and all(f"| {name} |" in card for name in COLUMNS) and "12345" in card
 
 
+def test_model_of_an_earlier_run_stays_until_the_next_is_whole(tmp_path, monkeypatch):
+    def fail(*_given):
+        assert model.read_bytes() == b"an earlier one"
+        raise MemoryError
+
+    model = tmp_path / "sightline.onnx"
+    model.write_bytes(b"an earlier one")
+    monkeypatch.setattr("sightline.training.shipping.read_outputs", fail)
+    with pytest.raises(MemoryError):
+        written(model, weights())
+    assert model.read_bytes() == b"an earlier one"
+
+
 def test_the_card_names_the_photographs_and_every_option(tmp_path):
     for number in range(FEWEST):
         picture = np.random.default_rng(number).integers(0, 255, (240, 320, 3), np.uint8)
