@@ -123,9 +123,11 @@ class SceneSource:
         return scene if self.mined_with is None else with_false_balls(scene, open_miner(self.mined_with))
 
     def note(self, scene: Scene | PhotoScene) -> dict[str, Any]:
-        """Return what is in a scene, and the model that found a part of it."""
+        """Return what is in a scene, all photographs that it was drawn with, and the model that found a part of it."""
         truths = [[one.label, one.box, one.seen] for one in scene.truths]
         note = {"truths": truths, "unclear": scene.unclear, "others": scene.others}
+        if self.photos is not None and isinstance(scene, PhotoScene):
+            note["photographs"] = _photographs_digest(self.photos)
         if self.mined_with is not None and isinstance(scene, PhotoScene):
             note["miner"] = _miner_digest(self.mined_with)
         # As it is read again: JSON has lists only.
@@ -136,6 +138,15 @@ class SceneSource:
 def _photographs(folder: Path) -> tuple[npt.NDArray[np.uint8], ...]:
     """Read once per process."""
     return tuple(one.rgb for one in read_photographs(folder))
+
+
+@cache
+def _photographs_digest(folder: Path) -> str:
+    """Hash all of them: the scenes that are drawn again for a comparison show only a few."""
+    digest = hashlib.sha256()
+    for one in _photographs(folder):
+        digest.update(repr(one.shape).encode() + one.tobytes())
+    return digest.hexdigest()[:16]
 
 
 Miner = Callable[[npt.NDArray[np.uint8]], list[Box]]

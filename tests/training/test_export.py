@@ -324,6 +324,24 @@ def test_scenes_are_drawn_again_for_other_notes_or_another_miner(tmp_path, photo
 
 
 @pytest.mark.usefixtures("no_simulator")
+def test_scenes_are_drawn_again_for_one_other_photograph_of_many(tmp_path, photographs, monkeypatch):
+    """Whichever it is: two scenes show at most two of them."""
+    monkeypatch.setattr(module, "_check_photographs", lambda _folder: None)
+
+    def stamp():
+        for cached in (_photographs, module._photographs_digest):
+            cached.cache_clear()
+        drawn_scenes(tmp_path, SceneSource(1, 2, photographs), 1, lambda _: None)
+        return (tmp_path / "scenes.npy").stat().st_mtime_ns
+
+    stamps = [stamp()]
+    for name in ("03.jpg", "07.jpg", "11.jpg"):  # one of them is in neither scene
+        cv2.imwrite(str(photographs / name), 255 - cv2.imread(str(photographs / name)))
+        stamps.append(stamp())
+    assert len({*stamps}) == 4 and stamp() == stamps[-1]
+
+
+@pytest.mark.usefixtures("no_simulator")
 @pytest.mark.parametrize("name", ["scenes.npy", "scenes.json"])
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.6])
 def test_damaged_scenes_are_drawn_again(name, share, tmp_path):
