@@ -22,7 +22,6 @@ import torch
 from torch import nn
 
 from sightline.protocol.errors import ConfigError, HardwareError
-from sightline.protocol.log import error_text
 from sightline.sim.scenes.model import LABELS
 from sightline.training.export import shifted
 from sightline.training.network import (
@@ -161,7 +160,6 @@ _JOIN_TIMEOUT: Final = timedelta(minutes=3)
 CHECKPOINT: Final = "checkpoint.pt"
 _CHECKPOINT_EVERY: Final = 100
 _LOG_EVERY: Final = 50
-_LONGEST: Final = 160  # of an error of PyTorch
 
 
 def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
@@ -269,9 +267,9 @@ def _checkpoint(path: Path, made_by: str, device: Any) -> dict[str, Any] | None:
     try:
         kept: dict[str, Any] = torch.load(path, map_location=device, weights_only=True)
         training = kept["training"]
-    except Exception as error:  # PyTorch raises errors of many classes for a damaged file
-        raise ConfigError(f"checkpoint {path} cannot be read ({error_text(error)[:_LONGEST]}); remove it to train from "
-                          "the start, or name another --out") from None
+    except Exception as error:  # PyTorch raises many classes for a damaged file, with texts that suggest an unsafe load
+        raise ConfigError(f"checkpoint {path} cannot be read ({type(error).__name__}); remove it to train from the "
+                          "start, or name another --out") from None
     if training != made_by:
         raise ConfigError(f"{path} is of a training with other settings or scenes: {training}; remove it, "
                           "or name another --out")
