@@ -1,16 +1,18 @@
 """The active mission, and the switch to the next one by way of standing still. Pure.
 
-A mission can be a third-party plug-in. One that raises, or returns an impossible twist, ends, and the robot stops.
+A mission can be a third-party plug-in. One that raises, or returns an impossible plan, ends, and the robot stops.
 """
 
+import math
 from dataclasses import replace
 from numbers import Real
 from types import UnionType
 from typing import Final
 
 from sightline.protocol.config import PLUGIN_ERRORS
-from sightline.protocol.log import report_fault
+from sightline.protocol.log import printable, report_fault
 from sightline.protocol.messages import STILL, CameraModel, Twist
+from sightline.vision_side.detect.plugin_calls import annotation_problem
 from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.registry import MissionSpec
@@ -22,6 +24,8 @@ STILL_MPS: Final = 0.01
 STILL_RAD_S: Final = 0.03
 MAX_COMMAND: Final = 1000.0
 """m/s and rad/s; beyond it a mission computes nonsense, and its text might not fit a twist's 64 bytes."""
+_FURTHEST_PX: Final = 1e6
+"""The same bound as for any number on the wire."""
 _TYPES: Final[dict[str, type | UnionType]] = {
     "twist": Twist, "phase": str, "note": str, "target": Detection | None,
     "bearing_rad": Real | None, "distance_m": Real | None, "track": Target | None,
@@ -88,10 +92,7 @@ class MissionSwitch:
 
     def _checked(self, view: View) -> Plan:
         try:
-            plan = self._mission.step(view)
-            if max(abs(plan.twist.linear_mps), abs(plan.twist.angular_rad_s)) > MAX_COMMAND:
-                raise ValueError(f"returned {plan.twist.linear_mps:g} m/s, {plan.twist.angular_rad_s:g} rad/s")
-            plan = _typed(plan)
+            plan = _usable(self._mission.step(view))
         except PLUGIN_ERRORS as error:  # vision goes on, the robot stands still
             plan = _failed(error)
         if plan.done:
@@ -99,12 +100,46 @@ class MissionSwitch:
         return plan
 
 
-def _typed(plan: Plan) -> Plan:
-    """Return a plan whose `done` is a bool. Raises TypeError for a field that the service cannot use."""
+def _usable(plan: Plan) -> Plan:
+    """Return a plan that a report and the log can carry. Raises TypeError or ValueError for one that cannot be used."""
     for name, kind in _TYPES.items():
         if not isinstance(getattr(plan, name), kind):
             raise TypeError(f"returned a {name} of type {type(getattr(plan, name)).__name__}")
-    return replace(plan, done=bool(plan.done))
+    linear_mps, angular_rad_s = plan.twist.linear_mps, plan.twist.angular_rad_s
+    if not (abs(linear_mps) <= MAX_COMMAND and abs(angular_rad_s) <= MAX_COMMAND):  # or not a number
+        raise ValueError(f"returned {linear_mps:g} m/s, {angular_rad_s:g} rad/s")
+    track = plan.track
+    if track and not all(map(math.isfinite, (track.x_m, track.y_m, track.vx_mps, track.vy_mps))):
+        raise ValueError("returned a track with a number that is nan or infinite")
+    return replace(
+        plan, twist=Twist(linear_mps=float(linear_mps), angular_rad_s=float(angular_rad_s)),
+        phase=_line(plan.phase), note=_line(plan.note), done=bool(plan.done), target=_usable_target(plan.target),
+        bearing_rad=_float(plan.bearing_rad), distance_m=_float(plan.distance_m),
+    )  # fmt: skip
+
+
+def _line(text: str) -> str:
+    return printable(" ".join(text.split()))
+
+
+def _float(number: float | None) -> float | None:
+    """Convert any real number, e.g. of NumPy or a fraction, which the wire and a format do not take."""
+    return None if number is None else float(number)
+
+
+def _usable_target(one: Detection | None) -> Detection | None:
+    if one is None:
+        return None
+    numbers = (one.x1_px, one.y1_px, one.x2_px, one.y2_px, one.score)
+    if (not all(abs(number) <= _FURTHEST_PX for number in numbers) or not 0 <= one.score <= 1
+            or one.x1_px > one.x2_px or one.y1_px > one.y2_px):
+        raise ValueError("returned a target with an invalid box or score")
+    if wrong := annotation_problem(one):
+        raise ValueError(f"returned a target with {wrong}")
+    if all(isinstance(number, float) for number in numbers):
+        return one  # itself: the overlay knows the target among the detections
+    x1_px, y1_px, x2_px, y2_px, score = map(float, numbers)
+    return replace(one, x1_px=x1_px, y1_px=y1_px, x2_px=x2_px, y2_px=y2_px, score=score)
 
 
 def _failed(error: BaseException) -> Plan:

@@ -1,6 +1,8 @@
 """From one mission to the next: at rest in between, whatever a mission does, and over when it is over."""
 
+import math
 from dataclasses import replace
+from fractions import Fraction
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,12 +12,13 @@ from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import faults
 from sightline.protocol.messages import STILL, FrameHeader, RequestId, Twist
 from sightline.vision_side.config import MissionConfig, VisionConfig
-from sightline.vision_side.detect.port import NoDetector
+from sightline.vision_side.detect.port import Circle, Detection, NoDetector
 from sightline.vision_side.detect.registry import configured_detector
 from sightline.vision_side.missions.port import Plan, View
 from sightline.vision_side.missions.registry import mission_spec
 from sightline.vision_side.missions.switch import SETTLE_S, MissionSwitch
 from sightline.vision_side.pipeline import Frame, Pipeline
+from sightline.vision_side.tracking.track import Target
 from tests.contracts.missions import CAMERA
 from tests.fixtures.vision.vision import jpeg_of, scene
 
@@ -260,6 +263,55 @@ def test_command_beyond_a_thousand_ends_the_mission(linear_mps, angular_rad_s, p
     plan = switch.step(looked())
     assert (plan.phase, plan.twist) == (phase, twist if phase == "driving" else STILL)
     assert switch.step(looked()).phase == phase
+
+
+@pytest.mark.parametrize("twist", [{"linear_mps": math.nan}, {"angular_rad_s": math.nan}, {"linear_mps": "1"}])
+def test_twist_that_was_not_validated_ends_the_mission(twist):
+    switch = MissionSwitch(scripted(), CAMERA)
+    twist = Twist.model_construct(**{"linear_mps": 0.0, "angular_rad_s": 0.0, **twist})
+    switch._mission.step = lambda _view: Plan(twist, "driving")
+    plan = switch.step(looked())
+    assert (plan.phase, plan.twist, plan.done) == ("failed", STILL, True)
+
+
+BOX = Detection(10.0, 20.0, 30.0, 40.0, 0.9, "ball")
+
+
+@pytest.mark.parametrize(("field", "value"), [
+    ("x1_px", "a"), ("x1_px", math.nan), ("x1_px", 31.0), ("y2_px", 1e300), ("score", None), ("score", 7.0),
+    ("label", None), ("label", "x" * 65), ("y1_px", 41), ("circle", (1, 2, 3)), ("circle", Circle(1.0, 2.0, -3.0)),
+])  # fmt: skip
+def test_target_that_the_wire_cannot_carry_ends_the_mission(field, value):
+    switch = MissionSwitch(scripted(), CAMERA)
+    switch._mission.step = lambda _view: Plan(STILL, "tracking", target=replace(BOX, **{field: value}))
+    plan = switch.step(looked())
+    assert (plan.phase, plan.target) == ("failed", None)
+
+
+@pytest.mark.parametrize("x_m", ["1", math.nan])
+def test_track_without_a_place_ends_the_mission(x_m):
+    switch = MissionSwitch(scripted(), CAMERA)
+    switch._mission.step = lambda _view: Plan(STILL, "tracking", track=Target(x_m, 0.0, 0.0, 0.0, 0, 1))
+    assert switch.step(looked()).phase == "failed"
+
+
+@pytest.mark.parametrize("kind", [Fraction, np.float32])
+def test_plan_may_contain_any_text_and_any_real_number(kind):
+    plan = Plan(STILL, "ph\ud800ase", "n\udcff\n o\x1b", bearing_rad=kind(0.25), distance_m=kind(0.5),
+                target=replace(BOX, x1_px=kind(10), score=kind(0.5)))
+    switch = MissionSwitch(scripted(), CAMERA)
+    switch._mission.step = lambda _view: plan
+    shown = switch.step(looked())
+    assert (shown.phase, shown.note) == ("ph?ase", "n? o?")
+    assert (shown.bearing_rad, shown.distance_m, shown.target) == (0.25, 0.5, replace(BOX, score=0.5))
+    assert shown.target is not None
+    assert all(type(one) is float for one in (shown.bearing_rad, shown.distance_m, shown.target.x1_px))
+
+
+def test_target_among_the_detections_stays_the_same_object():
+    switch = MissionSwitch(scripted(), CAMERA)
+    switch._mission.step = lambda _view: Plan(STILL, "tracking", target=BOX)
+    assert switch.step(looked()).target is BOX
 
 
 @pytest.mark.parametrize(("field", "value"), [
