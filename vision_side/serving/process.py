@@ -7,7 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Final
 
@@ -31,6 +31,8 @@ _WAIT_S = 0.2  # how long a stop signal may go unnoticed
 
 ENDS_WITHIN_S: Final = 3.0
 """Longest end after a signal: before systemd and containers kill the process without a line (4 s)."""
+_THREADS_END_S: Final = 0.5
+"""Least time for threads after the main thread: that of `viewing` ends only then."""
 
 
 @contextmanager
@@ -59,13 +61,28 @@ def ends_on_signal(ending: threading.Event) -> Iterator[None]:
 
 
 def _end_hanging(signals: socket.socket, left: threading.Event) -> None:
-    """Wait for a signal, and end this process if it does not leave `ends_on_signal` in time."""
+    """Wait for a signal, and end this process if it does not leave `ends_on_signal`, or does not end then, in time."""
     with signals:  # open until the end: a second signal is written to it, too
         number = signals.recv(1)
-        if number and not left.wait(ENDS_WITHIN_S):
-            _log.error("a detector or mission does not return; ended by force")
-            logging.shutdown()
-            os._exit(128 + number[0])
+        if not number:
+            return
+        until_s, what = time.monotonic() + ENDS_WITHIN_S, "a detector, a mission or the link does not return"
+        if left.wait(ENDS_WITHIN_S):
+            threading.main_thread().join()
+            what = "a thread of a detector or mission does not end"
+            if not _has_hanging_thread(max(until_s, time.monotonic() + _THREADS_END_S)):
+                return
+        _log.error("%s; ended by force", what)
+        logging.shutdown()
+        os._exit(128 + number[0])
+
+
+def _has_hanging_thread(until_s: float) -> bool:
+    """Wait for the threads that Python waits for after the main thread. Returns True if one is left at `until_s`."""
+    others = [one for one in threading.enumerate() if not one.daemon and one is not threading.main_thread()]
+    for one in others:
+        one.join(max(0.0, until_s - time.monotonic()))
+    return any(one.is_alive() for one in others)
 
 
 def run(config: VisionConfig, observe: Observe | None = None) -> int:
@@ -80,14 +97,17 @@ def run(config: VisionConfig, observe: Observe | None = None) -> int:
     if problem := date_problem(config.secure, SOURCE):
         _log.warning("vision: %s", problem)
     run_it = _run_fleet if set("*?") & set(config.robot) or config.share.enabled else _run_one
-    try:
-        with limit_floods(config.listen, lambda line: _log.info("vision: %s", line)):
-            return run_it(config, ending, observe, detector)
-    finally:
-        close_detector(detector)
+    with ExitStack() as guard:  # it also covers the end of the link and of the detector
+        try:
+            with limit_floods(config.listen, lambda line: _log.info("vision: %s", line)):
+                return run_it(config, ending, observe, detector, guard)
+        finally:
+            close_detector(detector)
 
 
-def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | None, detector: Detector) -> int:
+def _run_one(
+    config: VisionConfig, ending: threading.Event, observe: Observe | None, detector: Detector, guard: ExitStack
+) -> int:
     from sightline.protocol.transports.open import open_link
 
     legacy = any(is_legacy(one) for one in config.connect)
@@ -98,7 +118,8 @@ def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | N
     opened = open_link(config.robot, listen=listen, connect=config.connect, role=SOURCE,
                         max_frame_bytes=config.max_frame_bytes, secure=config.secure)
     # Signals are caught only from here on: until the link is open, they end the process by themselves.
-    with LegacyRobotLink(opened) if legacy else opened as link, ends_on_signal(ending):
+    with LegacyRobotLink(opened) if legacy else opened as link:
+        guard.enter_context(ends_on_signal(ending))
         if legacy:
             _log.info("vision: STOP and disarm of robot %s: sightline stop %s --connect %s", config.robot, config.robot,
                       ", ".join(listen or config.connect))
@@ -107,7 +128,9 @@ def _run_one(config: VisionConfig, ending: threading.Event, observe: Observe | N
     return 0
 
 
-def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe | None, detector: Detector) -> int:
+def _run_fleet(
+    config: VisionConfig, ending: threading.Event, observe: Observe | None, detector: Detector, guard: ExitStack
+) -> int:
     from sightline.protocol.transports.zenoh.link import open_fleet
     from sightline.vision_side.serving.fleet import Fleet, SharedFleet
 
@@ -116,7 +139,8 @@ def _run_fleet(config: VisionConfig, ending: threading.Event, observe: Observe |
         raise ConfigError(f"{web}: --share needs Zenoh; write tcp/<host>:<port>")
     opened = open_fleet(config.robot, listen=config.listen, connect=config.connect, role=SOURCE,
                        max_frame_bytes=config.max_frame_bytes, secure=config.secure, by_status=not shared)
-    with opened as fleet_link, ends_on_signal(ending):
+    with opened as fleet_link:
+        guard.enter_context(ends_on_signal(ending))
         _log.info("vision: looking for robots %s at %s", config.robot, endpoints_text(config))
         fleet = (SharedFleet if shared else Fleet)(config, fleet_link, _log.info, detector)
         fleet.serve(ending, observe)

@@ -518,3 +518,32 @@ def test_service_whose_detector_or_mission_hangs_is_ended_after_its_time(work, h
     _, told = started.communicate(timeout=20)
     assert "Exception ignored" not in told
     assert (started.returncode, "does not return; ended by force" in told) == ((143, True) if hangs else (0, False))
+
+
+@pytest.mark.parametrize(("detector", "line"), [
+    ("close = lambda _self: time.sleep(30)", "a detector, a mission or the link does not return"),
+    ("thread = threading.Thread(target=time.sleep, args=(30,)).start()", "a thread of a detector or mission"),
+    ("thread = threading.Thread(target=time.sleep, args=(1,), daemon=True).start()", ""),
+])  # fmt: skip
+def test_service_ends_in_time_whatever_its_detector_leaves_behind(detector, line):
+    code = (
+        "import sys, threading, time\n"
+        "from sightline.protocol.log import start_log\n"
+        "from sightline.vision_side.config import VisionConfig\n"
+        "from sightline.vision_side.serving import process\n"
+        f"class Plain:\n    {detector}\n"
+        "start_log(None, 'vision')\n"
+        "process.ENDS_WITHIN_S, process._THREADS_END_S = 0.8, 0.1\n"
+        "process.configured_detector = lambda _config: Plain()\n"
+        f"config = VisionConfig(connect=(), listen=({free_endpoint('ws://')!r},))\n"
+        "sys.exit(process.run(config, lambda _state: print('on', flush=True)))\n"
+    )
+    started = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    while started.stdout.readline() not in ("on\n", ""):
+        pass
+    started.send_signal(signal.SIGTERM)
+    _, printed = started.communicate(timeout=20)
+    assert (started.returncode, line in printed) == (143 if line else 0, True)
+    assert ("ended by force" in printed) == bool(line)
