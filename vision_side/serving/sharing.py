@@ -166,6 +166,8 @@ class Sharing:
         self.robots = {robot: SharedRobot(self._drivers[robot]) for robot in named}
         self._named = frozenset(named)
         self._services: set[VisionToken] = set()
+        self._twins = 0
+        """Services of this name that count before this one."""
         self._choices: dict[str, tuple[str, ...]] = {}
         self._is_changed = True
         self._full: dict[int, tuple[Sized, int]] = {}
@@ -178,10 +180,6 @@ class Sharing:
     def has_twin(self) -> bool:
         """Return True if another service has this name and counts instead of this one."""
         return self._twins > 0
-
-    @property
-    def _twins(self) -> int:
-        return sum(one.name == self.own.name and one.instance < self.own.instance for one in self._services)
 
     def add_own(self, token: DriverToken) -> None:
         """Note a token with which this service drives, before it is declared."""
@@ -226,6 +224,8 @@ class Sharing:
             elif not self._is_full(self._services, MAX_SERVICES):
                 self._services.add(token)
             self._is_changed = True
+            if token.name == self.own.name:
+                self._twins = sum(one.name == token.name and one.instance < self.own.instance for one in self._services)
 
     def _on_robot(self, robot: str, is_present: bool, now_us: int) -> None:
         if is_present and robot not in self.robots and not self._is_full(self.robots, MAX_ROBOTS):
@@ -383,13 +383,13 @@ class Sharing:
         others = robot.drivers if robot.is_not_mine else robot.others
         if self._is_leaving or robot.is_busy:
             return bool(others) and (self._is_leaving or robot.is_not_mine)
-        return any(other.name in self._before(name) for other in others)
+        return bool(others) and not {other.name for other in others}.isdisjoint(self._before(name))
 
     def _before(self, robot: str) -> list[str]:
         """Return the services that may claim a robot before this one, in their order. Twins follow one another."""
         first = self._choices[robot]
-        order = [*first, *ranked(robot, self.services())]
-        return order[: order.index(self.own.name)] + self._twins * [self.own.name]
+        order = first if self.own.name in first else [*first, *ranked(robot, self.services())]
+        return [*order[: order.index(self.own.name)], *self._twins * [self.own.name]]
 
     def _is_next(self, name: str, robot: SharedRobot, now_us: int) -> bool:
         """Return True if it is the turn of this service to claim a robot."""
@@ -399,7 +399,9 @@ class Sharing:
             late_us = now_us - robot.driverless_us - NO_DRIVER_US
             if is_owner or late_us < 0:
                 return is_owner
-            return late_us >= NEXT_CHOICE_US * min(2, len(self._before(name)) - 1)
+            # The order of all services takes long to compute for each of a thousand robots, and makes no difference.
+            place = len(self._before(name)) if self.own.name in self._choices[name] else len(self._choices[name])
+            return late_us >= NEXT_CHOICE_US * min(2, place - 1)
         if robot.is_silent:
             since_us = max(robot.active_us + SILENT_US, robot.driver_us)
             is_turn = self.own.name != second or robot.has_left or robot.status_us - since_us >= SECOND_STANDBY_US
