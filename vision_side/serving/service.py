@@ -268,6 +268,7 @@ class Service:
         self._robot_session = ""
         self._sessions = SessionSelector()
         self._reported: dict[str, str] = {}
+        self._changes = RepeatLimiter()
         if config.camera is not None:
             self._use(config.camera)
         self._heard_s = time.monotonic()
@@ -367,13 +368,14 @@ class Service:
             self._use(camera)
 
     def _use(self, camera: CameraModel) -> None:
-        self._camera = camera
+        self._camera, is_frequent = camera, self._pipeline is not None
         if self._pipeline is None:
             self._pipeline = Pipeline(self._config, camera, self._detector)
         else:
             self._pipeline.set_camera(camera)
         lens = "calibrated" if camera.calibrated else "not calibrated"
-        self._log_change("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}")
+        self._log_change("camera", f"camera is {camera.width_px}x{camera.height_px}, fx {camera.fx_px:.1f} px, {lens}",
+                         is_frequent=is_frequent)
 
     def _frame(self, message: Message, started_ns: int) -> None:
         """Answer a message. Note how long a frame waited, and how long its answer took."""
@@ -391,9 +393,7 @@ class Service:
         if not self._is_of_robot(header, self._frames.dropped):
             return
         self._heard_s = time.monotonic()
-        if header.session != self._robot_session:
-            self._robot_session = header.session
-            self._log_change("link", f"frames from robot {self._config.robot}, session {_shown(header.session)}")
+        self._note_session(header.session)
         if self._pipeline is None or not self._pipeline.fits(message.payload):
             self._find_camera(message.payload)
         if self._pipeline is None:
@@ -410,6 +410,12 @@ class Service:
         if not self._is_legacy:
             self._viewing.publish_detections(header, answer, started_ns)
         self._viewing.show(header, answer, self._pipeline.camera, started_ns=started_ns, jpeg=message.payload)
+
+    def _note_session(self, session: str) -> None:
+        if session != self._robot_session:
+            is_frequent, self._robot_session = bool(self._robot_session), session
+            self._log_change("link", f"frames from robot {self._config.robot}, session {_shown(session)}",
+                             is_frequent=is_frequent)
 
     def _is_of_robot(self, header: FrameHeader, replaced_frames: int = 0) -> bool:
         """Return True for a frame of the steered robot. Others are counted, and logged once.
@@ -515,11 +521,18 @@ class Service:
         elif seen.phase != "coasting":
             self._log_change("phase", ": ".join(filter(None, (seen.phase, seen.note))), seen.phase)
 
-    def _log_change(self, about: str, line: str, state: str = "") -> None:
-        """Log `line` if its subject changed since the last line about it."""
-        if self._reported.get(about) != (state or line):
+    def _log_change(self, about: str, line: str, state: str = "", *, is_frequent: bool = False) -> None:
+        """Log `line` if its subject changed since the last line about it.
+
+        A frequent change is logged at once and then after 1, 2, 4 ... 60 s, because any client of a network without
+        keys can cause it with each message.
+        """
+        if self._reported.get(about) == (state or line):
+            return
+        times = self._changes.due(about, self._now_us()) if is_frequent else 1
+        if times:
             self._reported[about] = state or line
-            self._report(f"vision: {line}")
+            self._report(f"vision: {line}" + (f" ({times} changes)" if times > 1 else ""))
 
 
 def _shown(session: str) -> str:
@@ -597,7 +610,7 @@ class BoxesService(Service):
         if header is None:
             return
         self._heard_s = time.monotonic()
-        self._log_change("link", f"frames from robot {self._config.robot}, session {_shown(header.session)}")
+        self._note_session(header.session)
         self._publish(header, PipelineAnswer(None, Observation("no image", note="another service detects")), 0)
         self._viewing.keep(header, message.payload)
         if self._pipeline is None or (self._is_legacy and not self._pipeline.fits(message.payload)):

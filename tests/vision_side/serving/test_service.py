@@ -376,6 +376,22 @@ def test_frames_after_a_silence_are_reported_again(bench: Bench, monkeypatch: py
     assert len([line for line in bench.said if f"frames from robot r1, session {SHOWN}" in line]) == 2
 
 
+def test_sessions_and_cameras_that_change_with_each_message_write_few_lines(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(service_module, "monotonic_us", lambda: bench.now_us)
+    bench.camera()
+    for seq in range(1, 301):  # 10 s
+        bench.frame(BALL, 10 * seq, session=f"{seq:08x}")
+        bench.camera(MODEL.model_copy(update={"fx_px": 200.0 + seq}))
+        bench.now_us += 1
+    for word in ("frames from robot r1, session", "camera is 320x240"):
+        lines = [line for line in bench.said if word in line]
+        assert 3 <= len(lines) <= 6 and lines[-1].endswith(" changes)"), lines
+        shown = sum(int(line.rpartition("(")[2].split()[0]) if "changes)" in line else 1 for line in lines)
+        assert 150 <= shown <= 301, "each change counts"
+
+
 def test_skipped_frames_are_counted_over_all_cameras(bench: Bench) -> None:
     bench.camera()
     for seq in range(1, 4):
@@ -536,13 +552,14 @@ def test_service_ends_in_time_whatever_its_detector_leaves_behind(detector, line
         "process.ENDS_WITHIN_S, process._THREADS_END_S = 0.8, 0.1\n"
         "process.configured_detector = lambda _config: Plain()\n"
         f"config = VisionConfig(connect=(), listen=({free_endpoint('ws://')!r},))\n"
-        "sys.exit(process.run(config, lambda _state: print('on', flush=True)))\n"
+        "sys.exit(process.run(config, lambda _state: print('READY\\n', end='', flush=True)))\n"
     )
     started = subprocess.Popen(
         [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    while started.stdout.readline() not in ("on\n", ""):
-        pass
+    for line_of_log in started.stdout:
+        if line_of_log.endswith("READY\n"):  # the log may write at the same moment
+            break
     started.send_signal(signal.SIGTERM)
     _, printed = started.communicate(timeout=20)
     assert (started.returncode, line in printed) == (143 if line else 0, True)
