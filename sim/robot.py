@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 from sightline.protocol.config import Config
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import CameraModel
-from sightline.sim.toml_file import check, find, read_table
+from sightline.sim.toml_file import check, find, is_file, read_table
 from sightline.sim.urdf import Front, Outline, Transform, Urdf, urdf_text
 
 ROBOTS = Path(__file__).parent / "robots"
@@ -177,7 +177,7 @@ def load_robot(name: str) -> RobotModel:
 def _measure(table: dict[str, Any], path: Path) -> None:
     """Add the wheels and sensors of the URDF. Raises ConfigError."""
     file = path.parent / str(table["urdf"])
-    if not file.exists() and (ROBOTS / str(table["urdf"])).exists():
+    if not is_file(file) and is_file(ROBOTS / str(table["urdf"])):
         file = ROBOTS / str(table["urdf"])  # it is that of the robot which this one extends
     table["urdf"] = str(file)
     wheels = _table(table, "wheels", path)
@@ -191,9 +191,12 @@ def _measure(table: dict[str, Any], path: Path) -> None:
     foot = body.foot(str(joints[0]), str(joints[1]), front)
     lidar = _table(table, "lidar", path)
     eyes = lidar.get("eyes", [])
+    if not isinstance(eyes, list):
+        raise ConfigError(f"{path}: lidar.eyes: {str(eyes)[:60]!r} is not a list of tables; write [[lidar.eyes]]")
     for sensor in (_table(table, "camera", path), lidar, *(one for one in eyes if isinstance(one, dict))):
         if sensor.get("link"):
-            _mount(sensor, body.place(str(sensor["link"]), foot), sensor in eyes)
+            is_eye, link = sensor in eyes, str(sensor["link"])
+            _mount(sensor, body.place(link, foot) if is_eye else body.mount(link, foot), is_eye)
 
 
 def _table(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:

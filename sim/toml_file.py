@@ -18,11 +18,19 @@ def find(kind: str, name: str, folder: Path) -> Path:
     Raises ConfigError with the nearest name and all names for an unknown one.
     """
     path = Path(name) if name.endswith(".toml") else folder / f"{name}.toml"
-    if path.is_file() and (name.endswith(".toml") or name in names_in(folder)):
+    if is_file(path) and (name.endswith(".toml") or name in names_in(folder)):
         return path
     if name.endswith(".toml"):
         raise ConfigError(f"no {kind} file {name}; by name there are {', '.join(names_in(folder))}")
     raise ConfigError(f"no {kind} called {name!r}{_nearest(name, folder)}; there are {', '.join(names_in(folder))}")
+
+
+def is_file(path: Path) -> bool:
+    """Return True if there is such a file: False also for a name that no file can have, e.g. a very long one."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
 
 
 def names_in(folder: Path) -> list[str]:

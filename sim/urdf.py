@@ -11,6 +11,7 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from sightline.protocol.errors import ConfigError, install_command
+from sightline.sim.toml_file import is_file
 
 Vector = tuple[float, float, float]
 Rotation = tuple[Vector, Vector, Vector]
@@ -78,8 +79,13 @@ _NUMBERS = {
     "xyz": 3, "rpy": 3, "size": 3, "value": 1, "radius": 1, "length": 1,
     "ixx": 1, "iyy": 1, "izz": 1, "ixy": 1, "ixz": 1, "iyz": 1,
 }
+_SHAPES = ("box", "cylinder", "sphere")
+_JOINTS = ("fixed", "continuous", "revolute", "prismatic", "floating", "planar", "spherical")
+"""Types of joints. With another one, and with a link below two joints, PyBullet may end the process."""
 _PLACED_WITHIN_M = 0.001
 _ACROSS = 0.999  # cosine: a URDF that writes a quarter turn as 1.57 is meant to be square
+_AHEAD = (Transform().turn, ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
+_TURNED = 0.01  # of any axis: half a degree
 _RIM = 0.03  # of the track width: so narrow a rim turns within 0.1 % of the distance of the joints
 _REST = 0.97  # of the radius
 _FEATHER = (
@@ -110,8 +116,7 @@ class Urdf:
     def __init__(self, text: str, name: str) -> None:
         self._name = name
         self._root = self._parsed(text)
-        self._links = {link.get("name", ""): link for link in self._root.findall("link")}
-        self._joints = {joint.get("name", ""): joint for joint in self._root.findall("joint")}
+        self._links, self._joints = self._named("link"), self._named("joint")
         self._check_numbers()
         self._check_bodies()
         self._frames = self._link_frames()
@@ -131,10 +136,11 @@ class Urdf:
         left, right = self._wheel(left_joint, seen_from), self._wheel(right_joint, seen_from)
         if left.place[1] <= right.place[1]:
             raise self._wrong(f"{left_joint!r} is not left of {right_joint!r}; swap the two, or turn `front`")
-        uneven_m = max(abs(left.place[0]), abs(left.place[1] + right.place[1]), abs(left.radius_m - right.radius_m))
+        uneven_m = max(abs(left.place[0]), abs(left.place[1] + right.place[1]), abs(left.place[2] - right.place[2]),
+                       abs(left.radius_m - right.radius_m))
         if uneven_m > _PLACED_WITHIN_M:
             raise self._wrong(
-                f"{left_joint!r} and {right_joint!r} are not a pair; use one radius, one x and opposite y"
+                f"{left_joint!r} and {right_joint!r} are not a pair; use one radius, one x and opposite y, on one level"
             )
         return left, right
 
@@ -143,6 +149,19 @@ class Urdf:
         if link not in self._links:
             raise self._wrong(f"has no link {link!r}{_nearest(link, self._links)}")
         return foot.inverse().of(self._frames[link])
+
+    def mount(self, link: str, foot: Transform) -> Transform:
+        """Return the position of a sensor that faces straight ahead in the middle. Raises ConfigError for another one.
+
+        A camera may lie as its optical frame does: z forward, x right.
+        """
+        where = self.place(link, foot)
+        turned = min(max(abs(one - other) for row, rows in zip(where.turn, ahead, strict=True)
+                         for one, other in zip(row, rows, strict=True)) for ahead in _AHEAD)
+        if abs(where.at[1]) > _PLACED_WITHIN_M or turned > _TURNED:
+            raise self._wrong(f"link {link!r} of a sensor is {where.at[1]:.3f} m left of the middle, or turned; put it "
+                              "in the middle, x forward and z up, or write x_m and z_m instead of `link`")
+        return where
 
     def outline(self, foot: Transform) -> Outline:
         """Return the outline of all collision shapes, including the wheels."""
@@ -164,6 +183,11 @@ class Urdf:
         the lens may lie within its housing.
         """
         root = ElementTree.fromstring(ElementTree.tostring(self._root))
+        for axis in root.iter("axis"):
+            x, y, z = _numbers(axis.get("xyz", "1 0 0"))
+            # PyBullet multiplies the speed of a joint by the length of its axis.
+            if (length := math.hypot(x, y, z)) not in (0.0, 1.0):
+                axis.set("xyz", f"{x / length!r} {y / length!r} {z / length!r}")
         for link in root.findall("link"):
             for visual in link.findall("visual"):
                 link.remove(visual)
@@ -186,6 +210,17 @@ class Urdf:
             raise self._wrong(f"not a URDF: its outermost element is <{root.tag}>, not <robot>")
         return root
 
+    def _named(self, tag: str) -> dict[str, Element]:
+        """Return all links or joints by name."""
+        found: dict[str, Element] = {}
+        for one in self._root.findall(tag):
+            name = one.get("name", "")
+            if not name or name in found:
+                raise self._wrong(f"two of its {tag}s are named {name!r}; give each its own name" if name
+                                  else f"a <{tag}> has no name; give it one")
+            found[name] = one
+        return found
+
     def _check_numbers(self) -> None:
         for owner in (*self._links.values(), *self._joints.values()):
             for element in owner.iter():
@@ -201,8 +236,10 @@ class Urdf:
             mass = link.find("inertial/mass")
             if mass is not None and _number(mass, "value", 0.0) <= 0:
                 raise self._wrong(f"link {name!r} has a mass of {mass.get('value')} kg; it must be above 0")
-            if link.find("collision/geometry/mesh") is not None:
-                raise self._wrong(f"link {name!r} collides as a mesh; write it as <box>, <cylinder> or <sphere>")
+            for shape in link.iterfind("collision/geometry/*"):
+                if shape.tag not in _SHAPES:
+                    raise self._wrong(f"link {name!r} collides as a {shape.tag}; write it as <box>, <cylinder> or "
+                                      "<sphere>")
 
     def _link_frames(self) -> dict[str, Transform]:
         """Every link, seen from the root, joints at zero."""
@@ -212,7 +249,13 @@ class Urdf:
                 link = _end(joint, end)
                 if link not in self._links:
                     raise self._wrong(f"joint {name!r}: its {end} {link!r} is not a link{_nearest(link, self._links)}")
-            above[_end(joint, "child")] = joint
+            if joint.get("type") not in _JOINTS:
+                raise self._wrong(f"joint {name!r} has type {joint.get('type')!r}; use {', '.join(_JOINTS)}")
+            child = _end(joint, "child")
+            if child in above:
+                raise self._wrong(f"link {child!r} is the child of two joints, {above[child].get('name')!r} and "
+                                  f"{name!r}; remove one")
+            above[child] = joint
         roots = [name for name in self._links if name not in above]
         if len(roots) != 1:
             raise self._wrong(f"must have one root link, it has {len(roots)}: {', '.join(roots)[:80]}")
@@ -359,7 +402,7 @@ def _nearest(name: str, names: Iterable[str]) -> str:
 
 def urdf_text(path: Path) -> str:
     """The URDF in `path`; a `.xacro` is expanded, which needs the extra. Raises ConfigError."""
-    if not path.is_file():
+    if not is_file(path):
         raise ConfigError(f"{path}: no such file; `urdf` names a file beside the robot's .toml")
     if path.suffix == ".xacro":
         return _expanded(path)

@@ -96,6 +96,17 @@ def thymio_with(tmp_path: Path, drawing: tuple[str, str] = ("", ""), words: tupl
     ('<cylinder radius="0.022" length="0.015"/>', '<box size="0.1 0.1 0.1"/>', "has no round <collision>"),
     ('<box size="0.11 0.112 0.045"/>', '<mesh filename="body.stl"/>', "collides as a mesh"),
     ('<parent link="main_body"/>', '<parent link="main_bdy"/>', "is not a link, did you mean 'main_body'?"),
+    ('<box size="0.11 0.112 0.045"/>', '<capsule radius="0.02" length="0.1"/>', "collides as a capsule; write it as"),
+    ('<box size="0.11 0.112 0.045"/>', '<plane normal="0 0 1"/>', "collides as a plane; write it as <box>"),
+    ('<link name="sensor_front"/>', '<link name="sensor_front"/><joint name="second" type="fixed"><parent '
+     'link="sensor_left"/><child link="sensor_front"/></joint>',
+     "link 'sensor_front' is the child of two joints, 'second' and 'front_joint'; remove one"),
+    ('name="front_joint" type="fixed"', 'name="front_joint"', "joint 'front_joint' has type None; use fixed, "),
+    ('name="front_joint" type="fixed"', 'name="front_joint" type="welded"', "has type 'welded'"),
+    ('name="front_joint"', 'name="left_joint"', "two of its joints are named 'left_joint'; give each its own name"),
+    ('<link name="sensor_front"/>', '<link name="sensor_left"/>', "two of its links are named 'sensor_left'"),
+    ('<link name="sensor_front"/>', '<link name="sensor_front"/><link/>', "a <link> has no name; give it one"),
+    ('xyz="-0.025 0.056 0.022"', 'xyz="-0.025 0.056 0.042"', "are not a pair; use one radius"),
     ('<robot name="thymio">', '<robot name="thymio"', "invalid XML"),
     ('<link name="sensor_front"/>', '<link name="sensor_front"/><link name="loose"/>', "must have one root link"),
 ])
@@ -116,12 +127,52 @@ def test_a_urdf_that_is_not_a_robot_is_one_line_with_the_fix(tmp_path, old, new,
     ('urdf = "thymio.urdf"', 'front = "-x"\nurdf = "thymio.urdf"', "is not left of 'right_wheel_joint'; swap the two"),
     ('urdf = "thymio.urdf"', 'urdf = "thymio.urdf"\nchassis = {}', "chassis"),
     ("max_torque_nm = 0.05", "max_torque_nm = nan", "wheels.max_torque_nm"),
+    ('link = "camera"', 'link = "sensor_left"', "'sensor_left' of a sensor is 0.053 m left of the middle, or"),
+    ('urdf = "thymio.urdf"', f'urdf = "{"x" * 300}"', "no such file; `urdf` names a file beside the robot's .toml"),
 ])
 def test_a_toml_that_does_not_fit_its_urdf_is_one_line_too(tmp_path, old, new, expected):
     with pytest.raises(ConfigError) as caught:
         load_robot(thymio_with(tmp_path, words=(old, new)))
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("eyes", ["5", '"x"', "{ link = 'sensor_left' }"])
+def test_range_sensors_that_are_not_a_list_are_one_line(tmp_path, eyes):
+    toml = (ROBOTS / "thymio.toml").read_text()
+    toml = toml[: toml.index("[[lidar.eyes]]")] + ""
+    path = tmp_path / "mine.toml"
+    path.write_text(toml.replace("[lidar]\n", f"[lidar]\neyes = {eyes}\n"))
+    with pytest.raises(ConfigError, match=r"mine\.toml: lidar\.eyes: .* is not a list of tables; write"):
+        load_robot(str(path))
+
+
+@pytest.mark.parametrize(("turn", "fits"), [
+    ("0 0 0", True), ("-1.5708 0 -1.5708", True), ("0 0.004 0", True), ("0 0 3.1416", False), ("3.1416 0 0", False),
+    ("0 0.1 0", False), ("0 0 -0.1", False),
+])
+def test_sensor_must_face_straight_ahead(tmp_path, turn, fits):
+    path = thymio_with(tmp_path)
+    text = (tmp_path / "thymio.urdf").read_text()
+    joint = text[text.index('<joint name="camera_joint"'):]
+    joint = joint[: joint.index("</joint>")]
+    turned = joint.replace("<origin ", f'<origin rpy="{turn}" ')
+    assert turned != joint
+    (tmp_path / "thymio.urdf").write_text(text.replace(joint, turned))
+    if fits:
+        assert load_robot(path).camera.x_m == load_robot("thymio").camera.x_m
+    else:
+        with pytest.raises(ConfigError, match=r"link 'camera' of a sensor is 0\.000 m left of the middle, or turned"):
+            load_robot(path)
+
+
+@pytest.mark.parametrize("factor", [2.0, 0.1])
+def test_length_of_an_axis_changes_nothing(factor):
+    text = (ROBOTS / "thymio.urdf").read_text()
+    long = text.replace('<axis xyz="0 1 0"/>', f'<axis xyz="0 {factor} 0"/>')
+    assert long != text
+    short = Urdf(long, "mine").text(*WHEELS, 0.0).replace("0.0 1.0 0.0", "0 1 0")
+    assert short == Urdf(text, "mine").text(*WHEELS, 0.0)
 
 
 def test_xacro_file_without_the_extra_prints_the_install_command(tmp_path, monkeypatch):
