@@ -30,6 +30,8 @@ def test_everything_shipped_loads():
         (load_scenario, "cirlce", "did you mean 'circle'"),
         (load_scenario, "../robots/raspberry", "no scenario called"),
         (load_scenario, "/nowhere/x.toml", "no scenario file /nowhere/x.toml"),
+        (load_scenario, "x" * 300 + ".toml", "no scenario file xxx"),
+        (load_robot, "x" * 300 + ".toml", "no robot file xxx"),
         (load_robot, "rasberry", "did you mean 'raspberry'"),
         (look_named, "dimm", "did you mean 'dim'"),
     ],
