@@ -491,6 +491,7 @@ Bounds = Annotated[
 
 
 SCENARIOS = Path(__file__).parent / "scenarios"
+_LONGEST_NAME_BYTES = 200  # of the 255 that a file system permits
 
 class Start(Config):
     """The start of the robot, drawn within each span: relative to lens and target, or on the map."""
@@ -534,15 +535,21 @@ class Wall(Config):
         return self
 
 
+def _part_of_a_file_name(name: str) -> str:
+    if not name or not name.isprintable() or "/" in name or len(name.encode()) > _LONGEST_NAME_BYTES:
+        raise ValueError("the folder of a run is named so; use up to 200 bytes of printable text without '/'")
+    return name
+
+
 class Scenario(Config):
     """One scenario. `stand_off_m` is what both the steering and the score go by: lens to the target's middle.
 
     `robot`, `mission` and `vision` (keys of vision.toml) are the settings that an operator chooses for it.
     """
 
-    name: str
+    name: Annotated[str, AfterValidator(_part_of_a_file_name)]
     summary: str = ""
-    seconds: Annotated[float, Field(gt=0, le=3600)] = 20.0
+    seconds: Annotated[float, Field(ge=1, le=3600)] = 20.0
     stand_off_m: Annotated[float, Field(gt=0, le=20)] = 0.8
     robot: Annotated[str, Field(min_length=1)] = "raspberry"
     mission: Annotated[str, Field(min_length=1)] = "follow"

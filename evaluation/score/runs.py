@@ -117,9 +117,9 @@ def cases(
         try:
             configured_mission(config)
         except ConfigError as error:
-            if mission is None:
-                raise
-            raise ConfigError(f"scenario {name}: {error}; choose with --scenario what {mission} can drive") from None
+            given = "; its goals_m are the waypoints" if scenario.goals_m else ""
+            fix = f"choose with --scenario what {mission} can drive" if mission else "correct its mission or options"
+            raise ConfigError(f"scenario {name}: {error}{given}; {fix}") from None
         if detector is not None:
             check_choice(detector, {}, config)
     if look is not None:

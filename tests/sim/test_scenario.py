@@ -50,6 +50,11 @@ def test_unknown_name_error_lists_the_nearest_and_all(load, name, expected):
         ("speed_mps = 0.25", "speed_mps = nan", "speed_mps"),
         ("speed_mps = 0.25", "speed_mps = -1", "speed_mps"),
         ("seconds = 30.0", 'seconds = "long"', "seconds"),
+        ("seconds = 30.0", "seconds = 0.99", "seconds: Input should be greater than or equal to 1"),
+        ("seconds = 30.0", 'name = "../x"', "name: the folder of a run is named so; use up to 200 bytes of printable"),
+        ("seconds = 30.0", 'name = "x\\u001b[31m"', "without '/'"),
+        ("seconds = 30.0", 'name = ""', "name: the folder of a run"),
+        ("seconds = 30.0", f'name = "{"圆" * 67}"', "name: the folder of a run"),
         ("turn_deg = 360.0", "turn_deg = 300.0", "does not close"),
         ("distance_m = [0.7, 1.0]", "distance_m = [1.0, 0.7]", "lowest first"),
         ("distance_m = [0.7, 1.0]", "distance_m = [-0.7, 1.0]", "distance_m"),
@@ -67,6 +72,11 @@ def test_bad_scenario_file_is_one_line_that_names_the_key(tmp_path, old, new, ex
         load_scenario(str(file))
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_shortest_scenario_and_longest_name_are_accepted(tmp_path):
+    file = write(tmp_path, f'extends = "static"\nseconds = 1\nname = "{"圆" * 66}"\n')
+    assert (load_scenario(file).seconds, len(load_scenario(file).name)) == (1.0, 66)
 
 
 def test_file_that_cannot_be_read_is_not_invalid_toml(tmp_path):

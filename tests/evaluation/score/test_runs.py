@@ -48,6 +48,13 @@ def test_impossible_setting_is_rejected_before_any_run(arguments):
         cases(*arguments, None)
 
 
+def test_goals_of_a_scenario_whose_mission_has_none_are_named(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text('extends = "static"\ngoals_m = [[1, 1]]\n')
+    with pytest.raises(ConfigError, match=r"scenario .*mine\.toml: mission 'follow': .*'waypoints'.*its goals_m are"):
+        cases([str(file)], [1], [0], [0], None)
+
+
 @pytest.mark.parametrize("at", range(3))
 @pytest.mark.parametrize("bad", [{"bearing_rms_deg": 0.9}, {"acquired_s": None}, {"wall_contacts": 1}])
 def test_one_bad_run_of_three_fails_its_figure_and_no_other(at, bad):
