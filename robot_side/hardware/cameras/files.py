@@ -73,6 +73,10 @@ def jpeg_size(path: Path, jpeg: bytes) -> JpegSize:
         size = read_jpeg_size(jpeg)
     except WireError as error:
         raise HardwareError(f"{path}: {error.detail}; remove it or convert it to a plain JPEG") from None
+    return _checked_size(path, size)
+
+
+def _checked_size(path: Path, size: JpegSize) -> JpegSize:
     for side_px in (size.width_px, size.height_px):
         if not LEAST_SIDE_PX <= side_px <= MOST_SIDE_PX:
             raise HardwareError(f"{path} has {size.width_px}x{size.height_px} pixels; expected {LEAST_SIDE_PX} to "
@@ -139,7 +143,7 @@ class VideoCamera:
         self._encode, self._cv2 = _packages()
         self._quality, self._scale_percent = config.quality, 100
         self._open()
-        self.model = camera_model(config, self._size())
+        self.model = camera_model(config, _checked_size(config.path, self._size()))
         fps = config.fps or self._own_fps()
         self._pace = FrameTimer(fps)
         self._fps = fps

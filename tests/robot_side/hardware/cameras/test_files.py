@@ -80,6 +80,13 @@ def test_invalid_video_is_reported(tmp_path, name, content):
         VideoCamera(VideoCamera.Config(path=tmp_path / name))
 
 
+@pytest.mark.parametrize("size", [(8, 64), (64, 8), (8194, 64)])
+def test_video_with_images_of_a_size_that_is_not_sent_is_one_line(tmp_path, size):
+    path = video(tmp_path / "film.avi", pictures=2, size=size)
+    with pytest.raises(HardwareError, match=rf"film.avi has {size[0]}x{size[1]} pixels; expected 16 to 8192 a side"):
+        VideoCamera(VideoCamera.Config(path=path))
+
+
 def test_libraries_print_nothing_about_an_invalid_video(tmp_path):
     (tmp_path / "film.mp4").write_bytes(b"no film at all" * 100)
     code = ("import sys; from sightline.robot_side.hardware.cameras.files import HardwareError, VideoCamera\n"
