@@ -1,6 +1,7 @@
 """The path of a run and its figures over time as a picture. Shell (writes a file)."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -71,9 +72,11 @@ def plot_run(
         _plot_distance(lower, times_s, samples, scenario.stand_off_m)
     if with_age and limits is not None:
         _plot_age(figure.add_subplot(grid[2, 1]), samples, statuses, limits)
-    figure.suptitle(title)
-    canvas.draw()  # type: ignore[no-untyped-call]  # equal scales change the numbers; what room those take shows now
-    canvas.print_png(path)  # type: ignore[no-untyped-call]
+    figure.suptitle(title, parse_math=False)  # names may contain a dollar sign
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from")  # letters that the font lacks become boxes
+        canvas.draw()  # type: ignore[no-untyped-call]  # equal scales change the numbers; what room those take shows now
+        canvas.print_png(path)  # type: ignore[no-untyped-call]
 
 
 def wall_corners(wall: Wall) -> list[tuple[float, float]]:

@@ -46,6 +46,11 @@ def area_like(path, color) -> int:
     return int((abs(image - tint) < 3).all(axis=2).sum())
 
 
+def test_title_may_have_any_letters(samples, tmp_path, recwarn):
+    plot_run(tmp_path / "run.png", samples, load_scenario("static"), "\u5706\u5708 $x{$, seed 1")
+    assert [str(one.message) for one in recwarn] == []
+
+
 @pytest.mark.slow
 def test_plot_shows_the_state_behind_the_frame_age(samples, tmp_path):
     from matplotlib.colors import to_rgb
