@@ -39,8 +39,8 @@ from sightline.vision_side.serving.service import (
 from sightline.vision_side.serving.sharing import Sharing, SharingPart
 
 _LONGEST_WAIT_S = 0.2
-_ADDS_FOR_S = 0.01
-"""Of one turn, for new robots: each takes about 4 ms, and the others wait for their frames meanwhile."""
+_CHANGES_FOR_S = 0.01
+"""Of one turn, for new robots, and for those that left: each takes up to 4 ms, and the others wait meanwhile."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S, _DOUBLINGS = 1.0, 30.0, 16
 """From the error of a robot's service to the start of its next one: twice as long each time."""
 
@@ -119,10 +119,7 @@ class Fleet:
         invalid configuration, which is that of every robot.
         """
         present = self._present()
-        for robot in self._links.keys() - present:
-            self._report_left(robot)
-            self._drop(robot)
-            self._starts_s.pop(robot, None)
+        self._drop_left(present)
         self._add_new(present)
         for robot in present:
             if robot in self.services:
@@ -130,9 +127,20 @@ class Fleet:
         while self._failed:
             self._on_error(*self._failed.popleft())
 
+    def _drop_left(self, present: list[str]) -> None:
+        """Drop robots that left, for a short time only, see `_add_new`."""
+        until_s = time.monotonic() + _CHANGES_FOR_S
+        for robot in self._links.keys() - present:
+            self._report_left(robot)
+            self._drop(robot)
+            self._starts_s.pop(robot, None)
+            if time.monotonic() >= until_s:
+                self._bell.set()
+                return
+
     def _add_new(self, present: list[str]) -> None:
         """Add new robots for a short time only: of a thousand that come at once, most wait for a later turn."""
-        until_s = time.monotonic() + _ADDS_FOR_S
+        until_s = time.monotonic() + _CHANGES_FOR_S
         for robot in present:
             if robot not in self._links and time.monotonic() >= self._starts_s.get(robot, 0.0):
                 self._attempt(robot, self._add_robot)

@@ -3,6 +3,7 @@
 import threading
 import time
 from contextlib import ExitStack
+from itertools import pairwise
 
 import pytest
 
@@ -178,6 +179,24 @@ def test_a_crowd_that_comes_keeps_no_robot_waiting(monkeypatch):
     added = [after - before for before, after in zip([1, *turns], turns, strict=False)]
     assert max(added) <= 5, "r0 had its turn after a few others"
     assert min(added) >= 1
+
+
+def test_a_crowd_that_leaves_keeps_no_robot_waiting(monkeypatch):
+    site = _NoRobots()
+    fleet = Fleet(VisionConfig(robot="r*"), site, lambda line: None)
+    site.robots().extend(f"r{number}" for number in range(31))
+    while len(fleet.services) < 31:
+        fleet.turn()
+    turns = [31]
+    monkeypatch.setattr(fleet.services["r0"], "turn", lambda wait_s: turns.append(len(fleet.services)))
+    monkeypatch.setattr(_Silent, "close", lambda _link: time.sleep(0.004), raising=False)
+    del site.robots()[1:]
+    while len(fleet.services) > 1:
+        fleet._bell.clear()
+        fleet.turn()
+        assert len(fleet.services) == 1 or fleet._bell.is_set()
+    dropped = [before - after for before, after in pairwise(turns)]
+    assert 1 <= min(dropped) <= max(dropped) <= 5, "r0 had its turn after a few others"
 
 
 def test_several_robots_need_zenoh():
