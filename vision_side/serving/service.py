@@ -271,7 +271,7 @@ class Service:
         self._changes = RepeatLimiter()
         if config.camera is not None:
             self._use(config.camera)
-        self._heard_s = time.monotonic()
+        self._heard_s = self._waited_s = time.monotonic()
         self._blind_since_s = 0.0
         self._newest: tuple[int, int | None] = (0, None)
         self.answered = self.steered = 0
@@ -343,6 +343,10 @@ class Service:
             self._note_silence(time.monotonic())
 
     def _note_silence(self, now_s: float) -> None:
+        # After a turn this late, e.g. of a suspended computer, frames may wait here: their silence begins now.
+        if now_s - max(self._waited_s, self._heard_s) > _SILENCE_S / 2:
+            self._heard_s = now_s
+        self._waited_s = now_s
         if now_s - self._heard_s > _NO_FRAMES_S:
             self._mission_channel.report(self._now_us() / 1e6, self._acknowledge(NO_FRAMES), None)
         if now_s - self._heard_s > _SILENCE_S:

@@ -376,6 +376,23 @@ def test_frames_after_a_silence_are_reported_again(bench: Bench, monkeypatch: py
     assert len([line for line in bench.said if f"frames from robot r1, session {SHOWN}" in line]) == 2
 
 
+def test_silence_is_not_that_of_the_robot_while_this_service_stood_still(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.camera()
+    bench.frame(BALL, 1)
+    begin_s = time.monotonic()
+
+    def silent_after(after_s: float) -> bool:
+        monkeypatch.setattr(time, "monotonic", lambda: begin_s + after_s)
+        bench.turn()
+        return any("no frames from robot r1" in line for line in bench.said)
+
+    assert not any(silent_after(tenths / 10) for tenths in range(5))
+    assert not any(silent_after(6.0 + tenths / 10) for tenths in range(30)), "it hung for 5.6 s"
+    assert silent_after(9.1)
+
+
 def test_sessions_and_cameras_that_change_with_each_message_write_few_lines(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
