@@ -82,6 +82,10 @@ _NUMBERS = {
 _SHAPES = ("box", "cylinder", "sphere")
 _JOINTS = ("fixed", "continuous", "revolute", "prismatic", "floating", "planar", "spherical")
 """Types of joints. With another one, and with a link below two joints, PyBullet may end the process."""
+_CHILDREN = {"inertial": ("mass", "inertia"), "collision": ("geometry",)}
+_ATTRIBUTES = {"mass": ("value",), "inertia": ("ixx", "iyy", "izz"), "box": ("size",), "cylinder": ("radius", "length"),
+               "sphere": ("radius",)}
+"""Of a link, required by PyBullet, whose own lines name no link."""
 _PLACED_WITHIN_M = 0.001
 _ACROSS = 0.999  # cosine: a URDF that writes a quarter turn as 1.57 is meant to be square
 _AHEAD = (Transform().turn, ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
@@ -118,6 +122,7 @@ class Urdf:
         self._root = self._parsed(text)
         self._links, self._joints = self._named("link"), self._named("joint")
         self._check_numbers()
+        self._check_complete()
         self._check_bodies()
         self._frames = self._link_frames()
 
@@ -230,6 +235,18 @@ class Urdf:
                         wanted = "a number" if count == 1 else f"{count} numbers"
                         raise self._wrong(f"{owner.tag} {owner.get('name')!r}: <{element.tag} {key}={text!r}> is not "
                                           f"{wanted}; write metres, kilograms and radians")
+
+    def _check_complete(self) -> None:
+        for name, link in self._links.items():
+            for part in (one for one in link if one.tag in _CHILDREN):
+                missing = [f"<{child}>" for child in _CHILDREN[part.tag] if part.find(child) is None]
+                missing += [f"{key} in <{one.tag}>" for one in part.iter() for key in _ATTRIBUTES.get(one.tag, ())
+                            if one.get(key) is None]
+                if missing:
+                    raise self._wrong(f"link {name!r}: its <{part.tag}> has no {missing[0]}; add it")
+        for name, joint in self._joints.items():
+            if joint.get("type") == "prismatic" and joint.find("limit") is None:
+                raise self._wrong(f"joint {name!r} is prismatic and has no <limit>; add it")
 
     def _check_bodies(self) -> None:
         for name, link in self._links.items():
