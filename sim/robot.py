@@ -192,7 +192,7 @@ def _measure(table: dict[str, Any], path: Path) -> None:
     lidar = _table(table, "lidar", path)
     eyes = lidar.get("eyes", [])
     if not isinstance(eyes, list):
-        raise ConfigError(f"{path}: lidar.eyes: {str(eyes)[:60]!r} is not a list of tables; write [[lidar.eyes]]")
+        raise ConfigError(f"{path}: `lidar.eyes` is {str(eyes)[:60]!r}, not a list of tables; write `[[lidar.eyes]]`")
     for sensor in (_table(table, "camera", path), lidar, *(one for one in eyes if isinstance(one, dict))):
         if sensor.get("link"):
             is_eye, link = sensor in eyes, str(sensor["link"])
