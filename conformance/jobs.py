@@ -1,19 +1,24 @@
 """Runs cases in several processes at once, each against a peer of its own that the kit starts. Shell (processes)."""
 
+import os
 import re
 import shlex
+import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
 from sightline.conformance.case import Case
 from sightline.conformance.report import from_lines
-from sightline.conformance.runner import Result
+from sightline.conformance.runner import Outcome, Result
 from sightline.protocol.errors import ConfigError, LinkError
 
 _KIT: Final = (sys.executable, "-P", "-m", "sightline.operator_side.cli.app", "conform")
@@ -21,6 +26,7 @@ _NO_PEER: Final = 4
 """Exit code of the kit before its peer answers."""
 _START_S: Final = 60.0
 _END_S: Final = 5.0
+_POLL_S: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +57,8 @@ class Jobs:
     def run(self, cases: Sequence[Case], on_result: Callable[[Result], None]) -> list[Result]:
         """Run each case in one of the jobs. Raises ConfigError or LinkError for a peer that cannot be tested."""
         commands = [self.command_of(job) for job in range(self.count)]
+        for job in range(self.count):
+            _check_free(self.endpoint_of(job))
         lock = threading.Lock()
 
         def show(result: Result) -> None:
@@ -66,23 +74,19 @@ class Jobs:
     def _run_one(
         self, job: int, command: list[str], cases: Sequence[Case], on_result: Callable[[Result], None]
     ) -> list[Result]:
-        try:
-            peer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        except OSError as error:
-            raise ConfigError(f"cannot start --start {command[0]!r}: {error.strerror}; is it installed?") from None
+        peer, errors = _start(command)
         deadline_s = time.monotonic() + _START_S
         try:
             while True:
                 code, results, reported = self._kit(job, cases, on_result)
-                if code != _NO_PEER or results or time.monotonic() > deadline_s or peer.poll() is not None:
+                ended = peer.poll()
+                if code != _NO_PEER or results or time.monotonic() > deadline_s or ended is not None:
                     break
         finally:
-            peer.terminate()
-            try:
-                peer.wait(_END_S)
-            except subprocess.TimeoutExpired:
-                peer.kill()
-                peer.wait()
+            _end(peer)
+        if ended is not None and (ended or not results) and not any(one.outcome is Outcome.FAILED for one in results):
+            raise LinkError(f"the peer of --start ended with exit code {ended}: {''.join(errors) or 'no message'}; "
+                            f"try its command: {shlex.join(command)}")
         if len(results) < len(cases):
             raise LinkError(f"job {job} ended after {len(results)} of {len(cases)} cases: {reported}")
         return results
@@ -107,3 +111,37 @@ class Jobs:
                     on_result(result)
             reader.join(_END_S)
         return kit.returncode, results, reported[-1].strip() if reported else "no message"
+
+
+def _check_free(endpoint: str) -> None:
+    """Raise ConfigError if something listens there: it would be tested in place of the peer that the kit starts."""
+    host, _, port = endpoint.rstrip("/").rpartition("/")[2].rpartition(":")
+    with suppress(OSError, ValueError, OverflowError):
+        socket.create_connection((host.strip("[]"), int(port)), _END_S).close()
+        raise ConfigError(f"something listens on {endpoint} already; end it, or leave out --start to test it")
+
+
+def _start(command: list[str]) -> tuple[subprocess.Popen[str], deque[str]]:
+    """Return the peer, and its last line of errors as it comes. Raises ConfigError for an unknown program."""
+    try:
+        peer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+                                errors="replace", start_new_session=True)
+    except OSError as error:
+        raise ConfigError(f"cannot start --start {command[0]!r}: {error.strerror}; is it installed?") from None
+    errors, lines = peer.stderr, deque[str](maxlen=1)
+    assert errors is not None
+    threading.Thread(target=lambda: lines.extend(filter(None, map(str.strip, errors))), daemon=True).start()
+    return peer, lines
+
+
+def _end(peer: subprocess.Popen[str]) -> None:
+    """End the peer and each process that it started, first by a request."""
+    deadline_s = time.monotonic() + _END_S
+    with suppress(ProcessLookupError):
+        os.killpg(peer.pid, signal.SIGTERM)
+        while time.monotonic() < deadline_s:
+            peer.poll()
+            os.killpg(peer.pid, 0)
+            time.sleep(_POLL_S)
+        os.killpg(peer.pid, signal.SIGKILL)
+    peer.wait()

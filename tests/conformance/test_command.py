@@ -2,7 +2,9 @@
 
 import json
 import os
+import shlex
 import signal
+import socket
 import sys
 import threading
 import xml.etree.ElementTree as ET
@@ -12,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from docs.make.conformance import to_page
+from sightline.conformance import jobs
 from sightline.conformance.case import Access, Case, Level
 from sightline.conformance.report import summary, to_dict, to_junit, to_line
 from sightline.conformance.robot.cases import CASES
@@ -22,7 +25,7 @@ from sightline.operator_side.cli import conform
 from sightline.operator_side.cli.conform import RunOptions, access_for
 from sightline.operator_side.setup import keys
 from sightline.protocol.channels import TWIST
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, LinkError
 from tests.conformance.robot.reference import virtual_robot
 from tests.conformance.robot.small_server import SmallServer
 from tests.fixtures.ports import free_endpoint
@@ -322,6 +325,41 @@ def test_jobs_start_a_peer_each_and_join_their_results(capsys):
     names = ("R-SOCK-01", "R-SOCK-02", "R-SOCK-07", "R-SOCK-13")
     code, out, err = run(capsys, "robot", first, *only(*names), "--jobs", "2", "--start", start, "--json")
     assert (code, [check["name"] for check in json.loads(out)["checks"]]) == (0, list(names)), err
+
+
+def started(start, code, monkeypatch, *, passed=True):
+    """Run one case by `--start`; the kit is a command that prints its result, and exits with `code` 4 without one."""
+    line = to_line(Result(CASES[0], Outcome.PASSED if passed else Outcome.FAILED), "robot", "ws://127.0.0.1:1")
+    kit = "exit 4" if code == 4 else f"sleep 0.2; echo {shlex.quote(line)}; exit {code}"
+    monkeypatch.setattr(jobs, "_KIT", ("sh", "-c", kit))
+    return jobs.Jobs("robot", "ws://127.0.0.1:1", start, 1, ()).run(CASES[:1], lambda result: None)
+
+
+def test_start_where_something_listens_already_starts_nothing(monkeypatch, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        endpoint = f"ws://127.0.0.1:{other.getsockname()[1]}/"
+        with pytest.raises(ConfigError, match=f"something listens on {endpoint} already"):
+            jobs.Jobs("robot", endpoint, f"touch {tmp_path / 'x'} {{endpoint}}", 1, ()).run(CASES[:1], print)
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("code", [0, 4])
+def test_peer_of_start_that_has_ended_conforms_to_nothing_and_its_last_error_is_shown(monkeypatch, code):
+    with pytest.raises(LinkError, match=r"ended with exit code 98: address in use; try its command: sh -c .*ws://"):
+        started("sh -c 'echo starts >&2; echo address in use >&2; echo >&2; exit 98' {endpoint}", code, monkeypatch)
+
+
+def test_peer_of_start_that_ends_in_a_case_has_its_results(monkeypatch):
+    results = started("sh -c 'exit 98' {endpoint}", 5, monkeypatch, passed=False)
+    assert [one.outcome for one in results] == [Outcome.FAILED]
+
+
+@pytest.mark.parametrize("wrapper", ["sleep 60 & echo $! > {file}; wait", "sleep 60 & echo $! > {file}"])
+def test_nothing_that_start_began_is_left_running(monkeypatch, tmp_path, wrapper):
+    file = tmp_path / "pid"
+    assert len(started(f"sh -c '{wrapper.format(file=file)}' {{endpoint}}", 0, monkeypatch)) == 1
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(file.read_text()), 0)
 
 
 def test_failed_case_shows_the_last_messages_bounded():
