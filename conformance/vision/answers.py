@@ -10,7 +10,8 @@ from typing import Any, Final
 
 from sightline.conformance.case import Bench, Suite, itself
 from sightline.conformance.vision.fixture import RobotPlayed, VisionAnswer, met
-from sightline.conformance.vision.images import png
+from sightline.conformance.vision.images import CAMERA as LENS
+from sightline.conformance.vision.images import HALF_CAMERA, png
 from sightline.protocol.channels import MAX_HEADER_BYTES
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import MAX_INTEGER, Planar
@@ -409,3 +410,24 @@ def new_start_new_memory(bench: Bench, robot: RobotPlayed) -> None:
     robot.is_driven(sent[-1])
     fastest = max((abs(one.speeds[0]) for frame in sent for one in robot.twists_to(frame)), default=0.0)
     bench.expect(fastest < _STILL_MPS, f"it drives at {fastest:g} m/s by nothing that this start has shown")
+
+
+_NOT_FOLLOWING: Final = "it does not follow the yellow ball"
+
+
+@SUITE.must("V-STEER-11", "4.4 Signs", met)
+def turns_by_the_new_size(bench: Bench, robot: RobotPlayed) -> None:
+    """After a change of the picture size, a target right of the new middle is turned to."""
+    bench.need(_last_twist(bench, robot, "right").speeds[1] < 0, _NOT_FOLLOWING)
+    robot.show(HALF_CAMERA)
+    angular = _last_twist(bench, robot, "right_half").speeds[1]
+    bench.expect(angular < 0, f"it turns at {angular:g} rad/s")
+
+
+@SUITE.should("V-STEER-12", "10.1 Camera, odometry, scan", met)
+def turns_by_the_new_model(bench: Bench, robot: RobotPlayed) -> None:
+    """A camera model of the same picture size, with its middle elsewhere, is steered by within a second."""
+    bench.need(_last_twist(bench, robot, "left").speeds[1] > 0, _NOT_FOLLOWING)
+    robot.show(LENS.model_copy(update={"cx_px": 40.0}))
+    angular = _last_twist(bench, robot, "left").speeds[1]
+    bench.expect(angular < 0, f"it turns at {angular:g} rad/s to a target that is right of the new middle")

@@ -14,6 +14,7 @@ from sightline.conformance.vision.images import (
     HALF_CAMERA,
     claiming,
     commented,
+    filled,
     many_scans,
     picture,
     png,
@@ -200,6 +201,7 @@ SUITE.must_all(met, {
 _CHECK: Final = "3.2 Bounds check"
 _SCANS: Final = 4_000
 _LARGE_SEGMENTS: Final = 3
+_LARGEST_SEGMENTS: Final = 6
 
 
 def _cut(share: float) -> bytes:
@@ -277,6 +279,12 @@ READ: Final[dict[str, tuple[str, str, Level, Callable[[], bytes]]]] = {
     "V-LIM-43": ("3.1 Payload", "A grey JPEG is read.", Level.MUST, lambda: picture("grey")),
     "V-LIM-44": ("1.4 Sizes", "A JPEG of 200 kB is read.", Level.SHOULD,
                  lambda: commented(picture("left"), _LARGE_SEGMENTS, 65_000)),
+    "V-LIM-45": (_CHECK, "A JPEG with fill bytes before its segments is read.", Level.MUST,
+                 lambda: filled(picture("left"), 8)),
+    "V-LIM-46": ("3.1 Payload", "A JPEG of extended sequential form (SOF1), 8 bits, is read.", Level.MUST,
+                 lambda: picture("left").replace(b"\xff\xc0", b"\xff\xc1", 1)),
+    "V-LIM-47": ("1.4 Sizes", "A JPEG of 390 kB is read.", Level.SHOULD,
+                 lambda: commented(picture("left"), _LARGEST_SEGMENTS, 64_000)),
 }
 
 

@@ -39,6 +39,11 @@ def commented(jpeg: bytes, comments: int, size: int = 0) -> bytes:
     return jpeg[:2] + (b"\xff\xfe" + (size + 2).to_bytes(2) + bytes(size)) * comments + jpeg[2:]
 
 
+def filled(jpeg: bytes, fill: int) -> bytes:
+    """Return `jpeg` with so many fill bytes before its first segment."""
+    return jpeg[:2] + b"\xff" * fill + jpeg[2:]
+
+
 def many_scans(jpeg: bytes, scans: int) -> bytes:
     """A progressive `jpeg` whose last scan comes over and over: each costs a decoder a pass over the whole picture."""
     last = jpeg.rfind(b"\xff\xda")

@@ -127,10 +127,10 @@ class Impatient(BrokenVision):
             super()._use(camera)
 
 
-@breaks("V-FLOW-08", "keeps its first camera model")
-class FirstCamera(BrokenVision):
+@breaks("V-FLOW-08", "keeps its first picture size")
+class FirstSize(BrokenVision):
     def _use(self, camera):
-        if self._pipeline is None:
+        if self._pipeline is None or camera.width_px == self._camera.width_px:
             super()._use(camera)
 
 

@@ -1,5 +1,6 @@
 """Broken vision services: those that steer where they should not. Pure."""
 
+from sightline.conformance.vision.images import CAMERA
 from sightline.protocol.messages import Twist
 from sightline.vision_side.pipeline import PipelineAnswer
 from tests.conformance.vision.broken import BrokenVision, breaks
@@ -57,7 +58,7 @@ def _(self, linear, angular, bearing):
 
 @steering("V-STEER-06", "turns left for ever once it did")
 def _(self, linear, angular, bearing):
-    return linear, abs(angular) if "left" in self.saw else angular
+    return linear, abs(angular) if "left" in self.saw and self._camera == CAMERA else angular
 
 
 @steering("V-STEER-09", "stops where it should drive forward")
@@ -90,6 +91,24 @@ class Remembers(Steering):
 
     def steers(self, linear, angular, bearing):
         return (0.3 if bearing is None and self.count < 4 and "ahead" in self.before else linear), angular
+
+
+@breaks("V-STEER-11", "measures from the middle of its first picture size")
+class FirstMiddle(BrokenVision):
+    first = None
+
+    def _use(self, camera):
+        self.first = self.first or camera
+        resized = camera.width_px != self.first.width_px
+        super()._use(camera.model_copy(update={"cx_px": self.first.cx_px}) if resized else camera)
+        self._camera = camera
+
+
+@breaks("V-STEER-12", "takes one camera model for each picture size")
+class OneModelPerSize(BrokenVision):
+    def _use(self, camera):
+        if self._camera is None or camera.width_px != self._camera.width_px:
+            super()._use(camera)
 
 
 class SwappedAxes(BrokenVision):

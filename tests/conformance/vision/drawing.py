@@ -239,6 +239,7 @@ DRAWINGS: Final = {
     "absent": Drawing("no target"),
     "left_progressive": Drawing("the same as `left`, written in several passes", 104, radius_px=20, progressive=True),
     "left_half": Drawing("the same view with half as many pixels each way", 52, 56, 10, 160, 120),
+    "right_half": Drawing("the same, of the target at the right", 108, 56, 10, 160, 120),
     "grey": Drawing("one component: a picture without colours", 104, radius_px=20, grey=True),
 }
 

@@ -9,7 +9,16 @@ import simplejpeg
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sightline.conformance.vision.images import CAMERA, HALF_CAMERA, claiming, commented, many_scans, picture, png
+from sightline.conformance.vision.images import (
+    CAMERA,
+    HALF_CAMERA,
+    claiming,
+    commented,
+    filled,
+    many_scans,
+    picture,
+    png,
+)
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
 from tests.conformance.vision import drawing as vision_pictures
@@ -88,5 +97,6 @@ def test_invalid_image_has_its_stated_defect():
     with pytest.raises(WireError, match="64 segments"):
         read_jpeg_size(commented(picture("left"), 64))
     assert cv2.imdecode(np.frombuffer(png(), np.uint8), cv2.IMREAD_GRAYSCALE).tolist() == [[128]]
+    assert read_jpeg_size(filled(picture("left"), 8)).width_px == 320
     bomb = many_scans(picture("left_progressive"), 50)
     assert bomb.count(b"\xff\xda") == 54 and read_jpeg_size(bomb).height_px == 240
