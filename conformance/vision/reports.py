@@ -1,16 +1,27 @@
-"""Cases about reports and detections: how often, the followed target, and the result for each image. Pure.
+"""Cases about missions, reports and detections: how often, the followed target, the result for each image. Pure.
 
-Both are optional. A service that publishes none leaves nothing to test here.
+All are optional. A service that publishes none leaves nothing to test here.
 """
 
 import math
-from typing import Final
+from typing import Any, Final
 
 from sightline.conformance.case import NOT_DRIVING, Bench, Model, Received, Suite
-from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed, Sent, met
+from sightline.conformance.vision.fixture import ANSWER_US, ARMED, RobotPlayed, Sent, met
 from sightline.conformance.vision.images import CAMERA as LENS
-from sightline.protocol.channels import DETECTIONS, REPORT
-from sightline.protocol.messages import Detections, DetectionsHeader, MissionReport, ReportedTarget
+from sightline.protocol.channels import DETECTIONS, MISSION, REPORT, STATUS
+from sightline.protocol.codec import encode
+from sightline.protocol.messages import (
+    DetectedBox,
+    Detections,
+    DetectionsHeader,
+    Echo,
+    MissionReport,
+    MissionRequest,
+    ReportedTarget,
+    RequestHeader,
+    RequestId,
+)
 
 SUITE = Suite("V")
 _EVERY_US: Final = 50_000
@@ -25,6 +36,11 @@ _AT_ONCE_US: Final = 300_000
 _TARGET_RADIUS_PX: Final = 20.0
 _NEAR_PX: Final = 8.0
 _NEAR_RAD: Final = 0.05
+_PLACES_PX: Final = (("left", 104, 112), ("right", 216, 112))
+"""Pictures, and the center of their ball."""
+_OLD_US: Final = 3_000_000
+_REST_US: Final = 800_000
+"""Less than the second for which a service waits for the wheels."""
 
 
 def _parsed(bench: Bench, received: list[Received], model: type[Model]) -> list[tuple[Received, Model]]:
@@ -104,7 +120,6 @@ def target(bench: Bench) -> None:
         named = [report.target for _, report in newer if report.target is not None]
         least = _TARGETS_PER_S * (sent[-1].at_us - sent[0].at_us) / 1e6 - 1
         bench.expect(len(named) >= least, f"{len(named)} of {len(newer)} reports in {len(sent)} images name the target")
-        bench.expect(newer[-1][1].detector, "no report names the detector")
         bench.expect(len({one.track for one in named}) == 1, "`track` changes while it follows one ball")
         for one in named:
             _expect_place(bench, one, x_px)
@@ -138,3 +153,106 @@ def detections(bench: Bench, robot: RobotPlayed) -> None:
     for _, one in found:
         tracks = [box.track for box in one.boxes if box.track is not None]
         bench.expect(len(tracks) == len(set(tracks)), f"two boxes of one image have one `track`: {tracks}")
+
+
+@SUITE.should("V-REP-05", "12.1 Detections")
+def boxes(bench: Bench) -> None:
+    """Each image of the ball that it drives by has a box around the ball, in pixels of that image."""
+    for name, *center_px in _PLACES_PX:
+        mark = bench.mark()
+        _robot, sent = _film_target(bench, name, 1 if center_px[0] < LENS.cx_px else -1)
+        found = [payload for one, payload in _parsed(bench, bench.received(DETECTIONS, mark), Detections)
+                 if any(_cites(one, frame) for frame in sent)]
+        bench.need(found, "it publishes no detections")
+        newest = found[-1]
+        size = newest.width_px, newest.height_px
+        bench.expect(size == (LENS.width_px, LENS.height_px), f"the image is {size[0]}x{size[1]} in the detections")
+        edges = [edge for sign in (-1, 1) for edge in (one + sign * _TARGET_RADIUS_PX for one in center_px)]
+        near = any(all(abs(one - other) <= _NEAR_PX for one, other in zip(_edges(box), edges, strict=True))
+                   for box in newest.boxes)
+        bench.expect(near, f"no box is near {edges}; there are {[_edges(box) for box in newest.boxes]}")
+
+
+def _edges(box: DetectedBox) -> list[float]:
+    return [round(one, 1) for one in (box.x1_px, box.y1_px, box.x2_px, box.y2_px)]
+
+
+@SUITE.should("V-REP-06", "18.4 Report")
+def label(bench: Bench) -> None:
+    """The label of the target is the label of a box in the detections of the same image."""
+    mark = bench.mark()
+    _robot, sent = _film_target(bench, "left", 1)
+    found = _parsed(bench, bench.received(DETECTIONS, mark), Detections)
+    pairs = [(report.target.label, [box.label for box in one.boxes])
+             for at, report in _reports(bench, mark) if report.target is not None
+             for frame in sent if _cites(at, frame) for by, one in found if _cites(by, frame)]
+    bench.need(pairs, "it publishes no target and detections of one image")
+    for name, labels in pairs:
+        bench.expect(name in labels, f"the target is {name!r}, the boxes are {labels}")
+
+
+# --- missions --------------------------------------------------------------------------------------------------------
+
+
+def _request(
+    bench: Bench, robot: RobotPlayed, source: str = "operator", old_us: int = 0, session: str = ""
+) -> RequestId:
+    """Request the reported mission again. The request cites a status as old as `old_us`, of this robot or `session`."""
+    mark = bench.mark()
+    robot.film("absent", _SECOND, _EVERY_US)
+    name = _reports(bench, mark)[-1][1].mission
+    stamp = robot.stamp()
+    robot.publish(STATUS, encode(ARMED), encode(stamp))
+    echo = Echo.of(stamp).model_copy(update={"session": session or robot.session, "t_us": stamp.t_us - old_us})
+    number = bench.number()
+    header = RequestHeader(source=source, session=f"{number:08x}", seq=1, echo=echo)
+    bench.publish(MISSION, header, MissionRequest(id=number, name=name), source)
+    return RequestId(digest=header.digest, id=number)
+
+
+def _starts(bench: Bench, robot: RobotPlayed, asked: RequestId, name: str = "absent") -> bool:
+    """Return True if a report in the next second states that the requested mission was started."""
+    mark = bench.mark()
+    robot.film(name, _SECOND, _EVERY_US)
+    return any(one.asked == asked and not one.refused for _, one in _reports(bench, mark))
+
+
+def _knows_missions(bench: Bench) -> RobotPlayed:
+    """Begin the cases about missions: an operator's request is one that it starts."""
+    robot = met(bench)
+    bench.need(_starts(bench, robot, _request(bench, robot)), "it does not start its mission on request")
+    return robot
+
+
+SUITE.must_all(_knows_missions, {
+    "V-REQ-02": ("18.1 Request", "A mission that a detector requests is not started.",
+                 lambda robot: _not_started(robot, "a detector's request", source="detector")),
+    "V-REQ-03": ("18.2 Freshness", "A mission that cites a status 3 s older than the frame is not started.",
+                 lambda robot: _not_started(robot, "an old request", old_us=_OLD_US)),
+    "V-REQ-04": ("18.2 Freshness", "A mission that cites another session of the robot is not started.",
+                 lambda robot: _not_started(robot, "a request of another session", session="0badf00d")),
+})
+
+
+def _not_started(robot: RobotPlayed, what: str, **how: Any) -> None:
+    asked = _request(robot.bench, robot, **how)
+    robot.bench.expect(not _starts(robot.bench, robot, asked), f"it started the mission of {what}")
+
+
+@SUITE.must("V-REQ-05", "18.3 Switching", _knows_missions)
+def begins_from_rest(bench: Bench, robot: RobotPlayed) -> None:
+    """While frames show that the wheels turn, a mission that was started sends 0|0, for a second at most."""
+    fast = (0.3, 0.0)
+    robot.film("far", _SECOND, _EVERY_US)
+    bench.need(robot.twists()[-1].speeds != (0, 0), "it does not drive to the yellow ball")
+    asked = _request(bench, robot)
+    bench.rest(2 * _EVERY_US)
+    sent, deadline_us = [], bench.now_us + _REST_US
+    while bench.now_us < deadline_us:
+        sent.append(robot.frame("far", moving=fast, applied=fast))
+        robot.is_answered(sent[-1])
+        bench.rest(_EVERY_US)
+    twists = [twist for frame in sent for twist in robot.twists_to(frame)]
+    bench.need(twists and _starts(bench, robot, asked, "far"), "it does not start its mission on request")
+    moving = [one.text for one in twists if one.speeds != (0, 0)]
+    bench.expect(not moving, f"it sent {moving[:3]} while the wheels turned")

@@ -12,7 +12,6 @@ UNTESTED = {
     "5.5 A picture that does not change": "the kit cannot freeze a robot's camera; tests/robot_side/safety",
     "5.6 Reasons": "the text that a peer shows to an operator is not on the wire; V-STAT-05 sends an unknown reason",
     "7.6 Loss": "a SHOULD, and the kit's links lose nothing; tests/robot_side/network/test_loss.py",
-    "12.1 Detections": "for services that detect without steering; the golden vectors hold its bounds",
     "12.4 Steering by them":
         "for a vision service that steers by the boxes of another source, which few do; tests/vision_side/serving",
     "13.1 Security": "a link without keys promises clauses 5 and 6",
@@ -28,10 +27,6 @@ UNTESTED = {
     "16.3 On Zenoh": "it permits nothing and rejects nothing",
     "16.4 On Zenoh": "for information only; tests/protocol/transports/zenoh/test_presence.py",
     "16.5 Liveliness tokens": "keys without a case of their own: those of 6.8 declare tokens under them",
-    "18.1 Request":
-        "for a vision service that knows missions, which is optional; tests/vision_side/missions/test_registry.py",
-    "18.2 Freshness": "as 18.1",
-    "18.3 Switching": "as 18.1",
     "19.1 Overlay and preview":
         "for a vision service that draws for viewers, which is optional; tests/vision_side/test_viewing.py",
     "19.2 Only while watched": "as 19.1",

@@ -17,9 +17,10 @@ PYTHON = ("robot", "vision")
 JAVASCRIPT = ("javascript-robot", "javascript-vision")
 VIRTUAL = (*PYTHON, *JAVASCRIPT)
 NOT_APPLICABLE = {"javascript-robot": {"R-FRAM-11", *(f"R-LEASE-{number}" for number in range(21, 28))},
-                  "javascript-vision": {f"V-REP-0{number}" for number in range(1, 5)}}
+                  "javascript-vision": {*(f"V-REP-0{number}" for number in range(1, 7)),
+                                        *(f"V-REQ-0{number}" for number in range(2, 6))}}
 """Cases that a peer's choices leave nothing to test in: the JavaScript robot publishes no scan, and has no Zenoh; the
-JavaScript vision service publishes no reports and no detections."""
+JavaScript vision service publishes no reports and no detections, and knows no missions."""
 
 
 AT_ONCE = 8

@@ -5,10 +5,14 @@ from collections import deque
 
 from sightline.conformance.vision.flow import BROKEN_STATUS
 from sightline.protocol.channels import DETECTIONS, FRAME, REPORT
+from sightline.protocol.codec import decode
+from sightline.protocol.messages import MissionRequest
 from sightline.protocol.spec.message_cases import packed
+from sightline.vision_side.missions.registry import requested_mission
 from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from tests.conformance.vision.broken import STANDING, BrokenVision, breaks
 from tests.conformance.vision.broken_answers import PerSession
+from tests.conformance.vision.fixture import CONFIG
 
 
 class Queueing(BrokenVision):
@@ -312,3 +316,49 @@ class SeldomNamed(Reporting):
 class Doubled(Reporting):
     def finds(self, fields):
         return fields | {"boxes": [box | {"track": 1} for box in fields["boxes"] * 2]}
+
+
+@breaks("V-REP-05", "measures its boxes from the middle")
+class FromTheMiddle(Reporting):
+    def finds(self, fields):
+        return fields | {"boxes": [box | {side: box[side] - 160 for side in ("x1_px", "x2_px")}
+                                   for box in fields["boxes"]]}
+
+
+@breaks("V-REP-06", "reports its target by a name of its own")
+class OwnName(Reporting):
+    def reports(self, fields):
+        return fields | ({"target": fields["target"] | {"label": "cat"}} if fields.get("target") else {})
+
+
+# --- missions --------------------------------------------------------------------------------------------------------
+
+
+class Obedient(BrokenVision):
+    """Starts a mission that it has to reject because of `reason`."""
+
+    def __init__(self, network, robot="r1"):
+        super().__init__(network, robot)
+        requests = self._mission_channel._requests
+        take = requests.take
+
+        def obeys(message, frame):
+            chosen = take(message, frame)
+            if self.reason in requests.rejection:
+                requests.rejection = ""
+                chosen = requested_mission(decode(MissionRequest, message.payload), CONFIG)
+            return chosen
+
+        requests.take = obeys
+
+
+for _id, _reason in (("V-REQ-02", "UNKNOWN_SOURCE"), ("V-REQ-03", "STALE"), ("V-REQ-04", "OTHER_SESSION")):
+    breaks(_id, f"starts a mission despite {_reason}")(type("Obedient", (Obedient,), {"reason": _reason}))
+
+
+@breaks("V-REQ-05", "starts a mission while the wheels turn")
+class Hasty(BrokenVision):
+    def hears(self, header, jpeg):
+        if self._pipeline is not None:  # each session has a switch of its own
+            self._pipeline._mission_switch._is_at_rest = lambda view: True
+        return header, jpeg

@@ -16,7 +16,7 @@ from sightline.protocol.transports.websocket.framing import pack
 from sightline.vision_side.pipeline import Observation, PipelineAnswer
 from tests.conformance.clauses import UNTESTED, clauses
 from tests.conformance.vision import broken_answers as vision_broken_answers  # noqa: F401
-from tests.conformance.vision import broken_flow as vision_broken_flow  # noqa: F401
+from tests.conformance.vision import broken_flow as vision_broken_flow
 from tests.conformance.vision import broken_inputs as vision_broken_inputs  # noqa: F401
 from tests.conformance.vision import broken_steering as vision_broken_steering
 from tests.conformance.vision.broken import BROKEN, BrokenVision
@@ -124,7 +124,15 @@ class LearnsFirst(VirtualVision):
         super()._publish(header, PipelineAnswer(None, Observation("learns")) if self.left else answer, compute_us)
 
 
-@pytest.mark.parametrize(("name", "vision"), [("V-FRAM-19", StrictClock), ("V-SEQ-05", LearnsFirst)])
+class NamesNoDetector(vision_broken_flow.Reporting):
+    """Its reports have only the fields without a default, and the target (18.4)."""
+
+    def reports(self, fields):
+        return {name: fields[name] for name in ("mission", "phase", "target") if name in fields}
+
+
+@pytest.mark.parametrize(("name", "vision"), [
+    ("V-FRAM-19", StrictClock), ("V-SEQ-05", LearnsFirst), ("V-REP-03", NamesNoDetector)])
 def test_case_demands_no_more_than_the_specification(name, vision):
     result = result_of(next(case for case in VIRTUAL if case.id == name), vision)
     assert (result.outcome, result.reason) == (Outcome.PASSED, "")
