@@ -13,9 +13,10 @@ import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, Final, Self
 
-from sightline.conformance.case import Bench, Suite
+from sightline.conformance.case import Bench, Suite, itself
 from sightline.conformance.raw_peers import (
     BINARY,
     CLOSE,
@@ -29,7 +30,7 @@ from sightline.conformance.raw_peers import (
 )
 from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.conformance.vision.images import picture
-from sightline.protocol.channels import CAMERA, FRAME, Channel
+from sightline.protocol.channels import CAMERA, FRAME, OVERLAY, PREVIEW, Channel
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import LinkError, WireError
 from sightline.protocol.messages import FrameHeader, Stamp
@@ -132,6 +133,10 @@ BACK_S: Final = 5.0
 _HELLO_S: Final = 2.0
 _END_S: Final = 3.0
 _ANSWER_S: Final = 1.0
+_DRAWN: Final = 8
+_DRAWN_S: Final = 0.15
+"""So many frames, and so long after the last message to each."""
+Fields = dict[str, Any]
 _TOO_LARGE_BYTES: Final = 3_000_000
 """Above what any peer can want: a frame has at most a million."""
 
@@ -177,9 +182,10 @@ def _fields(text: bytes) -> dict[str, Any]:
     return fields if isinstance(fields, dict) else {}
 
 
-def _greet(client: AcceptedClient, robot: str) -> None:
+def _greet(client: AcceptedClient, robot: str, **fields: Any) -> None:
+    """Send a hello as `robot`; `fields` replace those of a good one."""
     hello = {"v": 1, "robot": robot, "role": "robot", "session": client.session, "wants": ["twist", "ack"]}
-    client.send(TEXT, json.dumps(hello).encode())
+    client.send(TEXT, json.dumps(hello | fields).encode())
 
 
 def _message(channel: Channel, header: Stamp, payload: bytes) -> bytes:
@@ -203,6 +209,11 @@ def _answer(client: AcceptedClient) -> bytes | None:
     """The next binary message; None if none comes."""
     frame = client.frame_that(lambda one: one.opcode == BINARY, _ANSWER_S)
     return frame.data if frame else None
+
+
+def _channel(data: bytes) -> object:
+    """The channel that a binary message names; None for none."""
+    return _fields(data[2 : 2 + int.from_bytes(data[:2])]).get("channel")
 
 
 # --- opening ---------------------------------------------------------------------------------------------------------
@@ -246,16 +257,35 @@ def names_its_role(bench: Bench) -> None:
         bench.expect(role == "vision", f"its role is {role!r}")
 
 
-@SUITE.must("V-SOCK-05", "14.5 Hello", real=True)
-def leaves_another_robot(bench: Bench) -> None:
-    """It ends the connection to a robot that sends hello as another robot, and drives nothing there."""
+def _leaves(fields: Fields, whom: str, bench: Bench) -> None:
     with server_of(bench) as server:
         client = client_of(bench, server)
         _hello(client)
-        _greet(client, "another")
+        _greet(client, **{"robot": bench.robot} | fields)
         client.send(BINARY, _message(CAMERA, Stamp(session=client.session, seq=1, t_us=1), encode(LENS)))
         client.send(BINARY, _frame(client, 1))
-        bench.expect(_answer(client) is None, "it answered another robot's frame")
+        bench.expect(_answer(client) is None, f"it answered a frame of {whom}")
+        bench.expect(client.end(_END_S), f"it stayed with {whom}")
+
+
+SUITE.must_all(itself, {
+    "V-SOCK-05": ("14.5 Hello", "It ends the connection to a robot that sends hello as another robot, and drives "
+                  "nothing there.", partial(_leaves, {"robot": "another"}, "another robot")),
+    "V-SOCK-19": ("14.9 Ends", "It ends the connection to a robot whose hello is of another version.",
+                  partial(_leaves, {"v": 2}, "a robot of version 2")),
+    "V-SOCK-20": ("14.9 Ends", "It ends the connection to a robot whose hello has an invalid session.",
+                  partial(_leaves, {"session": SESSION_BEGINS + "123"}, "a robot with a session of seven digits")),
+}, real=True)
+
+
+@SUITE.must("V-SOCK-21", "14.5 Hello", real=True)
+def leaves_a_later_robot(bench: Bench) -> None:
+    """It ends the connection to a robot whose later hello is of another robot."""
+    with server_of(bench) as server:
+        client = met(bench, server)
+        client.send(BINARY, _frame(client, 1))
+        bench.need(_answer(client) is not None, "it answers nothing")
+        _greet(client, "another")
         bench.expect(client.end(_END_S), "it stayed with another robot")
 
 
@@ -271,9 +301,7 @@ def answers_in_binary(bench: Bench) -> None:
         data = _answer(client)
         bench.need(data is not None, "it answers nothing")
         assert data is not None
-        size = int.from_bytes(data[:2])
-        channel = _fields(data[2 : 2 + size]).get("channel")
-        bench.expect(channel in ("twist", "ack"), f"its block is {data[: 2 + size][:120]!r}")
+        bench.expect(_channel(data) in ("twist", "ack"), f"its block is {data[:120]!r}")
 
 
 @SUITE.must("V-SOCK-07", "14.6 Messages", real=True)
@@ -287,6 +315,21 @@ def reads_fragments(bench: Bench) -> None:
         client.send(CONTINUED, whole[100:2_000], fin=False)
         client.send(CONTINUED, whole[2_000:])
         bench.expect(_answer(client) is not None, "it did not answer")
+
+
+@SUITE.should("V-SOCK-22", "19.2 Only while watched", real=True)
+def draws_for_nobody(bench: Bench) -> None:
+    """To a robot whose hello does not want them it sends no overlay and no preview."""
+    with server_of(bench) as server:
+        client = met(bench, server)
+        names = []
+        for seq in range(1, _DRAWN):
+            client.send(BINARY, _frame(client, seq))
+            while (frame := client.frame_that(lambda one: one.opcode == BINARY, _DRAWN_S)) is not None:
+                names.append(_channel(frame.data))
+        bench.need(names, "it answers nothing")
+        drawn = sorted({OVERLAY.name, PREVIEW.name} & set(names))
+        bench.expect(not drawn, f"it sends {' and '.join(drawn)}")
 
 
 # --- liveness and ends -----------------------------------------------------------------------------------------------

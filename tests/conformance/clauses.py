@@ -29,7 +29,6 @@ UNTESTED = {
     "16.5 Liveliness tokens": "keys without a case of their own: those of 6.8 declare tokens under them",
     "19.1 Overlay and preview":
         "for a vision service that draws for viewers, which is optional; tests/vision_side/test_viewing.py",
-    "19.2 Only while watched": "as 19.1",
     "19.3 Passing on": "optional for a robot; tests/e2e/test_relay.py",
     "20.1 Port": "optional, and beside a link that the kit's endpoint need not be; tests/e2e/test_stop_port.py",
     "20.2 Datagram": "the golden vectors `stop` hold it",

@@ -13,6 +13,7 @@ from websockets.exceptions import ConnectionClosedError, WebSocketException
 from websockets.frames import Opcode
 from websockets.sync.client import connect
 
+from sightline.conformance.vision.images import picture
 from sightline.conformance.vision.websocket import SESSION_BEGINS
 
 SOCKETS = {
@@ -34,6 +35,10 @@ SOCKETS = {
     "V-SOCK-16": "comes from another site",
     "V-SOCK-17": "waits for the silent",
     "V-SOCK-18": "leaves a robot whose pong is late",
+    "V-SOCK-19": "greets a robot of any version",
+    "V-SOCK-20": "takes any session",
+    "V-SOCK-21": "reads one hello only",
+    "V-SOCK-22": "draws for nobody",
 }
 
 SILENCE_S = 3.0
@@ -98,7 +103,7 @@ class SocketVision:
         if not isinstance(first, str) and self.broken != "V-SOCK-12":
             link.close(1003, "no hello")
             return
-        if isinstance(first, str) and json.loads(first)["robot"] != "r1" and self.broken != "V-SOCK-05":
+        if isinstance(first, str) and self.rejects(json.loads(first)):
             link.close(1008, "another robot")
             return
         heard = self.listening(link)
@@ -107,6 +112,11 @@ class SocketVision:
                 self.hear(link, self.received(link))
             if self.broken == "V-SOCK-09" and time.monotonic() - heard[-1] > SILENCE_S:
                 return
+
+    def rejects(self, hello, accepts_another="V-SOCK-05"):
+        return ((hello["robot"] != "r1" and self.broken != accepts_another)
+                or (hello["v"] != 1 and self.broken != "V-SOCK-19")
+                or (len(hello["session"]) != 8 and self.broken != "V-SOCK-20"))
 
     def listening(self, link):
         """Record when bytes arrive, so that a service without pings still detects silence and has only one defect."""
@@ -122,6 +132,9 @@ class SocketVision:
 
     def hear(self, link, message):
         if isinstance(message, str):
+            if message and self.rejects(json.loads(message), "V-SOCK-21"):
+                link.close(1008, "another robot")
+                raise EOFError
             return
         size = int.from_bytes(message[:2])
         if len(message) < 2 + size:
@@ -146,3 +159,6 @@ class SocketVision:
             del header["channel"]
             block = json.dumps(header).encode()
         link.send(len(block).to_bytes(2) + block + b"0.0000|0.0000")
+        if self.broken == "V-SOCK-22":
+            block = json.dumps(header | {"channel": "overlay"}).encode()
+            link.send(len(block).to_bytes(2) + block + picture("left"))
