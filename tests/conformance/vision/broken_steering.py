@@ -15,7 +15,7 @@ class Steering(PerSession):
 
     def decides(self, header, answer):
         answer = super().decides(header, answer)
-        if answer.twist is None:
+        if answer.twist is None or answer.seen.phase == "switching":  # it comes to rest, as it has to
             return answer
         bearing = answer.seen.bearing_rad
         beside = bearing is not None and abs(bearing) > 0.1
