@@ -2,8 +2,9 @@
 
     uint16 BE length of the header block | header block | payload
 
-The header block is the header of the message, a JSON object, with `"channel"` as its first field. An empty header, or
-one that is not an object with fields, follows a separate object: `{"channel":"twist","source":"guest"}`.
+The header block is the header of the message, a JSON object, with `"channel"` as its first field. An empty header, one
+that is not an object with fields, or one that names no source or another follows a separate object:
+`{"channel":"twist","source":"guest"}`.
 """
 
 import json
@@ -67,7 +68,7 @@ def pack(channel: Channel, source: str, role: str, header: bytes, payload: bytes
     Args:
         channel: the channel.
         source: source of the message, or "" from a robot.
-        role: role in the hello of this end. The header block omits an equal source.
+        role: role in the hello of this end, the source of a message whose header names none.
         header: encoded header, may be empty.
         payload: encoded payload.
 
@@ -79,7 +80,7 @@ def pack(channel: Channel, source: str, role: str, header: bytes, payload: bytes
 
 def pack_pieces(channel: Channel, source: str, role: str, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
     """Pack a message in two pieces. The second is `payload` itself, which avoids a copy of the image."""
-    if header[:2] == b'{"' and source in ("", role):
+    if header[:2] == b'{"' and (source in ("", role) or _fields(header).get("source") == source):
         block = b'{"channel":"%b",%b' % (channel.name.encode("ascii"), header[1:])
     else:
         named = f',"source":"{source}"' if source else ""

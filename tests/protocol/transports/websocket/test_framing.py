@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sightline.protocol.channels import CHANNELS, MAX_HEADER_BYTES, TWIST, key_for
+from sightline.protocol.channels import CHANNELS, DETECTIONS, MAX_HEADER_BYTES, TWIST, key_for
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.transports.websocket.framing import MAX_BLOCK_BYTES, IncomingMessage, pack, parse_hello, unpack
 
@@ -40,6 +40,21 @@ def test_a_usual_header_is_one_json_object_with_the_channel_first():
     header = b'{"v":1,"source":"vision","session":"4e5f6071","seq":7}'
     assert pack(TWIST, "vision", "vision", header, b"0|0") == framed(BLOCK)
     assert pack(TWIST, "guest", "vision", b"", b"0|0") == framed(b'{"channel":"twist","source":"guest"}')
+
+
+def test_message_that_is_passed_on_is_one_json_object_if_its_header_names_its_source():
+    header = b'{"v":1,"source":"guest","session":"00000000","seq":7}'
+    message = pack(DETECTIONS, "guest", "", header, b"{}")
+    assert message == framed(b'{"channel":"detections",' + header[1:], b"{}")
+    assert unpack(message, "r1", "robot") == IncomingMessage("sightline/r1/detections/guest", header, b"{}")
+
+
+@pytest.mark.parametrize("header", [
+    b'{"v":1}', b'{"source":"vision"}', b'{"source":"guest","source":"vision"}', b'{"source":"guest"', b'{"source":7}'])
+def test_header_that_does_not_name_the_source_follows_an_object_of_its_own(header):
+    message = pack(DETECTIONS, "guest", "vision", header, b"{}")
+    assert message == framed(b'{"channel":"detections","source":"guest"}' + header, b"{}")
+    assert unpack(message, "r1", "vision") == IncomingMessage("sightline/r1/detections/guest", header, b"{}")
 
 
 def test_fields_may_come_in_any_order_and_with_blanks():
