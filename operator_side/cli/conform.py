@@ -6,7 +6,7 @@ import json
 import ssl
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -17,17 +17,20 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from sightline.conformance.benches import LiveBench
-from sightline.conformance.case import Access, Case
+from sightline.conformance.case import Access, Case, NotApplicableError
 from sightline.conformance.jobs import Jobs
 from sightline.conformance.measured import WheelRow, check_motor_log, read_motor_log
+from sightline.conformance.raw_peers import BINARY, CLOSE
 from sightline.conformance.report import LINE_START, from_lines, summary, to_dict, to_junit, to_line
 from sightline.conformance.robot.fixture import Robot as RobotUnderTest
-from sightline.conformance.runner import Outcome, Result, chosen, run_cases
+from sightline.conformance.runner import Outcome, Result, chosen, printable, run_cases
 from sightline.operator_side.cli.options import Json, Secure, command_group, print_result
 from sightline.operator_side.preflight import check_out_file, writes
 from sightline.operator_side.table import print_table, table_lines
-from sightline.protocol.errors import ConfigError, LinkError, home_path
+from sightline.protocol.channels import STATUS
+from sightline.protocol.errors import ConfigError, LinkError, WireError, home_path
 from sightline.protocol.transports.security import own_token
+from sightline.protocol.transports.websocket.framing import unpack
 
 _EXAMPLE = "e.g. --token vision=keys/vision.token"
 
@@ -175,6 +178,8 @@ def listing(cases: Sequence[Case]) -> str:
 
 _ROLES = ("vision", "operator")
 """The roles that the kit plays where each role has its own keys."""
+_SEEN_S = 1.0
+"""As long as a robot without a status is watched once more."""
 TRIES = 3
 """A network may lose a message, and a machine may be busy: a case fails when it fails three times in a row."""
 
@@ -337,6 +342,24 @@ def _use_motor_log(bench: LiveBench, file: Path | None) -> None:
         bench.motor_rows = lambda: [row for row in _motor_rows(file) if row.t_us >= t_us]
 
 
+def _seen_of(bench: LiveBench) -> str:
+    """Return what a robot without a status does instead, as another connection of the kit sees it."""
+    from sightline.conformance.robot.websocket import spoken
+
+    with suppress(NotApplicableError, LinkError), spoken(bench, STATUS.name) as raw:
+        frame = raw.frame_that(lambda one: one.opcode in (BINARY, CLOSE), _SEEN_S)
+        if frame is not None and frame.opcode == CLOSE:
+            reason = printable(frame.data[2:].decode("utf-8", "replace"))
+            return f"it ends the connection with {int.from_bytes(frame.data[:2])} {reason}".rstrip()
+        if frame is not None:
+            try:
+                unpack(frame.data, bench.robot, "")
+            except WireError as error:
+                return f"its messages are invalid: {error.detail}"
+    rejected = ", ".join(sorted(bench.dropped_here))
+    return f"its messages are rejected: {rejected}" if rejected else "check --robot, or publish status"
+
+
 def with_run_options(command: Callable[..., int]) -> Callable[..., int]:
     """Turn `command(..., run=RunOptions)` into a command with an option for each field of RunOptions."""
     fields = inspect.signature(RunOptions).parameters
@@ -418,7 +441,7 @@ def robot(
         )
         ending.enter_context(bench)
         if not side.is_there(bench):
-            raise LinkError(f"no status from robot '{robot}' at {endpoint}; check --robot, or publish status")
+            raise LinkError(f"no status from robot '{robot}' at {endpoint}; {_seen_of(bench)}")
         _use_motor_log(bench, motor_log)
         show_result = ending.enter_context(run.shown(len(left), "robot", endpoint))
         results = run_cases(left, bench, side.prepare, show_result, TRIES)

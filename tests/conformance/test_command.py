@@ -8,15 +8,18 @@ import socket
 import sys
 import threading
 import xml.etree.ElementTree as ET
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import serve
 
 from docs.make.conformance import to_page
 from sightline.conformance import jobs
 from sightline.conformance.case import Access, Case, Level
 from sightline.conformance.report import summary, to_dict, to_junit, to_line
+from sightline.conformance.robot import cases as robot_cases
 from sightline.conformance.robot.cases import CASES
 from sightline.conformance.runner import Outcome, Result, run_case
 from sightline.conformance.vision import cases as vision
@@ -189,6 +192,29 @@ def test_a_mistake_is_one_line_and_exit_code_2(capsys, arguments, says):
     code, out, err = run(capsys, *arguments)
     assert (code, out) == (2, "")
     assert says in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(("send", "seen"), [
+    (lambda client: client.close(1011, "the camera is gone"), "; it ends the connection with 1011 the camera is gone"),
+    (lambda client: client.send(b'\x1a\x00{"channel":"status","v":1}{}'), "header block of 6656 bytes in a message of"),
+    (lambda client: client.send(b"\0\x13" + b'{"channel":"smell"}'), "; its messages are rejected: INEXACT_KEY"),
+    (lambda client: None, "; check --robot, or publish status"),
+], ids=["closes", "little-endian", "invalid", "silent"])
+def test_robot_without_a_status_is_described_as_it_is_seen(capsys, monkeypatch, send, seen):
+    def play(client):
+        client.recv()
+        client.send(json.dumps({"v": 1, "robot": "r1", "session": "4e5f6071"}))
+        send(client)
+        with suppress(ConnectionClosed):
+            client.recv()
+
+    monkeypatch.setattr(robot_cases, "_FIRST_US", 300_000)
+    monkeypatch.setattr(conform, "_SEEN_S", 0.1)
+    with serve(play, "127.0.0.1", 0, subprotocols=["sightline.v1"]) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        code, out, err = run(capsys, "robot", f"ws://127.0.0.1:{server.socket.getsockname()[1]}", "--group", "stop")
+    assert (code, out) == (4, "")
+    assert "no status from robot 'r1'" in err and seen in err and err.count("\n") == 1
 
 
 @pytest.mark.slow

@@ -208,8 +208,9 @@ class SightlineV1:
 
     text = False
 
-    def __init__(self, robot: str, role: str) -> None:
-        self._robot, self._role = robot, role
+    def __init__(self, robot: str, role: str, *, connects: bool = False) -> None:
+        """`connects` is True at the end that connected, whose operator reads what the listening end is."""
+        self._robot, self._role, self._connects = robot, role, connects
         self.peer_role = ""
         """Role in the hello of the peer."""
         self.wants: tuple[str, ...] = ()
@@ -249,5 +250,6 @@ class SightlineV1:
         except WireError as error:
             raise PeerError(BAD_HELLO, 1008, f"invalid hello: {error.detail}") from None
         if hello.robot != self._robot:
-            raise PeerError(OTHER_ROBOT, 1008, f"this is robot {self._robot}, not {hello.robot}")
+            texts = f"this is robot {self._robot}, not {hello.robot}", f"the robot there is {hello.robot}, not {self._robot}"
+            raise PeerError(OTHER_ROBOT, 1008, texts[self._connects])
         self.peer_role, self.wants = hello.role, hello.wants

@@ -346,7 +346,7 @@ class WebSocketLink(BaseLink):
 
     def _dialect(self, end: WebSocketEndpoint, listening: bool, who: str) -> PeerCodec:
         if end.legacy is None:
-            return SightlineV1(self.robot, self._rules.role)
+            return SightlineV1(self.robot, self._rules.role, connects=not listening)
         if listening:
             client = LegacyClient(who, self._driver_slot, self._tell)
             return LegacyToVision(self.robot, end.legacy, monotonic_us, client)

@@ -1,6 +1,7 @@
 """Opening `sightline.v1` over real sockets: endpoints, errors and their messages, and leaving nothing behind."""
 
 import gc
+import json
 import os
 import re
 import socket
@@ -11,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from websockets.sync.server import serve
 
 from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, TWIST
@@ -118,6 +120,18 @@ def test_listener_of_another_robot_raises_for_the_opening_client(robot):
         open_websocket("r2", connect=robot.endpoint)
     assert robot.rejected == {OTHER_ROBOT: 1}
     robot.still_serves()
+
+
+def test_listener_that_answers_as_another_robot_is_named_as_what_it_is():
+    def greet(client):
+        client.recv()
+        client.send(json.dumps({"v": 1, "robot": "zz", "session": "4e5f6071"}))
+        client.recv()
+
+    with serve(greet, "127.0.0.1", 0, subprotocols=["sightline.v1"]) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with pytest.raises(LinkError, match="the robot there is zz, not r1"):
+            open_websocket("r1", connect=f"ws://127.0.0.1:{server.socket.getsockname()[1]}", timeout_s=5)
 
 
 def test_a_robot_may_connect_to_a_listening_vision():
