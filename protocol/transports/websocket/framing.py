@@ -250,6 +250,8 @@ class SightlineV1:
         except WireError as error:
             raise PeerError(BAD_HELLO, 1008, f"invalid hello: {error.detail}") from None
         if hello.robot != self._robot:
-            texts = f"this is robot {self._robot}, not {hello.robot}", f"the robot there is {hello.robot}, not {self._robot}"
-            raise PeerError(OTHER_ROBOT, 1008, texts[self._connects])
+            text = f"this is robot {self._robot}, not {hello.robot}"
+            if self._connects:
+                text = f"the robot there is {hello.robot}, not {self._robot}"
+            raise PeerError(OTHER_ROBOT, 1008, text)
         self.peer_role, self.wants = hello.role, hello.wants
