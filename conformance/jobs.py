@@ -130,7 +130,8 @@ def _start(command: list[str]) -> tuple[subprocess.Popen[str], deque[str]]:
         raise ConfigError(f"cannot start --start {command[0]!r}: {error.strerror}; is it installed?") from None
     errors, lines = peer.stderr, deque[str](maxlen=1)
     assert errors is not None
-    threading.Thread(target=lambda: lines.extend(filter(None, map(str.strip, errors))), daemon=True).start()
+    threading.Thread(target=lambda: lines.extend(filter(None, map(str.strip, errors))), name="conform-errors",
+                     daemon=True).start()
     return peer, lines
 
 

@@ -210,9 +210,10 @@ def test_robot_without_a_status_is_described_as_it_is_seen(capsys, monkeypatch, 
 
     monkeypatch.setattr(robot_cases, "_FIRST_US", 300_000)
     monkeypatch.setattr(conform, "_SEEN_S", 0.1)
-    with serve(play, "127.0.0.1", 0, subprotocols=["sightline.v1"]) as server:
+    endpoint = free_endpoint("ws://")
+    with serve(play, "127.0.0.1", int(endpoint.rpartition(":")[2]), subprotocols=["sightline.v1"]) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        code, out, err = run(capsys, "robot", f"ws://127.0.0.1:{server.socket.getsockname()[1]}", "--group", "stop")
+        code, out, err = run(capsys, "robot", endpoint, "--group", "stop")
     assert (code, out) == (4, "")
     assert "no status from robot 'r1'" in err and seen in err and err.count("\n") == 1
 
@@ -361,11 +362,11 @@ def started(start, code, monkeypatch, *, passed=True):
     return jobs.Jobs("robot", "ws://127.0.0.1:1", start, 1, ()).run(CASES[:1], lambda result: None)
 
 
-def test_start_where_something_listens_already_starts_nothing(monkeypatch, tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        endpoint = f"ws://127.0.0.1:{other.getsockname()[1]}/"
-        with pytest.raises(ConfigError, match=f"something listens on {endpoint} already"):
-            jobs.Jobs("robot", endpoint, f"touch {tmp_path / 'x'} {{endpoint}}", 1, ()).run(CASES[:1], print)
+def test_start_where_something_listens_already_starts_nothing(tmp_path):
+    endpoint = free_endpoint("ws://")
+    other, tested = ("127.0.0.1", int(endpoint.rpartition(":")[2])), f"touch {tmp_path / 'x'} {{endpoint}}"
+    with socket.create_server(other), pytest.raises(ConfigError, match=f"something listens on {endpoint} already"):
+        jobs.Jobs("robot", endpoint, tested, 1, ()).run(CASES[:1], print)
     assert not (tmp_path / "x").exists()
 
 

@@ -80,6 +80,7 @@ def pack(channel: Channel, source: str, role: str, header: bytes, payload: bytes
 
 def pack_pieces(channel: Channel, source: str, role: str, header: bytes, payload: bytes) -> tuple[bytes, bytes]:
     """Pack a message in two pieces. The second is `payload` itself, which avoids a copy of the image."""
+    # Parsed only for what is passed on: of its own messages this end knows the source.
     if header[:2] == b'{"' and (source in ("", role) or _fields(header).get("source") == source):
         block = b'{"channel":"%b",%b' % (channel.name.encode("ascii"), header[1:])
     else:
@@ -204,12 +205,14 @@ class PeerCodec(Protocol):
 
 
 class SightlineV1:
-    """Speaks `sightline.v1` with a peer of `robot`. `role` is the local one. A peer wants nothing until its hello."""
+    """Speaks `sightline.v1` with a peer of `robot`. `role` is the local one. A peer wants nothing until its hello.
+
+    `connects` is True at the end that connected.
+    """
 
     text = False
 
     def __init__(self, robot: str, role: str, *, connects: bool = False) -> None:
-        """`connects` is True at the end that connected, whose operator reads what the listening end is."""
         self._robot, self._role, self._connects = robot, role, connects
         self.peer_role = ""
         """Role in the hello of the peer."""
@@ -250,6 +253,8 @@ class SightlineV1:
         except WireError as error:
             raise PeerError(BAD_HELLO, 1008, f"invalid hello: {error.detail}") from None
         if hello.robot != self._robot:
+            # A listening end describes itself to the other one. An end that connected describes what it found, because
+            # its own operator reads the text.
             text = f"this is robot {self._robot}, not {hello.robot}"
             if self._connects:
                 text = f"the robot there is {hello.robot}, not {self._robot}"

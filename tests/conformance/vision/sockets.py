@@ -38,7 +38,7 @@ SOCKETS = {
     "V-SOCK-19": "greets a robot of any version",
     "V-SOCK-20": "takes any session",
     "V-SOCK-21": "reads one hello only",
-    "V-SOCK-22": "draws for nobody",
+    "V-SOCK-22": "draws unasked",
 }
 
 SILENCE_S = 3.0

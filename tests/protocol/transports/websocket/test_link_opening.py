@@ -128,10 +128,11 @@ def test_listener_that_answers_as_another_robot_is_named_as_what_it_is():
         client.send(json.dumps({"v": 1, "robot": "zz", "session": "4e5f6071"}))
         client.recv()
 
-    with serve(greet, "127.0.0.1", 0, subprotocols=["sightline.v1"]) as server:
+    port = free_port()
+    with serve(greet, "127.0.0.1", port, subprotocols=["sightline.v1"]) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         with pytest.raises(LinkError, match="the robot there is zz, not r1"):
-            open_websocket("r1", connect=f"ws://127.0.0.1:{server.socket.getsockname()[1]}", timeout_s=5)
+            open_websocket("r1", connect=f"ws://127.0.0.1:{port}", timeout_s=5)
 
 
 def test_a_robot_may_connect_to_a_listening_vision():
