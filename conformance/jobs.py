@@ -74,7 +74,7 @@ class Jobs:
     def _run_one(
         self, job: int, command: list[str], cases: Sequence[Case], on_result: Callable[[Result], None]
     ) -> list[Result]:
-        peer, errors = _start(command)
+        peer, last_error = _start(command)
         deadline_s = time.monotonic() + _START_S
         try:
             while True:
@@ -85,7 +85,7 @@ class Jobs:
         finally:
             _end(peer)
         if ended is not None and (ended or not results) and not any(one.outcome is Outcome.FAILED for one in results):
-            raise LinkError(f"the peer of --start ended with exit code {ended}: {''.join(errors) or 'no message'}; "
+            raise LinkError(f"the peer of --start ended with exit code {ended}: {last_error()}; "
                             f"try its command: {shlex.join(command)}")
         if len(results) < len(cases):
             raise LinkError(f"job {job} ended after {len(results)} of {len(cases)} cases: {reported}")
@@ -121,8 +121,8 @@ def _check_free(endpoint: str) -> None:
         raise ConfigError(f"something listens on {endpoint} already; end it, or leave out --start to test it")
 
 
-def _start(command: list[str]) -> tuple[subprocess.Popen[str], deque[str]]:
-    """Return the peer, and its last line of errors as it comes. Raises ConfigError for an unknown program."""
+def _start(command: list[str]) -> tuple[subprocess.Popen[str], Callable[[], str]]:
+    """Return the peer, and what returns its last line of errors after its end. Raises ConfigError."""
     try:
         peer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
                                 errors="replace", start_new_session=True)
@@ -130,9 +130,15 @@ def _start(command: list[str]) -> tuple[subprocess.Popen[str], deque[str]]:
         raise ConfigError(f"cannot start --start {command[0]!r}: {error.strerror}; is it installed?") from None
     errors, lines = peer.stderr, deque[str](maxlen=1)
     assert errors is not None
-    threading.Thread(target=lambda: lines.extend(filter(None, map(str.strip, errors))), name="conform-errors",
-                     daemon=True).start()
-    return peer, lines
+    reader = threading.Thread(target=lambda: lines.extend(filter(None, map(str.strip, errors))), name="conform-errors",
+                              daemon=True)
+    reader.start()
+
+    def last_error() -> str:
+        reader.join(_END_S)
+        return lines[0] if lines else "no message"
+
+    return peer, last_error
 
 
 def _end(peer: subprocess.Popen[str]) -> None:
