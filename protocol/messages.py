@@ -130,7 +130,7 @@ class SenderHeader(WireModel):
 
 
 _PROOF: Final = "the next element of the sender's hash chain; of the first command its commitment"
-_NEXT_PROOF: Final = "near the end of the chain: the first element of the next chain"
+_NEXT_PROOF: Final = "near the end of the chain: the first element of the next chain, never sent as `proof`"
 
 
 class AnswerHeader(SenderHeader):
