@@ -48,9 +48,10 @@ def _send_more(driver: Sender, twists: int) -> None:
 
 @SUITE.must("R-ARM-02", "6.4 Arming", ready)
 def too_few(_bench: Bench, driver: Sender) -> None:
-    """`arm` is rejected as NOT_ALLOWED after two good twists."""
-    driver.need_good()
-    Sender(driver.robot, "operator").expect_rejected("arm", "NOT_ALLOWED", "two twists")
+    """`arm` is rejected as NOT_ALLOWED after four good twists."""
+    for _ in range(3):
+        driver.need_good()
+    Sender(driver.robot, "operator").expect_rejected("arm", "NOT_ALLOWED", "four twists")
 
 
 @SUITE.must("R-ARM-03", "6.4 Arming", _driven)
@@ -89,12 +90,12 @@ def disarms(bench: Bench, driver: Sender) -> None:
     robot.expect_rest("after disarm")
 
 
-@SUITE.must("R-ARM-07", "8.3 Freshness", Robot)
-def arming_needs_news(bench: Bench, robot: Robot) -> None:
+@SUITE.must("R-ARM-07", "8.3 Freshness", _driven)
+def arming_needs_news(bench: Bench, driver: Sender) -> None:
     """`arm` that cites a `status` more than two seconds old is rejected as STALE."""
-    old = robot.stamp()
-    bench.rest(2_300_000)
-    _driven(bench).expect_rejected("arm", "STALE", "a request 2.5 s late", cite=old)
+    old = driver.robot.stamp()
+    bench.rest(2_050_000)
+    driver.expect_rejected("arm", "STALE", "a request more than 2 s late", cite=old)
 
 
 @SUITE.must("R-ARM-15", "8.3 Freshness", _driven)
@@ -118,6 +119,14 @@ def _human(bench: Bench) -> Sender:
     human = teleop(bench)
     human.need_good()
     return human
+
+
+@SUITE.must("R-ARM-19", "8.3 Freshness", teleop)
+def acquiring_after_disarm(bench: Bench, human: Sender) -> None:
+    """`acquire` that cites a `status` from before the last disarm is rejected as STALE."""
+    before = human.robot.stamp()
+    bench.need(Sender(human.robot, "operator").granted("disarm"), "disarm is not granted (R-ARM-05)")
+    human.expect_rejected("acquire", "STALE", "a request from before the disarm", cite=before)
 
 
 @SUITE.must("R-ARM-16", "8.3 Freshness", _human)
@@ -251,6 +260,8 @@ SUITE.must_all(_stopped, {
     "R-STOP-07": ("8.3 Freshness", "`reset` without `echo` is rejected.",
                   lambda it: _lifts_nothing(it, "reset", "a reset that cites nothing", cite=False)),
     "R-STOP-10": ("6.5 STOP", "`disarm` does not lift STOPPED.", lambda it: _lifts_nothing(it, "disarm", "disarm")),
+    "R-STOP-17": ("8.2 Requests and replies", "In STOPPED `disarm` is granted, as always.",
+                  lambda it: it.expect_granted("disarm", "disarm in STOPPED", cite=False)),
     "R-STOP-11": ("8.2 Requests and replies", "STOP may be repeated: it is granted again and stays.", _stops_again),
 })
 
@@ -274,6 +285,22 @@ def _at_full_speed(bench: Bench) -> Sender:
     driver = armed(bench, text=f"{min(limit, 10.0):.4f}|0.0000".encode())
     bench.rest(700_000)
     return driver
+
+
+@SUITE.must("R-ARM-18", "6.4 Arming", _at_full_speed)
+def arming_waits_for_the_wheels(bench: Bench, driver: Sender) -> None:
+    """`arm` while the wheels turn is rejected, however many good twists came."""
+    operator = Sender(driver.robot, "operator", acks=False)
+    operator.send_request("disarm")
+    driver.drive(b"0.0000|0.0000")  # so that wheels that turn after a granted `arm` turned before it
+    bench.need(driver.robot.becomes(State.DISARMED), "disarm does not disarm (R-ARM-05)")
+    turned = False
+    while driver.robot.status().applied != (0.0, 0.0):
+        reply = operator.reply("arm")
+        turns = driver.robot.next_status().applied != (0.0, 0.0)
+        bench.expect(not (reply.ok and turns), "it was granted while the wheels turned")
+        turned = turned or turns
+    bench.need(turned, "its wheels are at zero before a `status` shows DISARMED")
 
 
 @SUITE.must("R-STOP-15", "8.2 Requests and replies", _at_full_speed)

@@ -23,7 +23,7 @@ from sightline.protocol.channels import (
 from sightline.protocol.codec import decode_ranges
 from sightline.protocol.errors import WireError
 from sightline.protocol.jpeg import read_jpeg_size
-from sightline.protocol.messages import CameraModel, FrameHeader, Odometry, ScanHeader, Stamp, Status, WireModel
+from sightline.protocol.messages import CameraModel, FrameHeader, Odometry, ScanHeader, Stamp, State, Status, WireModel
 from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE
 
 SUITE: Final = Suite("R")
@@ -448,6 +448,12 @@ def _returns_nothing(watcher: Sender, what: str, forge: Callable[[Sender, FrameH
     bench.expect(fps < most, f"{fps:.0f} fps with {what}, {silent:.0f} without")
 
 
+def _ack_as_another(by: Sender, frame: FrameHeader) -> None:
+    """Acknowledge `frame` with the header of `vision` under the key of `teleop`."""
+    by.source = "teleop"
+    by.ack(frame, source="vision")
+
+
 SUITE.must_all(taught, {
     "R-FLOW-09": ("7.2 Credit", "An ack that cites another session of the robot returns no credit.",
                   lambda it: _returns_nothing(it, "acks for another session",
@@ -455,6 +461,11 @@ SUITE.must_all(taught, {
     "R-FLOW-10": ("7.2 Credit", "An ack that cites a frame not yet sent returns no credit.",
                   lambda it: _returns_nothing(it, "acks for frames to come",
                                               lambda by, frame: by.ack(frame, echo_seq=frame.seq + 1000))),
+    "R-FLOW-18": ("7.2 Credit", "An ack that cites a frame with a `t_us` off by one returns no credit.",
+                  lambda it: _returns_nothing(it, "acks with another `t_us`",
+                                              lambda by, frame: by.ack(frame, echo_t_us=frame.t_us + 1))),
+    "R-FLOW-19": ("7.2 Credit", "An ack whose header names another source than its key returns no credit.",
+                  lambda it: _returns_nothing(it, "acks under the key of another source", _ack_as_another)),
     "R-FLOW-12": ("7.2 Credit", "A twist that is MALFORMED returns no credit, though its header cites a frame.",
                   lambda it: _returns_nothing(it, "twists that are MALFORMED",
                                               lambda by, frame: by.twist(frame, b"x"))),
@@ -475,6 +486,19 @@ def not_proven_returns_nothing(bench: Bench, driver: Sender) -> None:
     fps = fps_of(bench, _LEASE_LASTS_US)
     bench.need(driver.robot.counts("NOT_PROVEN", before), "another proof is not NOT_PROVEN (R-PROOF-01)")
     bench.expect(fps <= _OF_QUICK * quick, f"{fps:.0f} fps with twists that are NOT_PROVEN, {quick:.0f} with good ones")
+
+
+@SUITE.must("R-FLOW-20", "7.2 Credit", vision)
+def stopped_twists_return_credit(bench: Bench, driver: Sender) -> None:
+    """A twist that is rejected as STOPPED returns credit."""
+    bench.rest(OWNED_US)
+    quick = _quick_fps(bench)
+    Sender(driver.robot, "operator", acks=False).send_request("stop")
+    bench.need(driver.robot.becomes(State.STOPPED), "STOP does not stop this robot (R-STOP-01)")
+    driver.drive()
+    bench.rest(300_000)
+    fps = fps_of(bench)
+    bench.expect(fps >= 0.7 * quick, f"{fps:.0f} fps with twists rejected as STOPPED, {quick:.0f} with acks")
 
 
 _ALONE_US: Final = 6_000_000

@@ -4,13 +4,25 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from sightline.conformance.case import Bench, Suite
-from sightline.conformance.robot.fixture import GOOD, NOT_COUNTED, Sender, moving, operator, ready, teleop, vision
-from sightline.protocol.channels import STATUS
+from sightline.conformance.robot.fixture import (
+    CRAWL,
+    GOOD,
+    NOT_COUNTED,
+    Sender,
+    moving,
+    operator,
+    ready,
+    teleop,
+    vision,
+)
+from sightline.protocol.channels import STATUS, TWIST
 from sightline.protocol.messages import LeaseHolder, State
 from sightline.protocol.proof import ProofChain
 
 SUITE: Final = Suite("R")
 _LEASE_US: Final = 1_000_000
+_NOTICED_US: Final = 300_000
+"""From the end of a lease until a `status` (10 Hz) shows it, with room for a slow machine."""
 _TOKEN_US: Final = 100_000
 """Until a token or its end is known everywhere; a dead process takes 4 ms."""
 _SUCCESSION_US: Final = 450_000
@@ -165,6 +177,50 @@ def human_lets_go(bench: Bench) -> None:
     robot.expect_rest("after the release")
 
 
+@SUITE.must("R-LEASE-28", "6.2 Losing the human", moving)
+def lost_human_who_only_acquired(bench: Bench, driver: Sender) -> None:
+    """A human that took the lease by `acquire` and falls silent disarms the robot, while vision's commands flow."""
+    human = Sender(driver.robot, "teleop", acks=False)
+    bench.need(human.granted("acquire") and _holder_is(human), "acquire takes no lease (R-LEASE-13)")
+    reached = driver.robot.becomes(State.DISARMED, within_us=2_500_000)
+    state, holder = driver.robot.status().state, driver.robot.status().holder
+    bench.expect(reached, f"2.5 s after a human acquired and fell silent: {state}, {holder} drives")
+    driver.robot.expect_rest("after the human fell silent")
+
+
+@SUITE.must("R-LEASE-29", "6.1 Lease", teleop)
+def second_human_waits(_bench: Bench, human: Sender) -> None:
+    """A second human is rejected as NOT_HOLDER."""
+    human.need_good()
+    _expect_while_held("NOT_HOLDER", human, Sender(human.robot, "teleop"), "a twist of the second")
+
+
+@SUITE.must("R-LEASE-30", "6.1 Lease")
+def guest_waits(bench: Bench) -> None:
+    """`guest` does not take the lease from `vision`, without a header or with one."""
+    bench.need(not bench.access.is_guarded, "where keys are demanded no guest gets in")
+    first = ready(bench)
+    guest = Sender(first.robot, "guest", acks=False)
+    bare = guest.result_of(lambda: bench.publish(TWIST, b"", CRAWL, "guest"))
+    bench.need(bare in (GOOD, "NOT_HOLDER"), f"guests are not received here: {bare} (R-DIAL-01)")
+    bench.expect(bare == "NOT_HOLDER", f"a guest's twist without header: {bare}, expected NOT_HOLDER")
+    first.need_good()
+    _expect_while_held("NOT_HOLDER", first, guest, "a guest's twist with a header")
+
+
+@SUITE.must("R-LEASE-31", "6.1 Lease", ready)
+def lease_is_one_second(bench: Bench, first: Sender) -> None:
+    """One second after the last good twist `status` names no holder any more, and not before."""
+    robot = first.robot
+    bench.need(_holder_is(first), "`status` names no holder (R-LEASE-01)")
+    sent_us = robot.clock_us() - (bench.now_us - first.sent_us)
+    first.fall_silent()
+    bench.need(robot.reaches(lambda status: status.holder is None, 2_500_000), "the lease does not end (R-LEASE-04)")
+    lasted_us = robot.stamp().t_us - sent_us
+    lasts = _LEASE_US * 9 // 10 <= lasted_us <= _LEASE_US + _NOTICED_US
+    bench.expect(lasts, f"`status` named it for {lasted_us / 1e6:.2f} s")
+
+
 @SUITE.must("R-LEASE-13", "8.2 Requests and replies", vision)
 def acquire(bench: Bench, sender: Sender) -> None:
     """`acquire` takes the lease before the first twist."""
@@ -294,6 +350,36 @@ def copied_identity_releases_nothing(bench: Bench, human: Sender) -> None:
     copy.expect_rejected("release", "NOT_PROVEN", "a release by a copied identity")
     human.expect(GOOD)
     bench.expect(_holder_is(human), "the lease is gone")
+
+
+@SUITE.must("R-PROOF-10", "6.6 Proof", teleop)
+def copied_identity_requests_nothing(bench: Bench, human: Sender) -> None:
+    """`arm`, `reset` and `acquire` that state the driver's session without its proof are NOT_PROVEN."""
+    human.need_good()
+    human.drive()
+    bench.need(bench.wait(lambda: human.seq >= 9, 3_000_000), "too few frames")
+    copy = Sender(human.robot, "teleop", acks=False)
+    copy.session = human.session
+    for verb in ("acquire", "reset", "arm"):
+        copy.expect_rejected(verb, "NOT_PROVEN", f"{verb} by a copied identity without a proof", proof=None)
+        copy.expect_rejected(verb, "NOT_PROVEN", f"{verb} by a copied identity with another proof")
+
+
+@SUITE.must("R-PROOF-11", "6.6 Proof", ready)
+def announced_element_proves_nothing(_bench: Bench, first: Sender) -> None:
+    """The element that `next_proof` announces is NOT_PROVEN as a proof: every peer has read it."""
+    announced = ProofChain(lambda count: bytes(range(count))).next().proof
+    first.expect(GOOD, proof=first.proofs.next().proof, next_proof=announced)
+    _expect_while_held("NOT_PROVEN", first, first, proof=announced)
+
+
+@SUITE.must("R-PROOF-12", "6.6 Proof", ready)
+def next_chain_of_the_last_alone(_bench: Bench, first: Sender) -> None:
+    """A next chain that the last accepted command did not announce is NOT_PROVEN."""
+    following = ProofChain(lambda count: bytes(range(count)))
+    first.expect(GOOD, proof=first.proofs.next().proof, next_proof=following.next().proof)
+    first.expect(GOOD, what="the next twist, which announces nothing")
+    _expect_while_held("NOT_PROVEN", first, first, proof=following.next().proof)
 
 
 @SUITE.must("R-PROOF-08", "6.7 Digest", ready)

@@ -60,6 +60,13 @@ def repeated_request(_bench: Bench, operator: Sender) -> None:
         operator.expect_granted("disarm", f"the {attempt} time", id=5, seq=5)
 
 
+@SUITE.must("R-REQ-15", "8.4 Requests and replies", operator)
+def seq_of_requests(_bench: Bench, operator: Sender) -> None:
+    """The `seq` of a request is not validated: one below the last is granted."""
+    for seq in (1000, 3):
+        operator.expect_granted("disarm", f"with seq {seq}", seq=seq)
+
+
 @SUITE.must("R-REQ-05", "8.1 Requests and replies", operator)
 def unknown_verb(bench: Bench, operator: Sender) -> None:
     """A verb that the robot does not know is counted as MALFORMED, granted by no reply, and changes nothing."""

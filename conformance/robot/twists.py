@@ -94,6 +94,9 @@ HEADERS: Final[Sequence[Row]] = (
      (lambda fields: as_json(fields)[:-1].ljust(MAX_HEADER_BYTES - 1) + b"}",)),
     ("R-HEAD-22", MUST, "18.6 What an answer went by", "A twist may name the scan and the mission that it went by.",
      GOOD, (_set(scan=7, mission={"digest": "0a0b0c0d", "id": 3}),)),
+    ("R-HEAD-23", MUST, "18.6 What an answer went by",
+     "A scan that is not an integer, or a mission without digest or id, is MALFORMED.", "MALFORMED",
+     (_set(scan="7"), _set(mission={"id": 3}), _set(mission={"digest": "0a", "id": 3}), _set(mission=3))),
 )  # fmt: skip
 
 CITED: Final[Sequence[Row]] = (
@@ -374,3 +377,24 @@ def remembers_senders(bench: Bench, sender: Sender) -> None:
     result = sender.twist_result(seq=sender.seq)
     bench.need(bench.now_us - began_us < _REMEMBERED_US, "too few frames: a robot may have forgotten the driver")
     bench.expect(result == "OUT_OF_ORDER", f"after {_OTHERS} others a replay is {result}")
+
+
+@SUITE.must("R-SEQ-16", "5.1 Order", ready)
+def remembers_for_ten_seconds(bench: Bench, first: Sender) -> None:
+    """A robot remembers a driver for ten seconds: a replay is OUT_OF_ORDER while another drives."""
+    began_us, last = bench.now_us, first.seq
+    replayed = first.twist_result(seq=last)
+    bench.need(replayed == "OUT_OF_ORDER", f"a replay is {replayed} (R-SEQ-06)")
+    first.fall_silent()
+    bench.rest(_REMEMBERED_US - 2_000_000)
+    Sender(first.robot).need_good()
+    result = first.twist_result(seq=last)
+    bench.need(bench.now_us - began_us < _REMEMBERED_US, "too few frames: a robot may have forgotten the driver")
+    bench.expect(result == "OUT_OF_ORDER", f"7 s after its last twist a replay is {result}")
+
+
+@SUITE.must("R-SEQ-15", "5.1 Order", vision)
+def greatest_leaps(_bench: Bench, sender: Sender) -> None:
+    """A `seq` of 2^32 begins a session, and one 2^20 above it continues that."""
+    sender.expect(GOOD, seq=1 << 32)
+    sender.expect(GOOD, seq=(1 << 32) + (1 << 20))

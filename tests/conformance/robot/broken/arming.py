@@ -54,15 +54,17 @@ def arms_for_nobody(robot):
 
 
 @breaks("R-ARM-02")
-def two_commands_will_do(robot):
+def four_commands_will_do(robot):
     gate = robot.driving.gate
-    wrap(
-        gate, "_missing_to_arm",
-        lambda inner, now_us: "" if gate.holder(now_us) and gate._live_commands >= 2 else inner(now_us),
-    )  # fmt: skip
+
+    def missing(inner, now_us):
+        ready = gate.holder(now_us) and gate._live_commands >= 4 and gate.applied == STILL
+        return "" if ready else inner(now_us)
+
+    wrap(gate, "_missing_to_arm", missing)
 
 
-@breaks("R-ARM-03", "R-ARM-15")
+@breaks("R-ARM-03", "R-ARM-15", "R-DIAL-09")
 def never_arms(robot):
     robot.driving.gate._missing_to_arm = lambda now_us: "not today"
 
@@ -98,12 +100,22 @@ def arms_without_echo(robot):
 
 @breaks("R-ARM-07")
 def arms_late(robot):
-    forgives(robot, Verb.ARM, late)
+    forgives(robot, Verb.ARM, lambda echo, now_us: late(echo, now_us) and now_us - echo.t_us < 2_400_000)
 
 
 @breaks("R-ARM-08", "R-ARM-16")
 def arms_from_before_the_disarm(robot):
     forgives(robot, Verb.ARM, denied(robot))
+
+
+@breaks("R-ARM-19")
+def acquires_from_before_the_disarm(robot):
+    forgives(robot, Verb.ACQUIRE, denied(robot))
+
+
+@breaks("R-ARM-18")
+def arms_turning_wheels(robot):
+    at_rest(robot, "arm")
 
 
 @breaks("R-ARM-09")
@@ -320,8 +332,25 @@ def never_arms_again(robot):
     wrap(gate, "_missing_to_arm", lambda inner, now_us: "it was stopped once" if stopped else inner(now_us))
 
 
+@breaks("R-STOP-17")
+def stopped_robots_grant_no_disarm(robot):
+    gate = robot.driving.gate
+
+    def around(inner, header, request, now_us):
+        if gate.state is State.STOPPED:
+            raise WireError(RejectReason.NOT_ALLOWED, "stopped")
+        return inner(header, request, now_us)
+
+    on_verb(robot, Verb.DISARM, around)
+
+
 @breaks("R-STOP-15")
 def resets_turning_wheels(robot):
+    at_rest(robot, "reset")
+
+
+def at_rest(robot, name):
+    """The method `name` of the gate believes that the wheels are at zero."""
     gate = robot.driving.gate
 
     def around(inner, who, now_us):
@@ -331,7 +360,7 @@ def resets_turning_wheels(robot):
         finally:
             gate.applied = applied
 
-    wrap(gate, "reset", around)
+    wrap(gate, name, around)
 
 
 @breaks("R-STOP-16")

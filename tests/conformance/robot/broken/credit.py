@@ -136,10 +136,29 @@ def a_guest_needs_a_header(robot):
     on_bare(robot, lambda _inner, message: gate.reject("guest", WireError(RejectReason.MALFORMED, "no header")))
 
 
-@breaks("R-DIAL-02")
+@breaks("R-DIAL-02", "R-DIAL-10")
 def guests_drive_fast(robot):
     gate = robot.driving.gate
     gate.config = gate.config.model_copy(update={"guest_max_linear_mps": 0.5, "guest_max_angular_rad_s": 2.0})
+
+
+@breaks("R-DIAL-09")
+def guests_are_never_armed(robot):
+    gate = robot.driving.gate
+
+    def missing(inner, now_us):
+        holder = gate.holder(now_us)
+        return "guests may not" if holder and holder.source == "guest" else inner(now_us)
+
+    wrap(gate, "_missing_to_arm", missing)
+
+
+@breaks("R-DIAL-10")
+def guests_with_a_header_drive_fast(robot):
+    def around(inner, source, twist, now_us, age_us):
+        inner(source if age_us is None else "vision", twist, now_us, age_us)
+
+    wrap(robot.driving.gate, "_accept", around)
 
 
 @breaks("R-DIAL-03")

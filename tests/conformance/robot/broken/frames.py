@@ -153,7 +153,7 @@ def odometry_does_not_count(robot):
     bend_out(robot, "odometry", lambda header, _payload: header.update(seq=0))
 
 
-@breaks("R-SEQ-05")
+@breaks("R-SEQ-05", "R-LEASE-31")
 def frames_have_a_clock_of_their_own(robot):
     bend_out(robot, "frame", lambda header, _payload: header.update(t_us=header["t_us"] + 10_000_000))
 
@@ -216,7 +216,7 @@ def reason_never_changes(robot):
     bend_out(robot, "status", lambda _header, payload: payload.update(reason="ok"))
 
 
-@breaks("R-STAT-08")
+@breaks("R-STAT-08", "R-DIAL-10")
 def status_says_nothing_is_applied(robot):
     bend_out(robot, "status", lambda _header, payload: payload.update(applied=[0.0, 0.0]))
 

@@ -50,12 +50,12 @@ def loser_is_not_told(robot):
     bend_out(robot, "status", bend)
 
 
-@breaks("R-LEASE-04")
+@breaks("R-LEASE-04", "R-LEASE-31")
 def lease_lasts_two_seconds(robot):
     robot.driving.gate._lease.life_us = 2_000_000
 
 
-@breaks("R-LEASE-05", "R-LEASE-25")
+@breaks("R-LEASE-05", "R-LEASE-25", "R-LEASE-31")
 def lease_ends_at_once(robot):
     robot.driving.gate._lease.life_us = 480_000
 
@@ -86,7 +86,8 @@ def a_proof_may_be_65_commands_ahead(robot):
     lease_of(robot, check_proof=check_proof)
 
 
-@breaks("R-LEASE-07", "R-PROOF-01", "R-PROOF-02", "R-PROOF-03", "R-PROOF-04", "R-PROOF-07", "R-PROOF-09")
+@breaks("R-LEASE-07", "R-PROOF-01", "R-PROOF-02", "R-PROOF-03", "R-PROOF-04", "R-PROOF-07", "R-PROOF-09", "R-PROOF-11",
+        "R-PROOF-12")
 def acks_renew(robot):
     def around(inner, message):
         inner(message)
@@ -132,7 +133,7 @@ def vision_takes_from_humans(robot):
     lease_of(robot, may_take=may_take)
 
 
-@breaks("R-LEASE-11", "R-ARM-17")
+@breaks("R-LEASE-11", "R-ARM-17", "R-LEASE-28")
 def lost_humans_are_not_noticed(robot):
     robot.driving.gate._notice_lost_human = lambda now_us: None
 
@@ -148,6 +149,39 @@ def humans_let_go_without_effect(robot):
         return "released"
 
     wrap(gate, "release", around)
+
+
+@breaks("R-LEASE-28")
+def humans_who_only_acquired_are_not_missed(robot):
+    def lost_human(self, now_us):
+        return Lease.lost_human(self, now_us) and robot.driving.gate._live_commands > 0
+
+    lease_of(robot, lost_human=lost_human)
+
+
+@breaks("R-LEASE-29")
+def humans_take_from_humans(robot):
+    takes_from(robot, "teleop", "teleop")
+
+
+@breaks("R-LEASE-30")
+def guests_take_from_vision(robot):
+    takes_from(robot, "guest", "vision")
+
+
+def takes_from(robot, source, holder):
+    """A driver of role `source` takes the lease from one of role `holder`."""
+    def may_take(self, who, now_us, proof=NO_PROOF):
+        live = self.live_holder(now_us)
+        stolen = live is not None and (who.source, live.source) == (source, holder)
+        return stolen or Lease.may_take(self, who, now_us, proof)
+
+    lease_of(robot, may_take=may_take)
+
+
+@breaks("R-LEASE-31")
+def lease_lasts_a_little_longer(robot):
+    robot.driving.gate._lease.life_us = 1_400_000
 
 
 @breaks("R-LEASE-13")
@@ -259,12 +293,13 @@ def proofs_of(robot, check):
     lease_of(robot, check_proof=check_proof)
 
 
-@breaks("R-PROOF-01", "R-PROOF-03", "R-PROOF-04", "R-PROOF-07", "R-PROOF-09")
+@breaks("R-PROOF-01", "R-PROOF-03", "R-PROOF-04", "R-PROOF-07", "R-PROOF-09", "R-PROOF-10", "R-PROOF-11",
+        "R-PROOF-12")
 def any_proof_will_do(robot):
     proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is not None)
 
 
-@breaks("R-PROOF-02")
+@breaks("R-PROOF-02", "R-PROOF-10")
 def no_proof_will_do(robot):
     proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is None)
 
@@ -274,7 +309,7 @@ def the_last_proof_will_do(robot):
     proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is not None and proof.proof == lease.proof.proof)
 
 
-@breaks("R-PROOF-04", "R-PROOF-07")
+@breaks("R-PROOF-04", "R-PROOF-07", "R-PROOF-10")
 def forged_seq_is_used_up(robot):
     gate = robot.driving.gate
 
@@ -325,6 +360,33 @@ def releases_for_anyone(robot):
         return inner(header, request, now_us)
 
     wrap(gate, "request", around)
+
+
+@breaks("R-PROOF-10")
+def arms_for_anyone(robot):
+    gate = robot.driving.gate
+
+    def around(inner, header, request, now_us):
+        if request.verb is Verb.ARM and header.proof is None:
+            return gate.arm(Holder(source=header.source, session=header.session), now_us)
+        return inner(header, request, now_us)
+
+    wrap(gate, "request", around)
+
+
+@breaks("R-PROOF-11")
+def the_announced_element_will_do(robot):
+    proofs_of(robot, lambda lease, who, proof, now_us: proof.proof in lease.proof[1:] and proof.proof is not None)
+
+
+@breaks("R-PROOF-12")
+def announcements_last(robot):
+    def take(self, who, now_us, proof=NO_PROOF):
+        held = self.live_holder(now_us) == who
+        Lease.take(self, who, now_us, proof._replace(
+            next_proof=proof.next_proof or (self.proof.next_proof if held else None)))
+
+    lease_of(robot, take=take)
 
 
 @breaks("R-PROOF-08")

@@ -8,7 +8,7 @@ from sightline.protocol.messages import MAX_INTEGER, Reply, State, Verb
 from sightline.protocol.proof import session_digest
 from sightline.protocol.transports.link import Message
 from tests.conformance.robot.broken.arming import absent, forgives
-from tests.conformance.robot.broken.breaking import bend_out, bend_twists, breaks, fields_of, last_seq, wrap
+from tests.conformance.robot.broken.breaking import bend_acks, bend_out, bend_twists, breaks, fields_of, last_seq, wrap
 from tests.conformance.robot.broken.credit import owns_too, stream_of
 from tests.conformance.robot.broken.validation import refuse, refuses
 
@@ -50,6 +50,11 @@ def headers_of_400_bytes(robot):
 @breaks("R-HEAD-22")
 def answers_go_by_nothing(robot):
     refuses(robot, lambda fields, _message: "scan" in fields or "mission" in fields)
+
+
+@breaks("R-HEAD-23")
+def missions_are_not_read(robot):
+    bend_twists(robot, lambda fields, _message: fields.update(mission=None))
 
 
 @breaks("R-GRAM-11")
@@ -149,6 +154,24 @@ def one_memory_for_all_senders(robot):
         inner(*arguments)
         if len(record._others) > 63:
             record._drivers.clear()
+
+    wrap(record, "check", around)
+
+
+@breaks("R-SEQ-15")
+def smaller_leaps(robot):
+    refuses(robot, lambda fields, _message: fields.get("seq") == (1 << 32) + (1 << 20), "OUT_OF_ORDER")
+
+
+@breaks("R-SEQ-16")
+def remembers_three_seconds(robot):
+    record = record_of(robot)
+
+    def around(inner, header, now_us):
+        for sender, (_seq, heard_us) in list(record._drivers.items()):
+            if now_us - heard_us > 3_000_000:
+                del record._drivers[sender]
+        inner(header, now_us)
 
     wrap(record, "check", around)
 
@@ -277,6 +300,33 @@ def acks_in_order_only(robot):
         inner(message)
 
     wrap(robot, "on_ack", around)
+
+
+@breaks("R-FLOW-18")
+def acks_of_any_time(robot):
+    def bend(fields, _message):
+        echo = echo_of(fields)
+        echo["t_us"] = robot.sending._frame_times.get(echo.get("seq"), echo.get("t_us"))
+
+    bend_acks(robot, bend)
+
+
+@breaks("R-FLOW-19")
+def acks_of_any_source(robot):
+    def around(inner, message):
+        source = (fields_of(message.header) or {}).get("source")
+        inner(Message(message.channel, source or message.source, message.header, message.payload))
+
+    wrap(robot, "on_ack", around)
+
+
+@breaks("R-FLOW-20")
+def stopped_twists_return_no_credit(robot):
+    def around(inner, message, now_us):
+        ack = inner(message, now_us)
+        return None if robot.driving.gate.state is State.STOPPED else ack
+
+    wrap(robot.driving, "on_twist", around)
 
 
 # --- requests and status ---------------------------------------------------------------------------------------------

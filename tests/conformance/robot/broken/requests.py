@@ -104,3 +104,16 @@ def resets_of_another_session(robot):
             header["echo"]["session"] = robot.driving.session
 
     bend_requests(robot, bend)
+
+
+@breaks("R-REQ-15")
+def requests_in_order_only(robot):
+    newest = {}
+
+    def around(inner, header, request, now_us):
+        if header.seq < newest.get(header.session, 0):
+            raise WireError(RejectReason.OUT_OF_ORDER, "below the last")
+        newest[header.session] = header.seq
+        return inner(header, request, now_us)
+
+    wrap(robot.driving.gate, "request", around)

@@ -277,7 +277,7 @@ def bend_echo(robot, change):
     bend_twists(robot, bend)
 
 
-@breaks("R-CAUS-01")
+@breaks("R-CAUS-01", "R-SEQ-15", "R-FLOW-20")
 def learns_of_a_frame_too_late(robot):
     waiting = []
     wrap(robot, "issue", lambda _inner, header: waiting.append(header))
@@ -399,7 +399,7 @@ def only_the_same_is_a_replay(robot):
     check_seq(robot, check)
 
 
-@breaks("R-SEQ-08")
+@breaks("R-SEQ-08", "R-SEQ-15")
 def no_jumps(robot):
     def check(inner, header, last):
         if 0 <= last < header.seq - 500:
