@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from sightline.conformance.case import Case, Level
-from sightline.conformance.runner import Outcome, Result, passed, printable
+from sightline.conformance.runner import Outcome, Result, passed, printable, untested
 from sightline.protocol.errors import ConfigError
 
 
@@ -22,11 +22,13 @@ def _counted_as(one: Result) -> str:
 
 
 def summary(results: Sequence[Result]) -> str:
-    """One line: does the peer conform, and how many of what."""
+    """One line: does the peer conform, how many of what, and why a MUST was left untested."""
     found = counts(results)
     names = (Outcome.PASSED.value, Outcome.FAILED.value, "SHOULD failed", Outcome.SKIPPED.value)
     figures = ", ".join(f"{found[name]} {name}" for name in names if found[name] or name == Outcome.PASSED.value)
-    return f"{'conforms' if passed(results) else 'does NOT conform'}: {figures}, of {len(results)} cases"
+    left = untested(results)
+    more = f"; {len(left)} MUST could not be tested, first {left[0].case.id}: {left[0].reason}" if left else ""
+    return f"{'conforms' if passed(results) else 'does NOT conform'}: {figures}, of {len(results)} cases{more}"
 
 
 def to_dict(results: Sequence[Result], side: str, peer: str) -> dict[str, Any]:

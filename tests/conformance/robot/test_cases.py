@@ -1,12 +1,14 @@
 """The kit against our own robot in virtual time, and its own parts. tests/conformance/mutants runs the broken ones."""
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
 from sightline.conformance.case import GROUPS, KEPT_MESSAGES, Case, Level, Suite
+from sightline.conformance.report import summary
 from sightline.conformance.robot.cases import CASES, prepare
-from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases
+from sightline.conformance.runner import Outcome, chosen, passed, run_case, run_cases, untested
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import ConfigError
 from sightline.robot_side.network.core import NetworkCore
@@ -116,6 +118,7 @@ def test_robot_with_any_camera_fails_no_case(monkeypatch, fps):
     monkeypatch.setattr(reference, "CAMERA_US", 1e6 / fps)
     results = {case.id: result_of(case) for case in VIRTUAL}
     assert {name: one.reason for name, one in results.items() if one.outcome is Outcome.FAILED} == {}
+    assert {one.case.id: one.reason for one in untested(list(results.values()))} == {}
 
 
 @pytest.mark.parametrize("fps", [120, 240])
@@ -274,6 +277,28 @@ def test_a_peer_conforms_if_no_must_failed_and_something_was_tested():
     assert not passed([good, bad])
     assert not passed([nothing])
     assert not passed([])
+
+
+def test_must_that_is_left_though_its_need_was_met_before_is_tried_again_and_does_not_conform():
+    bench, _robot = virtual_robot()
+    runs = []
+
+    def lacks(bench):
+        runs.append(bench.now_us)
+        bench.need(len(runs) > most, "not armed (R-CAUS-99)")
+
+    good = Case("R-CAUS-99", Level.MUST, "Headers", "A title.", lambda bench: None)
+    weak = replace(good, level=Level.SHOULD)
+    case = Case("R-CAUS-98", Level.MUST, "Headers", "A title.", lacks)
+    most = 9
+    assert passed(run_cases([case], bench, tries=3)) is False and len(runs) == 1
+    assert passed(run_cases([weak, case], bench, tries=3)) is True and len(runs) == 2
+    results = run_cases([good, case], bench, tries=3)
+    assert not passed(results) and len(runs) == 5
+    assert summary(results).endswith("; 1 MUST could not be tested, first R-CAUS-98: not armed (R-CAUS-99)")
+    most = 6
+    results = run_cases([good, case], bench, tries=2)
+    assert passed(results) and results[1].reason.startswith("at try 2")
 
 
 def test_time_passes_only_while_a_case_waits_and_callbacks_run_inside():
