@@ -539,6 +539,24 @@ def hello_again_with_another_role(bench: Bench) -> None:
         bench.expect(reported[1] == "operator", f"after a hello as operator it is taken for {reported[1]}'s")
 
 
+@SUITE.must("R-SOCK-51", "14.5 Hello", real=True)
+def later_hello_that_is_none(bench: Bench) -> None:
+    """A later hello is validated as the first: another robot, another version and no hello at all end with 1008."""
+    for later in (hello(bench, robot="other"), hello(bench, v=2), b'{"let": "me in"}'):
+        with spoken(bench) as raw:
+            raw.send(TEXT, later)
+            ends_with(raw, bench, (1008,), f"{later.decode()} after a good hello")
+
+
+@SUITE.must("R-SOCK-50", "8.2 Requests and replies", real=True)
+def replies_go_to_all(bench: Bench) -> None:
+    """A reply goes to every peer that wants replies, not to the requester alone."""
+    with spoken(bench, "reply") as raw, spoken(bench, "reply") as other:
+        raw.send(BINARY, disarm_request(bench))
+        bench.need(is_answered(raw, bench), "the requester gets no reply (R-REQ-01)")
+        bench.expect(is_answered(other, bench), "another peer than the requester gets none")
+
+
 @SUITE.must("R-SOCK-45", "14.6 Messages", real=True)
 def block_without_header(bench: Bench) -> None:
     """A block of channel and source alone is a message without header: a guest's twist, or UNKNOWN_SOURCE."""

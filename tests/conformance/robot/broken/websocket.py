@@ -50,6 +50,8 @@ DEFECTS = {
     "R-SOCK-47": "keeps missions",
     "R-SOCK-48": "rewrites missions",
     "R-SOCK-49": "only a pong counts",
+    "R-SOCK-50": "replies to the requester",
+    "R-SOCK-51": "any later hello",
     "R-DIAL-11": "pictures are binary",
     "R-DIAL-12": "one line",
     "R-DIAL-13": "deaf to twists",
