@@ -149,6 +149,20 @@ def applied_in_frames(bench: Bench, driver: Sender) -> None:
     driver.robot.expect_at_speed(max(reported) > 0.05, reason)
 
 
+@SUITE.must("R-FRAM-13", "2.8 Fields", armed)
+def latency_in_frames(bench: Bench, driver: Sender) -> None:
+    """`latency_us` of a frame, where it is given, is the time from capture to the acceptance of the last command."""
+    reported: list[int] = []
+    for delay_us in (20_000, 120_000):
+        driver.delay_us = driver.compute_us = delay_us
+        bench.rest(1_000_000)
+        latency_us = driver.robot.frame().latency_us
+        bench.need(latency_us is not None, "its frames give no latency")
+        reported.append(latency_us or 0)
+    follows = reported[0] + 50_000 <= reported[1] <= 400_000
+    bench.expect(follows, f"answers after 20 and 120 ms are reported to take {reported} us")
+
+
 def _grows(robot: Robot, channel: Channel, what: str, values: Iterable[int], least_step: int = 1) -> None:
     """Fail the case unless `values` grow by `least_step` each."""
     falls = (f"{was} is followed by {then}" for was, then in pairwise(values) if then - was < least_step)

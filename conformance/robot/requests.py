@@ -168,6 +168,19 @@ def sent_counts(bench: Bench, robot: Robot) -> None:
     bench.expect(grown >= came // 2, f"{came} frames came, `stream.sent` grew by {grown}")
 
 
+@SUITE.must("R-STAT-12", "9. Status", Robot)
+def rate_is_reported(bench: Bench, robot: Robot) -> None:
+    """`stream.fps` is the rate of the frames."""
+    Sender(robot)
+    bench.rest(1_500_000)
+    mark = bench.mark()
+    bench.rest(1_500_000)
+    fps = len(robot.frames(mark)) / 1.5
+    bench.need(fps >= 4, "too few frames")
+    reported = robot.next_status(3).stream.fps
+    bench.expect(fps / 2 <= reported <= fps * 2, f"{fps:.0f} frames a second came, `stream.fps` is {reported:g}")
+
+
 @SUITE.must("R-STAT-07", "9. Status", Robot)
 def reason_of_the_state(bench: Bench, robot: Robot) -> None:
     """`reason` reports why the robot does not move, and changes with the state."""

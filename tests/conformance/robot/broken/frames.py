@@ -130,6 +130,11 @@ def frames_say_nothing_is_applied(robot):
     bend_out(robot, "frame", lambda header, _payload: header.update(applied=[0.0, 0.0]))
 
 
+@breaks("R-FRAM-13")
+def frames_have_one_latency(robot):
+    bend_out(robot, "frame", lambda header, _payload: header.update(latency_us=50_000))
+
+
 # --- sequence --------------------------------------------------------------------------------------------------------
 
 
@@ -209,6 +214,11 @@ def latency_is_always_zero(robot):
 @breaks("R-STAT-06")
 def sent_stays_at_zero(robot):
     bend_out(robot, "status", lambda _header, payload: payload["stream"].update(sent=0))
+
+
+@breaks("R-STAT-12")
+def rate_is_a_wish(robot):
+    bend_out(robot, "status", lambda _header, payload: payload["stream"].update(fps=0.0))
 
 
 @breaks("R-STAT-07")
