@@ -35,7 +35,8 @@ TOKEN = "conformance-0123456789abcdef"
 
 PREFACE = """`python -m docs.make.conformance` runs the kit over these peers and writes this page. A case that a peer's
 choices leave nothing to test in (no guests, no scan, no port of the legacy protocol, no token, another transport)
-counts as not applicable. Most cases of a vision service need its twists, so one that never drives does not conform.
+counts as not applicable. Most cases of a vision service need its twists, so one that never drives does not conform. Nor
+does a peer with a MUST that was left although the cases of what it needs passed.
 The minimal peers are the examples of [Implement a peer](../../tutorials/implement-a-peer.md): they leave out clauses on
 purpose and therefore do not conform.
 Clauses are those of [protocol/README.md](https://github.com/sightline-robot/sightline/blob/main/protocol/README.md)."""
@@ -55,6 +56,8 @@ can lie about all of them. The kit does not see:
   measured to 0.1 s by `status` and 0.2 s by motion.
 - **What a vision service follows.** The cases about the axes use a yellow ball. They are not applicable to a service
   whose twists do not depend on it (V-STEER-10).
+- **A STOP that is forgotten over a restart** (6.3, 6.5): the kit restarts no robot.
+- **An ack with a payload**, and on WebSocket an ack whose header names another source than its key.
 - **The power supply, the emergency stop and the hardware watchdog.**"""
 
 LISTED_ELSEWHERE = ("codec",)
