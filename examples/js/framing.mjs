@@ -70,13 +70,24 @@ export function pack(name, header, payload) {
   return join(encode({ channel: name, ...header }), payload);
 }
 
-/** The same for a header as it came: it follows an object of names. @param {Uint8Array} header */
+/** The same for a header as it came: unless it names its source, it follows an object of names. @param {Uint8Array} header */
 export function packRaw(name, source, header, payload) {
-  const names = new TextEncoder().encode(`{"channel":"${name}","source":"${source}"}`);
-  const block = new Uint8Array(names.length + header.length);
+  const isNamed = sourceOf(header) === source;
+  const names = new TextEncoder().encode(isNamed ? `{"channel":"${name}",` : `{"channel":"${name}","source":"${source}"}`);
+  const rest = isNamed ? header.subarray(1) : header;
+  const block = new Uint8Array(names.length + rest.length);
   block.set(names);
-  block.set(header, names.length);
+  block.set(rest, names.length);
   return join(block, payload);
+}
+
+function sourceOf(header) {
+  try {
+    const text = UTF8.decode(header);
+    return text.startsWith('{"') ? JSON.parse(text).source : null;
+  } catch {
+    return null;
+  }
 }
 
 function join(block, payload) {
