@@ -260,7 +260,8 @@ class Operator:
     def _note(self, report: StatusReport) -> None:
         now_s, session = time.monotonic(), report.stamp.session
         self._recent = {one: known for one, known in self._recent.items() if now_s - known[0] < _RECENT_S}
-        if session in self._recent and self._report is not None and self._report.stamp.session != session:
+        last = self._report.stamp.session if self._report else session
+        if session in self._recent and session != last:
             self._twin_s = now_s  # it came back after another one
         self._recent[session] = now_s, report.status
 

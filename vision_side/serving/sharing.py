@@ -396,12 +396,11 @@ class Sharing:
         owner, _, second = self._choices[name]
         is_owner = self.own.name == owner and not self.has_twin
         if not robot.drivers:
-            late_us = now_us - robot.driverless_us - NO_DRIVER_US
-            if is_owner or late_us < 0:
-                return is_owner
+            if is_owner:
+                return True
             # The order of all services takes long to compute for each of a thousand robots, and makes no difference.
             place = len(self._before(name)) if self.own.name in self._choices[name] else len(self._choices[name])
-            return late_us >= NEXT_CHOICE_US * min(2, place - 1)
+            return now_us - robot.driverless_us - NO_DRIVER_US >= NEXT_CHOICE_US * min(2, place - 1)
         if robot.is_silent:
             since_us = max(robot.active_us + SILENT_US, robot.driver_us)
             is_turn = self.own.name != second or robot.has_left or robot.status_us - since_us >= SECOND_STANDBY_US

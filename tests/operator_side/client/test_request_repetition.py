@@ -21,6 +21,7 @@ from sightline.protocol.messages import (
     RequestHeader,
     Stamp,
     State,
+    Status,
     Twist,
     Verb,
 )
@@ -29,7 +30,7 @@ from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import PluginChoice, RobotConfig
 from sightline.robot_side.driver.core import DriverCore
 
-ROBOT, VISION = "0000000a", "0000000b"
+ROBOT, VISION, TWIN = "0000000a", "0000000b", "0000000c"
 TICK_US = 10_000
 BEGIN_US = 1_160_000
 """The robot's clock starts at 1 s and publishes its status each 100 ms, the next one 50 ms after this."""
@@ -52,6 +53,8 @@ class VirtualRobot:
         """So many of the next requests do not arrive."""
         self.on_sent = lambda count: None
         """Runs after each request of the operator, with their count."""
+        self.twin = None
+        """Status of another robot of this id, which it publishes when this one publishes its own."""
         self._seq = 0
 
     def subscribe(self, channel, handler):
@@ -79,6 +82,9 @@ class VirtualRobot:
             if self.publishes and message.channel in (STATUS, REPLY):
                 self.published.append(message)
                 self.handlers[message.channel](message)
+            if self.twin is not None and message.channel is STATUS:
+                stamp = Stamp(session=TWIN, seq=1, t_us=self.now_us)
+                self.handlers[STATUS](Message(STATUS, "", encode(stamp), encode(self.twin)))
 
     def _answer(self):
         self._seq += 1
@@ -497,3 +503,57 @@ def test_stop_is_not_confirmed_by_a_status_from_before_it(robot, operator):
     robot.publishes = robot.receives = False
     with pytest.raises(LinkError, match="did not confirm STOP"):
         operator.stop(lambda: None, timeout_s=0.6)
+
+
+# --- two robots of one id ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("state", "applied", "slow"), [
+    (State.ACTIVE, (0.3, 0.0), 1), (State.ACTIVE, (0.0, 0.0), 1), (State.STOPPED, (0.3, 0.0), 0),
+    (State.STOPPED, (0.0, 0.1), 0),
+])  # fmt: skip
+def test_stop_is_confirmed_only_when_each_robot_of_the_id_has_stopped(robot, operator, state, applied, slow):
+    robot.twin, warned = Status(reason="", state=state, applied=applied), []
+    operator.wait_report()
+    with pytest.raises(LinkError, match="did not confirm STOP"):
+        operator.stop(lambda: warned.append(True), timeout_s=0.6)
+    assert len(warned) == slow
+    robot.twin = Status(reason="", state=State.STOPPED)
+    assert operator.stop(lambda: pytest.fail("slow")).state is State.STOPPED
+
+
+def test_stop_waits_no_longer_than_half_a_second_for_a_robot_that_ended(robot, operator):
+    robot.twin = Status(reason="", state=State.ACTIVE)
+    operator.wait_report()
+    robot.twin = None
+    assert elapsed_ms(robot) == 50
+    operator.stop(lambda: None)
+    assert elapsed_ms(robot) == 550
+
+
+@pytest.mark.parametrize(("at_ms", "is_named"), [(200, True), (736, True), (740, False)])
+def test_rejection_names_two_robots_of_one_id_while_both_publish_or_did_so_in_the_last_half_second(
+    robot, operator, at_ms, is_named
+):
+    """The other robot publishes at 50 and 150 ms; the status of this one at 250 ms is the last sign of two."""
+    robot.twin, robot.drives = Status(reason="", state=State.DISARMED), False
+    while elapsed_ms(robot) < at_ms:
+        robot.turn(BEGIN_US + at_ms * 1000)
+        if elapsed_ms(robot) == 150:
+            robot.twin = None
+    robot.driving.gate._live_commands = 0
+    if is_named:
+        with pytest.raises(LinkError, match=r"^two robots have the id 'r1'; end one of them, `sightline robots` lists"):
+            operator._request(Verb.ARM, operator.report, 1.0)
+    else:
+        assert operator._request(Verb.ARM, operator.report, 1.0).detail.startswith("NOT_ALLOWED")
+    assert operator._request(Verb.DISARM, None, 1.0).ok, "what is granted is granted by the robot that has that session"
+
+
+def test_robot_that_starts_again_is_not_two(robot, operator):
+    robot.drives = robot.publishes = False
+    robot.twin = Status(reason="", state=State.DISARMED)
+    operator.wait_report()
+    operator.wait_report()
+    robot.twin, robot.publishes = None, True
+    assert operator._request(Verb.ARM, operator.report, 1.0).detail.startswith("OTHER_SESSION")

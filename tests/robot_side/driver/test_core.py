@@ -2,6 +2,7 @@
 
 import array
 import math
+import re
 from collections import Counter
 from contextlib import nullcontext
 from random import Random
@@ -298,10 +299,11 @@ def test_status_and_odometry_leave_at_once_and_then_at_their_periods(channel, pe
     assert times_us == [offsets_us[number] for number in (0, 2, 3, 5, 6, 7, 8)], "after a stall one more at once"
 
 
-@pytest.mark.parametrize(("ahead_us", "is_wrong"), [(0, False), (1_000_000, False), (1_000_001, True), (10**15, True)])
-def test_wheel_angles_of_another_clock_are_named(ahead_us, is_wrong):
+@pytest.mark.parametrize(("ahead_us", "named"), [(0, ""), (1_000_000, ""), (1_000_001, "1"), (3_000_000_000, "3e+03")])
+def test_wheel_angles_of_another_clock_are_named(ahead_us, named):
     core = core_of()
-    with pytest.raises(ValueError, match=r"WheelAngles\.t_us is 1.* s ahead") if is_wrong else nullcontext():
+    wrong = re.escape(f"WheelAngles.t_us is {named} s ahead")
+    with pytest.raises(ValueError, match=wrong) if named else nullcontext():
         core.tick(NOW_US, WheelAngles(0.0, 0.0, NOW_US + ahead_us), None)
     for step in range(2):
         core.tick(NOW_US + 2_000_000, WheelAngles(step, step, NOW_US + 1_500_000 + step), None)

@@ -279,13 +279,23 @@ BOX = Detection(10.0, 20.0, 30.0, 40.0, 0.9, "ball")
 
 @pytest.mark.parametrize(("field", "value"), [
     ("x1_px", "a"), ("x1_px", math.nan), ("x1_px", 31.0), ("y2_px", 1e300), ("score", None), ("score", 7.0),
-    ("label", None), ("label", "x" * 65), ("y1_px", 41), ("circle", (1, 2, 3)), ("circle", Circle(1.0, 2.0, -3.0)),
+    ("x1_px", -1e7), ("x2_px", 1_000_001.0), ("score", -0.1), ("score", 1.1), ("label", None),
+    ("label", "x" * 65), ("y1_px", 41), ("circle", (1, 2, 3)), ("circle", Circle(1.0, 2.0, -3.0)),
 ])  # fmt: skip
 def test_target_that_the_wire_cannot_carry_ends_the_mission(field, value):
     switch = MissionSwitch(scripted(), CAMERA)
     switch._mission.step = lambda _view: Plan(STILL, "tracking", target=replace(BOX, **{field: value}))
     plan = switch.step(looked())
     assert (plan.phase, plan.target) == ("failed", None)
+
+
+@pytest.mark.parametrize("changes", [
+    {"x1_px": 30.0}, {"y1_px": 40.0}, {"x1_px": -1e6, "y2_px": 1e6}, {"score": 0.0}, {"score": 1.0},
+])  # fmt: skip
+def test_target_at_a_limit_is_passed_on(changes):
+    switch, one = MissionSwitch(scripted(), CAMERA), replace(BOX, **changes)
+    switch._mission.step = lambda _view: Plan(STILL, "tracking", target=one)
+    assert switch.step(looked()).target is one
 
 
 @pytest.mark.parametrize("x_m", ["1", math.nan])
