@@ -238,11 +238,15 @@ def _screen() -> Iterator[Callable[[str], None]]:
 
     The terminal is opened again, since other programs share the mode of its first descriptor.
     """
-    screen = os.open(os.ttyname(sys.stdout.fileno()), os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        screen = os.open(os.ttyname(sys.stdout.fileno()), os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError:  # within a container the terminal may have no name
+        screen = os.dup(sys.stdout.fileno())
 
     def write(text: str) -> None:
         with suppress(OSError):
-            os.write(screen, text.encode())
+            if select.select([], [screen], [], 0)[1]:
+                os.write(screen, text.encode())
 
     try:
         yield write

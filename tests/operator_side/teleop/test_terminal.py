@@ -270,6 +270,14 @@ def test_keys_typed_before_the_help_is_shown_do_nothing(monkeypatch):
     assert taken == ["\x04"]
 
 
+def test_terminal_without_a_name_is_written_to(monkeypatch):
+    """Within a container its file may be out of reach."""
+    monkeypatch.setattr(terminal.os, "ttyname", lambda _number: "/nowhere/pts")
+    with pty_of(monkeypatch) as fingers:
+        types_at_help(fingers, b"\x04")
+        Cockpit(MemoryNetwork().link("r1", role="teleop"), Teleop("0000000a", Speeds(0.2, 1.0)), lambda: None).run()
+
+
 def test_full_terminal_delays_no_key(monkeypatch):
     """Try many widths: where the last bytes end decides whether a terminal that is not read calls itself writable."""
     network, teleop = MemoryNetwork(), Teleop("0000000a", Speeds(0.2, 1.0))
