@@ -261,12 +261,14 @@ def _cbreak(terminal: int) -> Iterator[None]:
     Keys pressed before count as little as those after: nothing was on the screen yet, and the shell must not get them.
     """
     before = termios.tcgetattr(terminal)
-    tty.setcbreak(terminal, termios.TCSAFLUSH)
+    tty.setcbreak(terminal, termios.TCSANOW)  # TCSAFLUSH would wait for a terminal that does not take its output
+    termios.tcflush(terminal, termios.TCIFLUSH)
     try:
         yield
     finally:
         with suppress(termios.error):
-            termios.tcsetattr(terminal, termios.TCSAFLUSH, before)
+            termios.tcflush(terminal, termios.TCIFLUSH)
+            termios.tcsetattr(terminal, termios.TCSANOW, before)
 
 
 @contextmanager
