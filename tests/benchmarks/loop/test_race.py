@@ -3,8 +3,9 @@
 import json
 import time
 from dataclasses import replace
-from itertools import cycle, pairwise
+from itertools import count, cycle, pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
@@ -440,8 +441,11 @@ def test_overload_means_so_many_times_more_pictures_than_can_be_detected(step_ms
     assert found.busy_ms == 0 or found.fps == fps
 
 
-def test_small_pictures_are_overloaded_by_a_slower_detector(tmp_path):
+def test_small_pictures_are_overloaded_by_a_slower_detector(tmp_path, monkeypatch):
+    """A step takes 1 ms; on a busy machine it might take so long that more pictures overload it."""
     write_pictures(tmp_path, 160, 120)
+    clock = SimpleNamespace(perf_counter_ns=count(0, 1_000_000).__next__)
+    monkeypatch.setattr("sightline.benchmarks.loop.vision.time", clock)
     said = []
     found = overloaded(replace(SMALL, pictures=tmp_path, fps=60.0, overload=2.0), said.append)
     assert (found.fps, found.busy_ms) == (60.0, pytest.approx(33.3, abs=0.1))
