@@ -63,7 +63,7 @@ class Operator:
         self._session = secrets.token_hex(4)
         self._digest = session_digest(SOURCE, self._session)
         self._seq = self._id = 0
-        self._changed, self._sending = threading.Condition(), threading.Lock()
+        self._changed = threading.Condition()
         self._report: StatusReport | None = None
         self._recent: dict[str, tuple[float, Status]] = {}
         """Newest status of each session, and its time: a second one is a restart, or another robot of this id."""
@@ -235,10 +235,10 @@ class Operator:
     def _send(self, number: int, verb: Verb, report: StatusReport | None) -> None:
         """Publish a request. Next: `robot_side/pipe.py`: `NetworkEnd.forward`."""
         echo = None if report is None else Echo.of(report.stamp)
-        with self._sending:  # one thread after the other, for the robot rejects a number that is lower than the last
+        with self._changed:
             self._seq += 1
             header = RequestHeader(source=SOURCE, session=self._session, seq=self._seq, echo=echo)
-            self._link.publish(REQUEST, encode(header), encode(Request(id=number, verb=verb)), SOURCE)
+        self._link.publish(REQUEST, encode(header), encode(Request(id=number, verb=verb)), SOURCE)
 
     # --- on the transport's thread: store and return -------------------------------------------------------------
 
