@@ -8,6 +8,8 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +41,17 @@ for _ in range(3000):
         break
 for row in rows[150:400]:
     print(*row)
+"""
+
+_LATE = """
+from sightline.protocol.clock import monotonic_us
+from sightline.sim.bus import TruthReader
+reader, until_us = TruthReader("/run/sightline"), monotonic_us() + 9_000_000
+print("watches", flush=True)
+while (now_us := monotonic_us()) < until_us:
+    truth = reader.read(1.0)
+    if truth is None or monotonic_us() - truth.t_us > 100_000:
+        print(now_us, flush=True)
 """
 
 
@@ -189,13 +202,30 @@ class Containers:
         """Return the commanded motor speeds as (left, right) in rad/s, oldest first."""
         return [(left, right) for _, left, right in self.motor_rows(sim)]
 
-    def stood_s(self, sim: str, first: int) -> float:
-        """Return the longest time without motion since motor command number `first`, s."""
-        longest_us, began_us = 0.0, None
+    def stands(self, sim: str, first: int) -> list[tuple[float, float]]:
+        """Return when a robot stood since motor command number `first`: from and to, us."""
+        stands, began_us = [], None
         for t_us, left, right in self.motor_rows(sim)[first:]:
-            began_us = None if left or right else t_us if began_us is None else began_us
-            longest_us = max(longest_us, 0.0 if began_us is None else t_us - began_us)
-        return longest_us / 1e6
+            if left or right:
+                began_us = None
+            elif began_us is None:
+                began_us = t_us
+                stands.append((t_us, t_us))
+            else:
+                stands[-1] = began_us, t_us
+        return stands
+
+    @contextmanager
+    def lateness(self, sims: list[str]) -> Iterator[dict[str, list[float]]]:
+        """Note for 9 s when each simulation is over 100 ms behind the clock, us."""
+        late_us: dict[str, list[float]] = {sim: [] for sim in sims}
+        watches = {sim: subprocess.Popen(["docker", "exec", self.container(sim), "python", "-c", _LATE], text=True,
+                                         stdout=subprocess.PIPE) for sim in sims}
+        for watch in watches.values():
+            assert watch.stdout.readline() == "watches\n"
+        yield late_us
+        for sim, watch in watches.items():
+            late_us[sim] += map(float, watch.communicate(timeout=20.0)[0].splitlines())
 
     def health(self) -> dict[str, str]:
         """Return the engine's health status of every service that has a health check."""

@@ -132,19 +132,35 @@ def test_robots_meet_again_after_the_router_was_restarted(running):
     assert all(running.drives(robot) for robot in running.profile.robots)
 
 
-def test_robots_go_on_when_a_vision_service_or_a_router_is_killed(running):
-    only(running, "shared")
-    visions, sims = running.replicas("vision-shared"), [sim for _, sim in running.profile.robots.values()]
-    assert len(visions) == 3
-    for container, bound_s in ((visions[0], 0.3), (visions[1], 0.3), (running.container("shared-router-a"), 2.0)):
+def stood_after_kill(running, container, bound_s):
+    """Kill a container, start it again, and return the stands longer than `bound_s`: of robots whose simulation was in
+    time, and of those whose simulation was late. The images of a late one are too old to drive by."""
+    sims = [sim for _, sim in running.profile.robots.values()]
+    with running.lateness(sims) as late_us:
+        time.sleep(1)  # the start of what notes the lateness takes CPU time
         before = {sim: len(running.motor_rows(sim)) for sim in sims}
         assert ask("docker", "kill", container).returncode == 0
         time.sleep(6)
-        stood = {sim: running.stood_s(sim, before[sim]) for sim in sims}
-        assert max(stood.values()) <= bound_s, (stood, running.compose("logs", "--tail", "20"))
-        assert ask("docker", "start", container).returncode == 0
-        assert all(running.drives(robot) for robot in running.profile.robots)
-        time.sleep(3)
+        stands = [(sim, *stand) for sim in sims for stand in running.stands(sim, before[sim])]
+    assert ask("docker", "start", container).returncode == 0
+    assert all(running.drives(robot) for robot in running.profile.robots)
+    long = [(sim, began_us, ended_us) for sim, began_us, ended_us in stands if ended_us - began_us > bound_s * 1e6]
+    late = [stand for stand in long if any(stand[1] - 5e5 < at_us < stand[2] for at_us in late_us[stand[0]])]
+    return [stand for stand in long if stand not in late], late
+
+
+def test_robots_go_on_when_a_vision_service_or_a_router_is_killed(running):
+    only(running, "shared")
+    visions = running.replicas("vision-shared")
+    assert len(visions) == 3
+    for container, bound_s in ((visions[0], 0.3), (visions[1], 0.3), (running.container("shared-router-a"), 2.0)):
+        for _ in range(5):
+            stood, late = stood_after_kill(running, container, bound_s)
+            assert not stood, running.compose("logs", "--tail", "20")
+            time.sleep(3)
+            if not late:
+                break
+        assert not late, "a simulation was behind the clock at every kill; is the machine busy?"
 
 
 def test_stop_stops_one_robot_until_reset_and_armed(running):
