@@ -22,7 +22,7 @@ const HEADERS = {
 export function servePage(host, robot) {
   return async (request, response) => {
     const problem = admissionProblem(request.rawHeaders, host);
-    const found = FILES.get(new URL(request.url, "http://robot").pathname);
+    const found = FILES.get(request.url.split("?")[0]);
     if (problem !== null || found === undefined || request.method !== "GET") {
       const [status, line] = problem ?? (found === undefined ? [404, "no such page; the viewer is at /"] : [405, "GET only"]);
       response.writeHead(status, { "Content-Type": "text/plain" }).end(`${line}\n`);

@@ -94,7 +94,7 @@ def test_robot_serves_only_the_viewers_page(quiet_robot):
     with urllib.request.urlopen(f"{base}/", timeout=5) as page:
         assert b"STOP" in page.read()
         assert "default-src 'none'" in page.headers["Content-Security-Policy"]
-    for path in ("/robot_server.mjs", "/../../pyproject.toml", "/%2e%2e/x"):
+    for path in ("/robot_server.mjs", "/../../pyproject.toml", "/%2e%2e/x", "//"):
         with pytest.raises(urllib.error.HTTPError) as missing:
             urllib.request.urlopen(base + path, timeout=5)
         assert missing.value.code == 404
