@@ -73,7 +73,7 @@ export class Eyes {
       this.clock.age_us(read.header, this.now_us());
       this.vision.onStatus(read.header, read.payload);
     }
-    if (channel.name === "reply" && read.payload.to === this.vision.digest) this.onReply(read.payload);
+    if (channel.name === "reply" && read.payload.to === this.vision.requester) this.onReply(read.payload);
   }
 
   /** One place for a frame, the newest; whoever was in it is not answered. */

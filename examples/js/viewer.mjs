@@ -6,7 +6,7 @@
 
 import { Eyes, EYES_WANT } from "./eyes.mjs";
 import { PeerError, SUBPROTOCOL, helloText, pack, readHello, unpack } from "./framing.mjs";
-import { Vision } from "./vision.mjs";
+import { OPERATOR, Vision } from "./vision.mjs";
 
 const FIRST_PAUSE_MS = 200;
 const LONGEST_PAUSE_MS = 1000;
@@ -25,7 +25,7 @@ export class Viewer {
     Object.assign(this, { url, robot, show, WebSocket });
     this.subprotocols = [SUBPROTOCOL, ...(token ? [`sightline.token.${token}`] : [])];
     this.session = [...crypto.getRandomValues(new Uint8Array(4))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
-    this.vision = new Vision(this.session, "viewer");
+    this.vision = new Vision(this.session, OPERATOR);
     this.eyes = new Eyes(this.vision, {
       look,
       send: (name, header, payload) => this.send(name, header, payload),
@@ -103,14 +103,15 @@ export class Viewer {
   }
 
   send(name, header, payload) {
+    if (name === "twist" && this.stopping) return; // without commands it stops, though STOP does not arrive
     const urgent = name === "request";
     if (this.isOpen && (urgent || this.socket.bufferedAmount < MOST_BUFFERED_BYTES)) this.socket.send(pack(name, header, payload));
   }
 
-  /** Drive, as `vision`, or only watch, as `viewer`. @param {boolean} drives */
+  /** Drive, as `vision`, or only watch. @param {boolean} drives */
   setDriving(drives) {
     this.eyes.drives = drives;
-    this.vision.source = drives ? "vision" : "viewer";
+    this.vision.source = drives ? "vision" : OPERATOR;
     if (this.isOpen) this.socket.send(this.hello());
   }
 

@@ -3,10 +3,14 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { encode } from "./codec.mjs";
+import { DRAWN_CAMERA, drawPicture } from "./drawing.mjs";
 import { helloText, pack, unpack } from "./framing.mjs";
+import { sessionDigest } from "./proof.mjs";
 import { Viewer } from "./viewer.mjs";
 
 const SESSION = "0a1b2c3d";
+const JPEG = drawPicture({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
+const BLACK = { width: 1, height: 1, scale: 1, data: [0, 0, 0], channels: 3 };
 
 /** What the page has sent, and what it was shown. Each connection that it opens is one of `sockets`. */
 class Rig {
@@ -29,7 +33,7 @@ class Rig {
         this.closed = true;
       }
     }
-    this.viewer = new Viewer({ url: "ws://r1/", robot: "r1", look: () => null, show: (what) => this.shown.push(what), WebSocket: FakeSocket });
+    this.viewer = new Viewer({ url: "ws://r1/", robot: "r1", look: () => BLACK, show: (what) => this.shown.push(what), WebSocket: FakeSocket });
     this.viewer.open();
     this.seq = 0;
   }
@@ -43,15 +47,28 @@ class Rig {
     this.socket.onmessage({ data: helloText("r1", SESSION, []) });
   }
 
-  status(state, applied = [0, 0]) {
+  receive(channel, payload) {
     const header = { v: 1, session: SESSION, seq: (this.seq += 1), t_us: this.seq };
-    const message = pack("status", header, encode({ state, reason: "as said", applied }));
-    this.socket.onmessage({ data: message.buffer });
+    this.socket.onmessage({ data: pack(channel, header, payload).buffer });
+  }
+
+  status(state, applied = [0, 0]) {
+    this.receive("status", encode({ state, reason: "as said", applied }));
+  }
+
+  /** A frame, and the channels of what the page has sent when it is drawn. */
+  async frame() {
+    this.receive("frame", JPEG);
+    await new Promise(setImmediate);
+    return this.packets().map((packet) => packet.channel.name);
+  }
+
+  packets() {
+    return this.socket.sent.filter((data) => typeof data !== "string").map((data) => unpack(data, "", "r1"));
   }
 
   requests() {
-    const binary = this.socket.sent.filter((data) => typeof data !== "string");
-    return binary.map((data) => unpack(data, "", "r1")).filter((packet) => packet.channel.name === "request").length;
+    return this.packets().filter((packet) => packet.channel.name === "request");
   }
 
   get stops() {
@@ -69,7 +86,7 @@ test("STOP is sent though the status at hand shows STOPPED: another operator may
   t.mock.timers.tick(200);
   rig.greet();
   t.mock.timers.tick(50);
-  assert.ok(rig.requests() >= 1);
+  assert.ok(rig.requests().length >= 1);
   assert.ok(!rig.stops.includes("STOPPED"), rig.stops.join());
   rig.status("ACTIVE", [0.2, 0]);
   t.mock.timers.tick(50);
@@ -79,6 +96,36 @@ test("STOP is sent though the status at hand shows STOPPED: another operator may
   rig.status("STOPPED");
   t.mock.timers.tick(50);
   assert.equal(rig.stops.at(-1), "STOPPED");
+  rig.viewer.close();
+});
+
+test("requests are an operator's, whether the page drives or not: no other token permits them", () => {
+  const rig = new Rig();
+  rig.greet();
+  for (const drives of [false, true]) {
+    rig.viewer.setDriving(drives);
+    const id = rig.viewer.ask("arm");
+    assert.equal(rig.requests().at(-1).source, "operator");
+    rig.receive("reply", encode({ to: sessionDigest("operator", rig.viewer.session), id, ok: true, state: "HOLD", detail: "armed" }));
+    assert.equal(rig.shown.at(-1).reply?.id, id);
+  }
+  rig.viewer.close();
+});
+
+test("the page steers no more from STOP on, though no STOP arrives", async (t) => {
+  t.mock.timers.enable({ apis: ["setTimeout"] });
+  const rig = new Rig();
+  rig.greet();
+  rig.viewer.setDriving(true);
+  rig.receive("camera", encode(DRAWN_CAMERA));
+  assert.deepEqual(await rig.frame(), ["twist"]);
+  rig.viewer.stop();
+  t.mock.timers.tick(1000);
+  rig.socket.sent.length = 0;
+  assert.deepEqual(await rig.frame(), []);
+  rig.status("STOPPED");
+  t.mock.timers.tick(50);
+  assert.deepEqual(await rig.frame(), ["twist"]);
   rig.viewer.close();
 });
 

@@ -57,10 +57,11 @@ export function steer(target, camera, side = 1) {
 }
 
 const AHEAD_US = 500_000; // more than links and clocks differ
+export const OPERATOR = "operator"; // the one role whose token permits requests
 
 /** What a vision knows of one robot, and the headers of its answers. */
 export class Vision {
-  /** @param {string} session 8 hex digits @param {string} source the role: `vision`, or one that only watches */
+  /** @param {string} session 8 hex digits @param {string} source the role: `vision`, or `operator` to watch only */
   constructor(session, source = "vision") {
     this.session = session;
     this.source = source;
@@ -77,6 +78,11 @@ export class Vision {
   /** What others see of source and session. */
   get digest() {
     return sessionDigest(this.source, this.session);
+  }
+
+  /** Whom replies to its requests name. */
+  get requester() {
+    return sessionDigest(OPERATOR, this.session);
   }
 
   /** A new session of the robot: what was learned from the old one is forgotten. */
@@ -140,7 +146,7 @@ export class Vision {
   }
 
   /**
-   * A request; what lets the robot move again cites the newest status.
+   * A request, as an operator; what lets the robot move again cites the newest status.
    * @param {string} verb
    * @returns {{header: object, payload: {id: number, verb: string}}}
    */
@@ -149,7 +155,7 @@ export class Vision {
     this.requestId += 1;
     const stamp = this.status?.header;
     const echo = stamp ? { channel: "status", session: stamp.session, seq: stamp.seq, t_us: stamp.t_us } : null;
-    const header = { v: 1, source: this.source, session: this.session, seq: this.requestSeq, echo, ...this.proofs.next() };
+    const header = { v: 1, source: OPERATOR, session: this.session, seq: this.requestSeq, echo };
     return { header, payload: { id: this.requestId, verb } };
   }
 }

@@ -114,7 +114,7 @@ def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer
     page.press("Space", " ")
     assert until(lambda: page.text("state") == "STOPPED", 3.0), page.text("news")
     assert page.run("document.getElementById('drive').checked") is True  # the space bar pressed no button
-    assert robot.says(r"STOPPED \(STOP by vision\)")
+    assert robot.says(r"STOPPED \(STOP by operator\)")
     assert page.errors == []
 
 
