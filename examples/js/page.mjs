@@ -11,6 +11,7 @@ const write = (id, text) => {
 };
 const drawnAt_ms = []; // of the last second
 let statusAt_ms = Infinity; // of the state on the page; Infinity: it shows none
+let newsState = null; // of the robot, that the news goes with; null: the news stays until the next
 let newest_ms = 0; // least age of the newest image when it was drawn
 
 /** @param {object} what one thing that changed */
@@ -21,8 +22,8 @@ function show({ link, status, reply, stop, target, age_us }) {
     if (link !== "connected") forgetStatus("");
   }
   if (status !== undefined) showStatus(status);
-  if (reply !== undefined) write("news", reply.detail);
-  if (stop !== undefined) write("news", stop);
+  if (reply !== undefined) tell(reply.detail, reply.state);
+  if (stop !== undefined) tell(stop, stop === "STOPPED" ? stop : null);
   if (target !== undefined) {
     drawnAt_ms.push(performance.now());
     newest_ms = age_us / 1000;
@@ -30,8 +31,19 @@ function show({ link, status, reply, stop, target, age_us }) {
   }
 }
 
+function tell(news, state) {
+  newsState = state;
+  write("news", news);
+}
+
+/** What a request or STOP came to is over with the state that it led to. */
+function forgetNews(state) {
+  if (newsState !== null && state !== newsState) tell("", null);
+}
+
 function showStatus({ state, reason, holder, applied, frame_age_us, latency_us, stream }) {
   statusAt_ms = performance.now();
+  forgetNews(state);
   write("state", state);
   part("state").className = state;
   write("reason", reason);
@@ -46,6 +58,7 @@ function showStatus({ state, reason, holder, applied, frame_age_us, latency_us, 
 /** What is no longer known must not look like the present. */
 function forgetStatus(reason) {
   statusAt_ms = Infinity;
+  forgetNews("?");
   for (const id of ["state", "wheels", "driver", "sight", "pictures"]) write(id, "?");
   part("state").className = "";
   write("reason", reason);

@@ -88,8 +88,10 @@ export class Viewer {
 
   receive(packet) {
     if (packet === null) return;
+    const before = this.vision.status;
     this.eyes.onMessage(packet);
-    if (packet.channel.name === "status" && this.vision.status !== null) this.show({ status: this.vision.status.payload });
+    const { status } = this.vision;
+    if (status !== before && status !== null) this.show({ status: status.payload });
   }
 
   lost(socket, why) {

@@ -4,7 +4,8 @@ import assert from "node:assert/strict";
 import { beforeEach, mock, test } from "node:test";
 import { encode } from "../../../examples/js/codec.mjs";
 import { drawPicture } from "../../../examples/js/drawing.mjs";
-import { helloText, pack } from "../../../examples/js/framing.mjs";
+import { helloText, pack, unpack } from "../../../examples/js/framing.mjs";
+import { sessionDigest } from "../../../examples/js/proof.mjs";
 
 const SESSION = "0a1b2c3d";
 const JPEG = drawPicture({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
@@ -29,7 +30,11 @@ class FakeSocket {
     sockets.push(this);
   }
 
-  send() {}
+  sent = [];
+
+  send(data) {
+    this.sent.push(data);
+  }
 
   close() {}
 }
@@ -58,7 +63,15 @@ async function receive(channel, payload, late_ms = 0) {
   await new Promise(setImmediate); // the picture is drawn
 }
 
-const receiveStatus = () => receive("status", encode({ state: "ACTIVE", reason: "drives", applied: [0.4, 0] }));
+const receiveStatus = (state = "ACTIVE", applied = [0.4, 0]) => receive("status", encode({ state, reason: "drives", applied }));
+
+/** To this page's newest request. */
+function receiveReply(detail, state = "DISARMED") {
+  parts.arm.onclick();
+  const { header } = unpack(sockets.at(-1).sent.at(-1), "", "r1");
+  const { source, session } = JSON.parse(new TextDecoder().decode(header));
+  return receive("reply", encode({ to: sessionDigest(source, session), id: 1, ok: state === "ACTIVE", state, detail }));
+}
 
 beforeEach(() => {
   sockets.at(-1).onopen();
@@ -97,10 +110,43 @@ test("a robot that sends frames but no status shows no state after 1 s", async (
   assert.equal(parts.state.textContent, "ACTIVE");
 });
 
+test("a status that cannot be read leaves no state", async () => {
+  await receiveStatus();
+  for (let count = 0; count < 12; count += 1) {
+    pass(100);
+    await receive("status", encode({ state: "ACTIVE", reason: 1, applied: [0.4, 0] }));
+  }
+  assert.deepEqual(stateShown(), UNKNOWN.with(1, "no status for more than 1 s"));
+});
+
+test("what a request came to goes with the state that it led to", async () => {
+  await receiveStatus("DISARMED");
+  await receiveReply("NOT_ALLOWED: repeat the request");
+  await receiveStatus("DISARMED");
+  assert.equal(parts.news.textContent, "NOT_ALLOWED: repeat the request");
+  await receiveStatus("ACTIVE");
+  assert.equal(parts.news.textContent, "");
+});
+
+test("a STOP that is not confirmed stays on the page, and STOPPED goes with that state", async () => {
+  parts.stop.onclick();
+  await receiveStatus();
+  assert.equal(parts.news.textContent, "STOP ...");
+  await receiveStatus("STOPPED", [0, 0]);
+  pass(50);
+  await receiveStatus("STOPPED", [0, 0]);
+  assert.equal(parts.news.textContent, "STOPPED");
+  await receiveStatus("DISARMED", [0, 0]);
+  assert.equal(parts.news.textContent, "");
+});
+
 test("a lost link leaves no state", async () => {
   await receiveStatus();
+  await receiveReply("armed", "ACTIVE");
+  assert.equal(parts.news.textContent, "armed");
   sockets.at(-1).onclose({ code: 1006 });
   assert.deepEqual([stateShown(), parts.state.className, parts.link.className], [UNKNOWN, "", "lost"]);
+  assert.equal(parts.news.textContent, "");
   pass(1500);
   assert.deepEqual(stateShown(), UNKNOWN);
 });
