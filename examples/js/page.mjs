@@ -83,6 +83,7 @@ function showAge() {
 
 const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/`;
 const token = location.hash.slice(1); // what stands behind the # is never sent with a request
+globalThis.onhashchange = () => location.reload(); // a token that is added opens no page by itself
 const viewer = new Viewer({ url, robot: document.body.dataset.robot, token, look: canvasLook(part("picture")), show });
 viewer.open();
 setInterval(refresh, REFRESH_MS);

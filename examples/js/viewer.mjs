@@ -50,7 +50,8 @@ export class Viewer {
     };
     socket.onmessage = ({ data }) => socket === this.socket && this.read(data);
     socket.onclose = ({ code, reason }) => this.lost(socket, reason || `code ${code}`);
-    socket.onerror = () => this.lost(socket, "nobody answers"); // not every platform closes what it never opened
+    // Not every platform closes what it never opened, and none shows the reason of the robot.
+    socket.onerror = () => this.lost(socket, "no answer, or a missing or wrong token after the # of the address");
     this.awaitMessage(socket);
   }
 

@@ -43,7 +43,7 @@ mock.timers.enable({ apis: ["setTimeout", "setInterval"] });
 mock.method(performance, "now", () => now_ms);
 Object.assign(globalThis, {
   document: { getElementById: (id) => (parts[id] ??= new FakeElement()), addEventListener: () => undefined, body: { dataset: { robot: "r1" } } },
-  location: { protocol: "http:", host: "r1", hash: "" },
+  location: { protocol: "http:", host: "r1", hash: "", reload: mock.fn() },
   WebSocket: FakeSocket,
   createImageBitmap: async () => ({ width: 8, height: 8, close: () => undefined }),
 });
@@ -138,6 +138,14 @@ test("a STOP that is not confirmed stays on the page, and STOPPED goes with that
   assert.equal(parts.news.textContent, "STOPPED");
   await receiveStatus("DISARMED", [0, 0]);
   assert.equal(parts.news.textContent, "");
+});
+
+test("a page whose connection does not open names the token, and takes one that is added to its address", () => {
+  sockets.at(-1).onerror();
+  assert.match(parts.link.textContent, /no answer.*token.*#/);
+  globalThis.onhashchange();
+  assert.equal(location.reload.mock.callCount(), 1);
+  pass(1500);
 });
 
 test("a lost link leaves no state", async () => {
