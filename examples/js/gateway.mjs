@@ -69,7 +69,7 @@ function passOn(to) {
 
 try {
   const { robot, port, to } = options();
-  const server = createServer({ headersTimeout: OPEN_MS, requestTimeout: OPEN_MS, maxHeaderSize: 8192 }, servePage(HOST, robot));
+  const server = createServer({ headersTimeout: OPEN_MS, requestTimeout: OPEN_MS, connectionsCheckingInterval: 500, maxHeaderSize: 8192 }, servePage(HOST, robot));
   server.maxConnections = MOST_SOCKETS;
   server.on("upgrade", passOn(to));
   server.once("error", ({ code, message }) => {

@@ -5,7 +5,7 @@ import os
 import socket
 import urllib.error
 import urllib.request
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 
@@ -87,6 +87,20 @@ def test_gateway_to_a_robot_that_does_not_answer_reports_it(tmp_path):
         with pytest.raises(InvalidStatus) as refused:
             connect(f"ws://127.0.0.1:{page_port}", subprotocols=["sightline.v1"], open_timeout=5)
     assert refused.value.response.status_code == 502
+
+
+def test_silent_connections_take_the_places_of_a_gateway_for_seconds_only(tmp_path):
+    options = ("--connect", f"ws://127.0.0.1:{free_port()}", "--robot", "r1", "--port", str(port := free_port()))
+    with JsProcess(tmp_path, "gateway.mjs", *options) as gateway, ExitStack() as silent:
+        assert gateway.says("viewer of robot r1")
+        for _ in range(32):
+            silent.enter_context(socket.create_connection(("127.0.0.1", port)))
+
+        def is_served():
+            with suppress(OSError), urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=1) as page:
+                return page.status == 200
+
+        assert until(is_served, 8.0)
 
 
 def test_robot_serves_only_the_viewers_page(quiet_robot):
