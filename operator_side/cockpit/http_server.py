@@ -8,7 +8,7 @@ import json
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from html import escape
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -23,7 +23,7 @@ from sightline.protocol.log import report_fault
 from sightline.protocol.transports.diagnosis import port_owner
 
 MAX_CONNECTIONS: Final = 32
-"""Security limit: a further connection is closed immediately. A browser opens six."""
+"""Security limit: a further connection receives the reason and is closed immediately. A browser opens six."""
 HOST: Final = "127.0.0.1"
 MAX_BODY_BYTES: Final = 4096
 """Security limit of the body of a POST."""
@@ -32,6 +32,9 @@ SILENCE_S: Final = 20.0
 _MAX_FIELDS: Final = 16
 _NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
 _POLICY: Final = "default-src 'self'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+_FULL: Final = json.dumps(
+    {"error": f"{MAX_CONNECTIONS} connections are open, which is the limit; close other pages and programs, and reload"}
+).encode()
 _KINDS: Final = {".html": "text/html; charset=utf-8", ".mjs": "text/javascript; charset=utf-8"}
 
 
@@ -115,6 +118,9 @@ class _Server(ThreadingMixIn, HTTPServer):
                 target=self.process_request_thread, args=(request, client_address), name="http-request", daemon=True
             ).start()
         else:
+            with suppress(OSError):
+                head = "HTTP/1.1 503 Service Unavailable\r\nContent-Type: application/json\r\nConnection: close\r\n"
+                request.sendall(f"{head}Content-Length: {len(_FULL)}\r\n\r\n".encode() + _FULL)
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:

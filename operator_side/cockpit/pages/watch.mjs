@@ -61,13 +61,20 @@ function showState({ robot, online, state, reason, lines }) {
   }));
 }
 
+/** The last state is over. */
+function forgetState(link) {
+  showState({ state: "", reason: "", lines: [] });
+  report(link);
+}
+
 async function showStates() {
   for (;;) {
     try {
-      showState(await (await fetch("state", { signal: AbortSignal.timeout(OLD_STATE_MS) })).json());
+      const { error, ...state } = await (await fetch("state", { signal: AbortSignal.timeout(OLD_STATE_MS) })).json();
+      if (error === undefined) showState(state);
+      else forgetState(error);
     } catch (error) {
-      showState({ state: "", reason: "", lines: [] }); // the last state is over
-      report(`\`sightline watch\` ${error.name === "TimeoutError" ? "does not answer" : "has ended"}`);
+      forgetState(`\`sightline watch\` ${error.name === "TimeoutError" ? "does not answer" : "has ended"}`);
     }
     await pause(STATE_MS);
   }

@@ -53,15 +53,20 @@ globalThis.fetch = async (path, { signal } = {}) => {
     process.exit(0);
   }
   if (states === 2 && process.argv[2] === "has ended") throw new TypeError("no connection");
-  if (states === 2) return new Promise((_, fail) => signal.addEventListener("abort", () => fail(signal.reason)));
-  return { json: async () => state };
+  if (states === 2 && process.argv[2] === "does not answer") {
+    return new Promise((_, fail) => signal.addEventListener("abort", () => fail(signal.reason)));
+  }
+  return { json: async () => (states === 2 ? { error: "too many" } : state) };
 };
 await import(process.argv[1]);
 """
 
 
-@pytest.mark.parametrize("end", ["has ended", "does not answer"])
-def test_page_shows_no_state_after_the_command_ended_or_hangs(end):
+@pytest.mark.parametrize(("end", "shown"), [
+    ("has ended", "`sightline watch` has ended"), ("does not answer", "`sightline watch` does not answer"),
+    ("rejects", "too many"),
+])
+def test_page_shows_no_state_after_the_command_ended_hangs_or_rejects(end, shown):
     command = [node(), "--input-type=module", "-e", ENDING_SCRIPT, (PAGES / "watch.mjs").as_uri(), end]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
-    assert json.loads(done.stdout) == [f"`sightline watch` {end}", "", "", "", []], done.stderr
+    assert json.loads(done.stdout) == [shown, "", "", "", []], done.stderr
