@@ -75,8 +75,12 @@ async function pick(to) {
 }
 
 async function post(what, value) {
-  const answer = await fetch(what, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(value) });
-  return answer.json();
+  const request = { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(value) };
+  try {
+    return await (await fetch(what, request)).json();
+  } catch {
+    return { error: "`sightline pick-color` has ended" };
+  }
 }
 
 async function show({ error, ranges, trial, toml }) {
@@ -112,11 +116,7 @@ canvas.onpointerup = async (event) => {
   if (from === null) return;
   const to = place(event);
   showBox(to);
-  try {
-    await pick(to);
-  } catch {
-    write("error", "`sightline pick-color` has ended");
-  }
+  await pick(to);
   from = null;
 };
 part("again").onclick = again;

@@ -70,3 +70,21 @@ def test_page_shows_no_state_after_the_command_ended_hangs_or_rejects(end, shown
     command = [node(), "--input-type=module", "-e", ENDING_SCRIPT, (PAGES / "watch.mjs").as_uri(), end]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
     assert json.loads(done.stdout) == [shown, "", "", "", []], done.stderr
+
+
+LOST_SCRIPT = """
+const parts = {};
+const element = () => ({ style: {} });
+globalThis.document = { getElementById: (id) => (parts[id] ??= element()), body: { dataset: { live: "true" } } };
+globalThis.fetch = async () => { throw new TypeError("no connection"); };
+await import(process.argv[1]);
+await parts.use.onclick();
+console.log(parts.error.textContent);
+process.exit(0);
+"""
+
+
+def test_page_that_cannot_save_the_range_shows_it():
+    command = [node(), "--input-type=module", "-e", LOST_SCRIPT, (PAGES / "pick.mjs").as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    assert done.stdout == "`sightline pick-color` has ended\n", done.stderr
