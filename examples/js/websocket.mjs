@@ -236,8 +236,9 @@ export function connect(url, { token, ca } = {}) {
     ...(token ? { Authorization: `Bearer ${token}` } : {}),
   };
   return new Promise((resolve, reject) => {
-    const asked = request({ ca, host: hostname.replace(/^\[|\]$/g, ""), port, headers, timeout: OPEN_MS });
-    asked.on("timeout", () => asked.destroy(new Error("no answer within 2 s")));
+    const asked = request({ ca, host: hostname.replace(/^\[|\]$/g, ""), port, headers });
+    const late = setTimeout(() => asked.destroy(new Error("no answer within 2 s")), OPEN_MS);
+    asked.on("close", () => clearTimeout(late));
     asked.on("error", reject);
     asked.on("response", (response) => {
       response.on("data", (body) => reject(new Error(String(body).trim().slice(0, 200)))).on("end", () => reject(new Error(`HTTP ${response.statusCode}`)));
@@ -245,7 +246,6 @@ export function connect(url, { token, ca } = {}) {
     asked.on("upgrade", (response, socket, head) => {
       const right = response.headers["sec-websocket-accept"] === acceptKey(key) && response.headers["sec-websocket-protocol"] === SUBPROTOCOL;
       if (!right) return socket.destroy(reject(new Error(`the service there does not support ${SUBPROTOCOL}`)));
-      socket.setTimeout(0);
       const connection = new Connection(socket, false);
       resolve(connection);
       if (head.length > 0) setImmediate(() => connection.read(head)); // after the caller has said what it listens for

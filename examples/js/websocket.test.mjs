@@ -1,10 +1,11 @@
 /** @file One open connection on a socket that is only made up: its end, and peers that are silent or late. */
 
 import assert from "node:assert/strict";
-import { EventEmitter } from "node:events";
+import { EventEmitter, once } from "node:events";
+import { createServer } from "node:net";
 import test from "node:test";
 import { OPCODE, closePayload, encodeFrame } from "./rfc6455.mjs";
-import { Connection } from "./websocket.mjs";
+import { Connection, connect } from "./websocket.mjs";
 
 const MASK = Uint8Array.from([1, 2, 3, 4]);
 const fromClient = (opcode, payload = new Uint8Array(0)) => encodeFrame(opcode, payload, MASK);
@@ -108,3 +109,21 @@ test("a peer that took what waited may read it first; after that it is silent", 
   rig.pass(2900);
   assert.deepEqual(rig.ends, [1011]);
 });
+
+for (const start of ["HTTP/1.1 101 Switching Protocols\r\n", "HTTP/1.1 200 OK\r\n\r\n"]) {
+  test(`a server that never ends its answer (${start.trim()}) is left after 2 s`, { timeout: 5000 }, async (t) => {
+    t.mock.timers.enable({ apis: ["setTimeout"] });
+    const server = createServer((socket) => {
+      const drip = setInterval(() => socket.write("a: b\r\n"), 50);
+      socket.on("error", () => undefined).on("close", () => clearInterval(drip)).write(start);
+    }).listen(0, "127.0.0.1");
+    t.after(() => server.close());
+    await once(server, "listening");
+    const opening = assert.rejects(connect(`ws://127.0.0.1:${server.address().port}`));
+    const [socket] = await once(server, "connection");
+    await once(socket, "data");
+    t.mock.timers.tick(2000);
+    await opening;
+    await once(socket, "close");
+  });
+}
