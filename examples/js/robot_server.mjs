@@ -103,6 +103,7 @@ class Latch {
 
   keep(stopped) {
     if (stopped === this.isSet) return;
+    mkdirSync(this.folder, { recursive: true }); // it may have been removed since
     if (stopped) closeSync(openSync(this.path, "w"));
     else rmSync(this.path, { force: true });
     const folder = openSync(this.folder, "r");
@@ -193,7 +194,11 @@ class Server {
     const [shown, driving] = [this.shown, ["ACTIVE", "DEGRADED"]];
     if (state === shown) return;
     this.shown = state;
-    this.latch.keep(state === "STOPPED");
+    try {
+      this.latch.keep(state === "STOPPED");
+    } catch (error) {
+      this.say(`${state} is not stored for a restart: ${error.message}; repair --state-dir`);
+    }
     if (!(driving.includes(state) && driving.includes(shown))) this.say(`${state} (${reason})`);
   }
 

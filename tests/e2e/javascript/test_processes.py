@@ -1,6 +1,7 @@
 """The JavaScript peers beside ours, each in a process: their robot with our vision and operator, ours with theirs."""
 
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -86,6 +87,22 @@ def test_the_stop_latch_of_the_javascript_robot_survives_kill_and_restart(tmp_pa
         assert vision.says("frames from robot js1")
         assert until(lambda: status(robot)["refused"].get("STOPPED", 0) > 5, 10)
         assert status(robot)["state"] == "STOPPED"
+
+@pytest.mark.parametrize("replaced", [False, True], ids=["removed", "a file"])
+def test_stop_is_stored_or_the_robot_reports_that_it_is_not(tmp_path, replaced):
+    header = {"channel": "request", "source": "operator", "v": 1, "session": "99999999", "seq": 0}
+    block = json.dumps(header, separators=(",", ":")).encode()
+    with JsRobot(tmp_path) as robot, connect(robot.endpoint, subprotocols=["sightline.v1"]) as operator:
+        operator.send(hello("js1", wants=["reply"]))
+        operator.recv(5)
+        shutil.rmtree(tmp_path / "state")
+        if replaced:
+            (tmp_path / "state").write_text("")
+        operator.send(len(block).to_bytes(2) + block + b'{"id":1,"verb":"stop"}')
+        assert json_payload(operator.recv(5))["state"] == "STOPPED"
+        assert (tmp_path / "state" / "js1.stopped").exists() != replaced
+        assert ("STOPPED is not stored for a restart" in robot.output()) == replaced
+        assert "error" not in robot.output()
 
 
 def test_javascript_robot_stops_when_its_vision_is_killed(tmp_path, our_vision):
