@@ -20,14 +20,16 @@ const KEEP_ALIVE_MS = 1000;
 
 class UsageError extends Error {}
 
+const isPort = (number) => Number.isInteger(number) && number >= 1 && number <= 65_535;
+
 function options() {
   const text = { type: "string" };
   const { values } = parseArgs({ options: { connect: text, robot: text, port: { ...text, default: "8765" } } });
   const found = /^ws:\/\/(\[[0-9a-fA-F:]+\]|[^:/?#]+):([0-9]{1,5})\/?$/.exec(values.connect ?? "");
-  if (found === null) throw new UsageError("--connect is ws://HOST:PORT, where the robot listens");
+  if (found === null || !isPort(Number(found[2]))) throw new UsageError("--connect is ws://HOST:PORT, where the robot listens");
   if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot ?? "")) throw new UsageError("--robot is 1 to 32 letters, digits, _ . -");
   const port = Number(values.port);
-  if (!(Number.isInteger(port) && port >= 1 && port <= 65_535)) throw new UsageError("--port is a number from 1 to 65535");
+  if (!isPort(port)) throw new UsageError("--port is a number from 1 to 65535");
   return { robot: values.robot, port, to: { host: found[1].replace(/^\[|\]$/g, ""), port: Number(found[2]) } };
 }
 

@@ -10,6 +10,7 @@ import { randomBytes } from "node:crypto";
 import { closeSync, existsSync, fsyncSync, mkdirSync, openSync, readFileSync, readdirSync, rmSync } from "node:fs";
 import { homedir } from "node:os";
 import { join } from "node:path";
+import { createSecureContext } from "node:tls";
 import { parseArgs } from "node:util";
 import { readJpegSize } from "./codec.mjs";
 import { DRAWN_CAMERA, ballAt, drawPicture } from "./drawing.mjs";
@@ -52,22 +53,40 @@ function options() {
   if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot)) throw new UsageError("--robot is 1 to 32 letters, digits, _ . -");
   if (!LOOPBACK.includes(values.host) && !values["token-file"]) throw new UsageError("--host beyond loopback needs a --token-file");
   if (!values.cert !== !values.key) throw new UsageError("--cert and --key go together");
-  const tls = values.cert ? { cert: readOption("--cert", values.cert), key: readOption("--key", values.key) } : undefined;
+  const tls = values.cert ? readTls(values) : undefined;
   return { ...values, port, fps, tls, token: values["token-file"] && readToken(values["token-file"]) };
 }
 
-function readOption(name, path) {
+function readOption(name, path, read = readFileSync) {
   try {
-    return readFileSync(path);
+    return read(path);
   } catch (error) {
     throw new UsageError(`${name} ${path}: ${error.message}`);
   }
+}
+
+function readTls({ cert, key }) {
+  const tls = { cert: readOption("--cert", cert), key: readOption("--key", key) };
+  try {
+    createSecureContext(tls);
+  } catch (error) {
+    throw new UsageError(`--cert ${cert}, --key ${key}: ${error.message}`);
+  }
+  return tls;
 }
 
 function readToken(path) {
   const token = readOption("--token-file", path).toString("ascii").trim();
   if (!/^[A-Za-z0-9_-]{16,128}$/.test(token)) throw new UsageError(`--token-file ${path}: a token is 16 to 128 of A-Z a-z 0-9 _ -`);
   return token;
+}
+
+function readPictures(folder) {
+  const names = readdirSync(folder).filter((name) => /\.jpe?g$/i.test(name)).sort();
+  if (names.length === 0) throw new Error("no .jpg in it");
+  const pictures = names.map((name) => new Uint8Array(readFileSync(join(folder, name))));
+  readJpegSize(pictures[0]); // of the camera's model
+  return pictures;
 }
 
 /** Pictures of a folder in turn, or drawn ones: `read(pose, t_us)` gives a JPEG; `model` is their CameraModel. */
@@ -77,14 +96,7 @@ function openCamera(folder) {
     let count = 0;
     return { model: DRAWN_CAMERA, read: (pose, t_us) => drawPicture(pose, ballAt(t_us - start_us), count++) };
   }
-  let names = [];
-  try {
-    names = readdirSync(folder).filter((name) => /\.jpe?g$/i.test(name)).sort();
-  } catch (error) {
-    throw new UsageError(`--pictures ${folder}: ${error.message}`);
-  }
-  if (names.length === 0) throw new UsageError(`--pictures ${folder}: no .jpg in it`);
-  const pictures = names.map((name) => new Uint8Array(readFileSync(join(folder, name))));
+  const pictures = readOption("--pictures", folder, readPictures);
   const { width_px, height_px } = readJpegSize(pictures[0]);
   const focal_px = GUESSED_FOCAL * width_px;
   const model = { width_px, height_px, fx_px: focal_px, fy_px: focal_px, cx_px: width_px / 2, cy_px: height_px / 2, calibrated: false };

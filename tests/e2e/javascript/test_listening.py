@@ -159,12 +159,17 @@ def _open_sockets(robot: JsRobot) -> int:
         ("robot_server.mjs", ["--pictures", "/nowhere"], "--pictures /nowhere"),
         ("robot_server.mjs", ["--colour", "red"], "--colour"),
         ("vision_client.mjs", ["--connect", "tcp/1", "--robot", "r1"], "ws://HOST:PORT"),
+        ("robot_server.mjs", ["--pictures", "{broken}"], "--pictures {broken}"),
+        ("robot_server.mjs", ["--cert", "{broken}/0.jpg", "--key", "{broken}/0.jpg"], "--cert {broken}/0.jpg"),
+        ("gateway.mjs", ["--connect", "ws://127.0.0.1:65536", "--robot", "r1"], "--connect"),
     ],
 )
 def test_a_bad_option_is_one_line_and_code_2(tmp_path, script, arguments, said):
-    with JsProcess(tmp_path, script, *arguments) as process:
+    (broken := tmp_path / "broken").mkdir()
+    (broken / "0.jpg").write_text("no JPEG, no certificate")
+    with JsProcess(tmp_path, script, *(one.format(broken=broken) for one in arguments)) as process:
         assert process.process.wait(10) == 2
-        assert process.output().startswith("error: ") and said in process.output()
+        assert process.output().startswith("error: ") and said.format(broken=broken) in process.output()
         assert process.output().count("\n") == 2 and "    at " not in process.output()
 
 
