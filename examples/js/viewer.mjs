@@ -65,7 +65,7 @@ export class Viewer {
   }
 
   hello() {
-    return helloText(this.robot, this.session, EYES_WANT, this.vision.source);
+    return helloText(this.robot, this.session, EYES_WANT, this.eyes.drives ? "vision" : "viewer");
   }
 
   read(data) {

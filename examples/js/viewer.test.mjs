@@ -99,6 +99,15 @@ test("STOP is sent though the status at hand shows STOPPED: another operator may
   rig.viewer.close();
 });
 
+test("a page that only watches takes the place of a viewer: the last ones are for those that control", () => {
+  const rig = new Rig();
+  rig.greet();
+  for (const drives of [true, false]) rig.viewer.setDriving(drives);
+  const hellos = rig.socket.sent.filter((data) => typeof data === "string");
+  assert.deepEqual(hellos.map((text) => JSON.parse(text).role), ["viewer", "vision", "viewer"]);
+  rig.viewer.close();
+});
+
 test("requests are an operator's, whether the page drives or not: no other token permits them", () => {
   const rig = new Rig();
   rig.greet();
