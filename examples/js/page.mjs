@@ -87,6 +87,7 @@ globalThis.onhashchange = () => location.reload(); // a token that is added open
 const viewer = new Viewer({ url, robot: document.body.dataset.robot, token, look: canvasLook(part("picture")), show });
 viewer.open();
 setInterval(refresh, REFRESH_MS);
+document.onvisibilitychange = document.onresume = refresh; // a page out of sight has had few timers, or none
 
 part("stop").onclick = () => viewer.stop();
 document.addEventListener("keydown", (event) => {

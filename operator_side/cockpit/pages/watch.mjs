@@ -95,5 +95,6 @@ function showAge() {
 }
 
 setInterval(showAge, AGE_MS);
+document.onvisibilitychange = document.onresume = showAge; // a page out of sight has had few timers, or none
 showPictures();
 showStates();

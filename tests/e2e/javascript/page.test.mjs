@@ -140,6 +140,16 @@ test("a STOP that is not confirmed stays on the page, and STOPPED goes with that
   assert.equal(parts.news.textContent, "");
 });
 
+test("a page that wakes shows at once how old its image and state are: no timer has run meanwhile", async () => {
+  for (const wakes of ["onvisibilitychange", "onresume"]) {
+    await receiveStatus();
+    await receive("frame", JPEG);
+    now_ms += 5000;
+    document[wakes]();
+    assert.deepEqual([parts.age.textContent, parts.figure.className, parts.state.textContent], ["no image for 5.0 s", "old", "?"]);
+  }
+});
+
 test("a page whose connection does not open names the token, and takes one that is added to its address", () => {
   sockets.at(-1).onerror();
   assert.match(parts.link.textContent, /no answer.*token.*#/);

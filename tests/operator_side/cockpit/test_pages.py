@@ -88,3 +88,32 @@ def test_page_that_cannot_save_the_range_shows_it():
     command = [node(), "--input-type=module", "-e", LOST_SCRIPT, (PAGES / "pick.mjs").as_uri()]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
     assert done.stdout == "`sightline pick-color` has ended\n", done.stderr
+
+
+WAKING_SCRIPT = """
+const parts = {};
+const element = () => ({ style: {}, getContext: () => ({ drawImage() {} }), replaceChildren() {} });
+globalThis.document = { getElementById: (id) => (parts[id] ??= element()) };
+globalThis.setInterval = globalThis.setTimeout = () => 0; // no timer runs in a page that sleeps
+globalThis.createImageBitmap = async () => ({ width: 8, height: 8, close() {} });
+let now_ms = 0;
+performance.now = () => now_ms;
+const headers = new Headers({ "X-Number": "1", "X-Channel": "frame", "X-Age-Us": "20000" });
+let requests = 0;
+const answer = { ok: true, headers, blob: async () => 0 };
+globalThis.fetch = async () => ((requests += 1) > 1 ? new Promise(() => 0) : answer);
+await import(process.argv[1]);
+await new Promise(setImmediate);
+for (const wakes of ["onvisibilitychange", "onresume"]) {
+  now_ms += 5000;
+  document[wakes]();
+  console.log(parts.age.textContent, parts.figure.className);
+}
+process.exit(0);
+"""
+
+
+def test_page_that_wakes_shows_at_once_how_old_its_image_is():
+    command = [node(), "--input-type=module", "-e", WAKING_SCRIPT, (PAGES / "watch.mjs").as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)
+    assert done.stdout == "no image for 5.0 s old\nno image for 10.0 s old\n", done.stderr
