@@ -209,7 +209,7 @@ class PickPage:
             ranges = pick(picture, Box(*(int(picked[name]) for name in _FIELDS)))
             self._picked = ranges, picture
             trial = try_out(ranges, self._gallery.recent())
-            found: dict[str, Any] = {"ranges": ranges_text(ranges), "toml": f"ranges = {ranges_toml(ranges)}",
+            found: dict[str, Any] = {"ranges": ranges_text(ranges), "toml": _toml(ranges),
                                     "trial": trial_text(trial), **asdict(trial)}
             try:
                 check_trial(trial)
@@ -222,10 +222,17 @@ class PickPage:
         with self._lock:
             return HttpAnswer(mask_png(*self._picked), "image/png") if self._picked else HttpAnswer(status=204)
 
-    def _take(self, _request: PageRequest, _body: bytes) -> HttpAnswer:
+    def _take(self, _request: PageRequest, body: bytes) -> HttpAnswer:
+        shown = json.loads(body)["toml"]
         with self._lock:
             if self._good is None:
                 raise ConfigError("pick a color first")
+            if shown != _toml(self._good):
+                raise ConfigError("another page has picked since; pick again")
             note = self._use(self._good)
         self.done.set()
         return as_json({"note": note})
+
+
+def _toml(ranges: Ranges) -> str:
+    return f"ranges = {ranges_toml(ranges)}"

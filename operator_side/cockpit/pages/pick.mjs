@@ -121,7 +121,7 @@ canvas.onpointerup = async (event) => {
 };
 part("again").onclick = again;
 part("use").onclick = async () => {
-  const { note, error } = await post("use", {});
+  const { note, error } = await post("use", { toml: part("toml").textContent });
   write("note", note);
   write("error", error);
   if (note !== undefined) for (const id of ["use", "again"]) part(id).disabled = true;

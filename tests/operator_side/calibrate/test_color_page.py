@@ -32,3 +32,17 @@ def test_shown_image_can_be_picked_after_the_next_one_arrived(frames):
 def test_image_that_left_the_buffer_is_reported():
     with pytest.raises(ConfigError, match="that image is gone; pick in a newer one"):
         gallery_of(1, shots=4).pixels(2)
+
+
+def test_only_the_range_that_the_page_shows_is_used():
+    used = []
+    page = PickPage(gallery_of(1, shots=1), "robot r1", lambda ranges: used.append(ranges) or "saved")
+    picked = {"number": 1, "x_px": BALL.x_px, "y_px": BALL.y_px, "width_px": 0, "height_px": 0}
+    shown = json.loads(page.routes["POST /pick"]({}, json.dumps(picked).encode()).body)
+    other = json.dumps({"toml": "ranges = [[1, 2, 3, 4, 5, 6]]"}).encode()  # of a second page, which picked before
+    with pytest.raises(ConfigError, match="another page has picked since; pick again"):
+        page.routes["POST /use"]({}, other)
+    assert not used and not page.done.is_set()
+    answer = page.routes["POST /use"]({}, json.dumps({"toml": shown["toml"]}).encode())
+    assert json.loads(answer.body) == {"note": "saved"}
+    assert len(used) == 1 and page.done.is_set()
