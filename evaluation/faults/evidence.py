@@ -6,7 +6,7 @@ It does not trust the software under test. The simulation stamps the motor log, 
 import itertools
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +31,8 @@ _AT_REST_MPS: Final = 0.01
 """A wheel is at zero when its motor is set to zero and its rim moves slower than this: 2 % of top speed, as in the
 bound that the robot computes."""
 _RAMPED_OUT_US: Final = RAMPED_US + 2 * TICK_US
+HELD_US: Final = 100_000
+"""A robot sets its motors every 20 ms. From so long a pause on, each tick of it counts as a line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +152,18 @@ def _ms_after(window: Sequence[MotorRow], index: int, since_us: int) -> float | 
 def last_valid_us(sent: Iterable[SentCommand], blind: Blind) -> int | None:
     """When the last command left that still counted when the blindness began; None without one."""
     return max((one.t_us for one in sent if blind.is_earlier(one)), default=None)
+
+
+def held_rows(rows: Sequence[MotorRow], from_us: int, until_us: int) -> list[MotorRow]:
+    """Add a line for each tick of a pause in the log that begins at `from_us` or later; the log ends at `until_us`.
+
+    Motors keep the speed of the last command, so a robot that sets none any more may drive on without a line.
+    """
+    held: list[MotorRow] = []
+    for row, end_us in zip(rows, [*(row.t_us for row in rows[1:]), until_us], strict=False):
+        is_held = row.t_us >= from_us and end_us - row.t_us > HELD_US
+        held += [row, *(replace(row, t_us=at_us) for at_us in range(row.t_us + TICK_US, end_us, TICK_US) if is_held)]
+    return held
 
 
 def moved_on_old_sight(rows: Sequence[MotorRow], sent: Sequence[SentCommand], blind: Blind | None) -> int:

@@ -21,6 +21,7 @@ from sightline.evaluation.faults.evidence import (
     ZERO_MS,
     Blind,
     Stop,
+    held_rows,
     last_valid_us,
     measure_stop,
     moved_on_old_sight,
@@ -29,6 +30,7 @@ from sightline.evaluation.faults.evidence import (
 from sightline.evaluation.faults.fixture import RobotFixture
 from sightline.evaluation.faults.sampler import STALL_US
 from sightline.evaluation.processes import terminated_like_interrupted
+from sightline.protocol.clock import monotonic_us
 from sightline.protocol.errors import SightlineError
 from sightline.sim.tun_emulator import why_impossible
 
@@ -161,14 +163,15 @@ def watched_us(injected: Injected, checks: Sequence[Check]) -> tuple[int, int]:
 
 
 def _motion_checks(row: FaultCase, rig: RobotFixture, injected: Injected) -> Iterable[Check]:
-    rows, sent = rig.motors(), rig.sent()
+    rows, now_us, sent = rig.motors(), monotonic_us(), rig.sent()
     blind = Blind(injected.at_us, injected.resumed_us, row.by_frame) if row.blind else None
     if row.stops:
         until_us = injected.resumed_us or rows[-1].t_us
         since_us = last_valid_us(sent, blind or Blind(until_us))
         stop = measure_stop(rows, since_us, injected.resumed_us) if since_us else Stop(None, None, 0.0)
         yield from stop_checks(stop, row.zero_ms, row.distance_m)
-    yield at_most("on an old frame", moved_on_old_sight(rows, sent, blind), "lines", 0)
+    held = held_rows(rows, injected.at_us, now_us)
+    yield at_most("on an old frame", moved_on_old_sight(held, sent, blind), "lines", 0)
     if row.again:
         yield at_least("drives again", bool(injected.again), "", 1)
 

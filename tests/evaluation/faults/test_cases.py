@@ -23,6 +23,7 @@ from sightline.evaluation.faults.cases import CASES, chosen
 from sightline.evaluation.faults.drivers import JOINED_GAP_MS, OWNER, STANDBY, handover_checks
 from sightline.evaluation.faults.evidence import (
     GOOD,
+    HELD_US,
     INJECTED,
     OLD_US,
     RAMPED_US,
@@ -30,6 +31,7 @@ from sightline.evaluation.faults.evidence import (
     EventLog,
     MotorRow,
     SentCommand,
+    held_rows,
     last_valid_us,
     measure_stop,
     most_gain_mps2,
@@ -174,6 +176,24 @@ def test_failed_check_extends_the_watched_time_to_all_measurements():
     assert from_us == 2_000_000 and to_us > 66_000_000
     assert stalled_us([Hole(3_000_000, 3_100_000)], from_us, to_us) > STALL_US
     assert watched_us(Injected(1, 6_000_000), [bad])[0] == 6_000_000
+
+
+def test_speed_that_a_robot_keeps_without_a_line_is_counted():
+    frozen, stands = log([0.5] * 51), log(drive_and_stop(plateau=60))
+    to_the_end = held_rows(frozen, 0, 3_000_000)
+    until_it_stands = held_rows([*frozen, *(row for row in stands if row.t_us > 2_000_000)], 0, 3_000_000)
+    assert moved_on_old_sight(to_the_end, commands(1_000_000), None) > 70
+    assert moved_on_old_sight(until_it_stands, commands(1_000_000), None) > 20
+    assert moved_on_old_sight(held_rows(stands, 0, 9_000_000), commands(1_000_000), None) == 0, "it stands"
+    assert moved_on_old_sight(to_the_end, commands(3_000_000), None) == 0, "frames are young"
+
+
+def test_only_a_long_pause_from_the_fault_on_counts_as_a_held_speed():
+    begin, end = (MotorRow(t_us, 5.0, 5.0, 0.0, 0.0) for t_us in (1_000_000, 1_000_000 + HELD_US))
+    assert held_rows([begin, end], 1_000_000, end.t_us) == [begin, end]
+    assert len(held_rows([begin, end], 1_000_000, end.t_us + HELD_US + 1)) == 7
+    assert held_rows([begin], 1_000_001, 9_000_000) == [begin]
+    assert held_rows([], 0, 9_000_000) == []
 
 
 def test_without_any_command_no_motion_is_allowed():
