@@ -17,7 +17,7 @@ import numpy as np
 
 from sightline.benchmarks.loop.figures import WheelCommand, read_wheel_commands
 from sightline.benchmarks.loop.pictures import write_pictures
-from sightline.benchmarks.network.cases import NetworkCase, spans_s
+from sightline.benchmarks.network.cases import ZENOH, NetworkCase, spans_s
 from sightline.benchmarks.network.figures import (
     Stretch,
     figures_of,
@@ -128,16 +128,19 @@ def _course(row: NetworkCase, stage: Stage) -> NetworkRun:
     notes = json.loads((stage.folder / "notes.json").read_text("utf-8"))
     rows = read_wheel_commands(stage.wheels.read_text("ascii"))
     figures = tuple(figures_of(notes, rows, stretch) for stretch in stretches)
-    checks = (*injected_checks(row, counts), *network_checks(row, figures), *_wheel_checks(rows, notes))
+    checks = (*injected_checks(row, counts), *network_checks(row, figures),
+              *wheel_checks(rows, notes["twists"], stage.setting.transport, stretches[-1].end_us))
     total = sum(counts.values(), Counter[str]())
     lost = {"lost_percent": 100 * total["lost"] / max(1, total["taken"])} if row.draws else {}
     return NetworkRun(row, stage.seed, injected, figures, checks, lost)
 
 
-def _wheel_checks(rows: Sequence[WheelCommand], notes: Mapping[str, Sequence[Sequence[int]]]) -> Iterator[Check]:
+def wheel_checks(
+    rows: Sequence[WheelCommand], twists: Sequence[Sequence[int]], transport: str, until_us: int
+) -> Iterator[Check]:
     """Yield checks of the wheel commands, independent of the robot's reports. Only Zenoh shows twists."""
-    if notes["twists"]:
-        lines = on_old_sight(rows, notes["twists"])
+    if transport == ZENOH:
+        lines = on_old_sight(rows, twists, until_us)
         yield at_most("moved on frames over 400 ms", float(lines), "lines", 0)
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from sightline.benchmarks.loop.figures import read_wheel_commands
 from sightline.benchmarks.network.figures import moves_again_s, on_old_sight
+from sightline.benchmarks.network.run import wheel_checks
 from sightline.benchmarks.network.scenes import (
     ROBOTS,
     again_checks,
@@ -71,6 +72,22 @@ def test_wheels_that_gain_speed_or_go_on_without_a_young_frame_are_counted(speed
     assert on_old_sight(told(*speeds), ANSWERS) >= 1
     late = [(at_us, at_us - 900_000) for at_us in range(SECOND_US, 3 * SECOND_US, 50_000)]
     assert on_old_sight(told(*speeds), ANSWERS + late) >= 1, "answers to old frames allow nothing"
+
+
+def test_speed_that_wheels_keep_without_a_line_is_counted():
+    driving = told((3, 1))
+    resumed = [*ANSWERS, *((at_us, at_us) for at_us in range(4 * SECOND_US, 5 * SECOND_US, 50_000))]
+    for later in (told((3, 4.02))[-1:], told((0, 4.02))[-1:]):
+        assert on_old_sight([*driving, *later], resumed) > 100
+    assert on_old_sight(driving, ANSWERS, 3 * SECOND_US) > 50
+    assert on_old_sight(driving, ANSWERS, SECOND_US) == 0
+    assert on_old_sight(told((3, 1), (0, 0.02)), ANSWERS, 3 * SECOND_US) == 0
+
+
+@pytest.mark.parametrize(("transport", "names"), [("zenoh", ["moved on frames over 400 ms"]), ("websocket", [])])
+def test_wheels_are_checked_although_no_twist_was_seen(transport, names):
+    checks = list(wheel_checks(told((3, 1)), [], transport, SECOND_US))
+    assert [check.name for check in checks] == names and not any(check.ok for check in checks)
 
 
 def test_without_any_answer_wheels_may_only_stand():
