@@ -1,8 +1,5 @@
 """Measure a remote detector, and services for many streams, with a deliberately slow detector. Shell."""
 
-import os
-import subprocess
-import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
@@ -16,13 +13,15 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
+from sightline.benchmarks.loop.counters import read_machine
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.evaluation.checks import Check, at_least, at_most
+from sightline.evaluation.processes import Processes, terminated_like_interrupted
 from sightline.protocol.channels import DETECTIONS, FRAME, STATUS
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.config import Config as Settings
-from sightline.protocol.errors import SightlineError, WireError
+from sightline.protocol.errors import ConfigError, SightlineError, WireError
 from sightline.protocol.messages import DetectionsHeader, FrameHeader, Stamp, State, Status
 from sightline.protocol.transports.link import Link, LinkRules, Message
 from sightline.protocol.transports.tokens import RobotToken
@@ -150,13 +149,18 @@ class StreamPlan:
     kill: bool = False
     """True to kill the last service in the middle of the run."""
 
+    def __post_init__(self) -> None:
+        """Raise ConfigError for a run that would have no service at its end."""
+        if self.kill and self.services < 2:
+            raise ConfigError("--kill needs a service that remains; add --services 2")
+
     def command(self, endpoint: str) -> list[str]:
-        """Return the command of one service."""
+        """Return the arguments of `sightline` for one service."""
         each_us = 0 if self.batch_us else round(OVERLOAD * 1e6 / (self.streams * _FPS))
         options = {"each_us": each_us, "batch_us": self.batch_us, "pixels": str(self.batch_us > 0).lower()}
         sets = [text for name, value in options.items() for text in ("--set", f"detector.options.{name}={value}")]
-        return [sys.executable, "-u", "-P", "-m", "sightline.operator_side.cli.app", "detector", "--serve",
-                "sightline.benchmarks.detector:SlowDetector", "--connect", endpoint, *sets, *self.arguments]
+        serving = ["detector", "--serve", "sightline.benchmarks.detector:SlowDetector"]
+        return [*serving, "--connect", endpoint, *sets, *self.arguments]
 
 
 @dataclass
@@ -264,6 +268,8 @@ class _Streams:
 
     def __init__(self, links: list[ZenohLink], jpeg: bytes) -> None:
         self._links, self._jpeg, self.load = links, jpeg, Load()
+        self._sent_us: dict[tuple[str, int], int] = {}
+        """Of each frame of each robot. An answer is not trusted: it may cite another time, or no frame at all."""
         self._seq = 0
         self._said_s = 0.0
         self.counting = False
@@ -279,13 +285,14 @@ class _Streams:
                 echo = decode(DetectionsHeader, message.header).echo
             except WireError:
                 return
-            if echo is None or not self.counting:
+            sent_us = self._sent_us.get((robot, echo.seq)) if echo is not None else None
+            if echo is None or sent_us is None or not self.counting:
                 return
             if echo.seq in seen:
                 self.load.repeated += 1
                 return
             seen.append(echo.seq)
-            self.load.answer(robot, echo.t_us, now_us)
+            self.load.answer(robot, sent_us, now_us)
 
         return note
 
@@ -301,83 +308,70 @@ class _Streams:
     def frame(self, index: int) -> None:
         self._seq += 1
         header = FrameHeader(session="0000abcd", seq=self._seq, t_us=monotonic_us())
+        self._sent_us[self._links[index].robot, self._seq] = header.t_us
         self._links[index].publish(FRAME, encode(header), self._jpeg)
         self.load.offered += self.counting
 
 
 def measure_streams(endpoint: str, folder: Path, plan: StreamPlan) -> Load:
-    """Offer streams to services as planned. Raises SightlineError if a service does not start."""
+    """Offer streams to services as planned. Raises SightlineError if a service does not start, or ends by itself."""
     write_pictures(folder, 320, 240)
     jpeg = sorted(folder.glob("*.jpg"))[0].read_bytes()
-    with ExitStack() as ending:
+    with terminated_like_interrupted(), ExitStack() as ending:
         session = ending.enter_context(closing(open_session([endpoint], (), 5.0)))
         links = [ZenohLink(session, LinkRules(f"s{index}", "robot"), shared=True) for index in range(plan.streams)]
         for link in links:
             ending.callback(link.close)
             ending.callback(declare_token(session, RobotToken(link.robot)))  # services that share find it by this
-        services = [_Service(plan, endpoint, folder / f"detector-{index}.log", ending)
-                    for index in range(plan.services)]
+        services = ending.enter_context(Processes(folder))
+        for index in range(plan.services):
+            services.start(f"detector-{index}", plan.command(endpoint))
         robots = _Streams(links, jpeg)
         _wait_ready(robots, plan, services)
         _offer(robots, plan.streams, _WARM_S, services)
         robots.load.begin((link.robot for link in links), monotonic_us())
         robots.counting = True
-        before_s = sum(one.cpu_s() for one in services)
+        before_s = _cpu_s(services)
         began_s = time.monotonic()
         _offer(robots, plan.streams, plan.seconds / 2, services)
-        took_s = sum(one.cpu_s() for one in services) - before_s
+        took_s = _cpu_s(services) - before_s
         robots.load.cpu_ms = took_s * 1000 / max(1, sum(robots.load.answered.values()))
         if plan.kill:
-            services[-1].kill()
+            services.kill(services.names[-1])
         _offer(robots, plan.streams, plan.seconds / 2, services)
         robots.load.seconds = time.monotonic() - began_s
         robots.load.end(monotonic_us())
     return robots.load
 
 
-class _Service:
-    """A service in a process of its own, until `ending`."""
-
-    def __init__(self, plan: StreamPlan, endpoint: str, log: Path, ending: ExitStack) -> None:
-        self._log = log
-        with log.open("wb") as out:
-            self._process = subprocess.Popen(plan.command(endpoint), stdout=out, stderr=out)
-        ending.callback(self._process.wait, 10)
-        ending.callback(self._process.terminate)
-
-    def receives(self) -> int:
-        """Count the robots whose frames it has received. Raises SightlineError if it has ended."""
-        text = self._log.read_text("utf-8", "replace")
-        if self._process.poll() is not None:
-            raise SightlineError(f"the detector service did not start: {text[-300:]}")
-        return text.count("receives the frames")
-
-    def cpu_s(self) -> float:
-        """Return the CPU time so far, s."""
-        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(") ")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
-
-    def kill(self) -> None:
-        """End it without a warning."""
-        self._process.kill()
-
-    def memory_mb(self) -> float:
-        """Return its memory, MB."""
-        text = Path(f"/proc/{self._process.pid}/status").read_text()
-        return int(text.partition("VmRSS:")[2].split()[0]) / 1024
+def _cpu_s(services: Processes) -> float:
+    """Return the CPU time of all services so far, s."""
+    return sum(read_machine({name: services.pid(name) for name in services.names}).cpu_s.values())
 
 
-def _wait_ready(robots: _Streams, plan: StreamPlan, services: Sequence[_Service]) -> None:
+def _memory_mb(services: Processes) -> float:
+    """Return the memory of the first service, MB. Raises ProcessError if a service has ended."""
+    services.check()
+    text = Path(f"/proc/{services.pid(services.names[0])}/status").read_text()
+    return int(text.partition("VmRSS:")[2].split()[0]) / 1024
+
+
+def _receives(services: Processes, name: str) -> int:
+    """Count the robots whose frames a service has received."""
+    return services.log(name).read_text("utf-8", "replace").count("receives the frames")
+
+
+def _wait_ready(robots: _Streams, plan: StreamPlan, services: Processes) -> None:
     """Wait until each service has started, and each robot's frames are received."""
     deadline_s = time.monotonic() + _READY_S
-    while not (all(counts := [one.receives() for one in services]) and sum(counts) >= plan.streams):
+    while not (all(counts := [_receives(services, name) for name in services.names]) and sum(counts) >= plan.streams):
         if time.monotonic() > deadline_s:
             raise SightlineError(f"the detector services did not start: they receive the frames of {counts} robots")
         robots.say()
-        time.sleep(_STATUS_S)
+        services.check(_STATUS_S)
 
 
-def _offer(robots: _Streams, streams: int, seconds: float, services: Sequence[_Service]) -> None:
+def _offer(robots: _Streams, streams: int, seconds: float, services: Processes) -> None:
     """Frames of one stream after the other, evenly spaced; the newest of each, as robots send them."""
     began_s = time.monotonic()
     for index in range(round(seconds * streams * _FPS)):
@@ -386,6 +380,6 @@ def _offer(robots: _Streams, streams: int, seconds: float, services: Sequence[_S
         if left_s > 0:
             time.sleep(left_s)
         if index % (streams * _FPS) == 0:
-            robots.load.memory_mb.append(services[0].memory_mb())
+            robots.load.memory_mb.append(_memory_mb(services))
         robots.say()
         robots.frame(index % streams)

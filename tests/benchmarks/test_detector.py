@@ -1,6 +1,14 @@
 """`sightline bench streams`: its checks on invented runs."""
 
-from sightline.benchmarks.detector import OVERLOAD, Load, StreamPlan, stream_checks
+import pytest
+
+from sightline.benchmarks.detector import OVERLOAD, Load, StreamPlan, _Streams, stream_checks
+from sightline.protocol.channels import DETECTIONS
+from sightline.protocol.clock import monotonic_us
+from sightline.protocol.codec import encode
+from sightline.protocol.errors import ConfigError
+from sightline.protocol.messages import DetectionsHeader, Echo
+from sightline.protocol.transports.link import Message
 
 ROBOTS = [f"s{index}" for index in range(40)]
 SECONDS = 60
@@ -31,3 +39,40 @@ def test_services_that_answer_to_the_end_pass():
 
 def test_services_that_stop_to_answer_in_the_middle_fail():
     assert failed(load(SECONDS / 2)) == {"offered per answered frame", "longest time without an answer"}
+
+
+class RobotLink:
+    """A link that only counts on its subscriber."""
+
+    def __init__(self, robot):
+        self.robot = robot
+
+    def subscribe(self, channel, heard):
+        self.heard = heard if channel is DETECTIONS else None
+
+    def publish(self, *_):
+        pass
+
+    def receive(self, seq, t_us):
+        echo = Echo(channel="frame", session="0000abcd", seq=seq, t_us=t_us)
+        header = DetectionsHeader(source="guest", session="0000abcd", seq=seq, echo=echo)
+        self.heard(Message(DETECTIONS, "guest", encode(header), b""))
+
+
+def test_answers_count_only_for_frames_of_their_robot_and_by_its_own_clock():
+    links = [RobotLink("s0"), RobotLink("s1")]
+    robots = _Streams(links, b"")
+    robots.load.begin(["s0", "s1"], monotonic_us())
+    robots.counting = True
+    robots.frame(0)
+    links[1].receive(1, monotonic_us())
+    links[0].receive(2, monotonic_us())
+    assert not robots.load.answered, "another robot's frame, and one that was never sent"
+    links[0].receive(1, monotonic_us() + 10_000_000)
+    assert robots.load.answered == {"s0": 1} and 0 <= robots.load.ages_ms[0] < 10_000
+
+
+def test_killing_the_only_service_is_rejected():
+    with pytest.raises(ConfigError, match="add --services 2"):
+        StreamPlan(kill=True)
+    assert StreamPlan(kill=True, services=2).services == 2
