@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -34,18 +35,19 @@ from sightline.protocol.transports.open import open_link
 
 
 def main(endpoint: str, count: int, nap_s: float) -> None:
-    """Watch until killed."""
-    seen = threading.Event()
+    """Watch until killed. It prints `watching` when each viewer has seen a frame."""
 
-    def watch(_message: Message) -> None:
+    def watch(seen: threading.Event, _message: Message) -> None:
         seen.set()
         time.sleep(nap_s)
 
     with ExitStack() as ending:
-        for number in range(count):
+        viewers = [threading.Event() for _ in range(count)]
+        for number, seen in enumerate(viewers):
             link = ending.enter_context(open_link(ROBOT, connect=[endpoint], role=f"viewer{number}"))
-            link.subscribe(FRAME, watch)
-        seen.wait()
+            link.subscribe(FRAME, partial(watch, seen))
+        for seen in viewers:
+            seen.wait()
         print("watching", flush=True)
         threading.Event().wait()
 

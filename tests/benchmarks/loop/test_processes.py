@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -120,6 +121,37 @@ def test_loop_that_films_few_images_beside_viewers_fails(fps, failed):
     alone = Watch(Course(60, 100.0, ages_us), 30.0, 50.0, 0.0)
     checks = viewers._checks(30.0, alone, replace(alone, fps=fps))
     assert {check.name for check in checks if not check.ok} == failed
+
+
+class ForeverError(Exception):
+    """A wait that nothing ends."""
+
+
+class Seen:
+    """An event whose `wait` fails at once where it would last for ever."""
+
+    def __init__(self):
+        self.set, self.wait = (lambda: setattr(self, "wait", lambda: None)), self.fail
+
+    def fail(self):
+        raise ForeverError
+
+
+@pytest.mark.parametrize(("admitted", "printed"), [(["viewer0", "viewer1"], "watching\n"), (["viewer0"], "")])
+def test_viewers_watch_only_when_each_has_seen_a_frame(monkeypatch, capsys, admitted, printed):
+    class Viewer(nullcontext):
+        def subscribe(self, _channel, saw):
+            if self.enter_result in admitted:
+                saw(None)
+
+        def __enter__(self):
+            return self
+
+    monkeypatch.setattr(viewers, "open_link", lambda *_, role, **__: Viewer(role))
+    monkeypatch.setattr(viewers.threading, "Event", Seen)
+    with pytest.raises(ForeverError):
+        viewers.main("tcp/127.0.0.1:1", 2, 0.0)
+    assert capsys.readouterr().out == printed
 
 
 @pytest.mark.slow
