@@ -158,9 +158,10 @@ def loop(
     )
     race = run_race(setting, lambda line: typer.echo(line, err=True))
     result = _race_result(race)
-    if out is not None:
+    code = print_result(result, [*_table(race), "", *check_lines(race.checks)], as_json)
+    if out is not None:  # after the results, which a full disk must not lose
         _leave(out, race, result)
-    return print_result(result, [*_table(race), "", *check_lines(race.checks)], as_json)
+    return code
 
 
 def watchers(

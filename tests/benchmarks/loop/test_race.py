@@ -389,11 +389,23 @@ def test_run_ends_within_four_minutes_and_marks_what_it_shortened(monkeypatch, s
     assert any(figures_of(one, setting).is_short for one in samples.values()) is (least_s < seconds)
 
 
-def test_table_shows_unpaced_figures_and_marks_disturbed_samples():
+def small_race():
     floor = replace(sample(FLOOR, [1.0] * 60), hot_us=1234.0)
     samples = {FLOOR: floor, OURS: sample(OURS, [2.0] * 60, taken=9.0)}
     figures = {name: figures_of(one, SMALL) for name, one in samples.items()}
-    head, *rows = bench._table(race.Race(SMALL, 1.0, samples, figures, loop_checks(figures, SMALL)))
+    return race.Race(SMALL, 1.0, samples, figures, loop_checks(figures, SMALL))
+
+
+def test_results_are_printed_although_their_folder_cannot_be_made(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(race, "run_race", lambda *_: small_race())
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="choose a folder"):
+        bench.loop(peers="none", out=tmp_path / "file" / "new")
+    assert "samples disturbed by others" in capsys.readouterr().out
+
+
+def test_table_shows_unpaced_figures_and_marks_disturbed_samples():
+    head, *rows = bench._table(small_race())
     assert [row[head.index("unpaced"):][:7].strip() for row in rows] == ["1.2", ""]
     assert ["!" in row for row in rows] == [False, True]
 
