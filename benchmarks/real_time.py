@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any, Final
 
+from sightline.evaluation.processes import ProcessError
+
 _JUDGED: Final = (0, 5)
 
 
@@ -39,7 +41,7 @@ def measure_demos(
 ) -> list[DemoFigure]:
     """Run every scenario with every seed, for as long as a demo takes if `seconds` is None.
 
-    Raises RuntimeError with the demo's own words if one cannot run.
+    Raises ProcessError with the last words and the exit code of a demo that cannot run.
     """
     figures: list[DemoFigure] = []
     for scenario in scenarios:
@@ -58,17 +60,24 @@ def _demo(scenario: str, seed: int, seconds: float | None) -> dict[str, Any]:
         command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode not in _JUDGED:
-        raise RuntimeError(f"demo {scenario} seed {seed}: {done.stderr.strip()}")
+        last = done.stderr.strip().rpartition("\n")[2].removeprefix("error: ")
+        raise ProcessError(f"demo of {scenario}, seed {seed}: {last}", done.returncode)
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))
 
 
 def _figures(scenario: str, results: Sequence[dict[str, Any]], kinds: Kinds) -> list[DemoFigure]:
     names = [check["name"] for check in results[0]["checks"]]
     figures = [_figure(scenario, [_named(result, name) for result in results], kinds) for name in names]
-    differing = [result["replayed"]["total"] - result["replayed"]["equal"] for result in results]
+    differing = [_differing(result["replayed"]) for result in results]
     none = all(result["replayed"]["total"] > 0 for result in results) and not any(differing)
     name = f"{scenario}: twists that replay otherwise"
     return [*figures, DemoFigure(name, median(differing), max(differing), "", 0.0, none)]
+
+
+def _differing(replayed: dict[str, Any]) -> int:
+    """Count the answers that differ, and all that is not in the recording: without it, no answer can be compared."""
+    lost: int = replayed["gaps"] + replayed["missing_frames"]
+    return lost + int(replayed["total"]) - int(replayed["equal"])
 
 
 def _named(result: dict[str, Any], name: str) -> dict[str, Any]:

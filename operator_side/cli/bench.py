@@ -100,12 +100,15 @@ def demo(
     with needs("all"):
         from sightline.benchmarks.real_time import Kinds, measure_demos
         from sightline.evaluation.checks import number
+        from sightline.evaluation.demo.run import DemoOptions
         from sightline.evaluation.score.figures import EXACT
         from sightline.sim.scenario import AT_LEAST, load_scenario, scenario_names
     names = scenario_names() if scenario == "all" else scenario.split(",")
     for name in names:
         load_scenario(name)
     wanted, kinds = numbers("--seeds", seeds, int), Kinds(AT_LEAST, EXACT)
+    for seed in wanted:
+        DemoOptions(seed=seed)  # before the first demo: raises ConfigError
     figures = measure_demos(names, wanted, seconds, kinds, lambda line: typer.echo(line, err=True))
     checks = [{**asdict(figure), "value": figure.worst} for figure in figures]
     lines = table_lines(

@@ -3,21 +3,23 @@
 import json
 import shutil
 import tomllib
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from sightline.benchmarks.real_time import Kinds, _figures
+from sightline.benchmarks import real_time
+from sightline.benchmarks.real_time import Kinds, _figures, measure_demos
 from sightline.evaluation.demo import report as demo_report
 from sightline.evaluation.demo import run as demo_run
 from sightline.evaluation.demo.run import MOTOR_LOG, RECORDING, DemoOptions, DemoRun
 from sightline.evaluation.lockstep import Conditions, Lockstep
+from sightline.evaluation.processes import ProcessError
 from sightline.evaluation.scenario_config import robot_config, robot_of, vision_config
 from sightline.evaluation.score.figures import EXACT
 from sightline.operator_side.recording.recorder import Recorder
-from sightline.operator_side.recording.replay import VISION_CONFIG
+from sightline.operator_side.recording.replay import VISION_CONFIG, Replayed
 from sightline.protocol.channels import CAMERA, STATUS
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import CheckError, ConfigError
@@ -235,10 +237,32 @@ def test_state_and_frame_age_come_from_the_recording_in_order(tmp_path):
 # --- many demos ------------------------------------------------------------------------------------------------------
 
 
+REPLAYED = asdict(Replayed(total=9, equal=9))
+
+
+@pytest.mark.parametrize(("changes", "worst", "ok"), [
+    ({}, 0, True), ({"equal": 7}, 2, False), ({"gaps": 3}, 3, False), ({"missing_frames": 4}, 4, False),
+    ({"total": 0, "equal": 0}, 0, False),
+])  # fmt: skip
+def test_recording_that_lacks_or_changes_answers_fails(changes, worst, ok):
+    results = [{"checks": [], "replayed": REPLAYED | one} for one in ({}, changes, {})]
+    (compared,) = _figures("ball", results, Kinds(AT_LEAST, EXACT))
+    assert (compared.worst, compared.ok) == (worst, ok)
+
+
+@pytest.mark.parametrize(("code", "exit_code"), [(3, 3), (-9, 1)])
+def test_demo_that_cannot_run_passes_its_error_and_exit_code_on(monkeypatch, code, exit_code):
+    done = SimpleNamespace(returncode=code, stderr="starting\nerror: no simulation; see sim.log\n", stdout="")
+    monkeypatch.setattr(real_time.subprocess, "run", lambda *_, **__: done)
+    with pytest.raises(ProcessError, match="demo of eight, seed 7: no simulation") as raised:
+        measure_demos(["eight"], [7], None, Kinds(AT_LEAST, EXACT), lambda _line: None)
+    assert raised.value.exit_code == exit_code
+
+
 def figure(name: str, bound: float, *values: float | None):
     """Return the check of one figure with these values."""
     results = [{"checks": [{"name": name, "value": value, "unit": "", "bound": bound}],
-                "replayed": {"total": 9, "equal": 9}} for value in values]
+                "replayed": REPLAYED} for value in values]
     return _figures("ball", results, Kinds(AT_LEAST, EXACT))[0]
 
 
