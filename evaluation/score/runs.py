@@ -108,7 +108,7 @@ def cases(
     seconds: float | None, *, mission: str | None = None, robot: str | None = None, look: str | None = None,
     detector: str | None = None,
 ) -> list[ScoreCase]:
-    """Every combination, those of one group together. Raises ConfigError for an invalid name or number."""
+    """Every combination once, those of one group together. Raises ConfigError for an invalid name or number."""
     if mission is not None:
         REGISTRY.load(mission)
     for name in scenarios:
@@ -128,10 +128,10 @@ def cases(
         raise ConfigError("--seeds needs whole numbers from 0, e.g. --seeds 101,102,103")
     if any(not 0 <= one <= 10_000 for one in latencies_ms) or any(not 0 <= one < 1 for one in losses):
         raise ConfigError("--latency-ms is 0 to 10000 and --loss 0 to below 1, e.g. --latency-ms 0,50 --loss 0.1")
-    return [
+    return list(dict.fromkeys(
         ScoreCase(name, latency_ms, loss, seed, seconds, mission, robot, look, detector)
-        for name, latency_ms, loss, seed in product(scenarios, latencies_ms, losses, seeds)
-    ]
+        for name, latency_ms, loss, seed in product(dict.fromkeys(scenarios), latencies_ms, losses, seeds)
+    ))
 
 
 def run_case(case: ScoreCase) -> tuple[Score, list[str]]:

@@ -33,6 +33,11 @@ def test_every_combination_is_a_case_and_groups_lie_together():
                for name in groups)
 
 
+def test_what_is_named_twice_runs_once():
+    once = cases(["static", "eight"], [1, 2], [0, 50], [0.0, 0.1], None)
+    assert cases(["static", "eight", "static"], [1, 2, 1], [0, 50, 0], [0.0, 0.1, 0.0], None) == once
+
+
 def test_different_losses_are_scored_separately():
     assert len({case.group for case in cases(["static"], [1], [0], [0.001, 0.004, 0.101, 0.104, 0.1], None)}) == 5
     assert cases(["static"], [1], [50], [0.1], None)[0].group == "static +50 ms 10% loss"
