@@ -687,13 +687,12 @@ CASES: Final[tuple[FaultCase, ...]] = (
 
 def chosen(only: Sequence[str], *, short: bool) -> list[FaultCase]:
     """The rows named by id or by what comes before the dot; all without names. Raises ConfigError for no such row."""
+    rows = [row for row in CASES if row.short or not short]
     for name in only:
-        if not any(_is_named(row, name) for row in CASES):
-            raise ConfigError(no_such_name("fault", name, [row.id for row in CASES]))
-    return [
-        row for row in CASES
-        if (not only or any(_is_named(row, name) for name in only)) and (row.short or not short)
-    ]
+        if not any(_is_named(row, name) for row in rows):
+            what = "fault of the short set" if short else "fault"
+            raise ConfigError(no_such_name(what, name, [row.id for row in rows]))
+    return [row for row in rows if not only or any(_is_named(row, name) for name in only)]
 
 
 def _is_named(row: FaultCase, name: str) -> bool:

@@ -456,6 +456,9 @@ def test_rows_are_chosen_by_id_group_and_length():
     assert all(row.short for row in chosen([], short=True))
     with pytest.raises(ConfigError, match=r"did you mean 'vision\.kill'"):
         chosen(["vison.kill"], short=False)
+    assert all(row.short for row in chosen(["vision"], short=True)), "each name has a short row"
+    with pytest.raises(ConfigError, match=r"unknown fault of the short set 'stop\.lossy'"):
+        chosen(["vision", "stop.lossy"], short=True)
 
 
 @pytest.mark.parametrize(
