@@ -198,6 +198,14 @@ def test_a_bound_that_is_broken_is_not_ok_and_none_is_never_ok():
     }
 
 
+def test_phase_without_a_status_fails_although_it_shows_no_hold():
+    row = NetworkCase("x", "x", CASES[0].phases, most_holds=0)
+    driven = seen(frames(*(40 + n % 10 for n in range(295))), [status(0), status(9.9)])
+    for phases, ok in (([driven, driven], True), ([driven, seen()], False), ([seen(), driven], False)):
+        checks = {check.name: check.ok for check in network_checks(row, phases)}
+        assert checks == {"holds": True, "wheels move": True, "oldest executed": ok}
+
+
 def test_the_worst_seed_of_each_demand_is_shown():
     def answered(fps):
         return Check("answered", fps, "fps", 12.0, fps >= 12)
