@@ -31,7 +31,7 @@ _FRAME_US = 33_333
 
 @dataclass(frozen=True, slots=True)
 class StepTime:
-    """One size of image, medians; `phase` shows that all steps ran.
+    """One size of image, medians; `phase` at their end shows that all steps ran.
 
     `median_us`: hot, one frame right after the other; the bound holds for this one. `alone_us`: of its rounds, the
     best. `paced_us`: 30 frames a second with sleep between, when caches and clock speed have to be regained each time.
@@ -106,9 +106,10 @@ def _time_size(size: tuple[int, int], frames: int, paced_frames: int) -> StepTim
     pipeline = Pipeline(config, _camera(*size), configured_detector(config))
     source = _frames(pictures)
     for _ in range(_WARM_UP):
-        phase = pipeline.step(next(source)).seen.phase
+        pipeline.step(next(source))
     hot_us = _took_us(pipeline.step, (next(source) for _ in range(frames)))
     paced_us = median(_took_us(pipeline.step, _paced(source, paced_frames)))
+    phase = pipeline.step(next(source)).seen.phase
     decode_us = _alone(_took_us(decoder.decode, islice(cycle(pictures), frames)))
     hsv = HsvDetector(config.hsv)
     hsv_us = _took_us(lambda jpeg: hsv.detect(decoder.decode(jpeg)), islice(cycle(pictures), frames))

@@ -1,7 +1,11 @@
-"""`sightline bench streams`: its checks on invented runs."""
+"""`sightline bench streams` and `bench pipeline`: their checks on invented runs."""
+
+from itertools import chain, repeat
+from types import SimpleNamespace
 
 import pytest
 
+from sightline.benchmarks import pipeline
 from sightline.benchmarks.detector import OVERLOAD, Load, StreamPlan, _Streams, stream_checks
 from sightline.protocol.channels import DETECTIONS
 from sightline.protocol.clock import monotonic_us
@@ -76,3 +80,12 @@ def test_killing_the_only_service_is_rejected():
     with pytest.raises(ConfigError, match="add --services 2"):
         StreamPlan(kill=True)
     assert StreamPlan(kill=True, services=2).services == 2
+
+
+@pytest.mark.parametrize("later", ["tracking", "searching"])
+def test_pipeline_that_loses_the_ball_after_it_was_warm_shows_that(monkeypatch, later):
+    phases = chain(repeat("tracking", pipeline._WARM_UP), repeat(later))
+    step = SimpleNamespace(step=lambda _frame: SimpleNamespace(seen=SimpleNamespace(phase=next(phases))))
+    monkeypatch.setattr(pipeline, "Pipeline", lambda *_: step)
+    monkeypatch.setattr(pipeline, "_pictures", lambda *_: [pipeline._encode(pipeline._drawn(320, 240, 1, 1), 80)])
+    assert pipeline._time_size((320, 240), frames=12, paced_frames=1).phase == later
