@@ -13,7 +13,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from sightline.benchmarks.loop.counters import read_machine
+from sightline.benchmarks.loop.counters import read_machine, resident_mb
 from sightline.benchmarks.loop.pictures import write_pictures
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.processes import Processes, terminated_like_interrupted
@@ -349,13 +349,6 @@ def _cpu_s(services: Processes) -> float:
     return sum(read_machine({name: services.pid(name) for name in services.names}).cpu_s.values())
 
 
-def _memory_mb(services: Processes) -> float:
-    """Return the memory of the first service, MB. Raises ProcessError if a service has ended."""
-    services.check()
-    text = Path(f"/proc/{services.pid(services.names[0])}/status").read_text()
-    return int(text.partition("VmRSS:")[2].split()[0]) / 1024
-
-
 def _receives(services: Processes, name: str) -> int:
     """Count the robots whose frames a service has received."""
     return services.log(name).read_text("utf-8", "replace").count("receives the frames")
@@ -380,6 +373,7 @@ def _offer(robots: _Streams, streams: int, seconds: float, services: Processes) 
         if left_s > 0:
             time.sleep(left_s)
         if index % (streams * _FPS) == 0:
-            robots.load.memory_mb.append(_memory_mb(services))
+            services.check()
+            robots.load.memory_mb.append(resident_mb(services.pid(services.names[0])))
         robots.say()
         robots.frame(index % streams)

@@ -3,10 +3,12 @@
 import os
 import socket
 import struct
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
+
+from sightline.protocol.errors import HardwareError
 
 _TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 _IDLE, _IOWAIT, _STEAL = 3, 4, 7  # columns of /proc/stat, proc(5)
@@ -23,7 +25,7 @@ class Reading:
 
 
 def read_machine(pids: Mapping[str, int]) -> Reading:
-    """Read now. Raises OSError if a process is gone."""
+    """Read now. Raises HardwareError if a process is gone."""
     columns = [int(text) / _TICKS_PER_S for text in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
     return Reading(
         cpu_s={name: _cpu_s(pid) for name, pid in pids.items()},
@@ -41,17 +43,37 @@ def taken_percent(before: Reading, after: Reading, seconds: float) -> float:
 
 
 def high_water_mb(pid: int) -> float:
-    """Return the most memory that the process used so far, in MB of 2**20 bytes."""
-    return _field_kib(Path(f"/proc/{pid}/status").read_text().splitlines(), "VmHWM") / 1024
+    """Return the most memory that the process used so far, in MB of 2**20 bytes. Raises HardwareError if it is gone."""
+    return _memory_mb(pid, "VmHWM:")
 
 
-def _field_kib(lines: Iterable[str], name: str) -> int:
-    return next(int(line.split()[1]) for line in lines if line.startswith(name + ":"))
+def resident_mb(pid: int) -> float:
+    """Return the memory that the process uses, in MB of 2**20 bytes. Raises HardwareError if it is gone."""
+    return _memory_mb(pid, "VmRSS:")
+
+
+def _memory_mb(pid: int, field: str) -> float:
+    lines = _read(pid, "status").splitlines()
+    held_kib = next((int(line.split()[1]) for line in lines if line.startswith(field)), None)
+    if held_kib is None:  # it has ended, and its parent has not noticed
+        raise _gone(pid)
+    return held_kib / 1024
+
+
+def _read(pid: int, file: str) -> str:
+    try:
+        return Path(f"/proc/{pid}/{file}").read_text()
+    except OSError:
+        raise _gone(pid) from None
+
+
+def _gone(pid: int) -> HardwareError:
+    return HardwareError(f"process {pid} ended while it was measured; start the services by hand to see why it ends")
 
 
 def _cpu_s(pid: int) -> float:
     # The command's name stands in brackets and may hold anything; what is numbered from 3 on follows it.
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    fields = _read(pid, "stat").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
 
 

@@ -1,6 +1,9 @@
 """`sightline bench loop`: its figures, its bounds and its options."""
 
 import json
+import os
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from itertools import count, cycle, pairwise
@@ -12,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sightline.benchmarks.loop import race
-from sightline.benchmarks.loop.counters import Reading, taken_percent
+from sightline.benchmarks.loop.counters import Reading, high_water_mb, read_machine, resident_mb, taken_percent
 from sightline.benchmarks.loop.figures import (
     FLOOR,
     MAX_FPS,
@@ -42,7 +45,7 @@ from sightline.benchmarks.loop.vision import overloaded, with_overload
 from sightline.operator_side.cli import bench
 from sightline.protocol.channels import TWIST
 from sightline.protocol.codec import encode
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import AnswerHeader, Echo, FrameHeader
 from sightline.protocol.transports.link import Message
 from sightline.robot_side.config import PluginChoice, RobotConfig
@@ -424,6 +427,19 @@ def test_time_of_other_processes_excludes_idle_and_own_time(monkeypatch):
 
 
 # --- options -----------------------------------------------------------------------------------------------------
+
+
+def test_process_that_ends_in_the_measurement_is_one_clear_error():
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    for held_mb in (high_water_mb, resident_mb):
+        with pytest.raises(HardwareError, match=f"process {process.pid} ended while it was measured"):
+            held_mb(process.pid)  # its parent has not noticed yet
+    process.wait()
+    for measured in (high_water_mb, resident_mb, lambda pid: read_machine({"network": pid})):
+        with pytest.raises(HardwareError, match=f"process {process.pid} ended while it was measured"):
+            measured(process.pid)
+    assert 0 < resident_mb(os.getpid()) <= high_water_mb(os.getpid())
 
 
 @pytest.mark.parametrize("text", ["640", "x480", "640x", "a640x480", "640x480x3", "６４０x480", "-1x4", ""])
