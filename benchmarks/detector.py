@@ -28,6 +28,7 @@ from sightline.protocol.transports.tokens import RobotToken
 from sightline.protocol.transports.zenoh.link import ZenohLink, declare_token
 from sightline.protocol.transports.zenoh.session import open_session
 from sightline.vision_side.decode import Decoder
+from sightline.vision_side.detect.plugin_calls import checked_results
 from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionResult, Detector, Maker, result_of
 
 
@@ -70,11 +71,13 @@ _DEADLINE_US: Final = 500_000
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Microseconds for one frame, medians; `unanswered` counts frames without a remote answer."""
+    """Microseconds for one frame, medians; `unanswered` counts frames without a valid remote answer."""
 
     here_us: float
     there_us: float
     unanswered: int
+    why: str = ""
+    """The cause of the first missing answer, where it is known."""
 
     @property
     def added_us(self) -> float:
@@ -86,26 +89,27 @@ def measure_cost(here: Detector, there: Detector, jpeg: bytes, size_px: tuple[in
                  period_s: float = HOT_S, robot: Link | None = None) -> Cost:
     """Send `frames` frames to both detectors. With `robot` they are also published, for a service that subscribes."""
     decoder, numbers, took = Decoder(*size_px, size_px[0] * size_px[1]), count(1), (list[float](), list[float]())
-    unanswered = 0
+    unanswered, why = 0, ""
     next_s = time.monotonic()
     for index in range(_WARM + frames):
         next_s += period_s
         time.sleep(max(0.0, next_s - time.monotonic()))
         for which, one in enumerate((here, there)):
             frame = DetectFrame("r1", _header(next(numbers)), jpeg, decoder)
-            us, answered = _timed(one, frame, robot if which else None)
+            us, result = _timed(one, frame, robot if which else None)
             if index >= _WARM:
-                unanswered += not answered
                 took[which].append(us)
-    return Cost(median(took[0]), median(took[1]), unanswered)
+                unanswered += isinstance(result, str)
+                why = why or (result if isinstance(result, str) else "")
+    return Cost(median(took[0]), median(took[1]), unanswered, why)
 
 
-def _timed(detector: Detector, frame: DetectFrame, robot: Link | None) -> tuple[float, bool]:
+def _timed(detector: Detector, frame: DetectFrame, robot: Link | None) -> tuple[float, DetectionResult | str]:
     began_ns = time.perf_counter_ns()
     if robot is not None:
         robot.publish(FRAME, encode(frame.header), frame.jpeg)
-    result = detector.detect([frame], monotonic_us() + _DEADLINE_US)[0]
-    return (time.perf_counter_ns() - began_ns) / 1000, result is not None
+    (result,) = checked_results(detector, [frame], monotonic_us() + _DEADLINE_US)
+    return (time.perf_counter_ns() - began_ns) / 1000, result
 
 
 def _header(number: int) -> FrameHeader:

@@ -340,7 +340,8 @@ def detector(
     for way, cost in costs.items():
         what = f"{name}: added, {way} (here {cost.here_us:.0f}, there {cost.there_us:.0f}, medians)"
         checks.append(at_most(what, cost.added_us, "us", bound if way == "hot" else float("inf")))
-        checks.append(at_most(f"{name}: unanswered of {frames}", cost.unanswered, "", most))
+        why = f" ({cost.why})" if cost.why else ""
+        checks.append(at_most(f"{name}: unanswered of {frames}, {way}{why}", cost.unanswered, "", most))
     return _print_checks(checks, as_json)
 
 

@@ -1,18 +1,28 @@
-"""`sightline bench streams` and `bench pipeline`: their checks on invented runs."""
+"""`sightline bench detector`, `bench streams` and `bench pipeline`: their checks on invented runs."""
 
+from dataclasses import replace
 from itertools import chain, repeat
 from types import SimpleNamespace
 
 import pytest
 
 from sightline.benchmarks import pipeline
-from sightline.benchmarks.detector import OVERLOAD, Load, StreamPlan, _Streams, stream_checks
+from sightline.benchmarks.detector import (
+    OVERLOAD,
+    Load,
+    SlowDetector,
+    StreamPlan,
+    _Streams,
+    measure_cost,
+    stream_checks,
+)
 from sightline.protocol.channels import DETECTIONS
 from sightline.protocol.clock import monotonic_us
 from sightline.protocol.codec import encode
 from sightline.protocol.errors import ConfigError
 from sightline.protocol.messages import DetectionsHeader, Echo
 from sightline.protocol.transports.link import Message
+from sightline.vision_side.detect.port import Maker, result_of
 
 ROBOTS = [f"s{index}" for index in range(40)]
 SECONDS = 60
@@ -89,3 +99,21 @@ def test_pipeline_that_loses_the_ball_after_it_was_warm_shows_that(monkeypatch, 
     monkeypatch.setattr(pipeline, "Pipeline", lambda *_: step)
     monkeypatch.setattr(pipeline, "_pictures", lambda *_: [pipeline._encode(pipeline._drawn(320, 240, 1, 1), 80)])
     assert pipeline._time_size((320, 240), frames=12, paced_frames=1).phase == later
+
+
+def crash(_frames):
+    raise ArithmeticError("no model")
+
+
+@pytest.mark.parametrize(("detect", "unanswered", "why"), [
+    (lambda frames: [result_of(one, (), Maker("x", device="cpu")) for one in frames], 0, ""),
+    (lambda _: [None], 4, "no answer in time"), (lambda _: [], 4, "0 results for 1 frames"),
+    (lambda _: ["ball"], 4, "AttributeError"), (crash, 4, "ArithmeticError: no model"),
+    (lambda frames: [replace(result_of(frames[0], (), Maker("x", device="cpu")), seq=0)], 4, "answers another frame"),
+])  # fmt: skip
+def test_answer_that_the_vision_service_would_not_use_is_not_an_answer(detect, unanswered, why):
+    there = SimpleNamespace(detect=lambda frames, _deadline_us: detect(frames))
+    here = SlowDetector(SlowDetector.Config(each_us=0))
+    jpeg = pipeline._encode(pipeline._drawn(320, 240, 1, 1), 80)
+    cost = measure_cost(here, there, jpeg, (320, 240), frames=4)
+    assert cost.unanswered == unanswered and why in cost.why and bool(why) is bool(cost.why)
