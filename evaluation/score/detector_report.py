@@ -306,8 +306,10 @@ def rows(report: DetectorReport) -> list[tuple[str, ...]]:
 
 
 def _cells(one: DetectorFigures) -> tuple[str, ...]:
-    counted = one.hits, one.missed, one.wrong_object, one.false_alarms, one.nowhere
-    shares = [f"{100 * share:.1f} %" for share in counted]
+    balls, empty = one.balls, one.frames - one.balls
+    counted = ((one.hits, balls), (one.missed, balls), (one.wrong_object, one.frames), (one.false_alarms, empty),
+               (one.nowhere, balls))
+    shares = [f"{100 * share:.1f} %" if of else "-" for share, of in counted]
     centre = "-" if one.centre_p50_px is None else f"{one.centre_p50_px:.2f} / {one.centre_p95_px:.2f}"
     time = "-" if one.compute_p50_us is None else f"{one.compute_p50_us / 1000:.2f}"
     return (*shares, centre, time)

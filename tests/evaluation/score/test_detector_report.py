@@ -78,6 +78,15 @@ def test_each_label_needs_enough_objects_also_without_detections():
     assert failed(report({})) == [f"least AP50, {label}" for label in LABELLED]
 
 
+@pytest.mark.parametrize(("balls", "shares"), [
+    (5, ["85.0 %", "10.0 %", "5.0 %", "-", "0.0 %"]), (0, ["-", "-", "5.0 %", "5.0 %", "-"]),
+    (4, ["85.0 %", "10.0 %", "5.0 %", "5.0 %", "0.0 %"]),
+])  # fmt: skip
+def test_share_of_no_scene_is_not_shown(balls, shares):
+    row = score_scenes_file.rows(report(nominal=replace(GOOD, frames=5, balls=balls)))[list(COLUMNS).index("nominal")]
+    assert list(row[2:7]) == shares
+
+
 def test_a_line_for_each_check_names_whose_it_is():
     lines = check_lines(all_detector_checks(report(nominal=replace(GOOD, centre_p50_px=None, hits=0.84))))
     assert " ".join(lines[0].split()) == "onnx: least hits, nominal 84 % bound 85 FAIL"
