@@ -29,6 +29,8 @@ from sightline.vision_side.detect.registry import check_choice
 from sightline.vision_side.missions.registry import REGISTRY, configured_mission
 
 Result = TypeVar("Result")
+BOUNDS_UP_TO_LOSS: Final = 0.1
+"""Loss on each leg up to which the bounds of the scenarios apply."""
 MOST_NOTICES: Final = 3
 """Of each group: later ones repeat the first with higher counts."""
 
@@ -210,7 +212,7 @@ class SabotagedRun:
 
     case: ScoreCase
     broken: tuple[str, ...]
-    """The bounds that it broke."""
+    """The bounds that it broke, without those that the healthy run breaks too."""
     seconds: float
     """When it ended: a bound that is broken for good ends it early."""
     unchanged: bool = False
@@ -295,7 +297,7 @@ def sabotaged(wanted: Sequence[ScoreCase], names: Sequence[str]) -> list[ScoreCa
 
 
 def run_sabotaged(case: ScoreCase) -> SabotagedRun:
-    """Run until a bound is broken for good, or to the end. Compare a run that broke none with the healthy run."""
+    """Run until a bound is broken for good, or to the end. Compare it with the healthy run, where that may fail too."""
     scenario = load_scenario(case.scenario)
     seconds = case.seconds or scenario.seconds
     is_own = bounds_of(scenario, case.latency_ms) == scenario.bounds  # others apply to the end of the run
@@ -304,10 +306,20 @@ def run_sabotaged(case: ScoreCase) -> SabotagedRun:
         return is_own and bool(broken(scenario, score(scenario, run), seconds))
 
     _, run = run_of(case, is_over)
+    names, healthy, ended_s = _broken_by(case, run), replace(case, sabotage=None), run.samples[-1].t_us / 1e6
+    as_it_is = ScoreCase(case.scenario, case.latency_ms, min(case.loss, BOUNDS_UP_TO_LOSS), case.seed, None)
+    if names and healthy == as_it_is and case.scenario in scenario_names():  # tests show that it breaks none
+        return SabotagedRun(case, names, ended_s)
+    _, compared = run_of(healthy)
+    anyway = _broken_by(healthy, compared)
+    names = tuple(name for name in names if name not in anyway)
+    return SabotagedRun(case, names, ended_s, not names and run == compared)
+
+
+def _broken_by(case: ScoreCase, run: Run) -> tuple[str, ...]:
+    scenario = load_scenario(case.scenario)
     checks = checks_of(scenario, score(scenario, run), case.latency_ms)
-    names = tuple(check.name for check in checks if not check.ok)
-    unchanged = not names and run == run_of(replace(case, sabotage=None))[1]
-    return SabotagedRun(case, names, run.samples[-1].t_us / 1e6, unchanged)
+    return tuple(check.name for check in checks if not check.ok)
 
 
 def run_all_sabotaged(

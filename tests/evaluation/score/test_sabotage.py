@@ -21,6 +21,7 @@ from sightline.evaluation.score.runs import (
     SabotageReport,
     ScoreCase,
     cases,
+    run_of,
     run_sabotaged,
     sabotaged,
 )
@@ -174,6 +175,23 @@ def test_run_that_broke_no_bound_is_compared_with_the_healthy_one(monkeypatch):
     monkeypatch.setattr(runs, "broken", lambda *_given: [])
     assert run_sabotaged(case("static", "nothing", seconds=0.6)).unchanged
     assert not run_sabotaged(case("static", "wheels-dead", seconds=0.6)).unchanged
+
+
+def test_bound_that_the_healthy_run_breaks_too_shows_no_sabotage():
+    result = run_sabotaged(case("static", "wheels-dead", seconds=0.5))
+    assert result.broken == () and not result.unchanged and not pair((result.broken, result.unchanged)).ok
+
+
+@pytest.mark.parametrize(("changes", "names", "is_compared"), [
+    ({}, ["static"], False), ({}, [], True), ({"loss": 0.11}, ["static"], True), ({"loss": 0.0}, ["static"], False),
+    ({"seconds": 9.0}, ["static"], True), ({"detector": "onnx"}, ["static"], True),
+])  # fmt: skip
+def test_healthy_run_is_compared_where_no_test_shows_that_it_passes(monkeypatch, changes, names, is_compared):
+    short = run_of(case("static", "wheels-dead", seconds=0.1))
+    monkeypatch.setattr(runs, "run_of", lambda *_: short)
+    monkeypatch.setattr(runs, "scenario_names", lambda: names)
+    result = run_sabotaged(replace(case("static", "wheels-dead"), **changes))
+    assert (result.broken == ()) is is_compared
 
 
 @pytest.mark.parametrize(("latency_ms", "ends_early"), [(50, True), (400, False)])
