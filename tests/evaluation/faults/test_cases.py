@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from docs.make.faults import describe_machine, report_page
 from sightline.evaluation.checks import Check, at_most, worst_checks
-from sightline.evaluation.faults import cases, devices, drivers, stop_cases
+from sightline.evaluation.faults import cases, devices, drivers, runner, stop_cases
 from sightline.evaluation.faults.cases import CASES, chosen
 from sightline.evaluation.faults.drivers import JOINED_GAP_MS, OWNER, STANDBY, handover_checks
 from sightline.evaluation.faults.evidence import (
@@ -40,11 +40,11 @@ from sightline.evaluation.faults.evidence import (
     read_motors,
     stop_checks,
 )
-from sightline.evaluation.faults.fixture import ROBOT
+from sightline.evaluation.faults.fixture import ROBOT, Setup
 from sightline.evaluation.faults.load_clients import client_hello
 from sightline.evaluation.faults.peer import ATTACKS, MALFORMED, OVERSIZED, read_recording
 from sightline.evaluation.faults.report import passed, run_line, to_dict
-from sightline.evaluation.faults.runner import FaultOutcome, Injected, run_case, watched_us
+from sightline.evaluation.faults.runner import FaultCase, FaultOutcome, Injected, run_case, watched_us
 from sightline.evaluation.faults.sampler import STALL_US, Hole, read_holes, stalled_us
 from sightline.operator_side.cli import evaluate as cli_faults
 from sightline.protocol.channels import REQUEST, TWIST
@@ -186,6 +186,14 @@ def test_speed_that_a_robot_keeps_without_a_line_is_counted():
     assert moved_on_old_sight(until_it_stands, commands(1_000_000), None) > 20
     assert moved_on_old_sight(held_rows(stands, 0, 9_000_000), commands(1_000_000), None) == 0, "it stands"
     assert moved_on_old_sight(to_the_end, commands(3_000_000), None) == 0, "frames are young"
+
+
+@pytest.mark.parametrize(("now_us", "ok"), [(3_000_000, False), (1_000_000, True)])
+def test_row_without_a_stop_counts_a_speed_that_lasts_until_its_end(monkeypatch, now_us, ok):
+    monkeypatch.setattr(runner, "monotonic_us", lambda: now_us)
+    rig = SimpleNamespace(motors=lambda: log([0.5] * 51), sent=lambda: commands(1_000_000))
+    row = FaultCase("x", "x", lambda _rig: Injected(1, 0), Setup(), stops=False)
+    assert [one.ok for one in runner._motion_checks(row, rig, Injected(1, 0))] == [ok]
 
 
 def test_only_a_long_pause_from_the_fault_on_counts_as_a_held_speed():
