@@ -97,9 +97,9 @@ class AckingService(Service):
 class ScansOnly(MissionChannel):
     """Takes no missions and reports nothing: what the robot does is not this one's doing."""
 
-    def prepare(self, pipeline: Pipeline, frame: FrameHeader) -> None:
+    def prepare(self, pipeline: Pipeline, frame: FrameHeader, waited_us: int = 0) -> None:
         """Give `pipeline` the newest scan."""
-        self._give_scan(pipeline, frame)
+        self._give_scan(pipeline, frame, waited_us)
 
     def report(self, *_given: object) -> None:
         """Log only the detector's notices."""

@@ -50,8 +50,8 @@ class MissionRequests:
         self.newest: RequestId | None = None
         self.rejection = ""
 
-    def take(self, message: Message, frame: FrameHeader) -> MissionSpec | None:
-        """Return the mission from `frame` on, or None for a repeated or rejected request.
+    def take(self, message: Message, frame: FrameHeader, waited_us: int) -> MissionSpec | None:
+        """Return the mission from `frame`, which waited here, on, or None for a repeated or rejected request.
 
         Raises WireError for an invalid message; `rejection` then contains it too.
         """
@@ -66,7 +66,7 @@ class MissionRequests:
             return None
         self.newest, self.rejection = request_id, ""
         try:
-            _check(header, message.source, frame)
+            _check(header, message.source, frame, waited_us)
             mission = requested_mission(request, self._config)
             check_mission_label(mission, self._config.detector.kind, self._labels)
             return mission
@@ -75,7 +75,7 @@ class MissionRequests:
             return None
 
 
-def _check(header: RequestHeader, source: str, frame: FrameHeader) -> None:
+def _check(header: RequestHeader, source: str, frame: FrameHeader, waited_us: int) -> None:
     """Raise WireError unless the source is permitted, the session is current and the status is recent."""
     if header.source != source:
         raise WireError(RejectReason.UNKNOWN_SOURCE, "key and header disagree on the source")
@@ -88,7 +88,7 @@ def _check(header: RequestHeader, source: str, frame: FrameHeader) -> None:
         raise WireError(RejectReason.OTHER_SESSION, f"requested in session {echo.session}, the robot is in "
                                                f"{frame.session}; repeat the request")
     age_us = frame.t_us - echo.t_us
-    if age_us < -AHEAD_US:
+    if age_us < -AHEAD_US - waited_us:  # while a frame waits for a slow detector, newer statuses come
         raise WireError(RejectReason.FROM_FUTURE, "cites a status from the future")
     if age_us > MAX_AGE_US:
         raise WireError(RejectReason.STALE, f"requested {age_us / 1e6:.1f} s ago; repeat the request")
@@ -202,12 +202,18 @@ class MissionChannel:
         self._session = secrets.token_hex(4)
         self._reports = 0
 
-    def prepare(self, pipeline: Pipeline, frame: FrameHeader) -> None:
-        """Give `pipeline` what it has to know before it answers `frame`: a requested mission, the newest scan."""
+    def prepare(self, pipeline: Pipeline, frame: FrameHeader, waited_us: int = 0) -> None:
+        """Give `pipeline` what it has to know before it answers `frame`: a requested mission, the newest scan.
+
+        Args:
+            pipeline: the pipeline of the robot.
+            frame: header of the frame, or of a status.
+            waited_us: time since the frame came here; what came later may be newer by it.
+        """
         message = self._missions.take()
         if message is not None:
-            self._apply(message, pipeline, frame)
-        self._give_scan(pipeline, frame)
+            self._apply(message, pipeline, frame, waited_us)
+        self._give_scan(pipeline, frame, waited_us)
 
     def report(
         self, now_s: float, answer: PipelineAnswer, frame: FrameHeader | None, camera: CameraModel | None = None
@@ -233,9 +239,9 @@ class MissionChannel:
         for line in notices_of(self._detector):
             self._log_change("detector", f"detector: {line}")
 
-    def _apply(self, message: Message, pipeline: Pipeline, frame: FrameHeader) -> None:
+    def _apply(self, message: Message, pipeline: Pipeline, frame: FrameHeader, waited_us: int) -> None:
         try:
-            chosen = self._requests.take(message, frame)
+            chosen = self._requests.take(message, frame, waited_us)
         except WireError as error:
             self._reject(error)
             return
@@ -245,7 +251,7 @@ class MissionChannel:
         elif self._requests.rejection:
             self._log_change("mission", f"rejected a mission of {message.source}: {self._requests.rejection}")
 
-    def _give_scan(self, pipeline: Pipeline, frame: FrameHeader) -> None:
+    def _give_scan(self, pipeline: Pipeline, frame: FrameHeader, waited_us: int) -> None:
         if not pipeline.mission.wants_scan:
             return
         if self._scans is None:
@@ -255,7 +261,7 @@ class MissionChannel:
             return
         try:
             stamp, scan = decode_scan(message.header, message.payload)
-            if stamp.session == frame.session and stamp.t_us > frame.t_us + AHEAD_US:
+            if stamp.session == frame.session and stamp.t_us > frame.t_us + AHEAD_US + waited_us:
                 raise WireError(RejectReason.FROM_FUTURE, "the time of the scan is ahead of the frames")
             pipeline.put_scan(stamp, scan)
         except WireError as error:

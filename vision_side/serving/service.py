@@ -403,7 +403,7 @@ class Service:
         if self._pipeline is None:
             self._publish(header, PipelineAnswer(None, Observation("no image", note="no camera model yet")), 0)
             return
-        self._mission_channel.prepare(self._pipeline, header)
+        self._mission_channel.prepare(self._pipeline, header, self._queue_ages_us[-1])
         deadline_us = monotonic_us() + round(self._config.detector.deadline_s * 1e6)
         answer = self._pipeline.step(Frame(header, message.payload, deadline_us))
         if answer.skipped:
@@ -638,7 +638,8 @@ class BoxesService(Service):
             return
         self._rejected_boxes.use()
         self._log_change("boxes", f"boxes from {self._config.boxes.source}")
-        self._mission_channel.prepare(self._pipeline, frame)
+        waited_us = self._sessions.clock.age_us(frame.session, frame.t_us, self._now_us()) or 0
+        self._mission_channel.prepare(self._pipeline, frame, waited_us)
         answer = self._pipeline.follow(frame, found)
         if answer.skipped:
             self.skipped[answer.skipped] += 1

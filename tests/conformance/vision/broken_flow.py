@@ -342,8 +342,8 @@ class Obedient(BrokenVision):
         requests = self._mission_channel._requests
         take = requests.take
 
-        def obeys(message, frame):
-            chosen = take(message, frame)
+        def obeys(message, frame, waited_us):
+            chosen = take(message, frame, waited_us)
             if self.reason in requests.rejection:
                 requests.rejection = ""
                 chosen = requested_mission(decode(MissionRequest, message.payload), CONFIG)

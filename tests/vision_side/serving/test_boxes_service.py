@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, STATUS, TWIST
+from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MISSION, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
 from sightline.protocol.messages import (
     AnswerHeader,
@@ -15,6 +15,8 @@ from sightline.protocol.messages import (
     DetectionsHeader,
     Echo,
     FrameHeader,
+    MissionRequest,
+    RequestHeader,
     Stamp,
     Status,
 )
@@ -110,6 +112,20 @@ def test_no_answer_differs_from_an_empty_result():
         bench.frame(seq)
         bench.boxes(seq, PERSON)
     assert bench.twist()[0].angular_rad_s != 0 and any("searching" in line for line in bench.said)
+
+
+@pytest.mark.parametrize(("ahead_us", "refused"), [(400_000, ""), (600_000, "FROM_FUTURE")])
+def test_mission_is_not_of_the_future_because_boxes_of_old_frames_come(ahead_us, refused, monkeypatch):
+    bench = Bench()
+    monkeypatch.setattr(bench.service, "_now_us", lambda: bench.now_us)
+    for seq in range(1, 40):
+        bench.frame(seq)
+    echo = Echo(channel="status", session="0000abcd", seq=4, t_us=39 * FRAME_US + ahead_us)
+    header = RequestHeader(source="operator", session="0000feed", seq=1, echo=echo)
+    bench.network.link("r1", role="operator").publish(
+        MISSION, encode(header), encode(MissionRequest(id=1, name="band")), "operator")
+    bench.boxes(10, PERSON)
+    assert bench.service._mission_channel._requests.rejection.partition(":")[0] == refused
 
 
 def test_another_source_steers_only_if_it_is_the_configured_one():

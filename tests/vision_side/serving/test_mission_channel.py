@@ -316,10 +316,34 @@ def test_a_mission_that_uses_scans_is_given_the_newest_and_cites_it():
     assert bench.answer().scan == 12
 
 
-def test_mission_that_cites_a_status_of_the_future_is_rejected():
-    bench = Bench().frames(2).ask(age_us=-600_000)
+@pytest.fixture(params=[0, 700_000])
+def late(request, monkeypatch):
+    """A bench, and the time for which each frame waits there for its turn."""
+    bench, clock_us = Bench(), [0]
+    take = bench.service._frames.take
+
+    def taken_late(wait_s):
+        clock_us[0] += request.param
+        return take(wait_s)
+
+    monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: clock_us[0])
+    monkeypatch.setattr(bench.service._frames, "take", taken_late)
+    return bench, request.param
+
+
+def test_mission_that_cites_a_status_of_the_future_is_rejected(late):
+    bench, waited_us = late
+    bench.frames(2).ask(age_us=-600_000 - waited_us)
     assert bench.report().refused.startswith("FROM_FUTURE")
-    assert bench.ask(number=2, age_us=-400_000).report().refused == ""
+    assert bench.ask(number=2, age_us=-400_000 - waited_us).report().refused == ""
+
+
+def test_scan_of_the_future_is_rejected(late):
+    bench, waited_us = late
+    bench.frames(5).ask("goto", waypoints=((1.0, 1.0),)).frames(6)
+    for ahead_us, scans in ((600_000, None), (400_000, 4)):
+        bench.robot.publish(SCAN, *scan(4, t_us=bench.seq * FRAME_US + ahead_us + waited_us))
+        assert bench.answer().scan == scans
 
 
 def test_scans_are_subscribed_only_for_a_mission_that_uses_them():
