@@ -110,6 +110,8 @@ class LiveGallery:
 def of_picture(path: Path) -> list[Image]:
     """Read an image file. Raises ConfigError for an invalid one."""
     try:
+        if not path.is_file() and path.exists():  # a device or a pipe may have no end
+            raise ConfigError(f"{path} is not a file; name a PNG or JPEG")
         if path.stat().st_size > MAX_FILE_BYTES:
             raise ConfigError(f"{path} is larger than {MAX_FILE_BYTES // 1_000_000} MB; use a smaller image")
         data = np.frombuffer(path.read_bytes(), np.uint8)

@@ -413,7 +413,7 @@ def _check_mask(mask: Path, others: Mapping[str, Path | None]) -> None:
     if mask.suffix.lower() != ".png":
         raise ConfigError(f"invalid --mask {mask}: expected a .png file, e.g. --mask mask.png")
     for option, path in others.items():
-        if path is not None and home_path(mask).resolve() == home_path(path).resolve():
+        if path is not None and os.path.realpath(home_path(mask)) == os.path.realpath(home_path(path)):
             raise ConfigError(f"--mask {mask} is also the file of {option}; name another .png file")
 
 

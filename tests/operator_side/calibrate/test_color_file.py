@@ -1,6 +1,7 @@
 """Color ranges are written into a configuration of vision: all comments and values stay, or nothing changes."""
 
 import json
+import re
 import stat
 import tomllib
 from pathlib import Path
@@ -161,6 +162,7 @@ def test_libraries_print_nothing_about_an_invalid_video():
     ("r1 --picture ball.png --at 1,1", "ROBOT and --picture exclude each other"),
     ("--picture none.png --at 1,1", "cannot read none.png: No such file"),
     ("--picture vision.toml --at 1,1", "invalid image vision.toml"),
+    ("--picture /dev/zero --at 1,1", "/dev/zero is not a file; name a PNG or JPEG"),
     ("--picture tiny.png --at 0,0", "tiny.png has 20x2, at least 16 pixels a side"),
     ("--video none.mp4 --at 1,1", "is not a file; name a video"),
     ("--video vision.toml --at 1,1", "invalid video vision.toml"),
@@ -181,3 +183,9 @@ def test_failed_pick_is_one_line_and_writes_nothing(there, capsys, arguments, wo
     assert words in said.err and said.err.count("\n") == 1 and said.err.startswith("error: ")
     after = {one.name: one.read_bytes() for one in there.iterdir() if one.name != "pick-color-mask.png"}
     assert after == before
+
+
+def test_loop_of_symbolic_links_is_one_line(there, capsys):
+    (there / "loop").symlink_to("loop")
+    assert run(["pick-color", "--picture", "loop", "--at", "1,1"]) == 2
+    assert re.fullmatch("error: .*loop: Too many levels of symbolic links; .*\n", capsys.readouterr().err)
