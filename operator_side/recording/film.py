@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
 from collections.abc import Iterator
@@ -182,7 +183,8 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
 
     The capture times end it, so that a first image that comes late does not make the film longer.
     """
-    unfinished = path.with_name(f".{path.name}.part.mp4")
+    target = Path(os.path.realpath(path))  # a symbolic link stays one
+    unfinished = target.with_name(f".{target.name}.part.mp4")
     try:
         with _terminated_like_ctrl_c():
             with writes(path), Film(unfinished, _FPS) as made:
@@ -190,7 +192,7 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
             if not made.frames:
                 raise LinkError(_silence(pictures, wanted))
             with writes(path):
-                unfinished.replace(path)
+                unfinished.replace(target)
         return Captured(path, made.frames, made.seconds, *made.size_px, cut)
     finally:
         unfinished.unlink(missing_ok=True)
@@ -257,10 +259,11 @@ def _silence(pictures: Pictures, wanted: Channel) -> str:
 
 
 def _write(path: Path, data: bytes) -> None:
-    unfinished = path.with_name(f".{path.name}.part")
+    target = Path(os.path.realpath(path))
+    unfinished = target.with_name(f".{target.name}.part")
     try:
         with writes(path):
             unfinished.write_bytes(data)
-            unfinished.replace(path)
+            unfinished.replace(target)
     finally:
         unfinished.unlink(missing_ok=True)

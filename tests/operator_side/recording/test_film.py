@@ -157,3 +157,16 @@ def test_snapshot_on_a_full_disk_is_reported(tmp_path: Path) -> None:
     with full_disk(), pytest.raises(ConfigError, match=f"cannot write {tmp_path}/one.jpg: File too large; "):
         snapshot(Played(), tmp_path / "one.jpg", FRAME)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_symbolic_link_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    for name in ("one.jpg", "one.png", "run.mp4"):
+        link, file = tmp_path / name, tmp_path / "real" / name
+        link.symlink_to(file)
+        if name == "run.mp4":
+            film(Played(), link, FRAME, 0.9)
+        else:
+            snapshot(Played(), link, FRAME)
+        assert link.readlink() == file and file.stat().st_size > 0
+    assert len(list(tmp_path.rglob("*"))) == 7
