@@ -38,6 +38,7 @@ from sightline.protocol.messages import (
     FrameHeader,
 )
 from sightline.protocol.transports.link import FleetLink, LatestSlot, Link, Message
+from sightline.protocol.transports.security import date_problem
 from sightline.protocol.transports.tokens import DetectorToken, RobotToken, Token, parse_token
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.per_robot import DecoderPool
@@ -113,6 +114,8 @@ def run(
     from sightline.protocol.transports.zenoh.link import open_fleet
 
     ending, services = threading.Event(), list[DetectorService]()
+    if problem := date_problem(config.secure, ROLE):
+        _log.warning("detector: %s", problem)
     with limit_floods(config.listen, lambda line: _log.info("detector: %s", line)):
         opened = open_fleet(
             config.robot, listen=config.listen, connect=config.connect, role=ROLE, secure=config.secure,

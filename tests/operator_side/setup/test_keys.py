@@ -16,10 +16,12 @@ from sightline.protocol.transports.diagnosis import diagnose_tls, keys_problem
 from sightline.protocol.transports.open import open_link
 from sightline.protocol.transports.security import RoleKeys, date_problem, validity
 from sightline.protocol.transports.stop_port import stop_secret_file
+from sightline.protocol.transports.zenoh import link as zenoh_link
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.network import process as robot_process
 from sightline.robot_side.pipe import NetworkSetup
 from sightline.vision_side.config import VisionConfig
+from sightline.vision_side.serving import detector_service
 from sightline.vision_side.serving import process as vision_process
 from tests.fixtures.ports import free_port
 
@@ -255,11 +257,16 @@ def _run_robot(config):
     robot_process._run(setup, None)
 
 
+def _run_detector(config):
+    detector_service.run(VisionConfig(**config), None, detector_service.ServingOptions("hsv"))
+
+
 @pytest.mark.parametrize(("run", "module", "name", "role"), [
     (_run_robot, robot_process, "open_link", "robot"),
     (lambda config: vision_process.run(VisionConfig(**config)), opening, "open_link", "vision"),
+    (_run_detector, zenoh_link, "open_fleet", "detector"),
     (lambda config: router.run(config["listen"], [], config["secure"]), router, "open_session", "router"),
-], ids=["robot", "vision", "router"])  # fmt: skip
+], ids=["robot", "vision", "detector", "router"])  # fmt: skip
 def test_service_whose_certificate_has_expired_warns_when_it_starts(
     tmp_path, monkeypatch, caplog, run, module, name, role
 ):
