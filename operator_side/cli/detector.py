@@ -18,6 +18,7 @@ from sightline.operator_side.cli.options import (
     MaybeSecure,
     ServiceConnect,
     Sets,
+    plugin_prints,
     print_result,
 )
 from sightline.operator_side.config.loading import load_service
@@ -145,7 +146,8 @@ def list_detectors(as_json: Json = False) -> int:
     """List detectors, and whether each works here"""
     with needs("vision"):
         from sightline.vision_side.detect.registry import REGISTRY
-    rows = [(name, _problem(REGISTRY, name)) for name in REGISTRY.names()]
+    with plugin_prints(as_json):
+        rows = [(name, _problem(REGISTRY, name)) for name in REGISTRY.names()]
     model = _shipped_model()
     if as_json:
         listed = [{"name": name, "usable": not why, "why": why} for name, why in rows]
@@ -198,18 +200,19 @@ def check(
         from sightline.vision_side.detect.plugin_calls import notices_of
         from sightline.vision_side.detect.registry import build_detector, check_device, check_takes_pictures
     settings = given.model_copy(update={"detector": given.detector.model_copy(update={"kind": name})})
-    check_device(settings)
-    check_takes_pictures(name)
     own, made = own_options(sets or ()), list["Detector"]()
 
     def make() -> "Detector":
         made.append(build_detector(name, own, settings))
         return made[-1]
 
-    results = check_detector(make, seed)
-    ok = not any(one.wrong for one in results)
-    times = time_detector(make, seed=seed) if ok else []
-    notices = list(dict.fromkeys(line for one in made for line in notices_of(one)))
+    with plugin_prints(as_json):
+        check_device(settings)
+        check_takes_pictures(name)
+        results = check_detector(make, seed)
+        ok = not any(one.wrong for one in results)
+        times = time_detector(make, seed=seed) if ok else []
+        notices = list(dict.fromkeys(line for one in made for line in notices_of(one)))
     report = _as_json(name, ok, results, times) | {"said": notices}
     return print_result(report, [_as_text(name, results, times, notices)], as_json)
 

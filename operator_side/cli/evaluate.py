@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from sightline.operator_side.cli.options import ConfigFile, Device, Json, Sets, numbers, print_result
+from sightline.operator_side.cli.options import ConfigFile, Device, Json, Sets, numbers, plugin_prints, print_result
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import print_table
@@ -234,12 +234,13 @@ def detectors(
     if demand and seeds < FROM:
         raise ConfigError(f"--demand needs seeds from {FROM} up, which no training uses; {seeds} is lower")
     columns, shown = _columns(column), frames or (DEMANDED_FRAMES if demand else FRAMES)
-    subjects = _subjects(names or COMPARED, config, sets or (), device)
-    try:
-        with progress_bar(int((len(columns) + LIGHT_SHARE) * shown)) as advance:
-            report = score_scenes(subjects, shown, seeds, looks=looks, columns=columns, each=lambda _scene: advance())
-    finally:
-        close_subjects(subjects)
+    with plugin_prints(as_json):
+        subjects = _subjects(names or COMPARED, config, sets or (), device)
+        try:
+            with progress_bar(int((len(columns) + LIGHT_SHARE) * shown)) as advance:
+                report = score_scenes(subjects, shown, seeds, looks=looks, columns=columns, each=lambda _: advance())
+        finally:
+            close_subjects(subjects)
     return _print_report(report, all_detector_checks(report) if demand else None, as_json)
 
 
@@ -267,10 +268,10 @@ def _score_photos(photos: Path, build: "Callable[[Sequence[str]], list[Subject]]
 
     photographs = folder.read_photographs(folder.SHIPPED if str(photos) == SHIPPED else photos)
     if not colored:
-        with progress_bar(len(KINDS) * each + len(photographs)) as advance:
+        with plugin_prints(as_json), progress_bar(len(KINDS) * each + len(photographs)) as advance:
             report = scored((), KINDS)
         return print_result(report.to_dict(), photo_lines(report), as_json)
-    with progress_bar(len(COLORS) * (each + len(photographs))) as advance:
+    with plugin_prints(as_json), progress_bar(len(COLORS) * (each + len(photographs))) as advance:
         reports = {kind: scored((color_setting(kind),), (kind,)) for kind in COLORS}
     return print_result({kind: one.to_dict() for kind, one in reports.items()}, colored_lines(reports), as_json)
 

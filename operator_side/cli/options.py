@@ -2,7 +2,9 @@
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from typing import Annotated, Any, Final, TypeVar
 
 import typer
@@ -80,6 +82,13 @@ CameraSets = Annotated[
 ]
 
 Number = TypeVar("Number", int, float)
+
+
+@contextmanager
+def plugin_prints(as_json: bool) -> Iterator[None]:
+    """With `--json`, send what a plug-in prints meanwhile to stderr: stdout has the result only."""
+    with redirect_stdout(sys.stderr) if as_json else nullcontext():
+        yield
 
 
 def print_result(result: dict[str, Any], lines: Iterable[str], as_json: bool) -> int:

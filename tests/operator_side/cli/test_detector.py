@@ -80,6 +80,18 @@ def test_plug_in_that_breaks_the_contract_is_reported(capsys, tmp_path: Path, mo
     assert "FAIL  A batch gets as many results" in out
 
 
+@pytest.mark.parametrize("arguments", ["detector check", "score detectors --frames 1 --column nominal"])
+def test_what_a_plug_in_prints_is_not_in_the_result(capsys, tmp_path: Path, monkeypatch, arguments) -> None:
+    prints = BROKEN.replace("return", "print('looks'); return").replace("[:-1]", "") + "\nprint('loads')\n"
+    prints = prints.replace("    def", "    def close(self):\n        print('ends')\n    def")
+    (tmp_path / "loud_eyes.py").write_text(prints.replace("Late", "Loud"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "loud_eyes", raising=False)
+    code, out, err = run(capsys, *arguments.split(), "loud_eyes:Loud", "--json")
+    assert code == 0 and json.loads(out) and {"looks", "loads", "ends"} <= set(err.splitlines())
+
+
 def test_a_model_is_checked_with_its_options(capsys, tmp_path: Path) -> None:
     path = brightness_model(tmp_path / "m.onnx", [[1, 1, 9, 9]], [0])
     code, out, _ = run(capsys, "detector", "check", f"onnx:{path}", "--set", "min_score=0.9", "--device", "cpu")
