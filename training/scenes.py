@@ -69,6 +69,8 @@ class DrawnScenes:
     """Boxes of distractors: things without a label."""
     simulated: int | None = None
     """The scenes from this one on are over photographs, in which only balls are labeled; None if none is."""
+    photographs: str = ""
+    """Digest of these photographs; empty without them."""
 
     @property
     def own(self) -> int:
@@ -76,15 +78,15 @@ class DrawnScenes:
         return len(self.truths) if self.simulated is None else self.simulated
 
     def digest(self) -> str:
-        """Hash the scenes: their number, all boxes, the first image."""
+        """Hash the scenes: their number, all boxes, the first image, all photographs."""
         truths = [[one.label, one.box] for row in self.truths for one in row]
         content = json.dumps([len(self.truths), truths, self.unclear, self.others])
-        return hashlib.sha256(content.encode() + self.pictures[0].tobytes()).hexdigest()[:16]
+        return hashlib.sha256((content + self.photographs).encode() + self.pictures[0].tobytes()).hexdigest()[:16]
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle images on disk by name: the receiver opens them again."""
         pictures = self.pictures.filename if isinstance(self.pictures, np.memmap) else self.pictures
-        return _reopened, (pictures, self.truths, self.unclear, self.others, self.simulated)
+        return _reopened, (pictures, self.truths, self.unclear, self.others, self.simulated, self.photographs)
 
 
 def _reopened(pictures: Any, *rest: Any) -> DrawnScenes:
@@ -202,7 +204,7 @@ def drawn_scenes(folder: Path, source: SceneSource, jobs: int, advance: Callable
     truths = tuple(tuple(_truth(one) for one in row["truths"]) for row in rows)
     unclear, others = (tuple(tuple((*one,) for one in row[kind]) for row in rows) for kind in ("unclear", "others"))
     return DrawnScenes(np.load(pictures, mmap_mode="r"), truths, unclear, others,
-                       source.count if source.over_photos else None)
+                       source.count if source.over_photos else None, rows[-1].get("photographs", ""))
 
 
 def _check_photographs(folder: Path) -> None:

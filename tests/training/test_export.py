@@ -331,14 +331,15 @@ def test_scenes_are_drawn_again_for_one_other_photograph_of_many(tmp_path, photo
     def stamp():
         for cached in (_photographs, module._photographs_digest):
             cached.cache_clear()
-        drawn_scenes(tmp_path, SceneSource(1, 2, photographs), 1, lambda _: None)
-        return (tmp_path / "scenes.npy").stat().st_mtime_ns
+        scenes = drawn_scenes(tmp_path, SceneSource(1, 2, photographs), 1, lambda _: None)
+        assert pickle.loads(pickle.dumps(scenes)).digest() == scenes.digest()
+        return (tmp_path / "scenes.npy").stat().st_mtime_ns, scenes.digest()
 
     stamps = [stamp()]
     for name in ("03.jpg", "07.jpg", "11.jpg"):  # one of them is in neither scene
         cv2.imwrite(str(photographs / name), 255 - cv2.imread(str(photographs / name)))
         stamps.append(stamp())
-    assert len({*stamps}) == 4 and stamp() == stamps[-1]
+    assert [len({*each}) for each in zip(*stamps, strict=True)] == [4, 4] and stamp() == stamps[-1]
 
 
 @pytest.mark.usefixtures("no_simulator")
