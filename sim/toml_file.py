@@ -49,10 +49,10 @@ def read_table(path: Path, folder: Path | None = None) -> dict[str, Any]:
     Raises ConfigError with the file and the line of invalid TOML.
     """
     try:
-        table = tomllib.loads(path.read_text("utf-8"))
+        table = tomllib.loads(path.read_text("utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}; name a TOML file that you may read") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also a number of too many digits
         raise ConfigError(f"{path}: cannot be read as TOML: {error}") from None
     return _extended(table, path, folder) if folder and "extends" in table else table
 

@@ -91,7 +91,8 @@ def write_ranges(path: Path, ranges: Ranges) -> None:
     unfinished = target.with_name(f".{target.name}.part")
     try:
         before = target.read_bytes().decode() if target.exists() else ""
-        after = with_ranges(before, ranges)
+        mark = "\ufeff" if before.startswith("\ufeff") else ""  # of the byte order; TOML does not know it
+        after = mark + with_ranges(before.removeprefix(mark), ranges)
         if "\r\n" in before and "\n" not in before.replace("\r\n", ""):
             after = after.replace("\r\n", "\n").replace("\n", "\r\n")
         unfinished.write_bytes(after.encode())

@@ -89,11 +89,11 @@ def table_of(text: str, where: str) -> tuple[tuple[float, float], ...]:
     """Read the rows of a table file. Raises ConfigError that names `where` and the invalid value."""
     try:
         return TableConfig.model_validate(tomllib.loads(text)).table
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{where}: invalid TOML: {error}") from None
     except ValidationError as error:
         problem = first_problem(error, known=TableConfig.model_fields)
         raise ConfigError(f"{where}: {problem}; rows are [duty, m/s], e.g. [0.4, 0.08]") from None
+    except (ValueError, RecursionError) as error:  # also a number of too many digits
+        raise ConfigError(f"{where}: invalid TOML: {error}") from None
 
 
 def table_text(rows: Sequence[tuple[float, float]], head: str) -> str:
@@ -455,7 +455,7 @@ def _rows(config: GpioDriveConfig) -> tuple[tuple[float, float], ...]:
     if path is None:
         return config.table
     try:
-        return table_of(home_path(path).read_text("utf-8"), str(path))
+        return table_of(home_path(path).read_text("utf-8-sig"), str(path))
     except (OSError, UnicodeDecodeError) as error:
         cause = error.strerror if isinstance(error, OSError) else "not text"
         raise ConfigError(f"{path}: cannot be read: {cause}; write one with `sightline calibrate drive`") from None

@@ -61,6 +61,8 @@ def test_unknown_name_error_lists_the_nearest_and_all(load, name, expected):
         ("[start]", "[[walls]]\nstart_m = [1, 1]\nend_m = [1, 1]\n[start]", "no length"),
         ('look = "plain"', 'look = "plane"', "did you mean 'plain'"),
         ("[target]", "[target", "cannot be read as TOML"),
+        ("seconds = 30.0", f"seconds = {'9' * 5000}", "cannot be read as TOML"),
+        ("seconds = 30.0", f"seconds = {'[' * 5000}", "cannot be read as TOML"),
     ],
 )
 def test_bad_scenario_file_is_one_line_that_names_the_key(tmp_path, old, new, expected):
@@ -75,7 +77,7 @@ def test_bad_scenario_file_is_one_line_that_names_the_key(tmp_path, old, new, ex
 
 
 def test_shortest_scenario_and_longest_name_are_accepted(tmp_path):
-    file = write(tmp_path, f'extends = "static"\nseconds = 1\nname = "{"圆" * 66}"\n')
+    file = write(tmp_path, f'\N{BYTE ORDER MARK}extends = "static"\nseconds = 1\nname = "{"圆" * 66}"\n')
     assert (load_scenario(file).seconds, len(load_scenario(file).name)) == (1.0, 66)
 
 

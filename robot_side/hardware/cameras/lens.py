@@ -59,12 +59,12 @@ def guessed_model(size: JpegSize, hfov_deg: float) -> CameraModel:
 def read_model(path: Path) -> CameraModel:
     """Read a model from a TOML file. Raises ConfigError that names the file and the invalid value."""
     try:
-        table = tomllib.loads(home_path(path).read_text("utf-8"))
+        table = tomllib.loads(home_path(path).read_text("utf-8-sig"))
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be read: {error.strerror}; `sightline calibrate camera` writes one"
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also a number of too many digits
         raise ConfigError(f"{path}: invalid TOML: {error}") from None
     return _checked(table, str(path))
 

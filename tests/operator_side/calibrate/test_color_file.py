@@ -100,7 +100,7 @@ def test_file_whose_line_ends_are_not_those_of_windows_gets_none_of_them(tmp_pat
 def test_link_to_the_file_and_its_line_ends_stay(tmp_path):
     file, link = tmp_path / "shared.toml", tmp_path / "vision.toml"
     link.symlink_to(file.name)
-    before = b"# mine\r\n[hsv]\r\nshape = 'any'\r\n\r\n[target]\r\nradius_m = 0.05\r\n"
+    before = b"\xef\xbb\xbf# mine\r\n[hsv]\r\nshape = 'any'\r\n\r\n[target]\r\nradius_m = 0.05\r\n"
     file.write_bytes(before)
     write_ranges(link, YELLOW)
     after = file.read_bytes()

@@ -67,6 +67,7 @@ def test_a_written_table_reads_back():
     ("table = [[0.4, 0.2], [0.6, 0.1]]", "both must rise"), ("table = [[1.4, 0.2]]", "less than or equal to 1"),
     ("table = [[0.4, nan]]", "finite"), ("tabel = [[0.4, 0.1]]", "tabel"), ("table = []", "at least 1"),
     ("table = [[0.4]]", "table.0"), ("table = [[0.0, 0.1]]", "greater than 0"),
+    (f"table = {'9' * 5000}", "invalid TOML"), (f"table = {'[' * 5000}", "invalid TOML"),
 ])  # fmt: skip
 def test_a_broken_table_is_one_line_with_its_file(text, says):
     with pytest.raises(ConfigError) as error:
@@ -76,7 +77,7 @@ def test_a_broken_table_is_one_line_with_its_file(text, says):
 
 def test_table_file_replaces_the_table_and_a_missing_file_is_reported(board, tmp_path):
     path = tmp_path / "drive.toml"
-    path.write_text("table = [[0.5, 0.2]]")
+    path.write_text("\N{BYTE ORDER MARK}table = [[0.5, 0.2]]")
     drive = GpioDrive(config(table_file=path))
     drive.set(0.2 / 0.0325, 0.0)
     assert duties(board) == {10: 0.5}

@@ -182,7 +182,9 @@ def test_a_wrong_model_is_rejected_by_name(changes, said):
         camera_model(LensConfig(model=MODEL | changes), SIZE)
 
 
-WRONG_FILES = [(None, "cannot be read"), ("= 3", "invalid TOML"), ("fx_px = 3.0", "width_px")]
+WRONG_FILES = [(None, "cannot be read"), ("= 3", "invalid TOML"), ("fx_px = 3.0", "width_px"),
+               ("\N{BYTE ORDER MARK}fx_px = 3.0", "width_px"), (f"fx_px = {'9' * 5000}", "invalid TOML"),
+               (f"fx_px = {'[' * 5000}", "invalid TOML")]
 
 
 @pytest.mark.parametrize(("text", "said"), WRONG_FILES)
