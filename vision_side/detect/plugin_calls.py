@@ -243,6 +243,9 @@ def _validated(one: Detection, width_px: int, height_px: int) -> Detection | Non
 
 def annotation_problem(one: Detection) -> str:
     """Return why the wire cannot carry its label, circle or track; empty if it can."""
+    label: object = one.label
+    if not isinstance(label, str):  # e.g. the number of a class
+        return f"invalid label {label!r}: not text"[:_LONGEST_WHY]
     if not is_label(one.label):
         return f"invalid label {one.label[:20]!r}, {len(one.label)} characters: not 1 to {LONGEST_LABEL} printable ones"
     if one.circle is not None and not _is_circle(one.circle):

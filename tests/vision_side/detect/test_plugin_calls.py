@@ -1,5 +1,8 @@
 """A plug-in whose code fails beside the looking: one line that names the plug-in, and all other work continues."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -63,6 +66,14 @@ def test_track_number_of_any_kind_of_integer_is_sent(track_id: object, expected:
 def test_other_track_numbers_are_invalid(track_id: object) -> None:
     with pytest.raises(ValueError, match=f"a track number {track_id}; expected an integer from 0"):
         validated(FRAME, answer(track_id))
+
+
+@pytest.mark.parametrize("label", [3, np.int64(3), None, b"x" * 500])
+def test_label_that_is_not_text_is_named(label: object) -> None:
+    result = answer(0)
+    wrong = replace(result, detections=(replace(result.detections[0], label=label),))
+    with pytest.raises(ValueError, match=re.escape(f"invalid label {label!r}: not text"[:160]) + "$"):
+        validated(FRAME, wrong)
 
 
 HEADER = FrameHeader(session="0000abcd", seq=1, t_us=1)
