@@ -31,6 +31,7 @@ from sightline.operator_side.cli.options import (
     check_camera_sets,
     command_group,
     numbers,
+    plugin_prints,
 )
 from sightline.operator_side.client.pictures import Pictures, viewer_role
 from sightline.operator_side.config.context import RobotAddress, target_of
@@ -208,7 +209,7 @@ def camera(
     wanted = _subject(board, square_m, ball_radius_m, distance_m)
     given = {"x_m": x_m, "y_m": y_m, "z_m": z_m, "pitch_rad": pitch_rad}
     _check_mounting(given)
-    with needs("vision"), ExitStack() as ending:
+    with needs("vision"), plugin_prints(as_json), ExitStack() as ending:
         source, mounted = _source(ending, pictures, (camera, camera_sets or []), (robot, connect, secure), seconds)
         mounting = _mounting(mounted, given)
         report = _quiet if as_json else _print_board

@@ -235,9 +235,18 @@ def test_the_command_writes_a_model_that_a_camera_takes(tmp_path, capsys):
     assert still.model.fx_px == pytest.approx(TRUTH.fx_px, rel=0.005)
 
 
-def test_a_ball_through_a_camera_plug_in(tmp_path, capsys):
+class Loud(StillCamera):
+    """A camera that prints."""
+
+    def close(self):
+        print("ends")
+        super().close()
+
+
+@pytest.mark.parametrize("kind", ["still", f"{__name__}:Loud"])
+def test_a_ball_through_a_camera_plug_in(tmp_path, capsys, kind):
     (tmp_path / "ball.jpg").write_bytes(jpeg_of(scene(camera(640, 480), 0.855, 0.0)))
-    run("--camera", "still", "--camera-set", f"path={tmp_path / 'ball.jpg'}", "--camera-set", "fps=200",
+    run("--camera", kind, "--camera-set", f"path={tmp_path / 'ball.jpg'}", "--camera-set", "fps=200",
         "--ball-radius-m", 0.1, "--distance-m", 0.8, "--out", tmp_path / "camera.toml", "--json")
     said = json.loads(capsys.readouterr().out)
     assert said["ok"]
