@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from sightline.protocol.clock import monotonic_us
+from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.log import report_fault
 from sightline.protocol.transports.link import Link
 from sightline.vision_side.detect.per_robot import MAX_ROBOTS, DecoderPool, PerSession
@@ -167,7 +168,7 @@ class ShadowDetector:
                 _, task = self._tasks.popitem(last=False)
             try:
                 self._compare(task)
-            except Exception as error:  # a plug-in's own fault, which must not end the shadow for good
+            except PLUGIN_ERRORS as error:  # a plug-in's own fault, which must not end the shadow for good
                 text = report_fault("detector", error, self._name)
                 self._notices.add(f"{self._name} failed: {type(error).__name__}: {text}"[:160])
 

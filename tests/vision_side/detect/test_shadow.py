@@ -1,5 +1,6 @@
 """The shadow: it sees what the driving detector sees, is compared with it and never steers."""
 
+import sys
 import threading
 from dataclasses import replace
 
@@ -163,9 +164,10 @@ def test_shadow_and_detector_are_closed_if_one_close_fails(pair) -> None:
     assert closed == ["two"]
 
 
-def test_shadow_that_raises_is_reported_and_continues(pair) -> None:
+@pytest.mark.parametrize("detect", [None, lambda *_: sys.exit(7)])  # calling None raises
+def test_shadow_that_raises_is_reported_and_continues(pair, detect) -> None:
     _, shadow, both = pair
-    shadow.detect, good = None, shadow.detect  # calling None raises
+    shadow.detect, good = detect, shadow.detect
     both.detect([frame(1)], NO_DEADLINE)
     assert until(lambda: any("failed" in line for line in both.notices())) and faults()["detector"] == 1
     shadow.detect = good
