@@ -171,9 +171,12 @@ def _shipped_model() -> str:
 
 
 def _problem(registry: "PluginRegistry", name: str) -> str:
+    from sightline.vision_side.detect.plugin_calls import plugin_guard
+
     try:
         missing: Callable[[], str] = getattr(registry.load(name), "missing", str)
-        return missing()
+        with plugin_guard(f"{name}'s missing()"):
+            return missing()
     except ConfigError as error:
         return str(error)
 

@@ -49,6 +49,13 @@ def test_detector_list_shows_which_detectors_work(capsys) -> None:
     assert code == 0 and re.search("adaptive +ok", out)
 
 
+def test_detector_list_names_a_plug_in_that_fails(capsys, monkeypatch) -> None:
+    monkeypatch.setattr(Hsv, "missing", lambda: 1 / 0, raising=False)
+    code, out, _ = run(capsys, "detector", "list", "--json")
+    why = {one["name"]: one["why"] for one in json.loads(out)["detectors"]}
+    assert code == 0 and why["hsv"].startswith("hsv's missing() raises ZeroDivisionError") and why["onnx"] == ""
+
+
 def test_detector_list_recommends_in_five_lines_and_names_missing_packages(capsys, monkeypatch) -> None:
     for package in ("torch", "ultralytics", "transformers"):
         monkeypatch.setitem(sys.modules, package, None)
