@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 _CLASSES: Final = PluginRegistry("model class", "sightline.torch_models")
 _IS_CLASS: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 _SIDE_PX: Final = 640
+_Side = Annotated[int, Field(ge=1, le=8192)]  # a size of 0 would count as open
 _LONGEST: Final = 200
 _RISK: Final = "may be a Python pickle, which can run any code on this machine when it is loaded"
 _ULTRALYTICS: Final = {"YOLO_AUTOINSTALL": "false", "YOLO_OFFLINE": "true", "YOLO_VERBOSE": "false"}
@@ -139,7 +140,7 @@ class TorchDetector(FrameworkDetector):
     class Config(FrameworkDetector.Config):
         """Those of each framework, and what a PyTorch model does not state by itself."""
 
-        size: Annotated[tuple[int, ...], Field(min_length=2, max_length=2)] | None = None
+        size: Annotated[tuple[_Side, ...], Field(min_length=2, max_length=2)] | None = None
         """Rows and columns of the input; None: those in the file, as Ultralytics writes them, or else 640x640."""
         weights: str = ""
         """For a class: the file of its `state_dict`, loaded without a pickle's code."""

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.messages import FrameHeader
@@ -68,6 +69,13 @@ def test_missing_package_is_one_line_with_the_command_and_the_license(kind, monk
 @pytest.mark.parametrize("kind", ALL)
 def test_detector_without_a_model_names_an_example(kind) -> None:
     assert f"write e.g. {kind.kind}:" in rejected(kind)
+
+
+@pytest.mark.parametrize("size", [(0, 64), (64, 0), (-1, 64), (8193, 64), (64,), (64, 64, 3)])
+def test_size_that_no_input_has_is_invalid(size) -> None:
+    with pytest.raises(ValidationError, match="size"):
+        TorchDetector.Config(size=size)
+    assert TorchDetector.Config(size=(1, 8192)).size == (1, 8192)
 
 
 # --- the frameworks that need not be installed: what is taken from their answers -------------------------------------
