@@ -59,12 +59,24 @@ def parse_zenoh_endpoint(endpoint: str) -> tuple[str, str, int]:
         ConfigError: the endpoint is invalid; the text shows the correct form.
     """
     match = _ZENOH_ENDPOINT.fullmatch(endpoint)
-    if match is None or not 1 <= int(match[3]) <= 65_535:
+    if match is None or not 1 <= int(match[3]) <= 65_535 or not _is_host(match[2]):
         raise ConfigError(
             f"invalid endpoint {endpoint!r}: expected <protocol>/<host>:<port> with a port from 1 to 65535, "
             "e.g. tcp/127.0.0.1:7447"
         )
     return match[1], match[2].strip("[]"), int(match[3])
+
+
+def _is_host(name: str) -> bool:
+    """Return False for a name that Python hands to no resolver: an empty label, or one of 64 characters or more."""
+    if name.isascii():  # as the codec, whose tables take a megabyte of the locked memory of a robot
+        *labels, last = name.split(".")
+        return all(0 < len(label) < 64 for label in labels) and len(last) < 64
+    try:
+        name.encode("idna")
+    except UnicodeError:
+        return False
+    return True
 
 
 def with_send_buffer(endpoint: str) -> str:
@@ -154,7 +166,8 @@ def parse_websocket_endpoint(text: str) -> WebSocketEndpoint:
         raise ConfigError(f"invalid endpoint {text!r}: write {scheme}/{rest}")
     match = _WEBSOCKET_ENDPOINT.fullmatch(text)
     port = int(match[3]) if match else 0
-    if match is None or not 1 <= port <= 65_535 or (match[4] is not None and match[1] != "ws-legacy"):
+    is_valid = match is not None and 1 <= port <= 65_535 and _is_host(match[2])
+    if match is None or not is_valid or (match[4] is not None and match[1] != "ws-legacy"):
         raise ConfigError(
             f"invalid endpoint {text!r}: expected ws://<host>:<port>, wss://<host>:<port> or ws-legacy://<host>:<port> "
             "with a port from 1 to 65535, e.g. ws://127.0.0.1:9090"

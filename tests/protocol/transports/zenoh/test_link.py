@@ -29,6 +29,7 @@ NO_ENDPOINTS = (
     "", "foo", "tcp", "tcp:/x", "tcp/", "tcp/127.0.0.1", "tcp/:7447", "tcp/127.0.0.1:", "tcp/127.0.0.1:0",
     "tcp/127.0.0.1:99999", "tcp/127.0.0.1:65536", "tcp/127.0.0.1:-1", "tcp/127.0.0.1:7447 ", "http://127.0.0.1:7447",
     "TCP/127.0.0.1:7447", "tcp/a b:7447", "tcp/127.0.0.1:7447/x", "127.0.0.1:7447", "tcp/::1:7447", "tcp/127.0.0.1:٧",
+    f"tcp/{'a' * 64}:7447", f"tcp/{'a' * 64}.b:7447", "tcp/a..b:7447", f"tcp/{'é' * 60}:7447",
 )  # fmt: skip
 
 
@@ -43,6 +44,9 @@ def test_an_endpoint_that_is_invalid_is_rejected_with_the_right_form(endpoint, e
 def test_well_formed_endpoints_and_their_send_buffer():
     assert parse_zenoh_endpoint("tcp/[::1]:7447") == ("tcp", "::1", 7447)
     assert parse_zenoh_endpoint("tls/robot.local:1#so_sndbuf=1") == ("tls", "robot.local", 1)
+    longest = f"{'a' * 63}.{'b' * 63}"
+    for host in (longest, f"{longest}.", "bücher.example"):
+        assert parse_zenoh_endpoint(f"tcp/{host}:1") == ("tcp", host, 1)
     assert with_send_buffer("tcp/h:1") == "tcp/h:1#so_sndbuf=262144"
     assert with_send_buffer("tcp/h:1#iface=wlan0") == "tcp/h:1#iface=wlan0"
     assert with_send_buffer("udp/h:1") == "udp/h:1"
