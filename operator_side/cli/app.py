@@ -11,7 +11,7 @@ import re
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
@@ -226,7 +226,14 @@ ABANDONED_THREAD: Final = "abandoned link"
 
 def main() -> None:
     """Run the command of this process and exit with its code."""
-    code = run(sys.argv[1:])
+    code = INTERRUPTED
+    with suppress(KeyboardInterrupt):  # a second Ctrl-C, while the first one ends the command
+        code = run(sys.argv[1:])
+    # After two, a link may be open: threads of Zenoh that call Python abort the process when its interpreter ends.
+    if code == INTERRUPTED and "zenoh" in sys.modules:
+        with suppress(KeyboardInterrupt, OSError, AttributeError):
+            sys.stdout.flush()
+        os._exit(code)
     if any(thread.name == ABANDONED_THREAD for thread in threading.enumerate()):
         os._exit(code)
     sys.exit(code)

@@ -171,6 +171,29 @@ def test_interrupt_while_the_command_is_imported_prints_no_traceback(moment):
     assert (done.returncode, done.stdout, done.stderr) == (cli.INTERRUPTED, "", "")
 
 
+_INTERRUPTED_TWICE = """
+import atexit, signal, sys
+sys.modules["zenoh"] = sys
+from sightline.operator_side.cli import app
+def interrupted(_arguments):
+    print("shown")
+    try:
+        signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.raise_signal(signal.SIGINT)
+setattr(app, sys.argv[1], interrupted)
+atexit.register(print, "the interpreter ends, and threads of Zenoh abort it")
+app.main()
+"""
+
+
+@pytest.mark.parametrize("within", ["_typed", "run"])
+def test_two_interrupts_at_once_end_a_command_as_one_does(within):
+    command = [sys.executable, "-P", "-c", _INTERRUPTED_TWICE, within]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (cli.INTERRUPTED, "shown\n", "")
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "expected"),
     [
