@@ -213,6 +213,8 @@ def install(
     """
     program = Path(sys.executable).with_name("sightline")
     file = home_path(config or Path(f"/etc/sightline/{service}.toml")).absolute()  # systemd changes the folder
+    if ".." in file.parts:  # which systemd ignores in a WorkingDirectory
+        file = file.parent.resolve() / file.name
     runs_it = user or os.environ.get("SUDO_USER") or getpass.getuser()
     planned, beside = units.plan(service, program, file, runs_it, units.UNIT_DIR, instances=instances), None
     # A service that cannot start is not installed.

@@ -124,12 +124,17 @@ def test_unit_runs_as_the_user_of_sudo(capsys, monkeypatch):
     assert "User=pi\n" in capsys.readouterr().out
 
 
-def test_relative_file_is_written_as_absolute_path(capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize(("folder", "written"), [("", ""), ("../units/", ""), ("link/../", ""), ("link/", "link")])
+def test_relative_file_is_written_as_absolute_path(capsys, monkeypatch, tmp_path, folder, written):
+    (home := tmp_path / "units").mkdir()
+    monkeypatch.chdir(home)
     Path("car.toml").write_text(CAR)
-    assert cli.run(["install", "robot", "--config", "car.toml", "--user", "pi"]) == 0
-    said = capsys.readouterr().out
-    assert said.count(f"robot --config {tmp_path / 'car.toml'}") == 3 and "--config car.toml" not in said
+    Path("other").mkdir()
+    Path("link").symlink_to("other" if ".." in folder else ".")
+    assert cli.run(["install", "robot", "--config", f"{folder}car.toml", "--user", "pi"]) == 0
+    unit, there = capsys.readouterr().out, home / written
+    assert unit.count(f"robot --config {there / 'car.toml'}") == 3 == unit.count("--config")
+    assert f"WorkingDirectory=-{there}\n" in unit, "systemd ignores one with '..', and finds no drive of one's own"
 
 
 def test_a_service_that_could_not_begin_is_not_installed(capsys, tmp_path):
