@@ -29,6 +29,7 @@ from sightline.operator_side.preflight import check_out_file, writes
 from sightline.operator_side.table import print_table, table_lines
 from sightline.protocol.channels import STATUS
 from sightline.protocol.errors import ConfigError, LinkError, WireError, home_path
+from sightline.protocol.transports.endpoints import parse_websocket_endpoint
 from sightline.protocol.transports.security import own_token
 from sightline.protocol.transports.websocket.framing import unpack
 
@@ -321,9 +322,11 @@ def _left(cases: Sequence[Case], earlier: Sequence[Result]) -> list[Case]:
     return [case for case in cases if case.id not in done]
 
 
-def _need_endpoint(endpoint: str, example: str) -> None:
+def _need_endpoint(endpoint: str, example: str, legacy: str = "") -> None:
     if not endpoint:
         raise ConfigError(f"no ENDPOINT; write its address, e.g. sightline conform {example}")
+    if legacy and parse_websocket_endpoint(legacy).legacy is None:
+        raise ConfigError(f"invalid --older {legacy}: expected ws-legacy://HOST:PORT, e.g. ws-legacy://127.0.0.1:9091")
 
 
 def _motor_rows(file: Path) -> list[WheelRow]:
@@ -414,7 +417,7 @@ def robot(
     cases = run.chosen(side.CASES)
     if not cases:
         return 0
-    _need_endpoint(endpoint, "robot ws://192.168.1.20:9090")
+    _need_endpoint(endpoint, "robot ws://192.168.1.20:9090", legacy)
     run.check_one_peer({"--older": legacy, "--motor-log": motor_log})
     earlier = run.earlier(cases, "robot", endpoint)
     left = _left(cases, earlier)

@@ -175,6 +175,8 @@ def test_missing_robot_exits_with_4(capsys):
         (["robot", "ws://127.0.0.1:1", "--motor-log", __file__], "line 1: expected t_us,left_rad_s,right_rad_s"),
         (["robot", "ws://127.0.0.1:1", "--resume", "/nowhere/r.jsonl"], "no folder /nowhere"),
         (["robot", "ws://127.0.0.1:1", "--resume", __file__], "line 1: not a result; remove the line"),
+        (["robot", "ws://127.0.0.1:1", "--older", "ftp://127.0.0.1:1"], "invalid endpoint 'ftp://127.0.0.1:1'"),
+        (["robot", "ws://127.0.0.1:1", "--older", "ws://127.0.0.1:1"], "invalid --older ws://127.0.0.1:1: expected"),
         (["vision"], "ENDPOINT"),
         (["robot", "tcp/127.0.0.1"], "expected <protocol>/<host>:<port>"),
         (["robot", "ws://127.0.0.1:1", "--token", "/nowhere/token"], "cannot read --token /nowhere/token"),
