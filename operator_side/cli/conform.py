@@ -1,5 +1,6 @@
 """Commands that test a peer against the protocol: conform robot, vision, codec. Shell."""
 
+import copy
 import functools
 import inspect
 import json
@@ -363,8 +364,11 @@ def _seen_of(bench: LiveBench) -> str:
     return f"its messages are rejected: {rejected}" if rejected else "check --robot, or publish status"
 
 
-def with_run_options(command: Callable[..., int]) -> Callable[..., int]:
-    """Turn `command(..., run=RunOptions)` into a command with an option for each field of RunOptions."""
+def with_run_options(command: Callable[..., int], rejects: Sequence[str] = ()) -> Callable[..., int]:
+    """Turn `command(..., run=RunOptions)` into a command with an option for each field of RunOptions.
+
+    The help does not list the options that the command `rejects`.
+    """
     fields = inspect.signature(RunOptions).parameters
 
     @functools.wraps(command)
@@ -374,10 +378,17 @@ def with_run_options(command: Callable[..., int]) -> Callable[..., int]:
 
     own = [parameter for parameter in inspect.signature(command).parameters.values() if parameter.name != "run"]
     shared = [field.replace(kind=inspect.Parameter.KEYWORD_ONLY) for field in fields.values()]
+    shared = [_unlisted(field) if field.name in rejects else field for field in shared]
     with_options.__signature__ = inspect.Signature([*own, *shared])  # type: ignore[attr-defined]
     with_options.__annotations__ = {parameter.name: parameter.annotation for parameter in (*own, *shared)}
     del with_options.__wrapped__
     return with_options
+
+
+def _unlisted(option: inspect.Parameter) -> inspect.Parameter:
+    kind, shown = option.annotation.__origin__, copy.copy(option.annotation.__metadata__[0])
+    shown.hidden = True
+    return option.replace(annotation=Annotated[kind, shown])
 
 
 def register(app: typer.Typer) -> None:
@@ -385,7 +396,9 @@ def register(app: typer.Typer) -> None:
     group = command_group("Test a robot, vision service or codec against the protocol")
     group.command(epilog="Example: sightline conform robot ws://192.168.1.20:9090")(with_run_options(robot))
     group.command(epilog="Example: sightline conform vision tcp/127.0.0.1:7447")(with_run_options(vision))
-    group.command(epilog="Example: sightline conform codec -- node codec.js")(with_run_options(codec))
+    group.command(epilog="Example: sightline conform codec -- node codec.js")(
+        with_run_options(codec, rejects=("jobs", "start"))
+    )
     app.add_typer(group, name="conform")
 
 

@@ -196,6 +196,13 @@ def test_a_mistake_is_one_line_and_exit_code_2(capsys, arguments, says):
     assert says in err and err.count("\n") == 1
 
 
+@pytest.mark.parametrize("command", ["robot", "vision", "codec"])
+def test_help_lists_no_option_that_the_command_always_rejects(capsys, command):
+    code, out, _ = run(capsys, command, "--help")
+    assert code == 0 and "--resume" in out
+    assert ("--jobs" in out) is ("--start" in out) is (command != "codec")
+
+
 @pytest.mark.parametrize(("send", "seen"), [
     (lambda client: client.close(1011, "the camera is gone"), "; it ends the connection with 1011 the camera is gone"),
     (lambda client: client.send(b'\x1a\x00{"channel":"status","v":1}{}'), "header block of 6656 bytes in a message of"),
