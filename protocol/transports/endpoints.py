@@ -17,8 +17,9 @@ DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 SEND_BUFFER_BYTES: Final = 262_144
 
 ROBOT_ID: Final = re.compile(NAME_PATTERN)
+_IPV6 = r"\[[0-9A-Fa-f:.]+(?:%[0-9A-Za-z_.-]+)?\]"  # after the %, the interface of a link-local address
 _ZENOH_ENDPOINT = re.compile(
-    r"(tcp|tls|quic|udp|ws)/(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]]+):([0-9]{1,5})(\?[^#\s]*)?(#\S*)?"
+    rf"(tcp|tls|quic|udp|ws)/({_IPV6}|[^\s:/?#\[\]]+):([0-9]{{1,5}})(\?[^#\s]*)?(#\S*)?"
 )
 _BUFFERED = ("tcp", "tls")
 OVER_UDP: Final = ("udp", "quic")
@@ -110,7 +111,7 @@ def check_zenoh_endpoints(listen: Sequence[str], connect: Sequence[str]) -> None
 
 
 _WEBSOCKET_ENDPOINT: Final = re.compile(
-    r"(ws|wss|ws-legacy)://(\[[0-9A-Fa-f:.]+\]|[^\s:/?#\[\]@]+):([0-9]{1,5})/?(?:\?([^\s?#]*))?", re.ASCII
+    rf"(ws|wss|ws-legacy)://({_IPV6}|[^\s:/?#\[\]@]+):([0-9]{{1,5}})/?(?:\?([^\s?#]*))?", re.ASCII
 )
 _NEVER_WEBSOCKET: Final = ("tcp", "tls", "quic", "udp")
 _WORDS: Final = ("dashed", "swapped", "nonnegative", "oneline", "boxes")

@@ -123,7 +123,8 @@ def listening_socket(endpoint: WebSocketEndpoint) -> socket.socket:
     """Listen on `endpoint`. Raises LinkError with the cause and the fix."""
     family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET
     try:
-        listening = socket.create_server((endpoint.host, endpoint.port), family=family)
+        place = socket.getaddrinfo(endpoint.host, endpoint.port, family)[0][4]  # with the interface of a link-local one
+        listening = socket.create_server(place, family=family)
     except OSError as error:
         raise _cannot_listen(endpoint, error) from None
     # Accepted sockets inherit it.

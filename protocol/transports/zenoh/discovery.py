@@ -142,13 +142,14 @@ def _statuses(session: zenoh.Session, ending: ExitStack) -> dict[str, Message]:
     return found
 
 
-def _usable(locator: str) -> str:
+def usable_endpoint(locator: str) -> str:
+    """Return the endpoint of a listener that answered, or "" for one that this machine cannot use."""
     text = str(locator).partition("?")[0].partition("#")[0]
     try:
         parse_zenoh_endpoint(text)
     except ConfigError:
         return ""
-    return text
+    return "" if "%" in text else text  # the number of an interface is that of the other machine
 
 
 def find_listeners(seconds: float) -> list[str]:
@@ -167,7 +168,7 @@ def find_listeners(seconds: float) -> list[str]:
         with zenoh.scout(answers, zenoh.WhatAmIMatcher("router"), zenoh.Config.from_json5(json.dumps(config))) as scout:
             time.sleep(seconds)
             hellos = iter(scout.try_recv, None)
-            found = {str(hello.zid): [locator for text in hello.locators if (locator := _usable(text))]
+            found = {str(hello.zid): [locator for text in hello.locators if (locator := usable_endpoint(text))]
                      for hello in hellos}
     except zenoh.ZError:  # no network at all
         return []

@@ -178,9 +178,9 @@ def _session_config(
 ) -> dict[str, Any]:
     return {
         "mode": "router" if listen else "client",
-        "listen": {"endpoints": [with_send_buffer(endpoint) for endpoint in listen], "exit_on_failure": True},
+        "listen": {"endpoints": [_for_zenoh(endpoint) for endpoint in listen], "exit_on_failure": True},
         "connect": {
-            "endpoints": [with_send_buffer(endpoint) for endpoint in connect],
+            "endpoints": [_for_zenoh(endpoint) for endpoint in connect],
             "timeout_ms": -1 if listen else 0 if _tries_each_once(listen, connect) else int(timeout_s * 1000),
             "exit_on_failure": not listen,
             "retry": RETRY,
@@ -190,6 +190,18 @@ def _session_config(
         "timestamping": {"enabled": False},
         "transport": _transport_config(max_sessions, _handshake_ms(listen, connect)),
     }
+
+
+def _for_zenoh(endpoint: str) -> str:
+    """Return the endpoint with its send buffer and with the number of its interface: Zenoh takes no name."""
+    address, _, rest = endpoint.partition("%")
+    name, bracket, port = rest.partition("]")
+    if bracket and not name.isdigit():
+        try:
+            endpoint = f"{address}%{socket.if_nametoindex(name)}{bracket}{port}"
+        except OSError:
+            raise ConfigError(f"{endpoint}: no interface '{name}' on this machine; `ip link` lists them") from None
+    return with_send_buffer(endpoint)
 
 
 def _handshake_ms(listen: Sequence[str], connect: Sequence[str]) -> int:

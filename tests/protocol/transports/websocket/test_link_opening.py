@@ -1,5 +1,6 @@
 """Opening `sightline.v1` over real sockets: endpoints, errors and their messages, and leaving nothing behind."""
 
+import errno
 import gc
 import json
 import os
@@ -17,9 +18,11 @@ from websockets.sync.server import serve
 from sightline.operator_side.setup import keys
 from sightline.protocol.channels import FRAME, TWIST
 from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.endpoints import parse_websocket_endpoint
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.websocket.framing import OTHER_ROBOT
 from sightline.protocol.transports.websocket.link import open_websocket
+from sightline.protocol.transports.websocket.server import listening_socket
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint, free_port
 
@@ -28,6 +31,7 @@ NO_ENDPOINTS = (
     "ws://127.0.0.1:-1", "ws://127.0.0.1:9090 ", "http://127.0.0.1:9090", "WS://127.0.0.1:9090", "ws://a b:9090",
     "ws://127.0.0.1:9090/x", "127.0.0.1:9090", "ws://::1:9090", "ws://127.0.0.1:٧", "ws://me@h:1", "tcp/127.0.0.1:7447",
     "ws://h:1?dashed", "wss://h:1?oneline", f"wss://h.{'a' * 64}:1", "ws://a..b:1",
+    "ws://[fe80::1%]:1",
 )  # fmt: skip
 
 
@@ -87,6 +91,19 @@ def test_missing_answer_raises_in_time():
     with pytest.raises(LinkError, match=re.escape(said)):
         open_websocket("r1", connect=endpoint, timeout_s=0.4)
     assert 0.3 < time.monotonic() - begin_s < 2
+
+
+def test_link_local_address_is_listened_on_at_its_interface(monkeypatch):
+    def create(place, family):
+        opened.append(place)
+        raise OSError(errno.EADDRNOTAVAIL, "")
+
+    opened, place = [], ("fe80::1", 9090, 0, 7)
+    monkeypatch.setattr(socket, "getaddrinfo", lambda host, *_given: [(0, 0, 0, "", place)] * (host == "fe80::1%wlan0"))
+    monkeypatch.setattr(socket, "create_server", create)
+    with pytest.raises(LinkError, match="Cannot assign requested address"):
+        listening_socket(parse_websocket_endpoint("ws://[fe80::1%wlan0]:9090"))
+    assert opened == [place]
 
 
 def test_an_address_of_another_machine_cannot_be_listened_on(tmp_path):

@@ -13,7 +13,13 @@ from sightline.protocol.codec import encode
 from sightline.protocol.messages import Stamp, State, Status
 from sightline.protocol.transports.tokens import DetectorToken, DriverToken, RobotToken, VisionToken
 from sightline.protocol.transports.zenoh import discovery
-from sightline.protocol.transports.zenoh.discovery import Discovered, PresentTokens, discover, find_listeners
+from sightline.protocol.transports.zenoh.discovery import (
+    Discovered,
+    PresentTokens,
+    discover,
+    find_listeners,
+    usable_endpoint,
+)
 from sightline.protocol.transports.zenoh.link import declare_token
 from sightline.protocol.transports.zenoh.presence import MAX_PEERS, PeerInfo, Presence
 from sightline.protocol.transports.zenoh.session import MULTICAST_OFF, multicast_section, open_session, session_config
@@ -67,6 +73,14 @@ def test_network_listener_answers_in_its_own_group_and_never_connects(listen):
     assert section["address"] == "224.0.0.224:7449"  # Zenoh's own is 7446
     assert not any(section["autoconnect"].values())
     assert session_config(listen, (), 1.0)["scouting"]["multicast"] == section
+
+
+@pytest.mark.parametrize(("locator", "endpoint"), [
+    ("tcp/10.0.0.7:7447#so_sndbuf=1", "tcp/10.0.0.7:7447"), ("tcp/[fd00::2]:7447?rel=1", "tcp/[fd00::2]:7447"),
+    ("tcp/[fe80::2%3]:7447", ""), ("unixsock-stream/x", ""),
+])  # fmt: skip
+def test_listener_is_found_at_an_address_that_is_valid_on_this_machine_too(locator, endpoint):
+    assert usable_endpoint(locator) == endpoint
 
 
 def test_empty_network_has_no_listeners():

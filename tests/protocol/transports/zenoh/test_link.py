@@ -21,7 +21,7 @@ from sightline.protocol.transports.endpoints import parse_zenoh_endpoint, with_s
 from sightline.protocol.transports.link import NOT_A_PUT
 from sightline.protocol.transports.zenoh.discovery import discover
 from sightline.protocol.transports.zenoh.link import MAX_KEPT_PUBLISHERS, ZenohLink, open_fleet, open_zenoh
-from sightline.protocol.transports.zenoh.session import open_session
+from sightline.protocol.transports.zenoh.session import open_session, session_config
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_endpoint, free_port
 
@@ -29,7 +29,7 @@ NO_ENDPOINTS = (
     "", "foo", "tcp", "tcp:/x", "tcp/", "tcp/127.0.0.1", "tcp/:7447", "tcp/127.0.0.1:", "tcp/127.0.0.1:0",
     "tcp/127.0.0.1:99999", "tcp/127.0.0.1:65536", "tcp/127.0.0.1:-1", "tcp/127.0.0.1:7447 ", "http://127.0.0.1:7447",
     "TCP/127.0.0.1:7447", "tcp/a b:7447", "tcp/127.0.0.1:7447/x", "127.0.0.1:7447", "tcp/::1:7447", "tcp/127.0.0.1:٧",
-    f"tcp/{'a' * 64}:7447", f"tcp/{'a' * 64}.b:7447", "tcp/a..b:7447", f"tcp/{'é' * 60}:7447",
+    f"tcp/{'a' * 64}:7447", f"tcp/{'a' * 64}.b:7447", "tcp/a..b:7447", f"tcp/{'é' * 60}:7447", "tcp/[fe80::1%]:1",
 )  # fmt: skip
 
 
@@ -50,6 +50,23 @@ def test_well_formed_endpoints_and_their_send_buffer():
     assert with_send_buffer("tcp/h:1") == "tcp/h:1#so_sndbuf=262144"
     assert with_send_buffer("tcp/h:1#iface=wlan0") == "tcp/h:1#iface=wlan0"
     assert with_send_buffer("udp/h:1") == "udp/h:1"
+
+
+@pytest.mark.parametrize(("given", "for_zenoh"), [
+    ("tcp/[fe80::1%wlan0]:7447", "tcp/[fe80::1%7]:7447#so_sndbuf=262144"),
+    ("udp/[fe80::1%wlan0.2]:7447#a=%", "udp/[fe80::1%7]:7447#a=%"),
+    ("tcp/[fe80::1%3]:7447#a", "tcp/[fe80::1%3]:7447#a"), ("tcp/a%b:7447#a", "tcp/a%b:7447#a"),
+])  # fmt: skip
+@pytest.mark.parametrize("end", ["listen", "connect"])
+def test_interface_of_a_link_local_address_is_a_number_for_zenoh(monkeypatch, given, for_zenoh, end):
+    monkeypatch.setattr(socket, "if_nametoindex", {"wlan0": 7, "wlan0.2": 7}.__getitem__)
+    config = session_config(**{"listen": (), "connect": (), "timeout_s": 1.0, end: (given,)})
+    assert config[end]["endpoints"] == [for_zenoh] and parse_zenoh_endpoint(given)[1] in given
+
+
+def test_interface_that_is_absent_is_one_line():
+    with pytest.raises(ConfigError, match=r"tcp/\[fe80::1%none0\]:1: no interface 'none0' on this machine; `ip"):
+        open_session((), ["tcp/[fe80::1%none0]:1"], 1.0)
 
 
 def test_free_port_has_no_owner():
