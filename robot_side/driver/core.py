@@ -19,6 +19,7 @@ from sightline.protocol.messages import (
     RequestHeader,
     ScanHeader,
     Stamp,
+    State,
     Status,
     StreamStatus,
     WireModel,
@@ -180,7 +181,8 @@ class DriverCore:
         """Everything that an operator needs to know why the robot moves or does not."""
         gate, limits, holder = self.gate, self.config.safety, self.gate.holder(now_us)
         return Status(
-            state=gate.state,
+            # Wheels of an earlier process may turn, whatever `applied` is: no STOP may count as carried out.
+            state=gate.state if gate.is_taken else State.FAULT,
             reason=self._reason(),
             holder=LeaseHolder.of(holder.source, holder.session) if holder else None,
             applied=(gate.applied.linear_mps, gate.applied.angular_rad_s),
@@ -225,7 +227,9 @@ class DriverCore:
 
     def _reason(self) -> str:
         stored = f"; not stored for a restart: {self.latch_failed}" if self.latch_failed else ""
-        return (self.gate.reason[: 200 - len(stored)] + stored)[:200]
+        is_known = self.gate.is_taken or self.gate.state is State.FAULT  # of the drive, by the reason of the gate
+        more = stored if is_known else f"; the drive takes no speeds{stored}"
+        return (self.gate.reason[: 200 - len(more)] + more)[:200]
 
     def _battery_v(self, now_us: int) -> float | None:
         volts = self.battery.volts(now_us) if self.battery else None

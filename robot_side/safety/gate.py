@@ -85,7 +85,8 @@ class SafetyGate:
         self.state = State.STOPPED if stopped else State.DISARMED
         self.reason = "STOP was set before the restart" if stopped else "not armed"
         self.applied = STILL
-        self._is_taken = True
+        self.is_taken = True
+        """Whether the drive took the twist of the last step."""
         self._sequence = SequenceRecord()
         self._repeats = RepeatRecord()
         # After so long a silence no command of the holder is in force.
@@ -221,7 +222,7 @@ class SafetyGate:
 
     def note_drive(self, before: Twist, *, is_taken: bool) -> None:
         """Note whether the drive took the twist of the last step. If not, the wheels may still turn as `before` it."""
-        self._is_taken = is_taken
+        self.is_taken = is_taken
         # A failed attempt to leave zero may have reached one wheel of two.
         if not is_taken and before != STILL:
             self.applied = before
@@ -339,7 +340,7 @@ class SafetyGate:
         self._reject_beside_human(who, now_us)
         if self.state not in (State.STOPPED, State.FAULT):
             return f"nothing to reset: {self.state}"
-        if not self._is_taken:
+        if not self.is_taken:
             raise WireError(RejectReason.NOT_ALLOWED, "the drive takes no speeds; see its error in the robot's log")
         if self.applied != STILL:
             raise WireError(RejectReason.NOT_ALLOWED, "the wheels are not at zero yet; repeat the request")

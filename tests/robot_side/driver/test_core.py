@@ -13,6 +13,7 @@ from sightline.protocol.channels import ODOMETRY, REPLY, REQUEST, SCAN, STATUS, 
 from sightline.protocol.codec import decode, decode_ranges, encode
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import (
+    STILL,
     AnswerHeader,
     Echo,
     Holder,
@@ -355,6 +356,20 @@ def test_reason_shows_a_latch_that_is_not_on_disk(reason, why, shown):
     core = core_of()
     core.gate.reason, core.latch_failed = reason, why
     assert status_of(core, NOW_US).reason == shown
+
+
+@pytest.mark.parametrize("state", [State.STOPPED, State.FAULT])
+def test_robot_whose_drive_takes_no_speeds_is_not_shown_as_stopped(state):
+    """Its wheels may turn since an earlier process, which `applied` does not show."""
+    core = core_of()
+    core.gate.stop("STOP") if state is State.STOPPED else core.gate.fault("broken")
+    reason, core.latch_failed = core.gate.reason, "No space"
+    why = "; the drive takes no speeds" if state is State.STOPPED else ""
+    for is_taken, shown, more in ((False, State.FAULT, why), (True, state, "")):
+        core.gate.note_drive(STILL, is_taken=is_taken)
+        status = status_of(core, NOW_US + 10**6 * is_taken)
+        assert (status.state, status.reason) == (shown, f"{reason}{more}; not stored for a restart: No space")
+        assert core.gate.state is state
 
 
 def test_status_shows_the_faults():
