@@ -342,7 +342,7 @@ def _run(setup: NetworkSetup, driver: NetworkEnd) -> None:
             )
         )
         where = ", ".join(config.listen) or "no port of its own"
-        where += f", connected to {', '.join(config.connect)}" if config.connect else ""
+        where += f", connects to {', '.join(config.connect)}" if config.connect else ""
         _log.info("robot %s: on %s, camera %s", config.robot, where, config.camera.kind)
         if reached := reachable_endpoints(config.listen):
             _log.info("robot %s: others reach it at %s", config.robot, ", ".join(reached))
