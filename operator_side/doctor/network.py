@@ -133,18 +133,18 @@ def _probe(host: str, port: int) -> tuple[list[float], str]:
             socket.create_connection((host, port), _PATIENCE_S).close()
         except TimeoutError:
             why = "no reply: firewall, wrong address, or client isolation on the access point"
-            return times_ms, why + neighbor(host)
+            return times_ms, why + neighbor(host, port)
         except socket.gaierror:
             return times_ms, f"host '{host}' does not resolve: check the name or use its IP address"
         except OSError as error:
             why = _UNREACHED.get(error.errno or 0, error.strerror or "unknown")
-            return times_ms, why + (neighbor(host) if error.errno == errno.EHOSTUNREACH else "")
+            return times_ms, why + (neighbor(host, port) if error.errno == errno.EHOSTUNREACH else "")
         times_ms.append((time.monotonic_ns() - begun_ns) / 1e6)
         time.sleep(0.01)
     return times_ms, ""
 
 
-def neighbor(host: str, table: Path = ARP_TABLE) -> str:
+def neighbor(host: str, port: int, table: Path = ARP_TABLE) -> str:
     """Return what the kernel knows of a silent machine on the same network: whether it exists at all."""
     try:
         rows = [line.split() for line in table.read_text().splitlines()[1:]]
@@ -155,7 +155,7 @@ def neighbor(host: str, table: Path = ARP_TABLE) -> str:
     if address not in flags:
         return ""
     if flags[address] & _ARP_COMPLETE:
-        return f"; {address} is on this network, so a firewall blocks it: sudo ufw allow 7447/tcp on that machine"
+        return f"; {address} is on this network, so a firewall blocks it: sudo ufw allow {port}/tcp on that machine"
     return (f"; no machine on this network has {address}: it is off, or the access point isolates its clients "
             "(switch off client isolation, or leave the guest network)")
 

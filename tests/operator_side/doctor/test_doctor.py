@@ -93,14 +93,15 @@ _ARP = "IP address HW type Flags HW address Mask Device\n192.168.1.7 0x1 {} aa:b
 
 
 @pytest.mark.parametrize(("flags", "host", "words"), [
-    ("0x0", "192.168.1.7", "client isolation"), ("0x2", "192.168.1.7", "a firewall blocks"), ("0x2", "192.168.1.8", ""),
+    ("0x0", "192.168.1.7", "client isolation"), ("0x2", "192.168.1.8", ""),
+    ("0x2", "192.168.1.7", "a firewall blocks it: sudo ufw allow 9090/tcp on that"),
     ("0x0", "no-such-name.invalid", ""),
 ])  # fmt: skip
 def test_isolated_client_and_firewall_are_distinguished(tmp_path, flags, host, words):
     (tmp_path / "arp").write_text(_ARP.format(flags))
-    said = between.neighbor(host, tmp_path / "arp")
+    said = between.neighbor(host, 9090, tmp_path / "arp")
     assert words in said and bool(said) is bool(words)
-    assert between.neighbor(host, tmp_path / "absent") == ""
+    assert between.neighbor(host, 9090, tmp_path / "absent") == ""
 
 
 @pytest.mark.parametrize(("offered", "ok", "said"), [
@@ -204,7 +205,7 @@ def test_unreadable_certificates_are_reported_with_the_extra(capsys, tmp_path, m
 
 
 def test_closed_port_and_unknown_host_have_different_fixes(capsys, monkeypatch):
-    monkeypatch.setattr(between, "neighbor", lambda host: "; a firewall blocks it")
+    monkeypatch.setattr(between, "neighbor", lambda *_given: "; a firewall blocks it")
     refused = _checks(capsys, "--peer", free_endpoint())["reach"]
     assert "firewall" not in refused["fix"], "a closed port"
     unknown = _checks(capsys, "--peer", "tcp/no-such-name.invalid:7447")["reach"]
@@ -218,7 +219,7 @@ def test_pages_quote_the_line_of_an_address_without_a_reply(page, monkeypatch):
         raise TimeoutError
 
     monkeypatch.setattr(between.socket, "create_connection", create_connection)
-    monkeypatch.setattr(between, "neighbor", lambda _host: "")
+    monkeypatch.setattr(between, "neighbor", lambda *_given: "")
     (found,) = between.findings("tcp/192.0.2.1:7447", "r1", "")
     text = (Path(__file__).parent.parent.parent.parent / "docs" / page).read_text("utf-8")
     assert f"| `{found.fix}` |" in text
