@@ -219,10 +219,12 @@ def install(
     planned, beside = units.plan(service, program, file, runs_it, units.UNIT_DIR, instances=instances), None
     # A service that cannot start is not installed.
     loaded = load_service(service, file=str(file), environ={}).config if yes or file.exists() else None
+    state_dir = None
     if isinstance(loaded, RobotConfig):
         beside = units.drop_in(loaded, program, file, units.UNIT_DIR)
         if loaded.state_dir != RobotConfig().state_dir:
-            planned = units.with_state_in(planned, loaded.state_dir)
+            state_dir = loaded.state_dir
+            planned = units.with_state_in(planned, state_dir)
     if not yes:
         _show(planned, beside)
         if not file.exists():
@@ -230,6 +232,8 @@ def install(
             typer.echo(f"{file} does not exist yet{second}; create it before --yes", err=True)
         return
     units.check_user(runs_it)
+    if state_dir is not None and not state_dir.is_dir():  # then systemd starts no service
+        raise ConfigError(f"state_dir {state_dir} does not exist; run: sudo install -d -o {runs_it} {state_dir}")
     stale = units.drop_in_path(planned.path.parent)
     if service == "robot" and beside is None and units.take_away(stale):
         typer.echo(f"removed {stale}: the drive of this robot is not gpio")

@@ -322,6 +322,17 @@ def test_both_files_are_written_only_with_yes(car, capsys):
                     ["restart", "sightline-robot.service"]], "one that runs has to go on with the new pins"
 
 
+def test_folder_of_the_stop_latch_that_is_absent_is_not_installed(car, capsys, tmp_path):
+    """systemd fails to start a unit with ReadWritePaths= of a folder that does not exist."""
+    file, units, told = car
+    file.write_text(f'state_dir = "{tmp_path}/state"\n{CAR}')
+    command = ["install", "robot", "--config", str(file), "--user", "pi", "--yes"]
+    assert cli.run(command) == 2 and (list(units.iterdir()), told) == ([], [])
+    assert f"does not exist; run: sudo install -d -o pi {tmp_path}/state\n" in capsys.readouterr().err
+    (tmp_path / "state").mkdir()
+    assert cli.run(command) == 0 and told
+
+
 def test_drop_in_is_removed_for_another_drive(car, capsys):
     file, units, _told = car
     command = ["install", "robot", "--config", str(file), "--user", "pi", "--yes"]
