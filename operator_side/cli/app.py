@@ -220,6 +220,15 @@ def _print_error(line: str, code: int) -> int:
     return code
 
 
+def _open_closed_streams() -> None:
+    """Open the null device in place of each standard stream that is closed, so that no socket takes its number."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            null = os.open(os.devnull, os.O_RDWR)  # gets the lowest number that is free, which is `number`
+            os.set_inheritable(null, True)  # so that the processes of a robot have it too
+            setattr(sys, name, os.fdopen(null, "w" if number else "r"))
+
+
 ABANDONED_THREAD: Final = "abandoned link"
 """Name of a thread that may still open a link when the command has its result: it must not delay the exit."""
 
@@ -227,6 +236,7 @@ ABANDONED_THREAD: Final = "abandoned link"
 def main() -> None:
     """Run the command of this process and exit with its code."""
     code = INTERRUPTED
+    _open_closed_streams()
     with suppress(KeyboardInterrupt):  # a second Ctrl-C, while the first one ends the command
         code = run(sys.argv[1:])
     # After two, a link may be open: threads of Zenoh that call Python abort the process when its interpreter ends.

@@ -194,6 +194,28 @@ def test_two_interrupts_at_once_end_a_command_as_one_does(within):
     assert (done.returncode, done.stdout, done.stderr) == (cli.INTERRUPTED, "shown\n", "")
 
 
+_CLOSED = """
+import os, subprocess, sys
+from sightline.operator_side.cli import app
+def shown(_arguments):
+    print(sys.stdin.read(), file=sys.stderr)
+    print("lost", flush=True)
+    child = "import os; print(*(os.fstat(number).st_rdev == os.stat(os.devnull).st_rdev for number in (0, 2)))"
+    are_null = subprocess.run([sys.executable, "-c", child], stdout=subprocess.PIPE, check=True).stdout
+    with open(sys.argv[1], "wb") as file:
+        file.write(are_null)
+app.run = shown
+app.main()
+"""
+
+
+def test_command_whose_standard_streams_are_closed_has_the_null_device_and_so_have_its_processes(tmp_path):
+    """A robot did not start, and a socket with the number of a stream would take what is printed."""
+    command = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", sys.executable, "-P", "-c", _CLOSED, str(tmp_path / "null")]
+    assert subprocess.run(command, timeout=30, check=False).returncode == 0
+    assert (tmp_path / "null").read_text() == "True True\n"
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "expected"),
     [
