@@ -38,7 +38,7 @@ from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import print_table
 from sightline.protocol.errors import ConfigError, home_path
 from sightline.protocol.log import start_log
-from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, check_zenoh_endpoints, own_stop_addresses
 from sightline.protocol.transports.open import open_link
 from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.plugins import DEVICE_GROUPS
@@ -395,6 +395,11 @@ def _check_names(config: BaseModel) -> None:
     if isinstance(config, RobotConfig):
         from sightline.robot_side.guardian.start import zero_of
 
+        home_path(config.state_dir)
+        own_stop_addresses(config.listen)
+        listen, connect = ([one for one in ends if "://" not in one] for ends in (config.listen, config.connect))
+        if listen or connect or not (config.listen or config.connect):
+            check_zenoh_endpoints(listen, connect)
         for group in DEVICE_GROUPS:
             choice = config.devices[group.key]
             if choice is not None:

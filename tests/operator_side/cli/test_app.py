@@ -227,6 +227,12 @@ def test_command_whose_standard_streams_are_closed_has_the_null_device_and_so_ha
         (["arm", "r1", "--connect"], 2, "see sightline arm --help"),
         (["config", "show", "robot", "--profile"], 2, "see sightline config show --help"),
         (["config", "check", "robto"], 2, "did you mean 'robot'"),
+        *((["config", "check", "robot", "--set", value], 2, why) for value, why in (
+            ("listen=[]", "no endpoint; pass one to listen on"),
+            ("listen=tcp/127.0.0.1:1,tcp/127.0.0.1:1", "tcp/127.0.0.1:1 is listed twice"),
+            ("listen=tcp/0.0.0.0:7448", "its STOP port would be 7449/udp"),
+            ("state_dir=~no-user/x", "no home folder for '~no-user' in ~no-user/x"),
+        )),
         (["config", "check", "robot", "no such file.toml"], 2,
          "no such file.toml: No such file or directory; name a TOML file that you may read"),
         (["config", "check", "vision", "--set", "targt.radius_m=1"], 2, "did you mean 'target.radius_m'"),
@@ -430,6 +436,8 @@ def test_config_commands_print_output_for_scripts(capsys, tmp_path):
     path.write_text('robot = "r9"\n')
     code, out, _ = run(capsys, "config", "check", "robot", str(path))
     assert (code, str(path) in out) == (0, True)
+    for fine in ("listen=ws://127.0.0.1:1", "connect=ws://127.0.0.1:1", "connect=tcp/127.0.0.1:1"):
+        assert run(capsys, "config", "check", "robot", "--set", fine)[::2] == (0, "")
     for fine in ("detector.kind=boxes", "missions.goto.sight_m=0.2", "missions.goto-baseline.max_linear_mps=0.05"):
         assert run(capsys, "config", "check", "vision", "--set", fine)[::2] == (0, "")
     code, out, _ = run(capsys, "config", "show", "robot", str(path), "--origin")
