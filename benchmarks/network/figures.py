@@ -9,7 +9,7 @@ from sightline.benchmarks.loop.figures import WheelCommand, percentile, wheel_ag
 from sightline.benchmarks.network.cases import NetworkCase
 from sightline.benchmarks.network.watch import NOTED
 from sightline.evaluation.checks import Check, at_least, at_most, worst_checks
-from sightline.evaluation.faults.evidence import HELD_US, OLD_US, RAMPED_US
+from sightline.evaluation.faults.evidence import OLD_US, RAMPED_US, held_us
 from sightline.robot_side.safety.limits import TICK_US
 
 _LATE_US: Final = 2 * TICK_US
@@ -32,7 +32,8 @@ def on_old_sight(rows: Sequence[WheelCommand], answers: Sequence[Sequence[int]],
     when even the ramp is at its end, none may turn. Wheels keep a speed without a line, too, and the last one up to
     `until_us`.
     """
-    rows = list(_each_tick(rows, until_us))
+    times_us = held_us([row.t_us for row in rows], 0, until_us)
+    rows = [row._replace(t_us=t_us) for row, each_us in zip(rows, times_us, strict=True) for t_us in each_us]
     ordered, known, youngest_us, lines = sorted(answers, key=lambda one: one[0]), 0, 0, 0
     for before, row in pairwise(rows):
         while known < len(ordered) and ordered[known][0] <= row.t_us + _LATE_US:
@@ -41,14 +42,6 @@ def on_old_sight(rows: Sequence[WheelCommand], answers: Sequence[Sequence[int]],
         age_us = row.t_us - youngest_us
         lines += (age_us > _OLD_US and _is_faster(before, row)) or (age_us > _RAMPED_OUT_US and row.moves)
     return lines
-
-
-def _each_tick(rows: Sequence[WheelCommand], until_us: int) -> Iterator[WheelCommand]:
-    """Yield the lines, and one for each tick of a long pause."""
-    for row, end_us in zip(rows, [*(row.t_us for row in rows[1:]), until_us], strict=False):
-        yield row
-        if end_us - row.t_us > HELD_US:
-            yield from (row._replace(t_us=at_us) for at_us in range(row.t_us + TICK_US, end_us, TICK_US))
 
 
 def _is_faster(before: WheelCommand, row: WheelCommand) -> bool:

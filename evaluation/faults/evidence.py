@@ -5,7 +5,7 @@ It does not trust the software under test. The simulation stamps the motor log, 
 
 import itertools
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -155,15 +155,19 @@ def last_valid_us(sent: Iterable[SentCommand], blind: Blind) -> int | None:
 
 
 def held_rows(rows: Sequence[MotorRow], from_us: int, until_us: int) -> list[MotorRow]:
-    """Add a line for each tick of a pause in the log that begins at `from_us` or later; the log ends at `until_us`.
+    """Add a line for each tick of a pause in the log that begins at `from_us` or later; the log ends at `until_us`."""
+    times_us = held_us([row.t_us for row in rows], from_us, until_us)
+    return [replace(row, t_us=t_us) for row, each_us in zip(rows, times_us, strict=True) for t_us in each_us]
+
+
+def held_us(lines_us: Sequence[int], from_us: int, until_us: int) -> Iterator[Sequence[int]]:
+    """Yield for each line its own time, and each tick of a long pause after it, us.
 
     Motors keep the speed of the last command, so a robot that sets none any more may drive on without a line.
     """
-    held: list[MotorRow] = []
-    for row, end_us in zip(rows, [*(row.t_us for row in rows[1:]), until_us], strict=False):
-        is_held = row.t_us >= from_us and end_us - row.t_us > HELD_US
-        held += [row, *(replace(row, t_us=at_us) for at_us in range(row.t_us + TICK_US, end_us, TICK_US) if is_held)]
-    return held
+    for t_us, end_us in zip(lines_us, [*lines_us[1:], until_us], strict=False):
+        is_held = t_us >= from_us and end_us - t_us > HELD_US
+        yield range(t_us, end_us, TICK_US) if is_held else (t_us,)
 
 
 def moved_on_old_sight(rows: Sequence[MotorRow], sent: Sequence[SentCommand], blind: Blind | None) -> int:
