@@ -38,9 +38,11 @@ from sightline.operator_side.preflight import needs
 from sightline.operator_side.table import print_table
 from sightline.protocol.errors import ConfigError, home_path
 from sightline.protocol.log import start_log
-from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, check_zenoh_endpoints, own_stop_addresses
-from sightline.protocol.transports.open import open_link
+from sightline.protocol.transports.endpoints import DEFAULT_ENDPOINT, own_stop_addresses
+from sightline.protocol.transports.open import check_link, open_link
+from sightline.protocol.transports.security import ROBOT_ROLE
 from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.hardware.cameras.lens import LensConfig
 from sightline.robot_side.plugins import DEVICE_GROUPS
 from sightline.sim.process import SimConfig
 from sightline.sim.robot import load_robot
@@ -397,19 +399,19 @@ def _check_names(config: BaseModel) -> None:
 
         home_path(config.state_dir)
         own_stop_addresses(config.listen)
-        listen, connect = ([one for one in ends if "://" not in one] for ends in (config.listen, config.connect))
-        if listen or connect or not (config.listen or config.connect):
-            check_zenoh_endpoints(listen, connect)
+        check_link(config.doors, config.connect, ROBOT_ROLE, config.secure)
         for group in DEVICE_GROUPS:
             choice = config.devices[group.key]
-            if choice is not None:
-                group.load(choice)
+            options = group.load(choice)[1] if choice else None
+            if isinstance(options, LensConfig):
+                options.given_model()
         zero_of(config)
     if isinstance(config, SimConfig):
         load_robot(config.robot or load_scenario(config.scenario).robot)
     if isinstance(config, VisionConfig):
         with needs("vision"):
             from sightline.vision_side.detect.registry import check_vision
+        check_link(config.listen, config.connect, "vision", config.secure)
         check_vision(config)
 
 

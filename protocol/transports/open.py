@@ -72,6 +72,25 @@ def open_link(
     return links[0] if len(links) == 1 else LinkGroup(links)
 
 
+def check_link(listen: Sequence[str], connect: Sequence[str], role: str, secure: str) -> None:
+    """Raise ConfigError for endpoints, keys or tokens without which `open_link` fails. Opens nothing."""
+    from sightline.protocol.transports.endpoints import check_zenoh_endpoints, parse_websocket_endpoint
+    from sightline.protocol.transports.security import check_listening, load_role_keys, read_tokens
+    from sightline.protocol.transports.websocket.tls import client_tls_context, server_tls_context
+
+    web, zenoh = ([_of_kind(ends, is_web) for ends in (listen, connect)] for is_web in (True, False))
+    if any(zenoh) or not any(web):
+        check_zenoh_endpoints(*zenoh)
+        if keys := load_role_keys(secure, role):
+            keys.check([*zenoh[0], *zenoh[1]])
+    for endpoint in map(parse_websocket_endpoint, web[0]):
+        check_listening(endpoint, {} if endpoint.legacy else read_tokens(secure))
+        if endpoint.secure:
+            server_tls_context(secure, role)
+    if any(parse_websocket_endpoint(text).secure for text in web[1]):
+        client_tls_context(secure)
+
+
 @contextmanager
 def _announced(connect: Sequence[str]) -> Iterator[None]:
     """Log the addresses once if they do not answer soon."""

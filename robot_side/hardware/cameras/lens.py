@@ -27,20 +27,27 @@ class LensConfig(Config):
     model_file: Path | None = None
     model: dict[str, Any] | None = None
 
+    def given_model(self) -> CameraModel | None:
+        """Return the calibrated model, or None without one.
+
+        Raises ConfigError for a file that cannot be read, a field that is wrong or unknown, and both sources at once.
+        """
+        if self.model_file is not None and self.model is not None:
+            raise ConfigError("camera options model and model_file are both set; keep one")
+        if self.model_file is not None:
+            return read_model(self.model_file)
+        return None if self.model is None else _checked(self.model, "camera option model")
+
 
 def camera_model(config: LensConfig, size: JpegSize) -> CameraModel:
     """Return the model of images of `size`.
 
-    Raises ConfigError for a file that cannot be read, a field that is wrong or unknown, both sources at once, and a
-    model that was made at another size: a camera may crop, so nothing is scaled.
+    Raises ConfigError as `given_model`, and for a model of another size: a camera may crop, so nothing is scaled.
     """
-    if config.model_file is not None and config.model is not None:
-        raise ConfigError("camera options model and model_file are both set; keep one")
-    if config.model_file is not None:
-        return _fitting(read_model(config.model_file), size, str(config.model_file))
-    if config.model is not None:
-        return _fitting(_checked(config.model, "camera option model"), size, "camera option model")
-    return guessed_model(size, config.hfov_deg)
+    given = config.given_model()
+    if given is None:
+        return guessed_model(size, config.hfov_deg)
+    return _fitting(given, size, str(config.model_file or "camera option model"))
 
 
 def guessed_model(size: JpegSize, hfov_deg: float) -> CameraModel:

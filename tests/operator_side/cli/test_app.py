@@ -431,6 +431,31 @@ def test_result_with_a_number_that_json_lacks_is_valid_json(capsys, number):
     assert result["checks"][0]["bound"] is None and result["ages_ms"] == [1.5, None]
 
 
+@pytest.mark.parametrize(("service", "given", "why"), [
+    *((service, given, why) for service in ("robot", "vision") for given, why in (
+        ('secure = "/no keys"', "ca.pem is missing in /no keys"),
+        ('secure = "KEYS"\nlisten = ["tcp/127.0.0.1:1"]', "tcp/127.0.0.1:1 has no TLS"),
+        ('listen = ["ws://0.0.0.0:9090"]', "accepts network clients without a token; pass --secure"),
+        ('listen = ["wss://0.0.0.0:9090"]\nconnect = []\nsecure = "KEYS"', None),
+        ('listen = []\nconnect = ["wss://robot:9090"]\nsecure = "/no keys"', "ca.pem contains no certificate"),
+        ('listen = ["tls/0.0.0.0:7447"]\nconnect = []\nsecure = "KEYS"', None),
+    )),
+    ("robot", 'listen = ["ws-legacy://0.0.0.0:9091"]', "list their addresses, legacy.allow_from"),
+    ("robot", 'listen = ["ws-legacy://0.0.0.0:9091"]\nlegacy.allow_from = ["10.0.0.0/8"]', None),
+    *(("robot", f'camera.kind = "v4l2"\ncamera.options.{lens}', why) for lens, why in (
+        ('model_file = "/gone.toml"', "/gone.toml: cannot be read"),
+        ('model_file = "KEYS/ca.pem"', "ca.pem: invalid TOML"),
+        ("model.fx_px = 1.0", "camera option model: key 'width_px' is missing"),
+    )),
+])
+def test_check_finds_keys_endpoints_and_lens_files_that_end_the_service(capsys, tmp_path, service, given, why):
+    keys, path = str(tmp_path / "keys"), tmp_path / "own.toml"
+    run(capsys, "keys", "init", keys)
+    path.write_text(given.replace("KEYS", keys))
+    code, _, err = run(capsys, "config", "check", service, str(path))
+    assert (code, err.count("\n")) == ((0, 0) if why is None else (2, 1)) and (why or "") in err
+
+
 def test_config_commands_print_output_for_scripts(capsys, tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text('robot = "r9"\n')
