@@ -1,5 +1,6 @@
 """`sightline bench detector`, `bench streams` and `bench pipeline`: their checks on invented runs."""
 
+from collections import Counter
 from dataclasses import replace
 from itertools import chain, repeat
 from types import SimpleNamespace
@@ -53,6 +54,22 @@ def test_services_that_answer_to_the_end_pass():
 
 def test_services_that_stop_to_answer_in_the_middle_fail():
     assert failed(load(SECONDS / 2)) == {"offered per answered frame", "longest time without an answer"}
+
+
+@pytest.mark.parametrize("streams", [2, 40, 80])
+def test_rate_with_a_time_for_a_batch_is_bounded_by_what_the_robots_send(streams):
+    plan = StreamPlan(streams=streams, batch_us=5_000)
+    for each_fps, is_enough in ((22.6, True), (22.4, False)):
+        answered = Load(answered=Counter({"s1": round(each_fps * streams * SECONDS)}), seconds=SECONDS)
+        rate = next(check for check in stream_checks(answered, plan) if check.name == "answered per second")
+        assert rate.ok is is_enough
+
+
+@pytest.mark.parametrize("batch_ms", [5, 100])
+def test_age_with_a_time_for_a_batch_is_bounded_by_60_ms_beside_two_batches(batch_ms):
+    for age_ms, is_young in ((60 + 2 * batch_ms, True), (61 + 2 * batch_ms, False)):
+        checks = stream_checks(Load(ages_ms=[age_ms], seconds=1.0), StreamPlan(batch_us=batch_ms * 1000))
+        assert next(check for check in checks if check.name == "age of boxes, p95").ok is is_young
 
 
 class RobotLink:
