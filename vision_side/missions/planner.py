@@ -130,7 +130,7 @@ class Planner:
     def __init__(self, filled: Cells, robot: Point, goal: Point, keep_m: float, roomy_m: float) -> None:
         self.goal = goal
         low, high = _window(filled, robot, goal, roomy_m)
-        self._low, size = low, high - low + 1
+        size = high - low + 1
         self._corner: Cell = (int(low[0]), int(low[1]))
         self._size: Cell = (int(size[0]), int(size[1]))
         self._next: dict[Cell, Cell | None] = {}
