@@ -1,7 +1,7 @@
-# The images from one file: targets robot, vision, sim, keys, examples. compose.yaml runs them together.
+# The images: targets robot, vision, sim, keys, examples. compose.yaml runs them together.
 # Plain multi-stage: works with BuildKit and without.
 
-# --- what every image runs on: a user without rights, and the folders it may write to when they are mounted ----------
+# --- base of all images: a user without rights, and the folders that it may write to when they are mounted ------------
 FROM python:3.11-slim-bookworm AS service
 RUN useradd --uid 10001 --no-create-home --shell /usr/sbin/nologin sightline \
  && install -d -m 0700 -o sightline -g sightline /run/sightline /var/lib/sightline \
@@ -12,14 +12,14 @@ USER sightline
 WORKDIR /tmp
 ENTRYPOINT ["sightline"]
 
-# --- the project as a wheel --------------------------------------------------------------------------------------------
+# --- the project as a wheel -------------------------------------------------------------------------------------------
 FROM python:3.11-slim-bookworm AS build
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_CONSTRAINT=/src/constraints.txt
 WORKDIR /src
 COPY requirements.lock pyproject.toml setup.py README.md LICENSE ./
 # The lock's versions as constraints: an extra of a local package cannot be installed by hash.
 RUN sed -n 's/^\([[:alnum:]].*[^ \\]\) *\\*$/\1/p' requirements.lock > constraints.txt
-# A wheel of the same name and extras without any code: what depends on it is built anew only when the lock changes.
+# A wheel of the same name and extras without code: what depends on it is built again only when the lock changes.
 RUN mkdir sightline protocol robot_side vision_side sim conformance operator_side evaluation training benchmarks \
  && pip wheel --no-deps --wheel-dir /empty .
 
@@ -36,7 +36,7 @@ COPY training training
 COPY benchmarks benchmarks
 RUN pip wheel --no-deps --wheel-dir /dist .
 
-# --- robot: no OpenCV, no NumPy, no PyBullet ---------------------------------------------------------------------------
+# --- robot: no OpenCV, no NumPy, no PyBullet --------------------------------------------------------------------------
 FROM build AS robot-packages
 RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[zenoh,websocket]"
 COPY --from=wheel /dist /dist
@@ -46,11 +46,11 @@ FROM service AS robot
 COPY --from=robot-packages /opt/sightline /opt/sightline
 CMD ["robot"]
 
-# --- what vision and sim have in common: OpenCV, NumPy -----------------------------------------------------------------
+# --- base of vision and sim: OpenCV, NumPy ----------------------------------------------------------------------------
 FROM build AS pictures
 RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[camera]"
 
-# --- vision ------------------------------------------------------------------------------------------------------------
+# --- vision -----------------------------------------------------------------------------------------------------------
 FROM pictures AS vision-packages
 RUN /opt/sightline/bin/pip install "$(echo /empty/*.whl)[vision,websocket,metrics]"
 COPY --from=wheel /dist /dist
@@ -60,7 +60,7 @@ FROM service AS vision
 COPY --from=vision-packages /opt/sightline /opt/sightline
 CMD ["vision"]
 
-# --- sim ---------------------------------------------------------------------------------------------------------------
+# --- sim --------------------------------------------------------------------------------------------------------------
 FROM pictures AS sim-packages
 # PyBullet has a ready-made wheel for x86_64 only; elsewhere pip compiles it, with the NumPy of `pictures` present: without
 # NumPy each image of the simulated camera would be a tuple. No debug symbols, as in environment.py.
@@ -75,7 +75,7 @@ FROM service AS sim
 COPY --from=sim-packages /opt/sightline /opt/sightline
 CMD ["sim"]
 
-# --- keys: makes certificates, speaks to nobody ----------------------------------------------------------------------------
+# --- keys: makes certificates; no network -----------------------------------------------------------------------------
 FROM build AS keys-packages
 RUN python -m venv /opt/sightline && /opt/sightline/bin/pip install "$(echo /empty/*.whl)[secure]"
 COPY --from=wheel /dist /dist
@@ -85,7 +85,7 @@ FROM service AS keys
 COPY --from=keys-packages /opt/sightline /opt/sightline
 CMD ["keys", "--help"]
 
-# --- examples: programs of one's own, with what vision has -----------------------------------------------------------------
+# --- examples: the programs in examples/, on the image of vision ------------------------------------------------------
 FROM vision AS examples
 WORKDIR /opt/examples
 COPY examples/detector_service.py examples/compose/older_client.py ./
