@@ -107,10 +107,10 @@ class RangeSensorMount(Config):
 
 
 class LidarModel(Config):
-    """The range sensor: a lidar over an arc, or several small sensors (`eyes`) merged into one scan.
+    """The range sensor: a lidar over an arc, or several small sensors (`sensors`) merged into one scan.
 
     Rays are evenly spaced from `first_deg` to `last_deg`, counter-clockwise, both ends included; a whole turn leaves
-    out its last, which is its first. With `eyes`, each echo is placed as seen from (`x_m`, 0), and the nearest one per
+    out its last, which is its first. With `sensors`, each echo is placed as seen from (`x_m`, 0), and the nearest one per
     ray counts. A direction that no sensor covers is inf, as free space is.
     """
 
@@ -125,7 +125,7 @@ class LidarModel(Config):
     rate_hz: Annotated[float, Field(gt=0, le=50)]
     noise_m: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Standard deviation of each range."""
-    eyes: Annotated[tuple[RangeSensorMount, ...], Field(max_length=16)] = ()
+    sensors: Annotated[tuple[RangeSensorMount, ...], Field(max_length=16)] = ()
 
     @model_validator(mode="after")
     def _sees_something(self) -> Self:
@@ -190,13 +190,14 @@ def _measure(table: dict[str, Any], path: Path) -> None:
     wheels |= {"radius_m": left.radius_m, "track_m": left.place[1] - right.place[1]}
     foot = body.foot(str(joints[0]), str(joints[1]), front)
     lidar = _table(table, "lidar", path)
-    eyes = lidar.get("eyes", [])
-    if not isinstance(eyes, list):
-        raise ConfigError(f"{path}: `lidar.eyes` is {str(eyes)[:60]!r}, not a list of tables; write `[[lidar.eyes]]`")
-    for sensor in (_table(table, "camera", path), lidar, *(one for one in eyes if isinstance(one, dict))):
+    small = lidar.get("sensors", [])
+    if not isinstance(small, list):
+        raise ConfigError(f"{path}: `lidar.sensors` is {str(small)[:60]!r}, not a list of tables; write "
+                          "`[[lidar.sensors]]`")
+    for sensor in (_table(table, "camera", path), lidar, *(one for one in small if isinstance(one, dict))):
         if sensor.get("link"):
-            is_eye, link = sensor in eyes, str(sensor["link"])
-            _mount(sensor, body.place(link, foot) if is_eye else body.mount(link, foot), is_eye)
+            is_small, link = sensor in small, str(sensor["link"])
+            _mount(sensor, body.place(link, foot) if is_small else body.mount(link, foot), is_small)
 
 
 def _table(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
@@ -206,10 +207,10 @@ def _table(table: dict[str, Any], name: str, path: Path) -> dict[str, Any]:
     return found
 
 
-def _mount(sensor: dict[str, Any], where: Transform, is_eye: bool) -> None:
+def _mount(sensor: dict[str, Any], where: Transform, is_small: bool) -> None:
     """Place a sensor at its link. A single-ray sensor, which lies in the plane of the scan, faces as its link does."""
     sensor["x_m"] = where.at[0]
-    if is_eye:
+    if is_small:
         sensor |= {"y_m": where.at[1], "facing_deg": math.degrees(where.yaw_rad)}
     else:
         sensor["z_m"] = where.at[2]

@@ -36,7 +36,7 @@ class Lidar:
     def scan(self, place: Vector, yaw_rad: float, t_us: int) -> Ranges:
         """One turn at an instant, the sensor at `place`."""
         model = self._model
-        seen = self._merged(place, yaw_rad) if model.eyes else self._cast(place, yaw_rad)
+        seen = self._merged(place, yaw_rad) if model.sensors else self._cast(place, yaw_rad)
         return Ranges(
             t_us=t_us, angle_min_rad=self._first_rad, angle_increment_rad=model.increment_rad,
             range_min_m=model.range_min_m, range_max_m=model.range_max_m, ranges_m=self._measured(seen),
@@ -61,8 +61,8 @@ class Lidar:
         """Merge all single-ray sensors into one scan. Each echo counts in the ray nearest to its direction."""
         model = self._model
         merged = np.full(model.rays, np.inf)
-        for eye in model.eyes:
-            away, angles_rad = self._echoes(eye, place, yaw_rad)
+        for sensor in model.sensors:
+            away, angles_rad = self._echoes(sensor, place, yaw_rad)
             numbers = np.rint((angles_rad - self._first_rad) / model.increment_rad).astype(int)
             if model.last_deg - model.first_deg == 360:
                 numbers %= model.rays
@@ -70,14 +70,14 @@ class Lidar:
             np.minimum.at(merged, numbers[inside], away[inside])
         return merged
 
-    def _echoes(self, eye: RangeSensorMount, place: Vector, yaw_rad: float) -> tuple[Numbers, Numbers]:
+    def _echoes(self, sensor: RangeSensorMount, place: Vector, yaw_rad: float) -> tuple[Numbers, Numbers]:
         """Return the echoes of one single-ray sensor: distance from the origin of the scan, and direction."""
-        half_rad = math.radians(eye.span_deg) / 2
-        angles_rad: Numbers = math.radians(eye.facing_deg) + np.linspace(-half_rad, half_rad, eye.rays)
-        ahead_m, left_m = eye.x_m - self._model.x_m, eye.y_m
+        half_rad = math.radians(sensor.span_deg) / 2
+        angles_rad: Numbers = math.radians(sensor.facing_deg) + np.linspace(-half_rad, half_rad, sensor.rays)
+        ahead_m, left_m = sensor.x_m - self._model.x_m, sensor.y_m
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         at = (place[0] + ahead_m * cos - left_m * sin, place[1] + ahead_m * sin + left_m * cos, place[2])
-        gone = self._distances(at, angles_rad + yaw_rad, eye.reach_m)
+        gone = self._distances(at, angles_rad + yaw_rad, sensor.reach_m)
         echoes = np.isfinite(gone)
         x_m = ahead_m + gone[echoes] * np.cos(angles_rad[echoes])
         y_m = left_m + gone[echoes] * np.sin(angles_rad[echoes])

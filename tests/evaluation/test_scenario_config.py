@@ -58,7 +58,7 @@ def test_the_guard_knows_the_robots_outline_and_its_sensors_dead_zone(name):
     assert guard.front_m >= reach.front_m - 1e-9
     assert guard.rear_m >= reach.rear_m - 1e-9
     assert guard.half_width_m >= reach.half_width_m - 1e-9
-    if not model.lidar.eyes:  # the blind zone must end before the stand-off of the robot
+    if not model.lidar.sensors:  # the blind zone must end before the stand-off of the robot
         assert guard.stop_m > model.lidar.x_m + model.lidar.range_min_m - guard.front_m + 2 * model.lidar.noise_m
 
 

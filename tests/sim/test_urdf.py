@@ -32,8 +32,8 @@ def test_a_robot_whose_front_is_at_minus_x_has_its_sensors_in_front():
 
 
 def test_range_sensors_face_as_their_links_do():
-    eyes = load_robot("thymio").lidar.eyes
-    assert [(round(eye.x_m, 4), round(eye.y_m, 4), round(eye.facing_deg, 3)) for eye in eyes] == [
+    sensors = load_robot("thymio").lidar.sensors
+    assert [(round(one.x_m, 4), round(one.y_m, 4), round(one.facing_deg, 3)) for one in sensors] == [
         (0.077, 0.0, 0.0), (0.065, 0.053, 90.0), (0.065, -0.053, -90.0),
     ]
 
@@ -142,12 +142,12 @@ def test_a_toml_that_does_not_fit_its_urdf_is_one_line_too(tmp_path, old, new, e
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("eyes", ["5", '"x"', "{ link = 'sensor_left' }"])
-def test_range_sensors_that_are_not_a_list_are_one_line(tmp_path, eyes):
+@pytest.mark.parametrize("sensors", ["5", '"x"', "{ link = 'sensor_left' }"])
+def test_range_sensors_that_are_not_a_list_are_one_line(tmp_path, sensors):
     toml = (ROBOTS / "thymio.toml").read_text()
-    toml = toml[: toml.index("[[lidar.eyes]]")]
+    toml = toml[: toml.index("[[lidar.sensors]]")]
     path = tmp_path / "mine.toml"
-    path.write_text(toml.replace("[lidar]", "[lidar]\n" + "=".join(("eyes", eyes))))
+    path.write_text(toml.replace("[lidar]", "[lidar]\n" + "=".join(("sensors", sensors))))
     with pytest.raises(ConfigError, match=r"mine\.toml: .* is .*, not a list of tables; write"):
         load_robot(str(path))
 
