@@ -4,7 +4,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 PYTEST := $(BIN)/python -m pytest
-# Where Python may not store what it compiled, each process compiles all tests anew: half of the time of `make test`.
+# Where Python may not store compiled files, each process compiles all tests again: half of the time of `make test`.
 unexport PYTHONDONTWRITEBYTECODE
 # Two goals run one after the other, also with -j: both change the environment, and both need the whole machine.
 .NOTPARALLEL:
