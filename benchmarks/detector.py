@@ -276,12 +276,12 @@ class _Streams:
         self._sent_us: dict[tuple[str, int], int] = {}
         """Of each frame of each robot. An answer is not trusted: it may cite another time, or no frame at all."""
         self._seq = 0
-        self._said_s = 0.0
+        self._published_s = 0.0
         self.counting = False
         for link in links:
-            link.subscribe(DETECTIONS, self._heard(link.robot))
+            link.subscribe(DETECTIONS, self._on_answer(link.robot))
 
-    def _heard(self, robot: str) -> Callable[[Message], None]:
+    def _on_answer(self, robot: str) -> Callable[[Message], None]:
         seen: deque[int] = deque(maxlen=_REMEMBERED)
 
         def note(message: Message) -> None:
@@ -301,11 +301,11 @@ class _Streams:
 
         return note
 
-    def say(self) -> None:
+    def publish_status(self) -> None:
         """Publish each robot's status, once a second: a robot without one has left."""
-        if time.monotonic() - self._said_s < _STATUS_S:
+        if time.monotonic() - self._published_s < _STATUS_S:
             return
-        self._said_s = time.monotonic() + 1.0 - _STATUS_S if self.counting else time.monotonic()
+        self._published_s = time.monotonic() + 1.0 - _STATUS_S if self.counting else time.monotonic()
         stamp = encode(Stamp(session="0000abcd", seq=self._seq, t_us=monotonic_us()))
         for link in self._links:
             link.publish(STATUS, stamp, encode(Status(state=State.HOLD, reason="bench")))
@@ -365,7 +365,7 @@ def _wait_ready(robots: _Streams, plan: StreamPlan, services: Processes) -> None
     while not (all(counts := [_receives(services, name) for name in services.names]) and sum(counts) >= plan.streams):
         if time.monotonic() > deadline_s:
             raise SightlineError(f"the detector services did not start: they receive the frames of {counts} robots")
-        robots.say()
+        robots.publish_status()
         services.check(_STATUS_S)
 
 
@@ -380,5 +380,5 @@ def _offer(robots: _Streams, streams: int, seconds: float, services: Processes) 
         if index % (streams * _FPS) == 0:
             services.check()
             robots.load.memory_mb.append(resident_mb(services.pid(services.names[0])))
-        robots.say()
+        robots.publish_status()
         robots.frame(index % streams)

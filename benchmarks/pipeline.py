@@ -83,11 +83,11 @@ def time_learned(frames: int = 600) -> LearnedTime:
     pictures, decoder = _pictures(*size), Decoder(*size, size[0] * size[1])
     config = OnnxDetector.Config(device="cpu")
     detector, model = OnnxDetector(config), read_onnx_model(config)
-    asked = [DetectFrame("r1", one.header, one.jpeg, decoder) for one in islice(_frames(pictures), frames)]
+    requested = [DetectFrame("r1", one.header, one.jpeg, decoder) for one in islice(_frames(pictures), frames)]
     pixels = [fit_picture(decoder.decode(jpeg), model.form)[0].copy() for jpeg in pictures]
-    seen = [detector.detect([one], NO_DEADLINE)[0] for one in asked[:_PICTURES]]
+    seen = [detector.detect([one], NO_DEADLINE)[0] for one in requested[:_PICTURES]]
     network_us = _took_us(model.engine.run, islice(cycle(pixels), frames))
-    whole_us = _took_us(lambda one: detector.detect([one], NO_DEADLINE), asked)
+    whole_us = _took_us(lambda one: detector.detect([one], NO_DEADLINE), requested)
     decode_us = _took_us(decoder.decode, islice(cycle(pictures), frames))
     empty = [DetectFrame("r1", one.header, one.jpeg, decoder) for one in islice(_frames(_pictures(*size, 0)), frames)]
     for one in empty:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from sightline.evaluation.processes import ProcessError
 
-_JUDGED: Final = (0, 5)
+_SCORED: Final = (0, 5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class DemoFigure:
 
 
 def measure_demos(
-    scenarios: Sequence[str], seeds: Sequence[int], seconds: float | None, kinds: Kinds, say: Callable[[str], None]
+    scenarios: Sequence[str], seeds: Sequence[int], seconds: float | None, kinds: Kinds, show: Callable[[str], None]
 ) -> list[DemoFigure]:
     """Run every scenario with every seed, for as long as a demo takes if `seconds` is None.
 
@@ -47,7 +47,7 @@ def measure_demos(
     for scenario in scenarios:
         results = []
         for seed in seeds:
-            say(f"{scenario}, seed {seed}")
+            show(f"{scenario}, seed {seed}")
             results.append(_demo(scenario, seed, seconds))
         figures += _figures(scenario, results, kinds)
     return figures
@@ -59,7 +59,7 @@ def _demo(scenario: str, seed: int, seconds: float | None) -> dict[str, Any]:
         arguments = ["demo", "--scenario", scenario, "--seed", str(seed), *lasting, "--out", folder, "--json"]
         command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode not in _JUDGED:
+    if done.returncode not in _SCORED:
         last = done.stderr.strip().rpartition("\n")[2].removeprefix("error: ")
         raise ProcessError(f"demo of {scenario}, seed {seed}: {last}", done.returncode)
     return dict(json.loads(done.stdout.strip().splitlines()[-1]))

@@ -60,12 +60,12 @@ _WAIT_S = 0.03
 """Wait for a frame. Afterwards it reads the labels of the simulation."""
 
 
-def run(robot: str, connect: list[str], secure: str, socket_dir: str, say: Callable[[str], None]) -> int:
+def run(robot: str, connect: list[str], secure: str, socket_dir: str, show: Callable[[str], None]) -> int:
     """Publish until interrupted. Raises HardwareError when the simulation is gone, LinkError as `open_link` does."""
     labels = LabelReader(socket_dir)
     with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
         publisher = LabelPublisher(link, labels)
-        say(f"labels: boxes of robot {robot}'s frames go to detections/{SOURCE}")
+        show(f"labels: boxes of robot {robot}'s frames go to detections/{SOURCE}")
         try:
             while True:
                 publisher.step()

@@ -185,7 +185,7 @@ class Lockstep:
         if scan is not None:
             self._pipeline.put_scan(*decode_scan(scan.header, scan.payload))
         answer = self._pipeline.step(frame) if self._labels is None else self._follow(self._labels, frame.header)
-        self.run.said.append(AnsweredFrame.of(frame.header.t_us, answer.seen))
+        self.run.answers.append(AnsweredFrame.of(frame.header.t_us, answer.seen))
         self._loss.update(frame.header, self._frames.dropped)
         if answer.twist is None:
             return [self._message(frame.header, answer, b"")]

@@ -280,8 +280,8 @@ def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
             yield pool
         except BrokenProcessPool:
             fewer = "; --jobs 1 needs less of it" if jobs > 1 else ""
-            said = f"a worker (of {jobs}) was ended from outside, perhaps as memory ran out{fewer}"
-            raise HardwareError(said) from None
+            ended = f"a worker (of {jobs}) was ended from outside, perhaps as memory ran out{fewer}"
+            raise HardwareError(ended) from None
         except BaseException:
             pool.shutdown(cancel_futures=True)  # waits: the pool's own end would take it back
             raise

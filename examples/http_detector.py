@@ -52,8 +52,8 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
     if scope["type"] != "http":
         return
     body = await _body(receive) if scope["method"] == "POST" else b""
-    status, said = (413, {"error": "too large"}) if body is None else answer(body)
-    data = json.dumps(said).encode()
+    status, content = (413, {"error": "too large"}) if body is None else answer(body)
+    data = json.dumps(content).encode()
     headers = [(b"content-type", b"application/json"), (b"content-length", str(len(data)).encode())]
     await send({"type": "http.response.start", "status": status, "headers": headers})
     await send({"type": "http.response.body", "body": data})

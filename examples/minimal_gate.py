@@ -40,13 +40,13 @@ class Gate:
 
     def offer(self, header: Header, text: bytes, now: int) -> None:
         try:
-            reason = self.judge(header, text, now)
+            reason = self.validate(header, text, now)
         except (KeyError, TypeError, ValueError):
             reason = "MALFORMED"
         self.refused[reason] += bool(reason)
         self.accepted += not reason
 
-    def judge(self, header: Header, text: bytes, now: int) -> str:
+    def validate(self, header: Header, text: bytes, now: int) -> str:
         """The reason of 5.1 that stands against a twist, or "" with the command taken over."""
         match, echo, who = TWIST.fullmatch(text[:65]), header["echo"], (header["source"], header["session"])
         linear, angular = (float(match[1]), float(match[2])) if match else (math.nan, math.nan)

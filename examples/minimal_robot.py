@@ -60,7 +60,7 @@ class Robot:
         self.seq[channel] += 1
         return {"v": 1, "session": SESSION, "seq": self.seq[channel], "t_us": now}
 
-    def hear(self, channel: str, header: Header, payload: bytes) -> Iterator[Message]:
+    def receive(self, channel: str, header: Header, payload: bytes) -> Iterator[Message]:
         """Take in a message; gives the reply, if there is one."""
         with self.lock:
             if channel == "twist":
@@ -106,7 +106,7 @@ def serve_websocket(robot: Robot, port: int) -> None:
 
     busy = threading.Lock()
 
-    def say(connection: ServerConnection, messages: Iterator[Message]) -> None:
+    def send_all(connection: ServerConnection, messages: Iterator[Message]) -> None:
         for channel, header, payload in messages:
             block = json.dumps({"channel": channel, **header}, separators=(",", ":")).encode()  # 14.6
             connection.send(len(block).to_bytes(2, "big") + block + payload)
@@ -119,14 +119,14 @@ def serve_websocket(robot: Robot, port: int) -> None:
         wants = ["twist", "ack", "request"]
         connection.send(json.dumps({"v": 1, "robot": ROBOT, "role": "robot", "session": SESSION, "wants": wants}))
         while True:
-            say(connection, robot.due())
+            send_all(connection, robot.due())
             try:
                 message = connection.recv(timeout=0.005)
             except TimeoutError:
                 continue
             if isinstance(message, bytes):  # a text is a new hello: this robot sends the same in any case
                 try:
-                    say(connection, robot.hear(*unpack(message, hello.get("role", ""))))
+                    send_all(connection, robot.receive(*unpack(message, hello.get("role", ""))))
                 except (KeyError, RecursionError, TypeError, ValueError):
                     robot.gate.refused["MALFORMED"] += 1
 
@@ -156,26 +156,26 @@ def serve_zenoh(robot: Robot, port: int) -> None:
     encoding = {"frame": zenoh.Encoding.IMAGE_JPEG}
 
     with zenoh.open(zenoh.Config.from_json5(json.dumps(config))) as session:
-        def say(messages: Iterator[Message]) -> None:
+        def send_all(messages: Iterator[Message]) -> None:
             for channel, header, payload in messages:
                 session.put(prefix + channel, payload, attachment=json.dumps(header).encode(),
                             encoding=encoding.get(channel, zenoh.Encoding.APPLICATION_JSON),
                             congestion_control=zenoh.CongestionControl.DROP)
 
-        def heard(sample: zenoh.Sample) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
             channel, _, source = str(sample.key_expr).removeprefix(prefix).partition("/")
             try:
                 header = json.loads(sample.attachment.to_bytes()) if sample.attachment else {}
                 if header.get("source") == source:  # 1.3
-                    say(robot.hear(channel, header, sample.payload.to_bytes()))
+                    send_all(robot.receive(channel, header, sample.payload.to_bytes()))
             except (AttributeError, KeyError, RecursionError, TypeError, ValueError):
                 robot.gate.refused["MALFORMED"] += 1
 
-        subscribers = [session.declare_subscriber(f"{prefix}{one}/*", heard) for one in ("twist", "ack", "request")]
+        subscribers = [session.declare_subscriber(f"{prefix}{one}/*", on_sample) for one in ("twist", "ack", "request")]
         frames = session.declare_publisher(prefix + "frame")
         while subscribers:
             if frames.matching_status:  # 3.4: without a subscriber, no frame is sent
-                say(robot.due())
+                send_all(robot.due())
             time.sleep(0.005)
 
 

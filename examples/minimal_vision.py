@@ -60,7 +60,7 @@ class Vision:
     """Answers each frame once: with a twist that cites it, or with an ack (4.5, 7.1)."""
 
     def __init__(self, answer: Answer) -> None:
-        self.answer, self.robot_session, self.last, self.heard_us = answer, "", (-1, -1), 0
+        self.answer, self.robot_session, self.last, self.received_us = answer, "", (-1, -1), 0
         self.over: list[str] = []  # 2.5: earlier sessions of the robot, the newest first
 
     def frame(self, header: Header, jpeg: bytes) -> None:
@@ -68,13 +68,13 @@ class Vision:
         session, now = header["session"], (header["seq"], header["t_us"])
         if header.get("v", 1) != 1 or any(type(one) is not int or not 0 <= one < 2**53 for one in now):  # 2.2, 2.4
             return
-        silent_us = started // 1000 - self.heard_us
+        silent_us = started // 1000 - self.received_us
         newer = now[0] > self.last[0] and 0 < now[1] - self.last[1] <= silent_us + 500_000  # 2.6: nor of the future
         newer |= session not in {self.robot_session, *self.over} or silent_us > 500_000
         twist = look(jpeg) if newer else None
         if newer:
             self.over = [one for one in dict.fromkeys([self.robot_session, *self.over]) if one != session][:8]
-            self.robot_session, self.last, self.heard_us = session, now, started // 1000
+            self.robot_session, self.last, self.received_us = session, now, started // 1000
         echo = {"channel": "frame", **{name: header[name] for name in ("session", "seq", "t_us")}}  # 2.7
         stamp = {"v": 1, "source": SOURCE, "session": SESSION, "seq": next(COUNT), "echo": echo,
                  "compute_us": (time.monotonic_ns() - started) // 1000}

@@ -356,7 +356,7 @@ def _wanted(data: bytes) -> tuple[int, int]:
 
 
 ENCODERS_US, TRUTH_US = 10_000, 20_000
-LAG_TOLD_US = 100_000
+LAG_LOGGED_US = 100_000
 LAG_GIVEN_UP_US = 1_000_000  # after a suspended machine, time is skipped rather than replayed
 
 
@@ -389,7 +389,7 @@ class Simulation:
         self._scans = PeriodicTimer(1e6 / world.robot.lidar.rate_hz)
         self._offset_us = monotonic_us()
         self._lag_us = 0
-        self._told_lag = False
+        self._logged_lag = False
         self.stopping = False
 
     def _hellos(self) -> dict[str, bytes]:
@@ -419,9 +419,9 @@ class Simulation:
         if late_us < 0:
             time.sleep(-late_us / 1e6)
         self._lag_us = max(0, late_us)
-        if self._lag_us > LAG_TOLD_US and not self._told_lag:
+        if self._lag_us > LAG_LOGGED_US and not self._logged_lag:
             _log.info("simulation is %d ms behind the clock; is the machine busy?", self._lag_us // 1000)
-        self._told_lag = self._lag_us > (LAG_TOLD_US // 5 if self._told_lag else LAG_TOLD_US)
+        self._logged_lag = self._lag_us > (LAG_LOGGED_US // 5 if self._logged_lag else LAG_LOGGED_US)
         if self._lag_us > LAG_GIVEN_UP_US:
             self._offset_us += self._lag_us
 

@@ -109,9 +109,9 @@ class RangeSensorMount(Config):
 class LidarModel(Config):
     """The range sensor: a lidar over an arc, or several small sensors (`sensors`) merged into one scan.
 
-    Rays are evenly spaced from `first_deg` to `last_deg`, counter-clockwise, both ends included; a whole turn leaves
-    out its last, which is its first. With `sensors`, each echo is placed as seen from (`x_m`, 0), and the nearest one per
-    ray counts. A direction that no sensor covers is inf, as free space is.
+    Rays are evenly spaced from `first_deg` to `last_deg`, counter-clockwise, with both ends. A full turn omits the
+    last one, which equals the first. With `sensors`, each echo is placed as seen from (`x_m`, 0), and the nearest one
+    per ray counts. A direction that no sensor covers is inf, as free space is.
     """
 
     link: str = ""

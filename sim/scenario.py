@@ -511,7 +511,7 @@ class Start(Config):
     """By how much the seed moves `at_m` along each axis."""
 
     @model_validator(mode="after")
-    def _says_where(self) -> Self:
+    def _names_place(self) -> Self:
         seen_from = {"distance_m", "bearing_deg", "approach_deg"}
         if self.at_m is None and not seen_from <= self.model_fields_set:
             raise ValueError("a start is either at_m, or distance_m, bearing_deg and approach_deg")

@@ -448,7 +448,7 @@ class TrainOptions:
     jobs: int
     validated: int
     """Scenes of each column that choose the thresholds."""
-    judged: int
+    scored: int
     """Scenes of each column that the model card's table is of."""
     start: Weights | None = None
     """Weights that the last round begins from, in place of the rounds before it."""
@@ -468,7 +468,7 @@ def run_training(options: TrainOptions, log: Callable[[str], None], progress: Pr
     model = options.out / MODEL
     written(model, shifted(weights, thresholds))
     log(f"{model}: {model.stat().st_size} bytes; it is being scored on scenes of no training")
-    report = final_report(model, options.judged, progress)
+    report = final_report(model, options.scored, progress)
     digest = hashlib.sha256(model.read_bytes()).hexdigest()
     parameters = sum(int(one.size) for one in weights.values())
     card = Card(options.training, options.scenes, options.device, thresholds, parameters, model.stat().st_size,

@@ -25,7 +25,7 @@ from sightline.evaluation.score.detector_report import (
 )
 from sightline.evaluation.score.detectors import FrameResult, LabelMatches
 from sightline.sim.scenes.model import COLUMNS, HARDER_FROM, LABELS, LATER_FROM, THINGS, VALIDATED_FROM, Column
-from sightline.sim.scenes.textures import JUDGED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED
+from sightline.sim.scenes.textures import SCORED, TRAINED, TRAINED_HARDER, TRAINED_LATER, VALIDATED
 from sightline.training.export import MOST_BOXES, OPSET, onnx_bytes
 from sightline.training.network import INPUT_PX, Weights
 from sightline.training.scenes import SceneSource
@@ -55,8 +55,8 @@ def ball_threshold(columns: Mapping[str, Sequence[FrameResult]]) -> float:
 def _worst(frames: Sequence[FrameResult], least: float) -> float:
     """Return the larger share of false alarms and wrong objects, if only scores from `least` on count."""
     empty = [one for one in frames if not one.has_ball]
-    alarms = sum(one.verdict != "none" and one.score >= least for one in empty)
-    wrong = sum(one.verdict == "wrong object" and one.score >= least for one in frames)
+    alarms = sum(one.outcome != "none" and one.score >= least for one in empty)
+    wrong = sum(one.outcome == "wrong object" and one.score >= least for one in frames)
     return max(alarms / max(1, len(empty)), wrong / max(1, len(frames)))
 
 
@@ -172,7 +172,7 @@ def _scored(card: Card) -> list[str]:
     last = report.first_seed + report.frames - 1
     return [
         f"{report.frames} scenes a column, seeds {report.first_seed} to {last}: floors and walls of the families "
-        f"{_families(JUDGED)}, and light from heights that training never saw. `sightline score detectors onnx:FILE "
+        f"{_families(SCORED)}, and light from heights that training never saw. `sightline score detectors onnx:FILE "
         f"--frames {report.frames} --demand` shows it again (`onnx` is the file that comes along). What it all means: "
         "docs/explanation/learned-detector.md. `ms p50` is of a machine that may have had other work: `sightline bench "
         "pipeline` measures time.", "", markdown(report), "", *_demanded(report),

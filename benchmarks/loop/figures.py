@@ -152,7 +152,7 @@ def joined(samples: Sequence[LoopSample]) -> LoopSample:
 
 
 def course_of_tally(
-    captured_us: Sequence[int], judged_us: Sequence[Sequence[int]], begin_us: int, end_us: int
+    captured_us: Sequence[int], commands_us: Sequence[Sequence[int]], begin_us: int, end_us: int
 ) -> Course:
     """Return the course of a contestant that recorded everything itself.
 
@@ -160,8 +160,8 @@ def course_of_tally(
     answered even with a late result.
     """
     captured = {t_us for t_us in captured_us if begin_us <= t_us < end_us}
-    answered = captured & {t_us for t_us, _ in judged_us}
-    ages_us = tuple((at_us, at_us - t_us) for t_us, at_us in judged_us if begin_us <= at_us < end_us)
+    answered = captured & {t_us for t_us, _ in commands_us}
+    ages_us = tuple((at_us, at_us - t_us) for t_us, at_us in commands_us if begin_us <= at_us < end_us)
     return Course(len(captured), 100 * len(answered) / max(1, len(captured)), ages_us)
 
 
@@ -340,7 +340,7 @@ def figures_of(sample: LoopSample, setting: LoopSetting) -> LoopFigures:
     course, fps = sample.course, sample.course.fps(sample.seconds)
     ages_ms = [age_us / 1000 for _, age_us in course.ages_us]
     parts = _parts(course.ages_us)
-    judged = max(1, len(ages_ms))
+    answers = max(1, len(ages_ms))
     return LoopFigures(
         name=sample.name,
         captured=course.captured,
@@ -356,7 +356,7 @@ def figures_of(sample: LoopSample, setting: LoopSetting) -> LoopFigures:
                          default=None),
         first_ms=parts[0],
         last_ms=parts[1],
-        cpu_ms={name: 1000 * cpu_s / judged for name, cpu_s in sample.cpu_s.items()},
+        cpu_ms={name: 1000 * cpu_s / answers for name, cpu_s in sample.cpu_s.items()},
         memory_mb=dict(sample.memory_mb),
         bytes_per_picture=None if sample.carried_bytes is None else sample.carried_bytes / max(1, course.captured),
         taken_percent=sample.taken_percent,

@@ -80,7 +80,7 @@ class Contestants:
     def course(self, begin_us: int, end_us: int) -> Course:
         """By its own notes."""
         noted = json.loads(self.tally.read_text())
-        return course_of_tally(noted["captured_us"], noted["judged_us"], begin_us, end_us)
+        return course_of_tally(noted["captured_us"], noted["commands_us"], begin_us, end_us)
 
 
 @dataclass(slots=True)
@@ -98,7 +98,7 @@ class Budget:
 
 
 def take_sample(
-    name: str, setting: LoopSetting, folder: Path, budget: Budget, say: Callable[[str], None]
+    name: str, setting: LoopSetting, folder: Path, budget: Budget, show: Callable[[str], None]
 ) -> LoopSample:
     """Return the least disturbed of up to `setting.tries` samples. Raises HardwareError without a start."""
     taken: list[LoopSample] = []
@@ -108,7 +108,7 @@ def take_sample(
         taken.append(_take_one(name, part, folder / f"{name}-{number}", number))
         budget.beside_s = (budget.beside_s + time.monotonic() - began_s - taken[-1].seconds) / 2
         others = taken[-1].taken_percent
-        say(f"{name}: {len(taken[-1].course.ages_us)} answers; others had {others:.1f} % of the machine's time")
+        show(f"{name}: {len(taken[-1].course.ages_us)} answers; others had {others:.1f} % of the machine's time")
         if others <= TAKEN_BOUND_PERCENT:
             break
     budget.samples -= 1
@@ -147,7 +147,7 @@ def _running(name: str, setting: LoopSetting, folder: Path, processes: Processes
     tally, port = folder / "tally.json", free_port()
     settings = json.dumps({
         "width_px": setting.width_px, "height_px": setting.height_px, "delay_ms": setting.detector_delay_ms,
-        "busy_ms": setting.busy_ms, "eyes": "classic" if name == OLDER else "ours",
+        "busy_ms": setting.busy_ms, "vision": "legacy" if name == OLDER else "ours",
         "fps": setting.fps, "pictures": str(setting.pictures), "tally": str(tally), "port": port,
     })
     if name == FLOOR:
@@ -182,7 +182,7 @@ class Race:
     checks: list[Check]
 
 
-def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
+def run_race(setting: LoopSetting, show: Callable[[str], None]) -> Race:
     """Measure every contestant, one after the other, on the same images; `setting.pictures` is filled in.
 
     Raises ConfigError for an unknown transport, HardwareError with its last words for a process that does not run.
@@ -194,13 +194,13 @@ def run_race(setting: LoopSetting, say: Callable[[str], None]) -> Race:
         jpeg_bytes = write_pictures(pictures, setting.width_px, setting.height_px)
         ready = replace(setting, pictures=pictures)
         if setting.overload:
-            ready = overloaded(ready, say)
-        samples = _samples(ready, Path(name), say)
+            ready = overloaded(ready, show)
+        samples = _samples(ready, Path(name), show)
     figures = {one: figures_of(sample, ready) for one, sample in samples.items()}
     return Race(ready, jpeg_bytes, samples, figures, loop_checks(figures, ready))
 
 
-def _samples(setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> dict[str, LoopSample]:
+def _samples(setting: LoopSetting, folder: Path, show: Callable[[str], None]) -> dict[str, LoopSample]:
     """Take a sample of each contestant.
 
     They take turns, because the results are differences, and a shared machine changes its clock from minute to minute.
@@ -213,5 +213,5 @@ def _samples(setting: LoopSetting, folder: Path, say: Callable[[str], None]) -> 
     taken: list[dict[str, LoopSample]] = []
     while len(taken) < turns and (not taken or budget.seconds() >= _LEAST_SAMPLE_S):
         turn = folder / f"turn-{len(taken)}"
-        taken.append({one: take_sample(one, part, turn, budget, say) for one in setting.contestants})
+        taken.append({one: take_sample(one, part, turn, budget, show) for one in setting.contestants})
     return {one: joined([samples[one] for samples in taken]) for one in setting.contestants}

@@ -83,7 +83,7 @@ class Watch:
     taken_percent: float
 
 
-def measure_watchers(setting: LoopSetting, viewers: int, say: Callable[[str], None]) -> list[Check]:
+def measure_watchers(setting: LoopSetting, viewers: int, show: Callable[[str], None]) -> list[Check]:
     """Run `setting.seconds` without, and again with `viewers` (2 to 12); `setting.pictures` is filled in.
 
     Taken again, `setting.tries` times at most, while others have the machine. Raises ConfigError for an unknown
@@ -97,18 +97,18 @@ def measure_watchers(setting: LoopSetting, viewers: int, say: Callable[[str], No
         for number in range(setting.tries):
             folder = Path(name) / str(number)
             folder.mkdir()
-            pairs.append(_measure(ready, viewers, folder, say))
+            pairs.append(_measure(ready, viewers, folder, show))
             if not any(map(_is_disturbed, pairs[-1])):
                 break
         return _checks(ready.fps, *min(pairs, key=lambda pair: max(one.taken_percent for one in pair)))
 
 
-def _measure(setting: LoopSetting, viewers: int, folder: Path, say: Callable[[str], None]) -> tuple[Watch, Watch]:
+def _measure(setting: LoopSetting, viewers: int, folder: Path, show: Callable[[str], None]) -> tuple[Watch, Watch]:
     with Processes(folder, oldest_first=True) as processes, running_services(setting, folder, processes) as ours:
         alone = _stretch(ours, {}, setting.seconds)
-        say(f"without viewers: others had {alone.taken_percent:.1f} % of the machine's time")
+        show(f"without viewers: others had {alone.taken_percent:.1f} % of the machine's time")
         crowded = _stretch(ours, start_viewers(processes, ours.endpoint, viewers), setting.seconds)
-        say(f"with {viewers} viewers: others had {crowded.taken_percent:.1f} %")
+        show(f"with {viewers} viewers: others had {crowded.taken_percent:.1f} %")
         processes.check()
         processes.end()
         return _watch(ours, alone), _watch(ours, crowded)

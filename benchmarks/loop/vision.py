@@ -85,11 +85,11 @@ _STEPS: Final = 60
 _FRAME_US: Final = 33_333
 
 
-def overloaded(setting: LoopSetting, say: Callable[[str], None]) -> LoopSetting:
+def overloaded(setting: LoopSetting, show: Callable[[str], None]) -> LoopSetting:
     """Return `setting` with the rate, or the detector's time, for its `overload`. Its images are written."""
     step_ms = _step_ms(PipelineVision(setting.width_px, setting.height_px), setting.pictures)
     found = with_overload(setting, step_ms)
-    say(f"overload {setting.overload:g}: one step takes {step_ms:.2f} ms; {found.fps:g} pictures a second, "
+    show(f"overload {setting.overload:g}: one step takes {step_ms:.2f} ms; {found.fps:g} pictures a second, "
         + (f"each detector works {found.busy_ms:.1f} ms" if found.busy_ms else "detectors as they are"))
     return found
 
@@ -102,13 +102,13 @@ def with_overload(setting: LoopSetting, step_ms: float) -> LoopSetting:
     return replace(setting, busy_ms=1000 * setting.overload / setting.fps)
 
 
-def _step_ms(eyes: PipelineVision, pictures: Path) -> float:
+def _step_ms(vision: PipelineVision, pictures: Path) -> float:
     """Median, without pauses: who is overloaded never pauses."""
     jpegs = [path.read_bytes() for path in sorted(pictures.glob("*.jpg"))]
     took_ms = []
     for number in range(_STEPS):
         began_ns = time.perf_counter_ns()
-        eyes.answer((number + 1) * _FRAME_US, jpegs[number % len(jpegs)])
+        vision.answer((number + 1) * _FRAME_US, jpegs[number % len(jpegs)])
         took_ms.append((time.perf_counter_ns() - began_ns) / 1e6)
     return median(took_ms)
 
@@ -121,7 +121,7 @@ def _step_ms(eyes: PipelineVision, pictures: Path) -> float:
 _WAIT_S = 0.2
 
 
-def _say(line: str) -> None:
+def _show(line: str) -> None:
     print(line, flush=True)
 
 
@@ -129,7 +129,7 @@ class TappedService(Service):
     """Remembers the header of every frame it was given, and its own commands."""
 
     def __init__(self, config: VisionConfig, link: Link, delay_ms: float, busy_ms: float) -> None:
-        super().__init__(config, link, _say, delayed_detector(config, delay_ms, busy_ms))
+        super().__init__(config, link, _show, delayed_detector(config, delay_ms, busy_ms))
         self.headers: list[bytes] = []
         self.commands: list[tuple[int, str]] = []
 

@@ -82,7 +82,7 @@ class Stretch:
     """One phase as it went: `[begin_us, end_us)`, bounds in force from `judged_us`."""
 
     begin_us: int
-    judged_us: int
+    bounded_us: int
     end_us: int
 
 
@@ -114,15 +114,15 @@ def figures_of(
     notes: Mapping[str, Sequence[Sequence[Any]]], rows: Sequence[WheelCommand], stretch: Stretch
 ) -> NetworkFigures:
     """Compute the figures of `stretch`. `rows` are the wheel commands of the whole run."""
-    frames = [row for row in notes["frames"] if stretch.judged_us <= row[1] < stretch.end_us]
+    frames = [row for row in notes["frames"] if stretch.bounded_us <= row[1] < stretch.end_us]
     statuses = [dict(zip(NOTED, row, strict=True)) for row in notes["statuses"]]
-    inside = [one for one in statuses if stretch.judged_us <= one["t_us"] < stretch.end_us]
-    seconds = (stretch.end_us - stretch.judged_us) / 1e6
+    inside = [one for one in statuses if stretch.bounded_us <= one["t_us"] < stretch.end_us]
+    seconds = (stretch.end_us - stretch.bounded_us) / 1e6
     never_ms = [float("inf")] * (inside[-1]["stale"] - inside[0]["stale"] if inside else 0)
     headers = [(row[0], row[1], row[2]) for row in notes["frames"]]
     moving_us = [row.t_us for row in rows if row.moves]
-    ages = [age for age in wheel_ages(headers, moving_us) if stretch.judged_us <= age.set_us < stretch.end_us]
-    moving = {t_us // _TENTH_US for t_us in moving_us if stretch.judged_us <= t_us < stretch.end_us}
+    ages = [age for age in wheel_ages(headers, moving_us) if stretch.bounded_us <= age.set_us < stretch.end_us]
+    moving = {t_us // _TENTH_US for t_us in moving_us if stretch.bounded_us <= t_us < stretch.end_us}
     ages_ms = [*(age.age_us / 1000 for age in ages), *never_ms]
     return NetworkFigures(
         p50_ms=percentile(ages_ms, 50),

@@ -66,7 +66,7 @@ class GatedRobot(PlayedRobot):
         self.core.on_issued(seq, t_us, 0)
         self._sent_us.append(t_us)
 
-    def _say(self, at_us: int) -> None:
+    def _publish(self, at_us: int) -> None:
         with self._lock:
             self.core.stream = self._network_core.status(at_us)
             messages = list(self.core.messages(at_us))

@@ -85,7 +85,7 @@ class PlayedRobot:
             self._see(at_us)
         if at_us >= self._status_due_us:
             self._status_due_us = at_us + _STATUS_US
-            self._say(at_us)
+            self._publish(at_us)
         return min(self._due_us, self._status_due_us)
 
     def _see(self, at_us: int) -> None:
@@ -103,7 +103,7 @@ class PlayedRobot:
     def _on_sent(self, seq: int, t_us: int) -> None:
         """Note a frame before it leaves."""
 
-    def _say(self, at_us: int) -> None:
+    def _publish(self, at_us: int) -> None:
         self._statuses += 1
         with self._lock:
             stream = self._network_core.status(at_us)

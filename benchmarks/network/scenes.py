@@ -331,8 +331,8 @@ def medium(row: NetworkCase, stage: Stage) -> NetworkRun:
 def _medium_run(row: NetworkCase, stage: Stage, rig: RobotFixture) -> NetworkRun:
     assert rig.wire is not None
     before = rig.wire.shape(stage.seeded(row.phases[0].shapes))
-    ledger = rig.folder / "person.ledger"
-    arguments = [rig.endpoint, ROBOT, str(ledger), str(stage.setting.seconds), str(stage.seed)]
+    event_log = rig.folder / "person.events"
+    arguments = [rig.endpoint, ROBOT, str(event_log), str(stage.setting.seconds), str(stage.seed)]
     rig.processes.start("person", arguments, module="sightline.benchmarks.network.stop_client",
                         namespace=rig.wire.far_side)
     rig.processes.wait_line("person", "person ready")
@@ -340,23 +340,23 @@ def _medium_run(row: NetworkCase, stage: Stage, rig: RobotFixture) -> NetworkRun
         last = rig.processes.log("person").read_text("utf-8").strip()[-200:]
         raise HardwareError(f"the operator process failed: {last}")
     injected = rig.wire.shape(LinkShapes()) - before
-    told_us = [one.t_us for one in rig.noted("person", REQUESTED)]
+    sent_us = [one.t_us for one in rig.noted("person", REQUESTED)]
     rows = rig.motors()
     checks = (
         at_least("injected", float(injected), "", 1.0),
-        *stop_checks_of(rows, told_us, [one.t_us for one in rig.noted("person", RESET)]),
-        reported_check(told_us, [one.frame_us for one in rig.noted("person", STOPPED)]),
+        *stop_checks_of(rows, sent_us, [one.t_us for one in rig.noted("person", RESET)]),
+        reported_check(sent_us, [one.frame_us for one in rig.noted("person", STOPPED)]),
         at_most("moved on frames over 400 ms", moved_on_old_sight(rows, rig.sent(), None), "lines", 0),
     )
-    return NetworkRun(row, stage.seed, injected, (), checks, {"stops": len(told_us)})
+    return NetworkRun(row, stage.seed, injected, (), checks, {"stops": len(sent_us)})
 
 
-def stop_checks_of(rows: Sequence[MotorRow], told_us: Sequence[int], reset_us: Sequence[int]) -> Sequence[Check]:
+def stop_checks_of(rows: Sequence[MotorRow], sent_us: Sequence[int], reset_us: Sequence[int]) -> Sequence[Check]:
     """Check the times from each STOP, sent at `told_us`, to the motor commands and to zero speed. Each must last until
     the wheels turn after its reset.
     """
     ends_us = [_again_us(rows, at_us) for at_us in reset_us]
-    pairs = list(zip(told_us, ends_us, strict=True))
+    pairs = list(zip(sent_us, ends_us, strict=True))
     reached = [reached_ms(_window(rows, at_us, end_us), at_us) for at_us, end_us in pairs]
     zero = [measure_stop(rows, at_us, end_us).zero_ms for at_us, end_us in pairs]
     return (
@@ -365,10 +365,10 @@ def stop_checks_of(rows: Sequence[MotorRow], told_us: Sequence[int], reset_us: S
     )
 
 
-def reported_check(told_us: Sequence[int], stopped_us: Sequence[int]) -> Check:
+def reported_check(sent_us: Sequence[int], stopped_us: Sequence[int]) -> Check:
     """Check the time from each STOP to the first status that reports STOPPED."""
-    delays_ms = [(stop_us - at_us) / 1000 for at_us, stop_us in zip(told_us, stopped_us, strict=False)]
-    value = percentile(delays_ms, 99) if len(stopped_us) == len(told_us) else None
+    delays_ms = [(stop_us - at_us) / 1000 for at_us, stop_us in zip(sent_us, stopped_us, strict=False)]
+    value = percentile(delays_ms, 99) if len(stopped_us) == len(sent_us) else None
     return at_most(f"robot reports STOPPED, p99 of {len(delays_ms)}", value, "ms", REPORTED_MS)
 
 
@@ -383,7 +383,7 @@ def _window(rows: Sequence[MotorRow], begin_us: int, end_us: int) -> list[MotorR
     return [*before[-1:], *(row for row in rows if begin_us < row.t_us <= end_us)]
 
 
-def reached_ms(window: Sequence[MotorRow], told_us: int) -> float | None:
+def reached_ms(window: Sequence[MotorRow], sent_us: int) -> float | None:
     """Return the time from STOP to the fall after which the wheels stayed at zero, ms, or None."""
     zero = 1 + max((index for index, row in enumerate(window) if wheel_mps(row) > 0), default=-1)
     if zero == len(window):
@@ -391,7 +391,7 @@ def reached_ms(window: Sequence[MotorRow], told_us: int) -> float | None:
     first = zero
     while first > 1 and wheel_mps(window[first - 2]) > wheel_mps(window[first - 1]):
         first -= 1
-    return max(0, window[first].t_us - told_us) / 1000
+    return max(0, window[first].t_us - sent_us) / 1000
 
 
 def _p99(values: Sequence[float | None]) -> float | None:

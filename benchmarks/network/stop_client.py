@@ -26,7 +26,7 @@ _PAUSE_S: Final = 0.2, 0.8
 """Between driving and STOP, drawn: a STOP meets the video in every phase."""
 
 
-def run(endpoint: str, robot: str, ledger: EventLog, seconds: float, seed: int) -> None:
+def run(endpoint: str, robot: str, event_log: EventLog, seconds: float, seed: int) -> None:
     """Until the time is over. Raises LinkError when the robot does not answer."""
     chance = Random(seed)
     with open_zenoh(robot, connect=[endpoint], role=SOURCE, timeout_s=15) as link:
@@ -37,21 +37,21 @@ def run(endpoint: str, robot: str, ledger: EventLog, seconds: float, seed: int) 
         while time.monotonic() < end_s:
             _until(operator, _drives)
             time.sleep(chance.uniform(*_PAUSE_S))
-            ledger.note(REQUESTED)
+            event_log.note(REQUESTED)
             operator.stop(lambda: print("a STOP took over 300 ms to be confirmed", flush=True))
             assert operator.report is not None
-            ledger.note(STOPPED, operator.report.stamp.t_us)
+            event_log.note(STOPPED, operator.report.stamp.t_us)
             _until(operator, lambda status: not any(status.applied))
-            ledger.note(RESET)
+            event_log.note(RESET)
             _agreed(lambda: operator.request(Verb.RESET))
             _agreed(lambda: operator.arm(_PATIENCE_S))
     print("person done", flush=True)
 
 
-def _agreed(ask: Callable[[], Reply]) -> None:
+def _agreed(send: Callable[[], Reply]) -> None:
     """Repeat a request that the robot rejects as too old, because the medium is full."""
     deadline_s = time.monotonic() + _PATIENCE_S
-    while not (reply := ask()).ok:
+    while not (reply := send()).ok:
         if not reply.detail.startswith(RejectReason.STALE) or time.monotonic() > deadline_s:
             raise SystemExit(f"the robot rejected the request: {reply.detail}")
 

@@ -34,7 +34,7 @@ class Notes:
         self.frames: list[tuple[bytes, int]] = []
         self.statuses: list[tuple[bytes, bytes]] = []
         self.twists: list[tuple[int, bytes]] = []
-        self.heard = threading.Event()
+        self.received = threading.Event()
 
     def frame(self, message: Message) -> None:
         """Store only the header and the size of a frame."""
@@ -47,7 +47,7 @@ class Notes:
     def status(self, message: Message) -> None:
         """Kept undecoded: decoding is for the end."""
         self.statuses.append((message.header, message.payload))
-        self.heard.set()
+        self.received.set()
 
     def decoded(self) -> dict[str, list[tuple[Any, ...]]]:
         """Return the contents of the file."""
@@ -88,7 +88,7 @@ def main(endpoint: str, path: Path, only: str = "") -> None:
             link.subscribe(FRAME, notes.frame)
             if not secure:
                 link.subscribe(TWIST, notes.twist)
-        notes.heard.wait()
+        notes.received.wait()
         print("watching", flush=True)
         while not ending.wait(0.1):
             pass

@@ -47,13 +47,13 @@ def _part(peer: ModuleType, role: str, vision: str, settings: dict[str, Any]) ->
 
 def _vision(settings: dict[str, Any]) -> Vision:
     """A robot has no use for any, and they are large; nor has a peer with its own for what ours import and set."""
-    if settings["eyes"] == "classic":
+    if settings["vision"] == "legacy":
         from sightline.benchmarks.peers.classic_detector import ClassicVision
 
         return ClassicVision(settings["delay_ms"], settings["busy_ms"])
-    from sightline.benchmarks.loop.vision import PipelineVision as OurEyes
+    from sightline.benchmarks.loop.vision import PipelineVision as OurVision
 
-    return OurEyes(settings["width_px"], settings["height_px"], settings["delay_ms"], settings["busy_ms"])
+    return OurVision(settings["width_px"], settings["height_px"], settings["delay_ms"], settings["busy_ms"])
 
 
 def _end(tally: Tally) -> None:

@@ -53,7 +53,7 @@ class Tally:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._captured_us: list[int] = []
-        self._judged_us: list[tuple[int, int]] = []
+        self._commands_us: list[tuple[int, int]] = []
         self.hot_us: float | None = None
         """Median of one step without pacing, where it was measured."""
 
@@ -61,13 +61,13 @@ class Tally:
         """Note that an image was captured at `t_us`."""
         self._captured_us.append(t_us)
 
-    def judge(self, t_us: int) -> None:
+    def validate(self, t_us: int) -> None:
         """Note that the answer to the image of `t_us` is parsed and ready for the motors."""
-        self._judged_us.append((t_us, monotonic_us()))
-        if len(self._judged_us) == 1:
+        self._commands_us.append((t_us, monotonic_us()))
+        if len(self._commands_us) == 1:
             print("first answer", flush=True)
 
     def save(self) -> None:
         """Write everything to the file."""
-        record = {"captured_us": self._captured_us, "judged_us": self._judged_us, "hot_us": self.hot_us}
+        record = {"captured_us": self._captured_us, "commands_us": self._commands_us, "hot_us": self.hot_us}
         self._path.write_text(json.dumps(record))

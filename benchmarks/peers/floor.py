@@ -14,20 +14,20 @@ if TYPE_CHECKING:
 _HOT_STEPS: Final = 150
 
 
-def alone(film: RecordedFrames, eyes: Vision, tally: Tally, *, hot: bool) -> None:
+def alone(film: RecordedFrames, detector: Vision, tally: Tally, *, hot: bool) -> None:
     """Answer images at their pace for ever; before that, `hot` measures steps without any pause."""
     if hot:
-        tally.hot_us = statistics.median(_step_us(film, eyes) for _ in range(_HOT_STEPS))
+        tally.hot_us = statistics.median(_step_us(film, detector) for _ in range(_HOT_STEPS))
     while True:
         time.sleep(film.next_in_s())
         t_us, jpeg = film.shoot()
         tally.capture(t_us)
-        parse_twist(eyes.answer(t_us, jpeg).encode())
-        tally.judge(t_us)
+        parse_twist(detector.answer(t_us, jpeg).encode())
+        tally.validate(t_us)
 
 
-def _step_us(film: RecordedFrames, eyes: Vision) -> float:
+def _step_us(film: RecordedFrames, detector: Vision) -> float:
     t_us, jpeg = film.shoot()
     began_ns = time.perf_counter_ns()
-    eyes.answer(t_us, jpeg)
+    detector.answer(t_us, jpeg)
     return (time.perf_counter_ns() - began_ns) / 1000

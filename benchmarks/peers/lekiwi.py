@@ -52,10 +52,10 @@ def _read_command(commands: Socket, tally: Tally) -> None:
     except zmq.Again:
         return
     float(command["x.vel"]), float(command["theta.vel"])
-    tally.judge(command["t_us"])
+    tally.validate(command["t_us"])
 
 
-def vision(eyes: Vision, port: int) -> None:
+def vision(detector: Vision, port: int) -> None:
     """Answer the newest image of the robot at `port`."""
     context = zmq.Context()
     commands = _socket(context, zmq.PUSH, zmq.CONFLATE, 1)
@@ -65,7 +65,7 @@ def vision(eyes: Vision, port: int) -> None:
     while True:
         header, jpeg = _newest(observations)
         t_us = json.loads(header)["t_us"]
-        linear, angular = eyes.answer(t_us, jpeg).split("|")
+        linear, angular = detector.answer(t_us, jpeg).split("|")
         commands.send_string(json.dumps({"t_us": t_us, "x.vel": float(linear), "theta.vel": float(angular)}))
 
 

@@ -38,7 +38,7 @@ class RepeatedCommand:
                 done = command
                 linear, angular, t_us = command.split("|")
                 float(linear), float(angular)
-                self._tally.judge(int(t_us))
+                self._tally.validate(int(t_us))
 
 
 def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
@@ -50,12 +50,12 @@ async def _serve(film: RecordedFrames, tally: Tally, port: int) -> None:
     clients: set[ServerConnection] = set()
     wheels = RepeatedCommand(tally)
 
-    async def hear(client: ServerConnection) -> None:
+    async def receive(client: ServerConnection) -> None:
         clients.add(client)
         async for text in client:
             wheels.command = str(text)
 
-    async with serve(hear, "127.0.0.1", port):
+    async with serve(receive, "127.0.0.1", port):
         odd = False
         while True:
             await asyncio.sleep(film.next_in_s())
@@ -80,7 +80,7 @@ class Newest:
             self.text, self.processed = str(message), False
 
 
-def vision(eyes: Vision, port: int) -> None:
+def vision(detector: Vision, port: int) -> None:
     """Answer the robot at `port`."""
     connection = connect(f"ws://127.0.0.1:{port}", compression=None)
     newest = Newest(connection)
@@ -89,5 +89,5 @@ def vision(eyes: Vision, port: int) -> None:
             continue
         stamp, _, picture = newest.text.partition(" ")
         newest.processed = True
-        answer = eyes.answer(int(stamp), base64.decodebytes(picture.encode()))
+        answer = detector.answer(int(stamp), base64.decodebytes(picture.encode()))
         connection.send(f"{answer}|{stamp}")

@@ -33,20 +33,20 @@ def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
         connection.send(STAMP.pack(t_us) + jpeg)
         answer = connection.recv()
         ANSWER.unpack(answer if isinstance(answer, bytes) else answer.encode())
-        tally.judge(t_us)
+        tally.validate(t_us)
 
 
-def vision(eyes: Vision, port: int) -> None:
+def vision(detector: Vision, port: int) -> None:
     """Serve answers at `port`."""
-    asyncio.run(_serve(eyes, port))
+    asyncio.run(_serve(detector, port))
 
 
-async def _serve(eyes: Vision, port: int) -> None:
+async def _serve(detector: Vision, port: int) -> None:
     async def handle(connection: ServerConnection) -> None:
         async for message in connection:
             data = message if isinstance(message, bytes) else message.encode()
             (t_us,) = STAMP.unpack_from(data)
-            linear, angular = eyes.answer(t_us, data[STAMP.size :]).split("|")
+            linear, angular = detector.answer(t_us, data[STAMP.size :]).split("|")
             await connection.send(ANSWER.pack(t_us, float(linear), float(angular)))
 
     async with serve(handle, "127.0.0.1", port, compression=None, max_size=None) as server:

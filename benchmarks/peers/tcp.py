@@ -36,15 +36,15 @@ def _listen(lines: IO[bytes], tally: Tally) -> None:
     for line in lines:
         linear, angular, t_us = line.split(b"|")
         float(linear), float(angular)
-        tally.judge(int(t_us))
+        tally.validate(int(t_us))
 
 
-def vision(eyes: Vision, port: int) -> None:
+def vision(detector: Vision, port: int) -> None:
     """Answer the robot at `port`."""
     connection = socket.create_connection(("127.0.0.1", port))
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     frames = connection.makefile("rb")
     while True:
         size, t_us = HEAD.unpack(frames.read(HEAD.size))
-        answer = eyes.answer(t_us, frames.read(size))
+        answer = detector.answer(t_us, frames.read(size))
         connection.sendall(f"{answer}|{t_us}\n".encode())

@@ -46,7 +46,7 @@ def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
     def on_command(sample: zenoh.Sample) -> None:
         linear, angular, t_us = sample.payload.to_string().split("|")
         float(linear), float(angular)
-        tally.judge(int(t_us))
+        tally.validate(int(t_us))
 
     with _session("listen", port) as session:
         session.declare_subscriber("peer/twist", on_command)
@@ -61,36 +61,36 @@ def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
 class _Answers:
     """Computes and publishes the answer to an image."""
 
-    def __init__(self, eyes: Vision, session: zenoh.Session) -> None:
-        self._eyes = eyes
+    def __init__(self, detector: Vision, session: zenoh.Session) -> None:
+        self._detector = detector
         self._commands = session.declare_publisher("peer/twist")
 
     def send(self, sample: zenoh.Sample) -> None:
         data = sample.payload.to_bytes()
         (t_us,) = STAMP.unpack_from(data)
-        self._commands.put(f"{self._eyes.answer(t_us, data[STAMP.size :])}|{t_us}")
+        self._commands.put(f"{self._detector.answer(t_us, data[STAMP.size :])}|{t_us}")
 
 
-def callback(eyes: Vision, port: int) -> None:
+def callback(detector: Vision, port: int) -> None:
     """Answer the robot at `port` in the callback."""
     with _session("connect", port) as session:
-        session.declare_subscriber(FRAME, _Answers(eyes, session).send)
+        session.declare_subscriber(FRAME, _Answers(detector, session).send)
         threading.Event().wait()
 
 
-def ring(eyes: Vision, port: int) -> None:
+def ring(detector: Vision, port: int) -> None:
     """Answer the newest image of the channel."""
     with _session("connect", port) as session:
-        answers = _Answers(eyes, session)
+        answers = _Answers(detector, session)
         frames = session.declare_subscriber(FRAME, zenoh.handlers.RingChannel(1))
         while True:
             answers.send(frames.recv())
 
 
-def newest(eyes: Vision, port: int) -> None:
+def newest(detector: Vision, port: int) -> None:
     """Answer the newest image outside the callback."""
     with _session("connect", port) as session:
-        answers, arrived, kept = _Answers(eyes, session), threading.Event(), {}
+        answers, arrived, kept = _Answers(detector, session), threading.Event(), {}
 
         def keep(sample: zenoh.Sample) -> None:
             kept["frame"] = sample

@@ -405,9 +405,9 @@ def _behavior(row: Row, results: Results, seeds: Sequence[int], folder: str) -> 
     yield "| figure | median | worst | bound | |\n|---|---:|---:|---:|---|"
     runs = [results[case] for case in row.cases(seeds)]
     for same in zip(*(_checks(row, run) for run in runs), strict=True):
-        verdict = "ok" if all(check.ok for check in same) else "**not kept**"
+        outcome = "ok" if all(check.ok for check in same) else "**not kept**"
         name = same[0].name
-        yield f"| {name} | {_both(runs, name)} | {_figure(same[0].bound, same[0].unit)} | {verdict} |"
+        yield f"| {name} | {_both(runs, name)} | {_figure(same[0].bound, same[0].unit)} | {outcome} |"
     if row.looks:
         yield from _in_other_light(row, results, seeds)
     yield _shown(row, seeds, folder)
@@ -423,9 +423,9 @@ def _in_other_light(row: Row, results: Results, seeds: Sequence[int]) -> Iterato
     yield f"| look | {' | '.join(_IN_LIGHT)} | |\n|---|{'---:|' * len(_IN_LIGHT)}---|"
     for look in row.looks:
         runs = [results[case] for case in row.cases(seeds, look)]
-        verdict = "ok" if all(check.ok for run in runs for check in _checks(row, run)) else "**not kept**"
+        outcome = "ok" if all(check.ok for run in runs for check in _checks(row, run)) else "**not kept**"
         worst = [_figure(median_and_worst(runs, name)[1], _UNITS[name]) for name in _IN_LIGHT]
-        yield f"| {look} | {' | '.join(worst)} | {verdict} |"
+        yield f"| {look} | {' | '.join(worst)} | {outcome} |"
 
 
 def _baseline(row: Row, results: Results, seeds: Sequence[int], folder: str) -> Iterator[str]:

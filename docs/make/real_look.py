@@ -242,7 +242,7 @@ def write_page(page: Path, names: Sequence[str], seeds: Sequence[int], jobs: int
         report = run_cases(wanted, jobs, lambda _case: advance())
     command = f"python -m docs.make.real_look --seeds {','.join(map(str, seeds))}"
     older = page.read_text("utf-8") if only else ""
-    page.write_text("\n".join(page_lines(wanted, report.judged, draws, command, older)) + "\n", "utf-8")
+    page.write_text("\n".join(page_lines(wanted, report.scored, draws, command, older)) + "\n", "utf-8")
     return all(one.per_s >= LEAST_PER_S for one in draws)
 
 

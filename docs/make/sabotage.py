@@ -89,7 +89,7 @@ def write_page(page: Path, seeds: Sequence[int], jobs: int, names: Sequence[str]
     with progress_bar(len(wanted) + len(broken)) as advance:
         noticed = run_all_sabotaged(broken, jobs, lambda _case: advance())
         healthy = run_cases(wanted, jobs, lambda _case: advance())
-    page.write_text("\n".join(page_lines(healthy.judged, noticed.pairs, names, seeds)) + "\n", "utf-8")
+    page.write_text("\n".join(page_lines(healthy.scored, noticed.pairs, names, seeds)) + "\n", "utf-8")
     return healthy.ok is True and noticed.ok is True
 
 

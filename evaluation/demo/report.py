@@ -76,16 +76,16 @@ def report(run: DemoRun) -> DemoReport:
     if not run.samples:
         raise CheckError(f"ended before the robot drove; the logs are in {run.folder}")
     recording = run.folder / RECORDING
-    said: list[AnsweredFrame] = []
+    answered: list[AnsweredFrame] = []
     try:  # the same pipeline produces the same for the same frames
         replayed = replay(
-            recording, lambda step: said.append(AnsweredFrame.of(step.frame.header.t_us, step.answer.seen)))
+            recording, lambda step: answered.append(AnsweredFrame.of(step.frame.header.t_us, step.answer.seen)))
     except ConfigError:
         if not run.recorder_failed:
             raise
         why = f"recording {recording} ends too early to be scored: {run.recorder_failed}"
         raise ConfigError(f"{why}; {OTHER_FOLDER}") from None
-    during = [one for one in said if run.samples[0].t_us <= one.t_us <= run.samples[-1].t_us]
+    during = [one for one in answered if run.samples[0].t_us <= one.t_us <= run.samples[-1].t_us]
     record = RunRecord(run.samples, during, accepted_us(recording), _wheels(run))
     result = score(run.scenario, record)
     injected = _injected(run)
@@ -93,12 +93,12 @@ def report(run: DemoRun) -> DemoReport:
     return DemoReport(run, result, checks, replayed, injected)
 
 
-def write_files(judged: DemoReport) -> None:
+def write_files(scored: DemoReport) -> None:
     """Write score.json, trajectory.png and run.mp4 to the run folder. Raises ConfigError if one cannot be written."""
-    folder = judged.run.folder
+    folder = scored.run.folder
     with writes(folder, OTHER_FOLDER):
-        (folder / "score.json").write_text(json.dumps(judged.to_dict(), indent=2) + "\n", "utf-8")
-        _draw(judged.run, folder / RECORDING)
+        (folder / "score.json").write_text(json.dumps(scored.to_dict(), indent=2) + "\n", "utf-8")
+        _draw(scored.run, folder / RECORDING)
 
 
 def accepted_us(recording: Path) -> int | None:
@@ -189,10 +189,10 @@ def _checks(run: DemoRun, result: Score) -> list[Check]:
     ]
 
 
-def summary(judged: DemoReport) -> list[str]:
+def summary(scored: DemoReport) -> list[str]:
     """Format the closing lines: the score with its bounds, the files, and the next commands."""
-    run, replayed = judged.run, judged.replayed
-    lines = check_lines(judged.checks)
+    run, replayed = scored.run, scored.replayed
+    lines = check_lines(scored.checks)
     if not bounds_of(run.scenario, run.options.latency_ms):
         lines.append(NOT_EVALUATED)
     lines.append(_replay_line(replayed))
@@ -210,8 +210,8 @@ def summary(judged: DemoReport) -> list[str]:
 def _detector_lines(log: Path) -> list[str]:
     """Return what the detector reported in a log of vision, e.g. that the color range marks the floor."""
     parts = (line.partition(" vision: detector: ") for line in log.read_text("utf-8", "replace").splitlines())
-    told = dict.fromkeys(line for _, found, line in parts if found)
-    return [f"detector: {line}" for line in list(told)[:MOST_NOTICES]]
+    lines_of = dict.fromkeys(line for _, found, line in parts if found)
+    return [f"detector: {line}" for line in list(lines_of)[:MOST_NOTICES]]
 
 
 def _replay_line(replayed: Replayed) -> str:
@@ -226,7 +226,7 @@ def _replay_line(replayed: Replayed) -> str:
 def _next_thing(run: DemoRun) -> str:
     options = run.options
     if not options.latency_ms and not options.loss:
-        eyes = f" --detector {options.detector}" if options.detector else ""
-        return f"next: sightline demo --scenario {options.scenario}{eyes} --latency-ms 100 --loss 0.1"
+        chosen = f" --detector {options.detector}" if options.detector else ""
+        return f"next: sightline demo --scenario {options.scenario}{chosen} --latency-ms 100 --loss 0.1"
     other = "pushed" if run.scenario.name == "eight" else "eight"
     return f"next: sightline demo --scenario {other} --latency-ms {options.latency_ms:g} --loss {options.loss:g}"

@@ -114,7 +114,7 @@ class DemoRun:
     interrupted: bool = False
 
 
-def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
+def run_demo(options: DemoOptions, print_line: Callable[[str], None]) -> DemoRun:
     """Run it. Raises ConfigError, LinkError, CheckError, the failure of a process, or KeyboardInterrupt at the start.
 
     Nothing is left running in any case.
@@ -129,7 +129,7 @@ def run_demo(options: DemoOptions, say: Callable[[str], None]) -> DemoRun:
         ending.enter_context(terminated_like_interrupted())
         processes = ending.enter_context(Processes(run.folder))
         try:
-            _drive(run, processes, processes.temporary_folder(), say)
+            _drive(run, processes, processes.temporary_folder(), print_line)
         except KeyboardInterrupt:
             if not run.samples:  # there is nothing to score
                 raise
@@ -154,12 +154,12 @@ def _check_vision(options: DemoOptions, scenario: Scenario) -> None:
     check_choice(kind, {}, config)
 
 
-def _drive(run: DemoRun, processes: Processes, sockets: str, say: Callable[[str], None]) -> None:
+def _drive(run: DemoRun, processes: Processes, sockets: str, print_line: Callable[[str], None]) -> None:
     options, endpoint = run.options, TRANSPORTS["zenoh"].format(free_port())
     for_vision = endpoint if options.transport == "zenoh" else TRANSPORTS[options.transport].format(free_port())
     listen = [part for end in dict.fromkeys((endpoint, for_vision)) for part in ("--listen", end)]
     _write_configuration(run, sockets)
-    say(f"simulation, robot and vision start as three processes; their logs are in {run.folder}")
+    print_line(f"simulation, robot and vision start as three processes; their logs are in {run.folder}")
     # The options of the run are on the command lines, because the environment takes precedence over files.
     processes.start("sim", ["sim", "--config", str(run.folder / "sim.toml"), "--scenario", options.scenario,
                             "--seed", str(options.seed), "--motor-log", str(run.folder / MOTOR_LOG),

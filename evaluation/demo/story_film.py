@@ -292,13 +292,13 @@ def truth_at(truths: Sequence[Truth], t_us: int) -> Truth:
 
 
 def film_images(
-    story: Story, scenario: Scenario, robot: RobotModel, *, say: Callable[[str], None], fps: float = FPS,
+    story: Story, scenario: Scenario, robot: RobotModel, *, show: Callable[[str], None], fps: float = FPS,
 ) -> "Iterator[Pillow.Image]":
     """Yield every image of the film in order, without the closing one."""
     page, cut = Page(), scenes(story)
     with closing(ChaseCamera(scenario, robot, VIEW_PX[0] * _FINE, VIEW_PX[1] * _FINE)) as chase:
         for number, scene in enumerate(cut, start=1):
-            say(f"filming {number} of {len(cut)}: {scene.take.name}")
+            show(f"filming {number} of {len(cut)}: {scene.take.name}")
             for t_us in scene.times_us(fps):
                 yield page.compose(_chased(chase, scene, t_us), robot_view(scene.take, t_us),
                                    shot(story, scene.take, t_us))
@@ -310,13 +310,13 @@ def _chased(chase: ChaseCamera, scene: FilmScene, t_us: int) -> Pixels:
 
 
 def write_story(
-    path: Path, story: Story, scenario: Scenario, robot: RobotModel, *, say: Callable[[str], None], fps: float = FPS,
+    path: Path, story: Story, scenario: Scenario, robot: RobotModel, *, show: Callable[[str], None], fps: float = FPS,
 ) -> int:
     """Write the film and return its images. Raises ConfigError without Pillow or for a place that cannot be written."""
-    images = list(film_images(story, scenario, robot, say=say, fps=fps))
+    images = list(film_images(story, scenario, robot, show=show, fps=fps))
     images.append(Page().close_with(closing_lines(story)))
     durations_ms = [round(1000 / fps)] * (len(images) - 1) + [round(1000 * CLOSING_S)]
-    say(f"writing {path.name}: {len(images)} images, {sum(durations_ms) / 1000:.0f} s")
+    show(f"writing {path.name}: {len(images)} images, {sum(durations_ms) / 1000:.0f} s")
     encoded = io.BytesIO()
     images[0].save(encoded, "WEBP", save_all=True, append_images=images[1:], duration=durations_ms, loop=0,
                    quality=_QUALITY, method=4, kmax=60, kmin=30, allow_mixed=True)

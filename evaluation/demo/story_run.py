@@ -279,14 +279,14 @@ def run_naive(folder: Path, seed: int) -> Take:
     return take
 
 
-def run_takes(folder: Path, seed: int, say: Callable[[str], None]) -> tuple[Take, Take]:
+def run_takes(folder: Path, seed: int, show: Callable[[str], None]) -> tuple[Take, Take]:
     """Run both takes in `folder`.
 
     Raises ConfigError, LinkError or the failure of a process; nothing is left running in any case.
     """
     takes = []
     for number, (name, run) in enumerate((("sightline", run_safe), ("naive", run_naive)), start=1):
-        say(f"running {number} of 2: {name}, up to 1 minute; the logs are in {folder / name}")
+        show(f"running {number} of 2: {name}, up to 1 minute; the logs are in {folder / name}")
         take = run(folder / name, seed)
         (folder / name / "events.json").write_text(json.dumps(take.events, indent=2) + "\n", "utf-8")
         takes.append(take)
@@ -325,7 +325,7 @@ class StoryResult:
         return [*check_lines(self.story.checks), f"left in {self.folder}: {FILM} story.json sightline naive"]
 
 
-def make_story(out: Path | None, seed: int, say: Callable[[str], None]) -> StoryResult:
+def make_story(out: Path | None, seed: int, show: Callable[[str], None]) -> StoryResult:
     """Run both takes and write the film.
 
     Raises ConfigError for a place that cannot be written or is too small, before any run where that can be known.
@@ -337,9 +337,9 @@ def make_story(out: Path | None, seed: int, say: Callable[[str], None]) -> Story
     check_space(folder, shutil.disk_usage(folder).free)
     try:
         with terminated_like_interrupted():
-            story = compose(*run_takes(folder, seed, say))
+            story = compose(*run_takes(folder, seed, show))
         scenario = load_scenario(str(folder / "sightline" / SCENARIO))
-        images = write_story(folder / FILM, story, scenario, robot_of(scenario), say=say)
+        images = write_story(folder / FILM, story, scenario, robot_of(scenario), show=show)
         result = StoryResult(story, folder, images)
         (folder / "story.json").write_text(json.dumps(result.to_dict(), indent=2) + "\n", "utf-8")
     except OSError as error:

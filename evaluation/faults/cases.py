@@ -332,7 +332,7 @@ HONEST_MS: Final = 10.0
 def _load(rig: RobotFixture, kind: str, at_least_times: int) -> Injected:
     """The clients connect while the robot drives, and stay. Then the driver dies."""
     came_us = monotonic_us()
-    rig.start_crowd(kind)
+    rig.start_load(kind)
     rig.processes.wait_line("crowd", READY)
     rig.watch(LOADED_S)
     slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > came_us)
@@ -363,8 +363,8 @@ def _keep_time(rig: RobotFixture) -> Injected:
         at_us = monotonic_us()
         rig.processes.kill("peer")
         rig.watch(SETTLED_S)
-    said = rig.processes.log("person").read_text("utf-8").rpartition("late by ")[2]
-    return Injected(BUSY, at_us, checks=tuple(_tick_checks(rows, rig.holes(), int(said.split()[0]))))
+    late = rig.processes.log("person").read_text("utf-8").rpartition("late by ")[2]
+    return Injected(BUSY, at_us, checks=tuple(_tick_checks(rows, rig.holes(), int(late.split()[0]))))
 
 
 def _tick_checks(rows: Sequence[MotorRow], holes: Sequence[Hole], published_us: int) -> list[Check]:
@@ -453,7 +453,7 @@ def _fail_drive(rig: RobotFixture) -> Injected:
     ))
 
 
-def _refuse_speeds(rig: RobotFixture) -> Injected:
+def _reject_speeds(rig: RobotFixture) -> Injected:
     """The drive takes no more speeds, neither zero: the guardian stops the wheels, and a new driver process waits."""
     at_us = rig.fail_drive("set")
     rig.watch(BAD_S)
@@ -639,7 +639,7 @@ OPERATOR_CASES: Final = (
         also="FAULT, counted in status, one traceback in the log",
     ),
     FaultCase(
-        "drive.refuses", "drive: the plug-in takes no more speeds", _refuse_speeds, _SCRIPT, blind=True, short=True,
+        "drive.refuses", "drive: the plug-in takes no more speeds", _reject_speeds, _SCRIPT, blind=True, short=True,
         also="ended by the guardian once",
     ),
     FaultCase(

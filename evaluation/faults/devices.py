@@ -1,6 +1,6 @@
 """A camera and a drive, plug-ins that fail on command. Shell (files, signals).
 
-Every image that was spoiled is noted in `camera.ledger` beside it, every failure of the drive in `drive.ledger`.
+Every image that was spoiled is noted in `camera.events` beside it, every failure of the drive in `drive.events`.
 """
 
 import ctypes
@@ -19,10 +19,10 @@ from sightline.robot_side.ports import Picture, WheelAngles
 from sightline.sim.bus import SimCamera, SimDrive, SimSocketConfig
 
 MODE: Final = "camera.mode"
-EVENTS: Final = "camera.ledger"
+EVENTS: Final = "camera.events"
 DRIVE_MODE: Final = "drive.mode"
 """While this file exists, the method of the drive that it names raises an exception of its own."""
-DRIVE_EVENTS: Final = "drive.ledger"
+DRIVE_EVENTS: Final = "drive.events"
 DRIVE_ERROR: Final = "no answer (injected by the bench)"
 GIL_HELD_S: Final = 1
 SLOW_S: Final = 0.2
@@ -40,7 +40,7 @@ class FaultyCamera:
     """A `Camera`. Modes: see FAULTS; anything else leaves it as it is."""
 
     class Config(SimSocketConfig):
-        """`folder` holds the mode and the ledger."""
+        """`folder` holds the mode and the event log."""
 
         folder: Path
 
@@ -48,7 +48,7 @@ class FaultyCamera:
         self._camera = SimCamera(SimSocketConfig(socket_dir=config.socket_dir))
         self.model, self.live = self._camera.model, self._camera.live
         self._mode = config.folder / MODE
-        self._ledger = EventLog(config.folder / EVENTS)
+        self._event_log = EventLog(config.folder / EVENTS)
         self._spares = {name: (config.folder / f"{name}.jpg").read_bytes() for name in SPARE}
         self._last: Picture | None = None
         self._held = False
@@ -62,7 +62,7 @@ class FaultyCamera:
             self._last = picture or self._last
             return picture
         self._held = mode == "gil"
-        self._ledger.note(INJECTED)
+        self._event_log.note(INJECTED)
         while mode == "hangs" and self._mode.read_text("ascii") == mode:
             time.sleep(0.05)
         if mode in SPARE:
@@ -79,13 +79,13 @@ class FaultyDrive(SimDrive):
     """The simulated wheels. They raise as in the file DRIVE_MODE. The signal LOOP begins an endless loop."""
 
     class Config(SimSocketConfig):
-        """`folder` holds the mode and the ledger."""
+        """`folder` holds the mode and the event log."""
 
         folder: Path
 
     def __init__(self, config: Config) -> None:
         super().__init__(SimSocketConfig(socket_dir=config.socket_dir))
-        self._mode, self._ledger = config.folder / DRIVE_MODE, EventLog(config.folder / DRIVE_EVENTS)
+        self._mode, self._event_log = config.folder / DRIVE_MODE, EventLog(config.folder / DRIVE_EVENTS)
         signal.signal(LOOP, _loop)
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
@@ -101,7 +101,7 @@ class FaultyDrive(SimDrive):
 
     def _fail(self, method: str) -> None:
         if self._mode.exists() and self._mode.read_text("ascii") == method:
-            self._ledger.note(INJECTED)
+            self._event_log.note(INJECTED)
             raise ArithmeticError(DRIVE_ERROR)
 
 

@@ -127,13 +127,14 @@ def _falls_ms(window: Sequence[MotorRow], since_us: int) -> float | None:
 
 
 def _zero_ms(window: Sequence[MotorRow], since_us: int) -> float | None:
-    told = [index for index, row in enumerate(window) if wheel_mps(row) > 0]
+    commanded = [index for index, row in enumerate(window) if wheel_mps(row) > 0]
     spans = list(itertools.pairwise(_thinned(window)))
     rolling = [b.t_us for a, b in spans if _rim_m(a, b) > _AT_REST_MPS * (b.t_us - a.t_us) / 1e6]
     if not spans or rolling[-1:] == [spans[-1][1].t_us]:
         return None
-    told_ms = _ms_after(window, max(told, default=-1) + 1, since_us)
-    return None if told_ms is None else max(told_ms, *((end_us - since_us) / 1000 for end_us in rolling[-1:]), 0.0)
+    commanded_ms = _ms_after(window, max(commanded, default=-1) + 1, since_us)
+    rolled_ms = ((end_us - since_us) / 1000 for end_us in rolling[-1:])
+    return None if commanded_ms is None else max(commanded_ms, *rolled_ms, 0.0)
 
 
 def _thinned(window: Sequence[MotorRow]) -> list[MotorRow]:
@@ -227,7 +228,7 @@ GOOD: Final = "good"
 INJECTED: Final = "injected"
 FLOOD_AT_LEAST: Final = 20_000
 """Commands of a flood. It lasts longer where a process cannot send 10,000 a second."""
-REQUESTED: Final = "told"
+REQUESTED: Final = "requested"
 
 
 class EventLog:

@@ -16,7 +16,6 @@ from typing import IO, Any, Final, Self
 
 from sightline.evaluation.checks import Check, at_least, at_most
 from sightline.evaluation.faults import devices
-from sightline.evaluation.faults import evidence as judge
 from sightline.evaluation.faults.evidence import (
     GOOD,
     INJECTED,
@@ -24,7 +23,9 @@ from sightline.evaluation.faults.evidence import (
     ZERO_MS,
     MotorRow,
     SentCommand,
+    measure_stop,
     read_events,
+    read_motors,
     wheel_mps,
 )
 from sightline.evaluation.faults.peer import PeerOptions, Role
@@ -150,8 +151,8 @@ def write_wrong_clock(folder: Path, offset_s: str) -> None:
 right, right_ns = time.time, time.time_ns
 time.time = lambda: right() + ({offset_s})
 time.time_ns = lambda: right_ns() + int(({offset_s}) * 1e9)
-with open({str(folder / "clock.ledger")!r}, "a") as ledger:
-    ledger.write(f"{INJECTED},{{time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000}},0\\n")
+with open({str(folder / "clock.events")!r}, "a") as log:
+    log.write(f"{INJECTED},{{time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1000}},0\\n")
 """,
         "utf-8",
     )
@@ -249,7 +250,7 @@ def moving_stop(
     """Check that the wheels turned at the first packet of a STOP, and the time until they stood."""
     speed_mps = next((wheel_mps(row) for row in reversed(rows) if row.t_us <= at_us), 0.0)
     yield at_least(f"speed at {since}", speed_mps, "m/s", kept_mps)
-    yield at_most(f"zero after {since}", judge.measure_stop(rows, at_us).zero_ms, "ms", zero_ms)
+    yield at_most(f"zero after {since}", measure_stop(rows, at_us).zero_ms, "ms", zero_ms)
 
 
 class RobotFixture:
@@ -306,7 +307,7 @@ class RobotFixture:
         else:
             self._start_own()
         self.wait_speed(self.setup.at_speed_mps)
-        self._before_kib = memory_kib(self.processes, self._judged)
+        self._before_kib = memory_kib(self.processes, self._measured)
 
     def _start_legacy(self) -> None:
         """Start a legacy robot, and vision by the README's line. Its address is the only option."""
@@ -322,16 +323,16 @@ class RobotFixture:
 
     def _write_files(self, sockets: str) -> None:
         device = {"kind": "sim", "options": {"socket_dir": sockets}}
-        eye = {"kind": "sightline.evaluation.faults.devices:FaultyCamera",
+        faulty_camera = {"kind": "sightline.evaluation.faults.devices:FaultyCamera",
                "options": {"socket_dir": sockets, "folder": str(self.folder)}}
         devices.write_spares(self.folder)
         self.camera_mode(self.setup.camera)
-        wheels = {"kind": "sightline.evaluation.faults.devices:FaultyDrive", "options": eye["options"]}
+        wheels = {"kind": "sightline.evaluation.faults.devices:FaultyDrive", "options": faulty_camera["options"]}
         files: dict[str, dict[str, Any]] = {
             "scenario": _CHASE if self.setup.driver == "vision" else _EMPTY,
             "sim": {"scenario": str(self.folder / "scenario.toml"), "socket_dir": sockets, "seed": 1,
                     "motor_log": str(self.folder / "motors.csv")},
-            "robot": {"robot": ROBOT, "state_dir": str(self.folder / "state"), "camera": eye, "drive": wheels,
+            "robot": {"robot": ROBOT, "state_dir": str(self.folder / "state"), "camera": faulty_camera, "drive": wheels,
                       "range_sensor": device, "safety": {"auto_arm": True, "guests": self.setup.guests},
                       "listen": []},
             "vision": {"robot": ROBOT},
@@ -363,7 +364,7 @@ class RobotFixture:
     def start_peer(self, name: str, role: Role, **changes: Any) -> None:
         """Start a vision service, a scripted driver or an operator."""
         options = PeerOptions(
-            role=role, endpoint=self.endpoint, web_endpoint=self.web_endpoint, ledger=self.folder / f"{name}.ledger",
+            role=role, endpoint=self.endpoint, web_endpoint=self.web_endpoint, event_log=self.folder / f"{name}.events",
             config=self.folder / "vision.toml" if role == "vision" else None, secure=self.keys, **changes,
         )
         self._peers.append(name)
@@ -387,9 +388,9 @@ class RobotFixture:
         ended = at_most("exit code of stop", code, "", 0)
         return at_us, (*(moving_stop(self.motors(), at_us, self.setup.kept_mps) if moving else ()), ended)
 
-    def start_crowd(self, kind: str, endpoint: str = "") -> None:
+    def start_load(self, kind: str, endpoint: str = "") -> None:
         """Let many clients come, WebSocket ones by default; what they do is noted as by a peer called `crowd`."""
-        arguments = [kind, endpoint or self.web_endpoint, str(self.folder / "crowd.ledger")]
+        arguments = [kind, endpoint or self.web_endpoint, str(self.folder / "crowd.events")]
         self.processes.start("crowd", arguments, module="sightline.evaluation.faults.load_clients")
 
     def _environment(self, sleeps: bool = False) -> dict[str, str]:
@@ -469,7 +470,7 @@ class RobotFixture:
     def motors(self) -> list[MotorRow]:
         """Read the motor log so far."""
         path = self.folder / "motors.csv"
-        return judge.read_motors(path.read_text("ascii")) if path.exists() else []
+        return read_motors(path.read_text("ascii")) if path.exists() else []
 
     def _latest_motors(self) -> list[MotorRow]:
         """The end of the motors' log: who waits looks often, and the log grows."""
@@ -478,7 +479,7 @@ class RobotFixture:
             return []
         with path.open("rb") as log:
             log.seek(max(0, path.stat().st_size - _TAIL_BYTES))
-            return judge.read_motors(log.read().decode("ascii"))  # its first line, cut or a heading, is left out
+            return read_motors(log.read().decode("ascii"))  # its first line, cut or a heading, is left out
 
     def sent(self, name: str | None = None) -> list[SentCommand]:
         """Good commands by one peer, or by all, oldest first."""
@@ -487,14 +488,14 @@ class RobotFixture:
 
     def noted(self, name: str, kind: str) -> list[SentCommand]:
         """Return the events of one kind from a peer, `camera` or `clock`."""
-        return read_events(self.folder / f"{name}.ledger", kind)
+        return read_events(self.folder / f"{name}.events", kind)
 
     def injected(self, name: str = "peer") -> int:
         """Return the number of injected faults."""
         return len(self.noted(name, INJECTED))
 
     @property
-    def _judged(self) -> tuple[str, ...]:
+    def _measured(self) -> tuple[str, ...]:
         """Sightline's own processes; what a scripted driver needs to send 10 MB is its own affair."""
         if self.setup.legacy is not None:  # its robot is a third-party server
             return ("sim", "vision")
@@ -518,7 +519,7 @@ class RobotFixture:
 
     def grown_mb(self) -> float:
         """Return the largest growth of a measured process since the wheels were at speed, in MB."""
-        after_kib = memory_kib(self.processes, self._judged)
+        after_kib = memory_kib(self.processes, self._measured)
         grown_kib = (after_kib[who] - before for who, before in self._before_kib.items() if who in after_kib)
         return max(grown_kib, default=0) / 1024
 

@@ -50,8 +50,8 @@ _BEGUN: Final = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgr"
 class LoadViewer:
     """One viewer; `reads` is False for the one that takes nothing but the hello out of its connection."""
 
-    def __init__(self, ledger: EventLog, role: str, *, reads: bool) -> None:
-        self._ledger, self._reads = ledger, reads
+    def __init__(self, event_log: EventLog, role: str, *, reads: bool) -> None:
+        self._event_log, self._reads = event_log, reads
         hello = Hello(robot="r1", role=role, session=secrets.token_hex(4), wants=(FRAME.name,))
         self._hello = encode(hello).decode("ascii")
         self.admitted = False
@@ -62,45 +62,45 @@ class LoadViewer:
         wire.send_text(self._hello)
         wire.receive_one(time.monotonic() + OPEN_S)  # the robot's hello, which confirms a place
         self.admitted = True
-        self._ledger.note(ADMITTED)
+        self._event_log.note(ADMITTED)
         if not self._reads:
             time.sleep(_NOT_READING_S)
             return
         while True:
             for message in wire.receive():
                 if isinstance(message, bytes):
-                    self._ledger.note(SEEN)
+                    self._event_log.note(SEEN)
             wire.wait(_AGAIN_S)
 
 
-def view(endpoint: str, ledger: EventLog) -> None:
+def view(endpoint: str, event_log: EventLog) -> None:
     """All viewers, for ever."""
     roles = ["operator"] * RESERVED_SLOTS + ["viewer"] * (VIEWERS - RESERVED_SLOTS)
-    viewers = [LoadViewer(ledger, role, reads=number != RESERVED_SLOTS) for number, role in enumerate(roles)]
+    viewers = [LoadViewer(event_log, role, reads=number != RESERVED_SLOTS) for number, role in enumerate(roles)]
     dialers = [Client(parse_websocket_endpoint(endpoint), viewer.watch, lambda _reason: None) for viewer in viewers]
     waiting = list(zip(viewers, dialers, strict=True))
     while waiting:
         knocked = [pair for pair in waiting if pair[0].admitted or pair[1].trouble]
         for pair in knocked:
-            ledger.note(INJECTED)
+            event_log.note(INJECTED)
             waiting.remove(pair)
         time.sleep(_AGAIN_S)
     print(READY, flush=True)
     threading.Event().wait()
 
 
-def leave_handshakes(endpoint: str, ledger: EventLog) -> None:
+def leave_handshakes(endpoint: str, event_log: EventLog) -> None:
     """Begin them, and begin again what the robot has closed."""
     end = parse_websocket_endpoint(endpoint)
     begun: list[socket.socket] = []
-    told = False
+    logged = False
     while True:
         begun = [one for one in begun if _is_open(one)]
         while len(begun) < HANDSHAKES:
             begun.append(_begin(end.host, end.port))
-            ledger.note(INJECTED)
-        if not told:
-            told = True
+            event_log.note(INJECTED)
+        if not logged:
+            logged = True
             print(READY, flush=True)
         time.sleep(_AGAIN_S)
 
@@ -142,14 +142,14 @@ def _place(endpoint: str) -> tuple[str, int]:
     return host, port
 
 
-def connect_often(endpoint: str, ledger: EventLog, rate_hz: int) -> None:
+def connect_often(endpoint: str, event_log: EventLog, rate_hz: int) -> None:
     """Open connections at a rate and close them immediately."""
     print(READY, flush=True)
     started_s, count = time.monotonic(), 0
     while True:
         with suppress(OSError):  # e.g. the backlog of the port is full
             socket.create_connection(_place(endpoint), 1.0).close()
-            ledger.note(INJECTED)
+            event_log.note(INJECTED)
         count += 1
         time.sleep(max(0.0, started_s + count / rate_hz - time.monotonic()))
 
@@ -162,12 +162,12 @@ def client_hello() -> bytes:
     return sent.read()
 
 
-def leave_half_open(endpoint: str, ledger: EventLog, first: bytes = b"") -> None:
+def leave_half_open(endpoint: str, event_log: EventLog, first: bytes = b"") -> None:
     """Open connections, send no more than `first`, and open again what the other end closes."""
     begun: list[socket.socket] = []
     is_reported = False
     while True:
-        begun = [one for one in begun if _is_open(one, partial(ledger.note, ANSWERED))]
+        begun = [one for one in begun if _is_open(one, partial(event_log.note, ANSWERED))]
         with suppress(OSError):
             while len(begun) < HALF_OPEN:
                 one = socket.socket()
@@ -176,14 +176,14 @@ def leave_half_open(endpoint: str, ledger: EventLog, first: bytes = b"") -> None
                 begun.append(one)
                 if first:
                     one.send(first)
-                ledger.note(INJECTED)
+                event_log.note(INJECTED)
         if not is_reported:
             is_reported = True
             print(READY, flush=True)
         time.sleep(_AGAIN_S)
 
 
-def open_sessions(endpoint: str, ledger: EventLog) -> None:
+def open_sessions(endpoint: str, event_log: EventLog) -> None:
     """Hold as many Zenoh sessions as the other end accepts beside one more."""
     from sightline.protocol.transports.zenoh.session import open_session
 
@@ -191,7 +191,7 @@ def open_sessions(endpoint: str, ledger: EventLog) -> None:
     for number in range(SESSIONS):
         with suppress(LinkError):
             sessions.append(open_session((), [endpoint], 1.0))
-            ledger.note(INJECTED)
+            event_log.note(INJECTED)
         if number == SESSIONS // 2:
             print(READY, flush=True)
     threading.Event().wait()
@@ -200,11 +200,11 @@ def open_sessions(endpoint: str, ledger: EventLog) -> None:
 HUGE_BYTES: Final = 1_000_000
 PUBLISHED_HZ: Final = 10_000
 PUBLISHED_EACH: Final = 1000
-"""Small twists for each event in the ledger."""
+"""Small twists for each event in the event log."""
 _PUBLISHED_AT_ONCE: Final = 50
 
 
-def publish_much(endpoint: str, ledger: EventLog) -> None:
+def publish_much(endpoint: str, event_log: EventLog) -> None:
     """Publish small twists as often as possible, up to 10 kHz, and payloads of 1 MB; all attachments are malformed."""
     from sightline.protocol.transports.zenoh.session import open_session
 
@@ -216,7 +216,7 @@ def publish_much(endpoint: str, ledger: EventLog) -> None:
                 session.put("sightline/r1/twist/vision", b"0.5|0.0", attachment=b"{" * 100)
             if count % PUBLISHED_EACH == 0:
                 session.put("sightline/r1/twist/vision", bytes(HUGE_BYTES), attachment=b"{" * 100)
-                ledger.note(INJECTED)
+                event_log.note(INJECTED)
             time.sleep(max(0.0, started_s + count / PUBLISHED_HZ - time.monotonic()))
 
 
@@ -227,7 +227,7 @@ LONGEST: Final = 2000
 FLOOD_S: Final = 10.0
 
 
-def send_garbage(endpoint: str, ledger: EventLog) -> None:
+def send_garbage(endpoint: str, event_log: EventLog) -> None:
     """Send datagrams of every length, for another robot, with a wrong HMAC, and an answer back; print the rate."""
     [place] = stop_addresses([endpoint])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
@@ -238,7 +238,7 @@ def send_garbage(endpoint: str, ledger: EventLog) -> None:
         others.append(answer)
         invalid = [*(os.urandom(length) for length in range(LONGEST + 1)), *others * LONGEST]
         print(READY, flush=True)
-        ledger.note(INJECTED)
+        event_log.note(INJECTED)
         started_s, sent = time.monotonic(), 0
         while time.monotonic() - started_s < FLOOD_S:
             for data in invalid:
@@ -248,7 +248,7 @@ def send_garbage(endpoint: str, ledger: EventLog) -> None:
     threading.Event().wait()
 
 
-def replay_stops(endpoint: str, ledger: EventLog) -> None:
+def replay_stops(endpoint: str, event_log: EventLog) -> None:
     """Send the recorded datagrams of an earlier STOP, and such of another robot with the same keys, repeatedly."""
     [place] = stop_addresses([endpoint])
     folder = Path(sys.argv[3]).parent
@@ -260,7 +260,7 @@ def replay_stops(endpoint: str, ledger: EventLog) -> None:
         # As it is, and under this robot's name.
         for data in itertools.cycle([*datagrams, of_other, of_other.replace(b"r2", b"r1", 1)]):
             one.sendto(data, place)
-            ledger.note(INJECTED)
+            event_log.note(INJECTED)
             time.sleep(0.005)
 
 
@@ -272,7 +272,7 @@ _KINDS: Final[dict[str, Callable[[str, EventLog], None]]] = {
     "connect_25": partial(connect_often, rate_hz=FEW_HZ),
     "connect_500": partial(connect_often, rate_hz=MANY_HZ),
     "half_open": leave_half_open,
-    "handshake": lambda endpoint, ledger: leave_half_open(endpoint, ledger, client_hello()),
+    "handshake": lambda endpoint, event_log: leave_half_open(endpoint, event_log, client_hello()),
     "sessions": open_sessions,
     "publisher": publish_much,
     "garbage": send_garbage,
@@ -280,10 +280,10 @@ _KINDS: Final[dict[str, Callable[[str, EventLog], None]]] = {
 }
 
 
-def main(kind: str, endpoint: str, ledger: str) -> None:
+def main(kind: str, endpoint: str, event_log: str) -> None:
     """Be a crowd until killed."""
     os.nice(_POLITE)
-    _KINDS[kind](endpoint, EventLog(Path(ledger)))
+    _KINDS[kind](endpoint, EventLog(Path(event_log)))
 
 
 if __name__ == "__main__":

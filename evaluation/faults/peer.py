@@ -71,7 +71,7 @@ class PeerOptions(Config):
     """Of a guest, and of a legacy robot. Its query names the text format."""
     sockets: str = ""
     """Of a legacy robot: the folder of the simulation's sockets. `fault` names its library."""
-    ledger: Path
+    event_log: Path
     robot: str = "r1"
     source: str = "vision"
     """The role that a scripted driver takes on the wire."""
@@ -107,8 +107,8 @@ class Trigger:
 def main() -> int:
     """Run one peer; returns its exit code."""
     options = PeerOptions.model_validate_json(sys.argv[1])
-    trigger, ledger = Trigger(), EventLog(options.ledger)
-    return ROLES[options.role](options, trigger.pulled, ledger)
+    trigger, event_log = Trigger(), EventLog(options.event_log)
+    return ROLES[options.role](options, trigger.pulled, event_log)
 
 
 # A driver by script: answers each frame with one twist, citing it properly, until its fault is triggered. Shell.
@@ -137,7 +137,7 @@ class Script:
     """The context of an attack: the link, the newest frame, all sent messages."""
 
     def __init__(
-        self, options: "PeerOptions", link: ZenohLink, ledger: EventLog, proofs: ProofChain,
+        self, options: "PeerOptions", link: ZenohLink, event_log: EventLog, proofs: ProofChain,
         withdraw: Callable[[], None] = lambda: None,
     ) -> None:
         self.options, self.link, self.proofs, self.withdraw = options, link, proofs, withdraw
@@ -145,7 +145,7 @@ class Script:
         self.seq = self._requests = 0
         self.sent: deque[SentMessage] = deque(maxlen=KEPT)
         self.twist = Twist(linear_mps=options.linear_mps, angular_rad_s=options.angular_rad_s)
-        self._ledger = ledger
+        self._event_log = event_log
         self._frames: LatestSlot[Message] = link.latest(FRAME)
         self._reports: LatestSlot[Message] = link.latest(STATUS)
         self._recording = options.recording.open("a") if options.recording and options.fault != "replay" else None
@@ -166,7 +166,7 @@ class Script:
     def drive(self, frame: FrameHeader, twist: Twist | None = None) -> None:
         """Send a good command."""
         header, text = encode(self.answer(frame)), format_twist(twist or self.twist)
-        self._ledger.note(GOOD, frame.t_us)
+        self._event_log.note(GOOD, frame.t_us)
         self._send(TWIST, header, text)
         if self._recording and self.seq % _REQUESTS_EVERY == 0 and (report := self._reports.take()):
             self._request_all(Echo.of(decode(Stamp, report.header)))
@@ -188,18 +188,18 @@ class Script:
 
     def replay(self, message: SentMessage) -> None:
         """Send a recorded message again."""
-        self._ledger.note(INJECTED)
+        self._event_log.note(INJECTED)
         self.link.publish(*message, self.options.source)
 
     def attack(self, header: AnswerHeader | bytes, text: bytes | None = None) -> None:
         """Send what must not move the wheels."""
         data = header if isinstance(header, bytes) else encode(header)
-        self._ledger.note(INJECTED)
+        self._event_log.note(INJECTED)
         self.link.publish(TWIST, data, format_twist(self.twist) if text is None else text, self.options.source)
 
     def injected(self) -> None:
         """Note that the fault was done in another way than by `attack`."""
-        self._ledger.note(INJECTED)
+        self._event_log.note(INJECTED)
 
     @property
     def key(self) -> str:
@@ -215,7 +215,7 @@ def _declare_driver(options: "PeerOptions", proofs: ProofChain, ending: ExitStac
     return declare_token(session, DriverToken(options.robot, options.share, proofs.token))
 
 
-def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
+def run_driver(options: "PeerOptions", pulled: threading.Event, event_log: EventLog) -> int:
     """Drive, then do what `options.fault` names, for ever or for `options.seconds`."""
     end_s = time.monotonic() + options.seconds if options.seconds else float("inf")
     proofs = ProofChain(secrets.token_bytes)
@@ -224,7 +224,7 @@ def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog
         link = ending.enter_context(open_zenoh(
             options.robot, connect=[options.endpoint], role=options.certificate or options.source, timeout_s=15,
             secure=options.secure))
-        script = Script(options, link, ledger, proofs, withdraw)
+        script = Script(options, link, event_log, proofs, withdraw)
         while not (pulled.is_set() and options.fault) and time.monotonic() < end_s:
             frame = script.frame()
             if frame is not None:
@@ -239,7 +239,7 @@ def run_driver(options: "PeerOptions", pulled: threading.Event, ledger: EventLog
 GUEST_HZ: Final = 20
 
 
-def run_guest(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
+def run_guest(options: "PeerOptions", pulled: threading.Event, event_log: EventLog) -> int:
     """Change the command each time; after the trigger repeat one command. It counts while the robot may apply it."""
     ends_us = SafetyConfig().guest_unchanged_ms * 1000
     with open_link(options.robot, connect=[options.web_endpoint], role="guest", timeout_s=15) as link:
@@ -250,9 +250,9 @@ def run_guest(options: "PeerOptions", pulled: threading.Event, ledger: EventLog)
             change = 0.0 if repeats_since_us else 0.001 * (number % 2)
             twist = Twist(linear_mps=options.linear_mps - change, angular_rad_s=options.angular_rad_s - change)
             if repeats_since_us:
-                ledger.note(INJECTED)
+                event_log.note(INJECTED)
             if not repeats_since_us or monotonic_us() - repeats_since_us < ends_us:
-                ledger.note(GOOD, monotonic_us())
+                event_log.note(GOOD, monotonic_us())
             link.publish(TWIST, b"", format_twist(twist))
             time.sleep(1 / GUEST_HZ)
     return 0
@@ -268,9 +268,9 @@ _IMAGE_S: Final = 0.05
 class LegacyRobot:
     """Reads texts as legacy robots do: what it cannot read raises an error, and the library closes the connection."""
 
-    def __init__(self, options: "PeerOptions", ledger: EventLog) -> None:
+    def __init__(self, options: "PeerOptions", event_log: EventLog) -> None:
         config = SimSocketConfig(socket_dir=options.sockets)
-        self._drive, self._camera, self._ledger = SimDrive(config), SimCamera(config), ledger
+        self._drive, self._camera, self._event_log = SimDrive(config), SimCamera(config), event_log
         self._form = options.web_endpoint.partition("?")[2]
         self._twist = Twist(linear_mps=0.0, angular_rad_s=0.0)
         threading.Thread(target=self._turn_wheels, name="wheels", daemon=True).start()
@@ -288,7 +288,7 @@ class LegacyRobot:
     def on_text(self, text: str) -> None:
         """Apply a command until the next one comes."""
         linear_mps, angular_rad_s = self._read(text)
-        self._ledger.note(GOOD, monotonic_us())
+        self._event_log.note(GOOD, monotonic_us())
         self._twist = Twist(linear_mps=linear_mps, angular_rad_s=angular_rad_s)
 
     def _read(self, text: str) -> tuple[float, float]:
@@ -382,9 +382,9 @@ LEGACY_LIBRARIES: Final[dict[str, Callable[[Any, LegacyRobot, int], None]]] = {
 }
 
 
-def run_legacy_robot(options: "PeerOptions", _pulled: threading.Event, ledger: EventLog) -> int:
+def run_legacy_robot(options: "PeerOptions", _pulled: threading.Event, event_log: EventLog) -> int:
     """Serve for ever with the library that `fault` names."""
-    robot = LegacyRobot(options, ledger)
+    robot = LegacyRobot(options, event_log)
     print("robot r1: on", flush=True)
     port = parse_websocket_endpoint(options.web_endpoint).port
     LEGACY_LIBRARIES[options.fault](importlib.import_module(options.fault), robot, port)
@@ -576,7 +576,7 @@ ATTACKS: Final[dict[str, Callable[[Script], None]]] = {
 
 # An operator as a process: requests STOP (then reset), or the presence of the robot. Shell.
 
-def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
+def run_operator(options: "PeerOptions", pulled: threading.Event, event_log: EventLog) -> int:
     """Wait for the trigger, send the request, and print the reply."""
     with open_zenoh(options.robot, connect=[options.endpoint], role=OPERATOR_SOURCE, timeout_s=15) as link:
         operator = Operator(link)
@@ -586,8 +586,8 @@ def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventL
         if options.fault == "lateness":
             print(f"late by {operator.wait_report(10.0).status.tick_late_max_us} us", flush=True)
             return 0
-        ledger.note(REQUESTED)
-        ledger.note(INJECTED)
+        event_log.note(REQUESTED)
+        event_log.note(INJECTED)
         if options.fault == "reset":  # before the wheels are at zero
             operator.stop(lambda: None, is_proven=lambda: (
                 operator.report is not None and operator.report.status.state is State.STOPPED))
@@ -601,14 +601,14 @@ def run_operator(options: "PeerOptions", pulled: threading.Event, ledger: EventL
 
 # A new operator: what `sightline stop` runs, in this process so that its first packet is noted. Shell.
 
-def run_stop(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) -> int:
+def run_stop(options: "PeerOptions", pulled: threading.Event, event_log: EventLog) -> int:
     """Wait for the trigger, stop the robot, and exit as the command does. A recording gets the datagrams."""
     datagrams, sent = StopRequests.datagrams, 0
 
     def noted(self: StopRequests) -> list[bytes]:
         nonlocal sent
         if not sent:
-            ledger.note(REQUESTED)
+            event_log.note(REQUESTED)
         made = datagrams(self)
         sent += len(made)
         if options.recording is not None:
@@ -631,10 +631,10 @@ def run_stop(options: "PeerOptions", pulled: threading.Event, ledger: EventLog) 
 
 
 ROLES: Final[dict[Role, Callable[[PeerOptions, threading.Event, EventLog], int]]] = {
-    "vision": lambda options, pulled, ledger: run_vision(
-        options.endpoint, options.config, options.fault, pulled, ledger),
-    "shared": lambda options, _pulled, ledger: run_shared(
-        options.endpoint, options.share, options.linear_mps, options.angular_rad_s, ledger),
+    "vision": lambda options, pulled, event_log: run_vision(
+        options.endpoint, options.config, options.fault, pulled, event_log),
+    "shared": lambda options, _pulled, event_log: run_shared(
+        options.endpoint, options.share, options.linear_mps, options.angular_rad_s, event_log),
     "driver": run_driver, "guest": run_guest, "legacy": run_legacy_robot, "operator": run_operator, "stop": run_stop,
 }
 

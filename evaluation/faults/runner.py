@@ -209,7 +209,7 @@ class _Running:
 
 
 def run_cases(
-    rows: Sequence[FaultCase], repeat: int, folder: Path, jobs: int, say: Callable[[FaultOutcome, FaultProgress], None]
+    rows: Sequence[FaultCase], repeat: int, folder: Path, jobs: int, show: Callable[[FaultOutcome, FaultProgress], None]
 ) -> list[list[FaultOutcome]]:
     """Every row `repeat` times, `jobs` at once, those that want it alone last. What is skipped is not repeated."""
     results: list[list[FaultOutcome]] = [[] for _ in rows]
@@ -221,7 +221,7 @@ def run_cases(
             results[turn.index].append(outcome)
             done += 1
             left_s = (time.monotonic() - began_s) / done * (total - done)
-            say(outcome, FaultProgress(done, total, left_s))
+            show(outcome, FaultProgress(done, total, left_s))
     return [[one for one in row if not one.skipped] or row[:1] for row in results]
 
 

@@ -52,7 +52,7 @@ that end within a millisecond leave nothing to count, so `connect_500` is report
 def _flood(rig: RobotFixture, kind: str, after_s: float | None = None) -> Injected:
     """Send STOP during a flood, or some time after its end."""
     rig.prepare_operator()
-    rig.start_crowd(kind, rig.web_endpoint or rig.endpoint)
+    rig.start_load(kind, rig.web_endpoint or rig.endpoint)
     rig.processes.wait_line("crowd", READY, READY_S)
     rig.watch(AT_WORK_S)
     if after_s is not None:
@@ -93,7 +93,7 @@ def _garbage(rig: RobotFixture) -> Injected:
     """Invalid datagrams for 10 s have no effect; a valid one among them stops the robot."""
     rig.prepare_operator()
     came_us = monotonic_us()
-    rig.start_crowd("garbage", rig.endpoint)
+    rig.start_load("garbage", rig.endpoint)
     rig.processes.wait_line("crowd", READY, READY_S)
     rig.watch(AT_WORK_S)
     slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > came_us)
@@ -118,13 +118,13 @@ def _replay(rig: RobotFixture) -> Injected:
     rig.start_robot()
     rig.wait_speed(rig.setup.at_speed_mps)
     since_us = monotonic_us()
-    rig.start_crowd("replayed", rig.endpoint)
+    rig.start_load("replayed", rig.endpoint)
     rig.processes.wait_line("crowd", READY, READY_S)
     rig.watch(AT_WORK_S)
     slowest_mps = min(wheel_mps(row) for row in rig.motors() if row.t_us > since_us)
     log = rig.processes.log("robot").read_text("utf-8")
     counted = sum(reason in log for reason in ("OTHER_SESSION", "OTHER_ROBOT"))
-    (rig.folder / "operator.ledger").unlink()
+    (rig.folder / "operator.events").unlink()
     rig.prepare_operator()
     at_us, checks = rig.stop_by_operator(moving=True)
     checks += at_least("speed kept", slowest_mps, "m/s", KEPT_MPS), at_least("reasons logged", counted, "", 2)

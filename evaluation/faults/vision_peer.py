@@ -1,6 +1,6 @@
 """The vision service as a peer: alone with a detector that fails on command, or with others that share robots. Shell.
 
-A ledger has each twist before it leaves.
+An event log has each twist before it leaves.
 """
 
 import os
@@ -32,14 +32,14 @@ SLOW_S: Final = 0.33
 class LoggingLink(LinkWrapper):
     """A link that notes every twist before it leaves."""
 
-    def __init__(self, link: Link, ledger: EventLog) -> None:
+    def __init__(self, link: Link, event_log: EventLog) -> None:
         super().__init__(link)
-        self._ledger = ledger
+        self._event_log = event_log
 
     def publish(self, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
         """Publish with the fault of this peer, see `Link`."""
         if channel is TWIST:
-            self._ledger.note(GOOD, decode(AnswerHeader, header).echo.t_us)
+            self._event_log.note(GOOD, decode(AnswerHeader, header).echo.t_us)
         return self._link.publish(channel, header, payload, source)
 
 
@@ -52,29 +52,29 @@ FAULTS: Final[dict[str, Callable[[], None]]] = {
 }
 
 
-def _spoil_detector(fault: str, pulled: threading.Event, ledger: EventLog) -> None:
+def _spoil_detector(fault: str, pulled: threading.Event, event_log: EventLog) -> None:
     """Every detector built from now on does `fault` before it detects, once the trigger is pulled."""
     detect = AutoDetector.detect
 
     def spoiled(self: AutoDetector, *given: Any) -> Any:
         if pulled.is_set():
-            ledger.note(INJECTED)
+            event_log.note(INJECTED)
             FAULTS[fault]()
         return detect(self, *given)
 
     AutoDetector.detect = spoiled  # type: ignore[assignment, method-assign]
 
 
-def run_vision(endpoint: str, file: Path | None, fault: str, pulled: threading.Event, ledger: EventLog) -> int:
+def run_vision(endpoint: str, file: Path | None, fault: str, pulled: threading.Event, event_log: EventLog) -> int:
     """Serve for ever. The detector does `fault` once the trigger is pulled."""
     if fault:
-        _spoil_detector(fault, pulled, ledger)
+        _spoil_detector(fault, pulled, event_log)
     loaded = load_service("vision", file=str(file) if file else None, options={"connect": (endpoint,)},
                           environ=os.environ)
     config = loaded.config
     assert isinstance(config, VisionConfig)
     opened = open_zenoh(config.robot, connect=config.connect, role=VISION_SOURCE, timeout_s=15)
-    with LoggingLink(opened, ledger) as link:
+    with LoggingLink(opened, event_log) as link:
         serve(config, link, threading.Event(), lambda line: print(line, flush=True))
     return 0
 
@@ -104,13 +104,13 @@ class CircleMission:
         return self._plan
 
 
-def run_shared(endpoint: str, name: str, linear_mps: float, angular_rad_s: float, ledger: EventLog) -> int:
+def run_shared(endpoint: str, name: str, linear_mps: float, angular_rad_s: float, event_log: EventLog) -> int:
     """Run what `sightline vision --share --name NAME` runs, until SIGTERM. The wheels of its robots make a circle."""
     publish = ZenohLink.publish
 
     def noted(self: ZenohLink, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:
         if channel is TWIST:
-            ledger.note(GOOD, decode(AnswerHeader, header).echo.t_us)
+            event_log.note(GOOD, decode(AnswerHeader, header).echo.t_us)
         return publish(self, channel, header, payload, source)
 
     ZenohLink.publish = noted  # type: ignore[method-assign]

@@ -20,7 +20,7 @@ from sightline.evaluation.score.detectors import (
     precisions,
 )
 from sightline.protocol.messages import FrameHeader
-from sightline.sim.scenes.model import COLUMNS, HEIGHT_PX, JUDGED_FROM, LABELS, THINGS, WIDTH_PX, Column, Scene
+from sightline.sim.scenes.model import COLUMNS, HEIGHT_PX, LABELS, SCORED_FROM, THINGS, WIDTH_PX, Column, Scene
 from sightline.sim.scenes.plan import as_seen
 from sightline.sim.scenes.render import SceneRenderer
 from sightline.vision_side.config import VisionConfig
@@ -41,7 +41,7 @@ _FRAME_US: Final = 33_333
 _ROBOT: Final = "judge"
 LIGHT_SHARE: Final = 2.5
 """As many scenes of lights and legs as of each column's: the three states share them."""
-_MOST_SAID: Final = 2  # lines from a detector next to the cause of a missing answer
+_MOST_NOTICES: Final = 2  # lines from a detector next to the cause of a missing answer
 LABELLED: Final = LABELS[1:]
 """Labels with a score of average precision. The ball has separate columns."""
 
@@ -111,24 +111,24 @@ def subjects(
     """Build each detector once with its `options`; close them afterwards. Raises ConfigError for an unknown name or a
     missing package, and HardwareError for a missing device.
     """
-    settings, given, asked = config or VisionConfig(), options or {}, list[Subject]()
+    settings, given, tested = config or VisionConfig(), options or {}, list[Subject]()
     with ExitStack() as ending:
-        ending.callback(close_subjects, asked)
+        ending.callback(close_subjects, tested)
         for name in dict.fromkeys(names):
             check_takes_pictures(name)
-            asked.append(Subject(name, build_detector(name, given.get(name, {}), settings), settings.target.label))
+            tested.append(Subject(name, build_detector(name, given.get(name, {}), settings), settings.target.label))
         ending.pop_all()
-    return asked
+    return tested
 
 
-def close_subjects(asked: Sequence[Subject]) -> None:
+def close_subjects(tested: Sequence[Subject]) -> None:
     """All of them."""
     with ExitStack() as ending:
-        for one in asked:
+        for one in tested:
             ending.callback(close_detector, one.detector)
 
 
-def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks: int) -> Iterable[ScoredScene]:
+def shown(column: Column, seeds: Iterable[int], tested: Sequence[Subject], looks: int) -> Iterable[ScoredScene]:
     """Each scene of the column in turn, in front of every subject, `looks` times in a row: some have to make sure.
 
     A mission follows the ball, except in scenes of lights and legs.
@@ -138,9 +138,9 @@ def shown(column: Column, seeds: Iterable[int], asked: Sequence[Subject], looks:
         for seed in seeds:
             scene = renderer.scene(seed, column)
             jpeg = as_seen(scene)
-            said = [answer_of(one, seed, jpeg, decoder, looks, follows=column is not THINGS) for one in asked]
-            yield ScoredScene(scene, jpeg, tuple(one if isinstance(one, DetectionResult) else None for one in said),
-                       tuple(one if isinstance(one, str) else "" for one in said))
+            given = [answer_of(one, seed, jpeg, decoder, looks, follows=column is not THINGS) for one in tested]
+            yield ScoredScene(scene, jpeg, tuple(one if isinstance(one, DetectionResult) else None for one in given),
+                       tuple(one if isinstance(one, str) else "" for one in given))
 
 
 def answer_of(subject: Subject, seed: int, jpeg: bytes, decoder: Decoder, looks: int, *, follows: bool = True,
@@ -161,7 +161,7 @@ def answer_of(subject: Subject, seed: int, jpeg: bytes, decoder: Decoder, looks:
 
 
 def score_scenes(
-    asked: Sequence[Subject], frames: int, first_seed: int = JUDGED_FROM, *, looks: int = 1,
+    tested: Sequence[Subject], frames: int, first_seed: int = SCORED_FROM, *, looks: int = 1,
     columns: Sequence[str] = tuple(COLUMNS), each: Callable[[ScoredScene], None] = lambda _seen: None,
 ) -> DetectorReport:
     """All columns, `frames` scenes each, and `LIGHT_SHARE` times as many of lights and legs.
@@ -169,14 +169,14 @@ def score_scenes(
     `each` is called for every scene.
     """
     seeds = range(first_seed, first_seed + frames)
-    counts = [_Count(one, columns) for one in asked]
+    counts = [_Count(one, columns) for one in tested]
     for name in columns:
-        for seen in shown(COLUMNS[name], seeds, asked, looks):
+        for seen in shown(COLUMNS[name], seeds, tested, looks):
             each(seen)
             for count, result, why in zip(counts, seen.answers, seen.whys, strict=True):
                 count.verdicts[name].append(scene_result(result, seen.scene, count.balls))
                 count.note(result, why)
-    for seen in shown(THINGS, range(first_seed, first_seed + int(LIGHT_SHARE * frames)), asked, looks):
+    for seen in shown(THINGS, range(first_seed, first_seed + int(LIGHT_SHARE * frames)), tested, looks):
         each(seen)
         for count, result, why in zip(counts, seen.answers, seen.whys, strict=True):
             for label, marks in count.found.items():
@@ -215,8 +215,8 @@ class _Count:
 
     def silence(self) -> Silence:
         """Return the missing answers, with the notices of the detector."""
-        said = notices_of(self._detector)[:_MOST_SAID]
-        return Silence(self.unanswered, self.scenes, "; ".join(dict.fromkeys([self._why, *said])))
+        given = notices_of(self._detector)[:_MOST_NOTICES]
+        return Silence(self.unanswered, self.scenes, "; ".join(dict.fromkeys([self._why, *given])))
 
 
 def detections(result: DetectionResult | None) -> tuple[Detection, ...]:

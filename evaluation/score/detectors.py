@@ -26,7 +26,7 @@ class FrameResult:
     """One frame: was there a ball, what was the answer, how sure, how far off, how long it took (None: no answer)."""
 
     has_ball: bool
-    verdict: Answer
+    outcome: Answer
     score: float = 0.0
     off_px: float | None = None
     compute_us: int | None = None
@@ -45,14 +45,14 @@ def frame_result(
 ) -> FrameResult:
     """Score one frame. None is a missing answer and not a hit. `balls` are the labels of a ball."""
     ball = ball_of(scene)
-    asked = [one for one in detections or () if one.label in balls]
-    if not asked:
+    candidates = [one for one in detections or () if one.label in balls]
+    if not candidates:
         return FrameResult(ball is not None, "none", compute_us=compute_us)
-    best = asked[0]  # detectors give the best first, each by its own measure
+    best = candidates[0]  # detectors give the best first, each by its own measure
     if ball is not None and is_hit(best, ball):
         return FrameResult(True, "hit", best.score, _off_px(best, ball), compute_us)
-    verdict: Answer = "wrong object" if _is_on_another(best, scene) else "nowhere"
-    return FrameResult(ball is not None, verdict, best.score, compute_us=compute_us)
+    outcome: Answer = "wrong object" if _is_on_another(best, scene) else "nowhere"
+    return FrameResult(ball is not None, outcome, best.score, compute_us=compute_us)
 
 
 def is_hit(one: Detection, ball: LabelledBox) -> bool:
@@ -111,10 +111,10 @@ def figures(frames: Sequence[FrameResult]) -> DetectorFigures:
     off = [one.off_px for one in balls if one.off_px is not None]
     times = [float(one.compute_us) for one in frames if one.compute_us is not None]
     return DetectorFigures(
-        len(frames), len(balls), _share(one.verdict == "hit" for one in balls),
-        _share(one.verdict == "none" for one in balls), _share(one.verdict == "wrong object" for one in frames),
-        _share(one.verdict != "none" for one in empty), _quantile(off, 0.5), _quantile(off, 0.95),
-        _quantile(times, 0.5), _share(one.verdict == "nowhere" for one in balls),
+        len(frames), len(balls), _share(one.outcome == "hit" for one in balls),
+        _share(one.outcome == "none" for one in balls), _share(one.outcome == "wrong object" for one in frames),
+        _share(one.outcome != "none" for one in empty), _quantile(off, 0.5), _quantile(off, 0.95),
+        _quantile(times, 0.5), _share(one.outcome == "nowhere" for one in balls),
     )
 
 

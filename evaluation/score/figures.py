@@ -53,7 +53,7 @@ class RunRecord:
     """The record of a run for its score, whether in lockstep or in real time."""
 
     samples: list[Truth] = field(default_factory=list)
-    said: list[AnsweredFrame] = field(default_factory=list)
+    answers: list[AnsweredFrame] = field(default_factory=list)
     accepted_us: int | None = None
     """When the robot accepted its first twist; None if it never did."""
     wheels: list[RimSpeeds] = field(default_factory=list)
@@ -181,16 +181,16 @@ def figures_of(scenario: Scenario, run: RunRecord, followed: Sequence[Truth]) ->
     figures: Figures = {
         "wall_contact_s": (samples[-1].wall_contacts - samples[0].wall_contacts) * STEP_S,
         "commanded_m": commanded_m(run.wheels, samples[0].t_us, samples[-1].t_us),
-        **identity_figures(followed, run.said),
+        **identity_figures(followed, run.answers),
     }
     if any(isinstance(thing, OnPath) for thing in scenario.things):
         figures["least_passes"] = samples[-1].passes - samples[0].passes
     if scenario.target.shape == "legs":
         figures |= legs_figures(samples, followed)
     if scenario.goals_m:
-        figures |= goal_figures(scenario, samples, run.said)
+        figures |= goal_figures(scenario, samples, run.answers)
     if scenario.light is not None:
-        figures |= light_figures(samples, run.said) | {"most_aside_m": _most_aside_m(scenario, samples)}
+        figures |= light_figures(samples, run.answers) | {"most_aside_m": _most_aside_m(scenario, samples)}
     return figures
 
 
@@ -203,11 +203,11 @@ def commanded_m(wheels: Sequence[RimSpeeds], begin_us: int, end_us: int) -> floa
     ) if wheels else 0.0
 
 
-def identity_figures(followed: Sequence[Truth], said: Sequence[AnsweredFrame]) -> Figures:
+def identity_figures(followed: Sequence[Truth], answers: Sequence[AnsweredFrame]) -> Figures:
     """Return how the mission followed another object, and the target again, in the frames since the acquisition."""
     times_us = [truth.t_us for truth in followed]
     wrong, missed = list[tuple[int, bool]](), list[tuple[int, bool]]()
-    for one in said:
+    for one in answers:
         if times_us and one.t_us >= times_us[0]:
             truth = followed[bisect_right(times_us, one.t_us) - 1]
             is_wrong = _is_wrong(truth, one)
@@ -247,14 +247,14 @@ def legs_figures(samples: Sequence[Truth], followed: Sequence[Truth]) -> Figures
     }
 
 
-def goal_figures(scenario: Scenario, samples: Sequence[Truth], said: Sequence[AnsweredFrame]) -> Figures:
+def goal_figures(scenario: Scenario, samples: Sequence[Truth], answers: Sequence[AnsweredFrame]) -> Figures:
     """Return the time of the last waypoint, the smallest clearance, and the time of "cannot reach"."""
     goals, reached_s = list(scenario.goals_m), None
     for truth in samples:
         if goals and math.dist((truth.x_m, truth.y_m), goals[0]) <= REACHED_WITHIN_M:
             goals.pop(0)
             reached_s = (truth.t_us - samples[0].t_us) / 1e6
-    given_up = next((one.t_us for one in said if one.phase == "cannot reach"), None)
+    given_up = next((one.t_us for one in answers if one.phase == "cannot reach"), None)
     clearances = [truth.clearance_m for truth in samples if truth.clearance_m is not None]
     return {
         "reached_s": None if goals else reached_s, "least_clearance_m": min(clearances, default=None),
@@ -279,7 +279,7 @@ def _most_aside_m(scenario: Scenario, samples: Sequence[Truth]) -> float:
     return max(abs((truth.y_m - y_m) * cos - (truth.x_m - x_m) * sin) for truth in samples)
 
 
-def light_figures(samples: Sequence[Truth], said: Sequence[AnsweredFrame]) -> Figures:
+def light_figures(samples: Sequence[Truth], answers: Sequence[AnsweredFrame]) -> Figures:
     """Crossings of the stop line and what the light showed, how soon it starts, and how often it misread the light."""
     crossings = list(_crossings(samples))
     starts = list(_starts(samples))
@@ -287,7 +287,7 @@ def light_figures(samples: Sequence[Truth], said: Sequence[AnsweredFrame]) -> Fi
         "least_crossings": len(crossings), "least_red_stops": red_stops(samples),
         "crossed_on_red": sum(light == "red" for light, _ in crossings),
         "crossed_late": sum(light == "yellow" and could_stop for light, could_stop in crossings),
-        "start_s": max(starts, default=0.0), "wrong_states_percent": _wrong_percent(samples, said),
+        "start_s": max(starts, default=0.0), "wrong_states_percent": _wrong_percent(samples, answers),
     }
 
 
@@ -323,12 +323,12 @@ def _starts(samples: Sequence[Truth]) -> Iterator[float]:
             green_us = None
 
 
-def _wrong_percent(samples: Sequence[Truth], said: Sequence[AnsweredFrame]) -> float | None:
+def _wrong_percent(samples: Sequence[Truth], answers: Sequence[AnsweredFrame]) -> float | None:
     """Return the share of frames before the line with a wrong or missing color of the mission, in percent."""
     times_us = [truth.t_us for truth in samples]
     changes = [now.t_us for before, now in pairwise(samples) if before.light != now.light]
     looked = right = 0
-    for t_us, _, note, *_ in said:
+    for t_us, _, note, *_ in answers:
         after = bisect_right(times_us, t_us)
         if not 0 < after < len(samples):
             continue

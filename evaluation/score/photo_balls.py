@@ -237,7 +237,7 @@ def _render(pose: _Pose, light: _Light, ball: BallSurface, rng: np.random.Genera
     return _Patch(x1, y1, rgb, alpha, covered, (float(box[0]), float(box[1]), float(box[2]), float(box[3])), seen)
 
 
-def _shade(normals: Floats, to_eye: Floats, ball: BallSurface, light: _Light, up: Floats) -> Floats:
+def _shade(normals: Floats, to_camera: Floats, ball: BallSurface, light: _Light, up: Floats) -> Floats:
     """Linear RGB, (n, 3), of points with these normals: Lambert, sky and floor, highlight and reflection."""
     albedo, bumpy = ball.at(normals)
     toward_light = bumpy @ light.toward
@@ -246,10 +246,10 @@ def _shade(normals: Floats, to_eye: Floats, ball: BallSurface, light: _Light, up
     # Near the floor the ball sees only the shadow below it.
     dim = 1 - 0.6 * np.clip(-(normals @ up), 0, 1)[:, None] ** 1.5
     ambient = (light.sky * above + light.floor * (1 - above)) * dim
-    facing = np.clip((bumpy * to_eye).sum(axis=1), 0, 1)
-    halfway = _unit(to_eye + light.toward)
+    facing = np.clip((bumpy * to_camera).sum(axis=1), 0, 1)
+    halfway = _unit(to_camera + light.toward)
     shine = np.clip((bumpy * halfway).sum(axis=1), 0, 1) ** ball.shininess * (toward_light > 0)
-    mirrored = 2 * facing[:, None] * bumpy - to_eye
+    mirrored = 2 * facing[:, None] * bumpy - to_camera
     seen_above = np.clip(0.5 + 1.5 * (mirrored @ up), 0, 1)[:, None]
     mirror = (0.04 + 0.5 * (1 - facing) ** 5)[:, None] * (light.sky * seen_above + light.floor * (1 - seen_above) * dim)
     rim = albedo * ball.rim * ((1 - facing) ** 2)[:, None] * light.sky

@@ -139,14 +139,14 @@ def _jpeg(rgb: Any, number: int, column: Column | None) -> bytes:
     return bytes(simplejpeg.encode_jpeg(rgb, QUALITY, "RGB", "420"))
 
 
-def score_photos(asked: Sequence[Subject], photographs: Sequence[Photograph], each: int, seed: int, *, looks: int = 1,
+def score_photos(tested: Sequence[Subject], photographs: Sequence[Photograph], each: int, seed: int, *, looks: int = 1,
                  tracked: bool = False, kinds: Sequence[str] = KINDS, column: Column | None = None,
                  advance: Callable[[], None] = lambda: None) -> PhotoReport:
     """Show every picture to every detector, `looks` times in a row; with `tracked`, as if a track expected the ball."""
     decoder = Decoder(WIDTH_PX, HEIGHT_PX, WIDTH_PX * HEIGHT_PX)
-    found = {one.name: PhotoFigures({kind: BallTally() for kind in kinds}, BallTally(), BallTally()) for one in asked}
+    found = {one.name: PhotoFigures({kind: BallTally() for kind in kinds}, BallTally(), BallTally()) for one in tested}
     for picture in photo_pictures(photographs, each, seed, kinds, column):
-        for one in asked:
+        for one in tested:
             answer = answer_of(one, picture.number, picture.jpeg, decoder, looks,
                                expected_px=_expected(picture) if tracked else None)
             _count(found[one.name], picture, best_ball(answer, one.balls))

@@ -77,7 +77,7 @@ class ScoreReport:
     """All runs, and what was demanded of them."""
 
     runs: list[tuple[ScoreCase, Score]]
-    judged: list[ScoredFigure]
+    scored: list[ScoredFigure]
     unevaluated: list[str] = field(default_factory=list)
     """Groups whose scenario has no bounds."""
     news: dict[str, list[str]] = field(default_factory=dict)
@@ -86,7 +86,7 @@ class ScoreReport:
     @property
     def ok(self) -> bool | None:
         """Return True if every run is within every bound, None if a scenario without bounds cannot show that."""
-        if not all(one.ok for one in self.judged):
+        if not all(one.ok for one in self.scored):
             return False
         return None if self.unevaluated else True
 
@@ -97,7 +97,7 @@ class ScoreReport:
             "checks": [
                 {"name": f"{one.group}: {one.name}", "value": one.worst, "median": one.median, "unit": one.unit,
                  "bound": one.bound, "ok": one.ok}
-                for one in self.judged
+                for one in self.scored
             ],
             "not_evaluated": self.unevaluated,
             "news": self.news,
@@ -165,12 +165,12 @@ def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCa
     for case in wanted:
         for line in results[case][1]:
             news.setdefault(case.group, []).append(line)
-    told = {group: list(dict.fromkeys(lines))[:MOST_NOTICES] for group, lines in news.items()}
+    notices = {group: list(dict.fromkeys(lines))[:MOST_NOTICES] for group, lines in news.items()}
     groups = {case.group: case for case in wanted}
     unevaluated = [
         name for name, case in groups.items() if not bounds_of(load_scenario(case.scenario), case.latency_ms)
     ]
-    return ScoreReport(runs, scored_figures(runs), unevaluated, told)
+    return ScoreReport(runs, scored_figures(runs), unevaluated, notices)
 
 
 def _run_each(
@@ -187,14 +187,14 @@ def _run_each(
 
 def scored_figures(runs: Sequence[tuple[ScoreCase, Score]]) -> list[ScoredFigure]:
     """Each group's figures: median, worst, and whether every run of it is within the bound."""
-    judged = []
+    scored = []
     for name, members in groupby(runs, key=lambda run: run[0].group):
         group = list(members)
         scenario = load_scenario(group[0][0].scenario)
         checks = [checks_of(scenario, result, case.latency_ms) for case, result in group]
         results = [result for _, result in group]
-        judged += [_scored_figure(name, list(same), results) for same in zip(*checks, strict=True)]
-    return judged
+        scored += [_scored_figure(name, list(same), results) for same in zip(*checks, strict=True)]
+    return scored
 
 
 def _scored_figure(group: str, checks: list[Check], results: list[Score]) -> ScoredFigure:
@@ -341,7 +341,7 @@ def score_text(report: ScoreReport) -> str:
     """Return one line per figure, below the name of its group and the notices of its detector."""
     lines: list[str] = []
     group = ""
-    for one in report.judged:
+    for one in report.scored:
         if one.group != group:
             group = one.group
             lines += [group, *(f"  {line}" for line in report.news.get(group, ()))]

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from sightline.sim.scenario import Color, State
 
-JUDGED_FROM: Final = 900_000
+SCORED_FROM: Final = 900_000
 """First seed of the scenes for scores only."""
 VALIDATED_FROM: Final = 800_000
 """Seeds from here up to `JUDGED_FROM` choose thresholds; training draws below."""
@@ -213,6 +213,6 @@ def trained_column(seed: int) -> Column:
     return HARDER if seed >= HARDER_FROM else TRAINED
 
 
-def is_judged(seed: int) -> bool:
+def is_scored(seed: int) -> bool:
     """Return True for a scene that is for scores only."""
-    return seed >= JUDGED_FROM
+    return seed >= SCORED_FROM

@@ -28,12 +28,12 @@ from sightline.sim.scenes.model import (
     Solid,
     Span,
     Surface,
-    is_judged,
+    is_scored,
 )
 from sightline.sim.scenes.textures import any_rgb, families
 
 _YELLOW = {"saturation": (0.72, 1.0), "value": (0.75, 1.0), "hue_deg": (42.0, 58.0)}
-_JUDGED_LIGHT_DEG = ((30.0, 50.0),)  # how high the light stands; between those of training, and never trained on
+_SCORED_LIGHT_DEG = ((30.0, 50.0),)  # how high the light stands; between those of training, and never trained on
 _TRAINED_LIGHT_DEG = ((10.0, 30.0), (50.0, 85.0))
 _HIGHEST_M, _LOWEST_M = 1.5, 0.04  # of the lens above the floor
 _HALF_OCCLUDED = 0.5
@@ -59,7 +59,7 @@ def plan_scene(seed: int, column: Column) -> ScenePlan:
     if has_ball and draw.random() < _HALF_OCCLUDED:
         solids.append(_occluder(draw, ball))
     farthest = max([2.0, *(math.dist(one.at_m, (0, 0, 0)) + 0.5 for one in solids)])
-    light_from, ambient = _light_from(draw, is_judged(seed))
+    light_from, ambient = _light_from(draw, is_scored(seed))
     return ScenePlan(
         seed, column, lens, floor_m, farthest * draw.uniform(1.0, 1.8), draw.uniform(-0.5, 0.5),
         _surface(draw, seed), _surface(draw, seed), light_from, ambient, tuple(solids), draw.uniform(0.0, 1.0),
@@ -174,8 +174,8 @@ def _occluder(draw: Random, ball: Solid) -> Solid:
     return Solid(shape, (x, y + aside_m, z), sizes, _any_colour(draw))
 
 
-def _light_from(draw: Random, judged: bool) -> tuple[Point, float]:
-    bands = _JUDGED_LIGHT_DEG if judged else _TRAINED_LIGHT_DEG
+def _light_from(draw: Random, scored: bool) -> tuple[Point, float]:
+    bands = _SCORED_LIGHT_DEG if scored else _TRAINED_LIGHT_DEG
     high = math.radians(draw.uniform(*bands[int(draw.integers(len(bands)))]))
     around = draw.uniform(math.pi / 2, 3 * math.pi / 2)  # from the lens's side, else all is dark
     way = (math.cos(high) * math.cos(around), math.cos(high) * math.sin(around), math.sin(high))

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from sightline.sim.scenes.model import HARDER_FROM, JUDGED_FROM, LATER_FROM, VALIDATED_FROM
+from sightline.sim.scenes.model import HARDER_FROM, LATER_FROM, SCORED_FROM, VALIDATED_FROM
 from sightline.sim.world.camera import floor_tile
 
 SIDE: Final = 128
@@ -322,7 +322,7 @@ TRAINED_HARDER: Final = (
 """Of the third round's. None is of discs alone: with so many flat ones about, balls look less sure than they are."""
 VALIDATED: Final = ("plaid", "scales", "script", "ridges")
 """A threshold that was chosen on textures that training knows is too low for others."""
-JUDGED: Final = ("mosaic", "stones", "weave", "marble")
+SCORED: Final = ("mosaic", "stones", "weave", "marble")
 FAMILIES: Final[dict[str, Callable[[Random], Field]]] = {
     "plain": _plain, "clouds": _clouds, "boards": _boards, "checks": _checks, "stripes": _stripes, "blots": _blots,
     "dots": _dots, "bricks": _bricks, "quilt": _quilt,
@@ -336,8 +336,8 @@ FAMILIES: Final[dict[str, Callable[[Random], Field]]] = {
 
 def families(seed: int) -> tuple[str, ...]:
     """Those that the scene of that seed has its floor and wall from."""
-    if seed >= JUDGED_FROM:
-        return JUDGED
+    if seed >= SCORED_FROM:
+        return SCORED
     if seed >= VALIDATED_FROM:
         return VALIDATED
     if seed >= HARDER_FROM:

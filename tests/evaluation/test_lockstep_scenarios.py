@@ -31,7 +31,7 @@ def test_every_scenario_runs_and_its_robot_is_let_drive(name):
     run = drive(name, 801, 1.2)
     assert State.ACTIVE in run.states and len(run.twists) > 15
     assert run.samples[-1].contacts == 0
-    assert all(phase not in ("failed", "cannot reach") for _, phase, *_ in run.said)
+    assert all(phase not in ("failed", "cannot reach") for _, phase, *_ in run.answers)
     if load_scenario(name).target.shape != "place":
         assert run.samples[-1].visible and abs(math.degrees(run.samples[-1].bearing_rad)) < 5
 
@@ -58,7 +58,7 @@ def test_ball_that_crosses_a_meter_ahead_is_not_followed():
 def test_band_steering_soon_finds_the_ball_too_far():
     """It is too small for its band: the robot stands, though the ball is in view."""
     run = drive("blue-sphere", 811, 3.0, "band")
-    assert run.said[-1][1] == "too far"
+    assert run.answers[-1][1] == "too far"
     assert all(truth.visible and abs(truth.linear_mps) < 0.01 for truth in last(run, 0.5))
 
 
@@ -67,7 +67,7 @@ def test_band_steering_hardly_turns_and_then_stands():
     """At the end the ball is out of view."""
     run = drive("blue-sphere", 811, 14.6, "band")
     assert all(abs(truth.linear_mps) < 0.01 and not truth.visible for truth in last(run, 0.5))
-    phases = [phase for _, phase, *_ in run.said]
+    phases = [phase for _, phase, *_ in run.answers]
     assert "too far" in phases and phases[-1] == "no target"
 
 
@@ -85,7 +85,7 @@ def test_two_speeds_by_the_pixel_never_settle():
     run = drive("chaser", 811, 6.0, "pixel-p")
     distances = [truth.distance_m for truth in last(run, 3.0)]
     assert max(distances) < 1.1 and max(distances) - min(distances) > 0.05
-    assert {phase for t_us, phase, *_ in run.said if t_us > 3e6} == {"near", "straight"}
+    assert {phase for t_us, phase, *_ in run.answers if t_us > 3e6} == {"near", "straight"}
 
 
 def test_the_older_legs_law_swings_from_edge_to_edge():
@@ -97,4 +97,4 @@ def test_legacy_waypoint_law_stops_at_the_cylinder_without_a_report():
     """Its sensors reach 0.2 m and it comes at 0.5 m/s: once so near, the guard lets no corner turn nearer."""
     run = drive("thymio", 811, 6.0, "goto-baseline")
     assert len({(round(truth.x_m, 2), round(truth.y_m, 2)) for truth in last(run, 2.0)}) == 1
-    assert run.samples[-1].contacts == 0 and run.said[-1][1] in ("left contour", "right contour")
+    assert run.samples[-1].contacts == 0 and run.answers[-1][1] in ("left contour", "right contour")

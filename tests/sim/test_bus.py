@@ -126,10 +126,10 @@ def test_a_picture_that_came_too_late_is_not_given_to_the_next_read(sim):
     camera = SimCamera(sim.config())
     assert camera.read(0.0) is None
     time.sleep(0.2)
-    asked_us = time.monotonic_ns() // 1000
+    requested_us = time.monotonic_ns() // 1000
     picture = camera.read(1.0)
     assert picture is not None
-    assert picture.t_us > asked_us - 8_000
+    assert picture.t_us > requested_us - 8_000
 
 
 def test_encoders_and_truth_follow_the_wheels(sim):

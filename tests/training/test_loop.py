@@ -19,7 +19,7 @@ import torch
 
 from sightline.operator_side.cli import app as cli
 from sightline.protocol.errors import ConfigError, HardwareError
-from sightline.sim.scenes.model import HEIGHT_PX, JUDGED_FROM, LABELS, VALIDATED_FROM, WIDTH_PX, LabelledBox
+from sightline.sim.scenes.model import HEIGHT_PX, LABELS, SCORED_FROM, VALIDATED_FROM, WIDTH_PX, LabelledBox
 from sightline.training import export as train_export
 from sightline.training import loop as train_run
 from sightline.training.export import onnx_bytes, weights_in
@@ -257,7 +257,7 @@ def test_a_gpu_takes_each_batch_whole(tmp_path, monkeypatch):
 
 
 def test_thresholds_are_not_chosen_on_scenes_for_scores(tmp_path, capsys):
-    assert cli.run(["train", "--out", str(tmp_path), "--validated", str(JUDGED_FROM - VALIDATED_FROM + 1)]) == 2
+    assert cli.run(["train", "--out", str(tmp_path), "--validated", str(SCORED_FROM - VALIDATED_FROM + 1)]) == 2
     assert "--validated" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 

@@ -14,13 +14,13 @@ from sightline.evaluation.photographs import read_photographs
 from sightline.evaluation.score.detector_report import MOST_WRONG, score_scenes, subjects
 from sightline.evaluation.score.photo_report import COLORS, score_photos
 from sightline.operator_side.cli import evaluate as cli_train
-from sightline.sim.scenes.model import COLUMNS, JUDGED_FROM, LABELS
+from sightline.sim.scenes.model import COLUMNS, LABELS, SCORED_FROM
 from sightline.training.network import INPUT_PX
 from sightline.vision_side.detect.onnx.detector import SHIPPED
 from sightline.vision_side.detect.onnx.engine import open_engine
 
 CARD = SHIPPED.with_suffix(".md").read_text("utf-8")
-SEED = JUDGED_FROM + 40_000  # other scenes than those of the card
+SEED = SCORED_FROM + 40_000  # other scenes than those of the card
 
 
 def columns_of_the_card():

@@ -270,7 +270,7 @@ def test_truth_at_is_the_newest_so_far():
 
 def test_film_that_cannot_be_written_is_one_line(tmp_path, story, scene):
     with pytest.raises(ConfigError, match=r"cannot be written: .*; pass another folder with --out"):
-        write_story(tmp_path / "gone" / "story.webp", story, *scene, say=lambda _line: None, fps=0.2)
+        write_story(tmp_path / "gone" / "story.webp", story, *scene, show=lambda _line: None, fps=0.2)
 
 
 def test_place_that_is_too_small_is_one_line(tmp_path):
@@ -283,7 +283,7 @@ def test_film_loops_and_holds_its_last_image(tmp_path, story, scene):
     from PIL import Image
 
     lines, lasting_ms = [], 0
-    images = write_story(tmp_path / "story.webp", story, *scene, say=lines.append, fps=0.4)
+    images = write_story(tmp_path / "story.webp", story, *scene, show=lines.append, fps=0.4)
     with Image.open(tmp_path / "story.webp") as film:
         assert (film.info["loop"], film.size) == (0, (WIDTH_PX, HEIGHT_PX))
         for number in range(film.n_frames):  # equal images are one of longer duration

@@ -224,10 +224,10 @@ def test_the_hardest_change_is_found(gain_mps2):
 
 
 def test_event_log_is_read_without_a_torn_line(tmp_path):
-    path = tmp_path / "a.ledger"
-    ledger = EventLog(path)
-    ledger.note(GOOD, 7)
-    ledger.note(INJECTED)
+    path = tmp_path / "a.events"
+    event_log = EventLog(path)
+    event_log.note(GOOD, 7)
+    event_log.note(INJECTED)
     with path.open("a") as torn:
         torn.write("good,12")
     assert [one.frame_us for one in read_events(path, GOOD)] == [7] and len(read_events(path, INJECTED)) == 1
@@ -355,7 +355,7 @@ def test_flood_that_is_weaker_than_its_row_states_fails(monkeypatch, row, least)
     nothing = SimpleNamespace(wait_line=lambda *_: None, kill=lambda *_: None)
     for count, is_ok in ((least, True), (least - 1, False)):
         rig = SimpleNamespace(
-            prepare_operator=lambda: None, start_crowd=lambda *_: None, processes=nothing, watch=lambda _: None,
+            prepare_operator=lambda: None, start_load=lambda *_: None, processes=nothing, watch=lambda _: None,
             noted=lambda *_, count=count: [None] * count, stop_by_operator=lambda **_: (0, ()), web_endpoint="",
             endpoint="")
         [case] = chosen([row], short=False)

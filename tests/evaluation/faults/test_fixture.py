@@ -28,7 +28,7 @@ receiver.close()
     (Setup(routed=True), {"sim", "robot", "router"}), (Setup("vision", "websockets", legacy=""), {"sim", "vision"}),
 ])
 def test_every_process_of_sightline_is_measured(tmp_path, setup, measured):
-    assert set(RobotFixture(tmp_path / "row", setup)._judged) == measured
+    assert set(RobotFixture(tmp_path / "row", setup)._measured) == measured
 
 
 def test_memory_of_stop_receiver_is_measured(tmp_path):

@@ -15,7 +15,7 @@ from sightline.evaluation.score.detector_report import DetectorReport, markdown,
 from sightline.evaluation.score.detectors import FrameResult, LabelMatches, figures, frame_result, precisions
 from sightline.operator_side.cli import app as cli
 from sightline.operator_side.cli import evaluate as cli_score_detectors
-from sightline.sim.scenes.model import COLUMNS, JUDGED_FROM, LabelledBox, Scene
+from sightline.sim.scenes.model import COLUMNS, SCORED_FROM, LabelledBox, Scene
 from sightline.sim.scenes.plan import plan_scene
 from sightline.training.shipping import ball_threshold, label_threshold
 from sightline.vision_side.detect.port import Circle, Detection, overlap
@@ -25,7 +25,7 @@ OTHER = (200.0, 100.0, 240.0, 160.0)
 
 
 def scene(truths=(BALL,), others=(OTHER,), unclear=()):
-    plan = plan_scene(JUDGED_FROM + 1, COLUMNS["nominal"])
+    plan = plan_scene(SCORED_FROM + 1, COLUMNS["nominal"])
     return Scene(plan, np.zeros((240, 320, 3), np.uint8), tuple(truths), tuple(others), tuple(unclear))
 
 
@@ -38,7 +38,7 @@ def test_overlap_is_intersection_by_union():
     assert overlap((0, 0, 2, 2), (2, 0, 3, 2)) == 0 and overlap((0, 0, 2, 2), (0, 0, 2, 2)) == 1
 
 
-@pytest.mark.parametrize(("detections", "verdict"), [
+@pytest.mark.parametrize(("detections", "outcome"), [
     ([found(100, 100, 140, 140)], "hit"),
     ([found(100, 100, 140, 121)], "hit"),  # just more than half of it
     ([found(100, 100, 140, 119)], "nowhere"),
@@ -51,14 +51,14 @@ def test_overlap_is_intersection_by_union():
     ([found(100, 100, 140, 140, label="target")], "hit"),  # what the colour detectors call it
     ([found(100, 100, 140, 140, label="sports ball")], "hit"),  # what models of COCO call it
 ])
-def test_first_answer_decides(detections, verdict):
-    assert frame_result(detections, scene()).verdict == verdict
+def test_first_answer_decides(detections, outcome):
+    assert frame_result(detections, scene()).outcome == outcome
 
 
 def test_a_half_hidden_ball_is_hit_by_its_visible_part_or_by_its_circle():
     half = replace(BALL, box=(120.0, 100.0, 140.0, 140.0), seen=0.5)
-    assert frame_result([found(120, 100, 140, 140)], scene([half])).verdict == "hit"
-    assert frame_result([found(130, 100, 140, 140, circle=Circle(120, 120, 20))], scene([half])).verdict == "hit"
+    assert frame_result([found(120, 100, 140, 140)], scene([half])).outcome == "hit"
+    assert frame_result([found(130, 100, 140, 140, circle=Circle(120, 120, 20))], scene([half])).outcome == "hit"
 
 
 def test_the_centre_counts_only_where_all_of_the_ball_is_in_view():
@@ -69,7 +69,7 @@ def test_the_centre_counts_only_where_all_of_the_ball_is_in_view():
 
 def test_legs_and_lights_are_wrong_objects_too():
     legs = LabelledBox("legs", (10.0, 100.0, 60.0, 200.0), 1.0)
-    assert frame_result([found(20, 110, 40, 150)], scene([BALL, legs])).verdict == "wrong object"
+    assert frame_result([found(20, 110, 40, 150)], scene([BALL, legs])).outcome == "wrong object"
 
 
 def test_figures_count_each_frame_where_it_belongs():
@@ -148,7 +148,7 @@ def test_a_labels_threshold_balances_what_is_found_and_what_is_right():
 
 
 def test_command_line_starts_at_the_first_scored_seed():
-    assert cli_score_detectors.FROM == JUDGED_FROM
+    assert cli_score_detectors.FROM == SCORED_FROM
 
 
 def test_detectors_are_scored_on_the_same_pictures():

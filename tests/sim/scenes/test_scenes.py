@@ -18,11 +18,11 @@ from sightline.sim.scenes.model import (
     COLUMNS,
     HARDER_FROM,
     HEIGHT_PX,
-    JUDGED_FROM,
     LABELS,
     LATER_FROM,
     MOST_DISTRACTORS,
     MOST_HIDDEN,
+    SCORED_FROM,
     STATES,
     THINGS,
     VALIDATED_FROM,
@@ -35,7 +35,7 @@ from sightline.sim.scenes.plan import as_seen, plan_scene, streak, with_defects
 from sightline.sim.scenes.render import SceneRenderer
 from sightline.sim.scenes.textures import (
     FAMILIES,
-    JUDGED,
+    SCORED,
     SIDE,
     TRAINED,
     TRAINED_HARDER,
@@ -44,7 +44,7 @@ from sightline.sim.scenes.textures import (
     texture,
 )
 from tests.fixtures.sim import use_pybullet_without_numpy
-from tests.sim.scenes import judged_scenes
+from tests.sim.scenes import scored_scenes
 
 ALL = [*COLUMNS.values(), THINGS, TRAINED_COLUMN]
 
@@ -56,39 +56,39 @@ def renderer():
 
 
 def judged_plans(column, count=150):
-    return [plan_scene(JUDGED_FROM + number, column) for number in range(count)]
+    return [plan_scene(SCORED_FROM + number, column) for number in range(count)]
 
 
 def test_a_seed_is_a_scene_in_any_order(renderer):
-    first = renderer.scene(JUDGED_FROM + 3, COLUMNS["all at once"])
+    first = renderer.scene(SCORED_FROM + 3, COLUMNS["all at once"])
     renderer.scene(17, TRAINED_COLUMN)
     with SceneRenderer() as other:
-        again = other.scene(JUDGED_FROM + 3, COLUMNS["all at once"])
+        again = other.scene(SCORED_FROM + 3, COLUMNS["all at once"])
     assert np.array_equal(first.rgb, again.rgb) and first.truths == again.truths
     assert as_seen(first) == as_seen(again)
-    assert not np.array_equal(first.rgb, renderer.scene(JUDGED_FROM + 4, COLUMNS["all at once"]).rgb)
+    assert not np.array_equal(first.rgb, renderer.scene(SCORED_FROM + 4, COLUMNS["all at once"]).rgb)
 
 
 def test_scene_with_pybullet_without_numpy_is_the_same(renderer, monkeypatch):
-    scene = renderer.scene(JUDGED_FROM + 3, COLUMNS["all at once"])
+    scene = renderer.scene(SCORED_FROM + 3, COLUMNS["all at once"])
     widths = use_pybullet_without_numpy(monkeypatch)
-    again = renderer.scene(JUDGED_FROM + 3, COLUMNS["all at once"])
+    again = renderer.scene(SCORED_FROM + 3, COLUMNS["all at once"])
     assert set(widths) == {WIDTH_PX} and scene.truths
     assert np.array_equal(scene.rgb, again.rgb) and (scene.truths, scene.unclear) == (again.truths, again.unclear)
 
 
 def test_scored_scenes_are_those_of_the_published_figures(monkeypatch):
-    then = judged_scenes.kept()
-    for now, before in zip(judged_scenes.drawn(), then, strict=True):
+    then = scored_scenes.kept()
+    for now, before in zip(scored_scenes.drawn(), then, strict=True):
         assert (now["column"], now["seed"]) == (before["column"], before["seed"])
-        assert not judged_scenes.differences(now, before), f"{judged_scenes.__doc__}\n{now['column']} {now['seed']}"
+        assert not scored_scenes.differences(now, before), f"{scored_scenes.__doc__}\n{now['column']} {now['seed']}"
     monkeypatch.setattr(scene_backdrop, "texture", lambda family, seed: texture(family, seed + 1))
-    assert all(map(judged_scenes.differences, judged_scenes.drawn(), then)), "another texture is noticed"
+    assert all(map(scored_scenes.differences, scored_scenes.drawn(), then)), "another texture is noticed"
 
 
 def test_a_ball_is_as_large_as_agreed_and_stands_in_view():
     for column in ALL:
-        for seed in range(JUDGED_FROM, JUDGED_FROM + 40):
+        for seed in range(SCORED_FROM, SCORED_FROM + 40):
             plan = plan_scene(seed, column)
             for one in plan.solids:
                 if one.label == "ball":
@@ -99,15 +99,15 @@ def test_a_ball_is_as_large_as_agreed_and_stands_in_view():
 
 def test_scored_scenes_were_never_trained_on():
     purposes = {0: TRAINED, LATER_FROM: TRAINED_LATER, HARDER_FROM: TRAINED_HARDER, VALIDATED_FROM: VALIDATED,
-                JUDGED_FROM: JUDGED}
+                SCORED_FROM: SCORED}
     trained = {*TRAINED, *TRAINED_LATER, *TRAINED_HARDER}
-    assert not set(JUDGED) & {*trained, *VALIDATED} and not set(VALIDATED) & trained
+    assert not set(SCORED) & {*trained, *VALIDATED} and not set(VALIDATED) & trained
     assert {name for names in purposes.values() for name in names} == set(FAMILIES)
     heights_deg = {True: [], False: []}
     for first, seed in [(first, first + number) for first in purposes for number in range(300)]:
         plan = plan_scene(seed, COLUMNS["nominal"])
         assert plan.floor.family in purposes[first] and plan.wall.family in purposes[first]
-        heights_deg[seed >= JUDGED_FROM].append(math.degrees(math.asin(plan.light_from[2])))
+        heights_deg[seed >= SCORED_FROM].append(math.degrees(math.asin(plan.light_from[2])))
     assert all(30 <= one <= 50 for one in heights_deg[True])
     assert not any(30 < one < 50 for one in heights_deg[False])
 
@@ -136,14 +136,14 @@ def test_columns_match_their_names():
 
 
 def test_each_fifth_scored_scene_has_no_ball():
-    for start in (JUDGED_FROM, VALIDATED_FROM):
+    for start in (SCORED_FROM, VALIDATED_FROM):
         has = [any(one.label == "ball" for one in plan_scene(start + n, COLUMNS["nominal"]).solids) for n in range(20)]
         assert has == [n % 5 != 0 for n in range(20)]
 
 
 def test_boxes_are_exact_and_no_ball_is_hidden_too_far(renderer):
     whole = hidden = 0
-    for seed in range(JUDGED_FROM, JUDGED_FROM + 60):
+    for seed in range(SCORED_FROM, SCORED_FROM + 60):
         scene = renderer.scene(seed, COLUMNS["same-color boxes"])
         assert sum(one.label == "ball" for one in scene.truths) == (seed % 5 != 0), "an answer is not a false alarm"
         assert sum(one.is_like_ball for one in scene.plan.solids) == 2, "the column is named for them"
@@ -183,7 +183,7 @@ def test_textures_are_tiles_of_their_seed(family):
 
 
 def test_light_and_quality_have_their_effects(renderer):
-    scene = renderer.scene(JUDGED_FROM + 2, COLUMNS["nominal"])
+    scene = renderer.scene(SCORED_FROM + 2, COLUMNS["nominal"])
     nominal, light = COLUMNS["nominal"], replace(COLUMNS["changed light"], gain=(0.25, 0.25))
     means = [simplejpeg.decode_jpeg(with_defects(scene.rgb, one, np.random.default_rng(4)), "RGB").mean()
              for one in (nominal, light)]
@@ -195,7 +195,7 @@ def test_light_and_quality_have_their_effects(renderer):
 
 
 def test_blur_takes_detail_away_and_keeps_the_light(renderer):
-    scene = renderer.scene(JUDGED_FROM + 2, COLUMNS["nominal"])
+    scene = renderer.scene(SCORED_FROM + 2, COLUMNS["nominal"])
     grey = [simplejpeg.decode_jpeg(with_defects(scene.rgb, COLUMNS[name], np.random.default_rng(4)), "GRAY")[..., 0]
             .astype(float) for name in ("nominal", "blur")]
     detail = [np.abs(np.diff(one, axis=0)).mean() for one in grey]

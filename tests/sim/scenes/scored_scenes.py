@@ -1,9 +1,9 @@
-"""Record some of the scored scenes: their truths, and their coarse images. Stored in `judged_scenes.json`.
+"""Record some of the scored scenes: their truths, and their coarse images. Stored in `scored_scenes.json`.
 
 Seeds alone pin nothing: another PyBullet, or a texture that was changed, would draw other scenes under them, and the
 figures that were published would be of scenes that are no more. If that is intended, write them again, and the figures:
 
-    python -m tests.sim.scenes.judged_scenes
+    python -m tests.sim.scenes.scored_scenes
 """
 
 import json
@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import simplejpeg
 
-from sightline.sim.scenes.model import COLUMNS, HEIGHT_PX, JUDGED_FROM, THINGS, WIDTH_PX
+from sightline.sim.scenes.model import COLUMNS, HEIGHT_PX, SCORED_FROM, THINGS, WIDTH_PX
 from sightline.sim.scenes.plan import as_seen
 from sightline.sim.scenes.render import SceneRenderer
 
-FILE = Path(__file__).parent.parent.parent / "judged_scenes.json"
+FILE = Path(__file__).parent.parent.parent / "scored_scenes.json"
 PINNED = [(COLUMNS["nominal"], 1), (COLUMNS["same-color boxes"], 212), (COLUMNS["all at once"], 333), (THINGS, 1204)]
 """Columns, with the distance above the first scored seed; together they contain every scored family of textures."""
 ACROSS, DOWN = 16, 12
@@ -27,7 +27,7 @@ MOST_PX, MOST_LEVELS = 1.01, 2
 def drawn():
     """The scenes as they are drawn now."""
     with SceneRenderer() as renderer:
-        return [outline(renderer.scene(JUDGED_FROM + above, column)) for column, above in PINNED]
+        return [outline(renderer.scene(SCORED_FROM + above, column)) for column, above in PINNED]
 
 
 def outline(scene):
