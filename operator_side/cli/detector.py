@@ -216,7 +216,7 @@ def check(
         ok = not any(one.wrong for one in results)
         times = time_detector(make, seed=seed) if ok else []
         notices = list(dict.fromkeys(line for one in made for line in notices_of(one)))
-    report = _as_json(name, ok, results, times) | {"said": notices}
+    report = _as_json(name, ok, results, times) | {"notices": notices}
     return print_result(report, [_as_text(name, results, times, notices)], as_json)
 
 

@@ -76,13 +76,14 @@ def test_detector_that_keeps_the_contract_passes(capsys) -> None:
     assert code == 0 and report["ok"] and len(report["checks"]) >= 8
     assert [one["size"] for one in report["times"]] == ["320x240", "640x480"]
     assert all(0 < one["p50_ms"] <= one["p95_ms"] for one in report["times"])
+    assert report["notices"] == []
 
 
 def test_plug_in_that_breaks_the_contract_is_reported(capsys, tmp_path: Path, monkeypatch) -> None:
-    (tmp_path / "late_eyes.py").write_text(BROKEN)
+    (tmp_path / "late_detector.py").write_text(BROKEN)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    code, out, _ = run(capsys, "detector", "check", "late_eyes:Late")
+    code, out, _ = run(capsys, "detector", "check", "late_detector:Late")
     assert code == 5
     assert "FAIL  A batch gets as many results" in out
 
@@ -91,11 +92,11 @@ def test_plug_in_that_breaks_the_contract_is_reported(capsys, tmp_path: Path, mo
 def test_what_a_plug_in_prints_is_not_in_the_result(capsys, tmp_path: Path, monkeypatch, arguments) -> None:
     prints = BROKEN.replace("return", "print('looks'); return").replace("[:-1]", "") + "\nprint('loads')\n"
     prints = prints.replace("    def", "    def close(self):\n        print('ends')\n    def")
-    (tmp_path / "loud_eyes.py").write_text(prints.replace("Late", "Loud"))
+    (tmp_path / "loud_detector.py").write_text(prints.replace("Late", "Loud"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "loud_eyes", raising=False)
-    code, out, err = run(capsys, *arguments.split(), "loud_eyes:Loud", "--json")
+    monkeypatch.delitem(sys.modules, "loud_detector", raising=False)
+    code, out, err = run(capsys, *arguments.split(), "loud_detector:Loud", "--json")
     assert code == 0 and json.loads(out) and {"looks", "loads", "ends"} <= set(err.splitlines())
 
 
