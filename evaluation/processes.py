@@ -60,7 +60,7 @@ class ProcessError(HardwareError):
 
 
 class Processes:
-    """Use it in a `with`. Each process leads a session of its own, so that Ctrl-C reaches only who starts them.
+    """Use it in a `with`. Each process has its own session, so that Ctrl-C reaches only the process that starts them.
 
     However this program ends, within 2 s no process and no folder of `temporary_folder` is left.
     """
@@ -78,7 +78,7 @@ class Processes:
     ) -> int:
         """Run `sightline ARGUMENTS`, or another module, inside a network namespace if one is named.
 
-        Its output goes to `<name>.log`, as text: who starts them reads it. Returns its process id.
+        Its output goes to `<name>.log`, as text, for the process that starts them. Returns its process id.
         """
         entering = ["ip", "netns", "exec", namespace] if namespace else []
         with self.log(name).open("wb") as log:

@@ -103,7 +103,7 @@ def with_overload(setting: LoopSetting, step_ms: float) -> LoopSetting:
 
 
 def _step_ms(vision: PipelineVision, pictures: Path) -> float:
-    """Median, without pauses: who is overloaded never pauses."""
+    """Return the median without pauses, because an overloaded service never pauses."""
     jpegs = [path.read_bytes() for path in sorted(pictures.glob("*.jpg"))]
     took_ms = []
     for number in range(_STEPS):

@@ -109,7 +109,7 @@ def silent_clients_stay(bench: Bench) -> None:
 
 @SUITE.must("R-DIAL-18", "15.3 On WebSocket: the legacy protocol", real=True)
 def twists_return_credit(bench: Bench) -> None:
-    """Its twist after a frame returns the credit: who answers gets picture after picture."""
+    """A twist after a frame returns the credit: a client that answers receives image after image."""
     with _legacy(bench) as raw:
         silent = len(list(raw.messages(_COMPARED_S)))
         answered = 0

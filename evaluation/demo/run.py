@@ -135,7 +135,7 @@ def run_demo(options: DemoOptions, print_line: Callable[[str], None]) -> DemoRun
                 raise
             run.interrupted = True
         except SightlineError:
-            processes.check(_DYING_S)  # who ended is the cause; what it broke here is not
+            processes.check(_DYING_S)  # the process that ended is the cause, not the error that it caused here
             raise
         run.killed = processes.end()
     return run

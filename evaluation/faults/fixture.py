@@ -176,7 +176,7 @@ time.clock_gettime_ns = clock_gettime_ns
     )
 
 
-# One robot at speed, about to be hurt: simulation, robot and who drives, as processes of their own. Shell.
+# One robot at speed before a fault: simulation, robot and driver, each a process. Shell.
 
 
 ROBOT: Final = "r1"
@@ -473,7 +473,7 @@ class RobotFixture:
         return read_motors(path.read_text("ascii")) if path.exists() else []
 
     def _latest_motors(self) -> list[MotorRow]:
-        """The end of the motors' log: who waits looks often, and the log grows."""
+        """Read the end of the motor log, because a waiting case reads it often, and it grows."""
         path = self.folder / "motors.csv"
         if not path.exists():
             return []

@@ -408,7 +408,7 @@ OVERSIZED: Final = (b"0" * 63 + b"|0", b"0.5|" + b"0" * 253, b"0.5|" + b"0" * HU
 
 
 def _frames(script: Script) -> Iterator[FrameHeader]:
-    """Every new frame, for ever; while none comes (who sends nonsense gets few) the last again, 20 times a second."""
+    """Yield every new frame; without one the last again, 20 times a second, since a sender of nonsense receives few."""
     last: FrameHeader | None = None
     while True:
         last = script.frame() or last

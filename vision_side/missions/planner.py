@@ -1,7 +1,7 @@
-"""Costmap of what the range sensors saw, and the path over it. Pure.
+"""Costmap of the echoes of the range sensors, and the path over it. Pure.
 
-Sensors that reach 0.2 m see a wall only while they are beside it. What they saw is kept in the odometry frame, and
-given up again when rays pass where it was: after a drift of the odometry, or when the thing went away.
+Sensors with a range of 0.2 m see a wall only while they are next to it. The costmap stores the echoes in the odometry
+frame. It removes an echo when rays pass its place: after a drift of the odometry, or when the obstacle is gone.
 """
 
 import math
@@ -18,24 +18,24 @@ Cells = NDArray[np.int64]
 CELL_M = 0.03
 """Fine enough for a robot of 0.11 m; a plan over 6 x 6 m still takes a few milliseconds."""
 MAX_CELLS = 20_000
-"""Security limit: 18 square meters of solid echoes; beyond it the oldest are forgotten."""
-_ECHO, _SUREST = 3, 6  # one echo counts at once; after two it takes six rays through the cell to give it up
+"""Security limit: 18 square meters of solid echoes; above it the costmap removes the oldest."""
+_ECHO, _SUREST = 3, 6  # one echo counts immediately; after two, six rays through the cell remove it
 _SHY_CELLS = 2.5  # a ray does not clear the cells this near to its echo: a wall at a grazing angle fills several
-_PROGRESS_CELL_M = 0.12  # something new was learned when a cell of this size is seen filled for the first time
+_PROGRESS_CELL_M = 0.12  # progress: a cell of this size is occupied for the first time
 
 
 class Costmap:
-    """Cells that something stands in. `version` changes whenever one comes or goes."""
+    """Occupied cells. `version` changes when one is added or removed."""
 
     def __init__(self) -> None:
         self._sure: dict[tuple[int, int], int] = {}
         self._known: set[tuple[int, int]] = set()
         self.version = 0
         self.discoveries = 0
-        """How many coarse cells were ever found filled: what a robot that makes no progress stops adding to."""
+        """Number of coarse cells that were ever occupied. It stops to grow when the robot makes no progress."""
 
     def see(self, sensor: tuple[float, float], echoes: Points) -> None:
-        """Take in the echoes that a sensor at `sensor` met.
+        """Add the echoes of a sensor at `sensor`.
 
         Only a ray with an echo shows that the floor before it is free: of several sensors merged into one scan, a
         number without an echo may stand for a ray that no sensor sends.
@@ -82,7 +82,7 @@ def cells_of(points: Points) -> Cells:
 
 
 def _passed(sensor: Points, ends: Points, cells: Cells) -> set[tuple[int, int]]:
-    """Return those of `cells` that the rays went through well before they ended, within the horizon."""
+    """Return those of `cells` that the rays passed well before their ends, within the horizon."""
     # Rays that end in one cell show the same floor.
     ends = ends[np.unique(cells_of(ends), axis=0, return_index=True)[1]]
     along = ends - sensor
@@ -99,29 +99,29 @@ def _passed(sensor: Points, ends: Points, cells: Cells) -> set[tuple[int, int]]:
     return {(x, y) for x, y in near[seen[tuple((near - corner).T)]].tolist()}
 
 
-# The way to a goal over what is known of the floor; what is not known counts as free. Pure.  From the goal a wave
-# spreads over all cells that the robot's middle may enter; who steps against the wave gets there by a shortest way.
-# Where the wave does not reach the robot, no way is left: everything seen closes it, and what was not seen cannot open
-# it. Each new plan comes from something newly seen, so a robot that follows them cannot circle forever.
+# The path to a goal over the known floor; the unknown floor counts as free. Pure. From the goal a wave spreads over all
+# cells that the center of the robot may enter. A robot that moves against the wave reaches the goal by a shortest path.
+# If the wave does not reach the robot, there is no path: what was seen blocks it, and the unknown floor cannot open it.
+# Each new plan comes from new observations, so a robot that follows the plans cannot circle forever.
 
 
 Point = tuple[float, float]
 Cell = tuple[int, int]
 
 HORIZON_M = 6.0
-"""Half the width of the largest plan; a goal further off is aimed at over the plan's border."""
+"""Half the width of the largest plan; the way to a goal beyond it leads over the border of the plan."""
 _UNREACHED = np.int32(2**30)
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-_SQUARE = np.ones((3, 3), np.uint8)  # by turns with the cross: circles of the wave become octagons, 6 % off at most
+_SQUARE = np.ones((3, 3), np.uint8)  # alternates with the cross: circles become octagons, at most 6 % off
 _TIGHT_STEPS = 3
 _AROUND = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
 _LOOK_AHEAD_CELLS = 48
-_NEAREST_CELLS = 6  # steering for a nearer point than this is weaving
-_TRIED_EVERY = 3  # of the way's cells, which are looked at for a straight line to them
+_NEAREST_CELLS = 6  # a robot that steers toward a nearer point weaves
+_TRIED_EVERY = 3  # of the cells of the path, which are tried for a straight line
 
 
 class Planner:
-    """One plan, good for any place of the robot until `ground` changes.
+    """One plan, valid for any place of the robot until the costmap changes.
 
     `keep_m`: smallest distance between the centers of a filled cell and of the robot. `roomy_m`: preferred distance, if
     it needs no long detour.
@@ -140,7 +140,7 @@ class Planner:
         self._steps = _flooded(self._blocked, self._tight, self._seeds(size))
 
     def _seeds(self, size: NDArray[np.int64]) -> list[tuple[int, Cell]]:
-        """(when, where) the wave begins: at the goal, or on the border with what is left from there to the goal."""
+        """Return (step, cell) of each start of the wave: the goal, or border cells by their distance to it."""
         i, j = self._cell(self.goal)
         if 0 <= i < size[0] and 0 <= j < size[1]:
             return [(0, (i, j))]
