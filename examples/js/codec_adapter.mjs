@@ -8,7 +8,7 @@ import { createInterface } from "node:readline";
 import { fileURLToPath } from "node:url";
 import { WireError, formatTwist, parseKey, readMessage } from "./codec.mjs";
 import { PeerError, parseHello, takeApart } from "./framing.mjs";
-import { parseBoxes, parseDashed, parsePicture } from "./older.mjs";
+import { parseBoxes, parseDashed, parsePicture } from "./legacy_text.mjs";
 
 const fromBase64 = (text) => new Uint8Array(Buffer.from(text, "base64"));
 const fromHex = (text) => new Uint8Array(Buffer.from(text, "hex"));

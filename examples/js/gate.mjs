@@ -5,8 +5,8 @@
  */
 
 import { WireError } from "./codec.mjs";
-import { FreshnessRecord, IssuedRecord, Lease, RANKS, RepeatRecord, SequenceRecord, isHuman, proofOf, same, shown } from "./judging.mjs";
 import { LIMITS, Ramp, STILL, ageFactor, clampTwist, isStill } from "./limits.mjs";
+import { FreshnessRecord, IssuedRecord, Lease, RANKS, RepeatRecord, SequenceRecord, isHuman, proofOf, same, shown } from "./validation.mjs";
 
 const MAX_REQUEST_AGE_US = 2_000_000;
 const GUEST = Object.freeze({ source: "guest", session: "00000000" }); // who speaks without headers

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import test from "node:test";
 import { AnswerHeader } from "./fields.mjs";
 import { CHANNELS, decode, encode } from "./codec.mjs";
-import { Eyes } from "./eyes.mjs";
+import { Eyes } from "./frame_loop.mjs";
 import { Outbox, PeerError, helloText, messageBound, pack, packRaw, readHello, unpack } from "./framing.mjs";
 import { FrameReader, OPCODE, closePayload, encodeFrame } from "./rfc6455.mjs";
 import { Robot } from "./robot.mjs";

@@ -7,7 +7,7 @@
 import { readFile } from "node:fs/promises";
 import { admissionProblem } from "./websocket.mjs";
 
-const MODULES = ["codec", "eyes", "fields", "framing", "json", "page", "proof", "viewer", "vision"];
+const MODULES = ["codec", "fields", "frame_loop", "framing", "json", "page", "proof", "viewer", "vision"];
 const FILES = new Map([["/", ["viewer.html", "text/html"]], ...MODULES.map((name) => [`/${name}.mjs`, [`${name}.mjs`, "text/javascript"]])]);
 const HEADERS = {
   "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'unsafe-inline'; connect-src 'self'; frame-ancestors 'none'",

@@ -7,9 +7,9 @@
 import { CHANNELS, WireError, encode, readJpegSize, readMessage } from "./codec.mjs";
 import { Gate } from "./gate.mjs";
 import { isStill } from "./limits.mjs";
-import { shown } from "./judging.mjs";
 import { sessionDigest } from "./proof.mjs";
 import { Stream } from "./stream.mjs";
+import { shown } from "./validation.mjs";
 
 const PERIODS_US = { status: 100_000, odometry: 50_000, camera: 500_000 };
 /** Channels that a robot wants of its peers. */

@@ -4,7 +4,7 @@
  * A frame is captured only while there is credit, so it is young when it leaves and nothing queues behind it.
  */
 
-import { same } from "./judging.mjs";
+import { same } from "./validation.mjs";
 
 const FIRST_TIMEOUT_US = 120_000;
 const LONGEST_TIMEOUT_US = 500_000;
@@ -51,7 +51,7 @@ export class Stream {
 
   /**
    * A twist or an ack answered frame `seq`: its credit comes back, and that of all older ones.
-   * @param {import("./judging.mjs").Holder} who
+   * @param {import("./validation.mjs").Holder} who
    */
   onAnswer(who, seq, compute_us, now_us) {
     if ((this.owner === null || now_us >= this.ownerUntil_us) && !same(who, this.owner)) this.belongTo(who);

@@ -4,7 +4,7 @@
  * A frame is acknowledged after it was drawn, so that the robot sends as fast as this page draws and nothing queues.
  */
 
-import { Eyes, EYES_WANT } from "./eyes.mjs";
+import { Eyes, EYES_WANT } from "./frame_loop.mjs";
 import { PeerError, SUBPROTOCOL, helloText, pack, readHello, unpack } from "./framing.mjs";
 import { OPERATOR, Vision } from "./vision.mjs";
 

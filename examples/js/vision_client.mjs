@@ -7,7 +7,7 @@
 import { randomBytes } from "node:crypto";
 import { readFileSync } from "node:fs";
 import { parseArgs } from "node:util";
-import { Eyes, EYES_WANT } from "./eyes.mjs";
+import { Eyes, EYES_WANT } from "./frame_loop.mjs";
 import { helloText } from "./framing.mjs";
 import { decodeDc } from "./jpeg_dc.mjs";
 import { Peer } from "./peer.mjs";

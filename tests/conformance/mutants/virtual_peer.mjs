@@ -44,7 +44,7 @@ async function robotOf({ load, session, jpeg, camera, limits, now_us }) {
 }
 
 async function visionOf({ load, session }) {
-  const [{ Eyes }, { Vision }, { CHANNELS, encode }, { decodeDc }] = await load("eyes", "vision", "codec", "jpeg_dc");
+  const [{ Eyes }, { Vision }, { CHANNELS, encode }, { decodeDc }] = await load("frame_loop", "vision", "codec", "jpeg_dc");
   let [clock_us, out, waiting] = [0, [], []];
   const look = (jpeg) => {
     clock_us += COMPUTE_US;
