@@ -11,13 +11,13 @@ export const MAX_HEADER_BYTES = 512;
 export const MAX_TWIST_BYTES = 64;
 export const MAX_PIXELS = 1920 * 1080;
 const MAX_SEGMENTS = 64;
-const MAX_DETAIL = 200;
+const MAX_DETAIL_CHARS = 200;
 
 /** A refusal: `reason` is one of the protocol's, `message` one line for a person. */
 export class WireError extends Error {
   /** @param {string} reason @param {string} detail */
   constructor(reason, detail) {
-    super(detail.slice(0, MAX_DETAIL));
+    super(detail.slice(0, MAX_DETAIL_CHARS));
     this.reason = reason;
   }
 }
@@ -31,29 +31,29 @@ export class WireError extends Error {
  * @property {number} maxPayloadBytes
  * @property {number} urgency 0 leaves first
  */
-const channel = (name, hasSource, header, payload, maxPayloadBytes, urgency) => ({
+const define = (name, hasSource, header, payload, maxPayloadBytes, urgency) => ({
   name, hasSource, header, payload, maxPayloadBytes, urgency,
 });
 
 /** @type {Record<string, Channel>} */
 export const CHANNELS = Object.assign(Object.create(null), {
-  frame: channel("frame", false, tables.FrameHeader, null, 1_000_000, 2),
-  twist: channel("twist", true, tables.AnswerHeader, null, MAX_TWIST_BYTES, 0),
-  ack: channel("ack", true, tables.AnswerHeader, null, 0, 0),
-  request: channel("request", true, tables.RequestHeader, tables.Request, 256, 0),
-  reply: channel("reply", false, tables.Stamp, tables.Reply, 1024, 1),
-  status: channel("status", false, tables.Stamp, tables.Status, 4096, 1),
-  odometry: channel("odometry", false, tables.Stamp, tables.Odometry, 256, 2),
-  scan: channel("scan", false, tables.ScanHeader, null, 16_384, 3),
-  camera: channel("camera", false, tables.Stamp, tables.CameraModel, 1024, 1),
-  detections: channel("detections", true, tables.DetectionsHeader, tables.Detections, 32_768, 1),
-  mission: channel("mission", true, tables.RequestHeader, tables.MissionRequest, 4096, 1),
-  report: channel("report", true, tables.DetectionsHeader, tables.MissionReport, 2048, 1),
-  overlay: channel("overlay", true, tables.DetectionsHeader, null, 250_000, 3),
-  preview: channel("preview", true, tables.DetectionsHeader, null, 100_000, 3),
+  frame: define("frame", false, tables.FrameHeader, null, 1_000_000, 2),
+  twist: define("twist", true, tables.AnswerHeader, null, MAX_TWIST_BYTES, 0),
+  ack: define("ack", true, tables.AnswerHeader, null, 0, 0),
+  request: define("request", true, tables.RequestHeader, tables.Request, 256, 0),
+  reply: define("reply", false, tables.Stamp, tables.Reply, 1024, 1),
+  status: define("status", false, tables.Stamp, tables.Status, 4096, 1),
+  odometry: define("odometry", false, tables.Stamp, tables.Odometry, 256, 2),
+  scan: define("scan", false, tables.ScanHeader, null, 16_384, 3),
+  camera: define("camera", false, tables.Stamp, tables.CameraModel, 1024, 1),
+  detections: define("detections", true, tables.DetectionsHeader, tables.Detections, 32_768, 1),
+  mission: define("mission", true, tables.RequestHeader, tables.MissionRequest, 4096, 1),
+  report: define("report", true, tables.DetectionsHeader, tables.MissionReport, 2048, 1),
+  overlay: define("overlay", true, tables.DetectionsHeader, null, 250_000, 3),
+  preview: define("preview", true, tables.DetectionsHeader, null, 100_000, 3),
 });
 
-const PICTURES = new Set(["frame", "overlay", "preview"]);
+const IMAGE_CHANNELS = new Set(["frame", "overlay", "preview"]);
 const ROBOT_ID = /^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/;
 const SOURCE = /^[a-z][a-z0-9_]{0,15}$/;
 const UTF8 = new TextDecoder("utf-8", { fatal: true, ignoreBOM: true }); // a byte order mark stays, and is no JSON
@@ -74,13 +74,13 @@ export function parseKey(key) {
   return found.hasSource && !SOURCE.test(source) ? null : { robot, channel: found, source };
 }
 
-/** @param {Channel} of @param {Uint8Array} header @param {Uint8Array} payload */
-export function checkSizes(of, header, payload) {
+/** @param {Channel} channel @param {Uint8Array} header @param {Uint8Array} payload */
+export function checkSizes(channel, header, payload) {
   if (header.length > MAX_HEADER_BYTES) {
-    throw new WireError("MALFORMED", `${of.name} header is ${header.length} bytes, at most ${MAX_HEADER_BYTES}`);
+    throw new WireError("MALFORMED", `${channel.name} header is ${header.length} bytes, at most ${MAX_HEADER_BYTES}`);
   }
-  if (payload.length > of.maxPayloadBytes) {
-    throw new WireError("MALFORMED", `${of.name} payload is ${payload.length} bytes, at most ${of.maxPayloadBytes}`);
+  if (payload.length > channel.maxPayloadBytes) {
+    throw new WireError("MALFORMED", `${channel.name} payload is ${payload.length} bytes, at most ${channel.maxPayloadBytes}`);
   }
 }
 
@@ -94,7 +94,7 @@ export function decode(fields, bytes) {
   try {
     return tables.readFields(fields, parseJson(UTF8.decode(bytes)));
   } catch (error) {
-    if (error instanceof tables.FieldError && error.where === "v") {
+    if (error instanceof tables.FieldError && error.path === "v") {
       throw new WireError("UNSUPPORTED_VERSION", `another version; this peer uses ${tables.VERSION}`);
     }
     const known = error instanceof tables.FieldError || error instanceof JsonError || error instanceof TypeError;
@@ -118,8 +118,8 @@ export function parseTwist(bytes) {
   const found = TWIST.exec(text);
   if (found === null) {
     const fields = text.split("|");
-    const wild = fields.length === 2 && fields.some((field) => NOT_FINITE.test(field));
-    throw new WireError(wild ? "NOT_FINITE" : "MALFORMED", "twist is not linear|angular, e.g. 0.2000|-0.3500");
+    const isNotFinite = fields.length === 2 && fields.some((field) => NOT_FINITE.test(field));
+    throw new WireError(isNotFinite ? "NOT_FINITE" : "MALFORMED", "twist is not linear|angular, e.g. 0.2000|-0.3500");
   }
   const [linear, angular] = [Number(found[1]), Number(found[2])];
   if (!Number.isFinite(linear) || !Number.isFinite(angular)) throw new WireError("NOT_FINITE", "twist overflows");
@@ -144,14 +144,14 @@ export function readJpegSize(jpeg, maxPixels = MAX_PIXELS) {
     if (at + 4 > jpeg.length || jpeg[at] !== 0xff) throw new WireError("MALFORMED", `picture: broken at byte ${at}`);
     const marker = jpeg[at + 1];
     if (marker >= 0xc0 && marker <= 0xc2) return sizeFromFrameHeader(jpeg, at, maxPixels);
-    if (isOtherCoding(marker)) throw new WireError("MALFORMED", `picture: marker ${marker.toString(16)}`);
+    if (isUnsupported(marker)) throw new WireError("MALFORMED", `picture: marker ${marker.toString(16)}`);
     at = nextSegment(jpeg, at, marker);
   }
   throw new WireError("MALFORMED", `picture: more than ${MAX_SEGMENTS} segments before the frame header`);
 }
 
 /** Lossless, hierarchical and arithmetic frame headers, and a scan before any frame header. */
-function isOtherCoding(marker) {
+function isUnsupported(marker) {
   return (marker >= 0xc3 && marker <= 0xcf && marker !== 0xc4 && marker !== 0xc8 && marker !== 0xcc) || marker === 0xda;
 }
 
@@ -188,18 +188,18 @@ export function decodeRanges(bytes) {
 
 /**
  * A message as its receiver reads it.
- * @param {Channel} of @param {string} source as in the key @param {Uint8Array} header @param {Uint8Array} payload
+ * @param {Channel} channel @param {string} source as in the key @param {Uint8Array} header @param {Uint8Array} payload
  * @returns {{source: string, header: object|null, payload: unknown}} `header` is null for a guest without one
  */
-export function readMessage(of, source, header, payload) {
-  checkSizes(of, header, payload);
-  const bare = of.name === "twist" && source === "guest" && header.length === 0;
-  return { source, header: bare ? null : decode(of.header, header), payload: readPayload(of, payload) };
+export function readMessage(channel, source, header, payload) {
+  checkSizes(channel, header, payload);
+  const isBare = channel.name === "twist" && source === "guest" && header.length === 0;
+  return { source, header: isBare ? null : decode(channel.header, header), payload: readPayload(channel, payload) };
 }
 
-function readPayload(of, payload) {
-  if (of.payload !== null) return decode(of.payload, payload);
-  if (PICTURES.has(of.name)) return readJpegSize(payload);
-  if (of.name === "twist") return parseTwist(payload);
-  return of.name === "scan" ? decodeRanges(payload) : null;
+function readPayload(channel, payload) {
+  if (channel.payload !== null) return decode(channel.payload, payload);
+  if (IMAGE_CHANNELS.has(channel.name)) return readJpegSize(payload);
+  if (channel.name === "twist") return parseTwist(payload);
+  return channel.name === "scan" ? decodeRanges(payload) : null;
 }

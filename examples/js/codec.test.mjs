@@ -10,7 +10,7 @@ import { Real, parseJson } from "./json.mjs";
 
 const VECTORS = new URL("../../protocol/vectors/", import.meta.url);
 const bytes = (text) => new TextEncoder().encode(text);
-const refusal = (reason) => (error) => error instanceof WireError && error.reason === reason;
+const hasReason = (reason) => (error) => error instanceof WireError && error.reason === reason;
 const base64 = (hex) => Buffer.from(hex, "hex").toString("base64");
 
 /** All but those of the STOP port, which these peers do not have. */
@@ -61,18 +61,18 @@ for (const text of ["", "01", "1.", ".5", "+1", "[1,]", '{"a":1,}', "{'a':1}", '
 test("of a field given twice the last counts, and __proto__ is a field like another", () => {
   const stamp = decode(Stamp, bytes('{"__proto__":{"seq":1},"session":"0a1b2c3d","seq":5,"seq":6,"t_us":0}'));
   assert.equal(stamp.seq, 6);
-  assert.throws(() => decode(Stamp, bytes('{"__proto__":{"seq":1},"session":"0a1b2c3d","t_us":0}')), refusal("MALFORMED"));
+  assert.throws(() => decode(Stamp, bytes('{"__proto__":{"seq":1},"session":"0a1b2c3d","t_us":0}')), hasReason("MALFORMED"));
 });
 
 test("the version is judged before the other fields", () => {
-  assert.throws(() => decode(AnswerHeader, bytes('{"v":2}')), refusal("UNSUPPORTED_VERSION"));
-  assert.throws(() => decode(AnswerHeader, bytes('{"v":true}')), refusal("UNSUPPORTED_VERSION"));
+  assert.throws(() => decode(AnswerHeader, bytes('{"v":2}')), hasReason("UNSUPPORTED_VERSION"));
+  assert.throws(() => decode(AnswerHeader, bytes('{"v":true}')), hasReason("UNSUPPORTED_VERSION"));
 });
 
 test("characters are code points", () => {
   const reply = { to: "0a1b2c3d", id: 1, ok: true, state: "HOLD", detail: "\u{1f6d1}".repeat(200) };
   assert.equal(decode(Reply, encode(reply)).detail.length, 400);
-  assert.throws(() => decode(Reply, encode({ ...reply, detail: "x".repeat(201) })), refusal("MALFORMED"));
+  assert.throws(() => decode(Reply, encode({ ...reply, detail: "x".repeat(201) })), hasReason("MALFORMED"));
 });
 
 test("what is encoded is decoded again, nulls left out", () => {
@@ -99,5 +99,5 @@ test("keys are exact", () => {
 test("a picture's bound can be set", () => {
   const gray = Uint8Array.from([0xff, 0xd8, 0xff, 0xc0, 0, 11, 8, 0, 48, 0, 64, 1, 1, 0x11, 0]);
   assert.deepEqual(readJpegSize(gray), { width_px: 64, height_px: 48, components: 1 });
-  assert.throws(() => readJpegSize(gray, 64 * 48 - 1), refusal("MALFORMED"));
+  assert.throws(() => readJpegSize(gray, 64 * 48 - 1), hasReason("MALFORMED"));
 });

@@ -7,31 +7,31 @@
 import { createInterface } from "node:readline";
 import { fileURLToPath } from "node:url";
 import { WireError, formatTwist, parseKey, readMessage } from "./codec.mjs";
-import { PeerError, parseHello, takeApart } from "./framing.mjs";
-import { parseBoxes, parseDashed, parsePicture } from "./legacy_text.mjs";
+import { PeerError, parseHello, splitMessage } from "./framing.mjs";
+import { decodeImage, parseBoxes, parseDashed } from "./legacy_text.mjs";
 
 const fromBase64 = (text) => new Uint8Array(Buffer.from(text, "base64"));
 const fromHex = (text) => new Uint8Array(Buffer.from(text, "hex"));
 const toHex = (bytes) => Buffer.from(bytes).toString("hex");
 
 /** JSON has no infinity: a range without return is the text "inf". */
-const shown = (payload) => (Array.isArray(payload) ? payload.map((range) => (range === Infinity ? "inf" : range)) : payload);
+const jsonPayload = (payload) => (Array.isArray(payload) ? payload.map((range) => (range === Infinity ? "inf" : range)) : payload);
 
 /** What is asked, by kind: `key`, `message` ... as in the golden vectors. */
 const READERS = {
   message({ key, header, payload }) {
-    const exact = parseKey(key);
-    if (exact === null) throw new WireError("INEXACT_KEY", key);
-    const read = readMessage(exact.channel, exact.source, fromBase64(header), fromBase64(payload));
-    return { ...read, payload: shown(read.payload) };
+    const parsed = parseKey(key);
+    if (parsed === null) throw new WireError("INEXACT_KEY", key);
+    const read = readMessage(parsed.channel, parsed.source, fromBase64(header), fromBase64(payload));
+    return { ...read, payload: jsonPayload(read.payload) };
   },
   hello: ({ text }) => parseHello(text),
   websocket({ message_hex, role, robot }) {
-    const { key, header, payload } = takeApart(fromHex(message_hex), role, robot);
+    const { key, header, payload } = splitMessage(fromHex(message_hex), role, robot);
     return { key, header_hex: toHex(header), payload_hex: toHex(payload) };
   },
   older_dashed: ({ text }) => parseDashed(text),
-  older_picture: ({ text, max_bytes }) => ({ jpeg_hex: toHex(parsePicture(text, max_bytes)) }),
+  older_picture: ({ text, max_bytes }) => ({ jpeg_hex: toHex(decodeImage(text, max_bytes)) }),
   older_boxes: ({ text }) => ({ boxes: parseBoxes(text) }),
   write_twist: (twist) => new TextDecoder().decode(formatTwist(twist)),
 };

@@ -32,8 +32,8 @@ export function ballAt(t_us) {
  * @param {number} [noise] one brightness step, so that no two pictures are the same byte for byte
  * @returns {Uint8Array} JPEG
  */
-export function drawPicture(pose, ball, noise = 0) {
-  const circle = projected(pose, ball);
+export function drawJpeg(pose, ball, noise = 0) {
+  const circle = projectBall(pose, ball);
   const [across, down] = [WIDTH_PX / 8, HEIGHT_PX / 8];
   return encodeFlat(across, down, (x, y) => {
     if (x === 0 && y === 0) return COLORS.wall.map((level) => level + (noise % 8));
@@ -50,7 +50,7 @@ function lightAt(circle, x_px, y_px) {
   return square < 0 ? null : 0.35 + 0.65 * Math.max(0, 0.52 * Math.sqrt(square) - 0.3 * right - 0.8 * down);
 }
 
-function projected(pose, ball) {
+function projectBall(pose, ball) {
   const [dx_m, dy_m] = [ball.x_m - pose.x_m, ball.y_m - pose.y_m];
   const ahead_m = dx_m * Math.cos(pose.yaw_rad) + dy_m * Math.sin(pose.yaw_rad);
   const left_m = dy_m * Math.cos(pose.yaw_rad) - dx_m * Math.sin(pose.yaw_rad);
@@ -71,28 +71,28 @@ export function encodeFlat(across, down, colorOf) {
   const bits = new BitWriter();
   const last = [0, 0, 0];
   for (let block = 0; block < across * down; block += 1) {
-    levels(colorOf(block % across, Math.floor(block / across))).forEach((level, index) => {
+    toYcc(colorOf(block % across, Math.floor(block / across))).forEach((level, index) => {
       bits.difference(level - last[index]);
       last[index] = level;
     });
   }
-  return Uint8Array.from([0xff, 0xd8, ...tables(across * 8, down * 8), ...bits.finish(), 0xff, 0xd9]);
+  return Uint8Array.from([0xff, 0xd8, ...headerSegments(across * 8, down * 8), ...bits.finish(), 0xff, 0xd9]);
 }
 
-function levels([red, green, blue]) {
+function toYcc([red, green, blue]) {
   const luma = 0.299 * red + 0.587 * green + 0.114 * blue;
   return [luma - 128, (blue - luma) / 1.772, (red - luma) / 1.402].map((level) => Math.max(-128, Math.min(127, Math.round(level))));
 }
 
-const two = (value) => [value >> 8, value & 0xff];
-const segment = (marker, data) => [0xff, marker, ...two(data.length + 2), ...data];
+const uint16 = (value) => [value >> 8, value & 0xff];
+const segment = (marker, data) => [0xff, marker, ...uint16(data.length + 2), ...data];
 
-function tables(width_px, height_px) {
+function headerSegments(width_px, height_px) {
   const components = [1, 2, 3].flatMap((id) => [id, 0x11, 0]);
   return [
     ...segment(0xe0, [0x4a, 0x46, 0x49, 0x46, 0, 1, 1, 0, 0, 1, 0, 1, 0, 0]), // JFIF
     ...segment(0xdb, [0, ...new Array(64).fill(DC_QUANTUM)]),
-    ...segment(0xc0, [8, ...two(height_px), ...two(width_px), 3, ...components]),
+    ...segment(0xc0, [8, ...uint16(height_px), ...uint16(width_px), 3, ...components]),
     ...segment(0xc4, [0x00, ...DC_COUNTS, ...DC_SYMBOLS]),
     ...segment(0xc4, [0x10, 1, ...new Array(15).fill(0), 0x00]), // one code, "0": nothing follows in this block
     ...segment(0xda, [3, 1, 0, 2, 0, 3, 0, 0, 63, 0]),
@@ -104,7 +104,7 @@ const DC_CODES = (() => {
   const codes = [];
   let code = 0;
   DC_COUNTS.forEach((count, index) => {
-    for (let one = 0; one < count; one += 1) codes.push([code++, index + 1]);
+    for (let number = 0; number < count; number += 1) codes.push([code++, index + 1]);
     code <<= 1;
   });
   return codes;

@@ -1,7 +1,7 @@
 /**
  * @file The field tables of the protocol: what each header and JSON payload may hold. Pure.
  *
- * One entry per row of the tables in `protocol/README.md`. A type is a function `(value, where) -> value` that throws
+ * One entry per row of the tables in `protocol/README.md`. A type is a function `(value, path) -> value` that throws
  * {@link FieldError}; a field is `[type]`, or `[type, default]` if it may be absent.
  */
 
@@ -11,52 +11,52 @@ import { Real } from "./json.mjs";
 export const MAX_INTEGER = Number.MAX_SAFE_INTEGER;
 export const VERSION = 1;
 
-/** Thrown for a value outside its table; `where` is the field's name. */
+/** Thrown for a value outside its table; `path` is the field's name. */
 export class FieldError extends Error {
-  constructor(where, what) {
-    super(`${where}: ${what}`);
-    this.where = where;
+  constructor(path, expected) {
+    super(`${path}: ${expected}`);
+    this.path = path;
   }
 }
 
-const fail = (where, what) => {
-  throw new FieldError(where, what);
+const fail = (path, expected) => {
+  throw new FieldError(path, expected);
 };
 
-const integer = (least, most) => (value, where) =>
-  typeof value === "number" && value >= least && value <= most ? value : fail(where, `an integer ${least} to ${most}`);
+const integer = (min, max) => (value, path) =>
+  typeof value === "number" && value >= min && value <= max ? value : fail(path, `an integer ${min} to ${max}`);
 
-const number = (least, most, open = false) => (value, where) => {
+const number = (min, max, open = false) => (value, path) => {
   const plain = value instanceof Real ? value.value : value;
-  const inside = typeof plain === "number" && plain <= most && (open ? plain > least : plain >= least);
-  return inside ? plain : fail(where, `a number ${open ? "above" : "from"} ${least} to ${most}`);
+  const inside = typeof plain === "number" && plain <= max && (open ? plain > min : plain >= min);
+  return inside ? plain : fail(path, `a number ${open ? "above" : "from"} ${min} to ${max}`);
 };
 
 /** Characters are code points, not UTF-16 units. */
-const text = (most) => (value, where) =>
-  typeof value === "string" && [...value].length <= most ? value : fail(where, `text of at most ${most} characters`);
+const text = (max) => (value, path) =>
+  typeof value === "string" && [...value].length <= max ? value : fail(path, `text of at most ${max} characters`);
 
-const matching = (pattern) => (value, where) =>
-  typeof value === "string" && pattern.test(value) ? value : fail(where, `text like ${pattern}`);
+const matching = (pattern) => (value, path) =>
+  typeof value === "string" && pattern.test(value) ? value : fail(path, `text like ${pattern}`);
 
-const oneOf = (...names) => (value, where) => (names.includes(value) ? value : fail(where, `one of ${names}`));
+const oneOf = (...names) => (value, path) => (names.includes(value) ? value : fail(path, `one of ${names}`));
 
-const boolean = (value, where) => (typeof value === "boolean" ? value : fail(where, "true or false"));
+const boolean = (value, path) => (typeof value === "boolean" ? value : fail(path, "true or false"));
 
-const list = (type, least, most) => (value, where) =>
-  Array.isArray(value) && value.length >= least && value.length <= most
-    ? value.map((item, index) => type(item, `${where}.${index}`))
-    : fail(where, `a list of ${least} to ${most}`);
+const list = (type, min, max) => (value, path) =>
+  Array.isArray(value) && value.length >= min && value.length <= max
+    ? value.map((item, index) => type(item, `${path}.${index}`))
+    : fail(path, `a list of ${min} to ${max}`);
 
-const map = (type, most = Infinity, named = /^/) => (value, where) => {
-  if (!isObject(value) || Object.keys(value).length > most) fail(where, `an object of at most ${most} fields`);
-  for (const name of Object.keys(value)) if (!named.test(name)) fail(where, `names like ${named}`);
-  return Object.fromEntries(Object.entries(value).map(([name, item]) => [name, type(item, `${where}.${name}`)]));
+const map = (type, max = Infinity, named = /^/) => (value, path) => {
+  if (!isObject(value) || Object.keys(value).length > max) fail(path, `an object of at most ${max} fields`);
+  for (const name of Object.keys(value)) if (!named.test(name)) fail(path, `names like ${named}`);
+  return Object.fromEntries(Object.entries(value).map(([name, item]) => [name, type(item, `${path}.${name}`)]));
 };
 
-const orNull = (type) => (value, where) => (value === null ? null : type(value, where));
+const orNull = (type) => (value, path) => (value === null ? null : type(value, path));
 
-const object = (fields) => (value, where) => readFields(fields, value, where);
+const object = (fields) => (value, path) => readFields(fields, value, path);
 
 /** @param {unknown} value */
 function isObject(value) {
@@ -68,14 +68,14 @@ function isObject(value) {
  * @param {Record<string, Array>} fields
  * @param {unknown} value as {@link import("./json.mjs").parseJson} gives it
  */
-export function readFields(fields, value, where = "") {
-  if (!isObject(value)) fail(where, "an object");
+export function readFields(fields, value, path = "") {
+  if (!isObject(value)) fail(path, "an object");
   const read = {};
-  for (const [name, [type, absent]] of Object.entries(fields)) {
-    const path = where ? `${where}.${name}` : name;
-    if (value[name] !== undefined) read[name] = type(value[name], path);
-    else if (absent === undefined) fail(path, "is missing");
-    else read[name] = structuredClone(absent);
+  for (const [name, [type, fallback]] of Object.entries(fields)) {
+    const fieldPath = path ? `${path}.${name}` : name;
+    if (value[name] !== undefined) read[name] = type(value[name], fieldPath);
+    else if (fallback === undefined) fail(fieldPath, "is missing");
+    else read[name] = structuredClone(fallback);
   }
   return read;
 }
@@ -88,7 +88,7 @@ const source = matching(/^[a-z][a-z0-9_]{0,15}$/);
 const pose = list(real, 3, 3);
 const planar = list(real, 2, 2);
 const version = integer(VERSION, VERSION);
-const any = (value, where) => (typeof value === "string" ? value : fail(where, "text"));
+const any = (value, path) => (typeof value === "string" ? value : fail(path, "text"));
 
 export const Echo = {
   channel: [oneOf("frame", "status", "beat")], session: [session], seq: [counter], t_us: [counter],
@@ -104,14 +104,14 @@ export const FrameHeader = {
 export const ScanHeader = {
   ...Stamp, angle_min_rad: [real], angle_increment_rad: [real], range_min_m: [real], range_max_m: [real],
 };
-const asker = { v: [version, VERSION], source: [source], session: [session], seq: [counter] };
-export const Asked = { digest: [session], id: [counter] };
+const SenderHeader = { v: [version, VERSION], source: [source], session: [session], seq: [counter] };
+export const RequestId = { digest: [session], id: [counter] };
 export const AnswerHeader = {
-  ...asker, echo: [object(Echo)], compute_us: [counter, 0], scan: [orNull(counter), null],
-  mission: [orNull(object(Asked)), null], proof: [orNull(element), null], next_proof: [orNull(element), null],
+  ...SenderHeader, echo: [object(Echo)], compute_us: [counter, 0], scan: [orNull(counter), null],
+  mission: [orNull(object(RequestId)), null], proof: [orNull(element), null], next_proof: [orNull(element), null],
 };
 export const RequestHeader = {
-  ...asker, echo: [orNull(object(Echo)), null], proof: [orNull(element), null], next_proof: [orNull(element), null],
+  ...SenderHeader, echo: [orNull(object(Echo)), null], proof: [orNull(element), null], next_proof: [orNull(element), null],
 };
 
 export const VERBS = ["arm", "disarm", "stop", "reset", "acquire", "release"];
@@ -121,7 +121,7 @@ export const Reply = { to: [session], id: [counter], ok: [boolean], state: [any]
 export const Odometry = { pose: [pose], moving: [planar] };
 
 export const LeaseHolder = { source: [source], digest: [session] };
-export const LastRefusal = { source: [text(32)], reason: [text(32)], detail: [text(200)] };
+export const LastRejection = { source: [text(32)], reason: [text(32)], detail: [text(200)] };
 export const StreamStatus = {
   sent: [counter, 0],
   credit_timeouts: [counter, 0],
@@ -146,7 +146,7 @@ export const Status = {
   latency_us: [orNull(counter), null],
   accepted: [counter, 0],
   refused: [map(counter), {}],
-  last_refusal: [orNull(object(LastRefusal)), null],
+  last_refusal: [orNull(object(LastRejection)), null],
   stream: [object(StreamStatus), readFields(StreamStatus, {})],
   auto_arm: [boolean, false],
   tick_late_max_us: [counter, 0],
@@ -181,17 +181,17 @@ const corners = {
   circle: [orNull(object(DetectedCircle)), null],
   track: [orNull(counter), null],
 };
-const DetectedBox = (value, where) => {
-  const box = readFields(corners, value, where);
-  return box.x2_px >= box.x1_px && box.y2_px >= box.y1_px ? box : fail(where, "x2_px >= x1_px and y2_px >= y1_px");
+const DetectedBox = (value, path) => {
+  const box = readFields(corners, value, path);
+  return box.x2_px >= box.x1_px && box.y2_px >= box.y1_px ? box : fail(path, "x2_px >= x1_px and y2_px >= y1_px");
 };
-export const DetectionsHeader = { ...asker, echo: [orNull(object(Echo)), null], compute_us: [counter, 0] };
+export const DetectionsHeader = { ...SenderHeader, echo: [orNull(object(Echo)), null], compute_us: [counter, 0] };
 export const Detections = {
   width_px: [integer(16, 8192)], height_px: [integer(16, 8192)], boxes: [list(DetectedBox, 0, 64), []],
   detector: [text(64), ""], device: [text(32), ""], model: [text(64), ""],
 };
 const meters = number(-100, 100);
-const option = (value, where) => (typeof value === "boolean" ? value : typeof value === "string" ? text(64)(value, where) : real(value, where));
+const option = (value, path) => (typeof value === "boolean" ? value : typeof value === "string" ? text(64)(value, path) : real(value, path));
 export const MissionRequest = {
   id: [counter],
   name: [matching(/^[a-z][a-z0-9-]{0,31}$/)],
@@ -208,7 +208,7 @@ export const MissionReport = {
   phase: [text(32)],
   note: [text(200), ""],
   done: [boolean, false],
-  asked: [orNull(object(Asked)), null],
+  asked: [orNull(object(RequestId)), null],
   refused: [text(200), ""],
   detector: [text(64), ""],
   device: [text(32), ""],

@@ -7,9 +7,9 @@
 import { WireError, checkSizes, decode, encode, formatTwist, readJpegSize, readMessage } from "./codec.mjs";
 import { findTarget } from "./vision.mjs";
 
-const NOTHING = new Uint8Array(0);
+const EMPTY = new Uint8Array(0);
 /** Channels that these eyes want of a robot. */
-export const EYES_WANT = Object.freeze(["frame", "camera", "status", "reply"]);
+export const WANTED_CHANNELS = Object.freeze(["frame", "camera", "status", "reply"]);
 const DRIFT = 5000; // two quartz clocks differ by less than 1 in this
 
 /** How late a robot's messages come, without synchronized clocks: at least by what they lose on the fastest of the session. */
@@ -24,26 +24,26 @@ export class RobotClock {
    * @returns {number} its least possible age, in us
    */
   age_us({ session, t_us }, now_us) {
-    const drift_us = (now_us - this.heard_us) / DRIFT;
+    const drift_us = (now_us - this.received_us) / DRIFT;
     const learned_us = session === this.session ? this.offset_us + drift_us : Infinity;
-    Object.assign(this, { session, heard_us: now_us, offset_us: Math.min(learned_us, now_us - t_us) });
+    Object.assign(this, { session, received_us: now_us, offset_us: Math.min(learned_us, now_us - t_us) });
     return now_us - t_us - this.offset_us;
   }
 }
 
-export class Eyes {
+export class FrameLoop {
   /**
    * @param {import("./vision.mjs").Vision} vision
-   * @param {object} world
-   * @param {(jpeg: Uint8Array) => object|Promise<object>} world.look decodes (and draws) a picture, for `findTarget`
-   * @param {(name: string, header: object, payload: Uint8Array) => void} world.send
-   * @param {() => number} world.now_us
-   * @param {() => Promise<void>} [world.pause] lets what has arrived be read first, so that the newest frame wins
-   * @param {(what: object) => void} [world.onSeen] told of each answer: {target, twist, age_us}, the least age of its frame
-   * @param {(reply: object) => void} [world.onReply]
+   * @param {object} environment
+   * @param {(jpeg: Uint8Array) => object|Promise<object>} environment.decodeImage decodes (and draws) a picture, for `findTarget`
+   * @param {(name: string, header: object, payload: Uint8Array) => void} environment.send
+   * @param {() => number} environment.now_us
+   * @param {() => Promise<void>} [environment.pause] lets what has arrived be read first, so that the newest frame wins
+   * @param {(what: object) => void} [environment.onDecision] told of each answer: {target, twist, age_us}, the least age of its frame
+   * @param {(reply: object) => void} [environment.onReply]
    */
-  constructor(vision, { look, send, now_us, pause = async () => undefined, onSeen = () => undefined, onReply = () => undefined }) {
-    Object.assign(this, { vision, look, send, now_us, pause, onSeen, onReply });
+  constructor(vision, { decodeImage, send, now_us, pause = async () => undefined, onDecision = () => undefined, onReply = () => undefined }) {
+    Object.assign(this, { vision, decodeImage, send, now_us, pause, onDecision, onReply });
     this.drives = true; // otherwise frames are acknowledged only
     this.clock = new RobotClock();
     this.newest = null;
@@ -59,14 +59,14 @@ export class Eyes {
   onMessage(packet) {
     try {
       if (packet.channel.name === "frame") return this.onFrame(packet);
-      if (EYES_WANT.includes(packet.channel.name)) this.onNews(packet);
+      if (WANTED_CHANNELS.includes(packet.channel.name)) this.onState(packet);
     } catch (error) {
       this.skip(error);
     }
     return undefined;
   }
 
-  onNews({ channel, source, header, payload }) {
+  onState({ channel, source, header, payload }) {
     const read = readMessage(channel, source, header, payload);
     if (channel.name === "camera") this.vision.onCamera(read.header, read.payload);
     if (channel.name === "status") {
@@ -101,10 +101,10 @@ export class Eyes {
   async decide({ stamp, jpeg, arrival_us, age_us }) {
     try {
       if (!this.vision.advances(stamp)) throw new WireError("OUT_OF_ORDER", "the robot's clock stands still");
-      this.checkPicture(jpeg);
-      const target = findTarget(await this.look(jpeg));
+      this.checkImage(jpeg);
+      const target = findTarget(await this.decodeImage(jpeg));
       const twist = this.drives ? this.vision.twistFor(target) : null;
-      this.onSeen({ target, twist, age_us: age_us + this.now_us() - arrival_us });
+      this.onDecision({ target, twist, age_us: age_us + this.now_us() - arrival_us });
       return twist;
     } catch (error) {
       this.skip(error);
@@ -113,7 +113,7 @@ export class Eyes {
   }
 
   /** @throws {WireError} for what no decoder should see, or is not what the camera's model says */
-  checkPicture(jpeg) {
+  checkImage(jpeg) {
     const { width_px, height_px } = readJpegSize(jpeg);
     const { camera } = this.vision;
     if (camera !== null && (camera.width_px !== width_px || camera.height_px !== height_px)) {
@@ -125,12 +125,12 @@ export class Eyes {
     this.answered += 1;
     const proof = twist === null ? {} : this.vision.proofs.next();
     const header = this.vision.answerHeader(stamp, this.now_us() - arrival_us, proof);
-    if (twist === null) this.send("ack", header, NOTHING);
+    if (twist === null) this.send("ack", header, EMPTY);
     else this.send("twist", header, formatTwist(twist));
   }
 
   /** @param {string} verb @returns {number} the id that the reply will bear */
-  ask(verb) {
+  request(verb) {
     const { header, payload } = this.vision.request(verb);
     this.send("request", header, encode(payload));
     return payload.id;

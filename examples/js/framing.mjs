@@ -11,14 +11,14 @@ import { JsonError, parseJson } from "./json.mjs";
 export const SUBPROTOCOL = "sightline.v1";
 export const MAX_HELLO_BYTES = 1024;
 export const MAX_BLOCK_BYTES = 576;
-const MAX_MADE_UP_SOURCES = 16; // security limit: of one channel, messages that wait and whose source is no role's
+const MAX_UNKNOWN_SOURCES = 16; // security limit: of one channel, messages that wait and whose source is no role's
 const ROLE_SOURCES = new Set(["vision", "operator", "teleop", "detector"]);
-const PASSED_ON = new Set(["detections", "mission", "report", "overlay", "preview"]); // their sources others choose
+const RELAYED = new Set(["detections", "mission", "report", "overlay", "preview"]); // their sources others choose
 
 const UTF8 = new TextDecoder("utf-8", { fatal: true, ignoreBOM: true });
 const LATIN1 = new TextDecoder("latin1");
-const ALONE = /^\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{0,64})")?\}/;
-const FIRST = /^\{"channel":"([^"\\]{1,64})",/;
+const NAMES_ONLY = /^\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{0,64})")?\}/;
+const CHANNEL_FIRST = /^\{"channel":"([^"\\]{1,64})",/;
 
 /** The connection must end with this close code; the message is the reason, one line for a person. */
 export class PeerError extends Error {
@@ -105,13 +105,13 @@ function join(block, payload) {
  * @throws {PeerError} 1007 for what cannot be taken apart
  */
 export function unpack(message, role, robot) {
-  const { key, header, payload } = takeApart(message, role, robot);
-  const exact = parseKey(key);
-  return exact && { channel: exact.channel, source: exact.source, header, payload };
+  const { key, header, payload } = splitMessage(message, role, robot);
+  const parsed = parseKey(key);
+  return parsed && { channel: parsed.channel, source: parsed.source, header, payload };
 }
 
 /** The same with the key as the peer claims it, still to be checked. */
-export function takeApart(message, role, robot) {
+export function splitMessage(message, role, robot) {
   const size = message.length < 2 ? MAX_BLOCK_BYTES + 1 : message[0] * 256 + message[1];
   if (size > MAX_BLOCK_BYTES || message.length < 2 + size) {
     throw new PeerError(1007, `header block cut or over ${MAX_BLOCK_BYTES} bytes in a message of ${message.length}`);
@@ -124,16 +124,16 @@ export function takeApart(message, role, robot) {
 /** The names in front of the header are no part of it, and do not count among its bytes. */
 function readBlock(block, role) {
   const text = LATIN1.decode(block);
-  const alone = ALONE.exec(text);
-  if (alone !== null) {
-    return { name: alone[1], source: alone[2] ?? role, header: block.subarray(alone[0].length) };
+  const namesOnly = NAMES_ONLY.exec(text);
+  if (namesOnly !== null) {
+    return { name: namesOnly[1], source: namesOnly[2] ?? role, header: block.subarray(namesOnly[0].length) };
   }
-  const first = FIRST.exec(text);
+  const channelFirst = CHANNEL_FIRST.exec(text);
   const fields = parseBlock(block) ?? {}; // broken JSON: whoever reads the header refuses it
-  const name = first === null ? fields.channel : first[1];
+  const name = channelFirst === null ? fields.channel : channelFirst[1];
   if (typeof name !== "string") throw new PeerError(1007, "the header block names no channel");
   const source = fields.source ?? role;
-  const header = first === null ? block : withBrace(block.subarray(first[0].length));
+  const header = channelFirst === null ? block : withBrace(block.subarray(channelFirst[0].length));
   return { name, source: typeof source === "string" ? source : "", header };
 }
 
@@ -164,7 +164,7 @@ export function messageBound(wants) {
 }
 
 /** Slots of messages that have not left: one per channel, source and verb, the newest; the most urgent leaves first. */
-export class Outbox {
+export class OutgoingQueue {
   constructor() {
     this.slots = new Map();
     this.dropped = 0;
@@ -176,15 +176,15 @@ export class Outbox {
    */
   put(name, source, message, verb = "") {
     const slot = `${name}/${source}/${verb}`;
-    const isCrowded = !this.slots.has(slot) && this.isCrowded(name, source);
-    this.dropped += this.slots.has(slot) || isCrowded ? 1 : 0;
-    if (!isCrowded) this.slots.set(slot, { name, source, urgency: name === "" || verb === "stop" ? -1 : CHANNELS[name].urgency, message });
+    const isFull = !this.slots.has(slot) && this.isFull(name, source);
+    this.dropped += this.slots.has(slot) || isFull ? 1 : 0;
+    if (!isFull) this.slots.set(slot, { name, source, urgency: name === "" || verb === "stop" ? -1 : CHANNELS[name].urgency, message });
   }
 
-  isCrowded(name, source) {
-    if (!PASSED_ON.has(name) || ROLE_SOURCES.has(source)) return false;
-    const madeUp = [...this.slots.values()].filter((slot) => slot.name === name && !ROLE_SOURCES.has(slot.source));
-    return madeUp.length >= MAX_MADE_UP_SOURCES;
+  isFull(name, source) {
+    if (!RELAYED.has(name) || ROLE_SOURCES.has(source)) return false;
+    const unknown = [...this.slots.values()].filter((slot) => slot.name === name && !ROLE_SOURCES.has(slot.source));
+    return unknown.length >= MAX_UNKNOWN_SOURCES;
   }
 
   /** @returns {string|Uint8Array|undefined} */

@@ -6,7 +6,7 @@
 
 import { WireError } from "./codec.mjs";
 import { LIMITS, Ramp, STILL, ageFactor, clampTwist, isStill } from "./limits.mjs";
-import { FreshnessRecord, IssuedRecord, Lease, RANKS, RepeatRecord, SequenceRecord, isHuman, proofOf, same, shown } from "./validation.mjs";
+import { FreshnessRecord, IssuedRecord, Lease, RANKS, RepeatRecord, SequenceRecord, isHuman, isSame, proofOf, publicHolder } from "./validation.mjs";
 
 const MAX_REQUEST_AGE_US = 2_000_000;
 const GUEST = Object.freeze({ source: "guest", session: "00000000" }); // who speaks without headers
@@ -22,7 +22,7 @@ export class Gate {
   constructor(session, limits = {}, stopped = false) {
     this.limits = { ...LIMITS, ...limits };
     this.issued = new IssuedRecord(session);
-    this.pictures = new FreshnessRecord();
+    this.freshness = new FreshnessRecord();
     this.repeats = new RepeatRecord();
     this.sequence = new SequenceRecord();
     this.lease = new Lease(this.limits.lease_us);
@@ -33,8 +33,8 @@ export class Gate {
     this.command = null; // {twist, echo_us, arrival_us, life_us, citesFrame}
     this.liveCommands = this.accepted = this.holdSince_us = 0;
     this.lastStep_us = null;
-    this.refused = {};
-    this.lastRefusal = this.latency_us = null;
+    this.counters = {};
+    this.lastRejection = this.latency_us = null;
   }
 
   get armed() {
@@ -57,26 +57,26 @@ export class Gate {
    */
   offer(source, header, twist, now_us) {
     try {
-      const { who, age_us } = this.identify(source, header, now_us);
-      this.admit(who, header, now_us);
-      this.keep(header, twist, now_us, age_us);
+      const { sender, age_us } = this.identify(source, header, now_us);
+      this.admit(sender, header, now_us);
+      this.accept(header, twist, now_us, age_us);
       this.accepted += 1;
       return null;
     } catch (error) {
-      return this.refuse(source, error);
+      return this.reject(source, error);
     }
   }
 
   /** Count a refusal; anything but a {@link WireError} is a fault of this program and goes on. */
-  refuse(source, error) {
+  reject(source, error) {
     if (!(error instanceof WireError)) throw error;
     this.count(error.reason);
-    this.lastRefusal = { source: source.slice(0, 32), reason: error.reason, detail: error.message };
+    this.lastRejection = { source: source.slice(0, 32), reason: error.reason, detail: error.message };
     return error.reason;
   }
 
   count(reason) {
-    this.refused[reason] = (this.refused[reason] ?? 0) + 1;
+    this.counters[reason] = (this.counters[reason] ?? 0) + 1;
   }
 
   /** Who sends, and how old the frame behind it is (steps 2 to 6 of the judging order). */
@@ -85,32 +85,32 @@ export class Gate {
       throw new WireError("UNKNOWN_SOURCE", `unknown source ${source}, or different from the header`);
     }
     if (source === "guest" && !this.limits.guests) throw new WireError("UNKNOWN_SOURCE", "guests are switched off (--guests)");
-    if (header === null) return { who: GUEST, age_us: 0 };
+    if (header === null) return { sender: GUEST, age_us: 0 };
     if (header.echo.session === this.issued.session && header.echo.channel === "status") {
       throw new WireError("UNKNOWN_FRAME", "a twist must cite a frame, not a status");
     }
     this.issued.age_us(header.echo, now_us, this.limits.zeroSpeedAge_us);
-    const age_us = now_us - this.pictures.shownSince_us(header.echo.t_us);
+    const age_us = now_us - this.freshness.shownSince_us(header.echo.t_us);
     if (age_us > this.limits.zeroSpeedAge_us) throw new WireError("STALE", "the camera image does not change");
-    const who = { source, session: header.session };
-    this.lease.checkProof(who, proofOf(header), now_us);
+    const sender = { source, session: header.session };
+    this.lease.checkProof(sender, proofOf(header), now_us);
     this.sequence.check(header, now_us);
-    return { who, age_us };
+    return { sender, age_us };
   }
 
   /** Steps 7 to 9: the latch, the lease, the arming. */
-  admit(who, header, now_us) {
+  admit(sender, header, now_us) {
     if (this.state === "STOPPED") throw new WireError(this.state, this.reason);
     this.noticeLostHuman(now_us);
     const holder = this.lease.liveHolder(now_us);
-    if (!this.lease.mayTake(who, now_us)) throw new WireError("NOT_HOLDER", `${holder.source} ${shown(holder).digest} drives`);
-    this.liveCommands = same(holder, who) ? this.liveCommands + 1 : 1;
-    this.lease.take(who, now_us, proofOf(header));
-    this.sequence.promote(who);
+    if (!this.lease.mayTake(sender, now_us)) throw new WireError("NOT_HOLDER", `${holder.source} ${publicHolder(holder).digest} drives`);
+    this.liveCommands = isSame(holder, sender) ? this.liveCommands + 1 : 1;
+    this.lease.take(sender, now_us, proofOf(header));
+    this.sequence.promote(sender);
     if (!this.armed) throw new WireError("DISARMED", this.reason);
   }
 
-  keep(header, twist, now_us, age_us) {
+  accept(header, twist, now_us, age_us) {
     const limits = this.limits;
     const guest = header === null || header.source === "guest";
     const maxLinear_mps = guest ? Math.min(limits.maxLinear_mps, limits.guestMaxLinear_mps) : limits.maxLinear_mps;
@@ -140,7 +140,7 @@ export class Gate {
 
   goal(now_us) {
     const { command, limits } = this;
-    if (this.pictures.unchanged_us() > limits.zeroSpeedAge_us) return this.hold("the camera image does not change", now_us);
+    if (this.freshness.unchanged_us() > limits.zeroSpeedAge_us) return this.hold("the camera image does not change", now_us);
     if (command === null) return this.hold("armed; no command yet", now_us);
     if (now_us - command.arrival_us > command.life_us) {
       return this.hold(`no accepted command for more than ${command.life_us / 1000} ms`, now_us);
@@ -172,26 +172,26 @@ export class Gate {
    * @throws {WireError} with the reason if it may not be
    */
   request(header, verb, now_us) {
-    const who = { source: header.source, session: header.session };
+    const sender = { source: header.source, session: header.session };
     if (!ALWAYS_GRANTED.includes(verb) && verb !== "release") this.issued.checkRequest(header.echo, now_us, MAX_REQUEST_AGE_US);
     this.noticeLostHuman(now_us);
     if (!ALWAYS_GRANTED.includes(verb)) {
-      this.lease.checkProof(who, proofOf(header), now_us);
-      this.lease.advance(who, proofOf(header), now_us);
+      this.lease.checkProof(sender, proofOf(header), now_us);
+      this.lease.advance(sender, proofOf(header), now_us);
     }
     switch (verb) {
       case "stop":
-        return this.stop(`STOP by ${who.source}`);
+        return this.stop(`STOP by ${sender.source}`);
       case "disarm":
-        return this.disarm(`disarmed by ${who.source}`);
+        return this.disarm(`disarmed by ${sender.source}`);
       case "release":
-        return this.release(who, now_us);
+        return this.release(sender, now_us);
       case "acquire":
-        return this.acquire(who, now_us, proofOf(header));
+        return this.acquire(sender, now_us, proofOf(header));
       case "reset":
-        return this.reset(who, now_us);
+        return this.reset(sender, now_us);
       default:
-        return this.arm(who, now_us);
+        return this.arm(sender, now_us);
     }
   }
 
@@ -209,43 +209,43 @@ export class Gate {
     return "disarmed";
   }
 
-  reset(who, now_us) {
-    this.refuseBesideHuman(who, now_us);
+  reset(sender, now_us) {
+    this.rejectBesideHuman(sender, now_us);
     if (this.state !== "STOPPED") return `nothing to reset: ${this.state}`;
     if (!isStill(this.applied)) throw new WireError("NOT_ALLOWED", "the wheels are not at zero yet; repeat the request");
-    this.leave("DISARMED", `reset by ${who.source}; not armed`);
+    this.leave("DISARMED", `reset by ${sender.source}; not armed`);
     return "reset; arm to drive";
   }
 
-  arm(who, now_us) {
-    this.refuseBesideHuman(who, now_us);
+  arm(sender, now_us) {
+    this.rejectBesideHuman(sender, now_us);
     if (this.armed) return "already armed";
     if (this.state !== "DISARMED") throw new WireError(this.state, `${this.reason}; reset first`);
     const missing = this.missingToArm(now_us);
     if (missing !== "") throw new WireError("NOT_ALLOWED", missing);
     this.armsItself = this.limits.autoArm;
     this.repeats = new RepeatRecord(); // who arms has looked at the robot
-    this.begin(`armed by ${who.source}`, now_us);
+    this.begin(`armed by ${sender.source}`, now_us);
     return "armed";
   }
 
-  acquire(who, now_us, proof) {
+  acquire(sender, now_us, proof) {
     const holder = this.lease.liveHolder(now_us);
-    if (!(who.source in RANKS) || !this.lease.mayTake(who, now_us)) {
-      throw new WireError("NOT_HOLDER", holder ? `${holder.source} drives` : `${who.source} may not drive`);
+    if (!(sender.source in RANKS) || !this.lease.mayTake(sender, now_us)) {
+      throw new WireError("NOT_HOLDER", holder ? `${holder.source} drives` : `${sender.source} may not drive`);
     }
-    if (same(holder, who)) return "already held";
+    if (isSame(holder, sender)) return "already held";
     this.liveCommands = 0;
     this.command = null; // the driver before neither arms nor drives for this one
-    this.lease.take(who, now_us, proof);
+    this.lease.take(sender, now_us, proof);
     return "acquired";
   }
 
-  release(who, now_us) {
-    if (!same(this.lease.liveHolder(now_us), who)) return "not held";
+  release(sender, now_us) {
+    if (!isSame(this.lease.liveHolder(now_us), sender)) return "not held";
     this.lease.drop();
     this.command = null;
-    if (isHuman(who.source)) this.loseHuman("the operator released control; arm again");
+    if (isHuman(sender.source)) this.loseHuman("the operator released control; arm again");
     return "released";
   }
 
@@ -253,10 +253,10 @@ export class Gate {
     return this.command?.citesFrame ? Math.max(0, now_us - this.command.echo_us) : null;
   }
 
-  refuseBesideHuman(who, now_us) {
+  rejectBesideHuman(sender, now_us) {
     const holder = this.lease.liveHolder(now_us);
-    if (holder !== null && isHuman(holder.source) && !same(holder, who)) {
-      throw new WireError("NOT_ALLOWED", `${holder.source} ${shown(holder).digest} drives`);
+    if (holder !== null && isHuman(holder.source) && !isSame(holder, sender)) {
+      throw new WireError("NOT_ALLOWED", `${holder.source} ${publicHolder(holder).digest} drives`);
     }
   }
 
@@ -287,12 +287,12 @@ export class Gate {
     this.reason = reason;
   }
 
-  /** Go where the wheels are off; `again`: it may arm itself later without a person. */
-  leave(state, reason, again = false) {
+  /** Go where the wheels are off; `armsItself`: it may arm itself later without a person. */
+  leave(state, reason, armsItself = false) {
     this.state = state;
     this.reason = reason;
     this.command = null;
     this.liveCommands = 0;
-    this.armsItself = again;
+    this.armsItself = armsItself;
   }
 }

@@ -35,23 +35,23 @@ class Rig {
     return this.gate.offer(source, header, twist, this.now_us);
   }
 
-  ask(verb, { source = "operator", session = "aaaaaaaa", echo = this.frame("status") } = {}) {
+  request(verb, { source = "operator", session = "aaaaaaaa", echo = this.frame("status") } = {}) {
     return this.gate.request({ source, session, echo }, verb, this.now_us);
   }
 
   /** Five live commands, then armed. */
-  arm(who = {}) {
+  arm(sender = {}) {
     for (let count = 0; count < 5; count += 1) {
       this.pass(TICK_US);
-      assert.equal(this.command(this.frame(), who), "DISARMED");
+      assert.equal(this.command(this.frame(), sender), "DISARMED");
     }
-    assert.equal(this.ask("arm", who.source === "teleop" ? who : {}), "armed");
+    assert.equal(this.request("arm", sender.source === "teleop" ? sender : {}), "armed");
   }
 
-  drive(ticks, who = {}) {
+  drive(ticks, sender = {}) {
     for (let count = 0; count < ticks; count += 1) {
       this.pass(TICK_US);
-      assert.equal(this.command(this.frame(), who), null);
+      assert.equal(this.command(this.frame(), sender), null);
       this.gate.step(this.now_us);
     }
   }
@@ -67,20 +67,20 @@ class Rig {
   }
 }
 
-const refuses = (reason, act) => assert.throws(act, (error) => error instanceof WireError && error.reason === reason);
+const rejects = (reason, act) => assert.throws(act, (error) => error instanceof WireError && error.reason === reason);
 
 test("armed by a person after five live commands, and not before", () => {
   const rig = new Rig();
-  refuses("NOT_ALLOWED", () => rig.ask("arm"));
+  rejects("NOT_ALLOWED", () => rig.request("arm"));
   for (let count = 0; count < 4; count += 1) rig.command(rig.frame());
-  refuses("NOT_ALLOWED", () => rig.ask("arm"));
+  rejects("NOT_ALLOWED", () => rig.request("arm"));
   rig.command(rig.frame());
-  assert.equal(rig.ask("arm"), "armed");
+  assert.equal(rig.request("arm"), "armed");
   assert.equal(rig.gate.state, "HOLD");
-  assert.equal(rig.ask("arm"), "already armed");
+  assert.equal(rig.request("arm"), "already armed");
 });
 
-const JUDGED = [
+const CITATIONS = [
   ["another session of the robot", (echo) => ({ ...echo, session: "ffffffff" }), 0, "OTHER_SESSION"],
   ["a seq never issued", (echo) => ({ ...echo, seq: 999 }), 0, "UNKNOWN_FRAME"],
   ["another time", (echo) => ({ ...echo, t_us: echo.t_us + 1 }), 0, "UNKNOWN_FRAME"],
@@ -89,14 +89,14 @@ const JUDGED = [
   ["a microsecond older", (echo) => echo, 400_001, "STALE"],
   ["from the future", (echo) => echo, -1, "FROM_FUTURE"],
 ];
-for (const [name, change, later_us, expected] of JUDGED) {
+for (const [name, change, later_us, expected] of CITATIONS) {
   test(`a command that cites ${name}: ${expected ?? "accepted"}`, () => {
     const rig = new Rig();
     rig.arm();
     const echo = change(rig.frame());
     rig.pass(later_us);
     assert.equal(rig.command(echo), expected);
-    assert.equal(rig.gate.refused[expected] ?? 0, expected === null ? 0 : 1);
+    assert.equal(rig.gate.counters[expected] ?? 0, expected === null ? 0 : 1);
   });
 }
 
@@ -226,11 +226,11 @@ test("STOP is latched, older statuses cannot undo it, reset starts nothing", () 
   rig.pass(1);
   assert.equal(rig.gate.request({ source: "x", session: "aaaaaaaa", echo: null }, "stop", rig.now_us), "STOPPED");
   assert.equal(rig.command(rig.frame()), "STOPPED");
-  refuses("STALE", () => rig.ask("reset", { echo: before }));
-  refuses("NOT_ALLOWED", () => rig.ask("reset"));
+  rejects("STALE", () => rig.request("reset", { echo: before }));
+  rejects("NOT_ALLOWED", () => rig.request("reset"));
   rig.stepUntil("STOPPED", 400_000);
-  refuses("STOPPED", () => rig.ask("arm"));
-  assert.match(rig.ask("reset"), /^reset/);
+  rejects("STOPPED", () => rig.request("arm"));
+  assert.match(rig.request("reset"), /^reset/);
   assert.equal(rig.gate.state, "DISARMED");
   assert.equal(rig.command(rig.frame()), "DISARMED");
 });
@@ -247,22 +247,22 @@ test("a latch from before the restart holds, even where the robot arms itself", 
 
 test("what lets a robot move cites a status at most 2 s old", () => {
   const rig = new Rig();
-  refuses("MALFORMED", () => rig.ask("arm", { echo: null }));
-  refuses("MALFORMED", () => rig.ask("arm", { echo: rig.frame() }));
+  rejects("MALFORMED", () => rig.request("arm", { echo: null }));
+  rejects("MALFORMED", () => rig.request("arm", { echo: rig.frame() }));
   const echo = rig.frame("status");
   rig.pass(2_000_001);
-  refuses("STALE", () => rig.ask("acquire", { source: "teleop", echo }));
+  rejects("STALE", () => rig.request("acquire", { source: "teleop", echo }));
 });
 
 test("acquire and release", () => {
   const rig = new Rig();
   const human = { source: "teleop", session: "bbbbbbbb" };
-  assert.equal(rig.ask("acquire", human), "acquired");
-  assert.equal(rig.ask("acquire", human), "already held");
-  refuses("NOT_HOLDER", () => rig.ask("acquire", { source: "vision" }));
-  refuses("NOT_ALLOWED", () => rig.ask("arm"));
-  assert.equal(rig.ask("release", { ...human, echo: null }), "released");
-  assert.equal(rig.ask("release", { ...human, echo: null }), "not held");
+  assert.equal(rig.request("acquire", human), "acquired");
+  assert.equal(rig.request("acquire", human), "already held");
+  rejects("NOT_HOLDER", () => rig.request("acquire", { source: "vision" }));
+  rejects("NOT_ALLOWED", () => rig.request("arm"));
+  assert.equal(rig.request("release", { ...human, echo: null }), "released");
+  assert.equal(rig.request("release", { ...human, echo: null }), "not held");
 });
 
 test("beyond the limits: one factor for both axes, counted", () => {
@@ -270,7 +270,7 @@ test("beyond the limits: one factor for both axes, counted", () => {
   const rig = new Rig();
   rig.arm();
   assert.equal(rig.command(rig.frame(), { twist: { linear_mps: 48, angular_rad_s: 48 } }), null);
-  assert.equal(rig.gate.refused.CLAMPED, 1);
+  assert.equal(rig.gate.counters.CLAMPED, 1);
 });
 
 test("the ramp is per elapsed time and never overshoots", () => {
@@ -286,7 +286,7 @@ test("a copied identity neither drives nor locks the driver out", () => {
   const rig = new Rig();
   const chain = new ProofChain();
   for (let count = 0; count < 5; count += 1) rig.command(rig.frame(), chain.next());
-  assert.equal(rig.ask("arm"), "armed");
+  assert.equal(rig.request("arm"), "armed");
   assert.equal(rig.command(rig.frame(), { proof: "ab".repeat(16), seq: 9_000 }), "NOT_PROVEN");
   assert.equal(rig.command(rig.frame(), { seq: 9_000 }), "NOT_PROVEN");
   assert.equal(rig.command(rig.frame(), chain.next()), null);

@@ -15,14 +15,14 @@ import { OPEN_MS, admissionProblem } from "./websocket.mjs";
 
 const USAGE = "node gateway.mjs --connect ws://HOST:PORT --robot ID [--port 8765]";
 const HOST = "127.0.0.1"; // beyond loopback whoever came through here would look like somebody of this machine
-const MOST_SOCKETS = 32; // security limit, that of a robot
+const MAX_SOCKETS = 32; // security limit, that of a robot
 const KEEP_ALIVE_MS = 1000;
 
 class UsageError extends Error {}
 
 const isPort = (number) => Number.isInteger(number) && number >= 1 && number <= 65_535;
 
-function options() {
+function readOptions() {
   const text = { type: "string" };
   const { values } = parseArgs({ options: { connect: text, robot: text, port: { ...text, default: "8765" } } });
   const found = /^ws:\/\/(\[[0-9a-fA-F:]+\]|[^:/?#]+):([0-9]{1,5})\/?$/.exec(values.connect ?? "");
@@ -34,15 +34,15 @@ function options() {
 }
 
 /** The request as it came, for the robot to judge. */
-function asSent({ method, url, rawHeaders }) {
+function rawRequest({ method, url, rawHeaders }) {
   const lines = [];
   for (let at = 0; at < rawHeaders.length; at += 2) lines.push(`${rawHeaders[at]}: ${rawHeaders[at + 1]}\r\n`);
   return `${method} ${url} HTTP/1.1\r\n${lines.join("")}\r\n`;
 }
 
 /** Two sockets as one: what either says goes to the other, at the pace that the other takes it. */
-function join(near, far) {
-  for (const [from, to] of [[near, far], [far, near]]) {
+function connectBoth(client, upstream) {
+  for (const [from, to] of [[client, upstream], [upstream, client]]) {
     from.setNoDelay(true);
     from.setKeepAlive(true, KEEP_ALIVE_MS); // an end that loses its power closes nothing
     from.on("error", () => to.destroy());
@@ -51,29 +51,29 @@ function join(near, far) {
   }
 }
 
-function passOn(to) {
-  return (request, near, head) => {
+function forward(to) {
+  return (request, client, head) => {
     const problem = admissionProblem(request.rawHeaders, HOST);
-    const refuse = ([status, line]) => near.end(`HTTP/1.1 ${status} Refused\r\nConnection: close\r\n\r\n${line}\n`);
-    near.on("error", () => near.destroy());
-    if (problem !== null) return refuse(problem);
-    const far = connect(to).setTimeout(OPEN_MS, () => far.destroy(new Error("no connection in time")));
-    far.once("error", () => refuse([502, "the robot does not answer"]));
-    far.once("connect", () => {
-      far.setTimeout(0);
-      far.removeAllListeners("error");
-      far.write(asSent(request));
-      far.write(head);
-      join(near, far);
+    const reject = ([status, line]) => client.end(`HTTP/1.1 ${status} Refused\r\nConnection: close\r\n\r\n${line}\n`);
+    client.on("error", () => client.destroy());
+    if (problem !== null) return reject(problem);
+    const upstream = connect(to).setTimeout(OPEN_MS, () => upstream.destroy(new Error("no connection in time")));
+    upstream.once("error", () => reject([502, "the robot does not answer"]));
+    upstream.once("connect", () => {
+      upstream.setTimeout(0);
+      upstream.removeAllListeners("error");
+      upstream.write(rawRequest(request));
+      upstream.write(head);
+      connectBoth(client, upstream);
     });
   };
 }
 
 try {
-  const { robot, port, to } = options();
+  const { robot, port, to } = readOptions();
   const server = createServer({ headersTimeout: OPEN_MS, requestTimeout: OPEN_MS, connectionsCheckingInterval: 500, maxHeaderSize: 8192 }, servePage(HOST, robot));
-  server.maxConnections = MOST_SOCKETS;
-  server.on("upgrade", passOn(to));
+  server.maxConnections = MAX_SOCKETS;
+  server.on("upgrade", forward(to));
   server.once("error", ({ code, message }) => {
     console.error(`error: ${code === "EADDRINUSE" ? "the port is in use; choose another --port" : message}`);
     process.exit(4);

@@ -7,7 +7,7 @@
 
 import { WireError } from "./codec.mjs";
 
-const bad = (what) => {
+const malformed = (what) => {
   throw new WireError("MALFORMED", `picture: ${what}`);
 };
 
@@ -16,10 +16,10 @@ const bad = (what) => {
  * @returns {{width: number, height: number, scale: number, rgb: Uint8ClampedArray}} in blocks; `scale` pixels each way
  */
 export function decodeDc(jpeg) {
-  const picture = new Picture();
+  const decoder = new DcDecoder();
   let at = 2;
   while (at + 4 <= jpeg.length) {
-    if (jpeg[at] !== 0xff) bad(`no marker at byte ${at}`);
+    if (jpeg[at] !== 0xff) malformed(`no marker at byte ${at}`);
     const marker = jpeg[at + 1];
     if (marker === 0xff || marker === 0x01) {
       at += marker === 0xff ? 1 : 2;
@@ -28,14 +28,14 @@ export function decodeDc(jpeg) {
     if (marker === 0xd9) break;
     const end = at + 2 + jpeg[at + 2] * 256 + jpeg[at + 3];
     const segment = jpeg.subarray(at + 4, end);
-    at = marker === 0xda ? picture.readScan(segment, jpeg, end) : end;
-    if (marker !== 0xda) picture.readTable(marker, segment);
-    if (picture.isComplete()) return picture.colors();
+    at = marker === 0xda ? decoder.readScan(segment, jpeg, end) : end;
+    if (marker !== 0xda) decoder.readTable(marker, segment);
+    if (decoder.isComplete()) return decoder.colors();
   }
-  return bad("ends before its colors");
+  return malformed("ends before its colors");
 }
 
-class Picture {
+class DcDecoder {
   constructor() {
     this.quantum = [];
     this.tables = {}; // "0/1": DC table 1, "1/0": AC table 0
@@ -75,23 +75,23 @@ class Picture {
     for (let index = 0; index < data[5]; index += 1) {
       const [id, sampling, quantiser] = data.subarray(6 + index * 3, 9 + index * 3);
       const [across, down] = [sampling >> 4, sampling & 15];
-      if (!(across >= 1 && across <= 4 && down >= 1 && down <= 4)) bad("sampling factors");
+      if (!(across >= 1 && across <= 4 && down >= 1 && down <= 4)) malformed("sampling factors");
       this.components.push({ id, across, down, quantiser, values: null, last: 0 });
     }
-    this.maxAcross = Math.max(...this.components.map((one) => one.across));
-    this.maxDown = Math.max(...this.components.map((one) => one.down));
+    this.maxAcross = Math.max(...this.components.map((component) => component.across));
+    this.maxDown = Math.max(...this.components.map((component) => component.down));
     this.mcusAcross = Math.ceil(this.width_px / (8 * this.maxAcross));
     this.mcusDown = Math.ceil(this.height_px / (8 * this.maxDown));
-    for (const one of this.components) one.stride = this.mcusAcross * one.across;
+    for (const component of this.components) component.stride = this.mcusAcross * component.across;
   }
 
   /** @returns {number} where the next marker begins */
   readScan(head, jpeg, start) {
     const scanned = [];
     for (let index = 0; index < head[0]; index += 1) {
-      const one = this.components.find(({ id }) => id === head[1 + index * 2]) ?? bad("a scan of no component");
+      const component = this.components.find(({ id }) => id === head[1 + index * 2]) ?? malformed("a scan of no component");
       const chosen = head[2 + index * 2];
-      scanned.push({ one, dc: this.tables[`0/${chosen >> 4}`], ac: this.tables[`1/${chosen & 15}`] });
+      scanned.push({ component, dc: this.tables[`0/${chosen >> 4}`], ac: this.tables[`1/${chosen & 15}`] });
     }
     const [from, , approximation] = head.subarray(1 + head[0] * 2);
     if (from === 0 && approximation >> 4 === 0) this.readBlocks(scanned, new Bits(jpeg, start), approximation & 15);
@@ -99,38 +99,38 @@ class Picture {
   }
 
   readBlocks(scanned, bits, shift) {
-    const alone = scanned.length === 1;
-    for (const { one, dc, ac } of scanned) {
-      if (dc === undefined || (ac === undefined && !this.progressive)) bad("a scan without its Huffman table");
-      one.values = new Int16Array(one.stride * this.mcusDown * one.down);
-      one.last = 0;
+    const isSingle = scanned.length === 1;
+    for (const { component, dc, ac } of scanned) {
+      if (dc === undefined || (ac === undefined && !this.progressive)) malformed("a scan without its Huffman table");
+      component.values = new Int16Array(component.stride * this.mcusDown * component.down);
+      component.last = 0;
     }
-    const { one } = scanned[0];
-    const across = alone ? Math.ceil((this.width_px * one.across) / (8 * this.maxAcross)) : this.mcusAcross;
-    const down = alone ? Math.ceil((this.height_px * one.down) / (8 * this.maxDown)) : this.mcusDown;
+    const { component } = scanned[0];
+    const across = isSingle ? Math.ceil((this.width_px * component.across) / (8 * this.maxAcross)) : this.mcusAcross;
+    const down = isSingle ? Math.ceil((this.height_px * component.down) / (8 * this.maxDown)) : this.mcusDown;
     for (let mcu = 0; mcu < across * down; mcu += 1) {
       if (this.restart && mcu > 0 && mcu % this.restart === 0) this.restartAt(bits, scanned);
       const [x, y] = [mcu % across, Math.floor(mcu / across)];
-      for (const part of scanned) this.readMcu(part, bits, shift, x, y, alone);
+      for (const part of scanned) this.readMcu(part, bits, shift, x, y, isSingle);
     }
   }
 
   restartAt(bits, scanned) {
     bits.skipRestart();
-    for (const { one } of scanned) one.last = 0;
+    for (const { component } of scanned) component.last = 0;
   }
 
-  readMcu({ one, dc, ac }, bits, shift, x, y, alone) {
-    const [wide, high] = alone ? [1, 1] : [one.across, one.down];
+  readMcu({ component, dc, ac }, bits, shift, x, y, isSingle) {
+    const [wide, high] = isSingle ? [1, 1] : [component.across, component.down];
     for (let block = 0; block < wide * high; block += 1) {
-      one.last += bits.signed(bits.symbol(dc));
+      component.last += bits.signed(bits.symbol(dc));
       if (!this.progressive) skipAc(bits, ac);
-      one.values[(y * high + Math.floor(block / wide)) * one.stride + x * wide + (block % wide)] = one.last << shift;
+      component.values[(y * high + Math.floor(block / wide)) * component.stride + x * wide + (block % wide)] = component.last << shift;
     }
   }
 
   isComplete() {
-    return this.components.length > 0 && this.components.every((one) => one.values !== null);
+    return this.components.length > 0 && this.components.every((component) => component.values !== null);
   }
 
   colors() {
@@ -139,9 +139,9 @@ class Picture {
     const levels = [0, 0, 0];
     for (let y = 0, at = 0; y < height; y += 1) {
       for (let x = 0; x < width; x += 1, at += 3) {
-        this.components.forEach((one, index) => {
-          const block = Math.floor((y * one.down) / this.maxDown) * one.stride + Math.floor((x * one.across) / this.maxAcross);
-          levels[index] = (one.values[block] * this.quantum[one.quantiser]) / 8;
+        this.components.forEach((component, index) => {
+          const block = Math.floor((y * component.down) / this.maxDown) * component.stride + Math.floor((x * component.across) / this.maxAcross);
+          levels[index] = (component.values[block] * this.quantum[component.quantiser]) / 8;
         });
         const [luma, blue, red] = levels;
         rgb[at] = luma + 128 + 1.402 * red;
@@ -190,7 +190,7 @@ class Bits {
   constructor(data, at) {
     this.data = data;
     this.at = at;
-    this.buffer = this.held = this.invented = 0;
+    this.buffer = this.held = this.padding = 0;
   }
 
   fill() {
@@ -199,7 +199,7 @@ class Bits {
       const ended = byte === undefined || (byte === 0xff && this.data[this.at + 1] !== 0);
       this.buffer = ((this.buffer << 8) | (ended ? 0 : byte)) & 0xffffff;
       this.held += 8;
-      if (ended) this.invented += 8;
+      if (ended) this.padding += 8;
       else this.at += byte === 0xff ? 2 : 1;
     }
   }
@@ -207,13 +207,13 @@ class Bits {
   skip(count) {
     this.fill();
     this.held -= count;
-    if (this.held < this.invented) bad("its data is cut short");
+    if (this.held < this.padding) malformed("its data is cut short");
   }
 
   symbol(table) {
     this.fill();
     const found = table[(this.buffer >> (this.held - 16)) & 0xffff];
-    if (found === 0) bad("a code of no table");
+    if (found === 0) malformed("a code of no table");
     this.skip(found & 31);
     return found >> 5;
   }
@@ -221,7 +221,7 @@ class Bits {
   /** A number of `size` bits as T.81 writes it: the upper half positive. */
   signed(size) {
     if (size === 0) return 0;
-    if (size > 15) bad("a number of over 15 bits");
+    if (size > 15) malformed("a number of over 15 bits");
     this.fill();
     const value = (this.buffer >> (this.held - size)) & ((1 << size) - 1);
     this.skip(size);
@@ -229,8 +229,8 @@ class Bits {
   }
 
   skipRestart() {
-    this.buffer = this.held = this.invented = 0;
-    if (this.data[this.at] !== 0xff || (this.data[this.at + 1] & 0xf8) !== 0xd0) bad("a restart marker is missing");
+    this.buffer = this.held = this.padding = 0;
+    if (this.data[this.at] !== 0xff || (this.data[this.at + 1] & 0xf8) !== 0xd0) malformed("a restart marker is missing");
     this.at += 2;
   }
 }

@@ -27,7 +27,7 @@ export function parseDashed(text) {
 }
 
 /** @param {string} text base64, with line ends or without @param {number} maxBytes of the picture @returns {Uint8Array} */
-export function parsePicture(text, maxBytes) {
+export function decodeImage(text, maxBytes) {
   const joined = text.replace(/[\r\n]/g, "");
   if (joined.length > 4 * Math.ceil(maxBytes / 3) || !BASE64.test(joined)) malformed(`picture is no base64 of at most ${maxBytes} bytes`);
   const jpeg = Uint8Array.from(atob(joined), (character) => character.charCodeAt(0));

@@ -1,16 +1,16 @@
-/** @file Frames of RFC 6455, `sightline.v1` on them, credit, and the robot and the eyes back to back. */
+/** @file Frames of RFC 6455, `sightline.v1` on them, credit, and the robot and the loop back to back. */
 
 import assert from "node:assert/strict";
 import test from "node:test";
 import { AnswerHeader } from "./fields.mjs";
 import { CHANNELS, decode, encode } from "./codec.mjs";
-import { Eyes } from "./frame_loop.mjs";
-import { Outbox, PeerError, helloText, messageBound, pack, packRaw, readHello, unpack } from "./framing.mjs";
+import { FrameLoop } from "./frame_loop.mjs";
+import { OutgoingQueue, PeerError, helloText, messageBound, pack, packRaw, readHello, unpack } from "./framing.mjs";
 import { FrameReader, OPCODE, closePayload, encodeFrame } from "./rfc6455.mjs";
 import { Robot } from "./robot.mjs";
 import { Stream } from "./stream.mjs";
 import { Vision, findTarget } from "./vision.mjs";
-import { DRAWN_CAMERA, ballAt, drawPicture } from "./drawing.mjs";
+import { DRAWN_CAMERA, ballAt, drawJpeg } from "./drawing.mjs";
 import { decodeDc } from "./jpeg_dc.mjs";
 import { admissionProblem } from "./websocket.mjs";
 
@@ -118,36 +118,36 @@ test("an end accepts no larger message than it wants", () => {
   assert.equal(messageBound(["frame", "status"]), 2 + 576 + CHANNELS.frame.maxPayloadBytes);
 });
 
-test("the outbox keeps the newest of each channel and source, the most urgent leaves first", () => {
-  const outbox = new Outbox();
-  outbox.put("frame", "", "old");
-  outbox.put("frame", "", "new");
-  outbox.put("ack", "a", "ack");
-  outbox.put("", "", "hello");
-  assert.deepEqual([outbox.take(), outbox.take(), outbox.take(), outbox.take()], ["hello", "ack", "new", undefined]);
-  assert.equal(outbox.dropped, 1);
+test("the queue keeps the newest of each channel and source, the most urgent leaves first", () => {
+  const queue = new OutgoingQueue();
+  queue.put("frame", "", "old");
+  queue.put("frame", "", "new");
+  queue.put("ack", "a", "ack");
+  queue.put("", "", "hello");
+  assert.deepEqual([queue.take(), queue.take(), queue.take(), queue.take()], ["hello", "ack", "new", undefined]);
+  assert.equal(queue.dropped, 1);
 });
 
 test("a request waits for each verb, and STOP goes first", () => {
-  const outbox = new Outbox();
-  for (const verb of ["arm", "stop", "arm", "stop", "disarm"]) outbox.put("request", "operator", verb, verb);
-  assert.deepEqual([outbox.take(), outbox.take(), outbox.take(), outbox.take()], ["stop", "arm", "disarm", undefined]);
-  outbox.put("", "", "hello");
-  outbox.put("request", "operator", "stop", "stop");
-  assert.deepEqual([outbox.take(), outbox.take()], ["hello", "stop"]);
+  const queue = new OutgoingQueue();
+  for (const verb of ["arm", "stop", "arm", "stop", "disarm"]) queue.put("request", "operator", verb, verb);
+  assert.deepEqual([queue.take(), queue.take(), queue.take(), queue.take()], ["stop", "arm", "disarm", undefined]);
+  queue.put("", "", "hello");
+  queue.put("request", "operator", "stop", "stop");
+  assert.deepEqual([queue.take(), queue.take()], ["hello", "stop"]);
 });
 
 test("whoever makes up sources gets few places, and takes none of the roles'", () => {
-  const outbox = new Outbox();
-  for (let number = 0; number < 1000; number += 1) outbox.put("detections", `s${number}`, "old");
-  for (const source of ["vision", "detector", "s0"]) outbox.put("detections", source, "new");
-  for (let number = 0; number < 20; number += 1) outbox.put("request", `s${number}`, "stop");
+  const queue = new OutgoingQueue();
+  for (let number = 0; number < 1000; number += 1) queue.put("detections", `s${number}`, "old");
+  for (const source of ["vision", "detector", "s0"]) queue.put("detections", source, "new");
+  for (let number = 0; number < 20; number += 1) queue.put("request", `s${number}`, "stop");
   const taken = [];
-  for (let message = outbox.take(); message !== undefined; message = outbox.take()) taken.push(message);
+  for (let message = queue.take(); message !== undefined; message = queue.take()) taken.push(message);
   assert.deepEqual(taken.slice(0, 20), Array(20).fill("stop"));
   assert.equal(taken.filter((message) => message === "old").length, 15);
   assert.equal(taken.filter((message) => message === "new").length, 3);
-  assert.equal(outbox.dropped, 1000 - 16 + 1);
+  assert.equal(queue.dropped, 1000 - 16 + 1);
 });
 
 const ADMITTED = [
@@ -167,14 +167,14 @@ for (const [headers, admitted] of ADMITTED) {
   });
 }
 
-const WHO = { source: "vision", session: "4e5f6071" };
+const SENDER = { source: "vision", session: "4e5f6071" };
 
 test("one frame in flight, credit comes back with its answer or after 120 ms", () => {
   const stream = new Stream(30);
   assert.ok(stream.mayCapture(0));
   stream.onSent(0, 0, 0);
   assert.ok(!stream.mayCapture(100_000));
-  stream.onAnswer(WHO, 0, 0, 5_000);
+  stream.onAnswer(SENDER, 0, 0, 5_000);
   assert.ok(stream.mayCapture(100_000));
   stream.onSent(1, 100_000, 100_000);
   assert.ok(stream.mayCapture(300_000));
@@ -186,8 +186,8 @@ test("the window widens by the link's delay, never by a slow detector", () => {
   for (let seq = 0; seq < 20; seq += 1) {
     slowLink.onSent(seq, seq * 100_000, seq * 100_000);
     slowPeer.onSent(seq, seq * 100_000, seq * 100_000);
-    slowLink.onAnswer(WHO, seq, 0, seq * 100_000 + 70_000);
-    slowPeer.onAnswer(WHO, seq, 69_000, seq * 100_000 + 70_000);
+    slowLink.onAnswer(SENDER, seq, 0, seq * 100_000 + 70_000);
+    slowPeer.onAnswer(SENDER, seq, 69_000, seq * 100_000 + 70_000);
   }
   assert.equal(slowLink.window, 3);
   assert.equal(slowPeer.window, 1);
@@ -195,28 +195,28 @@ test("the window widens by the link's delay, never by a slow detector", () => {
 
 test("credit belongs to who drives; others watch at that pace", () => {
   const stream = new Stream(30);
-  stream.onHolder(WHO, 0);
+  stream.onHolder(SENDER, 0);
   stream.onSent(0, 0, 0);
   stream.onAnswer({ source: "viewer", session: "99999999" }, 0, 0, 1000);
   assert.ok(!stream.mayCapture(50_000));
 });
 
-test("a drawn picture is seen by the eyes, steered at, and the robot drives", async () => {
+test("a drawn picture is seen by the loop, steered at, and the robot drives", async () => {
   let now_us = 1_000_000;
   const robot = new Robot({ session: "0a1b2c3d", fps: 30, camera: DRAWN_CAMERA, limits: { autoArm: true } });
-  const eyes = new Eyes(new Vision("4e5f6071"), {
-    look: decoded,
+  const loop = new FrameLoop(new Vision("4e5f6071"), {
+    decodeImage: decoded,
     send: (name, header, payload) => robot.onMessage(unpack(pack(name, header, payload), "vision", "js1"), now_us),
     now_us: () => now_us,
   });
   for (let count = 0; count < 60; count += 1, now_us += 33_333) {
-    for (const { name, header, payload } of robot.tick(now_us)) await eyes.onMessage(unpack(pack(name, header, payload), "", "js1"));
+    for (const { name, header, payload } of robot.tick(now_us)) await loop.onMessage(unpack(pack(name, header, payload), "", "js1"));
     assert.ok(robot.mayCapture(now_us), `credit at ${count}`);
-    const frame = robot.onPicture(drawPicture(robot.pose, { x_m: 1.5, y_m: 0.5 }), now_us, now_us);
-    await eyes.onMessage(unpack(pack(frame.name, frame.header, frame.payload), "", "js1"));
+    const frame = robot.onImage(drawJpeg(robot.pose, { x_m: 1.5, y_m: 0.5 }), now_us, now_us);
+    await loop.onMessage(unpack(pack(frame.name, frame.header, frame.payload), "", "js1"));
   }
-  assert.equal(eyes.answered, 60);
-  assert.deepEqual(eyes.vision.camera.width_px, 640);
+  assert.equal(loop.answered, 60);
+  assert.deepEqual(loop.vision.camera.width_px, 640);
   assert.equal(robot.gate.state, "ACTIVE");
   assert.ok(robot.pose.yaw_rad > 0.1 && robot.pose.x_m > 0.1, JSON.stringify(robot.pose));
 });
@@ -224,34 +224,34 @@ test("a drawn picture is seen by the eyes, steered at, and the robot drives", as
 test("a bad picture is acknowledged, a newer frame replaces one that waits", async () => {
   const sent = [];
   let release;
-  const look = () => new Promise((resolve) => (release = () => resolve({ width: 1, height: 1, scale: 8, data: [0, 0, 0], channels: 3 })));
-  const eyes = new Eyes(new Vision("4e5f6071"), { look, send: (name, header) => sent.push([name, header.echo.seq]), now_us: () => 0 });
+  const decodeImage = () => new Promise((resolve) => (release = () => resolve({ width: 1, height: 1, scale: 8, data: [0, 0, 0], channels: 3 })));
+  const loop = new FrameLoop(new Vision("4e5f6071"), { decodeImage, send: (name, header) => sent.push([name, header.echo.seq]), now_us: () => 0 });
   const frame = (seq, jpeg) => ({ channel: CHANNELS.frame, source: "", header: encode({ v: 1, session: "0a1b2c3d", seq, t_us: seq }), payload: jpeg });
-  await eyes.onMessage(frame(1, bytes("no picture")));
+  await loop.onMessage(frame(1, bytes("no picture")));
   assert.deepEqual(sent, [["ack", 1]]);
-  const good = drawPicture({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
-  eyes.vision.onCamera({ session: "0a1b2c3d" }, DRAWN_CAMERA);
-  const working = eyes.onMessage(frame(2, good));
+  const good = drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
+  loop.vision.onCamera({ session: "0a1b2c3d" }, DRAWN_CAMERA);
+  const working = loop.onMessage(frame(2, good));
   await Promise.resolve();
-  for (const seq of [3, 4]) eyes.onMessage(frame(seq, good));
-  eyes.onMessage(frame(3, good));
+  for (const seq of [3, 4]) loop.onMessage(frame(seq, good));
+  loop.onMessage(frame(3, good));
   for (let turn = 0; turn < 2; turn += 1) {
     release();
     for (let wait = 0; wait < 5; wait += 1) await Promise.resolve();
   }
   await working;
   assert.deepEqual(sent.map(([, seq]) => seq), [1, 2, 4]);
-  assert.equal(eyes.skipped.OUT_OF_ORDER, 1);
+  assert.equal(loop.skipped.OUT_OF_ORDER, 1);
 });
 
 test("the drawn ball is in sight of a robot that stands, at any time", () => {
   for (let t_us = 0; t_us < 40e6; t_us += 700e3) {
-    assert.ok(findTarget(decoded(drawPicture({ x_m: 0, y_m: 0, yaw_rad: 0 }, ballAt(t_us)))), `after ${t_us / 1e6} s`);
+    assert.ok(findTarget(decoded(drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, ballAt(t_us)))), `after ${t_us / 1e6} s`);
   }
 });
 
 test("a JPEG cut anywhere is refused, not decoded", () => {
-  const good = drawPicture({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
+  const good = drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
   assert.deepEqual([decodeDc(good).width, decodeDc(good).height], [80, 60]);
   for (let end = 0; end < good.length - 4; end += 7) assert.throws(() => decodeDc(good.subarray(0, end)), /picture/);
 });
@@ -266,14 +266,14 @@ test("detections are passed on as they came, and drive nothing", () => {
     assert.deepEqual([again.source, text(again.header), text(again.payload)], ["guest", text(came), text(found)]);
   }
   assert.equal(JSON.parse(text(packRaw("detections", "guest", header, bytes("")).subarray(2))).session, "4e5f6071");
-  assert.deepEqual(robot.gate.refused, {});
+  assert.deepEqual(robot.gate.counters, {});
 });
 
 test("a live camera whose picture does not change is old sight", () => {
   const robot = new Robot({ session: "0a1b2c3d", fps: 30, camera: DRAWN_CAMERA, live: true });
-  const jpeg = drawPicture({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
+  const jpeg = drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
   const answers = [0, 200_000, 400_000, 400_001].map((t_us) => {
-    const { header } = robot.onPicture(jpeg, 1_000_000 + t_us, 1_000_000 + t_us);
+    const { header } = robot.onImage(jpeg, 1_000_000 + t_us, 1_000_000 + t_us);
     const echo = { channel: "frame", session: header.session, seq: header.seq, t_us: header.t_us };
     return robot.gate.offer("vision", { ...HEADER, seq: header.seq + 1, echo }, { linear_mps: 0.1, angular_rad_s: 0 }, header.t_us);
   });
@@ -293,7 +293,7 @@ test("another session of the robot: what was learned is forgotten", () => {
 test("how quick one owner was says nothing of the next", () => {
   const stream = new Stream(30);
   stream.onSent(0, 0, 0);
-  stream.onAnswer(WHO, 0, 0, 2000);
+  stream.onAnswer(SENDER, 0, 0, 2000);
   assert.equal(stream.timeout_us, 15_000);
   stream.onAnswer({ source: "viewer", session: "99999999" }, 0, 0, 1_500_000);
   assert.equal(stream.timeout_us, 120_000);

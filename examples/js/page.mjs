@@ -1,72 +1,72 @@
 /** @file Ties the viewer to the elements of viewer.html. Shell. */
 
-import { Viewer, canvasLook, markTarget } from "./viewer.mjs";
+import { Viewer, canvasDecoder, markTarget } from "./viewer.mjs";
 
 const REFRESH_MS = 100;
 const OLD_MS = 500; // what is older than this must not look like the present
 const STATUS_MS = 1000; // ten times the period of a status
-const part = (id) => document.getElementById(id);
+const element = (id) => document.getElementById(id);
 const write = (id, text) => {
-  part(id).textContent = text;
+  element(id).textContent = text;
 };
 const drawnAt_ms = []; // of the last second
 let statusAt_ms = Infinity; // of the state on the page; Infinity: it shows none
-let newsState = null; // of the robot, that the news goes with; null: the news stays until the next
+let messageState = null; // of the robot, to which the message belongs; null: the message stays until the next one
 let newest_ms = 0; // least age of the newest image when it was drawn
 
 /** @param {object} what one thing that changed */
 function show({ link, status, reply, stop, target, age_us }) {
   if (link !== undefined) {
     write("link", link);
-    part("link").className = link === "connected" ? "" : "lost";
-    if (link !== "connected") forgetStatus("");
+    element("link").className = link === "connected" ? "" : "lost";
+    if (link !== "connected") clearStatus("");
   }
   if (status !== undefined) showStatus(status);
-  if (reply !== undefined) tell(reply.detail, reply.state);
-  if (stop !== undefined) tell(stop, stop === "STOPPED" ? stop : null);
+  if (reply !== undefined) showMessage(reply.detail, reply.state);
+  if (stop !== undefined) showMessage(stop, stop === "STOPPED" ? stop : null);
   if (target !== undefined) {
     drawnAt_ms.push(performance.now());
     newest_ms = age_us / 1000;
-    markTarget(part("picture"), target);
+    markTarget(element("picture"), target);
   }
 }
 
-function tell(news, state) {
-  newsState = state;
-  write("news", news);
+function showMessage(message, state) {
+  messageState = state;
+  write("message", message);
 }
 
 /** What a request or STOP came to is over with the state that it led to. */
-function forgetNews(state) {
-  if (newsState !== null && state !== newsState) tell("", null);
+function clearMessage(state) {
+  if (messageState !== null && state !== messageState) showMessage("", null);
 }
 
 function showStatus({ state, reason, holder, applied, frame_age_us, latency_us, stream }) {
   statusAt_ms = performance.now();
-  forgetNews(state);
+  clearMessage(state);
   write("state", state);
-  part("state").className = state;
+  element("state").className = state;
   write("reason", reason);
   const side = applied[1] < 0 ? "right" : "left";
   write("wheels", `${applied[0].toFixed(2)} m/s, turning ${side} at ${Math.abs(applied[1]).toFixed(2)} rad/s`);
   write("driver", holder === null ? "nobody" : holder.digest === viewer.vision.digest ? "this page" : `${holder.source} ${holder.digest}`);
   const ages = [["now", frame_age_us], ["when the last command came", latency_us]].filter(([, age_us]) => age_us !== null);
-  write("sight", ages.map(([what, age_us]) => `${Math.round(age_us / 1000)} ms old ${what}`).join(", ") || "none");
-  write("pictures", `${stream.sent} sent, ${viewer.eyes.answered} answered here, ${stream.credit_timeouts} unanswered in time`);
+  write("frame_age", ages.map(([what, age_us]) => `${Math.round(age_us / 1000)} ms old ${what}`).join(", ") || "none");
+  write("frames", `${stream.sent} sent, ${viewer.frameLoop.answered} answered here, ${stream.credit_timeouts} unanswered in time`);
 }
 
 /** What is no longer known must not look like the present. */
-function forgetStatus(reason) {
+function clearStatus(reason) {
   statusAt_ms = Infinity;
-  forgetNews("?");
-  for (const id of ["state", "wheels", "driver", "sight", "pictures"]) write(id, "?");
-  part("state").className = "";
+  clearMessage("?");
+  for (const id of ["state", "wheels", "driver", "frame_age", "frames"]) write(id, "?");
+  element("state").className = "";
   write("reason", reason);
 }
 
 function refresh() {
   showAge();
-  if (performance.now() - statusAt_ms > STATUS_MS) forgetStatus("no status for more than 1 s");
+  if (performance.now() - statusAt_ms > STATUS_MS) clearStatus("no status for more than 1 s");
 }
 
 /** What stands still, or comes late, must be seen to: the age grows while nothing comes. */
@@ -76,7 +76,7 @@ function showAge() {
   if (drawnAt_ms.length === 0) return;
   const since_ms = now_ms - drawnAt_ms.at(-1);
   const age_ms = since_ms + newest_ms;
-  part("figure").className = age_ms > OLD_MS ? "old" : "";
+  element("figure").className = age_ms > OLD_MS ? "old" : "";
   const images = `${drawnAt_ms.length} images/s, at least ${Math.round(age_ms)} ms old`;
   write("age", since_ms > OLD_MS ? `no image for ${(since_ms / 1000).toFixed(1)} s` : images);
 }
@@ -84,16 +84,16 @@ function showAge() {
 const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/`;
 const token = location.hash.slice(1); // what stands behind the # is never sent with a request
 globalThis.onhashchange = () => location.reload(); // a token that is added opens no page by itself
-const viewer = new Viewer({ url, robot: document.body.dataset.robot, token, look: canvasLook(part("picture")), show });
+const viewer = new Viewer({ url, robot: document.body.dataset.robot, token, decodeImage: canvasDecoder(element("picture")), show });
 viewer.open();
 setInterval(refresh, REFRESH_MS);
 document.onvisibilitychange = document.onresume = refresh; // a page out of sight has had few timers, or none
 
-part("stop").onclick = () => viewer.stop();
+element("stop").onclick = () => viewer.stop();
 document.addEventListener("keydown", (event) => {
   if (event.code !== "Space") return;
   event.preventDefault(); // or it would press the button that has the focus
   viewer.stop();
 });
-part("drive").onchange = ({ target }) => viewer.setDriving(target.checked);
-for (const verb of ["arm", "disarm", "reset"]) part(verb).onclick = () => viewer.ask(verb);
+element("drive").onchange = ({ target }) => viewer.setDriving(target.checked);
+for (const verb of ["arm", "disarm", "reset"]) element(verb).onclick = () => viewer.request(verb);

@@ -2,23 +2,23 @@
  * @file One peer of `sightline.v1` on an open connection: hello first, then messages, the newest of each kind. Shell.
  */
 
-import { Outbox, PeerError, messageBound, pack, packRaw, readHello, unpack } from "./framing.mjs";
+import { OutgoingQueue, PeerError, messageBound, pack, packRaw, readHello, unpack } from "./framing.mjs";
 import { OPEN_MS } from "./websocket.mjs";
 
 /** Told by whoever made it: `onMessage({channel, source, header, payload})`, `onOpen()`, `onEnd({code, reason})`. */
 export class Peer {
   /**
    * @param {import("./websocket.mjs").Connection} connection
-   * @param {{robot: string, hello: string, speaksFirst: boolean, onMessage: Function, onOpen?: Function, onEnd?: Function}} options
+   * @param {{robot: string, hello: string, sendsFirst: boolean, onMessage: Function, onOpen?: Function, onEnd?: Function}} options
    */
-  constructor(connection, { robot, hello, speaksFirst, onMessage, onOpen = () => undefined, onEnd = () => undefined }) {
-    Object.assign(this, { connection, robot, hello, speaksFirst, onMessage, onOpen });
-    this.outbox = new Outbox();
+  constructor(connection, { robot, hello, sendsFirst, onMessage, onOpen = () => undefined, onEnd = () => undefined }) {
+    Object.assign(this, { connection, robot, hello, sendsFirst, onMessage, onOpen });
+    this.queue = new OutgoingQueue();
     this.wants = new Set();
     this.role = "";
     this.isOpen = false;
     this.dropped = 0; // messages with a bad key
-    connection.next = () => this.outbox.take();
+    connection.next = () => this.queue.take();
     connection.onMessage = (message) => this.read(message);
     connection.onEnd = (end) => {
       clearTimeout(this.helloTimer);
@@ -26,12 +26,12 @@ export class Peer {
       onEnd(end);
     };
     this.helloTimer = setTimeout(() => connection.close(1008, "no hello within 2 s"), OPEN_MS);
-    if (speaksFirst) this.tell(hello);
+    if (sendsFirst) this.sendHello(hello);
   }
 
   /** Say hello again, with other wants. */
-  tell(hello) {
-    this.outbox.put("", "", hello);
+  sendHello(hello) {
+    this.queue.put("", "", hello);
     this.connection.pump();
   }
 
@@ -54,7 +54,7 @@ export class Peer {
     clearTimeout(this.helloTimer);
     this.isOpen = true;
     this.connection.reader.maxBytes = messageBound(JSON.parse(this.hello).wants);
-    if (!this.speaksFirst) this.tell(this.hello);
+    if (!this.sendsFirst) this.sendHello(this.hello);
     this.onOpen();
   }
 
@@ -62,19 +62,19 @@ export class Peer {
    * Send the newest message of a channel, if the peer wants it.
    * @param {string} name channel @param {object} header @param {Uint8Array} payload
    */
-  offer(name, header, payload) {
+  send(name, header, payload) {
     const verb = name === "request" ? JSON.parse(new TextDecoder().decode(payload)).verb : "";
-    this.post(name, header.source ?? "", () => pack(name, header, payload), verb);
+    this.enqueue(name, header.source ?? "", () => pack(name, header, payload), verb);
   }
 
   /** Pass a packet on as it came. */
   relay({ channel, source, header, payload }) {
-    this.post(channel.name, source, () => packRaw(channel.name, source, header, payload));
+    this.enqueue(channel.name, source, () => packRaw(channel.name, source, header, payload));
   }
 
-  post(name, source, write, verb = "") {
+  enqueue(name, source, write, verb = "") {
     if (!this.isOpen || !this.wants.has(name)) return;
-    this.outbox.put(name, source, write(), verb);
+    this.queue.put(name, source, write(), verb);
     this.connection.pump();
   }
 }

@@ -14,7 +14,7 @@ for (let number = 2; PRIMES.length < 64; number += 1) if (PRIMES.every((prime) =
 const fraction = (value) => Math.floor((value - Math.floor(value)) * 2 ** 32) | 0;
 const START = PRIMES.slice(0, 8).map((prime) => fraction(Math.sqrt(prime)));
 const ROUNDS = PRIMES.map((prime) => fraction(Math.cbrt(prime)));
-const rotated = (word, by) => (word >>> by) | (word << (32 - by));
+const rotate = (word, by) => (word >>> by) | (word << (32 - by));
 
 /** @param {Uint8Array} data at most 55 bytes: one block @returns {Uint8Array} */
 export function sha256(data) {
@@ -29,13 +29,13 @@ export function sha256(data) {
       continue;
     }
     const [far, near] = [words[at - 15], words[at - 2]];
-    const mixed = rotated(far, 7) ^ rotated(far, 18) ^ (far >>> 3);
-    words[at] = words[at - 16] + mixed + words[at - 7] + (rotated(near, 17) ^ rotated(near, 19) ^ (near >>> 10));
+    const mixed = rotate(far, 7) ^ rotate(far, 18) ^ (far >>> 3);
+    words[at] = words[at - 16] + mixed + words[at - 7] + (rotate(near, 17) ^ rotate(near, 19) ^ (near >>> 10));
   }
   let [a, b, c, d, e, f, g, h] = START;
   for (let at = 0; at < 64; at += 1) {
-    const one = (h + (rotated(e, 6) ^ rotated(e, 11) ^ rotated(e, 25)) + ((e & f) ^ (~e & g)) + ROUNDS[at] + words[at]) | 0;
-    const two = ((rotated(a, 2) ^ rotated(a, 13) ^ rotated(a, 22)) + ((a & b) ^ (a & c) ^ (b & c))) | 0;
+    const one = (h + (rotate(e, 6) ^ rotate(e, 11) ^ rotate(e, 25)) + ((e & f) ^ (~e & g)) + ROUNDS[at] + words[at]) | 0;
+    const two = ((rotate(a, 2) ^ rotate(a, 13) ^ rotate(a, 22)) + ((a & b) ^ (a & c) ^ (b & c))) | 0;
     [h, g, f, e, d, c, b, a] = [g, f, e, (d + one) | 0, c, b, a, (one + two) | 0];
   }
   const result = new DataView(new ArrayBuffer(32));
@@ -52,12 +52,12 @@ export class ProofChain {
   /** @param {(bytes: Uint8Array) => Uint8Array} draw fills with random bytes */
   constructor(draw = (bytes) => globalThis.crypto.getRandomValues(bytes)) {
     this.draw = draw;
-    this.elements = this.made();
+    this.elements = this.newElements();
     this.following = [];
     this.announced = undefined;
   }
 
-  made() {
+  newElements() {
     const elements = [this.draw(new Uint8Array(ELEMENT_BYTES))];
     while (elements.length < LENGTH) elements.push(hashed(elements.at(-1)));
     return elements;
@@ -68,7 +68,7 @@ export class ProofChain {
     if (this.elements.length === 0) [this.elements, this.following, this.announced] = [this.following, [], undefined];
     const proof = hex(this.elements.pop());
     if (this.announced === undefined && this.elements.length < ANNOUNCED) {
-      this.following = this.made();
+      this.following = this.newElements();
       this.announced = hex(this.following.pop()); // known from now on, so it proves nothing
     }
     return this.announced === undefined ? { proof } : { proof, next_proof: this.announced };

@@ -9,11 +9,11 @@ import { Gate } from "./gate.mjs";
 import { isStill } from "./limits.mjs";
 import { sessionDigest } from "./proof.mjs";
 import { Stream } from "./stream.mjs";
-import { shown } from "./validation.mjs";
+import { publicHolder } from "./validation.mjs";
 
 const PERIODS_US = { status: 100_000, odometry: 50_000, camera: 500_000 };
 /** Channels that a robot wants of its peers. */
-export const ROBOT_WANTS = Object.freeze(["twist", "ack", "request", "detections", "mission", "report"]);
+export const WANTED_CHANNELS = Object.freeze(["twist", "ack", "request", "detections", "mission", "report"]);
 
 export class Robot {
   /**
@@ -32,7 +32,7 @@ export class Robot {
     this.replies = [];
     this.lastFrame_us = -1;
     this.lastTick_us = null;
-    this.refusedPictures = this.tickLateMax_us = this.unwanted = 0;
+    this.rejectedImages = this.tickLateMax_us = this.unwanted = 0;
   }
 
   // --- what arrives --------------------------------------------------------------------------------------------
@@ -43,7 +43,7 @@ export class Robot {
    * @returns {boolean} whether it is to be passed on, as it came, to every other peer that wants its channel
    */
   onMessage({ channel, source, header, payload }, now_us) {
-    if (!ROBOT_WANTS.includes(channel.name)) {
+    if (!WANTED_CHANNELS.includes(channel.name)) {
       this.unwanted += 1;
       return false;
     }
@@ -54,7 +54,7 @@ export class Robot {
       else if (channel.name === "request") this.onRequest(source, read, now_us);
       else return read.header.source === source;
     } catch (error) {
-      if (channel.name === "twist" || channel.name === "request") this.gate.refuse(source, error);
+      if (channel.name === "twist" || channel.name === "request") this.gate.reject(source, error);
       else if (!(error instanceof WireError)) throw error;
       else if (channel.name === "ack") this.gate.count(error.reason);
     }
@@ -84,7 +84,7 @@ export class Robot {
       if (header.source !== source) throw new WireError("UNKNOWN_SOURCE", "key and header disagree on the source");
       reply.detail = this.gate.request(header, payload.verb, now_us);
     } catch (error) {
-      this.gate.refuse(source, error);
+      this.gate.reject(source, error);
       reply.ok = false;
       reply.detail = `${error.reason}: ${error.message}`.slice(0, 200);
     }
@@ -104,16 +104,16 @@ export class Robot {
    * @param {Uint8Array} jpeg
    * @returns {Publication|null} null, counted, for a picture that is none, too large, or not newer than the last
    */
-  onPicture(jpeg, t_us, now_us) {
-    if (t_us <= this.lastFrame_us || jpeg.length > CHANNELS.frame.maxPayloadBytes || !isPicture(jpeg)) {
-      this.refusedPictures += 1;
+  onImage(jpeg, t_us, now_us) {
+    if (t_us <= this.lastFrame_us || jpeg.length > CHANNELS.frame.maxPayloadBytes || !isJpeg(jpeg)) {
+      this.rejectedImages += 1;
       return null;
     }
     this.lastFrame_us = t_us;
     const motion = this.motion();
     const header = { ...this.stamp("frame", t_us), ...motion, applied: motion.moving, latency_us: this.gate.latency_us };
     this.gate.issued.add("frame", header.seq, t_us); // before anybody can answer it
-    this.gate.pictures.add(t_us, this.live ? jpeg : null);
+    this.gate.freshness.add(t_us, this.live ? jpeg : null);
     this.stream.onSent(header.seq, t_us, now_us);
     return { name: "frame", header, payload: jpeg };
   }
@@ -139,7 +139,7 @@ export class Robot {
   }
 
   /** Whether the wheels are off and at zero. */
-  get atRest() {
+  get isAtRest() {
     return !this.gate.armed && isStill(this.gate.applied);
   }
 
@@ -164,17 +164,17 @@ export class Robot {
   status(now_us) {
     const { gate } = this;
     const holder = gate.lease.liveHolder(now_us);
-    const stream = { ...this.stream.status(now_us), refused_pictures: this.refusedPictures, calibrated: this.camera.calibrated };
+    const stream = { ...this.stream.status(now_us), refused_pictures: this.rejectedImages, calibrated: this.camera.calibrated };
     return {
       state: gate.state,
       reason: gate.reason,
-      holder: holder && shown(holder),
+      holder: holder && publicHolder(holder),
       applied: rounded(gate.applied),
       frame_age_us: gate.frameAge_us(now_us),
       latency_us: gate.latency_us,
       accepted: gate.accepted,
-      refused: gate.refused,
-      last_refusal: gate.lastRefusal,
+      refused: gate.counters,
+      last_refusal: gate.lastRejection,
       stream,
       auto_arm: gate.armsItself,
       tick_late_max_us: this.tickLateMax_us,
@@ -202,7 +202,7 @@ export class Robot {
 const rounded = ({ linear_mps, angular_rad_s }) => [Number(linear_mps.toFixed(4)), Number(angular_rad_s.toFixed(4))];
 const wrapped = (angle_rad) => Math.atan2(Math.sin(angle_rad), Math.cos(angle_rad));
 
-function isPicture(jpeg) {
+function isJpeg(jpeg) {
   try {
     readJpegSize(jpeg);
     return true;

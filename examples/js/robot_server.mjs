@@ -13,12 +13,12 @@ import { join } from "node:path";
 import { createSecureContext } from "node:tls";
 import { parseArgs } from "node:util";
 import { readJpegSize } from "./codec.mjs";
-import { DRAWN_CAMERA, ballAt, drawPicture } from "./drawing.mjs";
+import { DRAWN_CAMERA, ballAt, drawJpeg } from "./drawing.mjs";
 import { helloText } from "./framing.mjs";
 import { TICK_US } from "./limits.mjs";
 import { servePage } from "./pages.mjs";
 import { Peer } from "./peer.mjs";
-import { ROBOT_WANTS, Robot } from "./robot.mjs";
+import { Robot, WANTED_CHANNELS } from "./robot.mjs";
 import { listen } from "./websocket.mjs";
 
 const USAGE = "node robot_server.mjs --port PORT --robot ID [--host 127.0.0.1] [--pictures FOLDER] [--fps 30] [--auto-arm] [--guests] [--state-dir DIR] [--token-file FILE] [--cert FILE --key FILE]";
@@ -30,7 +30,7 @@ const now_us = () => Number(process.hrtime.bigint() / 1000n);
 
 class UsageError extends Error {}
 
-function options() {
+function readOptions() {
   const stateDir = join(process.env.XDG_STATE_HOME || join(homedir(), ".local", "state"), "sightline-js");
   const { values } = parseArgs({
     options: {
@@ -81,7 +81,7 @@ function readToken(path) {
   return token;
 }
 
-function readPictures(folder) {
+function readImages(folder) {
   const names = readdirSync(folder).filter((name) => /\.jpe?g$/i.test(name)).sort();
   if (names.length === 0) throw new Error("no .jpg in it");
   const pictures = names.map((name) => new Uint8Array(readFileSync(join(folder, name))));
@@ -94,9 +94,9 @@ function openCamera(folder) {
   if (folder === undefined) {
     const start_us = now_us();
     let count = 0;
-    return { model: DRAWN_CAMERA, read: (pose, t_us) => drawPicture(pose, ballAt(t_us - start_us), count++) };
+    return { model: DRAWN_CAMERA, read: (pose, t_us) => drawJpeg(pose, ballAt(t_us - start_us), count++) };
   }
-  const pictures = readOption("--pictures", folder, readPictures);
+  const pictures = readOption("--pictures", folder, readImages);
   const { width_px, height_px } = readJpegSize(pictures[0]);
   const focal_px = GUESSED_FOCAL * width_px;
   const model = { width_px, height_px, fx_px: focal_px, fy_px: focal_px, cx_px: width_px / 2, cy_px: height_px / 2, calibrated: false };
@@ -113,7 +113,7 @@ class Latch {
     this.isSet = existsSync(this.path);
   }
 
-  keep(stopped) {
+  store(stopped) {
     if (stopped === this.isSet) return;
     mkdirSync(this.folder, { recursive: true }); // it may have been removed since
     if (stopped) closeSync(openSync(this.path, "w"));
@@ -126,40 +126,41 @@ class Latch {
 }
 
 class Server {
-  constructor(chosen) {
-    this.chosen = chosen;
-    this.camera = openCamera(chosen.pictures);
-    this.latch = new Latch(chosen["state-dir"], chosen.robot);
+  constructor(options) {
+    this.options = options;
+    this.camera = openCamera(options.pictures);
+    this.latch = new Latch(options["state-dir"], options.robot);
     const session = randomBytes(4).toString("hex");
-    const { pictures } = chosen;
-    const limits = { autoArm: chosen["auto-arm"], guests: chosen.guests };
-    this.robot = new Robot({ session, fps: chosen.fps, camera: this.camera.model, live: pictures === undefined, limits, stopped: this.latch.isSet });
-    this.hello = helloText(chosen.robot, session, ROBOT_WANTS);
+    const { pictures } = options;
+    const limits = { autoArm: options["auto-arm"], guests: options.guests };
+    this.robot = new Robot({ session, fps: options.fps, camera: this.camera.model, live: pictures === undefined, limits, stopped: this.latch.isSet });
+    this.hello = helloText(options.robot, session, WANTED_CHANNELS);
     this.peers = new Set();
-    this.shown = this.robot.gate.state;
+    this.loggedState = this.robot.gate.state;
   }
 
   async run() {
-    const { host, port, robot, pictures, tls, token } = this.chosen;
+    const { host, port, robot, pictures, tls, token } = this.options;
     this.server = await listen({
-      host, port, tls, token, onConnection: (connection) => this.welcome(connection), onPage: servePage(host, robot),
+      host, port, tls, token, onConnection: (connection) => this.onConnection(connection), onPage: servePage(host, robot),
     });
     const s = tls ? "s" : "";
-    this.say(`on ws${s}://${host}:${port}, session ${this.robot.session}, camera ${pictures ?? "drawn"}; viewer at http${s}://${host}:${port}/`);
-    if (this.latch.isSet) this.say("STOPPED (STOP was set before the restart)");
-    this.nextTick_us = this.nextPicture_us = now_us();
+    this.log(`on ws${s}://${host}:${port}, session ${this.robot.session}, camera ${pictures ?? "drawn"}; viewer at http${s}://${host}:${port}/`);
+    if (this.latch.isSet) this.log("STOPPED (STOP was set before the restart)");
+    this.nextTick_us = this.nextCapture_us = now_us();
     this.tick();
-    this.picture();
+    this.capture();
   }
 
-  say(line) {
-    console.log(`robot ${this.chosen.robot}: ${line}`);
+  log(line) {
+    console.log(`robot ${this.options.robot}: ${line}`);
   }
 
-  welcome(connection) {
-    const options = { robot: this.chosen.robot, hello: this.hello, speaksFirst: false };
+  onConnection(connection) {
     const onEnd = () => this.peers.delete(peer);
-    const peer = new Peer(connection, { ...options, onMessage: (packet) => this.onMessage(packet, peer), onEnd });
+    const peer = new Peer(connection, {
+      robot: this.options.robot, hello: this.hello, sendsFirst: false, onMessage: (packet) => this.onMessage(packet, peer), onEnd,
+    });
     this.peers.add(peer);
   }
 
@@ -174,7 +175,7 @@ class Server {
 
   publish(publications) {
     for (const { name, header, payload } of publications) {
-      for (const peer of this.peers) peer.offer(name, header, payload);
+      for (const peer of this.peers) peer.send(name, header, payload);
     }
   }
 
@@ -189,29 +190,29 @@ class Server {
   }
 
   /** The camera's own rhythm: a frame is sent at its capture or never. */
-  picture() {
+  capture() {
     const at_us = now_us();
-    this.nextPicture_us = Math.max(this.nextPicture_us + this.robot.stream.interval_us, at_us);
+    this.nextCapture_us = Math.max(this.nextCapture_us + this.robot.stream.interval_us, at_us);
     const wanted = [...this.peers].some((peer) => peer.wants.has("frame"));
     if (wanted && this.robot.mayCapture(at_us)) {
-      const frame = this.robot.onPicture(this.camera.read(this.robot.pose, at_us), at_us, now_us());
+      const frame = this.robot.onImage(this.camera.read(this.robot.pose, at_us), at_us, now_us());
       if (frame !== null) this.publish([frame]);
     }
-    setTimeout(() => this.picture(), (this.nextPicture_us - now_us()) / 1000);
+    setTimeout(() => this.capture(), (this.nextCapture_us - now_us()) / 1000);
   }
 
   /** One line per change of state; the latch is on disk before anybody is told. */
   showState() {
     const { state, reason } = this.robot.gate;
-    const [shown, driving] = [this.shown, ["ACTIVE", "DEGRADED"]];
-    if (state === shown) return;
-    this.shown = state;
+    const [logged, driving] = [this.loggedState, ["ACTIVE", "DEGRADED"]];
+    if (state === logged) return;
+    this.loggedState = state;
     try {
-      this.latch.keep(state === "STOPPED");
+      this.latch.store(state === "STOPPED");
     } catch (error) {
-      this.say(`${state} is not stored for a restart: ${error.message}; repair --state-dir`);
+      this.log(`${state} is not stored for a restart: ${error.message}; repair --state-dir`);
     }
-    if (!(driving.includes(state) && driving.includes(shown))) this.say(`${state} (${reason})`);
+    if (!(driving.includes(state) && driving.includes(logged))) this.log(`${state} (${reason})`);
   }
 
   /** Wheels to zero first, then goodbye. */
@@ -219,7 +220,7 @@ class Server {
     this.robot.gate.disarm("shutting down");
     setTimeout(() => process.exit(0), STOP_AT_END_MS);
     const poll = setInterval(() => {
-      if (!this.robot.atRest) return;
+      if (!this.robot.isAtRest) return;
       clearInterval(poll);
       this.server.closeAll("the robot is shutting down");
       setTimeout(() => process.exit(0), 50);
@@ -228,7 +229,7 @@ class Server {
 }
 
 try {
-  const server = new Server(options());
+  const server = new Server(readOptions());
   for (const signal of ["SIGINT", "SIGTERM", "SIGHUP"]) process.once(signal, () => server.end());
   await server.run();
 } catch (error) {

@@ -4,10 +4,10 @@
  * A frame is captured only while there is credit, so it is young when it leaves and nothing queues behind it.
  */
 
-import { same } from "./validation.mjs";
+import { isSame } from "./validation.mjs";
 
 const FIRST_TIMEOUT_US = 120_000;
-const LONGEST_TIMEOUT_US = 500_000;
+const MAX_TIMEOUT_US = 500_000;
 const OWNER_LIFE_US = 1_000_000;
 const MAX_WINDOW = 12;
 const REMEMBERED = 64;
@@ -51,11 +51,11 @@ export class Stream {
 
   /**
    * A twist or an ack answered frame `seq`: its credit comes back, and that of all older ones.
-   * @param {import("./validation.mjs").Holder} who
+   * @param {import("./validation.mjs").Holder} sender
    */
-  onAnswer(who, seq, compute_us, now_us) {
-    if ((this.owner === null || now_us >= this.ownerUntil_us) && !same(who, this.owner)) this.belongTo(who);
-    if (!same(who, this.owner)) return;
+  onAnswer(sender, seq, compute_us, now_us) {
+    if ((this.owner === null || now_us >= this.ownerUntil_us) && !isSame(sender, this.owner)) this.handOver(sender);
+    if (!isSame(sender, this.owner)) return;
     this.ownerUntil_us = now_us + OWNER_LIFE_US;
     const sent_us = this.sentAt_us.get(seq);
     if (sent_us !== undefined) this.measure(now_us - sent_us, compute_us);
@@ -63,17 +63,17 @@ export class Stream {
     for (const older of this.expires_us.keys()) if (older <= seq) this.expires_us.delete(older);
   }
 
-  /** Credit goes to who drives. */
+  /** Credit goes to the driver. */
   onHolder(holder, now_us) {
-    if (holder === null || same(holder, this.owner)) return;
-    this.belongTo(holder);
+    if (holder === null || isSame(holder, this.owner)) return;
+    this.handOver(holder);
     this.ownerUntil_us = now_us + OWNER_LIFE_US;
     this.expires_us.clear();
   }
 
   /** What was measured with the owner before says nothing of this one's link. */
-  belongTo(who) {
-    this.owner = who;
+  handOver(sender) {
+    this.owner = sender;
     this.delays_us = [];
     this.answer_us = null;
   }
@@ -92,7 +92,7 @@ export class Stream {
 
   get timeout_us() {
     if (this.answer_us === null) return FIRST_TIMEOUT_US;
-    return Math.min(LONGEST_TIMEOUT_US, Math.round(1.5 * this.answer_us) + 12_000);
+    return Math.min(MAX_TIMEOUT_US, Math.round(1.5 * this.answer_us) + 12_000);
   }
 
   /** @returns {object} the `stream` of a status */

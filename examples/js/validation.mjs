@@ -21,9 +21,9 @@ export const RANKS = Object.freeze(Object.assign(Object.create(null), { guest: 0
 const NO_PROOF = Object.freeze({ proof: null, next_proof: null });
 export const proofOf = (header) => (header === null ? NO_PROOF : { proof: header.proof ?? null, next_proof: header.next_proof ?? null });
 /** What others see of a driver: not its session, which a peer could copy. */
-export const shown = ({ source, session }) => ({ source, digest: sessionDigest(source, session) });
+export const publicHolder = ({ source, session }) => ({ source, digest: sessionDigest(source, session) });
 export const isHuman = (source) => source === "teleop";
-export const same = (one, other) => one !== null && other !== null && one.source === other.source && one.session === other.session;
+export const isSame = (one, other) => one !== null && other !== null && one.source === other.source && one.session === other.session;
 
 /** (channel, seq) -> t_us of what this session of the robot has issued. */
 export class IssuedRecord {
@@ -48,12 +48,12 @@ export class IssuedRecord {
   }
 
   /** Age of what `echo` names. @throws {WireError} OTHER_SESSION, UNKNOWN_FRAME, FROM_FUTURE, STALE */
-  age_us(echo, now_us, most_us) {
+  age_us(echo, now_us, maxAge_us) {
     if (echo.session !== this.session) throw new WireError("OTHER_SESSION", `cites robot session ${echo.session}, this is ${this.session}`);
     if (!this.knows(echo)) throw new WireError("UNKNOWN_FRAME", `cites ${echo.channel} ${echo.seq}, unknown to this robot`);
     const age_us = now_us - echo.t_us;
     if (age_us < 0) throw new WireError("FROM_FUTURE", `cites ${echo.channel} ${echo.seq} from ${-age_us} us ahead`);
-    if (age_us > most_us) throw new WireError("STALE", `${echo.channel} ${echo.seq} is ${Math.round(age_us / 1000)} ms old, at most ${most_us / 1000}`);
+    if (age_us > maxAge_us) throw new WireError("STALE", `${echo.channel} ${echo.seq} is ${Math.round(age_us / 1000)} ms old, at most ${maxAge_us / 1000}`);
     return age_us;
   }
 
@@ -63,9 +63,9 @@ export class IssuedRecord {
   }
 
   /** @throws {WireError} unless `echo` names a young status from after the last STOP or disarm */
-  checkRequest(echo, now_us, most_us) {
+  checkRequest(echo, now_us, maxAge_us) {
     if (echo === null || echo.channel !== "status") throw new WireError("MALFORMED", "a request that permits motion must cite a status");
-    this.age_us(echo, now_us, most_us);
+    this.age_us(echo, now_us, maxAge_us);
     if (echo.seq <= this.deniedSeq) throw new WireError("STALE", "cites a status from before the last STOP or disarm; repeat the request");
   }
 }
@@ -169,24 +169,24 @@ export class Lease {
     return now_us < this.expires_us ? this.holder : null;
   }
 
-  mayTake(who, now_us) {
+  mayTake(sender, now_us) {
     const holder = this.liveHolder(now_us);
-    return holder === null || same(holder, who) || RANKS[who.source] > RANKS[holder.source];
+    return holder === null || isSame(holder, sender) || RANKS[sender.source] > RANKS[holder.source];
   }
 
   /** @throws {WireError} NOT_PROVEN for a message that states the session of the driver and is not its own */
-  checkProof(who, proof, now_us) {
-    if (!same(this.liveHolder(now_us), who) || this.proof.proof === null || continues(proof.proof, this.proof)) return;
-    throw new WireError("NOT_PROVEN", `its proof does not continue that of the ${who.source} that drives`);
+  checkProof(sender, proof, now_us) {
+    if (!isSame(this.liveHolder(now_us), sender) || this.proof.proof === null || continues(proof.proof, this.proof)) return;
+    throw new WireError("NOT_PROVEN", `its proof does not continue that of the ${sender.source} that drives`);
   }
 
   /** The proof of the driver's request is used up. */
-  advance(who, proof, now_us) {
-    if (same(this.liveHolder(now_us), who)) this.proof = proof;
+  advance(sender, proof, now_us) {
+    if (isSame(this.liveHolder(now_us), sender)) this.proof = proof;
   }
 
-  take(who, now_us, proof = NO_PROOF) {
-    this.holder = who;
+  take(sender, now_us, proof = NO_PROOF) {
+    this.holder = sender;
     this.proof = proof;
     this.expires_us = now_us + this.life_us;
   }

@@ -4,36 +4,36 @@
  * A frame is acknowledged after it was drawn, so that the robot sends as fast as this page draws and nothing queues.
  */
 
-import { Eyes, EYES_WANT } from "./frame_loop.mjs";
+import { FrameLoop, WANTED_CHANNELS } from "./frame_loop.mjs";
 import { PeerError, SUBPROTOCOL, helloText, pack, readHello, unpack } from "./framing.mjs";
 import { OPERATOR, Vision } from "./vision.mjs";
 
 const FIRST_PAUSE_MS = 200;
-const LONGEST_PAUSE_MS = 1000;
-const SILENT_MS = 2000; // a robot that loses its power closes nothing; a status comes ten times a second
+const MAX_PAUSE_MS = 1000;
+const SILENCE_MS = 2000; // a robot that loses its power closes nothing; a status comes ten times a second
 const STOP_PERIOD_MS = 50;
 const STOP_SLOW_MS = 300; // a STOP that is not seen to work within this is told to the person
-const MOST_BUFFERED_BYTES = 65_536; // a browser queues without end; beyond this, commands are dropped
+const MAX_BUFFERED_BYTES = 65_536; // a browser queues without end; beyond this, commands are dropped
 
 /** One robot and one page. Told by `show(what)`: {link}, {status}, {reply}, {target, twist, age_us}, {stop}. */
 export class Viewer {
   /**
-   * @param {{url: string, robot: string, look: (jpeg: Uint8Array) => Promise<object>, show: (what: object) => void,
-   *   token?: string, WebSocket?: typeof WebSocket}} options `look` draws a picture and gives its pixels
+   * @param {{url: string, robot: string, decodeImage: (jpeg: Uint8Array) => Promise<object>, show: (what: object) => void,
+   *   token?: string, WebSocket?: typeof WebSocket}} options `decodeImage` draws a picture and gives its pixels
    */
-  constructor({ url, robot, look, show, token = "", WebSocket = globalThis.WebSocket }) {
+  constructor({ url, robot, decodeImage, show, token = "", WebSocket = globalThis.WebSocket }) {
     Object.assign(this, { url, robot, show, WebSocket });
     this.subprotocols = [SUBPROTOCOL, ...(token ? [`sightline.token.${token}`] : [])];
     this.session = [...crypto.getRandomValues(new Uint8Array(4))].map((byte) => byte.toString(16).padStart(2, "0")).join("");
     this.vision = new Vision(this.session, OPERATOR);
-    this.eyes = new Eyes(this.vision, {
-      look,
+    this.frameLoop = new FrameLoop(this.vision, {
+      decodeImage,
       send: (name, header, payload) => this.send(name, header, payload),
       now_us: () => Math.round(performance.now() * 1000),
-      onSeen: show,
+      onDecision: show,
       onReply: (reply) => show({ reply }),
     });
-    this.eyes.drives = false;
+    this.frameLoop.drives = false;
     this.pause_ms = FIRST_PAUSE_MS;
     this.socket = null;
     this.isOpen = this.stopping = this.ended = false;
@@ -49,9 +49,9 @@ export class Viewer {
       socket.send(this.hello());
     };
     socket.onmessage = ({ data }) => socket === this.socket && this.read(data);
-    socket.onclose = ({ code, reason }) => this.lost(socket, reason || `code ${code}`);
+    socket.onclose = ({ code, reason }) => this.onLost(socket, reason || `code ${code}`);
     // Not every platform closes what it never opened, and none shows the reason of the robot.
-    socket.onerror = () => this.lost(socket, "no answer, or a missing or wrong token after the # of the address");
+    socket.onerror = () => this.onLost(socket, "no answer, or a missing or wrong token after the # of the address");
     this.awaitMessage(socket);
   }
 
@@ -60,18 +60,18 @@ export class Viewer {
     clearTimeout(this.silence);
     this.silence = setTimeout(() => {
       socket.close();
-      this.lost(socket, "silent for 2 s");
-    }, SILENT_MS);
+      this.onLost(socket, "silent for 2 s");
+    }, SILENCE_MS);
   }
 
   hello() {
-    return helloText(this.robot, this.session, EYES_WANT, this.eyes.drives ? "vision" : "viewer");
+    return helloText(this.robot, this.session, WANTED_CHANNELS, this.frameLoop.drives ? "vision" : "viewer");
   }
 
   read(data) {
     this.awaitMessage(this.socket);
     try {
-      if (typeof data === "string") this.met(data);
+      if (typeof data === "string") this.onHello(data);
       else this.receive(unpack(new Uint8Array(data), "", this.robot));
     } catch (error) {
       if (!(error instanceof PeerError)) throw error;
@@ -80,7 +80,7 @@ export class Viewer {
     }
   }
 
-  met(text) {
+  onHello(text) {
     readHello(text, this.robot);
     this.isOpen = true;
     this.pause_ms = FIRST_PAUSE_MS;
@@ -90,37 +90,37 @@ export class Viewer {
   receive(packet) {
     if (packet === null) return;
     const before = this.vision.status;
-    this.eyes.onMessage(packet);
+    this.frameLoop.onMessage(packet);
     const { status } = this.vision;
     if (status !== before && status !== null) this.show({ status: status.payload });
   }
 
-  lost(socket, why) {
+  onLost(socket, why) {
     if (this.ended || socket !== this.socket) return;
     clearTimeout(this.silence);
     this.isOpen = false;
     this.socket = null;
     this.show({ link: `no connection: ${why}` });
     setTimeout(() => this.ended || this.open(), this.pause_ms);
-    this.pause_ms = Math.min(LONGEST_PAUSE_MS, this.pause_ms * 1.5);
+    this.pause_ms = Math.min(MAX_PAUSE_MS, this.pause_ms * 1.5);
   }
 
   send(name, header, payload) {
     if (name === "twist" && this.stopping) return; // without commands it stops, though STOP does not arrive
     const urgent = name === "request";
-    if (this.isOpen && (urgent || this.socket.bufferedAmount < MOST_BUFFERED_BYTES)) this.socket.send(pack(name, header, payload));
+    if (this.isOpen && (urgent || this.socket.bufferedAmount < MAX_BUFFERED_BYTES)) this.socket.send(pack(name, header, payload));
   }
 
   /** Drive, as `vision`, or only watch. @param {boolean} drives */
   setDriving(drives) {
-    this.eyes.drives = drives;
+    this.frameLoop.drives = drives;
     this.vision.source = drives ? "vision" : OPERATOR;
     if (this.isOpen) this.socket.send(this.hello());
   }
 
   /** @param {"arm"|"disarm"|"reset"} verb */
-  ask(verb) {
-    return this.eyes.ask(verb);
+  request(verb) {
+    return this.frameLoop.request(verb);
   }
 
   /** STOP is a level: repeated every 50 ms until a status that comes after the first one shows STOPPED and wheels at zero. */
@@ -128,23 +128,23 @@ export class Viewer {
     if (this.stopping) return;
     this.stopping = true;
     const since_ms = performance.now();
-    let before; // the status at hand when the first left: it may be from before a reset by another operator
-    const again = () => {
+    let statusAtSend; // the status at hand when the first left: it may be from before a reset by another operator
+    const repeat = () => {
       const { status } = this.vision;
-      const isLatched = before !== undefined && status !== before && status?.payload.state === "STOPPED";
+      const isLatched = statusAtSend !== undefined && status !== statusAtSend && status?.payload.state === "STOPPED";
       this.stopping = !this.ended && !(isLatched && status.payload.applied.every((speed) => speed === 0));
       if (this.ended) return;
       if (!this.stopping) {
         this.show({ stop: "STOPPED" });
         return;
       }
-      if (this.isOpen && before === undefined) before = status;
-      this.eyes.ask("stop");
+      if (this.isOpen && statusAtSend === undefined) statusAtSend = status;
+      this.frameLoop.request("stop");
       const isSlow = !isLatched && performance.now() - since_ms > STOP_SLOW_MS;
       this.show({ stop: isSlow ? "STOP is not confirmed; cut the power by hand" : "STOP ..." });
-      setTimeout(again, STOP_PERIOD_MS);
+      setTimeout(repeat, STOP_PERIOD_MS);
     };
-    again();
+    repeat();
   }
 
   close() {
@@ -155,7 +155,7 @@ export class Viewer {
 }
 
 /** Decode with the browser, draw on the canvas, and read the pixels back for the scan. */
-export function canvasLook(canvas) {
+export function canvasDecoder(canvas) {
   const context = canvas.getContext("2d", { willReadFrequently: true });
   return async (jpeg) => {
     const bitmap = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));

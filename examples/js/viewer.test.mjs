@@ -3,13 +3,13 @@
 import assert from "node:assert/strict";
 import test from "node:test";
 import { encode } from "./codec.mjs";
-import { DRAWN_CAMERA, drawPicture } from "./drawing.mjs";
+import { DRAWN_CAMERA, drawJpeg } from "./drawing.mjs";
 import { helloText, pack, unpack } from "./framing.mjs";
 import { sessionDigest } from "./proof.mjs";
 import { Viewer } from "./viewer.mjs";
 
 const SESSION = "0a1b2c3d";
-const JPEG = drawPicture({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
+const JPEG = drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
 const BLACK = { width: 1, height: 1, scale: 1, data: [0, 0, 0], channels: 3 };
 
 /** What the page has sent, and what it was shown. Each connection that it opens is one of `sockets`. */
@@ -33,7 +33,7 @@ class Rig {
         this.closed = true;
       }
     }
-    this.viewer = new Viewer({ url: "ws://r1/", robot: "r1", look: () => BLACK, show: (what) => this.shown.push(what), WebSocket: FakeSocket });
+    this.viewer = new Viewer({ url: "ws://r1/", robot: "r1", decodeImage: () => BLACK, show: (what) => this.shown.push(what), WebSocket: FakeSocket });
     this.viewer.open();
     this.seq = 0;
   }
@@ -113,7 +113,7 @@ test("requests are an operator's, whether the page drives or not: no other token
   rig.greet();
   for (const drives of [false, true]) {
     rig.viewer.setDriving(drives);
-    const id = rig.viewer.ask("arm");
+    const id = rig.viewer.request("arm");
     assert.equal(rig.requests().at(-1).source, "operator");
     rig.receive("reply", encode({ to: sessionDigest("operator", rig.viewer.session), id, ok: true, state: "HOLD", detail: "armed" }));
     assert.equal(rig.shown.at(-1).reply?.id, id);

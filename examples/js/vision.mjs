@@ -11,7 +11,7 @@ const MAX_ANGULAR_RAD_S = 1.2;
 const SEARCH_RAD_S = 0.4;
 const CRUISE_MPS = 0.25;
 const STOP_SHARE = 0.18; // of the picture's width: near enough
-const LEAST_PX = 128; // pixels of the encoded picture, two 8x8 blocks: fewer are noise
+const MIN_PX = 128; // pixels of the encoded picture, two 8x8 blocks: fewer are noise
 
 /** Yellow: red and green strong and alike, blue far below. */
 export const isYellow = (red, green, blue) => red > 110 && green > 85 && blue < 0.6 * green && Math.abs(red - green) < 0.4 * red;
@@ -32,7 +32,7 @@ export function findTarget({ width, height, scale, data, channels }, isColor = i
       count += 1;
     }
   }
-  if (count * scale * scale < LEAST_PX) return null;
+  if (count * scale * scale < MIN_PX) return null;
   const sum = columns.reduce((total, found, x) => total + found * (x + 0.5), 0);
   const filled = columns.reduce((total, found) => total + (found > 0 ? 1 : 0), 0);
   return { x_px: (sum / count) * scale, width_px: filled * scale, share: filled / width };
@@ -49,9 +49,9 @@ export function steer(target, camera, side = 1) {
   if (target === null) return { linear_mps: 0, angular_rad_s: side * SEARCH_RAD_S };
   const bearing_rad = Math.atan2(camera.cx_px - target.x_px, camera.fx_px); // left is positive
   const turn_rad_s = GAIN_PER_S * bearing_rad;
-  const far = Math.max(0, 1 - target.share / STOP_SHARE);
+  const speedFactor = Math.max(0, 1 - target.share / STOP_SHARE);
   return {
-    linear_mps: CRUISE_MPS * far * Math.max(0, Math.cos(2 * bearing_rad)),
+    linear_mps: CRUISE_MPS * speedFactor * Math.max(0, Math.cos(2 * bearing_rad)),
     angular_rad_s: Math.max(-MAX_ANGULAR_RAD_S, Math.min(MAX_ANGULAR_RAD_S, turn_rad_s)),
   };
 }
@@ -69,7 +69,7 @@ export class Vision {
     this.robotSession = "";
     this.camera = null;
     this.lastSeq = this.last_us = -1;
-    this.heard_us = -Infinity; // when the last new frame came, by this machine's clock
+    this.received_us = -Infinity; // when the last new frame came, by this machine's clock
     this.side = 1; // where the target was last: left
     this.seq = this.requestSeq = this.requestId = 0;
     this.status = null; // {header, payload}: the newest
@@ -86,7 +86,7 @@ export class Vision {
   }
 
   /** A new session of the robot: what was learned from the old one is forgotten. */
-  meet(session) {
+  onSession(session) {
     if (session === this.robotSession) return;
     this.robotSession = session;
     this.camera = this.status = null;
@@ -96,12 +96,12 @@ export class Vision {
 
   /** @param {{session: string}} header @param {object} model */
   onCamera(header, model) {
-    this.meet(header.session);
+    this.onSession(header.session);
     this.camera = model;
   }
 
   onStatus(header, payload) {
-    this.meet(header.session);
+    this.onSession(header.session);
     this.status = { header, payload };
   }
 
@@ -110,13 +110,13 @@ export class Vision {
    * @param {{session: string, seq: number, t_us: number}} header
    */
   isNew({ session, seq, t_us = 0 }, now_us = 0) {
-    this.meet(session);
-    const silent_us = now_us - this.heard_us;
+    this.onSession(session);
+    const silent_us = now_us - this.received_us;
     if (silent_us > AHEAD_US) this.lastSeq = this.last_us = -1; // what came last was not of the robot, or it paused
     const ahead = this.last_us >= 0 && t_us - this.last_us > silent_us + AHEAD_US;
     if (ahead || seq <= this.lastSeq) return false;
     this.lastSeq = seq;
-    this.heard_us = now_us;
+    this.received_us = now_us;
     return true;
   }
 

@@ -7,7 +7,7 @@
 import { randomBytes } from "node:crypto";
 import { readFileSync } from "node:fs";
 import { parseArgs } from "node:util";
-import { Eyes, EYES_WANT } from "./frame_loop.mjs";
+import { FrameLoop, WANTED_CHANNELS } from "./frame_loop.mjs";
 import { helloText } from "./framing.mjs";
 import { decodeDc } from "./jpeg_dc.mjs";
 import { Peer } from "./peer.mjs";
@@ -15,26 +15,26 @@ import { Vision } from "./vision.mjs";
 import { connect } from "./websocket.mjs";
 
 const FIRST_PAUSE_MS = 200;
-const LONGEST_PAUSE_MS = 1000;
+const MAX_PAUSE_MS = 1000;
 const USAGE = "node vision_client.mjs --connect ws://HOST:PORT --robot ID [--role vision] [--token-file FILE] [--ca FILE]";
 
-const say = (line) => console.log(`vision: ${line}`);
+const log = (line) => console.log(`vision: ${line}`);
 const now_us = () => Math.round(performance.now() * 1000);
 
 /** Prints a line when what it is about has changed, never one per frame. */
-class Teller {
+class StateLog {
   constructor() {
-    this.said = {};
+    this.states = {};
   }
 
-  tell(about, state, line = state) {
-    if (this.said[about] === state) return;
-    this.said[about] = state;
-    say(line);
+  report(about, state, line = state) {
+    if (this.states[about] === state) return;
+    this.states[about] = state;
+    log(line);
   }
 }
 
-function options() {
+function readOptions() {
   const text = { type: "string" };
   const given = { connect: text, robot: text, role: { type: "string", default: "vision" }, "token-file": text, ca: text };
   try {
@@ -51,22 +51,22 @@ function options() {
 }
 
 class Client {
-  constructor(chosen) {
-    this.chosen = chosen;
-    this.teller = new Teller();
+  constructor(options) {
+    this.options = options;
+    this.stateLog = new StateLog();
     this.session = randomBytes(4).toString("hex");
     this.peer = null;
-    const world = {
-      look: (jpeg) => {
+    const environment = {
+      decodeImage: (jpeg) => {
         const { width, height, scale, rgb } = decodeDc(jpeg);
         return { width, height, scale, data: rgb, channels: 3 };
       },
-      send: (name, header, payload) => this.peer?.offer(name, header, payload),
+      send: (name, header, payload) => this.peer?.send(name, header, payload),
       now_us,
       pause: () => new Promise(setImmediate),
-      onSeen: ({ target }) => this.teller.tell("target", target === null ? "nothing yellow in sight" : "target seen"),
+      onDecision: ({ target }) => this.stateLog.report("target", target === null ? "nothing yellow in sight" : "target seen"),
     };
-    this.eyes = new Eyes(new Vision(this.session, chosen.role), world);
+    this.frameLoop = new FrameLoop(new Vision(this.session, options.role), environment);
     this.ending = false;
   }
 
@@ -74,46 +74,46 @@ class Client {
   async run() {
     let pause_ms = FIRST_PAUSE_MS;
     while (!this.ending) {
-      if (await this.once()) pause_ms = FIRST_PAUSE_MS;
+      if (await this.connectOnce()) pause_ms = FIRST_PAUSE_MS;
       if (!this.ending) await new Promise((resume) => setTimeout(resume, pause_ms));
-      pause_ms = Math.min(LONGEST_PAUSE_MS, pause_ms * 1.5);
+      pause_ms = Math.min(MAX_PAUSE_MS, pause_ms * 1.5);
     }
   }
 
   /** One connection from beginning to end; whether it came about. */
-  async once() {
-    const { connect: url, robot, role } = this.chosen;
+  async connectOnce() {
+    const { connect: url, robot, role } = this.options;
     let connection;
     try {
-      connection = await connect(url, this.chosen);
+      connection = await connect(url, this.options);
     } catch (error) {
-      this.teller.tell("link", `no robot at ${url}: ${error.message}`);
+      this.stateLog.report("link", `no robot at ${url}: ${error.message}`);
       return false;
     }
     let opened = false;
     const ended = await new Promise((onEnd) => {
       const onOpen = () => {
         opened = true;
-        this.teller.tell("link", `frames from robot ${robot} at ${url}`);
+        this.stateLog.report("link", `frames from robot ${robot} at ${url}`);
       };
-      const hello = helloText(robot, this.session, EYES_WANT, role);
-      this.peer = new Peer(connection, { robot, hello, speaksFirst: true, onOpen, onEnd, onMessage: (packet) => this.eyes.onMessage(packet) });
+      const hello = helloText(robot, this.session, WANTED_CHANNELS, role);
+      this.peer = new Peer(connection, { robot, hello, sendsFirst: true, onOpen, onEnd, onMessage: (packet) => this.frameLoop.onMessage(packet) });
     });
     this.peer = null;
-    if (!this.ending) this.teller.tell("link", `link ended: ${ended.reason || "no reason given"} (${ended.code})`);
+    if (!this.ending) this.stateLog.report("link", `link ended: ${ended.reason || "no reason given"} (${ended.code})`);
     return opened;
   }
 
   end() {
     this.ending = true;
     this.peer?.connection.close(1001, "vision ends");
-    const skipped = Object.entries(this.eyes.skipped).map(([reason, count]) => `${count} ${reason}`);
-    say(`ended after ${this.eyes.answered} frames; skipped: ${skipped.join(", ") || "none"}`);
+    const skipped = Object.entries(this.frameLoop.skipped).map(([reason, count]) => `${count} ${reason}`);
+    log(`ended after ${this.frameLoop.answered} frames; skipped: ${skipped.join(", ") || "none"}`);
     setTimeout(() => process.exit(0), 100).unref();
   }
 }
 
-const client = new Client(options());
+const client = new Client(readOptions());
 for (const signal of ["SIGINT", "SIGTERM"]) process.once(signal, () => client.end());
-say(`looking for robot ${client.chosen.robot} at ${client.chosen.connect}`);
+log(`looking for robot ${client.options.robot} at ${client.options.connect}`);
 await client.run();

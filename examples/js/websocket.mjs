@@ -36,19 +36,19 @@ export class Connection {
     this.onMessage = () => undefined;
     this.onEnd = () => undefined;
     this.writing = this.closing = this.pinged = this.pingDue = false;
-    this.heard_ms = performance.now();
+    this.received_ms = performance.now();
     this.began_ms = this.waited_ms = -Infinity; // the newest write, and the newest one that had to wait for room
     this.pong = null; // only the newest ping is answered: who pings without reading piles nothing up
     socket.setNoDelay(true);
     socket.on("data", (chunk) => this.read(chunk));
     socket.on("error", () => socket.destroy());
     socket.on("end", () => socket.destroy());
-    socket.on("close", () => this.ended());
+    socket.on("close", () => this.onClosed());
     this.checks = setInterval(() => this.check(), CHECK_MS);
   }
 
   read(chunk) {
-    this.heard_ms = performance.now();
+    this.received_ms = performance.now();
     this.waited_ms = -Infinity;
     this.pinged = false;
     try {
@@ -87,8 +87,8 @@ export class Connection {
     const now_ms = performance.now();
     if (this.writing) this.waited_ms = this.began_ms;
     const isSlow = now_ms - this.waited_ms < STALLED_MS;
-    if (now_ms - this.heard_ms >= SILENT_MS && !isSlow) this.close(1011, "silent for too long");
-    if (now_ms - this.heard_ms < PING_MS || this.pinged) return;
+    if (now_ms - this.received_ms >= SILENT_MS && !isSlow) this.close(1011, "silent for too long");
+    if (now_ms - this.received_ms < PING_MS || this.pinged) return;
     this.pinged = this.pingDue = true;
     this.pump();
   }
@@ -136,7 +136,7 @@ export class Connection {
     this.socket.end();
   }
 
-  ended() {
+  onClosed() {
     clearInterval(this.checks);
     this.closing = true;
     this.onEnd(this.reason ?? { code: 1006, reason: "the connection broke" });
@@ -167,12 +167,12 @@ export function admissionProblem(rawHeaders, listenHost) {
 const TOKEN_ENTRY = "sightline.token."; // beside the sub-protocol: all that a browser can do
 
 /** Whether a request shows the token and no other, in the sub-protocols it offers or as `Authorization: Bearer`. */
-function showsToken(headers, offered, token) {
-  const shown = offered.filter((name) => name.startsWith(TOKEN_ENTRY)).map((name) => name.slice(TOKEN_ENTRY.length));
+function hasToken(headers, offered, token) {
+  const tokens = offered.filter((name) => name.startsWith(TOKEN_ENTRY)).map((name) => name.slice(TOKEN_ENTRY.length));
   const bearer = /^Bearer +(\S+)$/i.exec(headers.authorization ?? "");
-  if (bearer !== null) shown.push(bearer[1]);
+  if (bearer !== null) tokens.push(bearer[1]);
   const digest = (text) => createHash("sha256").update(text).digest(); // of one length, as the comparison needs
-  return shown.length === 1 && timingSafeEqual(digest(shown[0]), digest(token));
+  return tokens.length === 1 && timingSafeEqual(digest(tokens[0]), digest(token));
 }
 
 function upgradeProblem(request, token) {
@@ -181,12 +181,12 @@ function upgradeProblem(request, token) {
   if (headers["sec-websocket-version"] !== "13") return [426, "WebSocket version 13 is spoken here"];
   if (request.method !== "GET" || !/^[A-Za-z0-9+/]{22}==$/.test(headers["sec-websocket-key"] ?? "")) return [400, "no WebSocket handshake"];
   if (!offered.includes(SUBPROTOCOL)) return [400, `offer the sub-protocol ${SUBPROTOCOL}`];
-  return token === undefined || showsToken(headers, offered, token) ? null : [401, "show the token of this robot"];
+  return token === undefined || hasToken(headers, offered, token) ? null : [401, "show the token of this robot"];
 }
 
 const acceptKey = (key) => createHash("sha1").update(key + GUID).digest("base64");
 
-function refuse(socket, [status, line]) {
+function rejectUpgrade(socket, [status, line]) {
   const version = status === 426 ? "Sec-WebSocket-Version: 13\r\n" : "";
   socket.on("error", () => socket.destroy());
   socket.end(`HTTP/1.1 ${status} Refused\r\n${version}Connection: close\r\nContent-Type: text/plain\r\nContent-Length: ${line.length + 1}\r\n\r\n${line}\n`);
@@ -206,7 +206,7 @@ export function listen({ host, port, token, tls, onConnection, onPage }) {
   server.on("upgrade", (request, socket, head) => {
     const full = open.size >= MAX_CLIENTS ? [503, `${MAX_CLIENTS} clients are connected, which is the limit`] : null;
     const problem = admissionProblem(request.rawHeaders, host) ?? full ?? upgradeProblem(request, token);
-    if (problem !== null) return refuse(socket, problem);
+    if (problem !== null) return rejectUpgrade(socket, problem);
     const accept = acceptKey(request.headers["sec-websocket-key"]);
     socket.write(`HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: ${accept}\r\nSec-WebSocket-Protocol: ${SUBPROTOCOL}\r\n\r\n`);
     const connection = new Connection(socket, true);
@@ -229,27 +229,27 @@ export function listen({ host, port, token, tls, onConnection, onPage }) {
  */
 export function connect(url, { token, ca } = {}) {
   const { hostname, port, protocol } = new URL(url);
-  const request = protocol === "wss:" ? httpsRequest : httpRequest;
+  const open = protocol === "wss:" ? httpsRequest : httpRequest;
   const key = randomBytes(16).toString("base64");
   const headers = {
     Connection: "Upgrade", Upgrade: "websocket", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": key, "Sec-WebSocket-Protocol": SUBPROTOCOL,
     ...(token ? { Authorization: `Bearer ${token}` } : {}),
   };
   return new Promise((resolve, reject) => {
-    const asked = request({ ca, host: hostname.replace(/^\[|\]$/g, ""), port, headers });
-    const late = setTimeout(() => asked.destroy(new Error("no answer within 2 s")), OPEN_MS);
-    asked.on("close", () => clearTimeout(late));
-    asked.on("error", reject);
-    asked.on("response", (response) => {
+    const request = open({ ca, host: hostname.replace(/^\[|\]$/g, ""), port, headers });
+    const timeout = setTimeout(() => request.destroy(new Error("no answer within 2 s")), OPEN_MS);
+    request.on("close", () => clearTimeout(timeout));
+    request.on("error", reject);
+    request.on("response", (response) => {
       response.on("data", (body) => reject(new Error(String(body).trim().slice(0, 200)))).on("end", () => reject(new Error(`HTTP ${response.statusCode}`)));
     });
-    asked.on("upgrade", (response, socket, head) => {
-      const right = response.headers["sec-websocket-accept"] === acceptKey(key) && response.headers["sec-websocket-protocol"] === SUBPROTOCOL;
-      if (!right) return socket.destroy(reject(new Error(`the service there does not support ${SUBPROTOCOL}`)));
+    request.on("upgrade", (response, socket, head) => {
+      const isValid = response.headers["sec-websocket-accept"] === acceptKey(key) && response.headers["sec-websocket-protocol"] === SUBPROTOCOL;
+      if (!isValid) return socket.destroy(reject(new Error(`the service there does not support ${SUBPROTOCOL}`)));
       const connection = new Connection(socket, false);
       resolve(connection);
       if (head.length > 0) setImmediate(() => connection.read(head)); // after the caller has said what it listens for
     });
-    asked.end();
+    request.end();
   });
 }

@@ -9,17 +9,17 @@ const STATE_MS = 250;
 const OLD_STATE_MS = 1000; // ten times the period of a robot's status
 const AGE_MS = 100;
 const RETRY_MS = 500;
-const part = (id) => document.getElementById(id);
-const canvas = part("picture");
+const element = (id) => document.getElementById(id);
+const canvas = element("picture");
 const drawnAt_ms = []; // of the last second
 let last = 0; // number of the last image, drawn or not: the page requests the next one only after its arrival
 let newest = { channel: "", size: "", age_ms: null };
 
 const pause = (time_ms) => new Promise((resolve) => setTimeout(resolve, time_ms));
 
-function report(link) {
-  part("link").textContent = link;
-  part("link").className = link === "connected" ? "" : "lost";
+function showLink(link) {
+  element("link").textContent = link;
+  element("link").className = link === "connected" ? "" : "lost";
 }
 
 async function draw(answer) {
@@ -35,7 +35,7 @@ async function draw(answer) {
   drawnAt_ms.push(performance.now());
 }
 
-async function showPictures() {
+async function showImages() {
   for (;;) {
     try {
       const answer = await fetch(`picture?after=${last}`);
@@ -50,21 +50,21 @@ async function showPictures() {
 }
 
 function showState({ robot, online, state, reason, lines }) {
-  report(online ? "connected" : `no status from ${robot}`);
-  part("state").textContent = state;
-  part("state").className = state;
-  part("reason").textContent = reason;
-  part("lines").replaceChildren(...lines.flatMap(([name, text]) => [["dt", name], ["dd", text]]).map(([tag, text]) => {
-    const element = document.createElement(tag);
-    element.textContent = text;
-    return element;
+  showLink(online ? "connected" : `no status from ${robot}`);
+  element("state").textContent = state;
+  element("state").className = state;
+  element("reason").textContent = reason;
+  element("lines").replaceChildren(...lines.flatMap(([name, text]) => [["dt", name], ["dd", text]]).map(([tag, text]) => {
+    const item = document.createElement(tag);
+    item.textContent = text;
+    return item;
   }));
 }
 
 /** The last state is over. */
-function forgetState(link) {
+function clearState(link) {
   showState({ state: "", reason: "", lines: [] });
-  report(link);
+  showLink(link);
 }
 
 async function showStates() {
@@ -72,9 +72,9 @@ async function showStates() {
     try {
       const { error, ...state } = await (await fetch("state", { signal: AbortSignal.timeout(OLD_STATE_MS) })).json();
       if (error === undefined) showState(state);
-      else forgetState(error);
+      else clearState(error);
     } catch (error) {
-      forgetState(`\`sightline watch\` ${error.name === "TimeoutError" ? "does not answer" : "has ended"}`);
+      clearState(`\`sightline watch\` ${error.name === "TimeoutError" ? "does not answer" : "has ended"}`);
     }
     await pause(STATE_MS);
   }
@@ -87,14 +87,14 @@ function showAge() {
   if (drawnAt_ms.length === 0) return;
   const since_ms = now_ms - drawnAt_ms.at(-1);
   const age_ms = since_ms + (newest.age_ms ?? 0);
-  part("figure").className = age_ms > OLD_MS ? "old" : "";
+  element("figure").className = age_ms > OLD_MS ? "old" : "";
   const age = newest.age_ms === null ? "" : `, at least ${Math.round(age_ms)} ms old`;
-  part("age").textContent = since_ms > OLD_MS
+  element("age").textContent = since_ms > OLD_MS
     ? `no image for ${(since_ms / 1000).toFixed(1)} s`
     : `${newest.channel} ${newest.size}, ${drawnAt_ms.length} images/s${age}`;
 }
 
 setInterval(showAge, AGE_MS);
 document.onvisibilitychange = document.onresume = showAge; // a page out of sight has had few timers, or none
-showPictures();
+showImages();
 showStates();

@@ -16,17 +16,17 @@ const COMPUTE_US = 2_000; // what looking at a picture takes
 const bytes = (text) => new Uint8Array(Buffer.from(text, "base64"));
 const base64 = (data) => Buffer.from(data).toString("base64");
 
-async function robotOf({ load, session, jpeg, camera, limits, now_us }) {
+async function makeRobot({ load, session, jpeg, camera, limits, now_us }) {
   const [{ Robot }, { CHANNELS, encode }, { TICK_US }] = await load("robot", "codec", "limits");
   const robot = new Robot({ session, fps: 30, camera, limits });
-  const picture = bytes(jpeg);
+  const image = bytes(jpeg);
   const written = ({ name, header, payload }) => [name, "", base64(encode(header)), base64(payload)];
-  let [nextTick_us, nextPicture_us] = [now_us, now_us];
+  let [nextTick_us, nextCapture_us] = [now_us, now_us];
 
-  const photographed = (at_us, wanted) => {
-    if (at_us < nextPicture_us) return [];
-    nextPicture_us += robot.stream.interval_us;
-    const frame = wanted && robot.mayCapture(at_us) ? robot.onPicture(picture, at_us, at_us) : null;
+  const captured = (at_us, wanted) => {
+    if (at_us < nextCapture_us) return [];
+    nextCapture_us += robot.stream.interval_us;
+    const frame = wanted && robot.mayCapture(at_us) ? robot.onImage(image, at_us, at_us) : null;
     return frame === null ? [] : [frame];
   };
 
@@ -38,28 +38,28 @@ async function robotOf({ load, session, jpeg, camera, limits, now_us }) {
     tick({ now_us: at_us, wanted }) {
       const due = at_us >= nextTick_us ? robot.tick(at_us) : [];
       if (at_us >= nextTick_us) nextTick_us = at_us + TICK_US;
-      return [...due, ...photographed(at_us, wanted)].map(written);
+      return [...due, ...captured(at_us, wanted)].map(written);
     },
   };
 }
 
-async function visionOf({ load, session }) {
-  const [{ Eyes }, { Vision }, { CHANNELS, encode }, { decodeDc }] = await load("frame_loop", "vision", "codec", "jpeg_dc");
+async function makeVision({ load, session }) {
+  const [{ FrameLoop }, { Vision }, { CHANNELS, encode }, { decodeDc }] = await load("frame_loop", "vision", "codec", "jpeg_dc");
   let [clock_us, out, waiting] = [0, [], []];
-  const look = (jpeg) => {
+  const decodeImage = (jpeg) => {
     clock_us += COMPUTE_US;
     const { width, height, scale, rgb } = decodeDc(jpeg);
     return { width, height, scale, data: rgb, channels: 3 };
   };
   const send = (name, header, payload) => out.push([name, header.source, base64(encode(header)), base64(payload)]);
   const pause = () => new Promise((resume) => waiting.push(resume)); // until all that has arrived was read
-  const eyes = new Eyes(new Vision(session), { look, send, now_us: () => clock_us, pause });
+  const loop = new FrameLoop(new Vision(session), { decodeImage, send, now_us: () => clock_us, pause });
   const working = [];
 
   return {
     message({ now_us, channel, source, header, payload }) {
       clock_us = now_us;
-      working.push(eyes.onMessage({ channel: CHANNELS[channel], source, header: bytes(header), payload: bytes(payload) }));
+      working.push(loop.onMessage({ channel: CHANNELS[channel], source, header: bytes(header), payload: bytes(payload) }));
       return [];
     },
     async tick({ now_us }) {
@@ -71,7 +71,7 @@ async function visionOf({ load, session }) {
   };
 }
 
-const MAKERS = { robot: robotOf, vision: visionOf };
+const MAKERS = { robot: makeRobot, vision: makeVision };
 let peer = null;
 
 async function answerTo(line) {

@@ -3,12 +3,12 @@
 import assert from "node:assert/strict";
 import { beforeEach, mock, test } from "node:test";
 import { encode } from "../../../examples/js/codec.mjs";
-import { drawPicture } from "../../../examples/js/drawing.mjs";
+import { drawJpeg } from "../../../examples/js/drawing.mjs";
 import { helloText, pack, unpack } from "../../../examples/js/framing.mjs";
 import { sessionDigest } from "../../../examples/js/proof.mjs";
 
 const SESSION = "0a1b2c3d";
-const JPEG = drawPicture({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
+const JPEG = drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
 const parts = {};
 const sockets = [];
 let now_ms = 10_000;
@@ -92,7 +92,7 @@ test("an image that comes late is dimmed, and its age begins with its delay", as
   assert.deepEqual([parts.age.textContent, parts.figure.className], ["1 images/s, at least 1250 ms old", "old"]);
 });
 
-const stateShown = () => ["state", "reason", "wheels", "driver", "sight", "pictures"].map((id) => parts[id].textContent);
+const stateShown = () => ["state", "reason", "wheels", "driver", "frame_age", "frames"].map((id) => parts[id].textContent);
 const UNKNOWN = ["?", "", "?", "?", "?", "?"];
 
 test("a robot that sends frames but no status shows no state after 1 s", async () => {
@@ -123,21 +123,21 @@ test("what a request came to goes with the state that it led to", async () => {
   await receiveStatus("DISARMED");
   await receiveReply("NOT_ALLOWED: repeat the request");
   await receiveStatus("DISARMED");
-  assert.equal(parts.news.textContent, "NOT_ALLOWED: repeat the request");
+  assert.equal(parts.message.textContent, "NOT_ALLOWED: repeat the request");
   await receiveStatus("ACTIVE");
-  assert.equal(parts.news.textContent, "");
+  assert.equal(parts.message.textContent, "");
 });
 
 test("a STOP that is not confirmed stays on the page, and STOPPED goes with that state", async () => {
   parts.stop.onclick();
   await receiveStatus();
-  assert.equal(parts.news.textContent, "STOP ...");
+  assert.equal(parts.message.textContent, "STOP ...");
   await receiveStatus("STOPPED", [0, 0]);
   pass(50);
   await receiveStatus("STOPPED", [0, 0]);
-  assert.equal(parts.news.textContent, "STOPPED");
+  assert.equal(parts.message.textContent, "STOPPED");
   await receiveStatus("DISARMED", [0, 0]);
-  assert.equal(parts.news.textContent, "");
+  assert.equal(parts.message.textContent, "");
 });
 
 test("a page that wakes shows at once how old its image and state are: no timer has run meanwhile", async () => {
@@ -161,10 +161,10 @@ test("a page whose connection does not open names the token, and takes one that 
 test("a lost link leaves no state", async () => {
   await receiveStatus();
   await receiveReply("armed", "ACTIVE");
-  assert.equal(parts.news.textContent, "armed");
+  assert.equal(parts.message.textContent, "armed");
   sockets.at(-1).onclose({ code: 1006 });
   assert.deepEqual([stateShown(), parts.state.className, parts.link.className], [UNKNOWN, "", "lost"]);
-  assert.equal(parts.news.textContent, "");
+  assert.equal(parts.message.textContent, "");
   pass(1500);
   assert.deepEqual(stateShown(), UNKNOWN);
 });

@@ -70,7 +70,7 @@ def our_viewer(tmp_path: Path) -> Iterator[tuple[Browser, Started]]:
 
 def answered(page: Browser) -> int:
     """Return the number of frames that the page reports as drawn and answered."""
-    found = re.search(r"(\d+) answered here", page.text("pictures"))
+    found = re.search(r"(\d+) answered here", page.text("frames"))
     return int(found[1]) if found else 0
 
 
@@ -98,21 +98,21 @@ def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer
     page, robot = our_viewer
     assert until(lambda: page.text("link") == "connected", START_S), page.text("link")
     assert until(lambda: is_drawn(page), START_S), page.text("age")
-    assert until(lambda: answered(page) > 30, START_S), page.text("pictures")
+    assert until(lambda: answered(page) > 30, START_S), page.text("frames")
     assert re.fullmatch(r"\d+ images/s, at least \d+ ms old", page.text("age"))
     # The page only watches until a request to drive.
     assert page.text("driver") == "nobody"
 
     page.click("drive")
     assert until(lambda: page.text("driver") == "this page", START_S), page.text("driver")
-    assert until(lambda: is_armed(page), START_S), page.text("news")
+    assert until(lambda: is_armed(page), START_S), page.text("message")
     assert until(lambda: is_moving(page), START_S), page.text("reason")
-    assert "ms old" in page.text("sight")
+    assert "ms old" in page.text("frame_age")
     page.screenshot(tmp_path / "driving.png")
     assert (tmp_path / "driving.png").stat().st_size > 10_000
 
     page.press("Space", " ")
-    assert until(lambda: page.text("state") == "STOPPED", 3.0), page.text("news")
+    assert until(lambda: page.text("state") == "STOPPED", 3.0), page.text("message")
     assert page.run("document.getElementById('drive').checked") is True  # the space bar pressed no button
     assert robot.says(r"STOPPED \(STOP by operator\)")
     assert page.errors == []
@@ -122,7 +122,7 @@ def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer
 def test_page_reports_a_lost_robot_and_finds_it_again(tmp_path: Path) -> None:
     port = free_port()
     with JsRobot(tmp_path, port=port) as robot, Browser(tmp_path, f"http://127.0.0.1:{port}/") as page:
-        assert until(lambda: answered(page) > 10, START_S), page.text("pictures")
+        assert until(lambda: answered(page) > 10, START_S), page.text("frames")
         robot.kill()
         assert until(lambda: page.text("age").startswith("no image for"), 5.0), page.text("age")
         assert until(lambda: page.text("link").startswith("no connection"), 5.0), page.text("link")
@@ -141,8 +141,8 @@ def test_page_connects_with_the_token_after_the_hash(tmp_path: Path) -> None:
         address = f"http://127.0.0.1:{robot.port}/"
         with Browser(tmp_path, address + "#0123456789abcdef") as page:
             assert until(lambda: is_drawn(page), START_S), page.text("link")
-        stranger = tmp_path / "stranger"
-        stranger.mkdir()
-        with Browser(stranger, address) as page:
+        other = tmp_path / "other"
+        other.mkdir()
+        with Browser(other, address) as page:
             assert until(lambda: page.text("link").startswith("no connection"), START_S), page.text("link")
             assert answered(page) == 0

@@ -30,11 +30,11 @@ def report(*arguments: str, seconds: float) -> dict[str, Any]:
     return dict(json.loads(run.stdout))
 
 
-def failed(told: dict[str, Any]) -> list[str]:
+def failed(results: dict[str, Any]) -> list[str]:
     """Cases that failed, and those that did not apply for a reason that is not known."""
     return [
         f"{one['name']} {one['level']}: {one['title']} {one['reason']}"
-        for one in told["checks"]
+        for one in results["checks"]
         if one["value"] != "passed" and not one["reason"].startswith(NOT_APPLICABLE)
     ]
 
@@ -46,24 +46,24 @@ def test_a_known_reason_is_one_that_the_kit_gives(reason: str) -> None:
 
 
 def test_javascript_codec_conforms():
-    told = report("codec", "--json", "--", node(), str(EXAMPLES / "codec_adapter.mjs"), seconds=120)
-    assert failed(told) == []
-    assert told["ok"] and len(told["checks"]) >= 390
+    results = report("codec", "--json", "--", node(), str(EXAMPLES / "codec_adapter.mjs"), seconds=120)
+    assert failed(results) == []
+    assert results["ok"] and len(results["checks"]) >= 390
 
 
 @pytest.mark.long
 def test_javascript_robot_conforms(tmp_path):
     with JsRobot(tmp_path, "--guests") as robot:
-        told = report("robot", robot.endpoint, "--robot", "js1", "--json", seconds=580)
-    assert failed(told) == []
-    assert told["ok"] and len(told["checks"]) >= 60
+        results = report("robot", robot.endpoint, "--robot", "js1", "--json", seconds=580)
+    assert failed(results) == []
+    assert results["ok"] and len(results["checks"]) >= 60
 
 
 @pytest.mark.long
 def test_javascript_vision_conforms(tmp_path):
     endpoint = f"ws://127.0.0.1:{free_port()}"
     with JsVision(tmp_path, endpoint, "r1") as vision:
-        told = report("vision", endpoint, "--json", seconds=580)
+        results = report("vision", endpoint, "--json", seconds=580)
         assert vision.process.poll() is None, vision.output()
-    assert failed(told) == []
-    assert told["ok"] and len(told["checks"]) >= 60
+    assert failed(results) == []
+    assert results["ok"] and len(results["checks"]) >= 60

@@ -36,19 +36,19 @@ def quiet_robot(tmp_path_factory):
     ],
 )
 def test_peer_without_a_hello_receives_the_reason(quiet_robot, first, code, reason):
-    with connect(quiet_robot.endpoint, subprotocols=["sightline.v1"]) as stranger:
-        stranger.send(first)
+    with connect(quiet_robot.endpoint, subprotocols=["sightline.v1"]) as client:
+        client.send(first)
         with pytest.raises(ConnectionClosed) as closed:
-            stranger.recv(5)
+            client.recv(5)
     assert closed.value.rcvd.code == code and reason in closed.value.rcvd.reason
 
 
 def test_silent_client_is_dropped_after_two_seconds(quiet_robot):
     with (
-        connect(quiet_robot.endpoint, subprotocols=["sightline.v1"]) as stranger,
+        connect(quiet_robot.endpoint, subprotocols=["sightline.v1"]) as client,
         pytest.raises(ConnectionClosed) as closed,
     ):
-        stranger.recv(4)
+        client.recv(4)
     assert closed.value.rcvd.code == 1008
 
 
@@ -61,9 +61,9 @@ def test_silent_client_is_dropped_after_two_seconds(quiet_robot):
     ],
 )
 def test_rejected_client_receives_the_reason_by_http(quiet_robot, options, status_code):
-    with pytest.raises(InvalidStatus) as refused:
+    with pytest.raises(InvalidStatus) as rejection:
         connect(quiet_robot.endpoint, **options)
-    assert refused.value.response.status_code == status_code
+    assert rejection.value.response.status_code == status_code
 
 
 def test_seventeenth_client_is_rejected(tmp_path):
@@ -71,9 +71,9 @@ def test_seventeenth_client_is_rejected(tmp_path):
         for _ in range(16):
             client = clients.enter_context(connect(robot.endpoint, subprotocols=["sightline.v1"]))
             client.send(hello("js1"))  # without it the client is dropped after two seconds
-        with pytest.raises(InvalidStatus) as refused:
+        with pytest.raises(InvalidStatus) as rejection:
             connect(robot.endpoint, subprotocols=["sightline.v1"])
-        assert refused.value.response.status_code == 503
+        assert rejection.value.response.status_code == 503
 
 
 def test_gateway_to_a_robot_that_does_not_answer_reports_it(tmp_path):
@@ -84,9 +84,9 @@ def test_gateway_to_a_robot_that_does_not_answer_reports_it(tmp_path):
         ending.enter_context(socket.create_connection(robot))
         options = ("--connect", f"ws://127.0.0.1:{robot[1]}", "--robot", "r1", "--port", str(page_port))
         assert ending.enter_context(JsProcess(tmp_path, "gateway.mjs", *options)).says("viewer of robot r1")
-        with pytest.raises(InvalidStatus) as refused:
+        with pytest.raises(InvalidStatus) as rejection:
             connect(f"ws://127.0.0.1:{page_port}", subprotocols=["sightline.v1"], open_timeout=5)
-    assert refused.value.response.status_code == 502
+    assert rejection.value.response.status_code == 502
 
 
 def test_silent_connections_take_the_places_of_a_gateway_for_seconds_only(tmp_path):
@@ -151,7 +151,7 @@ def _open_sockets(robot: JsRobot) -> int:
 
 
 @pytest.mark.parametrize(
-    ("script", "arguments", "said"),
+    ("script", "arguments", "printed"),
     [
         ("robot_server.mjs", ["--port", "x"], "--port is a number"),
         ("robot_server.mjs", ["--host", "0.0.0.0"], "--token-file"),
@@ -164,12 +164,12 @@ def _open_sockets(robot: JsRobot) -> int:
         ("gateway.mjs", ["--connect", "ws://127.0.0.1:65536", "--robot", "r1"], "--connect"),
     ],
 )
-def test_a_bad_option_is_one_line_and_code_2(tmp_path, script, arguments, said):
+def test_a_bad_option_is_one_line_and_code_2(tmp_path, script, arguments, printed):
     (broken := tmp_path / "broken").mkdir()
     (broken / "0.jpg").write_text("no JPEG, no certificate")
     with JsProcess(tmp_path, script, *(one.format(broken=broken) for one in arguments)) as process:
         assert process.process.wait(10) == 2
-        assert process.output().startswith("error: ") and said.format(broken=broken) in process.output()
+        assert process.output().startswith("error: ") and printed.format(broken=broken) in process.output()
         assert process.output().count("\n") == 2 and "    at " not in process.output()
 
 
@@ -188,9 +188,9 @@ def test_a_robot_with_a_token_and_a_certificate(tmp_path):
         trusted = {"ca_certs": str(tmp_path / "ca.pem")}
         believe = partial(websocket.create_connection, secure, timeout=10, sslopt=trusted)
         for shown in ([], ["sightline.token.0123456789abcdeX"]):
-            with pytest.raises(websocket.WebSocketBadStatusException) as refused:
+            with pytest.raises(websocket.WebSocketBadStatusException) as rejection:
                 believe(subprotocols=["sightline.v1", *shown])
-            assert refused.value.status_code == 401
+            assert rejection.value.status_code == 401
         peer = believe(subprotocols=["sightline.token.0123456789abcdef", "sightline.v1"])
         assert peer.subprotocol == "sightline.v1"
         peer.close()

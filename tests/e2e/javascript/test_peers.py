@@ -146,9 +146,9 @@ def test_both_codecs_read_mutated_messages_alike(seed):
 
 
 def test_adapter_reports_unsupported_cases():
-    asked = ({"id": 3, "kind": "poem"}, {"id": 4, "kind": "write_twist", "linear_mps": 0.2, "angular_rad_s": -1e-5})
+    questions = ({"id": 3, "kind": "poem"}, {"id": 4, "kind": "write_twist", "linear_mps": 0.2, "angular_rad_s": -1e-5})
     run = subprocess.run(
-        [node(), str(EXAMPLES / "codec_adapter.mjs")], input="\n".join(map(json.dumps, asked)) + "\n",
+        [node(), str(EXAMPLES / "codec_adapter.mjs")], input="\n".join(map(json.dumps, questions)) + "\n",
         capture_output=True, text=True, timeout=20, check=True,
     )  # fmt: skip
     assert [json.loads(line) for line in run.stdout.splitlines()] == [

@@ -60,15 +60,15 @@ def test_our_vision_and_operator_drive_and_stop_the_javascript_robot(tmp_path, o
         armed = sightline("arm", "js1", "--connect", robot.endpoint)
         assert "armed" in armed
         assert robot.says(r"ACTIVE \(driving\)")
-        told: dict[str, Any] = {}
+        report: dict[str, Any] = {}
 
         def drives() -> bool:
-            told.update(status(robot))
-            return told["state"] == "ACTIVE" and told["holder"]["source"] == "vision" and any(told["applied"])
+            report.update(status(robot))
+            return report["state"] == "ACTIVE" and report["holder"]["source"] == "vision" and any(report["applied"])
 
-        assert until(drives, START_S), told
-        assert set(told["refused"]) <= {"DISARMED", "CLAMPED", "NOT_ALLOWED"}  # armed as soon as it was allowed
-        assert told["stream"]["credit_timeouts"] < told["stream"]["sent"] / 4
+        assert until(drives, START_S), report
+        assert set(report["refused"]) <= {"DISARMED", "CLAMPED", "NOT_ALLOWED"}  # armed as soon as it was allowed
+        assert report["stream"]["credit_timeouts"] < report["stream"]["sent"] / 4
         assert "STOPPED" in sightline("stop", "js1", "--connect", robot.endpoint)
         assert until(lambda: not any(applied(robot)), 5)
         assert "STOPPED" in sightline("arm", "js1", "--connect", robot.endpoint, ok=False)
@@ -142,9 +142,9 @@ def test_the_javascript_vision_drives_our_robot(tmp_path):
     ):
         assert vision.says("target seen"), vision.output() + robot.output()
         assert driving(robot, 2.0), robot.output()
-        told = json.loads(sightline("status", "r1", "--connect", endpoint, "--json"))
-        assert told["accepted"] > 5 and set(told["refused"]) <= {"DISARMED", "CLAMPED", "STALE"}  # on a busy machine
-        assert told["applied"][0] > 0 > told["applied"][1]  # the ball is on the right
+        report = json.loads(sightline("status", "r1", "--connect", endpoint, "--json"))
+        assert report["accepted"] > 5 and set(report["refused"]) <= {"DISARMED", "CLAMPED", "STALE"}  # busy machine
+        assert report["applied"][0] > 0 > report["applied"][1]  # the ball is on the right
         vision.kill()
         assert until(lambda: robot.speed() == 0, 2)
 
