@@ -1,5 +1,5 @@
 /**
- * The browser's viewer with the platform's own WebSocket and no screen: watches, steers, says STOP. Arguments: URL, robot.
+ * Run the viewer without a screen, with the WebSocket of Node: watch, steer, send STOP. Arguments: URL, robot.
  *
  *     node --experimental-websocket tests/javascript_viewer.mjs ws://127.0.0.1:9090 r1
  */
@@ -18,7 +18,7 @@ function print(line) {
 function show({ link, status, reply, stop, target }) {
   if (link !== undefined) print(`link: ${link}`);
   if (reply !== undefined) print(`reply: ${reply.detail}`);
-  if (target !== undefined) print(target === null ? "nothing" : "target");
+  if (target !== undefined) print(target === null ? "no target" : "target");
   if (stop === "STOPPED") finish();
   if (status?.state === "ACTIVE" && Math.abs(status.applied[0]) > 0.05) {
     print("driving");
@@ -35,7 +35,7 @@ function finish() {
 const decodeImage = async (jpeg) => {
   const { width, height, scale, rgb } = decodeDc(jpeg);
   drawn += 1;
-  if (drawn === 10) viewer.setDriving(true); // until then it only watches
+  if (drawn === 10) viewer.setDriving(true); // watches only until then
   return { width, height, scale, data: rgb, channels: 3 };
 };
 const [url, robot] = process.argv.slice(2);

@@ -1,5 +1,5 @@
 /**
- * @file Answers the conformance kit's questions about the codec, a JSON line each way. Shell.
+ * @file Run the codec for the conformance kit: one JSON line per question, one per answer. Shell.
  *
  *     sightline conform codec -- node examples/js/codec_adapter.mjs
  */
@@ -14,10 +14,10 @@ const fromBase64 = (text) => new Uint8Array(Buffer.from(text, "base64"));
 const fromHex = (text) => new Uint8Array(Buffer.from(text, "hex"));
 const toHex = (bytes) => Buffer.from(bytes).toString("hex");
 
-/** JSON has no infinity: a range without return is the text "inf". */
+/** Make a payload valid JSON, which has no infinity: a range without return becomes "inf". */
 const jsonPayload = (payload) => (Array.isArray(payload) ? payload.map((range) => (range === Infinity ? "inf" : range)) : payload);
 
-/** What is asked, by kind: `key`, `message` ... as in the golden vectors. */
+/** Decoders by `kind` of question: `message`, `hello` ... as in the golden vectors. */
 const READERS = {
   message({ key, header, payload }) {
     const parsed = parseKey(key);
@@ -36,13 +36,13 @@ const READERS = {
   write_twist: (twist) => new TextDecoder().decode(formatTwist(twist)),
 };
 
-/** @returns {object} `ok`, `refusal` or `unsupported` */
+/** Answer one question. @returns {object} with the key `ok`, `refusal` or `unsupported` */
 export function answerTo(question) {
   if (!Object.hasOwn(READERS, question.kind)) return { unsupported: true };
   try {
     return { ok: READERS[question.kind](question) };
   } catch (error) {
-    if (error instanceof PeerError) return { refusal: "MALFORMED" }; // what ends a connection stands so in the vectors
+    if (error instanceof PeerError) return { refusal: "MALFORMED" }; // as in the vectors
     if (!(error instanceof WireError)) throw error;
     return { refusal: error.reason };
   }

@@ -1,7 +1,7 @@
 /**
- * @file A drawn camera: the picture that a robot would see of a yellow ball on a gray floor, as a JPEG. Pure.
+ * @file Draw the camera image of a yellow ball on a gray floor as a JPEG. Pure.
  *
- * Each 8x8 block has one color, so that a JPEG is its DC coefficients and nothing else: no transform, no AC codes.
+ * Each 8x8 block has one color, so that the JPEG contains only DC coefficients: no transform, no AC codes.
  */
 
 const WIDTH_PX = 640;
@@ -12,24 +12,25 @@ const BALL_RADIUS_M = 0.1;
 const COLORS = { ball: [235, 200, 20], floor: [120, 120, 122], wall: [165, 170, 175] };
 const DC_COUNTS = [0, 1, 5, 1, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0, 0, 0]; // T.81, table K.3
 const DC_SYMBOLS = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11];
-const DC_QUANTUM = 8; // then the coefficient of a flat block is its level
+const DC_QUANTUM = 8; // makes the coefficient of a flat block equal to its level
 
-/** The CameraModel of what is drawn. */
+/** CameraModel of the drawn images. */
 export const DRAWN_CAMERA = Object.freeze({
   width_px: WIDTH_PX, height_px: HEIGHT_PX, fx_px: FOCAL_PX, fy_px: FOCAL_PX, cx_px: WIDTH_PX / 2, cy_px: HEIGHT_PX / 2,
   z_m: CAMERA_HEIGHT_M, calibrated: true,
 });
 
-/** Where the ball is: it swings in front of the place where the robot started, and in its sight, once in 20 s. */
+/** Compute the position of the ball. It swings with a period of 20 s, always visible from the start pose of the robot. */
 export function ballAt(t_us) {
   const angle_rad = 0.5 * Math.sin((t_us / 20e6) * 2 * Math.PI);
   return { x_m: 1.5 * Math.cos(angle_rad), y_m: 1.5 * Math.sin(angle_rad) };
 }
 
 /**
+ * Draw one image.
  * @param {{x_m: number, y_m: number, yaw_rad: number}} pose of the robot
  * @param {{x_m: number, y_m: number}} ball
- * @param {number} [noise] one brightness step, so that no two pictures are the same byte for byte
+ * @param {number} [noise] varies the brightness of one block: no two images of a live camera are equal
  * @returns {Uint8Array} JPEG
  */
 export function drawJpeg(pose, ball, noise = 0) {
@@ -43,7 +44,7 @@ export function drawJpeg(pose, ball, noise = 0) {
   });
 }
 
-/** The brightness of the ball at a pixel, 0..1, under a lamp above; null beside the ball. */
+/** Compute the brightness of the ball at a pixel, 0..1, under a lamp above; null outside the ball. */
 function lightAt(circle, x_px, y_px) {
   const [right, down] = [(x_px - circle.x_px) / circle.radius_px, (y_px - circle.y_px) / circle.radius_px];
   const square = 1 - right * right - down * down;
@@ -63,7 +64,7 @@ function projectBall(pose, ball) {
 }
 
 /**
- * A baseline JPEG of flat blocks.
+ * Encode a baseline JPEG of flat blocks.
  * @param {number} across blocks @param {number} down blocks
  * @param {(x: number, y: number) => number[]} colorOf red, green, blue of a block, 0 to 255
  */
@@ -94,12 +95,12 @@ function headerSegments(width_px, height_px) {
     ...segment(0xdb, [0, ...new Array(64).fill(DC_QUANTUM)]),
     ...segment(0xc0, [8, ...uint16(height_px), ...uint16(width_px), 3, ...components]),
     ...segment(0xc4, [0x00, ...DC_COUNTS, ...DC_SYMBOLS]),
-    ...segment(0xc4, [0x10, 1, ...new Array(15).fill(0), 0x00]), // one code, "0": nothing follows in this block
+    ...segment(0xc4, [0x10, 1, ...new Array(15).fill(0), 0x00]), // one code, "0": end of block
     ...segment(0xda, [3, 1, 0, 2, 0, 3, 0, 0, 63, 0]),
   ];
 }
 
-/** [code, length] of each size of a DC difference. */
+/** Huffman code of each size of a DC difference: [code, length]. */
 const DC_CODES = (() => {
   const codes = [];
   let code = 0;

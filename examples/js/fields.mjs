@@ -1,5 +1,5 @@
 /**
- * @file The field tables of the protocol: what each header and JSON payload may hold. Pure.
+ * @file Field tables of the headers and JSON payloads of the protocol. Pure.
  *
  * One entry per row of the tables in `protocol/README.md`. A type is a function `(value, path) -> value` that throws
  * {@link FieldError}; a field is `[type]`, or `[type, default]` if it may be absent.
@@ -7,20 +7,20 @@
 
 import { Real } from "./json.mjs";
 
-/** The largest integer on the wire: every JSON reader holds it exactly. */
+/** Largest integer on the wire. Every JSON reader represents it exactly. */
 export const MAX_INTEGER = Number.MAX_SAFE_INTEGER;
 export const VERSION = 1;
 
-/** Thrown for a value outside its table; `path` is the field's name. */
+/** An invalid value. `path` names the field. */
 export class FieldError extends Error {
-  constructor(path, expected) {
-    super(`${path}: ${expected}`);
+  constructor(path, problem) {
+    super(`${path}: ${problem}`);
     this.path = path;
   }
 }
 
 const fail = (path, expected) => {
-  throw new FieldError(path, expected);
+  throw new FieldError(path, `expected ${expected}`);
 };
 
 const integer = (min, max) => (value, path) =>
@@ -32,12 +32,12 @@ const number = (min, max, open = false) => (value, path) => {
   return inside ? plain : fail(path, `a number ${open ? "above" : "from"} ${min} to ${max}`);
 };
 
-/** Characters are code points, not UTF-16 units. */
+/** Text of at most `max` code points, not UTF-16 units. */
 const text = (max) => (value, path) =>
   typeof value === "string" && [...value].length <= max ? value : fail(path, `text of at most ${max} characters`);
 
 const matching = (pattern) => (value, path) =>
-  typeof value === "string" && pattern.test(value) ? value : fail(path, `text like ${pattern}`);
+  typeof value === "string" && pattern.test(value) ? value : fail(path, `text that matches ${pattern}`);
 
 const oneOf = (...names) => (value, path) => (names.includes(value) ? value : fail(path, `one of ${names}`));
 
@@ -50,7 +50,7 @@ const list = (type, min, max) => (value, path) =>
 
 const map = (type, max = Infinity, named = /^/) => (value, path) => {
   if (!isObject(value) || Object.keys(value).length > max) fail(path, `an object of at most ${max} fields`);
-  for (const name of Object.keys(value)) if (!named.test(name)) fail(path, `names like ${named}`);
+  for (const name of Object.keys(value)) if (!named.test(name)) fail(path, `names that match ${named}`);
   return Object.fromEntries(Object.entries(value).map(([name, item]) => [name, type(item, `${path}.${name}`)]));
 };
 
@@ -64,9 +64,10 @@ function isObject(value) {
 }
 
 /**
- * `value` with every field of the table checked, defaults filled in and unknown fields left out.
+ * Check every field of the table, fill in defaults and omit unknown fields.
  * @param {Record<string, Array>} fields
- * @param {unknown} value as {@link import("./json.mjs").parseJson} gives it
+ * @param {unknown} value as {@link import("./json.mjs").parseJson} returns it
+ * @throws {FieldError}
  */
 export function readFields(fields, value, path = "") {
   if (!isObject(value)) fail(path, "an object");
@@ -74,7 +75,7 @@ export function readFields(fields, value, path = "") {
   for (const [name, [type, fallback]] of Object.entries(fields)) {
     const fieldPath = path ? `${path}.${name}` : name;
     if (value[name] !== undefined) read[name] = type(value[name], fieldPath);
-    else if (fallback === undefined) fail(fieldPath, "is missing");
+    else if (fallback === undefined) throw new FieldError(fieldPath, "missing");
     else read[name] = structuredClone(fallback);
   }
   return read;

@@ -1,18 +1,18 @@
 /**
- * @file What a vision or a viewer does with what a robot sends: the newest frame is looked at and answered once. Pure.
+ * @file Process the messages of a robot for a vision service or viewer: answer the newest frame once. Pure.
  *
- * The caller brings the picture decoder, the clock and the link, so that Node and the browser run the same code.
+ * The caller provides the image decoder, the clock and the link, so that Node and the browser run the same code.
  */
 
 import { WireError, checkSizes, decode, encode, formatTwist, readJpegSize, readMessage } from "./codec.mjs";
 import { findTarget } from "./vision.mjs";
 
 const EMPTY = new Uint8Array(0);
-/** Channels that these eyes want of a robot. */
+/** Channels that a vision service or viewer requests from a robot. */
 export const WANTED_CHANNELS = Object.freeze(["frame", "camera", "status", "reply"]);
-const DRIFT = 5000; // two quartz clocks differ by less than 1 in this
+const DRIFT = 5000; // two quartz clocks differ by less than 1 in 5000
 
-/** How late a robot's messages come, without synchronized clocks: at least by what they lose on the fastest of the session. */
+/** Estimates the age of messages without synchronized clocks: their delay beyond that of the fastest message of the session. */
 export class RobotClock {
   constructor() {
     this.session = "";
@@ -21,7 +21,7 @@ export class RobotClock {
   /**
    * Learn from a message at its arrival.
    * @param {{session: string, t_us: number}} stamp @param {number} now_us
-   * @returns {number} its least possible age, in us
+   * @returns {number} its lowest possible age, us
    */
   age_us({ session, t_us }, now_us) {
     const drift_us = (now_us - this.received_us) / DRIFT;
@@ -31,20 +31,21 @@ export class RobotClock {
   }
 }
 
+/** Decodes the newest frame, finds the target and answers. */
 export class FrameLoop {
   /**
    * @param {import("./vision.mjs").Vision} vision
    * @param {object} environment
-   * @param {(jpeg: Uint8Array) => object|Promise<object>} environment.decodeImage decodes (and draws) a picture, for `findTarget`
+   * @param {(jpeg: Uint8Array) => object|Promise<object>} environment.decodeImage decodes (and draws) an image for `findTarget`
    * @param {(name: string, header: object, payload: Uint8Array) => void} environment.send
    * @param {() => number} environment.now_us
-   * @param {() => Promise<void>} [environment.pause] lets what has arrived be read first, so that the newest frame wins
-   * @param {(what: object) => void} [environment.onDecision] told of each answer: {target, twist, age_us}, the least age of its frame
+   * @param {() => Promise<void>} [environment.pause] ends when all received messages are read, so that the newest frame wins
+   * @param {(decision: object) => void} [environment.onDecision] receives {target, twist, age_us}; age_us: lowest age of the frame
    * @param {(reply: object) => void} [environment.onReply]
    */
   constructor(vision, { decodeImage, send, now_us, pause = async () => undefined, onDecision = () => undefined, onReply = () => undefined }) {
     Object.assign(this, { vision, decodeImage, send, now_us, pause, onDecision, onReply });
-    this.drives = true; // otherwise frames are acknowledged only
+    this.drives = true; // false: acknowledge frames without a twist
     this.clock = new RobotClock();
     this.newest = null;
     this.busy = false;
@@ -53,8 +54,9 @@ export class FrameLoop {
   }
 
   /**
+   * Process one message.
    * @param {{channel: object, source: string, header: Uint8Array, payload: Uint8Array}} packet
-   * @returns {Promise<void>|undefined} when all that had arrived is answered
+   * @returns {Promise<void>|undefined} resolves when no frame waits for an answer
    */
   onMessage(packet) {
     try {
@@ -76,7 +78,7 @@ export class FrameLoop {
     if (channel.name === "reply" && read.payload.to === this.vision.requester) this.onReply(read.payload);
   }
 
-  /** One place for a frame, the newest; whoever was in it is not answered. */
+  /** Store the newest frame. The frame that it replaces gets no answer. @throws {WireError} */
   onFrame({ channel, header, payload }) {
     checkSizes(channel, header, payload);
     const stamp = decode(channel.header, header);
@@ -97,10 +99,10 @@ export class FrameLoop {
     this.busy = false;
   }
 
-  /** The twist for a frame; null where it is only acknowledged: a bad picture, or nobody drives from here. */
+  /** Compute the twist for a frame, or null to acknowledge it only: an invalid image, or this peer does not drive. */
   async decide({ stamp, jpeg, arrival_us, age_us }) {
     try {
-      if (!this.vision.advances(stamp)) throw new WireError("OUT_OF_ORDER", "the robot's clock stands still");
+      if (!this.vision.advances(stamp)) throw new WireError("OUT_OF_ORDER", "the clock of the robot does not advance");
       this.checkImage(jpeg);
       const target = findTarget(await this.decodeImage(jpeg));
       const twist = this.drives ? this.vision.twistFor(target) : null;
@@ -112,12 +114,12 @@ export class FrameLoop {
     }
   }
 
-  /** @throws {WireError} for what no decoder should see, or is not what the camera's model says */
+  /** @throws {WireError} MALFORMED for an unsupported image, or a size other than that of the camera model */
   checkImage(jpeg) {
     const { width_px, height_px } = readJpegSize(jpeg);
     const { camera } = this.vision;
     if (camera !== null && (camera.width_px !== width_px || camera.height_px !== height_px)) {
-      throw new WireError("MALFORMED", `picture of ${width_px}x${height_px}, the camera makes ${camera.width_px}x${camera.height_px}`);
+      throw new WireError("MALFORMED", `image is ${width_px}x${height_px}, the camera model ${camera.width_px}x${camera.height_px}`);
     }
   }
 
@@ -129,14 +131,14 @@ export class FrameLoop {
     else this.send("twist", header, formatTwist(twist));
   }
 
-  /** @param {string} verb @returns {number} the id that the reply will bear */
+  /** Send a request. @param {string} verb @returns {number} the id of its reply */
   request(verb) {
     const { header, payload } = this.vision.request(verb);
     this.send("request", header, encode(payload));
     return payload.id;
   }
 
-  /** A picture that a browser's decoder refuses is no {@link WireError}, and no reason to end either. */
+  /** Count a skipped frame or message. The image decoder of a browser throws errors other than {@link WireError}. */
   skip(error) {
     const reason = error instanceof WireError ? error.reason : "UNDECODABLE";
     this.skipped[reason] = (this.skipped[reason] ?? 0) + 1;

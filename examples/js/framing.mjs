@@ -1,5 +1,5 @@
 /**
- * @file The sub-protocol `sightline.v1`: `hello`, and channel messages as one binary message each. Pure; Node and browser.
+ * @file The sub-protocol `sightline.v1`: `hello`, and one binary message per channel message. Pure; Node and browser.
  *
  *     uint16 BE length of the header block | header block | payload
  */
@@ -11,16 +11,16 @@ import { JsonError, parseJson } from "./json.mjs";
 export const SUBPROTOCOL = "sightline.v1";
 export const MAX_HELLO_BYTES = 1024;
 export const MAX_BLOCK_BYTES = 576;
-const MAX_UNKNOWN_SOURCES = 16; // security limit: of one channel, messages that wait and whose source is no role's
+const MAX_UNKNOWN_SOURCES = 16; // security limit: waiting messages of one channel whose source is not a role
 const ROLE_SOURCES = new Set(["vision", "operator", "teleop", "detector"]);
-const RELAYED = new Set(["detections", "mission", "report", "overlay", "preview"]); // their sources others choose
+const RELAYED = new Set(["detections", "mission", "report", "overlay", "preview"]); // other peers choose the sources of these
 
 const UTF8 = new TextDecoder("utf-8", { fatal: true, ignoreBOM: true });
 const LATIN1 = new TextDecoder("latin1");
 const NAMES_ONLY = /^\{"channel":"([^"\\]{1,64})"(?:,"source":"([^"\\]{0,64})")?\}/;
 const CHANNEL_FIRST = /^\{"channel":"([^"\\]{1,64})",/;
 
-/** The connection must end with this close code; the message is the reason, one line for a person. */
+/** An error that ends the connection with the close code `code`. The message is one line for the operator. */
 export class PeerError extends Error {
   /** @param {number} code @param {string} reason */
   constructor(code, reason) {
@@ -30,6 +30,7 @@ export class PeerError extends Error {
 }
 
 /**
+ * Write a hello.
  * @param {string} robot @param {string} session 8 hex digits @param {string[]} wants channels @param {string} [role]
  * @returns {string}
  */
@@ -37,7 +38,7 @@ export function helloText(robot, session, wants, role = "") {
   return JSON.stringify({ v: 1, robot, ...(role ? { role } : {}), session, wants });
 }
 
-/** @param {string} text @throws {WireError} MALFORMED or UNSUPPORTED_VERSION */
+/** Parse a hello. @param {string} text @throws {WireError} MALFORMED or UNSUPPORTED_VERSION */
 export function parseHello(text) {
   const bytes = new TextEncoder().encode(text);
   if (bytes.length > MAX_HELLO_BYTES) throw new WireError("MALFORMED", `a hello has at most ${MAX_HELLO_BYTES} bytes`);
@@ -45,10 +46,10 @@ export function parseHello(text) {
 }
 
 /**
- * Read a peer's hello, and agree on the robot.
- * @param {string} text @param {string} robot whose link this is
+ * Read the hello of a peer, and check its robot.
+ * @param {string} text @param {string} robot id of the robot of this link
  * @returns {{robot: string, role: string, session: string, wants: string[]}}
- * @throws {PeerError} 1008
+ * @throws {PeerError} 1008 for an invalid hello or another robot
  */
 export function readHello(text, robot) {
   let hello;
@@ -63,6 +64,7 @@ export function readHello(text, robot) {
 }
 
 /**
+ * Pack a channel message.
  * @param {string} name channel @param {object} header @param {Uint8Array} payload
  * @returns {Uint8Array} one binary message
  */
@@ -70,7 +72,7 @@ export function pack(name, header, payload) {
   return join(encode({ channel: name, ...header }), payload);
 }
 
-/** The same for a header as it came: unless it names its source, it follows an object of names. @param {Uint8Array} header */
+/** Pack a message with its header as received, after an object of names unless it names its source. @param {Uint8Array} header */
 export function packRaw(name, source, header, payload) {
   const isNamed = sourceOf(header) === source;
   const names = new TextEncoder().encode(isNamed ? `{"channel":"${name}",` : `{"channel":"${name}","source":"${source}"}`);
@@ -99,10 +101,10 @@ function join(block, payload) {
 }
 
 /**
- * Take a binary message apart.
- * @param {Uint8Array} message @param {string} role of the peer's hello @param {string} robot of the peer's hello
- * @returns {{channel: object, source: string, header: Uint8Array, payload: Uint8Array}|null} null: dropped, no such key
- * @throws {PeerError} 1007 for what cannot be taken apart
+ * Unpack a binary message.
+ * @param {Uint8Array} message @param {string} role in the hello of the peer @param {string} robot in the hello of the peer
+ * @returns {{channel: object, source: string, header: Uint8Array, payload: Uint8Array}|null} null for an invalid key: drop the message
+ * @throws {PeerError} 1007 for an invalid header block
  */
 export function unpack(message, role, robot) {
   const { key, header, payload } = splitMessage(message, role, robot);
@@ -110,18 +112,18 @@ export function unpack(message, role, robot) {
   return parsed && { channel: parsed.channel, source: parsed.source, header, payload };
 }
 
-/** The same with the key as the peer claims it, still to be checked. */
+/** Split a binary message. The returned key contains the claims of the peer and is not checked yet. */
 export function splitMessage(message, role, robot) {
   const size = message.length < 2 ? MAX_BLOCK_BYTES + 1 : message[0] * 256 + message[1];
   if (size > MAX_BLOCK_BYTES || message.length < 2 + size) {
-    throw new PeerError(1007, `header block cut or over ${MAX_BLOCK_BYTES} bytes in a message of ${message.length}`);
+    throw new PeerError(1007, `header block incomplete or over ${MAX_BLOCK_BYTES} bytes in a message of ${message.length}`);
   }
   const { name, source, header } = readBlock(message.subarray(2, 2 + size), role);
   const tail = CHANNELS[name]?.hasSource && source ? `/${source}` : "";
   return { key: `sightline/${robot}/${name}${tail}`, header, payload: message.subarray(2 + size) };
 }
 
-/** The names in front of the header are no part of it, and do not count among its bytes. */
+/** Separate the names from the header, which is counted and passed on without them. */
 function readBlock(block, role) {
   const text = LATIN1.decode(block);
   const namesOnly = NAMES_ONLY.exec(text);
@@ -129,7 +131,7 @@ function readBlock(block, role) {
     return { name: namesOnly[1], source: namesOnly[2] ?? role, header: block.subarray(namesOnly[0].length) };
   }
   const channelFirst = CHANNEL_FIRST.exec(text);
-  const fields = parseBlock(block) ?? {}; // broken JSON: whoever reads the header refuses it
+  const fields = parseBlock(block) ?? {}; // invalid JSON: the decoder of the header rejects it
   const name = channelFirst === null ? fields.channel : channelFirst[1];
   if (typeof name !== "string") throw new PeerError(1007, "the header block names no channel");
   const source = fields.source ?? role;
@@ -155,15 +157,15 @@ function withBrace(rest) {
 }
 
 /**
- * The largest message that an end which wants these channels accepts.
- * @param {string[]} wants
+ * Compute the size of the largest message of the wanted channels.
+ * @param {string[]} wants @returns {number} bytes
  */
 export function messageBound(wants) {
   const payloads = wants.map((name) => CHANNELS[name]?.maxPayloadBytes ?? 0);
   return Math.max(MAX_HELLO_BYTES, 2 + MAX_BLOCK_BYTES + Math.max(0, ...payloads));
 }
 
-/** Slots of messages that have not left: one per channel, source and verb, the newest; the most urgent leaves first. */
+/** Messages that wait: the newest per channel, source and verb. The most urgent one leaves first. */
 export class OutgoingQueue {
   constructor() {
     this.slots = new Map();
@@ -171,6 +173,7 @@ export class OutgoingQueue {
   }
 
   /**
+   * Add a message, in place of an older one of its slot.
    * @param {string} name channel, "" for a hello @param {string} source @param {string|Uint8Array} message
    * @param {string} [verb] of a request
    */
@@ -187,7 +190,7 @@ export class OutgoingQueue {
     return unknown.length >= MAX_UNKNOWN_SOURCES;
   }
 
-  /** @returns {string|Uint8Array|undefined} */
+  /** Remove the most urgent message. @returns {string|Uint8Array|undefined} undefined if none waits */
   take() {
     let best;
     for (const [slot, { urgency }] of this.slots) {

@@ -1,7 +1,7 @@
 /**
- * @file The gate: the only road to the wheels. Judges commands, keeps state, lease and STOP latch. Pure.
+ * @file The gate: the only path from a command to the wheels. Contains state, lease and STOP latch. Pure.
  *
- * `offer` judges a command on arrival; `step` decides at each tick, with the age judged again, what the wheels do.
+ * `offer` validates a command once, on arrival. `step` checks its age again at each tick and computes the twist.
  */
 
 import { WireError } from "./codec.mjs";
@@ -9,7 +9,7 @@ import { LIMITS, Ramp, STILL, ageFactor, clampTwist, isStill } from "./limits.mj
 import { FreshnessRecord, IssuedRecord, Lease, RANKS, RepeatRecord, SequenceRecord, isHuman, isSame, proofOf, publicHolder } from "./validation.mjs";
 
 const MAX_REQUEST_AGE_US = 2_000_000;
-const GUEST = Object.freeze({ source: "guest", session: "00000000" }); // who speaks without headers
+const GUEST = Object.freeze({ source: "guest", session: "00000000" }); // the sender of every twist without a header
 const ARMED = ["HOLD", "ACTIVE", "DEGRADED"];
 const ALWAYS_GRANTED = ["stop", "disarm"];
 
@@ -17,7 +17,7 @@ export class Gate {
   /**
    * @param {string} session 8 hex digits, new at each start
    * @param {Partial<typeof LIMITS>} limits
-   * @param {boolean} stopped whether the STOP latch was set before the restart
+   * @param {boolean} stopped true if the STOP latch was set before the restart
    */
   constructor(session, limits = {}, stopped = false) {
     this.limits = { ...LIMITS, ...limits };
@@ -48,12 +48,12 @@ export class Gate {
   // --- commands ------------------------------------------------------------------------------------------------
 
   /**
-   * Judge one command; every refusal is counted and kept in words.
-   * @param {string} source as in the key
-   * @param {object|null} header null for a guest without one
+   * Validate one command on arrival. Counts each rejection and stores the newest.
+   * @param {string} source role in the key of the message
+   * @param {object|null} header null for a guest without a header
    * @param {import("./limits.mjs").Twist} twist
    * @param {number} now_us
-   * @returns {string|null} the refusal, null if it was accepted
+   * @returns {string|null} the reason of a rejection, or null if the command was accepted
    */
   offer(source, header, twist, now_us) {
     try {
@@ -67,7 +67,7 @@ export class Gate {
     }
   }
 
-  /** Count a refusal; anything but a {@link WireError} is a fault of this program and goes on. */
+  /** Count a rejection. Rethrow any error but a {@link WireError}, which is a fault of this program. */
   reject(source, error) {
     if (!(error instanceof WireError)) throw error;
     this.count(error.reason);
@@ -79,7 +79,7 @@ export class Gate {
     this.counters[reason] = (this.counters[reason] ?? 0) + 1;
   }
 
-  /** Who sends, and how old the frame behind it is (steps 2 to 6 of the judging order). */
+  /** Return the sender, and the age of the cited frame (steps 2 to 6 of the validation). @throws {WireError} */
   identify(source, header, now_us) {
     if (!(source in RANKS) || (header !== null && header.source !== source)) {
       throw new WireError("UNKNOWN_SOURCE", `unknown source ${source}, or different from the header`);
@@ -98,7 +98,7 @@ export class Gate {
     return { sender, age_us };
   }
 
-  /** Steps 7 to 9: the latch, the lease, the arming. */
+  /** Check the latch, the lease and the arming (steps 7 to 9). @throws {WireError} */
   admit(sender, header, now_us) {
     if (this.state === "STOPPED") throw new WireError(this.state, this.reason);
     this.noticeLostHuman(now_us);
@@ -125,7 +125,7 @@ export class Gate {
 
   // --- the wheels ----------------------------------------------------------------------------------------------
 
-  /** What the wheels do from now until the next step. @returns {import("./limits.mjs").Twist} */
+  /** Compute the twist from now until the next step. @returns {import("./limits.mjs").Twist} */
   step(now_us) {
     this.noticeLostHuman(now_us);
     if (this.armsItself && this.state === "DISARMED" && this.missingToArm(now_us) === "") {
@@ -163,13 +163,13 @@ export class Gate {
     return STILL;
   }
 
-  // --- what people ask -----------------------------------------------------------------------------------------
+  // --- requests ------------------------------------------------------------------------------------------------
 
   /**
    * Carry out a request.
    * @param {{source: string, session: string, echo: object|null}} header @param {string} verb
-   * @returns {string} what happened, in words
-   * @throws {WireError} with the reason if it may not be
+   * @returns {string} one line for the operator
+   * @throws {WireError} if the request is rejected
    */
   request(header, verb, now_us) {
     const sender = { source: header.source, session: header.session };
@@ -195,7 +195,7 @@ export class Gate {
     }
   }
 
-  /** Latch STOPPED: wheels to zero and held until `reset`. Always granted. */
+  /** Latch STOPPED. The wheels ramp to zero and stay there until `reset`. Always granted. */
   stop(reason) {
     this.issued.denyEarlier();
     this.leave("STOPPED", reason);
@@ -224,7 +224,7 @@ export class Gate {
     const missing = this.missingToArm(now_us);
     if (missing !== "") throw new WireError("NOT_ALLOWED", missing);
     this.armsItself = this.limits.autoArm;
-    this.repeats = new RepeatRecord(); // who arms has looked at the robot
+    this.repeats = new RepeatRecord(); // an operator who arms has looked at the robot
     this.begin(`armed by ${sender.source}`, now_us);
     return "armed";
   }
@@ -236,7 +236,7 @@ export class Gate {
     }
     if (isSame(holder, sender)) return "already held";
     this.liveCommands = 0;
-    this.command = null; // the driver before neither arms nor drives for this one
+    this.command = null; // commands of the previous driver must not move the robot for the new one
     this.lease.take(sender, now_us, proof);
     return "acquired";
   }
@@ -260,7 +260,7 @@ export class Gate {
     }
   }
 
-  /** What still stands against arming, "" if nothing. */
+  /** Return the condition that still prevents arming, or "". */
   missingToArm(now_us) {
     const needed = this.limits.liveCommandsToArm;
     if (this.lease.liveHolder(now_us) === null) return "no valid commands yet; start the vision service";
@@ -287,7 +287,7 @@ export class Gate {
     this.reason = reason;
   }
 
-  /** Go where the wheels are off; `armsItself`: it may arm itself later without a person. */
+  /** Go to a state with the wheels off. `armsItself`: the robot may arm later without an operator. */
   leave(state, reason, armsItself = false) {
     this.state = state;
     this.reason = reason;

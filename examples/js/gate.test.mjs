@@ -1,4 +1,4 @@
-/** @file The gate, at the boundaries of every rule in the order of judging; times are made up. */
+/** @file Tests of the gate at the boundaries of every rule, in the order of validation, in simulated time. */
 
 import assert from "node:assert/strict";
 import test from "node:test";
@@ -11,7 +11,7 @@ const ROBOT = "0a1b2c3d";
 const FORWARD = { linear_mps: 0.4, angular_rad_s: 0 };
 const START_US = 50_000_000;
 
-/** A gate with a clock: each `frame` is issued now, each `command` answers one. */
+/** A gate with a clock. `frame` issues a frame now, `command` answers one. */
 class Rig {
   constructor(limits = {}, stopped = false) {
     this.gate = new Gate(ROBOT, limits, stopped);
@@ -39,7 +39,7 @@ class Rig {
     return this.gate.request({ source, session, echo }, verb, this.now_us);
   }
 
-  /** Five live commands, then armed. */
+  /** Send five live commands, then arm. */
   arm(sender = {}) {
     for (let count = 0; count < 5; count += 1) {
       this.pass(TICK_US);
@@ -69,7 +69,7 @@ class Rig {
 
 const rejects = (reason, act) => assert.throws(act, (error) => error instanceof WireError && error.reason === reason);
 
-test("armed by a person after five live commands, and not before", () => {
+test("an operator can arm after five live commands, not earlier", () => {
   const rig = new Rig();
   rejects("NOT_ALLOWED", () => rig.request("arm"));
   for (let count = 0; count < 4; count += 1) rig.command(rig.frame());
@@ -82,12 +82,12 @@ test("armed by a person after five live commands, and not before", () => {
 
 const CITATIONS = [
   ["another session of the robot", (echo) => ({ ...echo, session: "ffffffff" }), 0, "OTHER_SESSION"],
-  ["a seq never issued", (echo) => ({ ...echo, seq: 999 }), 0, "UNKNOWN_FRAME"],
+  ["an unknown seq", (echo) => ({ ...echo, seq: 999 }), 0, "UNKNOWN_FRAME"],
   ["another time", (echo) => ({ ...echo, t_us: echo.t_us + 1 }), 0, "UNKNOWN_FRAME"],
   ["the reserved beat", (echo) => ({ ...echo, channel: "beat" }), 0, "UNKNOWN_FRAME"],
-  ["as old as allowed", (echo) => echo, 400_000, null],
-  ["a microsecond older", (echo) => echo, 400_001, "STALE"],
-  ["from the future", (echo) => echo, -1, "FROM_FUTURE"],
+  ["a frame of the largest age", (echo) => echo, 400_000, null],
+  ["a frame that is a microsecond older", (echo) => echo, 400_001, "STALE"],
+  ["a frame from the future", (echo) => echo, -1, "FROM_FUTURE"],
 ];
 for (const [name, change, later_us, expected] of CITATIONS) {
   test(`a command that cites ${name}: ${expected ?? "accepted"}`, () => {
@@ -100,12 +100,12 @@ for (const [name, change, later_us, expected] of CITATIONS) {
   });
 }
 
-test("a twist cites no status", () => {
+test("a twist that cites a status is rejected", () => {
   const rig = new Rig();
   assert.equal(rig.command(rig.frame("status")), "UNKNOWN_FRAME");
 });
 
-test("seq counts up within a source and session", () => {
+test("seq must increase within a source and session", () => {
   const rig = new Rig();
   rig.arm();
   assert.equal(rig.command(rig.frame(), { seq: 100 }), null);
@@ -114,7 +114,7 @@ test("seq counts up within a source and session", () => {
   assert.equal(rig.command(rig.frame(), { seq: 101 }), null);
 });
 
-test("a role that may not drive, guests that are off, a header of another role", () => {
+test("a viewer, a guest while guests are off, and a header of another role are rejected", () => {
   const rig = new Rig();
   assert.equal(rig.command(rig.frame(), { source: "viewer" }), "UNKNOWN_SOURCE");
   assert.equal(rig.command(rig.frame(), { source: "constructor" }), "UNKNOWN_SOURCE");
@@ -122,7 +122,7 @@ test("a role that may not drive, guests that are off, a header of another role",
   assert.equal(rig.gate.offer("teleop", { source: "vision" }, FORWARD, rig.now_us), "UNKNOWN_SOURCE");
 });
 
-test("a guest is slow, short-lived and lowest", () => {
+test("a guest has lower speed limits, a shorter command life and the lowest rank", () => {
   const rig = new Rig({ guests: true, autoArm: true });
   for (let count = 0; count < 60; count += 1) {
     rig.pass(TICK_US);
@@ -159,7 +159,7 @@ for (const [speed_mps, most_m] of [[0.2, 0.27], [0.05, 0.11]]) {
   });
 }
 
-test("silence stops the robot within 700 ms, ten seconds of it disarm", () => {
+test("silence stops the robot within 700 ms and disarms it after 10 s", () => {
   const rig = new Rig();
   rig.arm();
   rig.drive(60);
@@ -168,7 +168,7 @@ test("silence stops the robot within 700 ms, ten seconds of it disarm", () => {
   assert.ok(rig.stepUntil("DISARMED", 10_100_000) >= 9_900_000);
 });
 
-test("refused commands keep nothing alive", () => {
+test("rejected commands do not prolong the last accepted one", () => {
   const rig = new Rig();
   rig.arm();
   rig.drive(60);
@@ -182,7 +182,7 @@ test("refused commands keep nothing alive", () => {
   assert.equal(rig.gate.applied.linear_mps, 0);
 });
 
-test("the age is judged again at every tick", () => {
+test("each tick checks the age of the frame again", () => {
   const rig = new Rig();
   rig.arm();
   rig.drive(60);
@@ -196,7 +196,7 @@ test("the age is judged again at every tick", () => {
   assert.equal(ageFactor(LIMITS, 400_000), 0);
 });
 
-test("a higher rank takes the lease, an equal one waits", () => {
+test("a higher rank takes the lease, an equal rank is rejected", () => {
   const rig = new Rig();
   rig.arm();
   assert.equal(rig.command(rig.frame(), { session: "99999999", seq: 1 }), "NOT_HOLDER");
@@ -204,7 +204,7 @@ test("a higher rank takes the lease, an equal one waits", () => {
   assert.equal(rig.command(rig.frame()), "NOT_HOLDER");
 });
 
-test("a lost human disarms, and vision does not take over", () => {
+test("the loss of a human driver disarms, and vision does not continue", () => {
   const rig = new Rig({ autoArm: true });
   const human = { source: "teleop", session: "bbbbbbbb" };
   rig.arm(human);
@@ -218,7 +218,7 @@ test("a lost human disarms, and vision does not take over", () => {
   }
 });
 
-test("STOP is latched, older statuses cannot undo it, reset starts nothing", () => {
+test("STOP is latched, no older status permits a reset, and reset does not arm", () => {
   const rig = new Rig();
   rig.arm();
   rig.drive(60);
@@ -235,7 +235,7 @@ test("STOP is latched, older statuses cannot undo it, reset starts nothing", () 
   assert.equal(rig.command(rig.frame()), "DISARMED");
 });
 
-test("a latch from before the restart holds, even where the robot arms itself", () => {
+test("the latch survives a restart, also with auto_arm", () => {
   const rig = new Rig({ autoArm: true }, true);
   for (let count = 0; count < 10; count += 1) {
     rig.pass(TICK_US);
@@ -245,7 +245,7 @@ test("a latch from before the restart holds, even where the robot arms itself", 
   assert.equal(rig.gate.state, "STOPPED");
 });
 
-test("what lets a robot move cites a status at most 2 s old", () => {
+test("a request that permits motion must cite a status of at most 2 s", () => {
   const rig = new Rig();
   rejects("MALFORMED", () => rig.request("arm", { echo: null }));
   rejects("MALFORMED", () => rig.request("arm", { echo: rig.frame() }));
@@ -254,7 +254,7 @@ test("what lets a robot move cites a status at most 2 s old", () => {
   rejects("STALE", () => rig.request("acquire", { source: "teleop", echo }));
 });
 
-test("acquire and release", () => {
+test("acquire takes the lease, release returns it", () => {
   const rig = new Rig();
   const human = { source: "teleop", session: "bbbbbbbb" };
   assert.equal(rig.request("acquire", human), "acquired");
@@ -265,7 +265,7 @@ test("acquire and release", () => {
   assert.equal(rig.request("release", { ...human, echo: null }), "not held");
 });
 
-test("beyond the limits: one factor for both axes, counted", () => {
+test("a twist over the limits is scaled by one factor and counted", () => {
   assert.deepEqual(clampTwist({ linear_mps: 1, angular_rad_s: 1 }, 0.5, 2), { linear_mps: 0.5, angular_rad_s: 0.5 });
   const rig = new Rig();
   rig.arm();
@@ -273,7 +273,7 @@ test("beyond the limits: one factor for both axes, counted", () => {
   assert.equal(rig.gate.counters.CLAMPED, 1);
 });
 
-test("the ramp is per elapsed time and never overshoots", () => {
+test("the ramp depends on the elapsed time and does not overshoot", () => {
   const [often, seldom] = [new Ramp(LIMITS), new Ramp(LIMITS)];
   for (let count = 0; count < 10; count += 1) often.step(FORWARD, 10_000);
   seldom.step(FORWARD, 100_000);
@@ -282,7 +282,7 @@ test("the ramp is per elapsed time and never overshoots", () => {
   assert.equal(seldom.step(FORWARD, 900_000).linear_mps, 0.4);
 });
 
-test("a copied identity neither drives nor locks the driver out", () => {
+test("a copied identity does not drive and does not block the driver", () => {
   const rig = new Rig();
   const chain = new ProofChain();
   for (let count = 0; count < 5; count += 1) rig.command(rig.frame(), chain.next());

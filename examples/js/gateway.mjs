@@ -1,10 +1,10 @@
 /**
- * @file Serves the viewer's page for a robot that serves none, and passes its WebSocket on, on one port of loopback. Shell.
+ * @file Serve the viewer page for a robot without one, and forward its WebSocket, on one port of loopback. Shell.
  *
  *     node examples/js/gateway.mjs --connect ws://127.0.0.1:9090 --robot r1 --port 8765
  *
- * A robot lets in pages of its own host and port only, so page and WebSocket must come from one place. The robot still
- * judges what it always judges: `Host`, `Origin` and token go through as the browser sent them.
+ * A robot admits only pages of its own host and port, so page and WebSocket must have one origin. The robot still checks
+ * `Host`, `Origin` and token, because the gateway forwards them unchanged.
  */
 
 import { createServer } from "node:http";
@@ -14,8 +14,8 @@ import { servePage } from "./pages.mjs";
 import { OPEN_MS, admissionProblem } from "./websocket.mjs";
 
 const USAGE = "node gateway.mjs --connect ws://HOST:PORT --robot ID [--port 8765]";
-const HOST = "127.0.0.1"; // beyond loopback whoever came through here would look like somebody of this machine
-const MAX_SOCKETS = 32; // security limit, that of a robot
+const HOST = "127.0.0.1"; // loopback only: to the robot, each client of the gateway is on this machine
+const MAX_SOCKETS = 32; // security limit, as of a robot
 const KEEP_ALIVE_MS = 1000;
 
 class UsageError extends Error {}
@@ -26,25 +26,25 @@ function readOptions() {
   const text = { type: "string" };
   const { values } = parseArgs({ options: { connect: text, robot: text, port: { ...text, default: "8765" } } });
   const found = /^ws:\/\/(\[[0-9a-fA-F:]+\]|[^:/?#]+):([0-9]{1,5})\/?$/.exec(values.connect ?? "");
-  if (found === null || !isPort(Number(found[2]))) throw new UsageError("--connect is ws://HOST:PORT, where the robot listens");
-  if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot ?? "")) throw new UsageError("--robot is 1 to 32 letters, digits, _ . -");
+  if (found === null || !isPort(Number(found[2]))) throw new UsageError("invalid --connect: expected ws://HOST:PORT of the robot");
+  if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot ?? "")) throw new UsageError("invalid --robot: expected 1 to 32 letters, digits, _ . -");
   const port = Number(values.port);
-  if (!isPort(port)) throw new UsageError("--port is a number from 1 to 65535");
+  if (!isPort(port)) throw new UsageError("invalid --port: expected 1 to 65535");
   return { robot: values.robot, port, to: { host: found[1].replace(/^\[|\]$/g, ""), port: Number(found[2]) } };
 }
 
-/** The request as it came, for the robot to judge. */
+/** Write the request as received, so that the robot can validate it. */
 function rawRequest({ method, url, rawHeaders }) {
   const lines = [];
   for (let at = 0; at < rawHeaders.length; at += 2) lines.push(`${rawHeaders[at]}: ${rawHeaders[at + 1]}\r\n`);
   return `${method} ${url} HTTP/1.1\r\n${lines.join("")}\r\n`;
 }
 
-/** Two sockets as one: what either says goes to the other, at the pace that the other takes it. */
+/** Connect two sockets, each at the rate at which the other reads. */
 function connectBoth(client, upstream) {
   for (const [from, to] of [[client, upstream], [upstream, client]]) {
     from.setNoDelay(true);
-    from.setKeepAlive(true, KEEP_ALIVE_MS); // an end that loses its power closes nothing
+    from.setKeepAlive(true, KEEP_ALIVE_MS); // an end that loses its power does not close
     from.on("error", () => to.destroy());
     from.on("close", () => to.destroy());
     from.pipe(to);
@@ -54,7 +54,7 @@ function connectBoth(client, upstream) {
 function forward(to) {
   return (request, client, head) => {
     const problem = admissionProblem(request.rawHeaders, HOST);
-    const reject = ([status, line]) => client.end(`HTTP/1.1 ${status} Refused\r\nConnection: close\r\n\r\n${line}\n`);
+    const reject = ([status, line]) => client.end(`HTTP/1.1 ${status} Rejected\r\nConnection: close\r\n\r\n${line}\n`);
     client.on("error", () => client.destroy());
     if (problem !== null) return reject(problem);
     const upstream = connect(to).setTimeout(OPEN_MS, () => upstream.destroy(new Error("no connection in time")));

@@ -1,19 +1,21 @@
 /**
- * @file Reads a JPEG at an eighth of its size: the mean color of each 8x8 block, from the DC coefficients alone. Pure.
+ * @file Decode a JPEG at an eighth of its size: the mean color of each 8x8 block, from the DC coefficients alone. Pure.
  *
- * Enough to find a colored blob, in 200 lines: no inverse DCT, AC coefficients are only skipped. Baseline Huffman, and
- * the first DC scan of a progressive picture (ITU-T T.81). Bound the picture with `readJpegSize` before it comes here.
+ * This is enough to find a colored blob, without an inverse DCT. It reads baseline Huffman images, and the first DC scan
+ * of progressive ones (ITU-T T.81). Check the size of the image with `readJpegSize` first.
  */
 
 import { WireError } from "./codec.mjs";
 
-const malformed = (what) => {
-  throw new WireError("MALFORMED", `picture: ${what}`);
+const malformed = (problem) => {
+  throw new WireError("MALFORMED", `image: ${problem}`);
 };
 
 /**
+ * Decode the mean color of each block.
  * @param {Uint8Array} jpeg
- * @returns {{width: number, height: number, scale: number, rgb: Uint8ClampedArray}} in blocks; `scale` pixels each way
+ * @returns {{width: number, height: number, scale: number, rgb: Uint8ClampedArray}} size in blocks of `scale` x `scale` px
+ * @throws {WireError} MALFORMED
  */
 export function decodeDc(jpeg) {
   const decoder = new DcDecoder();
@@ -32,7 +34,7 @@ export function decodeDc(jpeg) {
     if (marker !== 0xda) decoder.readTable(marker, segment);
     if (decoder.isComplete()) return decoder.colors();
   }
-  return malformed("ends before its colors");
+  return malformed("no complete scan");
 }
 
 class DcDecoder {
@@ -75,7 +77,7 @@ class DcDecoder {
     for (let index = 0; index < data[5]; index += 1) {
       const [id, sampling, quantiser] = data.subarray(6 + index * 3, 9 + index * 3);
       const [across, down] = [sampling >> 4, sampling & 15];
-      if (!(across >= 1 && across <= 4 && down >= 1 && down <= 4)) malformed("sampling factors");
+      if (!(across >= 1 && across <= 4 && down >= 1 && down <= 4)) malformed("invalid sampling factors");
       this.components.push({ id, across, down, quantiser, values: null, last: 0 });
     }
     this.maxAcross = Math.max(...this.components.map((component) => component.across));
@@ -85,11 +87,11 @@ class DcDecoder {
     for (const component of this.components) component.stride = this.mcusAcross * component.across;
   }
 
-  /** @returns {number} where the next marker begins */
+  /** Read a scan. @returns {number} offset of the next marker */
   readScan(head, jpeg, start) {
     const scanned = [];
     for (let index = 0; index < head[0]; index += 1) {
-      const component = this.components.find(({ id }) => id === head[1 + index * 2]) ?? malformed("a scan of no component");
+      const component = this.components.find(({ id }) => id === head[1 + index * 2]) ?? malformed("a scan of an unknown component");
       const chosen = head[2 + index * 2];
       scanned.push({ component, dc: this.tables[`0/${chosen >> 4}`], ac: this.tables[`1/${chosen & 15}`] });
     }
@@ -170,7 +172,7 @@ function nextMarker(jpeg, start) {
   return jpeg.length;
 }
 
-/** For each 16 bits that may come, symbol * 32 + the length of its code; 0 where there is no code. */
+/** Build the lookup table of the next 16 bits: symbol * 32 + the length of its code, or 0 without a code. */
 function huffmanTable(counts, symbols) {
   const table = new Uint16Array(65_536);
   let [code, index] = [0, 0];
@@ -185,7 +187,7 @@ function huffmanTable(counts, symbols) {
   return table;
 }
 
-/** Bits of a scan, most significant first; a stuffed zero after 0xFF is left out. */
+/** Bits of a scan, most significant first, without the stuffed zero after 0xFF. */
 class Bits {
   constructor(data, at) {
     this.data = data;
@@ -207,21 +209,21 @@ class Bits {
   skip(count) {
     this.fill();
     this.held -= count;
-    if (this.held < this.padding) malformed("its data is cut short");
+    if (this.held < this.padding) malformed("scan cut short");
   }
 
   symbol(table) {
     this.fill();
     const found = table[(this.buffer >> (this.held - 16)) & 0xffff];
-    if (found === 0) malformed("a code of no table");
+    if (found === 0) malformed("invalid Huffman code");
     this.skip(found & 31);
     return found >> 5;
   }
 
-  /** A number of `size` bits as T.81 writes it: the upper half positive. */
+  /** Read a signed number of `size` bits (T.81, F.2.2.1: the upper half is positive). */
   signed(size) {
     if (size === 0) return 0;
-    if (size > 15) malformed("a number of over 15 bits");
+    if (size > 15) malformed("a coefficient of over 15 bits");
     this.fill();
     const value = (this.buffer >> (this.held - size)) & ((1 << size) - 1);
     this.skip(size);
@@ -230,7 +232,7 @@ class Bits {
 
   skipRestart() {
     this.buffer = this.held = this.padding = 0;
-    if (this.data[this.at] !== 0xff || (this.data[this.at + 1] & 0xf8) !== 0xd0) malformed("a restart marker is missing");
+    if (this.data[this.at] !== 0xff || (this.data[this.at + 1] & 0xf8) !== 0xd0) malformed("missing restart marker");
     this.at += 2;
   }
 }

@@ -1,11 +1,11 @@
 /**
- * @file Strict JSON that keeps what `JSON.parse` loses: whether a number was written as an integer. Pure.
+ * @file Parse strict JSON, and distinguish integers from reals, which `JSON.parse` does not. Pure.
  *
- * The protocol refuses `7.0` where an integer belongs, and `JSON.parse` reads it as `7`. Of a key given twice the last
- * value counts. Objects come without a prototype, so that a key `__proto__` is a key.
+ * The protocol rejects `7.0` as an integer, and `JSON.parse` reads it as `7`. The last of two equal keys counts. Objects
+ * have no prototype, so that `__proto__` is an ordinary key.
  */
 
-const MAX_DEPTH = 32; // security limit, allowed by clause 2.1: nothing of the protocol is deeper than 4
+const MAX_DEPTH = 32; // security limit, permitted by clause 2.1: messages of the protocol have at most 4 levels
 const NUMBER = /-?(?:0|[1-9][0-9]*)(\.[0-9]+)?([eE][+-]?[0-9]+)?/y;
 const PLAIN = /[^"\\\u0000-\u001f]*/y;
 const BLANKS = /[ \t\n\r]*/y;
@@ -20,17 +20,19 @@ export class Real {
   }
 }
 
-/** Thrown for anything that is no JSON text. */
+/** Invalid JSON. */
 export class JsonError extends Error {}
 
 /**
+ * Parse a JSON text.
  * @param {string} text
  * @returns {unknown} integers as numbers, other numbers as {@link Real}
+ * @throws {JsonError}
  */
 export function parseJson(text) {
   const reader = new Reader(text);
   const value = reader.value(0);
-  if (reader.at !== text.length) throw new JsonError(`something follows at character ${reader.at}`);
+  if (reader.at !== text.length) throw new JsonError(`unexpected text at character ${reader.at}`);
   return value;
 }
 
@@ -103,10 +105,10 @@ class Reader {
       value += this.match(PLAIN)[0];
       const next = this.text[this.at++];
       if (next === '"') break;
-      if (next !== "\\") throw new JsonError("a string does not end, or holds a control character");
+      if (next !== "\\") throw new JsonError("a string without an end, or with a control character");
       value += this.escape();
     }
-    if (!value.isWellFormed()) throw new JsonError("half a surrogate pair");
+    if (!value.isWellFormed()) throw new JsonError("an unpaired surrogate");
     return value;
   }
 
@@ -114,7 +116,7 @@ class Reader {
     const letter = this.text[this.at++];
     if (letter in ESCAPES) return ESCAPES[letter];
     const digits = this.text.slice(this.at, this.at + 4);
-    if (letter !== "u" || !/^[0-9a-fA-F]{4}$/.test(digits)) throw new JsonError("no such escape in a string");
+    if (letter !== "u" || !/^[0-9a-fA-F]{4}$/.test(digits)) throw new JsonError("an unknown escape in a string");
     this.at += 4;
     return String.fromCharCode(parseInt(digits, 16));
   }
@@ -140,7 +142,7 @@ class Reader {
   }
 
   expect(character) {
-    if (this.text[this.at] !== character) throw new JsonError(`${character} is missing at character ${this.at}`);
+    if (this.text[this.at] !== character) throw new JsonError(`missing ${character} at character ${this.at}`);
     this.at += 1;
   }
 }

@@ -1,7 +1,7 @@
 /**
- * @file The codecs of the older dialect: base64 pictures, `linear-angular`, boxes joined by `-`. Pure; Node and browser.
+ * @file Codecs of the legacy protocol: base64 images, `linear-angular`, boxes joined by `-`. Pure; Node and browser.
  *
- * The peers of this folder speak `sightline.v1` only; these are for who meets an older program.
+ * The peers of this folder use only `sightline.v1`. A peer for a legacy program needs these codecs.
  */
 
 import { MAX_TWIST_BYTES, WireError, parseTwist } from "./codec.mjs";
@@ -15,26 +15,30 @@ const BOX = new RegExp(`^${DECIMAL}(?:,${DECIMAL}){3}$`);
 const CLASSED_BOX = new RegExp(`^([A-Za-z0-9_ ]{1,32}),(${DECIMAL}),(${DECIMAL}),(${DECIMAL}),(${DECIMAL})$`);
 const BASE64 = /^(?:[A-Za-z0-9+/]{4})*(?:[A-Za-z0-9+/]{2}==|[A-Za-z0-9+/]{3}=)?$/;
 
-const malformed = (what) => {
-  throw new WireError("MALFORMED", what);
+const malformed = (problem) => {
+  throw new WireError("MALFORMED", problem);
 };
 
-/** @param {string} text @returns {import("./limits.mjs").Twist} */
+/** Parse `linear-angular`. @param {string} text @returns {import("./limits.mjs").Twist} @throws {WireError} */
 export function parseDashed(text) {
   const found = text.length > MAX_TWIST_BYTES ? null : DASHED.exec(text);
   if (found === null) return malformed("twist is not linear-angular, e.g. 0.2--0.35");
   return parseTwist(new TextEncoder().encode(`${found[1]}|${found[2]}`));
 }
 
-/** @param {string} text base64, with line ends or without @param {number} maxBytes of the picture @returns {Uint8Array} */
+/** Decode an image. @param {string} text base64, with or without newlines @param {number} maxBytes @returns {Uint8Array} JPEG */
 export function decodeImage(text, maxBytes) {
   const joined = text.replace(/[\r\n]/g, "");
-  if (joined.length > 4 * Math.ceil(maxBytes / 3) || !BASE64.test(joined)) malformed(`picture is no base64 of at most ${maxBytes} bytes`);
+  if (joined.length > 4 * Math.ceil(maxBytes / 3) || !BASE64.test(joined)) malformed(`image is not base64 of at most ${maxBytes} bytes`);
   const jpeg = Uint8Array.from(atob(joined), (character) => character.charCodeAt(0));
-  return jpeg.length > maxBytes ? malformed(`picture is over ${maxBytes} bytes`) : jpeg;
+  return jpeg.length > maxBytes ? malformed(`image is over ${maxBytes} bytes`) : jpeg;
 }
 
-/** @param {string} text @returns {{y_min: number, x_min: number, y_max: number, x_max: number, label: string}[]} fractions of the picture */
+/**
+ * Parse boxes.
+ * @param {string} text
+ * @returns {{y_min: number, x_min: number, y_max: number, x_max: number, label: string}[]} fractions of the image size
+ */
 export function parseBoxes(text) {
   const parts = text === "" ? [] : text.split("-");
   if (text.length > MAX_BOXES_BYTES || parts.length > MAX_BOXES) malformed(`at most ${MAX_BOXES} boxes`);

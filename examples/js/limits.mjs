@@ -1,5 +1,5 @@
 /**
- * @file The numbers that a robot keeps, and the ramp that keeps them. Pure.
+ * @file Limits of a robot, and the ramp that applies them. Pure.
  *
  * @typedef {{linear_mps: number, angular_rad_s: number}} Twist
  */
@@ -9,8 +9,8 @@ export const STILL = Object.freeze({ linear_mps: 0, angular_rad_s: 0 });
 export const TICK_US = 20_000; // 50 Hz
 
 /**
- * Times and limits of a robot; the protocol's defaults. With these, a robot at 0.5 m/s stands still 300 + 250 ms after its
- * last command (silence, then 2 m/s2), within the 700 ms that are promised.
+ * Default times and limits of the protocol. A robot at 0.5 m/s stops 300 + 250 ms after its last command (silence, then
+ * 2 m/s2), within the promised 700 ms.
  */
 export const LIMITS = Object.freeze({
   maxLinear_mps: 0.5,
@@ -32,15 +32,15 @@ export const LIMITS = Object.freeze({
   autoArm: false,
 });
 
-/** Share of the speed limit that a frame of this age leaves: 1 when young, falling linearly to 0. */
+/** Compute the share of the speed limit for a frame of this age: 1 up to `fullSpeedAge_us`, then linearly down to 0. */
 export function ageFactor(limits, age_us) {
   const span_us = limits.zeroSpeedAge_us - limits.fullSpeedAge_us;
   return Math.min(1, Math.max(0, (limits.zeroSpeedAge_us - age_us) / span_us));
 }
 
 /**
- * Both axes scaled by one factor until both limits hold, so that the curve stays.
- * @param {Twist} twist @returns {Twist} the same object if nothing was cut
+ * Scale both axes by one factor until both limits hold, so that the curve does not change.
+ * @param {Twist} twist @returns {Twist} the same object if it is within the limits
  */
 export function clampTwist(twist, maxLinear_mps, maxAngular_rad_s) {
   if (maxLinear_mps <= 0 || maxAngular_rad_s <= 0) return STILL;
@@ -49,14 +49,14 @@ export function clampTwist(twist, maxLinear_mps, maxAngular_rad_s) {
   return { linear_mps: twist.linear_mps / excess, angular_rad_s: twist.angular_rad_s / excess };
 }
 
-/** What the wheels do on the way to a goal, within the accelerations, per elapsed time and not per call. */
+/** Limits the acceleration of the wheels, per elapsed time and not per call. */
 export class Ramp {
   constructor(limits) {
     this.limits = limits;
     this.twist = STILL;
   }
 
-  /** @param {Twist} goal @param {number} elapsed_us @returns {Twist} */
+  /** Approach the goal. @param {Twist} goal @param {number} elapsed_us @returns {Twist} */
   step(goal, elapsed_us) {
     const elapsed_s = Math.min(elapsed_us, 1_000_000) / 1e6;
     const linear = approach(this.twist.linear_mps, goal.linear_mps, this.limits.maxAcceleration_mps2 * elapsed_s);

@@ -1,4 +1,4 @@
-/** @file Frames of RFC 6455, `sightline.v1` on them, credit, and the robot and the loop back to back. */
+/** @file Tests of RFC 6455 frames, `sightline.v1`, credit, and the robot with the frame loop. */
 
 import assert from "node:assert/strict";
 import test from "node:test";
@@ -18,11 +18,11 @@ const bytes = (text) => new TextEncoder().encode(text);
 const text = (data) => new TextDecoder().decode(data);
 const MASK = Uint8Array.from([1, 2, 3, 250]);
 const closes = (code, act) => assert.throws(act, (error) => error instanceof PeerError && error.code === code);
-const decoded = (jpeg, picture = decodeDc(jpeg)) => ({ ...picture, data: picture.rgb, channels: 3 });
+const decoded = (jpeg, image = decodeDc(jpeg)) => ({ ...image, data: image.rgb, channels: 3 });
 const server = (maxBytes = 1024) => new FrameReader({ masked: true, maxBytes });
 
 for (const size of [0, 1, 125, 126, 127, 65_535, 65_536]) {
-  test(`a frame of ${size} bytes comes back, whole and byte by byte`, () => {
+  test(`a frame of ${size} bytes is decoded, whole and byte by byte`, () => {
     const data = new Uint8Array(size).map((_, index) => index % 251);
     const frame = encodeFrame(OPCODE.BINARY, data, MASK);
     assert.deepEqual([...server(70_000).feed(frame)], [{ kind: "binary", data }]);
@@ -33,9 +33,9 @@ for (const size of [0, 1, 125, 126, 127, 65_535, 65_536]) {
   });
 }
 
-test("fragments with a ping between them", () => {
+test("a message in fragments with a ping between them is assembled", () => {
   const parts = [encodeFrame(OPCODE.TEXT, bytes("hé").subarray(0, 2), MASK), encodeFrame(OPCODE.PING, bytes("p"), MASK), encodeFrame(OPCODE.CONTINUATION, bytes("hé").subarray(2), MASK)];
-  parts[0][0] &= 0x7f; // not the last
+  parts[0][0] &= 0x7f; // not final
   const events = [...server().feed(Uint8Array.from(parts.flatMap((part) => [...part])))];
   assert.deepEqual(events, [{ kind: "ping", data: bytes("p") }, { kind: "text", data: "hé" }]);
 });
@@ -46,20 +46,20 @@ const BROKEN = [
   ["a reserved bit", changed(EMPTY_TEXT, 0, 0xc1), 1002],
   ["an unknown opcode", changed(EMPTY_TEXT, 0, 0x83), 1002],
   ["no mask from a client", encodeFrame(OPCODE.TEXT, bytes("x")), 1002],
-  ["a continuation of nothing", encodeFrame(OPCODE.CONTINUATION, bytes("x"), MASK), 1002],
-  ["a ping in pieces", changed(encodeFrame(OPCODE.PING, bytes("x"), MASK), 0, 0x09), 1002],
+  ["a continuation without a message", encodeFrame(OPCODE.CONTINUATION, bytes("x"), MASK), 1002],
+  ["a ping in fragments", changed(encodeFrame(OPCODE.PING, bytes("x"), MASK), 0, 0x09), 1002],
   ["a ping of 126 bytes", encodeFrame(OPCODE.PING, new Uint8Array(126), MASK), 1002],
   ["text that is not UTF-8", encodeFrame(OPCODE.TEXT, Uint8Array.of(0xff), MASK), 1007],
-  ["a message over the bound", encodeFrame(OPCODE.BINARY, new Uint8Array(1025), MASK), 1009],
+  ["a message over the limit", encodeFrame(OPCODE.BINARY, new Uint8Array(1025), MASK), 1009],
   ["the head of a message of 2^60 bytes", Uint8Array.of(0x82, 0xff, 0x10, 0, 0, 0, 0, 0, 0, 0, 1, 2, 3, 4), 1009],
-  ["half a close code", encodeFrame(OPCODE.CLOSE, Uint8Array.of(3), MASK), 1002],
-  ["a close code that is none", encodeFrame(OPCODE.CLOSE, closePayload(1005, ""), MASK), 1002],
+  ["a close code of one byte", encodeFrame(OPCODE.CLOSE, Uint8Array.of(3), MASK), 1002],
+  ["an invalid close code", encodeFrame(OPCODE.CLOSE, closePayload(1005, ""), MASK), 1002],
 ];
 for (const [name, frame, code] of BROKEN) {
   test(`${name} ends the connection with ${code}`, () => closes(code, () => [...server().feed(frame)]));
 }
 
-test("many small fragments are bounded like one message", () => {
+test("many small fragments have the size limit of one message", () => {
   const part = encodeFrame(OPCODE.CONTINUATION, new Uint8Array(10), MASK);
   part[0] &= 0x7f;
   const reader = server(1024);
@@ -76,7 +76,7 @@ test("a close reason is cut between characters", () => {
   assert.equal(text(closePayload(1008, "é".repeat(100)).subarray(2)), "é".repeat(61));
 });
 
-test("a hello says who and what; another robot, another version and nonsense end with 1008", () => {
+test("a hello is read; another robot, another version and an invalid text end with 1008", () => {
   const hello = readHello(helloText("r1", "0a1b2c3d", ["frame", "later"], "vision"), "r1");
   assert.deepEqual(hello, { v: 1, robot: "r1", role: "vision", session: "0a1b2c3d", wants: ["frame", "later"] });
   closes(1008, () => readHello(helloText("r2", "0a1b2c3d", []), "r1"));
@@ -94,17 +94,17 @@ test("a packed message is unpacked", () => {
   assert.deepEqual(decode(AnswerHeader, packet.header), { ...HEADER, scan: null, mission: null, proof: null, next_proof: null });
 });
 
-test("the channel may stand anywhere, the role of the hello stands in for a source", () => {
+test("the channel may be any field, and the role of the hello replaces a missing source", () => {
   const packet = unpack(message('{"seq":1, "channel" : "ack"}', ""), "viewer", "r1");
   assert.deepEqual([packet.channel.name, packet.source], ["ack", "viewer"]);
 });
 
-test("a message without a header, and what follows the names as it is", () => {
+test("a message without a header is empty, and bytes after the names are the header", () => {
   assert.equal(unpack(message('{"channel":"twist","source":"guest"}'), "", "r1").header.length, 0);
   assert.equal(text(unpack(message('{"channel":"twist","source":"guest"}[1]'), "", "r1").header), "[1]");
 });
 
-test("a bad key is dropped, a broken block ends the connection", () => {
+test("an invalid key is dropped, an invalid block ends the connection", () => {
   assert.equal(unpack(message('{"channel":"nonsense"}'), "vision", "r1"), null);
   assert.equal(unpack(message('{"channel":"twist","source":"Vision"}'), "", "r1"), null);
   for (const block of ["", "{}", "[]", '{"channel":1}', "\u0001"]) closes(1007, () => unpack(message(block), "vision", "r1"));
@@ -112,13 +112,13 @@ test("a bad key is dropped, a broken block ends the connection", () => {
   closes(1007, () => unpack(new Uint8Array(700).fill(0x20).map((byte, at) => (at === 0 ? 2 : at === 1 ? 65 : byte)), "", "r1"));
 });
 
-test("an end accepts no larger message than it wants", () => {
+test("the wanted channels limit the message size", () => {
   assert.equal(messageBound(["twist", "ack", "request"]), 1024);
   assert.equal(messageBound(["twist", "detections"]), 2 + 576 + 32_768);
   assert.equal(messageBound(["frame", "status"]), 2 + 576 + CHANNELS.frame.maxPayloadBytes);
 });
 
-test("the queue keeps the newest of each channel and source, the most urgent leaves first", () => {
+test("the queue keeps the newest message per channel and source, and the most urgent leaves first", () => {
   const queue = new OutgoingQueue();
   queue.put("frame", "", "old");
   queue.put("frame", "", "new");
@@ -128,7 +128,7 @@ test("the queue keeps the newest of each channel and source, the most urgent lea
   assert.equal(queue.dropped, 1);
 });
 
-test("a request waits for each verb, and STOP goes first", () => {
+test("the queue keeps one request per verb, and STOP leaves first", () => {
   const queue = new OutgoingQueue();
   for (const verb of ["arm", "stop", "arm", "stop", "disarm"]) queue.put("request", "operator", verb, verb);
   assert.deepEqual([queue.take(), queue.take(), queue.take(), queue.take()], ["stop", "arm", "disarm", undefined]);
@@ -137,7 +137,7 @@ test("a request waits for each verb, and STOP goes first", () => {
   assert.deepEqual([queue.take(), queue.take()], ["hello", "stop"]);
 });
 
-test("whoever makes up sources gets few places, and takes none of the roles'", () => {
+test("unknown sources have few places in the queue and displace no role", () => {
   const queue = new OutgoingQueue();
   for (let number = 0; number < 1000; number += 1) queue.put("detections", `s${number}`, "old");
   for (const source of ["vision", "detector", "s0"]) queue.put("detections", source, "new");
@@ -162,14 +162,14 @@ const ADMITTED = [
   [["Host", "127.0.0.1:9090", "Origin", "null"], false],
 ];
 for (const [headers, admitted] of ADMITTED) {
-  test(`${headers.join(" ")} is ${admitted ? "let in" : "sent away"}`, () => {
+  test(`${headers.join(" ")} is ${admitted ? "admitted" : "rejected"}`, () => {
     assert.equal(admissionProblem(headers, "127.0.0.1") === null, admitted);
   });
 }
 
 const SENDER = { source: "vision", session: "4e5f6071" };
 
-test("one frame in flight, credit comes back with its answer or after 120 ms", () => {
+test("one frame is in flight, and its credit returns with the answer or after 120 ms", () => {
   const stream = new Stream(30);
   assert.ok(stream.mayCapture(0));
   stream.onSent(0, 0, 0);
@@ -181,7 +181,7 @@ test("one frame in flight, credit comes back with its answer or after 120 ms", (
   assert.equal(stream.status(300_000).credit_timeouts, 1);
 });
 
-test("the window widens by the link's delay, never by a slow detector", () => {
+test("the window grows with the delay of the link, not with computing time", () => {
   const [slowLink, slowPeer] = [new Stream(30), new Stream(30)];
   for (let seq = 0; seq < 20; seq += 1) {
     slowLink.onSent(seq, seq * 100_000, seq * 100_000);
@@ -193,7 +193,7 @@ test("the window widens by the link's delay, never by a slow detector", () => {
   assert.equal(slowPeer.window, 1);
 });
 
-test("credit belongs to who drives; others watch at that pace", () => {
+test("only answers of the driver return credit", () => {
   const stream = new Stream(30);
   stream.onHolder(SENDER, 0);
   stream.onSent(0, 0, 0);
@@ -201,7 +201,7 @@ test("credit belongs to who drives; others watch at that pace", () => {
   assert.ok(!stream.mayCapture(50_000));
 });
 
-test("a drawn picture is seen by the loop, steered at, and the robot drives", async () => {
+test("the frame loop finds the drawn ball and drives the robot", async () => {
   let now_us = 1_000_000;
   const robot = new Robot({ session: "0a1b2c3d", fps: 30, camera: DRAWN_CAMERA, limits: { autoArm: true } });
   const loop = new FrameLoop(new Vision("4e5f6071"), {
@@ -221,13 +221,13 @@ test("a drawn picture is seen by the loop, steered at, and the robot drives", as
   assert.ok(robot.pose.yaw_rad > 0.1 && robot.pose.x_m > 0.1, JSON.stringify(robot.pose));
 });
 
-test("a bad picture is acknowledged, a newer frame replaces one that waits", async () => {
+test("an invalid image is acknowledged, and a newer frame replaces a waiting one", async () => {
   const sent = [];
   let release;
   const decodeImage = () => new Promise((resolve) => (release = () => resolve({ width: 1, height: 1, scale: 8, data: [0, 0, 0], channels: 3 })));
   const loop = new FrameLoop(new Vision("4e5f6071"), { decodeImage, send: (name, header) => sent.push([name, header.echo.seq]), now_us: () => 0 });
   const frame = (seq, jpeg) => ({ channel: CHANNELS.frame, source: "", header: encode({ v: 1, session: "0a1b2c3d", seq, t_us: seq }), payload: jpeg });
-  await loop.onMessage(frame(1, bytes("no picture")));
+  await loop.onMessage(frame(1, bytes("not a JPEG")));
   assert.deepEqual(sent, [["ack", 1]]);
   const good = drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
   loop.vision.onCamera({ session: "0a1b2c3d" }, DRAWN_CAMERA);
@@ -244,19 +244,19 @@ test("a bad picture is acknowledged, a newer frame replaces one that waits", asy
   assert.equal(loop.skipped.OUT_OF_ORDER, 1);
 });
 
-test("the drawn ball is in sight of a robot that stands, at any time", () => {
+test("the drawn ball is visible from the start pose at any time", () => {
   for (let t_us = 0; t_us < 40e6; t_us += 700e3) {
     assert.ok(findTarget(decoded(drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, ballAt(t_us)))), `after ${t_us / 1e6} s`);
   }
 });
 
-test("a JPEG cut anywhere is refused, not decoded", () => {
+test("a JPEG cut anywhere is rejected", () => {
   const good = drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
   assert.deepEqual([decodeDc(good).width, decodeDc(good).height], [80, 60]);
-  for (let end = 0; end < good.length - 4; end += 7) assert.throws(() => decodeDc(good.subarray(0, end)), /picture/);
+  for (let end = 0; end < good.length - 4; end += 7) assert.throws(() => decodeDc(good.subarray(0, end)), /image/);
 });
 
-test("detections are passed on as they came, and drive nothing", () => {
+test("detections are forwarded unchanged and do not drive", () => {
   const robot = new Robot({ session: "0a1b2c3d", fps: 30, camera: DRAWN_CAMERA });
   const [found, header] = ['{"width_px":640,"height_px":480,"boxes":[]}', '{"source":"guest", "session":"4e5f6071","seq":1}'].map((one) => bytes(one));
   const packet = { channel: CHANNELS.detections, source: "guest", header, payload: found };
@@ -269,7 +269,7 @@ test("detections are passed on as they came, and drive nothing", () => {
   assert.deepEqual(robot.gate.counters, {});
 });
 
-test("a live camera whose picture does not change is old sight", () => {
+test("a live camera whose image does not change makes commands stale", () => {
   const robot = new Robot({ session: "0a1b2c3d", fps: 30, camera: DRAWN_CAMERA, live: true });
   const jpeg = drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
   const answers = [0, 200_000, 400_000, 400_001].map((t_us) => {
@@ -280,7 +280,7 @@ test("a live camera whose picture does not change is old sight", () => {
   assert.deepEqual(answers, ["DISARMED", "DISARMED", "DISARMED", "STALE"]);
 });
 
-test("another session of the robot: what was learned is forgotten", () => {
+test("a new session of the robot discards the state of the old one", () => {
   const vision = new Vision("4e5f6071");
   vision.onCamera({ session: "0a1b2c3d" }, DRAWN_CAMERA);
   assert.ok(vision.isNew({ session: "0a1b2c3d", seq: 9 }));
@@ -290,7 +290,7 @@ test("another session of the robot: what was learned is forgotten", () => {
   assert.equal(vision.twistFor(null), null);
 });
 
-test("how quick one owner was says nothing of the next", () => {
+test("the answer times of one owner do not apply to the next", () => {
   const stream = new Stream(30);
   stream.onSent(0, 0, 0);
   stream.onAnswer(SENDER, 0, 0, 2000);

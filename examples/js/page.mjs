@@ -1,20 +1,20 @@
-/** @file Ties the viewer to the elements of viewer.html. Shell. */
+/** @file Connect the viewer to the elements of viewer.html. Shell. */
 
 import { Viewer, canvasDecoder, markTarget } from "./viewer.mjs";
 
 const REFRESH_MS = 100;
-const OLD_MS = 500; // what is older than this must not look like the present
-const STATUS_MS = 1000; // ten times the period of a status
+const OLD_MS = 500; // an older image must not look current
+const STATUS_MS = 1000; // ten periods of a status
 const element = (id) => document.getElementById(id);
 const write = (id, text) => {
   element(id).textContent = text;
 };
-const drawnAt_ms = []; // of the last second
-let statusAt_ms = Infinity; // of the state on the page; Infinity: it shows none
-let messageState = null; // of the robot, to which the message belongs; null: the message stays until the next one
-let newest_ms = 0; // least age of the newest image when it was drawn
+const drawnAt_ms = []; // times of the images of the last second
+let statusAt_ms = Infinity; // arrival of the status on the page; Infinity: the page shows no status
+let messageState = null; // state that clears the message when it ends; null: the message stays until the next one
+let newest_ms = 0; // lowest age of the newest image when it was drawn
 
-/** @param {object} what one thing that changed */
+/** Show a change. @param {object} change one of those of {@link Viewer} */
 function show({ link, status, reply, stop, target, age_us }) {
   if (link !== undefined) {
     write("link", link);
@@ -36,7 +36,7 @@ function showMessage(message, state) {
   write("message", message);
 }
 
-/** What a request or STOP came to is over with the state that it led to. */
+/** Clear the result of a request or STOP when the state that followed it ends. */
 function clearMessage(state) {
   if (messageState !== null && state !== messageState) showMessage("", null);
 }
@@ -49,13 +49,14 @@ function showStatus({ state, reason, holder, applied, frame_age_us, latency_us, 
   write("reason", reason);
   const side = applied[1] < 0 ? "right" : "left";
   write("wheels", `${applied[0].toFixed(2)} m/s, turning ${side} at ${Math.abs(applied[1]).toFixed(2)} rad/s`);
-  write("driver", holder === null ? "nobody" : holder.digest === viewer.vision.digest ? "this page" : `${holder.source} ${holder.digest}`);
-  const ages = [["now", frame_age_us], ["when the last command came", latency_us]].filter(([, age_us]) => age_us !== null);
-  write("frame_age", ages.map(([what, age_us]) => `${Math.round(age_us / 1000)} ms old ${what}`).join(", ") || "none");
-  write("frames", `${stream.sent} sent, ${viewer.frameLoop.answered} answered here, ${stream.credit_timeouts} unanswered in time`);
+  write("driver", holder === null ? "none" : holder.digest === viewer.vision.digest ? "this page" : `${holder.source} ${holder.digest}`);
+  const age = frame_age_us === null ? [] : [`${Math.round(frame_age_us / 1000)} ms old`];
+  const latency = latency_us === null ? [] : [`capture to command ${Math.round(latency_us / 1000)} ms`];
+  write("frame_age", [...age, ...latency].join(", ") || "none");
+  write("frames", `${stream.sent} sent, ${viewer.frameLoop.answered} answered by this page, ${stream.credit_timeouts} credit timeouts`);
 }
 
-/** What is no longer known must not look like the present. */
+/** Clear the status: an old one must not look current. */
 function clearStatus(reason) {
   statusAt_ms = Infinity;
   clearMessage("?");
@@ -69,7 +70,7 @@ function refresh() {
   if (performance.now() - statusAt_ms > STATUS_MS) clearStatus("no status for more than 1 s");
 }
 
-/** What stands still, or comes late, must be seen to: the age grows while nothing comes. */
+/** Show the age of the image. It grows while no image arrives, so that a frozen or late image is visible as one. */
 function showAge() {
   const now_ms = performance.now();
   while (drawnAt_ms.length > 1 && drawnAt_ms[0] < now_ms - 1000) drawnAt_ms.shift();
@@ -82,17 +83,17 @@ function showAge() {
 }
 
 const url = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/`;
-const token = location.hash.slice(1); // what stands behind the # is never sent with a request
-globalThis.onhashchange = () => location.reload(); // a token that is added opens no page by itself
+const token = location.hash.slice(1); // a browser never sends the part after the #
+globalThis.onhashchange = () => location.reload(); // a browser does not reload a page for a new token
 const viewer = new Viewer({ url, robot: document.body.dataset.robot, token, decodeImage: canvasDecoder(element("picture")), show });
 viewer.open();
 setInterval(refresh, REFRESH_MS);
-document.onvisibilitychange = document.onresume = refresh; // a page out of sight has had few timers, or none
+document.onvisibilitychange = document.onresume = refresh; // a hidden page has few timers, or none
 
 element("stop").onclick = () => viewer.stop();
 document.addEventListener("keydown", (event) => {
   if (event.code !== "Space") return;
-  event.preventDefault(); // or it would press the button that has the focus
+  event.preventDefault(); // otherwise it presses the focused button
   viewer.stop();
 });
 element("drive").onchange = ({ target }) => viewer.setDriving(target.checked);

@@ -1,7 +1,7 @@
 /**
- * @file Serves the viewer's page and the modules it imports, and nothing else. Shell (reads files).
+ * @file Serve the viewer page and the modules that it imports. Shell (reads files).
  *
- * A page must come from the robot's own host and port: a robot lets in no other site's pages.
+ * The page must come from the host and port of the robot, because a robot rejects pages of other sites.
  */
 
 import { readFile } from "node:fs/promises";
@@ -16,7 +16,8 @@ const HEADERS = {
 };
 
 /**
- * @param {string} host that is listened on @param {string} robot
+ * Make the request handler.
+ * @param {string} host on which the server listens @param {string} robot id
  * @returns {(request: import("node:http").IncomingMessage, response: import("node:http").ServerResponse) => Promise<void>}
  */
 export function servePage(host, robot) {

@@ -1,11 +1,11 @@
 /**
- * @file One peer of `sightline.v1` on an open connection: hello first, then messages, the newest of each kind. Shell.
+ * @file One peer of `sightline.v1` on an open connection: a hello, then the newest message of each channel. Shell.
  */
 
 import { OutgoingQueue, PeerError, messageBound, pack, packRaw, readHello, unpack } from "./framing.mjs";
 import { OPEN_MS } from "./websocket.mjs";
 
-/** Told by whoever made it: `onMessage({channel, source, header, payload})`, `onOpen()`, `onEnd({code, reason})`. */
+/** Calls `onMessage({channel, source, header, payload})`, `onOpen()` and `onEnd({code, reason})`. */
 export class Peer {
   /**
    * @param {import("./websocket.mjs").Connection} connection
@@ -17,7 +17,7 @@ export class Peer {
     this.wants = new Set();
     this.role = "";
     this.isOpen = false;
-    this.dropped = 0; // messages with a bad key
+    this.dropped = 0; // messages with an invalid key
     connection.next = () => this.queue.take();
     connection.onMessage = (message) => this.read(message);
     connection.onEnd = (end) => {
@@ -29,7 +29,7 @@ export class Peer {
     if (sendsFirst) this.sendHello(hello);
   }
 
-  /** Say hello again, with other wants. */
+  /** Send a hello, also when `wants` changes. */
   sendHello(hello) {
     this.queue.put("", "", hello);
     this.connection.pump();
@@ -40,7 +40,7 @@ export class Peer {
       this.onHello(message);
       return;
     }
-    if (!this.isOpen) throw new PeerError(1003, "the first message is a hello, as text");
+    if (!this.isOpen) throw new PeerError(1003, "the first message must be a hello, as text");
     const packet = unpack(message, this.role, this.robot);
     if (packet === null) this.dropped += 1;
     else this.onMessage(packet);
@@ -67,7 +67,7 @@ export class Peer {
     this.enqueue(name, header.source ?? "", () => pack(name, header, payload), verb);
   }
 
-  /** Pass a packet on as it came. */
+  /** Forward a packet unchanged. */
   relay({ channel, source, header, payload }) {
     this.enqueue(channel.name, source, () => packRaw(channel.name, source, header, payload));
   }

@@ -1,7 +1,7 @@
 /**
- * @file Proof that commands are of one sender (6.6): each reveals one more element of a hash chain. Pure.
+ * @file Prove that commands are of one sender (6.6): each reveals one more element of a hash chain. Pure.
  *
- * SHA-256 (FIPS 180-4) is written out, because a browser's own is asynchronous.
+ * It contains SHA-256 (FIPS 180-4), because that of a browser is asynchronous.
  */
 
 const ELEMENT_BYTES = 16;
@@ -16,7 +16,7 @@ const START = PRIMES.slice(0, 8).map((prime) => fraction(Math.sqrt(prime)));
 const ROUNDS = PRIMES.map((prime) => fraction(Math.cbrt(prime)));
 const rotate = (word, by) => (word >>> by) | (word << (32 - by));
 
-/** @param {Uint8Array} data at most 55 bytes: one block @returns {Uint8Array} */
+/** Compute SHA-256. @param {Uint8Array} data at most 55 bytes, one block @returns {Uint8Array} */
 export function sha256(data) {
   const block = new DataView(new ArrayBuffer(64));
   data.forEach((byte, at) => block.setUint8(at, byte));
@@ -47,7 +47,7 @@ const hex = (bytes) => [...bytes].map((byte) => byte.toString(16).padStart(2, "0
 const fromHex = (text) => Uint8Array.from(text.match(/../g), (pair) => parseInt(pair, 16));
 const hashed = (element) => sha256(element).subarray(0, ELEMENT_BYTES);
 
-/** The chain of one sender; it continues in another before it ends. */
+/** The chain of one sender. It continues in another chain before it ends. */
 export class ProofChain {
   /** @param {(bytes: Uint8Array) => Uint8Array} draw fills with random bytes */
   constructor(draw = (bytes) => globalThis.crypto.getRandomValues(bytes)) {
@@ -63,19 +63,19 @@ export class ProofChain {
     return elements;
   }
 
-  /** Fields of the next command's header. @returns {{proof: string, next_proof?: string}} */
+  /** Return the proof fields of the header of the next command. @returns {{proof: string, next_proof?: string}} */
   next() {
     if (this.elements.length === 0) [this.elements, this.following, this.announced] = [this.following, [], undefined];
     const proof = hex(this.elements.pop());
     if (this.announced === undefined && this.elements.length < ANNOUNCED) {
       this.following = this.newElements();
-      this.announced = hex(this.following.pop()); // known from now on, so it proves nothing
+      this.announced = hex(this.following.pop()); // the announced element is public, so it proves nothing
     }
     return this.announced === undefined ? { proof } : { proof, next_proof: this.announced };
   }
 }
 
-/** Whether `proof` was revealed by the sender of `last`, at most MAX_LOST commands later. */
+/** Return true if the sender of `last` revealed `proof`, at most MAX_LOST commands later. */
 export function continues(proof, last) {
   if (proof === null) return false;
   let element = fromHex(proof);
@@ -87,5 +87,5 @@ export function continues(proof, last) {
   return false;
 }
 
-/** What a robot shows of a driver's session. */
+/** Compute the digest by which a robot shows the session of a driver: 8 hex digits. */
 export const sessionDigest = (source, session) => hex(sha256(new TextEncoder().encode(`${source}/${session}`))).slice(0, 8);

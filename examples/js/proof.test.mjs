@@ -1,11 +1,11 @@
-/** @file Chains of proofs, and digests. */
+/** @file Tests of proof chains and digests. */
 
 import assert from "node:assert/strict";
 import { createHash } from "node:crypto";
 import test from "node:test";
 import { ProofChain, continues, sessionDigest, sha256 } from "./proof.mjs";
 
-test("proofs: SHA-256 as Node's, a chain that is renewed, and nothing that was revealed continues it", () => {
+test("SHA-256 equals that of Node, and a renewed chain continues only with unrevealed elements", () => {
   for (const text of ["", "abc", "x".repeat(55)]) {
     assert.equal(Buffer.from(sha256(Buffer.from(text))).toString("hex"), createHash("sha256").update(text).digest("hex"));
   }

@@ -1,7 +1,7 @@
 /**
- * @file WebSocket frames (RFC 6455), from bytes and to bytes. Pure; the browser needs none of this.
+ * @file Encode and decode WebSocket frames (RFC 6455). Pure; for Node only.
  *
- * Each end feeds what its socket gives to a {@link FrameReader} and gets whole messages and control frames back.
+ * Each end passes the bytes of its socket to a {@link FrameReader}, which returns whole messages and control frames.
  */
 
 import { PeerError } from "./framing.mjs";
@@ -11,9 +11,10 @@ const MAX_CONTROL_BYTES = 125;
 const EMPTY = new Uint8Array(0);
 
 /**
+ * Encode one frame.
  * @param {number} opcode
  * @param {Uint8Array} payload
- * @param {Uint8Array|null} mask four bytes from who connected, null from who listens
+ * @param {Uint8Array|null} mask four bytes of a client, null of a server
  * @returns {Uint8Array}
  */
 export function encodeFrame(opcode, payload, mask = null) {
@@ -31,7 +32,7 @@ export function encodeFrame(opcode, payload, mask = null) {
   return frame;
 }
 
-/** @param {number} code @param {string} reason at most 123 bytes are kept */
+/** Encode a close payload. @param {number} code @param {string} reason cut after 123 bytes */
 export function closePayload(code, reason) {
   let text = new TextEncoder().encode(reason);
   if (text.length > MAX_CONTROL_BYTES - 2) {
@@ -45,7 +46,7 @@ function unmask(data, mask) {
   for (let index = 0; index < data.length; index += 1) data[index] ^= mask[index & 3];
 }
 
-/** Codes that may stand in a close frame (RFC 6455, 7.4; IANA registry). */
+/** Return true for a code that a close frame may contain (RFC 6455, 7.4; IANA registry). */
 const isCloseCode = (code) => (code >= 1000 && code <= 1014 && ![1004, 1005, 1006].includes(code)) || (code >= 3000 && code < 5000);
 
 const utf8 = (bytes) => {
@@ -56,9 +57,9 @@ const utf8 = (bytes) => {
   }
 };
 
-/** Reassembles frames and fragments. Security limit: `maxBytes` of a whole message, judged before it is stored. */
+/** Assembles messages from frames and fragments. Security limit: `maxBytes` of a message, checked before it is stored. */
 export class FrameReader {
-  /** @param {{masked: boolean, maxBytes: number}} options `masked`: whether the other end must mask */
+  /** @param {{masked: boolean, maxBytes: number}} options `masked`: true if the other end must mask */
   constructor({ masked, maxBytes }) {
     this.masked = masked;
     this.maxBytes = maxBytes;
@@ -66,13 +67,14 @@ export class FrameReader {
     this.stored = 0;
     this.fragments = [];
     this.fragmentBytes = 0;
-    this.opcode = 0; // of the message whose fragments are being read
+    this.opcode = 0; // of the message whose fragments arrive
   }
 
   /**
+   * Read the bytes of a chunk.
    * @param {Uint8Array} chunk
    * @returns {Generator<{kind: "text"|"binary"|"ping"|"pong"|"close", data: Uint8Array|string, code?: number}>}
-   * @throws {PeerError} with the close code that the broken rule asks for
+   * @throws {PeerError} with the close code for the broken rule
    */
   *feed(chunk) {
     this.chunks.push(chunk);
@@ -86,7 +88,7 @@ export class FrameReader {
     }
   }
 
-  /** The next frame's head, or null while it is not complete. */
+  /** Read the head of the next frame, or return null while it is incomplete. */
   readHead() {
     const bytes = this.peek(14);
     if (bytes.length < 2) return null;
@@ -98,20 +100,20 @@ export class FrameReader {
     const view = new DataView(bytes.buffer, bytes.byteOffset);
     const size = extended === 0 ? short : extended === 2 ? view.getUint16(2) : Number(view.getBigUint64(2));
     if (opcode < 8 && this.fragmentBytes + size > this.maxBytes) {
-      throw new PeerError(1009, `a message of over ${this.maxBytes} bytes; this end wants no larger one`);
+      throw new PeerError(1009, `message over ${this.maxBytes} bytes, the largest that this end accepts`);
     }
     return { fin, opcode, size, at, mask: this.masked ? bytes.slice(at - 4, at) : null };
   }
 
   check(bytes, fin, opcode, short) {
-    const broken = (what) => {
-      throw new PeerError(1002, what);
+    const broken = (problem) => {
+      throw new PeerError(1002, problem);
     };
-    if (bytes[0] & 0x70) broken("a reserved bit is set; no extension was agreed on");
+    if (bytes[0] & 0x70) broken("a reserved bit is set without an extension");
     if ((bytes[1] >= 0x80) !== this.masked) broken(this.masked ? "a client must mask" : "a server must not mask");
-    if (![0, 1, 2, 8, 9, 10].includes(opcode)) broken(`no such opcode: ${opcode}`);
-    if (opcode >= 8 && (!fin || short > MAX_CONTROL_BYTES)) broken("a control frame in pieces, or over 125 bytes");
-    if (opcode === OPCODE.CONTINUATION && this.opcode === 0) broken("a continuation of nothing");
+    if (![0, 1, 2, 8, 9, 10].includes(opcode)) broken(`unknown opcode ${opcode}`);
+    if (opcode >= 8 && (!fin || short > MAX_CONTROL_BYTES)) broken("a control frame in fragments or over 125 bytes");
+    if (opcode === OPCODE.CONTINUATION && this.opcode === 0) broken("a continuation without a message");
     if ((opcode === OPCODE.TEXT || opcode === OPCODE.BINARY) && this.opcode !== 0) broken("a message within a message");
   }
 
@@ -129,7 +131,7 @@ export class FrameReader {
     return { kind, data: kind === "text" ? utf8(whole) : whole };
   }
 
-  /** A million empty fragments must not become a million objects. */
+  /** Join the fragments, because a peer can send any number of empty ones. */
   bundle() {
     if (this.fragments.length > 64) this.fragments = [join(this.fragments, this.fragmentBytes)];
     return null;
@@ -138,11 +140,11 @@ export class FrameReader {
   onClose(data) {
     if (data.length === 0) return { kind: "close", code: 1005, data: "" };
     const code = data.length === 1 ? 0 : data[0] * 256 + data[1];
-    if (!isCloseCode(code)) throw new PeerError(1002, `no such close code: ${code}`);
+    if (!isCloseCode(code)) throw new PeerError(1002, `invalid close code ${code}`);
     return { kind: "close", code, data: utf8(data.subarray(2)) };
   }
 
-  /** Up to `size` bytes from the front, without taking them. */
+  /** Return up to `size` bytes from the front without removing them. */
   peek(size) {
     if ((this.chunks[0]?.length ?? 0) < size && this.chunks.length > 1) {
       this.chunks = [join(this.chunks, this.stored)];

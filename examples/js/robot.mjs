@@ -1,5 +1,5 @@
 /**
- * @file A robot of the Sightline protocol: messages in, messages and a twist out. Pure: the caller brings clock, camera, link.
+ * @file A robot of the Sightline protocol: messages in, messages and a twist out. Pure: the caller provides clock, camera, link.
  *
  * @typedef {{name: string, header: object, payload: Uint8Array}} Publication
  */
@@ -12,13 +12,13 @@ import { Stream } from "./stream.mjs";
 import { publicHolder } from "./validation.mjs";
 
 const PERIODS_US = { status: 100_000, odometry: 50_000, camera: 500_000 };
-/** Channels that a robot wants of its peers. */
+/** Channels that a robot requests from its peers. */
 export const WANTED_CHANNELS = Object.freeze(["twist", "ack", "request", "detections", "mission", "report"]);
 
 export class Robot {
   /**
    * @param {{session: string, fps: number, camera: object, live?: boolean, limits?: object, stopped?: boolean}} options
-   *   `camera` is the CameraModel that is published; the pictures of a `live` one never repeat unless it hangs
+   *   `camera`: the published CameraModel. `live`: true if two equal images mean a frozen camera
    */
   constructor({ session, fps, camera, live = false, limits = {}, stopped = false }) {
     this.session = session;
@@ -35,12 +35,13 @@ export class Robot {
     this.rejectedImages = this.tickLateMax_us = this.unwanted = 0;
   }
 
-  // --- what arrives --------------------------------------------------------------------------------------------
+  // --- receiving -----------------------------------------------------------------------------------------------
 
   /**
+   * Process a message.
    * @param {{channel: object, source: string, header: Uint8Array, payload: Uint8Array}} packet
    * @param {number} now_us
-   * @returns {boolean} whether it is to be passed on, as it came, to every other peer that wants its channel
+   * @returns {boolean} true if the caller must forward it, unchanged, to every other peer that wants its channel
    */
   onMessage({ channel, source, header, payload }, now_us) {
     if (!WANTED_CHANNELS.includes(channel.name)) {
@@ -72,7 +73,7 @@ export class Robot {
     if (header.source === source) this.returnCredit(header, now_us);
   }
 
-  /** Only what cites a frame that this robot issued is an answer. */
+  /** Return credit for an answer. An answer cites a frame that this robot issued. */
   returnCredit({ source, session, echo, compute_us }, now_us) {
     if (echo.channel !== "frame" || !this.gate.issued.knows(echo)) return;
     this.stream.onAnswer({ source, session }, echo.seq, compute_us, now_us);
@@ -89,20 +90,20 @@ export class Robot {
       reply.detail = `${error.reason}: ${error.message}`.slice(0, 200);
     }
     this.replies.push({ ...reply, state: this.gate.state });
-    if (this.replies.length > 16) this.replies.shift(); // a flood of requests piles nothing up
+    if (this.replies.length > 16) this.replies.shift(); // bounds the replies in a flood of requests
   }
 
-  // --- what leaves ---------------------------------------------------------------------------------------------
+  // --- sending -------------------------------------------------------------------------------------------------
 
-  /** Whether to take a picture now. */
+  /** Return true if the camera should capture a frame now. */
   mayCapture(now_us) {
     return this.stream.mayCapture(now_us);
   }
 
   /**
-   * A picture was captured at `t_us`.
+   * Publish the image that was captured at `t_us`.
    * @param {Uint8Array} jpeg
-   * @returns {Publication|null} null, counted, for a picture that is none, too large, or not newer than the last
+   * @returns {Publication|null} null, counted, for an image that is invalid, too large, or not newer than the last
    */
   onImage(jpeg, t_us, now_us) {
     if (t_us <= this.lastFrame_us || jpeg.length > CHANNELS.frame.maxPayloadBytes || !isJpeg(jpeg)) {
@@ -112,16 +113,16 @@ export class Robot {
     this.lastFrame_us = t_us;
     const motion = this.motion();
     const header = { ...this.stamp("frame", t_us), ...motion, applied: motion.moving, latency_us: this.gate.latency_us };
-    this.gate.issued.add("frame", header.seq, t_us); // before anybody can answer it
+    this.gate.issued.add("frame", header.seq, t_us); // before an answer can arrive
     this.gate.freshness.add(t_us, this.live ? jpeg : null);
     this.stream.onSent(header.seq, t_us, now_us);
     return { name: "frame", header, payload: jpeg };
   }
 
   /**
-   * 50 times a second.
+   * Step the gate and the wheels, 50 times a second.
    * @param {number} now_us
-   * @returns {Publication[]} what is due now
+   * @returns {Publication[]} messages that are due now
    */
   tick(now_us) {
     const twist = this.gate.step(now_us);
@@ -133,12 +134,12 @@ export class Robot {
     return due;
   }
 
-  /** Replies that wait; to be sent as soon as their requests are carried out. */
+  /** Remove the waiting replies. Send them immediately after their requests. */
   takeReplies(now_us) {
     return this.replies.splice(0).map((reply) => this.publication("reply", reply, now_us));
   }
 
-  /** Whether the wheels are off and at zero. */
+  /** Return true if the wheels are off and at zero. */
   get isAtRest() {
     return !this.gate.armed && isStill(this.gate.applied);
   }
@@ -183,7 +184,7 @@ export class Robot {
     };
   }
 
-  /** Wheels that do at once what they are told, and slip nowhere. */
+  /** Move the pose, for wheels without delay or slip. */
   move({ linear_mps, angular_rad_s }, now_us) {
     const elapsed_s = (now_us - (this.lastTick_us ?? now_us)) / 1e6;
     this.lastTick_us = now_us;

@@ -1,9 +1,9 @@
 /**
- * @file A robot for Node: pictures of a folder or drawn ones, wheels that are only computed, on WebSocket. Shell.
+ * @file A robot for Node on WebSocket: images of a folder or drawn images, computed wheels. Shell.
  *
  *     node examples/js/robot_server.mjs --port 8765 --robot js1 --pictures examples/pictures
  *
- * One process, where a robot with motors needs two: whoever owns the motors must outlive what hangs beside it.
+ * It is one process. A robot with motors needs two, because the owner of the motors must survive a hanging network.
  */
 
 import { randomBytes } from "node:crypto";
@@ -24,7 +24,7 @@ import { listen } from "./websocket.mjs";
 const USAGE = "node robot_server.mjs --port PORT --robot ID [--host 127.0.0.1] [--pictures FOLDER] [--fps 30] [--auto-arm] [--guests] [--state-dir DIR] [--token-file FILE] [--cert FILE --key FILE]";
 const STOP_AT_END_MS = 1500;
 const LOOPBACK = ["127.0.0.1", "::1", "localhost"];
-const GUESSED_FOCAL = 0.75; // of the width: nobody has measured the folder's camera
+const ASSUMED_FOCAL = 0.75; // of the width; the camera of the folder is not calibrated
 
 const now_us = () => Number(process.hrtime.bigint() / 1000n);
 
@@ -48,11 +48,11 @@ function readOptions() {
     },
   });
   const [port, fps] = [Number(values.port), Number(values.fps)];
-  if (!(Number.isInteger(port) && port >= 1 && port <= 65_535)) throw new UsageError("--port is a number from 1 to 65535");
-  if (!(fps > 0 && fps <= 240)) throw new UsageError("--fps is a number above 0, at most 240");
-  if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot)) throw new UsageError("--robot is 1 to 32 letters, digits, _ . -");
-  if (!LOOPBACK.includes(values.host) && !values["token-file"]) throw new UsageError("--host beyond loopback needs a --token-file");
-  if (!values.cert !== !values.key) throw new UsageError("--cert and --key go together");
+  if (!(Number.isInteger(port) && port >= 1 && port <= 65_535)) throw new UsageError("invalid --port: expected 1 to 65535");
+  if (!(fps > 0 && fps <= 240)) throw new UsageError("invalid --fps: expected a number above 0, at most 240");
+  if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot)) throw new UsageError("invalid --robot: expected 1 to 32 letters, digits, _ . -");
+  if (!LOOPBACK.includes(values.host) && !values["token-file"]) throw new UsageError(`--host ${values.host} accepts network clients without a token; pass --token-file FILE`);
+  if (!values.cert !== !values.key) throw new UsageError("--cert and --key need each other; pass both");
   const tls = values.cert ? readTls(values) : undefined;
   return { ...values, port, fps, tls, token: values["token-file"] && readToken(values["token-file"]) };
 }
@@ -77,34 +77,34 @@ function readTls({ cert, key }) {
 
 function readToken(path) {
   const token = readOption("--token-file", path).toString("ascii").trim();
-  if (!/^[A-Za-z0-9_-]{16,128}$/.test(token)) throw new UsageError(`--token-file ${path}: a token is 16 to 128 of A-Z a-z 0-9 _ -`);
+  if (!/^[A-Za-z0-9_-]{16,128}$/.test(token)) throw new UsageError(`--token-file ${path}: invalid token; expected 16 to 128 of A-Z a-z 0-9 _ -`);
   return token;
 }
 
 function readImages(folder) {
   const names = readdirSync(folder).filter((name) => /\.jpe?g$/i.test(name)).sort();
-  if (names.length === 0) throw new Error("no .jpg in it");
-  const pictures = names.map((name) => new Uint8Array(readFileSync(join(folder, name))));
-  readJpegSize(pictures[0]); // of the camera's model
-  return pictures;
+  if (names.length === 0) throw new Error("the folder contains no .jpg file");
+  const images = names.map((name) => new Uint8Array(readFileSync(join(folder, name))));
+  readJpegSize(images[0]); // rejects a file that is not a JPEG
+  return images;
 }
 
-/** Pictures of a folder in turn, or drawn ones: `read(pose, t_us)` gives a JPEG; `model` is their CameraModel. */
+/** Open a camera of the images of a folder, or of drawn images: `read(pose, t_us)` returns a JPEG; `model`: its CameraModel. */
 function openCamera(folder) {
   if (folder === undefined) {
     const start_us = now_us();
     let count = 0;
     return { model: DRAWN_CAMERA, read: (pose, t_us) => drawJpeg(pose, ballAt(t_us - start_us), count++) };
   }
-  const pictures = readOption("--pictures", folder, readImages);
-  const { width_px, height_px } = readJpegSize(pictures[0]);
-  const focal_px = GUESSED_FOCAL * width_px;
+  const images = readOption("--pictures", folder, readImages);
+  const { width_px, height_px } = readJpegSize(images[0]);
+  const focal_px = ASSUMED_FOCAL * width_px;
   const model = { width_px, height_px, fx_px: focal_px, fy_px: focal_px, cx_px: width_px / 2, cy_px: height_px / 2, calibrated: false };
   let next = 0;
-  return { model, read: () => pictures[next++ % pictures.length] };
+  return { model, read: () => images[next++ % images.length] };
 }
 
-/** The STOP latch on disk: a file that is there while the robot is stopped. */
+/** The STOP latch on disk: a file that exists while the robot is stopped. */
 class Latch {
   constructor(folder, robot) {
     mkdirSync(folder, { recursive: true });
@@ -115,7 +115,7 @@ class Latch {
 
   store(stopped) {
     if (stopped === this.isSet) return;
-    mkdirSync(this.folder, { recursive: true }); // it may have been removed since
+    mkdirSync(this.folder, { recursive: true }); // it may have been removed since the start
     if (stopped) closeSync(openSync(this.path, "w"));
     else rmSync(this.path, { force: true });
     const folder = openSync(this.folder, "r");
@@ -179,7 +179,7 @@ class Server {
     }
   }
 
-  /** At absolute 20 ms deadlines; what came late is said in `status`. */
+  /** Tick at absolute 20 ms deadlines. `status` reports the latest tick. */
   tick() {
     const at_us = now_us();
     this.robot.tickLateMax_us = Math.max(this.robot.tickLateMax_us, at_us - this.nextTick_us);
@@ -189,7 +189,7 @@ class Server {
     setTimeout(() => this.tick(), (this.nextTick_us - now_us()) / 1000);
   }
 
-  /** The camera's own rhythm: a frame is sent at its capture or never. */
+  /** Capture at the rate of the camera. A frame is sent at its capture or never. */
   capture() {
     const at_us = now_us();
     this.nextCapture_us = Math.max(this.nextCapture_us + this.robot.stream.interval_us, at_us);
@@ -201,7 +201,7 @@ class Server {
     setTimeout(() => this.capture(), (this.nextCapture_us - now_us()) / 1000);
   }
 
-  /** One line per change of state; the latch is on disk before anybody is told. */
+  /** Log each change of state. The latch is on disk before a peer receives the state. */
   showState() {
     const { state, reason } = this.robot.gate;
     const [logged, driving] = [this.loggedState, ["ACTIVE", "DEGRADED"]];
@@ -215,7 +215,7 @@ class Server {
     if (!(driving.includes(state) && driving.includes(logged))) this.log(`${state} (${reason})`);
   }
 
-  /** Wheels to zero first, then goodbye. */
+  /** Stop the wheels, then close the connections. */
   end() {
     this.robot.gate.disarm("shutting down");
     setTimeout(() => process.exit(0), STOP_AT_END_MS);
@@ -234,7 +234,7 @@ try {
   await server.run();
 } catch (error) {
   const usage = error instanceof UsageError || String(error.code).startsWith("ERR_PARSE_ARGS");
-  const busy = error.code === "EADDRINUSE" ? "the port is in use; end what uses it or choose another --port" : error.message;
+  const busy = error.code === "EADDRINUSE" ? "the port is in use; end its process or pass another --port" : error.message;
   console.error(`error: ${busy}${usage ? `\nusage: ${USAGE}` : ""}`);
   process.exit(usage ? 2 : 4);
 }

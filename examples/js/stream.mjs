@@ -1,7 +1,7 @@
 /**
- * @file What a robot sends and when: credit, its timeout, the window, the rate. Pure.
+ * @file Decide when to send a frame: credit, timeouts, window, rate. Pure.
  *
- * A frame is captured only while there is credit, so it is young when it leaves and nothing queues behind it.
+ * A frame is captured only with credit, so that it is young when it leaves and no queue grows.
  */
 
 import { isSame } from "./validation.mjs";
@@ -14,11 +14,11 @@ const REMEMBERED = 64;
 const DELAYS_KEPT = 12;
 
 export class Stream {
-  /** @param {number} fps the camera's */
+  /** @param {number} fps of the camera */
   constructor(fps) {
     this.interval_us = Math.round(1e6 / fps);
-    this.expires_us = new Map(); // seq in flight -> when its credit times out
-    this.sentAt_us = new Map(); // also of frames whose credit has timed out
+    this.expires_us = new Map(); // seq in flight -> time at which its credit returns
+    this.sentAt_us = new Map(); // includes frames whose credit has timed out
     this.owner = null;
     this.ownerUntil_us = 0;
     this.delays_us = [];
@@ -28,7 +28,7 @@ export class Stream {
     this.lastSecond_us = [];
   }
 
-  /** Whether to take the next picture now. */
+  /** Return true if the frame interval is over and the stream has credit. */
   mayCapture(now_us) {
     for (const [seq, expires_us] of this.expires_us) {
       if (now_us >= expires_us) {
@@ -43,14 +43,14 @@ export class Stream {
     this.expires_us.set(seq, now_us + this.timeout_us);
     this.sentAt_us.set(seq, now_us);
     if (this.sentAt_us.size > REMEMBERED) this.sentAt_us.delete(this.sentAt_us.keys().next().value);
-    this.next_us = Math.max(this.next_us + this.interval_us, t_us + this.interval_us / 2); // a late tick costs no rate
+    this.next_us = Math.max(this.next_us + this.interval_us, t_us + this.interval_us / 2); // a late tick does not reduce the rate
     this.sent += 1;
     this.lastSecond_us.push(now_us);
     while (this.lastSecond_us[0] < now_us - 1_000_000) this.lastSecond_us.shift();
   }
 
   /**
-   * A twist or an ack answered frame `seq`: its credit comes back, and that of all older ones.
+   * Note an answer (twist or ack) to frame `seq`. It returns the credit of this frame and of all older ones.
    * @param {import("./validation.mjs").Holder} sender
    */
   onAnswer(sender, seq, compute_us, now_us) {
@@ -63,7 +63,7 @@ export class Stream {
     for (const older of this.expires_us.keys()) if (older <= seq) this.expires_us.delete(older);
   }
 
-  /** Credit goes to the driver. */
+  /** Pass the credit to a new holder of the lease. */
   onHolder(holder, now_us) {
     if (holder === null || isSame(holder, this.owner)) return;
     this.handOver(holder);
@@ -71,7 +71,7 @@ export class Stream {
     this.expires_us.clear();
   }
 
-  /** What was measured with the owner before says nothing of this one's link. */
+  /** Pass the credit to another peer. The times of the previous owner do not apply to its link. */
   handOver(sender) {
     this.owner = sender;
     this.delays_us = [];
@@ -84,7 +84,7 @@ export class Stream {
     this.answer_us = this.answer_us === null ? answer_us : 0.9 * this.answer_us + 0.1 * answer_us;
   }
 
-  /** Frames that may be in flight: as many as the camera makes while the link alone carries one round trip. */
+  /** Frames that may be in flight: as many as the camera captures in one round trip of the link, without computing time. */
   get window() {
     if (this.delays_us.length === 0) return 1;
     return Math.min(MAX_WINDOW, 1 + Math.floor(Math.min(...this.delays_us) / this.interval_us));
@@ -95,7 +95,7 @@ export class Stream {
     return Math.min(MAX_TIMEOUT_US, Math.round(1.5 * this.answer_us) + 12_000);
   }
 
-  /** @returns {object} the `stream` of a status */
+  /** Return the `stream` field of a status. @returns {object} */
   status(now_us) {
     const fps = this.lastSecond_us.filter((sent_us) => now_us - sent_us <= 1_000_000).length;
     return { sent: this.sent, credit_timeouts: this.creditTimeouts, window: this.window, fps };

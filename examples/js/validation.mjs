@@ -1,7 +1,7 @@
 /**
- * @file What a robot remembers to judge commands by: what it issued, whose seq it saw, who drives. Pure.
+ * @file Records for the validation of commands: issued messages, sequence numbers, the lease. Pure.
  *
- * Nothing here trusts a sender: a frame is known because this robot issued it, and as old as the robot's clock says.
+ * No rule trusts the sender. A frame is known because this robot issued it. Its age comes from the robot's own clock.
  *
  * @typedef {{source: string, session: string}} Holder
  */
@@ -10,7 +10,7 @@ import { WireError } from "./codec.mjs";
 import { STILL, isStill } from "./limits.mjs";
 import { continues, sessionDigest } from "./proof.mjs";
 
-const KEPT_PER_CHANNEL = 256; // 8 s of 30 fps frames; anything older is STALE long before
+const KEPT_PER_CHANNEL = 256; // 8 s of frames at 30 fps; an older frame is STALE
 const KEPT_SENDERS = 64;
 const SENDER_MEMORY_US = 10_000_000;
 const MAX_FIRST_SEQ = 2 ** 32;
@@ -20,12 +20,12 @@ const MAX_SEQ_JUMP = 2 ** 20;
 export const RANKS = Object.freeze(Object.assign(Object.create(null), { guest: 0, vision: 1, teleop: 2 }));
 const NO_PROOF = Object.freeze({ proof: null, next_proof: null });
 export const proofOf = (header) => (header === null ? NO_PROOF : { proof: header.proof ?? null, next_proof: header.next_proof ?? null });
-/** What others see of a driver: not its session, which a peer could copy. */
+/** Return the public name of a driver, without its session, which a peer could copy. */
 export const publicHolder = ({ source, session }) => ({ source, digest: sessionDigest(source, session) });
 export const isHuman = (source) => source === "teleop";
 export const isSame = (one, other) => one !== null && other !== null && one.source === other.source && one.session === other.session;
 
-/** (channel, seq) -> t_us of what this session of the robot has issued. */
+/** Stores the time of each message of this robot session by channel and sequence number. */
 export class IssuedRecord {
   /** @param {string} session */
   constructor(session) {
@@ -35,7 +35,7 @@ export class IssuedRecord {
     this.lastStatusSeq = -1;
   }
 
-  /** To be told before it is published: nobody may answer what the robot does not know. */
+  /** Store a message. Call this before publishing it, so that no answer can arrive earlier. */
   add(channel, seq, t_us) {
     const times = this.times[channel];
     times.set(seq, t_us);
@@ -47,7 +47,7 @@ export class IssuedRecord {
     return echo.session === this.session && this.times[echo.channel].get(echo.seq) === echo.t_us;
   }
 
-  /** Age of what `echo` names. @throws {WireError} OTHER_SESSION, UNKNOWN_FRAME, FROM_FUTURE, STALE */
+  /** Compute the age of the cited message. @returns {number} us @throws {WireError} OTHER_SESSION, UNKNOWN_FRAME, FROM_FUTURE, STALE */
   age_us(echo, now_us, maxAge_us) {
     if (echo.session !== this.session) throw new WireError("OTHER_SESSION", `cites robot session ${echo.session}, this is ${this.session}`);
     if (!this.knows(echo)) throw new WireError("UNKNOWN_FRAME", `cites ${echo.channel} ${echo.seq}, unknown to this robot`);
@@ -57,12 +57,12 @@ export class IssuedRecord {
     return age_us;
   }
 
-  /** Somebody said STOP or disarm: no request may cite a status from before. */
+  /** Reject requests that cite a status from before this call: before a STOP, a disarm or the loss of a human. */
   denyEarlier() {
     this.deniedSeq = this.lastStatusSeq;
   }
 
-  /** @throws {WireError} unless `echo` names a young status from after the last STOP or disarm */
+  /** Check the status that a request cites. @throws {WireError} unless it is young and after the last STOP or disarm */
   checkRequest(echo, now_us, maxAge_us) {
     if (echo === null || echo.channel !== "status") throw new WireError("MALFORMED", "a request that permits motion must cite a status");
     this.age_us(echo, now_us, maxAge_us);
@@ -70,7 +70,7 @@ export class IssuedRecord {
   }
 }
 
-/** Since when a live camera's picture has been the same, byte for byte: a sensor's noise never repeats. */
+/** Stores since when the image of a live camera is the same, byte for byte. The noise of a sensor never repeats. */
 export class FreshnessRecord {
   constructor() {
     this.jpeg = null;
@@ -78,7 +78,7 @@ export class FreshnessRecord {
     this.newest_us = 0;
   }
 
-  /** @param {Uint8Array|null} jpeg null for a source that is not live, which is never judged */
+  /** Record a frame. @param {Uint8Array|null} jpeg null for a source that is not live and may repeat an image */
   add(t_us, jpeg) {
     const repeated = jpeg !== null && this.jpeg !== null && jpeg.length === this.jpeg.length && jpeg.every((byte, at) => byte === this.jpeg[at]);
     if (!repeated) this.changed_us = t_us;
@@ -90,20 +90,20 @@ export class FreshnessRecord {
     return this.newest_us - this.changed_us;
   }
 
-  /** Since when has been seen what a frame of `t_us` shows. */
+  /** Return the time at which the image of a frame of `t_us` first appeared. */
   shownSince_us(t_us) {
     return this.jpeg === null ? t_us : Math.min(t_us, this.changed_us);
   }
 }
 
-/** Since when, and how far, the robot drives by one twist without a header. Only another twist starts it again, no pause. */
+/** Stores since when, and how far, the robot drives by one twist without a header. A pause does not restart it. */
 export class RepeatRecord {
   constructor() {
     this.twist = STILL;
     this.since_us = this.driven_m = 0;
   }
 
-  /** @param {import("./limits.mjs").Twist} twist as it arrived */
+  /** Record an accepted twist. @param {import("./limits.mjs").Twist} twist before limits */
   add(twist, now_us) {
     if (twist.linear_mps === this.twist.linear_mps && twist.angular_rad_s === this.twist.angular_rad_s) return;
     this.twist = twist;
@@ -115,21 +115,21 @@ export class RepeatRecord {
     this.driven_m += (Math.abs(linear_mps) * elapsed_us) / 1e6;
   }
 
-  /** Only a changed twist shows that its sender sees a new picture. */
+  /** Return true after too long without a change, which alone shows that the sender has a new image. */
   isOver({ guestUnchanged_us, guestUnchanged_m }, now_us) {
     const isLong = now_us - this.since_us > guestUnchanged_us || this.driven_m > guestUnchanged_m;
     return isLong && !isStill(this.twist);
   }
 }
 
-/** The newest seq of each (source, session); the longest silent sender is forgotten first. Rejected senders displace no driver. */
+/** Stores the newest seq of each (source, session), for a bounded number of senders. Rejected senders evict no driver. */
 export class SequenceRecord {
   constructor() {
     this.drivers = new Map();
     this.others = new Map();
   }
 
-  /** @throws {WireError} OUT_OF_ORDER unless newer than all before, and not too far ahead */
+  /** Store the seq of a command. @throws {WireError} OUT_OF_ORDER if it is not the newest, or jumps too far */
   check({ source, session, seq }, now_us) {
     const sender = `${source}/${session}`;
     const table = this.drivers.has(sender) ? this.drivers : this.others;
@@ -140,7 +140,7 @@ export class SequenceRecord {
     store(table, sender, { seq, now_us });
   }
 
-  /** Its last command took or renewed the lease. */
+  /** Store a sender with the drivers: its last command took or renewed the lease. */
   promote({ source, session }) {
     const sender = `${source}/${session}`;
     const entry = this.others.get(sender);
@@ -156,7 +156,7 @@ function store(table, sender, entry) {
   if (table.size > KEPT_SENDERS) table.delete(table.keys().next().value);
 }
 
-/** Who drives: one at a time, by rank, for as long as its commands are judged good. */
+/** The right to drive: one driver at a time, by rank, while its commands are accepted. */
 export class Lease {
   /** @param {number} life_us */
   constructor(life_us) {
@@ -164,7 +164,7 @@ export class Lease {
     this.drop();
   }
 
-  /** @returns {Holder|null} */
+  /** Return the driver that holds the lease now. @returns {Holder|null} */
   liveHolder(now_us) {
     return now_us < this.expires_us ? this.holder : null;
   }
@@ -174,13 +174,13 @@ export class Lease {
     return holder === null || isSame(holder, sender) || RANKS[sender.source] > RANKS[holder.source];
   }
 
-  /** @throws {WireError} NOT_PROVEN for a message that states the session of the driver and is not its own */
+  /** Check that a message which names the holder is of the holder. @throws {WireError} NOT_PROVEN */
   checkProof(sender, proof, now_us) {
     if (!isSame(this.liveHolder(now_us), sender) || this.proof.proof === null || continues(proof.proof, this.proof)) return;
     throw new WireError("NOT_PROVEN", `its proof does not continue that of the ${sender.source} that drives`);
   }
 
-  /** The proof of the driver's request is used up. */
+  /** Store the proof of a request of the holder, so that no copy of it proves anything. */
   advance(sender, proof, now_us) {
     if (isSame(this.liveHolder(now_us), sender)) this.proof = proof;
   }
@@ -197,7 +197,7 @@ export class Lease {
     this.expires_us = 0;
   }
 
-  /** Whether a human held it and let it run out. */
+  /** Return true if a human held the lease and it expired. */
   lostHuman(now_us) {
     return this.holder !== null && isHuman(this.holder.source) && now_us >= this.expires_us;
   }

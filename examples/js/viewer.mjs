@@ -1,7 +1,7 @@
 /**
- * @file The viewer in a browser: shows a robot's frames, steers at something yellow if asked to, and says STOP. Shell.
+ * @file The viewer in a browser: shows the frames of a robot, steers at a yellow target on request, and sends STOP. Shell.
  *
- * A frame is acknowledged after it was drawn, so that the robot sends as fast as this page draws and nothing queues.
+ * It acknowledges a frame after drawing it, so that the robot sends as fast as the page draws and no queue grows.
  */
 
 import { FrameLoop, WANTED_CHANNELS } from "./frame_loop.mjs";
@@ -10,16 +10,16 @@ import { OPERATOR, Vision } from "./vision.mjs";
 
 const FIRST_PAUSE_MS = 200;
 const MAX_PAUSE_MS = 1000;
-const SILENCE_MS = 2000; // a robot that loses its power closes nothing; a status comes ten times a second
+const SILENCE_MS = 2000; // a robot that loses its power does not close; a status arrives ten times a second
 const STOP_PERIOD_MS = 50;
-const STOP_SLOW_MS = 300; // a STOP that is not seen to work within this is told to the person
-const MAX_BUFFERED_BYTES = 65_536; // a browser queues without end; beyond this, commands are dropped
+const STOP_SLOW_MS = 300; // after this time the page reports that a STOP is not confirmed
+const MAX_BUFFERED_BYTES = 65_536; // a browser queues without limit; above this the viewer drops commands
 
-/** One robot and one page. Told by `show(what)`: {link}, {status}, {reply}, {target, twist, age_us}, {stop}. */
+/** Connects one page to one robot. Calls `show(change)`: {link}, {status}, {reply}, {target, twist, age_us} or {stop}. */
 export class Viewer {
   /**
-   * @param {{url: string, robot: string, decodeImage: (jpeg: Uint8Array) => Promise<object>, show: (what: object) => void,
-   *   token?: string, WebSocket?: typeof WebSocket}} options `decodeImage` draws a picture and gives its pixels
+   * @param {{url: string, robot: string, decodeImage: (jpeg: Uint8Array) => Promise<object>, show: (change: object) => void,
+   *   token?: string, WebSocket?: typeof WebSocket}} options `decodeImage` draws an image and returns its pixels
    */
   constructor({ url, robot, decodeImage, show, token = "", WebSocket = globalThis.WebSocket }) {
     Object.assign(this, { url, robot, show, WebSocket });
@@ -39,7 +39,7 @@ export class Viewer {
     this.isOpen = this.stopping = this.ended = false;
   }
 
-  /** Connect, and again whenever the connection is lost. */
+  /** Connect. Reconnect after each loss of the connection. */
   open() {
     const socket = new this.WebSocket(this.url, this.subprotocols);
     socket.binaryType = "arraybuffer";
@@ -50,12 +50,12 @@ export class Viewer {
     };
     socket.onmessage = ({ data }) => socket === this.socket && this.read(data);
     socket.onclose = ({ code, reason }) => this.onLost(socket, reason || `code ${code}`);
-    // Not every platform closes what it never opened, and none shows the reason of the robot.
+    // Some platforms send no close event here, and none shows the reason that the robot sent.
     socket.onerror = () => this.onLost(socket, "no answer, or a missing or wrong token after the # of the address");
     this.awaitMessage(socket);
   }
 
-  /** Leave the connection unless something comes in time. */
+  /** Drop the connection unless a message arrives in time. */
   awaitMessage(socket) {
     clearTimeout(this.silence);
     this.silence = setTimeout(() => {
@@ -75,7 +75,7 @@ export class Viewer {
       else this.receive(unpack(new Uint8Array(data), "", this.robot));
     } catch (error) {
       if (!(error instanceof PeerError)) throw error;
-      this.socket?.close(3000, "not understood"); // a page may not close with 1002 to 1011
+      this.socket?.close(3000, "invalid message"); // a page must not close with 1002 to 1011
       this.show({ link: error.message });
     }
   }
@@ -95,40 +95,40 @@ export class Viewer {
     if (status !== before && status !== null) this.show({ status: status.payload });
   }
 
-  onLost(socket, why) {
+  onLost(socket, reason) {
     if (this.ended || socket !== this.socket) return;
     clearTimeout(this.silence);
     this.isOpen = false;
     this.socket = null;
-    this.show({ link: `no connection: ${why}` });
+    this.show({ link: `no connection: ${reason}` });
     setTimeout(() => this.ended || this.open(), this.pause_ms);
     this.pause_ms = Math.min(MAX_PAUSE_MS, this.pause_ms * 1.5);
   }
 
   send(name, header, payload) {
-    if (name === "twist" && this.stopping) return; // without commands it stops, though STOP does not arrive
+    if (name === "twist" && this.stopping) return; // without commands the robot stops, even if no STOP arrives
     const urgent = name === "request";
     if (this.isOpen && (urgent || this.socket.bufferedAmount < MAX_BUFFERED_BYTES)) this.socket.send(pack(name, header, payload));
   }
 
-  /** Drive, as `vision`, or only watch. @param {boolean} drives */
+  /** Drive as `vision`, or watch only. @param {boolean} drives */
   setDriving(drives) {
     this.frameLoop.drives = drives;
     this.vision.source = drives ? "vision" : OPERATOR;
     if (this.isOpen) this.socket.send(this.hello());
   }
 
-  /** @param {"arm"|"disarm"|"reset"} verb */
+  /** Send a request. @param {"arm"|"disarm"|"reset"} verb */
   request(verb) {
     return this.frameLoop.request(verb);
   }
 
-  /** STOP is a level: repeated every 50 ms until a status that comes after the first one shows STOPPED and wheels at zero. */
+  /** Send STOP every 50 ms until a status after the first one shows STOPPED and wheels at zero. */
   stop() {
     if (this.stopping) return;
     this.stopping = true;
     const since_ms = performance.now();
-    let statusAtSend; // the status at hand when the first left: it may be from before a reset by another operator
+    let statusAtSend; // it may be older than a reset by another operator, so it confirms nothing
     const repeat = () => {
       const { status } = this.vision;
       const isLatched = statusAtSend !== undefined && status !== statusAtSend && status?.payload.state === "STOPPED";
@@ -154,7 +154,7 @@ export class Viewer {
   }
 }
 
-/** Decode with the browser, draw on the canvas, and read the pixels back for the scan. */
+/** Return a decoder that draws an image on the canvas and returns its pixels. */
 export function canvasDecoder(canvas) {
   const context = canvas.getContext("2d", { willReadFrequently: true });
   return async (jpeg) => {
@@ -168,7 +168,7 @@ export function canvasDecoder(canvas) {
   };
 }
 
-/** A cross where the target is. */
+/** Mark the target with a rectangle. */
 export function markTarget(canvas, target) {
   if (target === null) return;
   const context = canvas.getContext("2d");

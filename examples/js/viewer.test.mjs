@@ -1,4 +1,4 @@
-/** @file The viewer on a WebSocket that is only made up: STOP, and a robot that falls silent. */
+/** @file Tests of the viewer on a fake WebSocket: STOP, and a robot that becomes silent. */
 
 import assert from "node:assert/strict";
 import test from "node:test";
@@ -12,7 +12,7 @@ const SESSION = "0a1b2c3d";
 const JPEG = drawJpeg({ x_m: 0, y_m: 0, yaw_rad: 0 }, { x_m: 1, y_m: 0 });
 const BLACK = { width: 1, height: 1, scale: 1, data: [0, 0, 0], channels: 3 };
 
-/** What the page has sent, and what it was shown. Each connection that it opens is one of `sockets`. */
+/** Records the changes that the viewer shows, and the connections that it opens. */
 class Rig {
   constructor() {
     const sockets = (this.sockets = []);
@@ -33,7 +33,7 @@ class Rig {
         this.closed = true;
       }
     }
-    this.viewer = new Viewer({ url: "ws://r1/", robot: "r1", decodeImage: () => BLACK, show: (what) => this.shown.push(what), WebSocket: FakeSocket });
+    this.viewer = new Viewer({ url: "ws://r1/", robot: "r1", decodeImage: () => BLACK, show: (change) => this.shown.push(change), WebSocket: FakeSocket });
     this.viewer.open();
     this.seq = 0;
   }
@@ -53,10 +53,10 @@ class Rig {
   }
 
   status(state, applied = [0, 0]) {
-    this.receive("status", encode({ state, reason: "as said", applied }));
+    this.receive("status", encode({ state, reason: "a reason", applied }));
   }
 
-  /** A frame, and the channels of what the page has sent when it is drawn. */
+  /** Deliver a frame. @returns {Promise<string[]>} channels of all messages sent when it is drawn */
   async frame() {
     this.receive("frame", JPEG);
     await new Promise(setImmediate);
@@ -72,11 +72,11 @@ class Rig {
   }
 
   get stops() {
-    return this.shown.filter((what) => "stop" in what).map((what) => what.stop);
+    return this.shown.filter((change) => "stop" in change).map((change) => change.stop);
   }
 }
 
-test("STOP is sent though the status at hand shows STOPPED: another operator may have reset since", (t) => {
+test("STOP is sent although the last status shows STOPPED, because another operator may have reset the robot", (t) => {
   t.mock.timers.enable({ apis: ["setTimeout"] });
   const rig = new Rig();
   rig.greet();
@@ -99,7 +99,7 @@ test("STOP is sent though the status at hand shows STOPPED: another operator may
   rig.viewer.close();
 });
 
-test("a page that only watches takes the place of a viewer: the last ones are for those that control", () => {
+test("a page has the role viewer unless it drives, so that it takes no place of a driver", () => {
   const rig = new Rig();
   rig.greet();
   for (const drives of [true, false]) rig.viewer.setDriving(drives);
@@ -108,7 +108,7 @@ test("a page that only watches takes the place of a viewer: the last ones are fo
   rig.viewer.close();
 });
 
-test("requests are an operator's, whether the page drives or not: no other token permits them", () => {
+test("requests have the role operator whether the page drives or not, because no other token permits them", () => {
   const rig = new Rig();
   rig.greet();
   for (const drives of [false, true]) {
@@ -121,7 +121,7 @@ test("requests are an operator's, whether the page drives or not: no other token
   rig.viewer.close();
 });
 
-test("the page steers no more from STOP on, though no STOP arrives", async (t) => {
+test("the page sends no twist after STOP until the robot confirms it", async (t) => {
   t.mock.timers.enable({ apis: ["setTimeout"] });
   const rig = new Rig();
   rig.greet();
@@ -138,7 +138,7 @@ test("the page steers no more from STOP on, though no STOP arrives", async (t) =
   rig.viewer.close();
 });
 
-test("a robot that sends nothing for 2 s is left and connected to again", (t) => {
+test("a robot that is silent for 2 s is disconnected, and the viewer reconnects", (t) => {
   t.mock.timers.enable({ apis: ["setTimeout"] });
   const rig = new Rig();
   t.mock.timers.tick(1500);
@@ -153,12 +153,12 @@ test("a robot that sends nothing for 2 s is left and connected to again", (t) =>
   t.mock.timers.tick(1);
   t.mock.timers.tick(200);
   assert.deepEqual([rig.sockets.length, rig.sockets[0].closed], [2, true]);
-  rig.sockets[0].onmessage({ data: "no hello: it comes late, on the connection that was left" });
+  rig.sockets[0].onmessage({ data: "invalid hello, late, on the dropped connection" });
   assert.equal(rig.socket.closed, false);
   rig.viewer.close();
 });
 
-test("a robot that never says hello is left, too", (t) => {
+test("a robot that never sends a hello is disconnected", (t) => {
   t.mock.timers.enable({ apis: ["setTimeout"] });
   const rig = new Rig();
   rig.socket.onopen();

@@ -1,26 +1,26 @@
 /**
- * @file A vision of the Sightline protocol: find a colored blob, steer at it, answer each frame once. Pure; Node and browser.
+ * @file Find a colored blob, steer at it, and write the answer to each frame. Pure; Node and browser.
  *
- * @typedef {{x_px: number, width_px: number, share: number}} Target in pixels of the encoded picture
+ * @typedef {{x_px: number, width_px: number, share: number}} Target in px of the encoded image; share: of its width
  */
 
 import { ProofChain, sessionDigest } from "./proof.mjs";
 
-const GAIN_PER_S = 2; // turn rate per radian of bearing; times a total latency of 0.2 s it stays below 0.9
+const GAIN_PER_S = 2; // turn rate per bearing; stable because gain times a latency of 0.2 s is below 0.9
 const MAX_ANGULAR_RAD_S = 1.2;
 const SEARCH_RAD_S = 0.4;
 const CRUISE_MPS = 0.25;
-const STOP_SHARE = 0.18; // of the picture's width: near enough
-const MIN_PX = 128; // pixels of the encoded picture, two 8x8 blocks: fewer are noise
+const STOP_SHARE = 0.18; // of the image width; a target of this size is near enough
+const MIN_PX = 128; // of the encoded image, two 8x8 blocks; a smaller blob is noise
 
-/** Yellow: red and green strong and alike, blue far below. */
+/** Return true for yellow: high and similar red and green, low blue. */
 export const isYellow = (red, green, blue) => red > 110 && green > 85 && blue < 0.6 * green && Math.abs(red - green) < 0.4 * red;
 
 /**
- * A plain scan over the pixels: middle and extent of all that is of the color.
- * @param {{width: number, height: number, scale: number, data: ArrayLike<number>, channels: 3|4}} picture
- *   `scale` is how many pixels of the encoded picture one of these is wide
- * @returns {Target|null}
+ * Compute center and extent of all pixels of a color.
+ * @param {{width: number, height: number, scale: number, data: ArrayLike<number>, channels: 3|4}} pixels
+ *   `scale`: pixels of the encoded image per pixel of `data`, in each direction
+ * @returns {Target|null} null without a target
  */
 export function findTarget({ width, height, scale, data, channels }, isColor = isYellow) {
   const columns = new Uint32Array(width);
@@ -39,10 +39,10 @@ export function findTarget({ width, height, scale, data, channels }, isColor = i
 }
 
 /**
- * Turn towards the target, go on until it is large. Nothing in sight: look round, towards where it was last.
+ * Compute the twist: turn toward the target and approach it until it is large. Without a target, turn to search for it.
  * @param {Target|null} target
  * @param {{width_px: number, fx_px: number, cx_px: number}} camera
- * @param {number} side 1 left, -1 right
+ * @param {number} side where the target was last: 1 left, -1 right
  * @returns {import("./limits.mjs").Twist}
  */
 export function steer(target, camera, side = 1) {
@@ -56,12 +56,12 @@ export function steer(target, camera, side = 1) {
   };
 }
 
-const AHEAD_US = 500_000; // more than links and clocks differ
-export const OPERATOR = "operator"; // the one role whose token permits requests
+const AHEAD_US = 500_000; // more than the links and clocks of one robot differ
+export const OPERATOR = "operator"; // the only role whose token permits requests
 
-/** What a vision knows of one robot, and the headers of its answers. */
+/** State of a vision service or viewer for one robot. Writes the headers of its messages. */
 export class Vision {
-  /** @param {string} session 8 hex digits @param {string} source the role: `vision`, or `operator` to watch only */
+  /** @param {string} session 8 hex digits @param {string} source role: `vision`, or `operator` to watch only */
   constructor(session, source = "vision") {
     this.session = session;
     this.source = source;
@@ -69,23 +69,23 @@ export class Vision {
     this.robotSession = "";
     this.camera = null;
     this.lastSeq = this.last_us = -1;
-    this.received_us = -Infinity; // when the last new frame came, by this machine's clock
-    this.side = 1; // where the target was last: left
+    this.received_us = -Infinity; // arrival of the last new frame, on the clock of this machine
+    this.side = 1; // where the target was last: 1 left, -1 right
     this.seq = this.requestSeq = this.requestId = 0;
     this.status = null; // {header, payload}: the newest
   }
 
-  /** What others see of source and session. */
+  /** The digest by which a status names this peer as the driver. */
   get digest() {
     return sessionDigest(this.source, this.session);
   }
 
-  /** Whom replies to its requests name. */
+  /** The digest in replies to requests of this peer. */
   get requester() {
     return sessionDigest(OPERATOR, this.session);
   }
 
-  /** A new session of the robot: what was learned from the old one is forgotten. */
+  /** Discard the state of an earlier session of the robot. */
   onSession(session) {
     if (session === this.robotSession) return;
     this.robotSession = session;
@@ -106,13 +106,13 @@ export class Vision {
   }
 
   /**
-   * Whether a frame is newer than all before, and does not run ahead of this machine's clock: that one is forged.
+   * Return true if a frame is newer than all others and its time is possible. A time that runs ahead is forged.
    * @param {{session: string, seq: number, t_us: number}} header
    */
   isNew({ session, seq, t_us = 0 }, now_us = 0) {
     this.onSession(session);
     const silent_us = now_us - this.received_us;
-    if (silent_us > AHEAD_US) this.lastSeq = this.last_us = -1; // what came last was not of the robot, or it paused
+    if (silent_us > AHEAD_US) this.lastSeq = this.last_us = -1; // the last frame was forged, or the robot paused
     const ahead = this.last_us >= 0 && t_us - this.last_us > silent_us + AHEAD_US;
     if (ahead || seq <= this.lastSeq) return false;
     this.lastSeq = seq;
@@ -120,14 +120,14 @@ export class Vision {
     return true;
   }
 
-  /** Whether the robot's clock went on since the last frame; one that did not is no frame to steer by. */
+  /** Return true if the clock of the robot advanced since the last frame. Otherwise no twist may cite the frame. */
   advances({ t_us }) {
     const later = t_us > this.last_us;
     this.last_us = Math.max(this.last_us, t_us);
     return later;
   }
 
-  /** The twist for what was found; null without the camera's model. @param {Target|null} target */
+  /** Compute the twist, or null without a camera model. @param {Target|null} target */
   twistFor(target) {
     if (this.camera === null) return null;
     if (target !== null) this.side = target.x_px <= this.camera.cx_px ? 1 : -1;
@@ -135,8 +135,8 @@ export class Vision {
   }
 
   /**
-   * Header of the one answer to a frame.
-   * @param {{session: string, seq: number, t_us: number}} frame its header, cited field for field
+   * Write the header of the answer to a frame.
+   * @param {{session: string, seq: number, t_us: number}} frame its header, whose fields the answer cites
    * @param {number} compute_us from receiving the frame to sending the answer
    */
   answerHeader({ session, seq, t_us }, compute_us, proof = {}) {
@@ -146,7 +146,7 @@ export class Vision {
   }
 
   /**
-   * A request, as an operator; what lets the robot move again cites the newest status.
+   * Write a request of an operator. It cites the newest status, as a request that permits motion must.
    * @param {string} verb
    * @returns {{header: object, payload: {id: number, verb: string}}}
    */

@@ -1,5 +1,5 @@
 /**
- * @file A vision for Node: looks at a robot's frames for something yellow and steers at it. Shell.
+ * @file A vision service for Node: finds a yellow target in the frames of a robot and steers at it. Shell.
  *
  *     node examples/js/vision_client.mjs --connect ws://127.0.0.1:9090 --robot r1
  */
@@ -21,15 +21,15 @@ const USAGE = "node vision_client.mjs --connect ws://HOST:PORT --robot ID [--rol
 const log = (line) => console.log(`vision: ${line}`);
 const now_us = () => Math.round(performance.now() * 1000);
 
-/** Prints a line when what it is about has changed, never one per frame. */
+/** Logs a line when the state of a subject changes, not for each frame. */
 class StateLog {
   constructor() {
     this.states = {};
   }
 
-  report(about, state, line = state) {
-    if (this.states[about] === state) return;
-    this.states[about] = state;
+  report(subject, state, line = state) {
+    if (this.states[subject] === state) return;
+    this.states[subject] = state;
     log(line);
   }
 }
@@ -39,9 +39,9 @@ function readOptions() {
   const given = { connect: text, robot: text, role: { type: "string", default: "vision" }, "token-file": text, ca: text };
   try {
     const { values } = parseArgs({ options: given });
-    if (!/^wss?:\/\/([^/:]+|\[[0-9a-fA-F:]+\]):[0-9]+\/?$/.test(values.connect ?? "")) throw new Error("--connect ws://HOST:PORT is needed");
-    if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot ?? "")) throw new Error("--robot is needed: 1 to 32 letters, digits, _ . -");
-    if (!/^[a-z][a-z0-9_]{0,15}$/.test(values.role)) throw new Error("--role is 1 to 16 lower-case letters, digits or _");
+    if (!/^wss?:\/\/([^/:]+|\[[0-9a-fA-F:]+\]):[0-9]+\/?$/.test(values.connect ?? "")) throw new Error("invalid --connect: expected ws://HOST:PORT or wss://HOST:PORT");
+    if (!/^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$/.test(values.robot ?? "")) throw new Error("invalid --robot: expected 1 to 32 letters, digits, _ . -");
+    if (!/^[a-z][a-z0-9_]{0,15}$/.test(values.role)) throw new Error("invalid --role: expected 1 to 16 lowercase letters, digits, _");
     const token = values["token-file"] && readFileSync(values["token-file"], "ascii").trim();
     return { ...values, token, ca: values.ca && readFileSync(values.ca) };
   } catch (error) {
@@ -64,13 +64,13 @@ class Client {
       send: (name, header, payload) => this.peer?.send(name, header, payload),
       now_us,
       pause: () => new Promise(setImmediate),
-      onDecision: ({ target }) => this.stateLog.report("target", target === null ? "nothing yellow in sight" : "target seen"),
+      onDecision: ({ target }) => this.stateLog.report("target", target === null ? "no target" : "target seen"),
     };
     this.frameLoop = new FrameLoop(new Vision(this.session, options.role), environment);
     this.ending = false;
   }
 
-  /** Connect, and again whenever the connection is lost. */
+  /** Connect. Reconnect after each loss of the connection. */
   async run() {
     let pause_ms = FIRST_PAUSE_MS;
     while (!this.ending) {
@@ -80,7 +80,7 @@ class Client {
     }
   }
 
-  /** One connection from beginning to end; whether it came about. */
+  /** Run one connection until its end. @returns {Promise<boolean>} true if it opened */
   async connectOnce() {
     const { connect: url, robot, role } = this.options;
     let connection;
@@ -100,13 +100,13 @@ class Client {
       this.peer = new Peer(connection, { robot, hello, sendsFirst: true, onOpen, onEnd, onMessage: (packet) => this.frameLoop.onMessage(packet) });
     });
     this.peer = null;
-    if (!this.ending) this.stateLog.report("link", `link ended: ${ended.reason || "no reason given"} (${ended.code})`);
+    if (!this.ending) this.stateLog.report("link", `link ended: ${ended.reason || "no reason"} (${ended.code})`);
     return opened;
   }
 
   end() {
     this.ending = true;
-    this.peer?.connection.close(1001, "vision ends");
+    this.peer?.connection.close(1001, "the vision service is shutting down");
     const skipped = Object.entries(this.frameLoop.skipped).map(([reason, count]) => `${count} ${reason}`);
     log(`ended after ${this.frameLoop.answered} frames; skipped: ${skipped.join(", ") || "none"}`);
     setTimeout(() => process.exit(0), 100).unref();

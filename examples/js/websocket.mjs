@@ -1,7 +1,7 @@
 /**
- * @file WebSocket on Node's own `http` and `net`: a listening end, a connecting end, one open connection. Shell.
+ * @file WebSocket on `http` and `net` of Node: server, client, and one open connection. Shell.
  *
- * Node 20 has no WebSocket of its own without a flag; a browser has, and needs none of this.
+ * Node 20 has a WebSocket only behind a flag. A browser has its own.
  */
 
 import { createHash, randomBytes, timingSafeEqual } from "node:crypto";
@@ -12,33 +12,33 @@ import { MAX_HELLO_BYTES, PeerError, SUBPROTOCOL } from "./framing.mjs";
 import { FrameReader, OPCODE, closePayload, encodeFrame } from "./rfc6455.mjs";
 
 const GUID = "258EAFA5-E914-47DA-95CA-C5AB0DC85B11"; // RFC 6455, 1.3
-const PING_MS = 1000; // of silence of the other end
+const PING_MS = 1000; // silence of the other end before a ping
 const SILENT_MS = 2000;
-const STALLED_MS = 30_000; // for the end of a message whose bytes the other machine takes slowly, or not at all
+const STALLED_MS = 30_000; // for the end of a message that the other machine takes slowly, or never
 const CHECK_MS = 250;
 const CLOSE_MS = 1000;
-export const OPEN_MS = 2000; // security limit: for the HTTP handshake, and once more for the hello
+export const OPEN_MS = 2000; // security limit: for the HTTP handshake, and again for the hello
 const MAX_CLIENTS = 16; // security limit, of the protocol
-const MAX_SOCKETS = 32; // security limit: clients, and those whose handshake goes on
+const MAX_SOCKETS = 32; // security limit: clients and unfinished handshakes
 const EMPTY = new Uint8Array(0);
 
-/** An open connection: whole messages in, the newest of each kind out, pings, a goodbye. */
+/** An open connection: receives whole messages, sends the newest of each channel, pings and closes. */
 export class Connection {
   /**
    * @param {import("node:net").Socket} socket
-   * @param {boolean} listening which end this is
+   * @param {boolean} listening true for the server
    */
   constructor(socket, listening) {
     this.socket = socket;
     this.listening = listening;
     this.reader = new FrameReader({ masked: listening, maxBytes: MAX_HELLO_BYTES });
-    this.next = () => undefined; // gives the next message to send, when there is room
+    this.next = () => undefined; // returns the next message to send, when the kernel has room
     this.onMessage = () => undefined;
     this.onEnd = () => undefined;
     this.writing = this.closing = this.pinged = this.pingDue = false;
     this.received_ms = performance.now();
     this.began_ms = this.waited_ms = -Infinity; // the newest write, and the newest one that had to wait for room
-    this.pong = null; // only the newest ping is answered: who pings without reading piles nothing up
+    this.pong = null; // answers only the newest ping: a client that pings and never reads fills no memory
     socket.setNoDelay(true);
     socket.on("data", (chunk) => this.read(chunk));
     socket.on("error", () => socket.destroy());
@@ -54,8 +54,8 @@ export class Connection {
     try {
       for (const event of this.reader.feed(chunk)) this.onEvent(event);
     } catch (error) {
-      if (!(error instanceof PeerError)) console.error(`error: a message broke this end: ${error.stack}`);
-      const ours = { code: 1011, message: "this end failed" }; // it ends one connection, not the robot
+      if (!(error instanceof PeerError)) console.error(`error: exception while reading a message: ${error.stack}`);
+      const ours = { code: 1011, message: "internal error" }; // ends one connection, not the robot
       const { code, message } = error instanceof PeerError ? error : ours;
       this.close(code, message);
     }
@@ -80,8 +80,8 @@ export class Connection {
   }
 
   /**
-   * Ping an end that is silent; whatever it sends shows that it is there. An end for which a write waits is slow, not
-   * gone, and so is one that still has to read what waited: it gets the ping only after that.
+   * Ping a silent end. Any bytes that it sends prove that it is alive. An end for which a write waits is slow, not gone.
+   * So is an end that has not read that write yet: it receives the ping only after it.
    */
   check() {
     const now_ms = performance.now();
@@ -93,7 +93,7 @@ export class Connection {
     this.pump();
   }
 
-  /** Send what waits, one message at a time, each only once the one before has left for the kernel. */
+  /** Send the waiting messages one at a time, each after the kernel took the previous one. */
   pump() {
     if (this.writing || this.closing) return;
     const [opcode, payload] = this.nextFrame();
@@ -120,16 +120,16 @@ export class Connection {
     if (this.socket.writable) this.socket.write(encodeFrame(opcode, payload, this.listening ? null : randomBytes(4)), done);
   }
 
-  /** Say goodbye; the socket is gone within a second. */
+  /** Send a close frame. The socket ends within a second. */
   close(code, reason) {
     if (this.closing) return;
     this.reason = { code, reason };
     this.write(OPCODE.CLOSE, closePayload(code, reason));
-    this.reader.feed = function* nothing() {}; // what follows a broken rule is not read
+    this.reader.feed = function* nothing() {}; // read nothing after a protocol error
     this.end(code === 1001 ? CLOSE_MS : CLOSE_MS / 2);
   }
 
-  /** What was written leaves in this time; then the socket is gone, whatever the other end does. */
+  /** Let written bytes leave for this time, then destroy the socket. */
   end(within_ms) {
     this.closing = true;
     setTimeout(() => this.socket.destroy(), within_ms).unref();
@@ -144,10 +144,10 @@ export class Connection {
 }
 
 /**
- * Why a request may not come in, as [HTTP status, one line]; null if it may.
+ * Return the reason to reject a request as [HTTP status, one line], or null.
  *
- * A page of a foreign site reaches this machine by pointing a name of its own at it, so the name must be one that no
- * foreign site can own: an address, a name without a dot, one in `.local`, or the one listened on.
+ * A page of a foreign site can reach this machine with a DNS name that the site owns. Valid names are therefore addresses,
+ * names without a dot, names in `.local`, and the name on which the server listens.
  * @param {string[]} rawHeaders @param {string} listenHost
  */
 export function admissionProblem(rawHeaders, listenHost) {
@@ -164,24 +164,24 @@ export function admissionProblem(rawHeaders, listenHost) {
   return null;
 }
 
-const TOKEN_ENTRY = "sightline.token."; // beside the sub-protocol: all that a browser can do
+const TOKEN_ENTRY = "sightline.token."; // in the list of sub-protocols, the only header that a page can set
 
-/** Whether a request shows the token and no other, in the sub-protocols it offers or as `Authorization: Bearer`. */
+/** Return true if a request has this token and no other, in its sub-protocols or as `Authorization: Bearer`. */
 function hasToken(headers, offered, token) {
   const tokens = offered.filter((name) => name.startsWith(TOKEN_ENTRY)).map((name) => name.slice(TOKEN_ENTRY.length));
   const bearer = /^Bearer +(\S+)$/i.exec(headers.authorization ?? "");
   if (bearer !== null) tokens.push(bearer[1]);
-  const digest = (text) => createHash("sha256").update(text).digest(); // of one length, as the comparison needs
+  const digest = (text) => createHash("sha256").update(text).digest(); // of equal length, as the comparison requires
   return tokens.length === 1 && timingSafeEqual(digest(tokens[0]), digest(token));
 }
 
 function upgradeProblem(request, token) {
   const { headers } = request;
   const offered = (headers["sec-websocket-protocol"] ?? "").split(",").map((name) => name.trim());
-  if (headers["sec-websocket-version"] !== "13") return [426, "WebSocket version 13 is spoken here"];
-  if (request.method !== "GET" || !/^[A-Za-z0-9+/]{22}==$/.test(headers["sec-websocket-key"] ?? "")) return [400, "no WebSocket handshake"];
+  if (headers["sec-websocket-version"] !== "13") return [426, "unsupported WebSocket version; use 13"];
+  if (request.method !== "GET" || !/^[A-Za-z0-9+/]{22}==$/.test(headers["sec-websocket-key"] ?? "")) return [400, "invalid WebSocket handshake"];
   if (!offered.includes(SUBPROTOCOL)) return [400, `offer the sub-protocol ${SUBPROTOCOL}`];
-  return token === undefined || hasToken(headers, offered, token) ? null : [401, "show the token of this robot"];
+  return token === undefined || hasToken(headers, offered, token) ? null : [401, "missing or wrong token; send the token of this robot"];
 }
 
 const acceptKey = (key) => createHash("sha1").update(key + GUID).digest("base64");
@@ -189,14 +189,14 @@ const acceptKey = (key) => createHash("sha1").update(key + GUID).digest("base64"
 function rejectUpgrade(socket, [status, line]) {
   const version = status === 426 ? "Sec-WebSocket-Version: 13\r\n" : "";
   socket.on("error", () => socket.destroy());
-  socket.end(`HTTP/1.1 ${status} Refused\r\n${version}Connection: close\r\nContent-Type: text/plain\r\nContent-Length: ${line.length + 1}\r\n\r\n${line}\n`);
+  socket.end(`HTTP/1.1 ${status} Rejected\r\n${version}Connection: close\r\nContent-Type: text/plain\r\nContent-Length: ${line.length + 1}\r\n\r\n${line}\n`);
 }
 
 /**
  * Listen for peers.
  * @param {{host: string, port: number, token?: string, tls?: {cert: Buffer, key: Buffer}, onConnection: (connection: Connection) => void,
  *   onPage: (request: object, response: object) => void}} options
- * @returns {Promise<import("node:http").Server>} with `closeAll(reason)`; rejects if the port cannot be listened on
+ * @returns {Promise<import("node:http").Server>} with `closeAll(reason)`; rejects if the port is not available
  */
 export function listen({ host, port, token, tls, onConnection, onPage }) {
   const open = new Set();
@@ -223,9 +223,9 @@ export function listen({ host, port, token, tls, onConnection, onPage }) {
 }
 
 /**
- * One connection to `ws://host:port` or `wss://host:port`.
- * @param {string} url @param {{token?: string, ca?: Buffer}} [keys] what the robot demands, and whom to believe its name
- * @returns {Promise<Connection>} rejects with one line for a person
+ * Connect to `ws://host:port` or `wss://host:port`.
+ * @param {string} url @param {{token?: string, ca?: Buffer}} [keys] token of the robot, and the authority of its certificate
+ * @returns {Promise<Connection>} rejects with one line for the operator
  */
 export function connect(url, { token, ca } = {}) {
   const { hostname, port, protocol } = new URL(url);
@@ -248,7 +248,7 @@ export function connect(url, { token, ca } = {}) {
       if (!isValid) return socket.destroy(reject(new Error(`the service there does not support ${SUBPROTOCOL}`)));
       const connection = new Connection(socket, false);
       resolve(connection);
-      if (head.length > 0) setImmediate(() => connection.read(head)); // after the caller has said what it listens for
+      if (head.length > 0) setImmediate(() => connection.read(head)); // after the caller has set its callbacks
     });
     request.end();
   });

@@ -1,4 +1,4 @@
-/** @file One open connection on a socket that is only made up: its end, and peers that are silent or late. */
+/** @file Tests of one connection on a fake socket: its end, and silent or late peers. */
 
 import assert from "node:assert/strict";
 import { EventEmitter, once } from "node:events";
@@ -10,7 +10,7 @@ import { Connection, connect } from "./websocket.mjs";
 const MASK = Uint8Array.from([1, 2, 3, 4]);
 const fromClient = (opcode, payload = new Uint8Array(0)) => encodeFrame(opcode, payload, MASK);
 
-/** The listening end of one connection, on a clock of its own. */
+/** The server end of one connection, in simulated time. */
 class Rig {
   constructor({ mock }) {
     mock.timers.enable({ apis: ["setTimeout", "setInterval"] });
@@ -19,7 +19,7 @@ class Rig {
     this.now_ms = 0;
     this.written = [];
     this.ends = [];
-    this.isFull = false; // whether the kernel takes nothing at once
+    this.isFull = false; // true if the kernel takes no bytes immediately
     this.socket = Object.assign(new EventEmitter(), {
       writable: true,
       setNoDelay: () => undefined,
@@ -28,7 +28,7 @@ class Rig {
         if (this.isFull) this.taken = taken;
         else taken?.();
       },
-      end: () => undefined, // the other end keeps its half open
+      end: () => undefined, // the other end does not close
       destroy: () => this.socket.emit("close"),
     });
     this.connection = new Connection(this.socket, true);
@@ -49,7 +49,7 @@ class Rig {
 }
 
 for (const payload of [new Uint8Array(0), closePayload(1000, "")]) {
-  test(`a peer that sends Close (${payload.length} bytes) and keeps TCP open takes no place for ever`, (t) => {
+  test(`a peer that sends Close (${payload.length} bytes) and keeps TCP open is dropped`, (t) => {
     const rig = new Rig(t);
     rig.client(OPCODE.CLOSE, payload);
     rig.connection.close(1001, "the robot is shutting down");
@@ -58,13 +58,13 @@ for (const payload of [new Uint8Array(0), closePayload(1000, "")]) {
   });
 }
 
-test("a peer that sends data stays, however late its pongs are", (t) => {
+test("a peer that sends data stays connected with late pongs", (t) => {
   const rig = new Rig(t);
   rig.pass(5000, (now_ms) => now_ms % 100 === 0 && rig.client(OPCODE.BINARY, Uint8Array.of(1)));
   assert.deepEqual(rig.ends, []);
 });
 
-test("a peer whose only word is a late pong stays, a silent one is left after 2 s", (t) => {
+test("a peer that sends only late pongs stays connected, a silent one is dropped after 2 s", (t) => {
   const rig = new Rig(t);
   rig.pass(5200, (now_ms) => now_ms % 1300 === 0 && rig.client(OPCODE.PONG));
   assert.equal(rig.written.filter((opcode) => opcode === OPCODE.PING).length, 4);
@@ -74,7 +74,7 @@ test("a peer whose only word is a late pong stays, a silent one is left after 2 
   assert.deepEqual(rig.ends, [1011]);
 });
 
-test("a peer that takes data slowly and answers no ping stays; it is pinged between messages", (t) => {
+test("a peer that reads slowly and answers no ping stays connected, and gets pings between messages", (t) => {
   const rig = new Rig(t);
   rig.isFull = true;
   rig.connection.next = () => Uint8Array.of(1);
@@ -84,7 +84,7 @@ test("a peer that takes data slowly and answers no ping stays; it is pinged betw
   assert.deepEqual(rig.written.slice(0, 4), [OPCODE.BINARY, OPCODE.PING, OPCODE.BINARY, OPCODE.BINARY]);
 });
 
-test("a peer that takes nothing for 30 s is left", (t) => {
+test("a peer that reads nothing for 30 s is dropped", (t) => {
   const rig = new Rig(t);
   rig.isFull = true;
   rig.connection.next = () => Uint8Array.of(1);
@@ -95,7 +95,7 @@ test("a peer that takes nothing for 30 s is left", (t) => {
   assert.deepEqual(rig.ends, [1011]);
 });
 
-test("a peer that took what waited may read it first; after that it is silent", (t) => {
+test("a peer may read the waiting message before it must answer the ping", (t) => {
   const rig = new Rig(t);
   rig.isFull = true;
   rig.connection.next = () => (rig.isFull ? Uint8Array.of(1) : undefined);
@@ -111,7 +111,7 @@ test("a peer that took what waited may read it first; after that it is silent", 
 });
 
 for (const start of ["HTTP/1.1 101 Switching Protocols\r\n", "HTTP/1.1 200 OK\r\n\r\n"]) {
-  test(`a server that never ends its answer (${start.trim()}) is left after 2 s`, { timeout: 5000 }, async (t) => {
+  test(`a server that never ends its answer (${start.trim()}) is dropped after 2 s`, { timeout: 5000 }, async (t) => {
     t.mock.timers.enable({ apis: ["setTimeout"] });
     const server = createServer((socket) => {
       const drip = setInterval(() => socket.write("a: b\r\n"), 50);

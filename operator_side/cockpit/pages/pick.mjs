@@ -1,14 +1,14 @@
-/** @file Picks a color in a robot's live pictures, which stand still from the first touch on, or in those of a file. Shell. */
+/** @file Pick a color in the live images of a robot, which freeze at the first touch, or in the images of a file. Shell. */
 
-const CLICK_PX = 4; // on the screen: a smaller box was meant as a click
+const CLICK_PX = 4; // on the screen; a smaller box counts as a click
 const RETRY_MS = 500;
 const element = (id) => document.getElementById(id);
 const canvas = element("picture");
 const live = document.body.dataset.live === "true";
-let number = 0; // of the picture that is shown
-let last = 0; // number of the picture that came last, drawn or not
-let isFrozen = false; // live pictures stand still
-let start = null; // where a box was begun
+let number = 0; // of the image on the page
+let last = 0; // number of the last received image, drawn or not
+let isFrozen = false; // the page shows no further live image
+let start = null; // first corner of the box
 let picks = 0;
 
 const pause = (time_ms) => new Promise((resolve) => setTimeout(resolve, time_ms));

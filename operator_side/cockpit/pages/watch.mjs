@@ -1,17 +1,17 @@
 /**
- * @file Shows one robot's pictures and state. Shell.
+ * @file Show the images and the state of one robot. Shell.
  *
- * The page requests the next image after it drew the last, so nothing queues between the vision service and this page.
+ * The page requests the next image after it drew the last one, so that no queue grows between it and the vision service.
  */
 
-const OLD_MS = 500; // what is older than this must not look like the present
+const OLD_MS = 500; // an older image must not look current
 const STATE_MS = 250;
-const OLD_STATE_MS = 1000; // ten times the period of a robot's status
+const OLD_STATE_MS = 1000; // ten periods of a status
 const AGE_MS = 100;
 const RETRY_MS = 500;
 const element = (id) => document.getElementById(id);
 const canvas = element("picture");
-const drawnAt_ms = []; // of the last second
+const drawnAt_ms = []; // times of the images of the last second
 let last = 0; // number of the last image, drawn or not: the page requests the next one only after its arrival
 let newest = { channel: "", size: "", age_ms: null };
 
@@ -61,7 +61,7 @@ function showState({ robot, online, state, reason, lines }) {
   }));
 }
 
-/** The last state is over. */
+/** Clear the state: an old one must not look current. */
 function clearState(link) {
   showState({ state: "", reason: "", lines: [] });
   showLink(link);
@@ -80,7 +80,7 @@ async function showStates() {
   }
 }
 
-/** What stands still, or comes late, must be seen to: the age grows while nothing comes. */
+/** Show the age of the image. It grows while no image arrives, so that a frozen or late image is visible as one. */
 function showAge() {
   const now_ms = performance.now();
   while (drawnAt_ms.length > 1 && drawnAt_ms[0] < now_ms - 1000) drawnAt_ms.shift();
@@ -95,6 +95,6 @@ function showAge() {
 }
 
 setInterval(showAge, AGE_MS);
-document.onvisibilitychange = document.onresume = showAge; // a page out of sight has had few timers, or none
+document.onvisibilitychange = document.onresume = showAge; // a hidden page has few timers, or none
 showImages();
 showStates();

@@ -1,6 +1,6 @@
-"""The JavaScript peers in virtual time, in one Node process; any of their files may be changed. Shell (a process).
+"""Run the JavaScript peers in virtual time in one Node process, with or without a change of a file. Shell (a process).
 
-`JsPeers` starts Node once. Each peer is fresh, from the modules of a folder: examples/js, or a copy with one change.
+`JsPeers` starts Node once. Each peer is new, from the modules of a folder: examples/js, or a copy with one change.
 """
 
 import base64
@@ -32,7 +32,7 @@ class PeerFailedError(Exception):
 
 
 class JsPeers:
-    """`with JsPeers() as node`: a Node process, which ends with the block."""
+    """Run a Node process until the end of the block: `with JsPeers() as node`."""
 
     def __enter__(self):
         self._process = subprocess.Popen([node(), str(SHELL)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -69,7 +69,7 @@ class JsPeer:
             self.link.subscribe(channel, self._receive)
 
     def _receive(self, message):
-        """A robot reads at once. A vision service reads at its turn, so that the newest of what arrived counts."""
+        """Pass a message on to a robot. Store it for a vision service until its turn, where the newest frame counts."""
         if self._robot:
             self._pass_on(message, self.network.now_us)
         else:
@@ -81,7 +81,7 @@ class JsPeer:
         self._send(self._peers.call(do="message", now_us=now_us, **fields, **parts))
 
     def tick(self, now_us):
-        """Its turn."""
+        """Run one turn of the peer."""
         arrived, self._arrived = self._arrived, []
         for message in arrived:
             self._pass_on(message, now_us)
@@ -98,7 +98,7 @@ def _text(data):
 
 
 def virtual_js(peers, side, folder=EXAMPLES):
-    """(bench, peer): a fresh peer, and the kit connected to it."""
+    """Return (bench, peer): a new peer, and the kit connected to it."""
     network = MemoryNetwork()
     network.advance(1_000_000)
     peer = JsPeer(peers, network, side, folder)
@@ -108,7 +108,7 @@ def virtual_js(peers, side, folder=EXAMPLES):
 
 
 def changed_copy(folder, file, old, new):
-    """Copy the modules to `folder` with one text of one file replaced. Raises ValueError unless it is there once."""
+    """Copy the modules to `folder` with one text of one file replaced. Raises ValueError unless it occurs once."""
     source = (EXAMPLES / file).read_text("utf-8")
     if source.count(old) != 1:
         raise ValueError(f"{file} has {old!r} {source.count(old)} times; expected once")

@@ -1,17 +1,17 @@
 /**
- * @file The pure parts of the JavaScript peers in virtual time: one JSON line in, one JSON line out. Shell (stdin, stdout).
+ * @file Run the pure parts of the JavaScript peers in virtual time: one JSON line in, one JSON line out. Shell (stdin, stdout).
  *
- *     node virtual_peer.mjs          {"do": "robot"|"vision", "folder", "now_us", ...}  a fresh peer from the modules of `folder`
+ *     node virtual_peer.mjs          {"do": "robot"|"vision", "folder", "now_us", ...}  a new peer from the modules of `folder`
  *                                    {"do": "message", "now_us", "channel", "source", "header", "payload"}     bytes in base64
  *                                    {"do": "tick", "now_us", "wanted"}  ->  {"out": [[channel, source, header, payload], ...]}
  *
- * What `robot_server.mjs` and `vision_client.mjs` do with a clock, a camera and a link, this does with the caller's.
+ * It replaces `robot_server.mjs` and `vision_client.mjs`; the caller provides clock, camera and link.
  */
 
 import { createInterface } from "node:readline";
 import { pathToFileURL } from "node:url";
 
-const COMPUTE_US = 2_000; // what looking at a picture takes
+const COMPUTE_US = 2_000; // simulated time to decode an image
 
 const bytes = (text) => new Uint8Array(Buffer.from(text, "base64"));
 const base64 = (data) => Buffer.from(data).toString("base64");
@@ -52,7 +52,7 @@ async function makeVision({ load, session }) {
     return { width, height, scale, data: rgb, channels: 3 };
   };
   const send = (name, header, payload) => out.push([name, header.source, base64(encode(header)), base64(payload)]);
-  const pause = () => new Promise((resume) => waiting.push(resume)); // until all that has arrived was read
+  const pause = () => new Promise((resume) => waiting.push(resume)); // ends after all received messages are read
   const loop = new FrameLoop(new Vision(session), { decodeImage, send, now_us: () => clock_us, pause });
   const working = [];
 

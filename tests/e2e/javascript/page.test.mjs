@@ -1,4 +1,4 @@
-/** @file The viewer's page on elements, a socket and pictures that are only made up: what is old does not look new. */
+/** @file Tests of the viewer page on fake elements, sockets and images: old images and states do not look current. */
 
 import assert from "node:assert/strict";
 import { beforeEach, mock, test } from "node:test";
@@ -56,16 +56,16 @@ function pass(ms) {
   }
 }
 
-/** A message that the robot stamped `late_ms` ago by this clock. */
+/** Deliver a message with a time `late_ms` ago. */
 async function receive(channel, payload, late_ms = 0) {
   const header = { v: 1, session: SESSION, seq: (seq += 1), t_us: (now_ms - late_ms) * 1000 };
   sockets.at(-1).onmessage({ data: pack(channel, header, payload).buffer });
-  await new Promise(setImmediate); // the picture is drawn
+  await new Promise(setImmediate); // until the image is drawn
 }
 
 const receiveStatus = (state = "ACTIVE", applied = [0.4, 0]) => receive("status", encode({ state, reason: "drives", applied }));
 
-/** To this page's newest request. */
+/** Deliver the reply to the newest request of this page. */
 function receiveReply(detail, state = "DISARMED") {
   parts.arm.onclick();
   const { header } = unpack(sockets.at(-1).sent.at(-1), "", "r1");
@@ -78,7 +78,7 @@ beforeEach(() => {
   sockets.at(-1).onmessage({ data: helloText("r1", SESSION, []) });
 });
 
-test("an image that comes late is dimmed, and its age begins with its delay", async () => {
+test("a late image is dimmed, and its age includes its delay", async () => {
   await receiveStatus();
   await receive("frame", JPEG, 20);
   pass(100);
@@ -95,7 +95,7 @@ test("an image that comes late is dimmed, and its age begins with its delay", as
 const stateShown = () => ["state", "reason", "wheels", "driver", "frame_age", "frames"].map((id) => parts[id].textContent);
 const UNKNOWN = ["?", "", "?", "?", "?", "?"];
 
-test("a robot that sends frames but no status shows no state after 1 s", async () => {
+test("the page shows no state 1 s after the last status, although frames arrive", async () => {
   await receiveStatus();
   assert.deepEqual([...stateShown().slice(0, 2), parts.state.className], ["ACTIVE", "drives", "ACTIVE"]);
   for (let count = 0; count < 9; count += 1) {
@@ -110,7 +110,7 @@ test("a robot that sends frames but no status shows no state after 1 s", async (
   assert.equal(parts.state.textContent, "ACTIVE");
 });
 
-test("a status that cannot be read leaves no state", async () => {
+test("an invalid status does not prolong the state", async () => {
   await receiveStatus();
   for (let count = 0; count < 12; count += 1) {
     pass(100);
@@ -119,7 +119,7 @@ test("a status that cannot be read leaves no state", async () => {
   assert.deepEqual(stateShown(), UNKNOWN.with(1, "no status for more than 1 s"));
 });
 
-test("what a request came to goes with the state that it led to", async () => {
+test("the result of a request disappears with the state that followed it", async () => {
   await receiveStatus("DISARMED");
   await receiveReply("NOT_ALLOWED: repeat the request");
   await receiveStatus("DISARMED");
@@ -128,7 +128,7 @@ test("what a request came to goes with the state that it led to", async () => {
   assert.equal(parts.message.textContent, "");
 });
 
-test("a STOP that is not confirmed stays on the page, and STOPPED goes with that state", async () => {
+test("an unconfirmed STOP stays on the page, and STOPPED disappears with the state", async () => {
   parts.stop.onclick();
   await receiveStatus();
   assert.equal(parts.message.textContent, "STOP ...");
@@ -140,7 +140,7 @@ test("a STOP that is not confirmed stays on the page, and STOPPED goes with that
   assert.equal(parts.message.textContent, "");
 });
 
-test("a page that wakes shows at once how old its image and state are: no timer has run meanwhile", async () => {
+test("a page that wakes shows the age of its image and state immediately, before any timer", async () => {
   for (const wakes of ["onvisibilitychange", "onresume"]) {
     await receiveStatus();
     await receive("frame", JPEG);
@@ -150,7 +150,7 @@ test("a page that wakes shows at once how old its image and state are: no timer 
   }
 });
 
-test("a page whose connection does not open names the token, and takes one that is added to its address", () => {
+test("a page without a connection names the token, and reloads with a token added to its address", () => {
   sockets.at(-1).onerror();
   assert.match(parts.link.textContent, /no answer.*token.*#/);
   globalThis.onhashchange();
@@ -158,7 +158,7 @@ test("a page whose connection does not open names the token, and takes one that 
   pass(1500);
 });
 
-test("a lost link leaves no state", async () => {
+test("a lost connection clears the state", async () => {
   await receiveStatus();
   await receiveReply("armed", "ACTIVE");
   assert.equal(parts.message.textContent, "armed");

@@ -1,4 +1,4 @@
-"""The JavaScript viewer in a real browser, at our own robot in a simulated world and at the JavaScript one."""
+"""Test the JavaScript viewer in a browser, with a simulated Sightline robot and with the JavaScript robot."""
 
 import os
 import re
@@ -16,7 +16,7 @@ from tests.fixtures.ports import free_port
 
 SIGHTLINE = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app"]
 
-# Brightness of the canvas at a grid of points: a picture has several, an empty canvas one.
+# Brightness of the canvas at a grid of points: an image has several levels, an empty canvas one.
 LEVELS = """(() => {
   const canvas = document.getElementById("picture");
   const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
@@ -27,7 +27,7 @@ LEVELS = """(() => {
 
 
 class Started:
-    """`with Started(folder, "sim", "--seed", "3") as sim`: a command of ours, ended at the end."""
+    """Run a `sightline` command until the end of the block: `with Started(folder, "sim", "--seed", "3") as sim`."""
 
     def __init__(self, folder: Path, *arguments: str) -> None:
         self._command = [*SIGHTLINE, *arguments]
@@ -49,7 +49,7 @@ class Started:
 
 @pytest.fixture
 def our_viewer(tmp_path: Path) -> Iterator[tuple[Browser, Started]]:
-    """A page on our robot, which drives in the simulation, through the gateway; and that robot."""
+    """Yield the page of a simulated Sightline robot behind the gateway, and the robot."""
     chromium(), node()
     sockets, port, page_port = f"/tmp/sl-{os.getpid()}-{free_port()}", free_port(), free_port()
     device = f'{{kind = "sim", options = {{socket_dir = "{sockets}"}}}}'
@@ -70,7 +70,7 @@ def our_viewer(tmp_path: Path) -> Iterator[tuple[Browser, Started]]:
 
 def answered(page: Browser) -> int:
     """Return the number of frames that the page reports as drawn and answered."""
-    found = re.search(r"(\d+) answered here", page.text("frames"))
+    found = re.search(r"(\d+) answered by this page", page.text("frames"))
     return int(found[1]) if found else 0
 
 
@@ -101,19 +101,19 @@ def test_a_browser_watches_steers_and_stops_our_robot(tmp_path: Path, our_viewer
     assert until(lambda: answered(page) > 30, START_S), page.text("frames")
     assert re.fullmatch(r"\d+ images/s, at least \d+ ms old", page.text("age"))
     # The page only watches until a request to drive.
-    assert page.text("driver") == "nobody"
+    assert page.text("driver") == "none"
 
     page.click("drive")
     assert until(lambda: page.text("driver") == "this page", START_S), page.text("driver")
     assert until(lambda: is_armed(page), START_S), page.text("message")
     assert until(lambda: is_moving(page), START_S), page.text("reason")
-    assert "ms old" in page.text("frame_age")
+    assert re.fullmatch(r"\d+ ms old, capture to command \d+ ms", page.text("frame_age"))
     page.screenshot(tmp_path / "driving.png")
     assert (tmp_path / "driving.png").stat().st_size > 10_000
 
     page.press("Space", " ")
     assert until(lambda: page.text("state") == "STOPPED", 3.0), page.text("message")
-    assert page.run("document.getElementById('drive').checked") is True  # the space bar pressed no button
+    assert page.run("document.getElementById('drive').checked") is True  # the space bar did not press a button
     assert robot.says(r"STOPPED \(STOP by operator\)")
     assert page.errors == []
 

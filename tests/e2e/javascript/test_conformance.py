@@ -1,4 +1,4 @@
-"""The conformance kit on the JavaScript peers, as a third party runs it; every MUST and SHOULD passes."""
+"""Run the conformance kit on the JavaScript peers like a third party. Every MUST and SHOULD passes."""
 
 import json
 import subprocess
@@ -24,14 +24,14 @@ NOT_APPLICABLE = (
 
 
 def report(*arguments: str, seconds: float) -> dict[str, Any]:
-    """The kit's JSON."""
+    """Return the JSON of the kit."""
     run = subprocess.run([*CONFORM, *arguments], check=False, capture_output=True, text=True, timeout=seconds)
     assert run.stdout.startswith("{"), run.stdout + run.stderr
     return dict(json.loads(run.stdout))
 
 
 def failed(results: dict[str, Any]) -> list[str]:
-    """Cases that failed, and those that did not apply for a reason that is not known."""
+    """Return the cases that failed, or that do not apply for an unknown reason."""
     return [
         f"{one['name']} {one['level']}: {one['title']} {one['reason']}"
         for one in results["checks"]

@@ -1,4 +1,4 @@
-"""Clients that may enter the JavaScript robot, the cost of unknown ones, and its programs' errors for bad options."""
+"""Test which clients the JavaScript robot admits, their cost, and the errors of the programs for invalid options."""
 
 import base64
 import os
@@ -77,7 +77,7 @@ def test_seventeenth_client_is_rejected(tmp_path):
 
 
 def test_gateway_to_a_robot_that_does_not_answer_reports_it(tmp_path):
-    with ExitStack() as ending, socket.socket() as full:  # its queue is full, so that no further client is connected
+    with ExitStack() as ending, socket.socket() as full:  # a full queue: no further client connects
         full.bind(("127.0.0.1", free_port()))
         full.listen(0)
         robot, page_port = full.getsockname(), free_port()
@@ -145,7 +145,7 @@ def _resident_kb(robot: JsRobot) -> int:
 
 
 def _open_sockets(robot: JsRobot) -> int:
-    """Established TCP connections of the robot's port, from /proc (state 01)."""
+    """Count the established TCP connections of the port of the robot, from /proc (state 01)."""
     rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()][1:]
     return sum(1 for row in rows if int(row[1].split(":")[1], 16) == robot.port and row[3] == "01")
 
@@ -153,7 +153,7 @@ def _open_sockets(robot: JsRobot) -> int:
 @pytest.mark.parametrize(
     ("script", "arguments", "printed"),
     [
-        ("robot_server.mjs", ["--port", "x"], "--port is a number"),
+        ("robot_server.mjs", ["--port", "x"], "invalid --port"),
         ("robot_server.mjs", ["--host", "0.0.0.0"], "--token-file"),
         ("robot_server.mjs", ["--token-file", "/nowhere"], "--token-file /nowhere"),
         ("robot_server.mjs", ["--pictures", "/nowhere"], "--pictures /nowhere"),
@@ -184,14 +184,14 @@ def test_a_robot_with_a_token_and_a_certificate(tmp_path):
     tls = ("--cert", str(tmp_path / "cert.pem"), "--key", str(tmp_path / "key.pem"))
     with JsRobot(tmp_path, *keys, *tls) as robot:
         secure = robot.endpoint.replace("ws://", "wss://")
-        # Not `websockets.sync`: its reading thread beside a write makes one TLS connection of 750 hang.
+        # Not `websockets.sync`: its read thread next to a write makes one TLS connection of 750 hang.
         trusted = {"ca_certs": str(tmp_path / "ca.pem")}
-        believe = partial(websocket.create_connection, secure, timeout=10, sslopt=trusted)
+        open_trusted = partial(websocket.create_connection, secure, timeout=10, sslopt=trusted)
         for shown in ([], ["sightline.token.0123456789abcdeX"]):
             with pytest.raises(websocket.WebSocketBadStatusException) as rejection:
-                believe(subprotocols=["sightline.v1", *shown])
+                open_trusted(subprotocols=["sightline.v1", *shown])
             assert rejection.value.status_code == 401
-        peer = believe(subprotocols=["sightline.token.0123456789abcdef", "sightline.v1"])
+        peer = open_trusted(subprotocols=["sightline.token.0123456789abcdef", "sightline.v1"])
         assert peer.subprotocol == "sightline.v1"
         peer.close()
         ca = ("--ca", str(tmp_path / "ca.pem"))

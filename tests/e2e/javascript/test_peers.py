@@ -1,4 +1,4 @@
-"""The JavaScript peers: their own unit tests, their size, and their codec next to ours on generated messages."""
+"""Run the unit tests of the JavaScript peers, check their size, and compare their codec with the Python codec."""
 
 import base64
 import json
@@ -66,7 +66,7 @@ def test_javascript_imports_only_the_platform():
     "model", ["FrameHeader", "AnswerHeader", "RequestHeader", "Status", "StreamStatus", "CameraModel", "Detections"]
 )
 def test_javascript_field_tables_have_the_same_fields_in_the_same_order(model):
-    """A field added on our side must be added there: a default that is missing shows in no message."""
+    """Check that a new field is in both languages. A missing default is not visible in any message."""
     assert _js_fields(model) == list(json_schema()["$defs"][model]["properties"])
 
 
@@ -90,7 +90,7 @@ def _messages() -> list[tuple[str, bytes, bytes]]:
 
 
 def _mutated(seed: int, count: int) -> Iterator[tuple[str, bytes, bytes]]:
-    """Golden messages with bytes flipped, taken out, doubled, or swapped for what JSON readers trip over."""
+    """Yield golden messages with bytes changed, removed, doubled, or replaced by difficult JSON."""
     dice = random.Random(seed)
     parts = (b"1e5", b"-0", b"7.0", b"null", b"true", b'"', b"\\ud800", b"\xff", b"{}", b"[", b",", b"9" * 30, b" ")
     messages = _messages()
@@ -123,12 +123,12 @@ def _js_outcomes(messages: list[tuple[str, bytes, bytes]]) -> list[Any]:
 
 
 def _by_value(text: str) -> Any:
-    """JSON with every number as a double: JavaScript writes large ones without exponent, in rounded digits."""
+    """Parse JSON with every number as a double, because JavaScript rounds the digits of large ones."""
     return json.loads(text, parse_int=float)
 
 
 def _is_allowed_to_differ(header: bytes, payload: bytes) -> bool:
-    """Clauses 2.1 and 2.2 leave two things open: NaN and Infinity, and deep nesting, in a field that is ignored."""
+    """Return True for NaN, Infinity or deep nesting in an ignored field, which clauses 2.1 and 2.2 leave open."""
     both = header + payload
     return any(word in both for word in (b"NaN", b"Infinity", b"[" * 20, b"{" * 20))
 
@@ -158,7 +158,7 @@ def test_adapter_reports_unsupported_cases():
 
 
 def test_page_does_not_call_stop_an_emergency_stop():
-    """No network button is an emergency stop, and none is called one."""
+    """No network button is an emergency stop, and no text calls it one."""
     for path in [*SOURCES, Path(ROOT / "docs" / "reference" / "javascript.md")]:
         text = re.sub("no emergency stop|not an emergency stop", "", path.read_text("utf-8"))
         assert not re.search(r"emergency\s*stop|e-stop|not-?aus", text, re.IGNORECASE)

@@ -1,4 +1,4 @@
-"""The JavaScript peers beside ours, each in a process: their robot with our vision and operator, ours with theirs."""
+"""Test JavaScript and Python peers together, each in a process: robot, vision service, operator and viewer."""
 
 import json
 import shutil
@@ -37,7 +37,7 @@ def applied(robot: JsRobot) -> list[float]:
 
 @pytest.fixture
 def our_vision(tmp_path):
-    """Starts `sightline vision` for a JavaScript robot; ended at the end."""
+    """Yield a function that starts `sightline vision` for a JavaScript robot."""
     running = []
 
     def start(robot: JsRobot) -> subprocess.Popen[bytes]:
@@ -117,13 +117,13 @@ def test_javascript_robot_stops_when_its_vision_is_killed(tmp_path, our_vision):
             killed_s = time.monotonic()
             while any(json_payload(watcher.recv())["applied"]):
                 assert time.monotonic() - killed_s < 3
-        assert time.monotonic() - killed_s < 1.2  # 0.7 s, a status at 10 Hz, and what other processes take
-        # The last frame may be old already when the vision service dies, and its age is then what ends the drive.
+        assert time.monotonic() - killed_s < 1.2  # 0.7 s, a status at 10 Hz, and the load of other processes
+        # The last frame may already be old when the vision service dies. Then its age stops the robot.
         assert robot.says(r"HOLD \((no accepted command|the frame behind the command is too old)")
 
 
 def _yellow_ball(folder):
-    """Pictures of a yellow ball, off the middle, as a camera would make them: chroma at half resolution."""
+    """Write images of a yellow ball, right of the center, with chroma at half resolution like those of a camera."""
     folder.mkdir()
     for number, x in enumerate((380, 390, 400)):
         picture = np.full((480, 640, 3), (120, 125, 118), np.uint8)
@@ -149,10 +149,10 @@ def test_the_javascript_vision_drives_our_robot(tmp_path):
         assert until(lambda: robot.speed() == 0, 2)
 
 
-# Our robot stops a viewer that does not keep up with its frames: nothing may starve that one of Node.
+# The Python robot drops a viewer that is slower than its frames, so that no other test may load the machine.
 @pytest.mark.parametrize("whose", [pytest.param("ours", marks=pytest.mark.alone), "theirs"])
 def test_the_viewer_watches_steers_and_stops_a_robot(tmp_path, whose):
-    """With the platform's WebSocket, as in a browser; what is missing is the screen."""
+    """Run the viewer with the WebSocket of Node, like a browser without a screen."""
     endpoint = f"ws://127.0.0.1:{free_port()}"
     camera = {"kind": "folder", "options": {"path": str(_yellow_ball(tmp_path / "balls"))}}
     ours = whose == "ours"
@@ -165,7 +165,7 @@ def test_the_viewer_watches_steers_and_stops_a_robot(tmp_path, whose):
             assert until(lambda: viewer.process.poll() is not None, 20), viewer.output() + robot.output()
             assert viewer.process.returncode == 0, viewer.output()
             lines = viewer.output().splitlines()
-    assert [line for line in lines if line != "nothing" and not line.startswith("link: no")] == [
+    assert [line for line in lines if line != "no target" and not line.startswith("link: no")] == [
         "link: connected", "target", "driving", "reply: STOPPED", "stopped; frames: many; skipped: {}",
     ]  # fmt: skip
 
