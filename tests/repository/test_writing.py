@@ -1,5 +1,7 @@
 """The banned patterns of the writing guide over the texts of the source: strings, docstrings, comments, test names.
 
+Other files than Python: comments and strings of JavaScript, each line of the rest.
+
 Text in backticks is not read. `python -m tests.repository.test_writing FOLDER` prints every place in a folder.
 """
 
@@ -42,6 +44,7 @@ BANNED = {
 EXCEPTIONS = {
     ("tests/repository/test_writing.py", None): "the patterns themselves",
     ("tests/conformance/test_codec.py", "refusal"): "a field of the kit's line protocol for codecs",
+    ("compose.yaml", "refused"): "a field of the status",
 }
 
 FOLDERS = (
@@ -53,6 +56,11 @@ COMMENTED = (
     "robot_side/safety", "robot_side/network", "protocol/transports", "vision_side/pipeline.py", "vision_side/tracking",
 )
 _BACKTICKS = re.compile(r"`[^`\n]*`")
+_JAVASCRIPT = re.compile(r"""/\*.*?\*/|(?<!:)//[^\n]*|"(?:[^"\\\n]|\\.)*"|`(?:[^`\\]|\\.)*`""", re.DOTALL)
+"""Comments and strings."""
+_CODE = re.compile(r"^(old|new|before|after|where|place) = |\$\{[^}]*\}")
+"""Quoted code in the tables of mutants, and in the strings of JavaScript."""
+LINES = (".toml", ".yaml", ".html", ".service", ".conf", "Makefile", "Dockerfile", "run", "engine", "other_python")
 
 
 @cache
@@ -97,9 +105,21 @@ def texts(path: Path) -> Iterator[tuple[str, int, str]]:
                 yield "comment", token.start[0], token.string.lstrip("# ")
 
 
+def other_texts(path: Path) -> Iterator[tuple[str, int, str]]:
+    """Yield (kind, line, text) of a file that is not Python."""
+    source = path.read_text(encoding="utf-8")
+    if path.suffix == ".mjs":
+        for found in _JAVASCRIPT.finditer(source):
+            if " " in found[0]:
+                text = found[0][1:-1] if found[0][0] == "`" else found[0]
+                yield "text", source.count("\n", 0, found.start()) + 1, _CODE.sub("", text)
+    else:
+        yield from (("line", number, line) for number, line in enumerate(source.splitlines(), 1) if not _CODE.match(line))
+
+
 def hits_in(path: Path) -> Iterator[str]:
     name = path.relative_to(ROOT).as_posix()
-    for kind, line, text in texts(path):
+    for kind, line, text in texts(path) if path.suffix == ".py" else other_texts(path):
         plain = _BACKTICKS.sub("`x`", text).strip()
         if not anything().search(plain):
             continue
@@ -128,6 +148,20 @@ def hits_of(folder: str) -> list[str]:
 def test_no_text_contains_a_banned_pattern(folder):
     hits = hits_of(folder)
     assert hits == [], "\n".join([f"{folder}: {len(hits)} hits", *hits[:40]])
+
+
+def other_files() -> list[Path]:
+    """Return the JavaScript, settings and scripts of the repository."""
+    roots = [ROOT / name for name in (*FOLDERS, "tests", "deploy", ".ci")]
+    paths = [*ROOT.iterdir(), *(path for root in roots for path in root.rglob("*"))]
+    return sorted({path for path in paths if path.is_file() and path.name.endswith((".mjs", *LINES))})
+
+
+def test_no_text_outside_python_contains_a_banned_pattern():
+    files = other_files()
+    assert {"compose.yaml", "gate.mjs", "Makefile", "circle.toml", "watch.html", "run"} <= {path.name for path in files}
+    hits = [hit for path in files for hit in hits_in(path)]
+    assert hits == [], "\n".join([f"{len(hits)} hits", *hits[:40]])
 
 
 def sentences_without_a_figure(text: str) -> list[str]:
@@ -193,6 +227,15 @@ def test_a_text_with_each_pattern_is_found(tmp_path, monkeypatch):
     )
     kinds = [hit.split(": ")[1] for hit in hits_in(module)]
     assert sorted(kinds) == ["comment", "docstring", "string", "test"]
+    script = tmp_path / "script.mjs"
+    script.write_text(
+        '/** Who\n * nobody hears. */\nconst told = "obeyed";  // judged `told`\nlog(`${told} refused ${x}`, "is none");\n',
+        encoding="utf-8",
+    )
+    assert [hit.split(":")[1] for hit in hits_in(script)] == ["1", "1", "3", "4", "4"]
+    table = tmp_path / "mutants.toml"
+    table.write_text('# whoever\nold = "refused"\nname = "it says no"\n', encoding="utf-8")
+    assert [hit.split(":")[1] for hit in hits_in(table)] == ["1", "3"]
 
 
 if __name__ == "__main__":
