@@ -221,7 +221,7 @@ def stop_checks(stop: Stop, zero_ms: float = ZERO_MS, distance_m: float = DISTAN
 #
 # `good,T_US,FRAME_US`    a command that the robot must apply was sent, citing the frame captured at FRAME_US
 # `injected,T_US,0`       the fault was injected once more
-# `told,T_US,0`           a request of an operator was sent
+# `requested,T_US,0`      a request of an operator was sent
 
 
 GOOD: Final = "good"

@@ -38,7 +38,7 @@ from sightline.vision_side.detect.port import (
 from sightline.vision_side.detect.registry import build_detector, check_takes_pictures
 
 _FRAME_US: Final = 33_333
-_ROBOT: Final = "judge"
+_ROBOT: Final = "score"
 LIGHT_SHARE: Final = 2.5
 """As many scenes of lights and legs as of each column's: the three states share them."""
 _MOST_NOTICES: Final = 2  # lines from a detector next to the cause of a missing answer

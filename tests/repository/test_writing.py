@@ -60,7 +60,7 @@ _JAVASCRIPT = re.compile(r"""/\*.*?\*/|(?<!:)//[^\n]*|"(?:[^"\\\n]|\\.)*"|`(?:[^
 """Comments and strings."""
 _CODE = re.compile(r"^(old|new|before|after|where|place) = |\$\{[^}]*\}")
 """Quoted code in the tables of mutants, and in the strings of JavaScript."""
-LINES = (".toml", ".yaml", ".html", ".service", ".conf", "Makefile", "Dockerfile", "run", "engine", "other_python")
+LINES = (".toml", ".yaml", ".urdf", ".xacro", ".css", ".html", ".service", ".conf", "Makefile", "Dockerfile", "run", "engine", "other_python")
 
 
 @cache
