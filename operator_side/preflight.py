@@ -64,8 +64,8 @@ def writes(path: Path, fix: str = "choose another file") -> Iterator[None]:
         raise ConfigError(f"cannot write {path}: {error.strerror or error}; {fix}") from None
 
 
-def write_whole(path: Path, text: str, fix: str = "choose another file") -> None:
-    """Write a text file as a whole or not at all; a symbolic link stays one. Raises ConfigError.
+def write_whole(path: Path, content: str | bytes, fix: str = "choose another file") -> None:
+    """Write a file as a whole or not at all; a symbolic link stays one. Raises ConfigError.
 
     What cannot be replaced, e.g. `/dev/stdout` or a file in a folder of another user, is written in place.
     """
@@ -74,7 +74,7 @@ def write_whole(path: Path, text: str, fix: str = "choose another file") -> None
     part = target.with_name(f".{target.name}.part") if is_replaced else target
     with writes(path, fix):
         try:
-            part.write_bytes(text.encode())
+            part.write_bytes(content.encode() if isinstance(content, str) else content)
             if is_replaced and target.exists():
                 shutil.copymode(target, part)
             if is_replaced:

@@ -20,7 +20,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from sightline.operator_side.client.pictures import Pictures, Shot
-from sightline.operator_side.preflight import check_out_file, needs, writes
+from sightline.operator_side.preflight import check_out_file, needs, write_whole, writes
 from sightline.protocol.channels import OVERLAY, Channel
 from sightline.protocol.errors import ConfigError, LinkError, RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
@@ -164,6 +164,8 @@ def check_target(path: Path, seconds: float | None) -> None:
     if kind in PICTURES and seconds is not None:
         raise ConfigError(f"--seconds needs a video, and {path} is an image; use --out NAME.mp4")
     check_out_file(path)
+    if kind == VIDEO and path.exists() and not path.is_file():
+        raise ConfigError(f"cannot write {path}: it is a device or a pipe; name a file")
 
 
 def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
@@ -172,7 +174,7 @@ def snapshot(pictures: Pictures, path: Path, wanted: Channel) -> Captured:
     while (shot := _wanted(pictures, wanted, ends_s)) is not None:
         with suppress(WireError):  # the next one may be valid
             data = shot.jpeg if path.suffix.lower() != ".png" else cv2.imencode(".png", jpeg_pixels(shot.jpeg))[1]
-            _write(path, bytes(data))
+            write_whole(path, bytes(data))
             return Captured(path, 1, 0.0, shot.width_px, shot.height_px)
     raise LinkError(_silence(pictures, wanted))
 
@@ -256,14 +258,3 @@ def _silence(pictures: Pictures, wanted: Channel) -> str:
     if wanted is OVERLAY:
         return f"no overlay of robot '{robot}' after {PATIENCE_S:g} s; run `sightline vision`"
     return f"no image from robot '{robot}' after {PATIENCE_S:g} s; run `sightline status {robot}`"
-
-
-def _write(path: Path, data: bytes) -> None:
-    target = Path(os.path.realpath(path))
-    unfinished = target.with_name(f".{target.name}.part")
-    try:
-        with writes(path):
-            unfinished.write_bytes(data)
-            unfinished.replace(target)
-    finally:
-        unfinished.unlink(missing_ok=True)

@@ -1,6 +1,7 @@
 """Films and snapshots: what ends them, and a full disk, which is one line and leaves no unfinished file."""
 
 import json
+import os
 import resource
 import signal
 from collections.abc import Iterator
@@ -14,7 +15,7 @@ import simplejpeg
 
 from sightline.operator_side.cli import watch
 from sightline.operator_side.client.pictures import Shot
-from sightline.operator_side.recording.film import Captured, Cut, Film, film, snapshot
+from sightline.operator_side.recording.film import Captured, Cut, Film, check_target, film, snapshot
 from sightline.protocol.channels import FRAME
 from sightline.protocol.errors import ConfigError
 from tests.fixtures.commands import run
@@ -170,3 +171,19 @@ def test_symbolic_link_stays_one(tmp_path: Path) -> None:
             snapshot(Played(), link, FRAME)
         assert link.readlink() == file and file.stat().st_size > 0
     assert len(list(tmp_path.rglob("*"))) == 7
+
+
+@pytest.mark.parametrize("name", ["pipe.jpg", "link.jpg", "pipe.mp4", "link.mp4"])
+def test_device_or_pipe_is_never_replaced(tmp_path: Path, name: str) -> None:
+    pipe = tmp_path / f"pipe{Path(name).suffix}"
+    os.mkfifo(pipe)
+    (tmp_path / f"link{pipe.suffix}").symlink_to(pipe)
+    with os.fdopen(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK), "rb") as reader:
+        if pipe.suffix == ".mp4":  # its index is written into the part before
+            with pytest.raises(ConfigError, match=f"cannot write {tmp_path / name}: it is a device or a pipe; name a"):
+                check_target(tmp_path / name, None)
+        else:
+            check_target(tmp_path / name, None)
+            snapshot(Played(), tmp_path / name, FRAME)
+            assert reader.read() == NOISE
+    assert pipe.is_fifo() and len(list(tmp_path.iterdir())) == 2
