@@ -1,6 +1,7 @@
 """Checks of what a command needs: its extra is installed, and its result can be written. Shell (files)."""
 
 import os
+import secrets
 import shutil
 import sys
 from collections.abc import Iterator
@@ -64,6 +65,11 @@ def writes(path: Path, fix: str = "choose another file") -> Iterator[None]:
         raise ConfigError(f"cannot write {path}: {error.strerror or error}; {fix}") from None
 
 
+def unfinished(target: Path, suffix: str) -> Path:
+    """Return the name of an unfinished file beside `target`, another one at each call: two programs may write it."""
+    return target.with_name(f".{target.name}.{secrets.token_hex(4)}{suffix}")
+
+
 def write_whole(path: Path, content: str | bytes, fix: str = "choose another file") -> None:
     """Write a file as a whole or not at all; a symbolic link stays one. Raises ConfigError.
 
@@ -71,7 +77,7 @@ def write_whole(path: Path, content: str | bytes, fix: str = "choose another fil
     """
     target = Path(os.path.realpath(path))
     is_replaced = not target.exists() or (target.is_file() and os.access(target.parent, os.W_OK))
-    part = target.with_name(f".{target.name}.part") if is_replaced else target
+    part = unfinished(target, ".part") if is_replaced else target
     with writes(path, fix):
         try:
             part.write_bytes(content.encode() if isinstance(content, str) else content)

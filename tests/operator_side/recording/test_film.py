@@ -187,3 +187,25 @@ def test_device_or_pipe_is_never_replaced(tmp_path: Path, name: str) -> None:
             snapshot(Played(), tmp_path / name, FRAME)
             assert reader.read() == NOISE
     assert pipe.is_fifo() and len(list(tmp_path.iterdir())) == 2
+
+
+def test_two_videos_to_one_file_leave_a_whole_one(tmp_path: Path) -> None:
+    path, images = tmp_path / "run.mp4", 80
+
+    class Interrupting(Played):
+        """While the encoder already writes, another program makes a video of the same name."""
+
+        def __init__(self) -> None:
+            self._shots = iter([Shot(FRAME, NOISE, "0000000a", at, at * 20_000, 160, 120) for at in range(images + 1)])
+            self._taken = 0
+
+        def take(self, seconds: float) -> Shot:
+            self._taken += 1
+            if self._taken == images - 5:
+                film(Played(), path, FRAME, 0.9)
+            return super().take(seconds)
+
+    film(Interrupting(), path, FRAME, (images - 1.5) * 0.02)
+    with av.open(str(path)) as file:
+        assert len(list(file.decode(video=0))) == images - 1
+    assert list(tmp_path.iterdir()) == [path]
