@@ -50,7 +50,8 @@ def _checker(width_px: int, height_px: int) -> Decoder:
 Image = NDArray[np.uint8]
 _TICKS_PER_S: Final = 90_000  # usual for H.264
 _TIME_BASE: Final = Fraction(1, _TICKS_PER_S)
-_ENCODING: Final = {"preset": "veryfast", "crf": "23"}
+# Without B-frames the last image is the last in the file. With them the file ends before it.
+_ENCODING: Final = {"preset": "veryfast", "crf": "23", "bf": "0"}
 
 
 class Film:

@@ -9,6 +9,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pytest
 import simplejpeg
@@ -209,3 +210,16 @@ def test_two_videos_to_one_file_leave_a_whole_one(tmp_path: Path) -> None:
     with av.open(str(path)) as file:
         assert len(list(file.decode(video=0))) == images - 1
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 10, 11, 17, 18])
+def test_video_lasts_to_its_last_image(tmp_path: Path, count: int) -> None:
+    gaps_ms = [68, 136, 68, 100, 136, 100, 68, 68, 136, 200, 68, 68, 100, 136, 100, 100, 168, 100][:count]
+    times_us = [1000 * sum(gaps_ms[:at]) for at in range(count + 1)]
+    floor = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (120, 160, 3), np.uint8), (15, 15), 0)
+    with Film(tmp_path / "run.mp4", 30) as made:
+        for at, t_us in enumerate(times_us):
+            made.add(np.roll(floor, at, 1), t_us)
+    with av.open(str(tmp_path / "run.mp4")) as file:
+        assert [frame.time for frame in file.decode(video=0)] == pytest.approx([at / 1e6 for at in times_us], abs=1e-4)
+        assert file.duration / av.time_base > times_us[-1] / 1e6
