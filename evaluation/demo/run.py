@@ -1,13 +1,15 @@
 """Starts, arms, watches and ends the three processes of a demo. Shell."""
 
+import fcntl
 import math
 import os
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -278,7 +280,7 @@ def _about(run: DemoRun) -> dict[str, str]:
 def run_folder(out: Path | None, name: str) -> Path:
     """Make the folder of a run: `out`, or a new one below `runs`.
 
-    Raises ConfigError if it cannot be made, or has files and none of them is of a run.
+    Raises ConfigError if it cannot be made, has files and none of them is of a run, or is of a run in progress.
     """
     dated = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
     folder = home_path(out or Path("runs") / dated).absolute()
@@ -287,11 +289,25 @@ def run_folder(out: Path | None, name: str) -> Path:
             folder.mkdir(parents=True, exist_ok=out is not None)
             if any(folder.iterdir()) and not any((folder / mark).exists() for mark in _MARKS):
                 raise ConfigError(f"run folder {folder} has other files; choose a new one with --out")
+            _lock(folder)
             return folder
         except OSError as error:
             if out is not None or not isinstance(error, FileExistsError):
                 raise ConfigError(f"run folder {folder}: {error.strerror}; choose another with --out") from None
             folder = folder.with_name(folder.name + "-again")  # another run began in the same second
+
+
+@cache
+def _lock(folder: Path) -> int:
+    """Keep other processes from running in `folder` until this one ends. Raises ConfigError if one does."""
+    number = os.open(folder, os.O_RDONLY)
+    with suppress(OSError):  # a file system without locks
+        try:
+            fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(number)
+            raise ConfigError(f"run folder {folder} is of a run in progress; choose another with --out") from None
+    return number
 
 
 @contextmanager

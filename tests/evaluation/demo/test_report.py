@@ -1,6 +1,9 @@
 """The score of one demo and of many: also by the reports of the mission, and each figure by its own kind of bound."""
 
+import errno
+import fcntl
 import json
+import os
 import shutil
 import tomllib
 from dataclasses import asdict, replace
@@ -183,6 +186,29 @@ def test_interrupt_before_the_first_sample_ends_the_demo(tmp_path, monkeypatch):
     monkeypatch.setattr(demo_run, "_drive", interrupted)
     with pytest.raises(KeyboardInterrupt):
         demo_run.run_demo(DemoOptions(out=tmp_path), print)
+
+
+def test_run_folder_of_a_run_in_progress_is_rejected(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    other = os.open(folder, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    for _ in range(2):
+        with pytest.raises(ConfigError, match=f"run folder {folder} is of a run in progress; choose another with"):
+            demo_run.run_folder(folder, "")
+    os.close(other)
+    assert demo_run.run_folder(folder, "") == folder
+    with pytest.raises(BlockingIOError):
+        fcntl.flock(os.open(folder, os.O_RDONLY), fcntl.LOCK_EX | fcntl.LOCK_NB)
+    assert demo_run.run_folder(folder, "") == folder, "the same process may run there again"
+
+
+def test_run_folder_without_locks_is_used(tmp_path, monkeypatch):
+    def without_locks(_number, _flags):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", without_locks)
+    assert demo_run.run_folder(tmp_path / "run", "") == tmp_path / "run"
 
 
 def test_run_folder_is_new_or_of_an_earlier_run(tmp_path):
