@@ -5,7 +5,7 @@ import secrets
 import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Final
 
@@ -65,9 +65,18 @@ def writes(path: Path, fix: str = "choose another file") -> Iterator[None]:
         raise ConfigError(f"cannot write {path}: {error.strerror or error}; {fix}") from None
 
 
-def unfinished(target: Path, suffix: str) -> Path:
-    """Return the name of an unfinished file beside `target`, another one at each call: two programs may write it."""
-    return target.with_name(f".{target.name}.{secrets.token_hex(4)}{suffix}")
+@contextmanager
+def whole(target: Path, suffix: str = ".part") -> Iterator[Path]:
+    """Yield an unfinished file beside `target`, which replaces it at the end of the block and is removed by an error.
+
+    It has another name each time, because two programs may write `target`.
+    """
+    part = target.with_name(f".{target.name}.{secrets.token_hex(4)}{suffix}")
+    try:
+        yield part
+        part.replace(target)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def write_whole(path: Path, content: str | bytes, fix: str = "choose another file") -> None:
@@ -77,14 +86,7 @@ def write_whole(path: Path, content: str | bytes, fix: str = "choose another fil
     """
     target = Path(os.path.realpath(path))
     is_replaced = not target.exists() or (target.is_file() and os.access(target.parent, os.W_OK))
-    part = unfinished(target, ".part") if is_replaced else target
-    with writes(path, fix):
-        try:
-            part.write_bytes(content.encode() if isinstance(content, str) else content)
-            if is_replaced and target.exists():
-                shutil.copymode(target, part)
-            if is_replaced:
-                part.replace(target)
-        finally:
-            if is_replaced:
-                part.unlink(missing_ok=True)
+    with writes(path, fix), whole(target) if is_replaced else nullcontext(target) as part:
+        part.write_bytes(content.encode() if isinstance(content, str) else content)
+        if is_replaced and target.exists():
+            shutil.copymode(target, part)

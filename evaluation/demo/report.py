@@ -25,7 +25,7 @@ from sightline.evaluation.score.figures import (
 )
 from sightline.evaluation.score.runs import MOST_NOTICES
 from sightline.operator_side.client.requests import StatusReport, read_report
-from sightline.operator_side.preflight import needs, writes
+from sightline.operator_side.preflight import needs, whole, writes
 from sightline.operator_side.recording.recorder import read_recording
 from sightline.operator_side.recording.replay import Replayed, replay
 from sightline.protocol.channels import STATUS
@@ -97,7 +97,8 @@ def write_files(scored: DemoReport) -> None:
     """Write score.json, trajectory.png and run.mp4 to the run folder. Raises ConfigError if one cannot be written."""
     folder = scored.run.folder
     with writes(folder, OTHER_FOLDER):
-        (folder / "score.json").write_text(json.dumps(scored.to_dict(), indent=2) + "\n", "utf-8")
+        with whole(folder / "score.json") as part:
+            part.write_text(json.dumps(scored.to_dict(), indent=2) + "\n", "utf-8")
         _draw(scored.run, folder / RECORDING)
 
 
@@ -120,8 +121,10 @@ def _draw(run: DemoRun, recording: Path) -> None:
     options, safety = run.options, robot_config(robot_of(run.scenario)).safety
     limits, statuses = AgeLimits(safety.full_speed_age_ms, safety.zero_speed_age_ms), read_statuses(recording)
     title = f"{run.scenario.name}, seed {options.seed}, +{options.latency_ms:g} ms, {options.loss:.0%} loss"
-    plot_run(run.folder / "trajectory.png", run.samples, run.scenario, title, statuses=statuses, limits=limits)
-    film_run(run.folder / "run.mp4", recording, run.samples, run.scenario, statuses)
+    with whole(run.folder / "trajectory.png", ".png") as part:
+        plot_run(part, run.samples, run.scenario, title, statuses=statuses, limits=limits)
+    with whole(run.folder / "run.mp4", ".mp4") as part:
+        film_run(part, recording, run.samples, run.scenario, statuses)
 
 
 def read_statuses(recording: Path) -> "list[StatusAt]":

@@ -20,7 +20,7 @@ import simplejpeg
 from numpy.typing import NDArray
 
 from sightline.operator_side.client.pictures import Pictures, Shot
-from sightline.operator_side.preflight import check_out_file, needs, unfinished, write_whole, writes
+from sightline.operator_side.preflight import check_out_file, needs, whole, write_whole, writes
 from sightline.protocol.channels import OVERLAY, Channel
 from sightline.protocol.errors import ConfigError, LinkError, RejectReason, WireError
 from sightline.protocol.jpeg import read_jpeg_size
@@ -187,18 +187,12 @@ def film(pictures: Pictures, path: Path, wanted: Channel, seconds: float) -> Cap
     The capture times end it, so that a first image that comes late does not make the film longer.
     """
     target = Path(os.path.realpath(path))  # a symbolic link stays one
-    part = unfinished(target, VIDEO)
-    try:
-        with _terminated_like_ctrl_c():
-            with writes(path), Film(part, _FPS) as made:
-                cut = _fill(made, pictures, wanted, seconds)
-            if not made.frames:
-                raise LinkError(_silence(pictures, wanted))
-            with writes(path):
-                part.replace(target)
-        return Captured(path, made.frames, made.seconds, *made.size_px, cut)
-    finally:
-        part.unlink(missing_ok=True)
+    with _terminated_like_ctrl_c(), writes(path), whole(target, VIDEO) as part:
+        with Film(part, _FPS) as made:
+            cut = _fill(made, pictures, wanted, seconds)
+        if not made.frames:
+            raise LinkError(_silence(pictures, wanted))
+    return Captured(path, made.frames, made.seconds, *made.size_px, cut)
 
 
 def _fill(made: Film, pictures: Pictures, wanted: Channel, seconds: float) -> Cut:

@@ -4,6 +4,7 @@ import errno
 import fcntl
 import json
 import os
+import resource
 import shutil
 import tomllib
 from dataclasses import asdict, replace
@@ -139,6 +140,26 @@ def test_results_are_printed_before_files_that_cannot_be_written(lights, tmp_pat
     assert code == 2 and json.loads(out)["checks"]
     assert err.splitlines()[-1] == (
         f"error: cannot write {folder}: Is a directory; free some space or pass another folder with --out")
+
+
+@pytest.mark.parametrize(("room_bytes", "files"), [
+    (500, []), (5_000, ["score.json"]), (80_000, ["score.json", "trajectory.png"]),
+])  # fmt: skip
+def test_full_disk_leaves_no_damaged_file(lights, tmp_path, monkeypatch, room_bytes, files):
+    judged = demo_report.report(lights)
+    monkeypatch.setattr(lights, "folder", tmp_path)
+    with Recorder(StatusLink(), tmp_path / RECORDING, {}):
+        pass
+    monkeypatch.setattr("sightline.evaluation.plots.plot_run", lambda path, *_, **__: path.write_bytes(bytes(50_000)))
+    monkeypatch.setattr("sightline.evaluation.demo.video.film_run", lambda path, *_: path.write_bytes(bytes(90_000)))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room_bytes, limits[1]))
+    try:
+        with pytest.raises(ConfigError, match=f"cannot write {tmp_path}: File too large; free some space"):
+            demo_report.write_files(judged)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [RECORDING, *files]
 
 
 def test_recording_without_a_camera_model_names_the_error_of_the_disk(lights, tmp_path):
