@@ -207,7 +207,7 @@ def _fill(made: Film, pictures: Pictures, wanted: Channel, seconds: float) -> Cu
                 elapsed_s = max(now_s + seconds - ends_s, made.seconds + 0.001)
                 session, offset_us = shot.session, round(elapsed_s * 1e6) - shot.t_us
             if made.since_first_s(shot.t_us + offset_us) > seconds:
-                return ""
+                break
             with suppress(WireError):  # an invalid image
                 made.add(jpeg_pixels(shot.jpeg), shot.t_us + offset_us)
     except KeyboardInterrupt:

@@ -142,6 +142,12 @@ def test_film_whose_images_end_early_is_reported(monkeypatch, tmp_path: Path, la
     assert (made.frames, made.cut) == (last_ms // 100, cut)
 
 
+@pytest.mark.parametrize(("at", "cut"), [(500, "silent"), (1900, "silent"), (2300, "")])
+def test_film_that_a_wrong_capture_time_ends_early_is_reported(monkeypatch, tmp_path: Path, at: int, cut: str) -> None:
+    shots = {one: ("0000000a", one if one < at else 10**9) for one in range(100, 4000, 100)}
+    assert film(Timed(monkeypatch, shots), tmp_path / "run.mp4", FRAME, 3.0).cut == cut
+
+
 @pytest.mark.parametrize(("cut", "lines"), [("", 0), ("interrupted", 0), ("silent", 1)])
 def test_capture_names_a_video_that_is_not_complete(monkeypatch, capsys, tmp_path: Path, cut: Cut, lines: int) -> None:
     monkeypatch.setattr(watch, "open_link", lambda *_given, **_more: nullcontext())
