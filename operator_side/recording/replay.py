@@ -5,8 +5,11 @@ and with the scan and the mission that each answer cites.
 """
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from pydantic import ValidationError
 
 from sightline.operator_side.recording.recorder import read_about, read_recording
 from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, MISSION, SCAN, TWIST
@@ -102,6 +105,23 @@ def replay_steps(path: Path) -> Iterator[Step]:
     return _steps(path, answers)
 
 
+def _messages(path: Path) -> Iterator[Message]:
+    """Yield the valid messages; the services ignored the others, too."""
+    for recorded in read_recording(path):
+        with suppress(WireError):
+            _check(recorded.message)
+            yield recorded.message
+
+
+def _check(message: Message) -> None:
+    channel = message.channel
+    decode(channel.header, message.header)
+    if channel is SCAN:
+        decode_scan(message.header, message.payload)
+    elif channel.payload is not None:
+        decode(channel.payload, message.payload, channel.max_payload_bytes)
+
+
 def _newest_camera(message: Message, camera: CameraModel, pipelines: Iterable[Pipeline]) -> CameraModel:
     """Return the camera model in `message`; the pipelines continue with a new one."""
     model = decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
@@ -115,8 +135,7 @@ def _steps(path: Path, answers: _Answers) -> Iterator[Step]:
     config = _vision_config(path)
     camera, detector = _first_camera(path), configured_detector(config)
     pipelines: dict[str, Pipeline] = {}
-    for recorded in read_recording(path):
-        message = recorded.message
+    for message in _messages(path):
         if message.channel is CAMERA:
             camera = _newest_camera(message, camera, pipelines.values())
         if message.channel is not FRAME:
@@ -161,8 +180,7 @@ def _gather_cited(path: Path, answers: _Answers) -> int:
     headers = [header for some in answers.by_frame.values() for header, _ in some]
     scans = {(one.echo.session, one.scan) for one in headers if one.scan is not None}
     missions = {one.mission for one in headers if one.mission is not None}
-    for recorded in read_recording(path):
-        message = recorded.message
+    for message in _messages(path):
         if message.channel is DETECTIONS:
             echo = decode(DetectionsHeader, message.header).echo
             if echo is not None:
@@ -181,13 +199,13 @@ def _gather_cited(path: Path, answers: _Answers) -> int:
 def _answers(path: Path) -> _Answers:
     answers = _Answers()
     last: dict[str, int] = {}
-    for recorded in read_recording(path):
-        header = _answer_header(recorded.message)
+    for message in _messages(path):
+        header = _answer_header(message)
         if header is None:
             continue
         answers.gaps += max(0, header.seq - last.get(header.session, header.seq - 1) - 1)
         last[header.session] = header.seq
-        twist = recorded.message.payload if recorded.message.channel is TWIST else None
+        twist = message.payload if message.channel is TWIST else None
         of_frame = answers.by_frame.setdefault((header.echo.session, header.echo.seq), [])
         # On a lossy link a twist is sent twice. The pipeline computed it once.
         if twist is None or not any((one.session, sent) == (header.session, twist) for one, sent in of_frame):
@@ -199,10 +217,7 @@ def _answer_header(message: Message) -> AnswerHeader | None:
     """Return the header of a vision service's answer to a frame; None for another message."""
     if message.channel not in (TWIST, ACK) or message.source != SOURCE:
         return None
-    try:
-        header = decode(AnswerHeader, message.header)
-    except WireError:
-        return None
+    header = decode(AnswerHeader, message.header)
     return header if header.echo.channel == "frame" else None
 
 
@@ -210,13 +225,16 @@ def _vision_config(path: Path) -> VisionConfig:
     text = read_about(path).get(VISION_CONFIG)
     if text is None:
         raise ConfigError(f"{path} lacks the configuration of the vision service; record it again")
-    return VisionConfig.model_validate_json(text)
+    try:
+        return VisionConfig.model_validate_json(text)
+    except ValidationError:
+        raise ConfigError(f"{path} has a configuration of another version; record it again") from None
 
 
 def _first_camera(path: Path) -> CameraModel:
-    for recorded in read_recording(path):
-        if recorded.message.channel is CAMERA:
-            return decode(CameraModel, recorded.message.payload, CAMERA.max_payload_bytes)
+    for message in _messages(path):
+        if message.channel is CAMERA:
+            return decode(CameraModel, message.payload, CAMERA.max_payload_bytes)
     raise ConfigError(f"{path} has no camera model; record it again")
 
 

@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 
 from sightline.evaluation.lockstep import Conditions, Lockstep
 from sightline.evaluation.scenario_config import robot_config, vision_config
-from sightline.operator_side.recording.recorder import CHUNK_BYTES, MAX_WAITING, Recorder, read_about, read_recording
+from sightline.operator_side.recording.recorder import (
+    CHUNK_BYTES,
+    MAX_WAITING,
+    RECORDED,
+    Recorder,
+    read_about,
+    read_recording,
+)
 from sightline.operator_side.recording.replay import VISION_CONFIG, replay, replay_steps
 from sightline.protocol.channels import CAMERA, CHANNELS, FRAME, STATUS, TWIST
 from sightline.protocol.codec import encode
@@ -195,6 +202,30 @@ def test_replay_reports_missing_messages(recorded, tmp_path, channel, missing_fr
     result = replay(rewritten(recorded, tmp_path / "run.mcap", lambda at, one: None if at == sixth else one))
     assert (result.missing_frames, result.gaps, result.ok) == (missing_frames, gaps, False)
     assert result.total == channels.count(TWIST) - 1
+
+
+@pytest.mark.parametrize("channel", RECORDED)
+@pytest.mark.parametrize("is_of_header", [True, False])
+def test_replay_ignores_an_invalid_message_as_the_services_did(recorded, tmp_path, channel, is_of_header):
+    messages = [one.message for one in read_recording(recorded)]
+    tenth = [at for at, one in enumerate(messages) if one.channel is TWIST][9]
+    header = encode(Stamp(session="0000000b", seq=1, t_us=1))
+    bad = Message(channel, "vision" if channel.has_source else "", b"{" if is_of_header else header, b"{")
+    record(tmp_path / "run.mcap", [bad, *messages[:20], bad, *messages[20 : tenth + 1], bad], **read_about(recorded))
+    result = replay(tmp_path / "run.mcap")
+    assert result.ok and result.total == 10
+
+
+@pytest.mark.parametrize("config", ["{", '{"an_option_of_a_later_version": 1}'])
+def test_recording_of_another_version_is_one_line(recorded, tmp_path, config):
+    messages = [one.message for one in read_recording(recorded)]
+    record(tmp_path / "run.mcap", messages, **{VISION_CONFIG: config})
+    with pytest.raises(ConfigError, match=r"run\.mcap has a configuration of another version; record it again"):
+        replay(tmp_path / "run.mcap")
+    later = [Message(one.channel, one.source, one.header.replace(b'"v":1', b'"v":2'), one.payload) for one in messages]
+    record(tmp_path / "later.mcap", later, **read_about(recorded))
+    with pytest.raises(ConfigError, match=r"later\.mcap has no camera model; record it again"):
+        replay(tmp_path / "later.mcap")
 
 
 def test_replay_needs_the_configuration_of_vision(recorded, tmp_path):
