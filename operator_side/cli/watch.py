@@ -149,7 +149,8 @@ def _silence_fix(channel: Channel) -> str:
     if channel.name == "scan":
         return "check that the robot has a range sensor"
     if channel.direction is Direction.TO_ROBOT and not channel.passed_on:
-        return "connect by an unsecured tcp/ endpoint, since other links deliver it to the robot only"
+        return ("check its publisher, and connect by an unsecured tcp/ endpoint, since other links deliver it to the "
+                "robot only")
     return "check that the robot and the publisher of this channel run"
 
 

@@ -102,6 +102,7 @@ def test_invalid_watch_is_one_line(site: Site, capsys: pytest.CaptureFixture[str
         (["r1", "status", "--csv"], 2, "--csv is for the target"), (["r1", "--csv"], 2, "--csv is for the target"),
         (["r1", "target", "--csv", "--json"], 2, "--csv is for the target"),
         (["r1", "twist", "--connect", site.web, "--seconds", "1"], 4, "deliver it to the robot only"),
+        (["r1", "request", "--connect", site.zenoh, "--seconds", "0.5"], 4, "check its publisher, and connect by"),
         (["r1", "scan", "--connect", "tcp/127.0.0.1:1", "--seconds", "1"], 4, "tcp/127.0.0.1:1"),
     ):
         assert run(["watch", *arguments]) == code
