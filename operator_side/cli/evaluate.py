@@ -162,7 +162,7 @@ def score(
         from sightline.evaluation.score.sabotage import sabotages_named
         from sightline.sim.scenario import scenario_names
     wanted = cases(
-        scenario_names() if scenario == "all" else scenario.split(","),
+        scenario_names() if scenario == "all" else [name.strip() for name in scenario.split(",")],
         numbers("--seeds", seeds, int), numbers("--latency-ms", latency_ms, float), numbers("--loss", loss, float),
         seconds, mission=mission, robot=robot_model, look=look, detector=detector,
     )

@@ -137,6 +137,11 @@ def test_scenario_without_bounds_at_this_latency_is_not_evaluated(capsys):
     assert result["ok"] is None and result["checks"] == [] and len(result["not_evaluated"]) == 1
 
 
+def test_blanks_beside_the_commas_of_a_list_change_nothing(capsys):
+    assert cli.run(["score", "--scenario", " static , circle, nosuch", "--seeds", "1, 2"]) == 2
+    assert capsys.readouterr().err.startswith("error: no scenario called 'nosuch'")
+
+
 def test_scenario_that_extends_another_is_scored_by_its_bounds(tmp_path, capsys):
     mine = tmp_path / "mine.toml"
     mine.write_text(OPEN_VIEW.replace("bounds = {}", ""))
