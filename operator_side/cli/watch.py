@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -183,7 +184,7 @@ def capture(
     target = target_of(robot, connect, secure)
     robot, secure = target.robot, target.secure
     kind = "mp4" if seconds is not None else "png"
-    path = home_path(out or Path(f"{robot}-{time.strftime('%Y%m%d-%H%M%S')}.{kind}"))
+    path = home_path(out or Path(f"{robot}-{datetime.now():%Y%m%d-%H%M%S-%f}.{kind}"))
     check_target(path, seconds)
     wanted, role = OVERLAY if overlay else FRAME, viewer_role(secure)
     with open_link(robot, connect=target.connect, role=role, secure=secure) as link:

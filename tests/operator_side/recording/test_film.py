@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import resource
 import signal
 from collections.abc import Iterator
@@ -159,6 +160,16 @@ def test_capture_names_a_video_that_is_not_complete(monkeypatch, capsys, tmp_pat
     warnings = [line for line in err.splitlines() if "shorter than requested" in line]
     assert code == 0 and json.loads(out)["complete"] is (cut == "") and len(warnings) == lines
     assert all("after 2.0 s" in line for line in warnings)
+
+
+def test_captures_of_one_second_have_names_of_their_own(monkeypatch, capsys, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(watch, "open_link", lambda *_given, **_more: nullcontext())
+    monkeypatch.setattr(watch, "Pictures", lambda *_given: Played())
+    outcomes = [run(capsys, "capture", "r1", "--connect", "tcp/127.0.0.1:1") for _ in range(4)]
+    assert [code for code, _, _ in outcomes] == [0] * 4
+    names = [path.name for path in tmp_path.iterdir()]
+    assert len(names) == 4 and all(re.fullmatch(r"r1-\d{8}-\d{6}-\d{6}\.png", name) for name in names)
 
 
 def test_snapshot_on_a_full_disk_is_reported(tmp_path: Path) -> None:
