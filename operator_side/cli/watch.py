@@ -30,6 +30,7 @@ from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.preflight import needs
 from sightline.protocol.channels import CHANNELS, FRAME, OVERLAY, PREVIEW, REPORT, Channel, Direction
 from sightline.protocol.errors import ConfigError, LinkError, home_path
+from sightline.protocol.log import printable
 from sightline.protocol.transports.link import Link, Message
 from sightline.protocol.transports.open import open_link
 
@@ -113,7 +114,7 @@ def _target_form(robot: str, as_json: bool, as_csv: bool) -> Callable[[Message],
         if as_csv:
             line = io.StringIO()
             csv.writer(line, lineterminator="").writerow("" if one is None else one for one in target.values())
-            return line.getvalue()
+            return printable(line.getvalue())
         return json.dumps(target) if as_json else target_line(target)
 
     return form

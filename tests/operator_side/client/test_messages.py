@@ -1,13 +1,15 @@
 """Any message of any channel as text: nothing is lost as JSON; no bytes whatever raise or reach the terminal raw."""
 
+import csv
 import json
 import math
 import struct
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from sightline.operator_side.cli.watch import _target_form
 from sightline.operator_side.client.messages import (
     MAX_WAITING,
     TARGET_COLUMNS,
@@ -18,6 +20,7 @@ from sightline.operator_side.client.messages import (
     target_object,
 )
 from sightline.protocol.channels import CHANNELS, JPEG, SCAN, STATUS, TWIST
+from sightline.protocol.log import printable
 from sightline.protocol.spec.message_cases import ANSWER, CASES, REPORT, TARGET, USUAL, packed
 from sightline.protocol.transports.link import Message
 from sightline.protocol.transports.memory import MemoryNetwork
@@ -80,6 +83,18 @@ def test_message_of_a_peer_cannot_control_the_terminal():
     assert line.isprintable() and "gone" in line and "mine" in line
     assert target_line(target_of(label="\x9b2J")).isprintable()
     assert target_line(target_object(usual("report", payload=packed(REPORT | {"phase": "\x1b[2J"})))).isprintable()
+
+
+@settings(max_examples=30)
+@given(st.text(max_size=32), st.text(st.characters(max_codepoint=0x9F), max_size=32))
+@example("\x1b[2J", "mine\nr1,0,tracking")
+@example('a "quoted", \r\n one', "\x85\u2028")
+def test_row_of_a_table_is_one_line_that_cannot_control_the_terminal(phase, detector):
+    form = _target_form("r1", as_json=False, as_csv=True)
+    row = form(usual("report", payload=packed(REPORT | {"phase": phase, "detector": detector})))
+    assert row.isprintable()
+    cells = dict(zip(TARGET_COLUMNS, *csv.reader([row]), strict=True))
+    assert [cells["phase"], cells["detector"]] == [printable(phase), printable(detector)]
 
 
 @given(st.sampled_from(list(CHANNELS.values())), st.binary(max_size=80), st.binary(max_size=80))
