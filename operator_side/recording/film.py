@@ -68,7 +68,7 @@ class Film:
         self._first_us = self._last_ticks = -1
         self.frames = 0
         self.size_px = (0, 0)
-        """Width and height of the first image."""
+        """Width and height of the film, which are even."""
 
     def add(self, picture: Image, t_us: int) -> bool:
         """Append an image (BGR). Returns False and skips it unless it is later than the last."""
@@ -116,8 +116,7 @@ class Film:
     def _opened(self, picture: Image) -> Any:
         stream = self._container.add_stream("libx264", rate=self._fps)
         height, width = picture.shape[:2]
-        self.size_px = (width, height)
-        stream.width, stream.height = max(2, width - width % 2), max(2, height - height % 2)
+        self.size_px = stream.width, stream.height = max(2, width - width % 2), max(2, height - height % 2)
         stream.pix_fmt = "yuv420p"  # every player shows it; it needs even sides
         stream.time_base = stream.codec_context.time_base = _TIME_BASE
         stream.options = dict(_ENCODING)

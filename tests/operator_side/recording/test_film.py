@@ -240,3 +240,12 @@ def test_video_lasts_to_its_last_image(tmp_path: Path, count: int) -> None:
     with av.open(str(tmp_path / "run.mp4")) as file:
         assert [frame.time for frame in file.decode(video=0)] == pytest.approx([at / 1e6 for at in times_us], abs=1e-4)
         assert file.duration / av.time_base > times_us[-1] / 1e6
+
+
+@pytest.mark.parametrize("sizes_px", [[(161, 121)], [(160, 120), (80, 61)], [(1, 1), (160, 120)], [(2, 3), (5, 4)]])
+def test_size_of_a_video_is_that_of_its_file(tmp_path: Path, sizes_px: list[tuple[int, int]]) -> None:
+    with Film(tmp_path / "run.mp4", 30) as made:
+        for at, (width_px, height_px) in enumerate(sizes_px):
+            assert made.add(np.full((height_px, width_px, 3), 99, np.uint8), at * 100_000)
+    with av.open(str(tmp_path / "run.mp4")) as file:
+        assert {(frame.width, frame.height) for frame in file.decode(video=0)} == {made.size_px}
