@@ -37,6 +37,7 @@ from sightline.protocol.config import Config
 from sightline.protocol.messages import Holder, Planar, Pose, SessionId
 from sightline.protocol.transports.link import Message, OutgoingQueue
 from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS
 
 _log: Final = logging.getLogger(__name__)
 
@@ -259,8 +260,6 @@ _END_S = 1.0
 _FIRST_PATIENCE_US, _LONGEST_PATIENCE_US = 2_000_000, 60_000_000
 CAMERA_EXIT: Final = 71
 """Exit code of a network process whose camera hangs or gives no image. A new process opens the camera again."""
-KEYS: Final = (signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP)
-"""Ctrl-C, Ctrl-\\ and Ctrl-Z reach the network process too. It ignores them; the driver ends it, after zero."""
 _CHILD: Final = (
     "import json, sys; sys.path[:] = json.loads(sys.argv.pop()); "
     "from sightline.robot_side.network.process import main; main()"
@@ -335,8 +334,9 @@ class DriverEnd:
             )
             ours.send(setup.model_dump_json().encode())
             ends = (theirs.fileno(), their_aside.fileno())
-            # The child inherits the mask, so a key does not interrupt its imports; later it ignores these signals.
-            unmask.callback(signal.pthread_sigmask, signal.SIG_SETMASK, signal.pthread_sigmask(signal.SIG_BLOCK, KEYS))
+            # The child inherits the mask, so that no signal interrupts its imports; later it ignores these signals.
+            before = signal.pthread_sigmask(signal.SIG_BLOCK, EXIT_SIGNALS)
+            unmask.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
             self._process = subprocess.Popen(_command(ends), pass_fds=ends, stdin=subprocess.DEVNULL)
             undo.pop_all()
         self.socket, self._aside = ours, aside

@@ -28,8 +28,9 @@ from sightline.protocol.transports.open import Relay, open_link
 from sightline.protocol.transports.security import ROBOT_ROLE, date_problem
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import PluginChoice
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS
 from sightline.robot_side.network.core import NetworkCore
-from sightline.robot_side.pipe import CAMERA_EXIT, KEYS, NetworkEnd, NetworkSetup
+from sightline.robot_side.pipe import CAMERA_EXIT, NetworkEnd, NetworkSetup
 from sightline.robot_side.plugins import CAMERAS
 from sightline.robot_side.ports import Camera, Picture, check_image
 
@@ -354,9 +355,10 @@ def _run(setup: NetworkSetup, driver: NetworkEnd) -> None:
 def main() -> None:
     """Run the network process. argv[1] and argv[2] are the descriptors of its sockets."""
     start_log(None, "robot")
-    for number in KEYS:
+    # A terminal and systemd send them to all processes. The driver ends this one, after wheels at zero.
+    for number in EXIT_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, KEYS)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, EXIT_SIGNALS)
     driver = NetworkEnd(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
     setup = NetworkSetup.model_validate_json(driver.receive())
     code = 1

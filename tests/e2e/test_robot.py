@@ -20,7 +20,8 @@ from tests.fixtures.robot_process import RobotProcess, Vision, driving, stop_aft
 pytestmark = pytest.mark.waits
 
 BOUND_S, BOUND_M = 0.7, 0.25
-KEYS = [signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP]  # Ctrl-C, Ctrl-\, Ctrl-Z
+# Ctrl-C, Ctrl-\, Ctrl-Z, a terminal that closes, and systemd: each signals every process.
+KEYS = [signal.SIGINT, signal.SIGQUIT, signal.SIGTSTP, signal.SIGHUP, signal.SIGTERM]
 
 
 def test_robot_drives_on_fresh_answers_and_stops_when_they_end(tmp_path):
@@ -77,17 +78,20 @@ def test_background_robot_is_not_stopped_by_its_terminal(tmp_path, number):
         assert until(lambda: vision.status().state is State.ACTIVE)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, *KEYS])
-def test_shutdown_follows_zero_and_leaves_no_process(tmp_path, number):
+@pytest.mark.parametrize(("number", "is_for_all"), [
+    (signal.SIGTERM, False), (signal.SIGHUP, False), *((key, True) for key in KEYS),
+])
+def test_shutdown_follows_zero_and_leaves_no_process(tmp_path, number, is_for_all):
     with RobotProcess(tmp_path) as robot, Vision(robot.endpoint):
         assert driving(robot)
         driver, network, since = robot.driver_pid(), robot.network_pid(), monotonic_us()
-        for pid in (robot.process.pid, driver, network) if number in KEYS else (robot.process.pid,):
+        for pid in (robot.process.pid, driver, network) if is_for_all else (robot.process.pid,):
             os.kill(pid, number)
         assert robot.process.wait(3) == 0
         assert robot.speed() == 0.0
         seconds, metres = stop_after(robot.motor_rows(), since)
         assert seconds <= BOUND_S and metres <= BOUND_M
+        assert "network process ended" not in robot.output(), "the driver ends it, after wheels at zero"
         for pid in (driver, network):
             with pytest.raises(ProcessLookupError):
                 os.kill(pid, 0)

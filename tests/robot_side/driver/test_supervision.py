@@ -19,6 +19,7 @@ from sightline.robot_side.hardware.log_drive import LogDrive
 from tests.fixtures.links import START_S, until
 from tests.fixtures.robot_process import RobotProcess
 
+BOUND_S = 0.7
 UNIT = Path(__file__).parent.parent.parent.parent / "robot_side" / "systemd" / "sightline-robot.service"
 
 
@@ -37,6 +38,15 @@ def test_the_unit_watches_restarts_and_zeroes():
     assert service["ExecStart"].split(" --zero")[0] == service["ExecStopPost"].split(" --zero")[0]
     assert float(service["TimeoutStopSec"]) > ENDS_WITHIN_US / 1e6, "the guardian waits so long for the driver process"
     assert int(service["LimitRTPRIO"]) >= GUARDIAN_PRIORITY > DRIVER_PRIORITY
+
+
+def test_systemd_leaves_a_live_driver_time_to_ramp_and_zeroes_only_after_all_processes_ended():
+    """With KillMode=mixed, systemd 252 kills the driver process 10 ms after a guardian that was killed, and calls
+    --zero-motors while a hung driver process still has the motors."""
+    service = unit_file()["Service"]
+    assert service["KillMode"] == "control-group"
+    assert service["WatchdogSignal"] == "SIGTERM", "SIGABRT would kill a driver process that can still ramp to zero"
+    assert BOUND_S <= float(service["TimeoutAbortSec"]) <= 1, "then systemd kills those that hang"
 
 
 def test_a_robot_that_waits_for_its_router_tries_for_ever_and_one_that_fails_at_once_stays_stopped():

@@ -14,9 +14,10 @@ from sightline.protocol.messages import AnswerHeader, CameraModel, Echo, FrameHe
 from sightline.protocol.transports.link import Message
 from sightline.robot_side import pipe as ipc
 from sightline.robot_side.config import RobotConfig
+from sightline.robot_side.driver.supervision import EXIT_SIGNALS
 from sightline.robot_side.network import process as network_process
 from sightline.robot_side.network.process import NetworkProcess
-from sightline.robot_side.pipe import KEYS, DriverEnd, NetworkEnd, NetworkSetup
+from sightline.robot_side.pipe import DriverEnd, NetworkEnd, NetworkSetup
 from sightline.robot_side.ports import Picture
 
 ROBOT = "0000000a"
@@ -220,8 +221,8 @@ def test_camera_loop_wakes_for_an_answer_only_once_a_frame_is_due(process, monke
     assert (slept, waited) == (slept_s, waited_s)
 
 
-@pytest.mark.parametrize("number", KEYS)
-def test_a_key_during_a_start_of_the_network_process_does_not_end_it(tmp_path, monkeypatch, number):
+@pytest.mark.parametrize("number", EXIT_SIGNALS)
+def test_signal_during_a_start_of_the_network_process_does_not_end_it(tmp_path, monkeypatch, number):
     """Whatever it does then, e.g. importing, a traceback would be the last that the operator reads."""
     monkeypatch.setattr(ipc, "_command", lambda _ends: [sys.executable, "-c", "import time; time.sleep(30)"])
     driver_end = DriverEnd(RobotConfig(state_dir=tmp_path), ROBOT)
