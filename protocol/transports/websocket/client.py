@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from sightline.protocol.log import report_fault
 from sightline.protocol.transports.endpoints import SEND_BUFFER_BYTES, WebSocketEndpoint
-from sightline.protocol.transports.security import bearer_header, own_token
+from sightline.protocol.transports.security import bearer_header, certificate_role, own_token
 from sightline.protocol.transports.websocket.connection import Connection
 from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUBPROTOCOL, PeerError
 from sightline.protocol.transports.websocket.peer import OPEN_S, PROTOCOL_OPTIONS
@@ -56,6 +56,7 @@ class Client:
         """
         self.endpoint = endpoint
         self._token = "" if endpoint.legacy else own_token(*keys)
+        self._keys = keys
         self._context = client_tls_context(keys[0]) if endpoint.secure else None
         self._serve, self._count_rejection, self._max_bytes = serve, count_rejection, max_bytes
         self._closing = threading.Event()
@@ -88,7 +89,8 @@ class Client:
             return True
         except InvalidStatus as error:
             answer = (error.response.body or b"").decode("utf-8", "replace").strip()
-            self._turned_away(answer[:200] or f"HTTP {error.response.status_code}", error.response.status_code < 500)
+            status = error.response.status_code
+            self._turned_away(self._missing_token(status) or answer[:200] or f"HTTP {status}", status < 500)
         except ConnectionClosed as error:
             self._turned_away(error.rcvd.reason if error.rcvd else "closed without a reason", _is_final(error))
         except PeerError as error:
@@ -110,6 +112,14 @@ class Client:
         except Exception as error:
             self._turned_away(f"{type(error).__name__}: {report_fault('websocket', error)}"[:200], False)
         return False
+
+    def _missing_token(self, status: int) -> str:
+        """Return which file of the own folder is missing, if a peer that requires a token answers with `status`."""
+        folder, source = self._keys
+        if status != 401 or not folder or self._token:
+            return ""
+        missing = f"{certificate_role(source)}.token is missing in {folder}"
+        return f"{missing}; copy it from the folder of `sightline keys init` to this machine"
 
     def _hangs_up(self) -> str:
         """Return the likely causes of a connection that closes without a byte."""

@@ -192,6 +192,19 @@ def test_a_token_is_shown_once_in_one_of_two_ways(authorizations, offers, role):
     assert role_of_token({token: name for name, token in TOKENS.items()}, authorizations, offers) == role
 
 
+@pytest.mark.parametrize(("source", "file"), [("vision", "vision"), ("teleop", "operator"), ("metrics", "viewer")])
+def test_a_folder_without_the_token_of_its_role_names_the_missing_file(keys, tmp_path, source, file):
+    endpoint, here = everywhere()
+    others = tmp_path / "others"
+    others.mkdir()
+    for role in TOKENS.keys() - {file}:
+        (others / f"{role}.token").write_text(TOKENS[role])
+    with open_websocket("r1", listen=endpoint, secure=keys), pytest.raises(LinkError) as raised:
+        open_websocket("r1", connect=here, role=source, secure=str(others))
+    missing = f"{file}.token is missing in {others}; copy it from the folder of `sightline keys init`"
+    assert f": {missing}" in str(raised.value)
+
+
 def test_only_the_token_permits_a_connection(keys, caplog):
     endpoint, here = everywhere()
     with open_websocket("r1", listen=endpoint, secure=keys) as robot:
