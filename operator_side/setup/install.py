@@ -193,5 +193,5 @@ def _systemctl(arguments: list[str]) -> None:
     except FileNotFoundError:
         raise ConfigError("systemd is missing; the unit is written, start the service in another way") from None
     except subprocess.CalledProcessError as error:
-        lines = (error.stderr or error.stdout).strip().splitlines()
-        raise ConfigError(f"{' '.join(command)}: {lines[-1] if lines else 'failed'}") from None
+        cause = " ".join((error.stderr or error.stdout).split())
+        raise ConfigError(f"{' '.join(command)}: {cause or 'failed'}") from None

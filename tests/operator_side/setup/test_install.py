@@ -151,6 +151,22 @@ def test_folder_that_cannot_be_written_is_reported(name, tmp_path):
         install.write(planned)
 
 
+@pytest.mark.parametrize(("printed", "shown"), [
+    ("Job for x.service failed: the control process exited with an error.\nSee \"systemctl status x.service\".",
+     "Job for x.service failed: the control process exited with an error. See \"systemctl status x.service\"."),
+    ("Failed to connect to bus: No such file or directory", "Failed to connect to bus: No such file or directory"),
+    ("", "failed"),
+])  # fmt: skip
+def test_failure_of_systemctl_is_one_line_with_its_cause(monkeypatch, tmp_path, printed, shown):
+    program = tmp_path / "systemctl"
+    program.write_text(f"#!/bin/sh\ncat >&2 <<'E'\n{printed}\nE\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    with pytest.raises(ConfigError) as raised:
+        install._systemctl(["restart", "x.service"])
+    assert str(raised.value) == f"systemctl restart x.service: {shown}"
+
+
 # --- several vision services ----------------------------------------------------------------------------------------
 
 
