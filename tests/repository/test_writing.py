@@ -60,7 +60,10 @@ _JAVASCRIPT = re.compile(r"""/\*.*?\*/|(?<!:)//[^\n]*|"(?:[^"\\\n]|\\.)*"|`(?:[^
 """Comments and strings."""
 _CODE = re.compile(r"^(old|new|before|after|where|place) = |\$\{[^}]*\}")
 """Quoted code in the tables of mutants, and in the strings of JavaScript."""
-LINES = (".toml", ".yaml", ".urdf", ".xacro", ".css", ".html", ".service", ".conf", "Makefile", "Dockerfile", "run", "engine", "other_python")
+LINES = (
+    ".toml", ".yaml", ".urdf", ".xacro", ".html", ".service", ".conf", "Makefile", "Dockerfile", "run", "engine",
+    "other_python",
+)
 
 
 @cache
@@ -114,7 +117,8 @@ def other_texts(path: Path) -> Iterator[tuple[str, int, str]]:
                 text = found[0][1:-1] if found[0][0] == "`" else found[0]
                 yield "text", source.count("\n", 0, found.start()) + 1, _CODE.sub("", text)
     else:
-        yield from (("line", number, line) for number, line in enumerate(source.splitlines(), 1) if not _CODE.match(line))
+        lines = enumerate(source.splitlines(), 1)
+        yield from (("line", number, line) for number, line in lines if not _CODE.match(line))
 
 
 def hits_in(path: Path) -> Iterator[str]:
@@ -229,8 +233,8 @@ def test_a_text_with_each_pattern_is_found(tmp_path, monkeypatch):
     assert sorted(kinds) == ["comment", "docstring", "string", "test"]
     script = tmp_path / "script.mjs"
     script.write_text(
-        '/** Who\n * nobody hears. */\nconst told = "obeyed";  // judged `told`\nlog(`${told} refused ${x}`, "is none");\n',
-        encoding="utf-8",
+        '/** Who\n * nobody hears. */\nconst told = "obeyed";  // judged `told`\n'
+        'log(`${told} refused ${x}`, "is none");\n', "utf-8",
     )
     assert [hit.split(":")[1] for hit in hits_in(script)] == ["1", "1", "3", "4", "4"]
     table = tmp_path / "mutants.toml"
