@@ -85,9 +85,12 @@ def _is_doubtful(result: Result, before: Sequence[Result]) -> bool:
 
 
 def _after(last: Result, this: Result, count: int) -> Result:
-    """Return the result of two runs of a case after a failed first one. Only a pass, at try `count`, replaces it."""
+    """Return the result of two runs of a case after a failed first one. Only a pass, at try `count`, replaces it.
+
+    A robot that the first run left with turning wheels fails the next ones before they begin, which explains nothing.
+    """
     if this.outcome is not Outcome.PASSED:
-        return this if this.outcome is Outcome.FAILED else last
+        return this if last.outcome is Outcome.SKIPPED else last
     return Result(this.case, this.outcome, f"at try {count}; before: {last.reason}", this.took_us)
 
 

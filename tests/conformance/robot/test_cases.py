@@ -270,6 +270,20 @@ def test_case_with_a_second_try_reports_the_number_of_tries():
     assert run_cases([lacking], bench, tries=2)[0].outcome is Outcome.FAILED
 
 
+@pytest.mark.parametrize("tries", [2, 3])
+def test_case_that_fails_again_reports_its_first_failure(tries):
+    bench, _robot = virtual_robot()
+    runs = []
+
+    def leaves_wheels_turning(bench):
+        runs.append(bench.now_us)
+        bench.expect(False, "the wheels still turn" if len(runs) == 1 else "could not be brought to rest")
+
+    case = Case("R-SIL-99", Level.MUST, "5.4 Silence", "A title.", leaves_wheels_turning)
+    (result,) = run_cases([case], bench, tries=tries)
+    assert (result.outcome, result.reason, len(runs)) == (Outcome.FAILED, "the wheels still turn", tries)
+
+
 def test_a_peer_conforms_if_no_must_failed_and_something_was_tested():
     good, weak = outcome(lambda bench: None), outcome(lambda bench: bench.expect(False, "x"), Level.SHOULD)
     bad, nothing = outcome(lambda bench: bench.expect(False, "x")), outcome(lambda bench: bench.need(False, "x"))
