@@ -394,6 +394,34 @@ def late_stop(bench: Bench, robot: Robot) -> None:
     robot.expect_state(State.STOPPED)
 
 
+@SUITE.must("R-STOP-21", "8.3 Freshness", operator)
+def stop_cites_anything(bench: Bench, operator: Sender) -> None:
+    """STOP is applied whatever status it cites, of another session or never issued, and whatever its `seq` is."""
+    stamp = operator.robot.stamp()
+    for what, changes in (("another session", {"session": "fffffff0"}), ("no status", {"seq": stamp.seq + 5000})):
+        operator.send_request("stop", cite=stamp.model_copy(update=changes), seq=0)
+        operator.robot.expect_state(State.STOPPED, what=f"after a STOP that cites {what}")
+        bench.need(operator.granted("reset"), "reset does not reset (R-STOP-06)")
+        operator.robot.expect_state(State.DISARMED)
+
+
+@SUITE.must("R-STOP-20", "6.6 Proof", _driven)
+def stop_needs_no_proof(bench: Bench, driver: Sender) -> None:
+    """`disarm` and STOP that state the driver's session are granted without its proof."""
+    reply = driver.reply("disarm", proof=None)
+    bench.expect(reply.ok, f"disarm without a proof: {reply.detail}")
+    driver.send_request("stop", proof=None)
+    driver.robot.expect_state(State.STOPPED, what="after STOP without a proof")
+
+
+@SUITE.must("R-ARM-22", "8.2 Requests and replies")
+def disarms_beside_a_human(bench: Bench) -> None:
+    """`disarm` of another role is granted while a human drives."""
+    human = armed(bench, "teleop")
+    Sender(human.robot, "operator").send_request("disarm", cite=False)
+    human.robot.expect_state(State.DISARMED)
+
+
 @SUITE.must("R-STOP-13", "8.2 Requests and replies", armed)
 def reset_of_nothing(bench: Bench, driver: Sender) -> None:
     """`reset` where there is nothing to reset changes nothing: an armed robot drives on."""

@@ -417,6 +417,13 @@ def teleop(bench: Bench) -> Sender:
     return Sender(Robot(bench), "teleop")
 
 
+def ready_human(bench: Bench) -> Sender:
+    """A human driver whose first twist was good, so that it holds the lease."""
+    human = teleop(bench)
+    human.need_good()
+    return human
+
+
 def watcher(bench: Bench) -> Sender:
     """A peer of a role that may not drive."""
     return Sender(Robot(bench), bench.access.watcher)

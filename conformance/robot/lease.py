@@ -12,6 +12,7 @@ from sightline.conformance.robot.fixture import (
     moving,
     operator,
     ready,
+    ready_human,
     teleop,
     vision,
 )
@@ -286,7 +287,14 @@ _FORGED: Final = "ab" * 16
 
 def _copied(bench: Bench) -> tuple[Sender, Sender]:
     """The driver, and a peer that has read its session and its last number, and has a chain of its own."""
-    first = ready(bench)
+    return _copy_of(ready(bench))
+
+
+def _copied_human(bench: Bench) -> tuple[Sender, Sender]:
+    return _copy_of(ready_human(bench))
+
+
+def _copy_of(first: Sender) -> tuple[Sender, Sender]:
     copy = Sender(first.robot, first.source, acks=False)
     copy.session, copy.seq = first.session, first.seq + 100
     return first, copy
@@ -297,6 +305,12 @@ SUITE.must_all(_copied, {
                    lambda held: _expect_while_held("NOT_PROVEN", *held)),
     "R-PROOF-02": ("6.6 Proof", "A twist that states the driver's session without a proof is NOT_PROVEN.",
                    lambda held: _expect_while_held("NOT_PROVEN", *held, proof=None)),
+})
+
+
+SUITE.must_all(_copied_human, {
+    "R-PROOF-13": ("6.6 Proof", "A twist that states the session of a human who drives, without its proof, is "
+                   "NOT_PROVEN.", lambda held: _expect_while_held("NOT_PROVEN", *held, proof=None)),
 })
 
 

@@ -176,13 +176,19 @@ def _zero_us(bench: Bench, since: int) -> int | None:
     return reported[last_moving + 1][0] if last_moving + 1 < len(reported) else None
 
 
-def _driving(bench: Bench) -> Sender:
-    """The driver of a robot that drives as fast as it may."""
-    limit = _limits(Robot(bench).status())[0]
-    driver = armed(bench, text=f"{min(limit, 10.0):.4f}|0.0000".encode())
+def _driving(bench: Bench, source: str = "vision", way: Planar = (1.0, 0.0)) -> Sender:
+    """The driver of a robot that moves this way, in shares of its limits, as fast as it may."""
+    limits = _limits(Robot(bench).status())
+    linear, angular = (share * min(limit, 10.0) for share, limit in zip(way, limits, strict=True))
+    driver = armed(bench, source, f"{linear:.4f}|{angular:.4f}".encode())
     bench.rest(700_000)
-    bench.need(driver.robot.next_status().applied[0] > 0, "it does not drive (R-LIM-01)")
+    axis = _axis_of(way)
+    bench.need(driver.robot.next_status().applied[axis] * way[axis] > 0, "it does not drive (R-LIM-01)")
     return driver
+
+
+def _axis_of(way: Planar) -> int:
+    return 0 if way[0] else 1
 
 
 def _stopping(bench: Bench) -> Sender:
@@ -254,6 +260,10 @@ def others_keep_nothing_alive(bench: Bench, driver: Sender) -> None:
 @SUITE.must("R-SIL-04", "5.3 Age", _stopping)
 def old_frame_stops(bench: Bench, driver: Sender) -> None:
     """Twists that go on citing one old frame do not keep the wheels turning: age is validated at every tick."""
+    _expect_stop_on_one_frame(bench, driver)
+
+
+def _expect_stop_on_one_frame(bench: Bench, driver: Sender) -> None:
     mark, cited = _silent(driver)
     for number in range(38):
         bench.after(number * 10_000, lambda: driver.twist(cited, b"10.0000|0.0000"))
@@ -263,11 +273,21 @@ def old_frame_stops(bench: Bench, driver: Sender) -> None:
 @SUITE.must("R-SIL-05", "5.3 Age", armed)
 def ageing_frame_slows(bench: Bench, driver: Sender) -> None:
     """On frames between 150 and 400 ms old the robot drives, DEGRADED, at a lower speed."""
-    limit = _limits(driver.robot.status())[0]
+    _expect_slower(bench, driver, 0, "m/s")
+
+
+@SUITE.must("R-SIL-14", "5.3 Age", armed)
+def ageing_frame_slows_a_turn(bench: Bench, driver: Sender) -> None:
+    """On frames between 150 and 400 ms old the robot turns on the spot, DEGRADED, at a lower rate."""
+    _expect_slower(bench, driver, 1, "rad/s")
+
+
+def _expect_slower(bench: Bench, driver: Sender, axis: int, unit: str) -> None:
+    limit = _limits(driver.robot.status())[axis]
     bench.need(limit < math.inf, "the robot reports no limit (R-LIM-02)")
-    driver.drive(f"{limit:.4f}|0.0000".encode())
+    driver.drive("|".join(f"{limit if one == axis else 0.0:.4f}" for one in (0, 1)).encode())
     bench.rest(1_000_000)
-    full = driver.robot.next_status().applied[0]
+    full = driver.robot.next_status().applied[axis]
     slowed_us = driver.robot.clock_us()
     driver.delay_us = driver.compute_us = 250_000
     bench.rest(1_500_000)
@@ -277,12 +297,13 @@ def ageing_frame_slows(bench: Bench, driver: Sender) -> None:
     seen = _reports(bench, mark)
     bench.need(full > 0, "it does not drive (R-LIM-01)")
     bench.need(driver.robot.status().accepted > accepted.accepted, "answers 250 ms late are not accepted (R-CAUS-10)")
-    states, fastest = {state for _, _, state in seen}, max(applied[0] for _, applied, _ in seen)
+    states, fastest = {state for _, _, state in seen}, max(applied[axis] for _, applied, _ in seen)
     bench.expect(State.DEGRADED in states, f"answers 250 ms late leave it {sorted(state.value for state in states)}")
-    bench.expect(fastest < 0.9 * full, f"it still drives at {fastest} of {full} m/s")
+    bench.expect(fastest < 0.9 * full, f"it still drives at {fastest} of {full} {unit}")
     slower = mean_moving(driver.robot.readings(settled_us))
     if measured is not None and slower is not None:
-        bench.expect(slower[0] < 0.95 * measured[0], f"by `moving` it is at {slower[0]:.2f} of {measured[0]:.2f} m/s")
+        by_moving = f"by `moving` it is at {slower[axis]:.2f} of {measured[axis]:.2f} {unit}"
+        bench.expect(slower[axis] < 0.95 * measured[axis], by_moving)
 
 
 @SUITE.must("R-SIL-06", "5.4 Silence", armed)
@@ -317,7 +338,74 @@ def hold_goes_on(bench: Bench, driver: Sender) -> None:
 @SUITE.must("R-SIL-09", "5.4 Silence", _stopping)
 def acks_keep_nothing_alive(bench: Bench, driver: Sender) -> None:
     """Many acks of the driver do not keep the wheels turning."""
+    _expect_stop_beside_acks(bench, driver)
+
+
+def _expect_stop_beside_acks(bench: Bench, driver: Sender) -> None:
     mark, cited = _silent(driver)
     for number in range(100):
         bench.after(number * 10_000, lambda: driver.ack(cited))
     _expect_stop(bench, mark, "acks")
+
+
+# --- a human drives --------------------------------------------------------------------------------------------------
+
+
+def _human_driving(bench: Bench) -> Sender:
+    return _driving(bench, "teleop")
+
+
+@SUITE.must("R-SIL-12", "5.4 Silence", _human_driving)
+def silence_of_a_human_stops(bench: Bench, human: Sender) -> None:
+    """When the twists of a human cease, the wheels are at zero within 700 ms, also while acks come."""
+    _expect_stop_beside_acks(bench, human)
+
+
+@SUITE.must("R-SIL-13", "5.3 Age", _human_driving)
+def old_frame_stops_a_human(bench: Bench, human: Sender) -> None:
+    """Twists of a human that go on citing one old frame do not keep the wheels turning."""
+    _expect_stop_on_one_frame(bench, human)
+
+
+# --- backwards, and turns on the spot --------------------------------------------------------------------------------
+# One axis at a time: where both turn, the stop of one may hide that the other goes on.
+
+
+def _backing(bench: Bench) -> Sender:
+    return _driving(bench, way=(-1.0, 0.0))
+
+
+def _turning(bench: Bench) -> Sender:
+    return _driving(bench, way=(0.0, 1.0))
+
+
+def _falls_silent(driver: Sender) -> None:
+    _expect_stop(driver.bench, _silent(driver)[0], "silence")
+
+
+def _is_stopped(driver: Sender) -> None:
+    Sender(driver.robot, "operator").send_request("stop")
+    driver.robot.expect_state(State.STOPPED)
+    _expect_stop(driver.bench, driver.bench.mark(), "STOP")
+
+
+def _is_disarmed(driver: Sender) -> None:
+    Sender(driver.robot, "operator").send_request("disarm")
+    driver.robot.expect_state(State.DISARMED)
+    _expect_stop(driver.bench, driver.bench.mark(), "disarm")
+
+
+SUITE.must_all(_backing, {
+    "R-SIL-10": ("5.4 Silence", "When twists cease while the robot drives backwards, the wheels are at zero within "
+                 "700 ms.", _falls_silent),
+    "R-STOP-18": ("6.5 STOP", "STOP while the robot drives backwards: the wheels are at zero.", _is_stopped),
+    "R-ARM-20": ("8.2 Requests and replies", "`disarm` while the robot drives backwards: the wheels are at zero.",
+                 _is_disarmed),
+})
+SUITE.must_all(_turning, {
+    "R-SIL-11": ("5.4 Silence", "When twists cease while the robot turns on the spot, the wheels are at zero within "
+                 "700 ms.", _falls_silent),
+    "R-STOP-19": ("6.5 STOP", "STOP while the robot turns on the spot: the wheels are at zero.", _is_stopped),
+    "R-ARM-21": ("8.2 Requests and replies", "`disarm` while the robot turns on the spot: the wheels are at zero.",
+                 _is_disarmed),
+})

@@ -14,6 +14,7 @@ from sightline.conformance.robot.fixture import (
     Sender,
     as_json,
     ready,
+    ready_human,
     vision,
 )
 from sightline.protocol.channels import MAX_HEADER_BYTES, TWIST
@@ -198,6 +199,22 @@ def stale_frame(bench: Bench, sender: Sender) -> None:
     result = sender.result_of(lambda: sender.twist(frame))
     bench.expect(result in ("STALE", "UNKNOWN_FRAME"), f"it was {result}")
     sender.robot.expect_unmoved("though no twist was applied")
+
+
+@SUITE.must("R-CAUS-17", "5.1 Order", ready_human)
+def human_cites_too(bench: Bench, human: Sender) -> None:
+    """A twist of `teleop` is validated by its frame: STALE a second later, UNKNOWN_FRAME with a `t_us` off by one."""
+    frame = human.robot.frame()
+    human.expect("UNKNOWN_FRAME", what="a `t_us` off by one", echo_t_us=frame.t_us + 1)
+    bench.rest(1_200_000)
+    result = human.result_of(lambda: human.twist(frame))
+    bench.expect(result in ("STALE", "UNKNOWN_FRAME"), f"on a frame more than a second old it was {result}")
+
+
+@SUITE.must("R-SEQ-17", "5.1 Order", ready_human)
+def human_counts_too(_bench: Bench, human: Sender) -> None:
+    """A twist of `teleop` with the `seq` of the one before is rejected as OUT_OF_ORDER."""
+    human.expect("OUT_OF_ORDER", seq=human.seq)
 
 
 @SUITE.must("R-CAUS-07", "4.5 Echo", ready)

@@ -1,7 +1,7 @@
 """Robots that arm, disarm, stop or reset wrongly. Pure."""
 
 from sightline.protocol.errors import RejectReason, WireError
-from sightline.protocol.messages import STILL, State, Twist, Verb
+from sightline.protocol.messages import STILL, Holder, State, Twist, Verb
 from sightline.robot_side.safety.lease import RANKS
 from sightline.robot_side.safety.validation import AcceptedCommand, CommandResult
 from tests.conformance.robot.broken.breaking import breaks, wrap
@@ -225,6 +225,32 @@ def requests_live_for_half_a_second(robot):
 @breaks("R-STOP-03")
 def stop_needs_an_echo(robot):
     on_verb(robot, Verb.STOP, _needs(lambda echo, now_us: echo is not None, "MALFORMED"))
+
+
+@breaks("R-STOP-21")
+def stop_cites_this_session(robot):
+    issued = robot.driving.gate.issued
+    on_verb(robot, Verb.STOP, _needs(lambda echo, _now_us: echo is None or echo.session == issued.session, "STALE"))
+
+
+@breaks("R-STOP-20")
+def stop_needs_a_proof(robot):
+    def around(inner, header, request, now_us):
+        robot.driving.gate._check_proof(Holder(source=header.source, session=header.session), header, now_us)
+        return inner(header, request, now_us)
+
+    on_verb(robot, Verb.STOP, around)
+
+
+@breaks("R-ARM-22")
+def humans_are_never_disarmed(robot):
+    def around(inner, header, request, now_us):
+        holder = robot.driving.gate.holder(now_us)
+        if holder is not None and holder.source == "teleop" and header.source != "teleop":
+            raise WireError(RejectReason.NOT_ALLOWED, "a human drives")
+        return inner(header, request, now_us)
+
+    on_verb(robot, Verb.DISARM, around)
 
 
 @breaks("R-STOP-04")

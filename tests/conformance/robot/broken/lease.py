@@ -299,9 +299,14 @@ def any_proof_will_do(robot):
     proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is not None)
 
 
-@breaks("R-PROOF-02", "R-PROOF-10")
+@breaks("R-PROOF-02", "R-PROOF-10", "R-PROOF-13")
 def no_proof_will_do(robot):
     proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is None)
+
+
+@breaks("R-PROOF-13")
+def humans_need_no_proof(robot):
+    proofs_of(robot, lambda lease, who, proof, now_us: proof.proof is None and who.source == "teleop")
 
 
 @breaks("R-PROOF-03")

@@ -33,6 +33,10 @@ def goal(robot, change):
     wrap(gate, "_goal", around)
 
 
+def turned(twist, angular_rad_s):
+    return Twist(linear_mps=twist.linear_mps, angular_rad_s=angular_rad_s)
+
+
 @breaks("R-LIM-01")
 def does_not_know_backwards(robot):
     goal(robot, lambda twist, _asked: Twist(linear_mps=abs(twist.linear_mps), angular_rad_s=twist.angular_rad_s))
@@ -124,25 +128,36 @@ def anybodys_commands_keep_it_going(robot):
     revived_by(robot, "NOT_HOLDER")
 
 
-@breaks("R-SIL-04")
-def judges_age_by_arrival(robot):
+@breaks("R-SIL-04", "R-SIL-13")
+def judges_age_by_arrival(robot, sources=("vision", "teleop")):
     last = [None]
 
     def around(inner, message):
         echo = (fields_of(message.header) or {}).get("echo")
         before = robot.driving.gate.accepted
         inner(message)
-        if robot.driving.gate.accepted > before and echo == last[0]:
+        if robot.driving.gate.accepted > before and echo == last[0] and message.source in sources:
             revive(robot)
         last[0] = echo
 
     wrap(robot, "on_twist", around)
 
 
-@breaks("R-SIL-05")
+@breaks("R-SIL-13")
+def judges_age_of_humans_by_arrival(robot):
+    judges_age_by_arrival(robot, ("teleop",))
+
+
+@breaks("R-SIL-05", "R-SIL-14")
 def full_speed_on_ageing_sight(robot):
     gate = robot.driving.gate
     gate.config = gate.config.model_copy(update={"full_speed_age_ms": 399})
+
+
+@breaks("R-SIL-14")
+def turns_at_full_rate_on_ageing_sight(robot):
+    most = robot.driving.gate.config.max_angular_rad_s
+    goal(robot, lambda twist, asked: turned(twist, max(-most, min(most, asked.angular_rad_s))))
 
 
 @breaks("R-SIL-06")
@@ -172,15 +187,55 @@ def hold_is_the_end(robot):
     wrap(gate, "offer", around)
 
 
-@breaks("R-SIL-09")
-def acks_keep_it_going(robot):
+@breaks("R-SIL-09", "R-SIL-12")
+def acks_keep_it_going(robot, sources=("vision", "teleop")):
     def around(inner, message):
         inner(message)
         who = who_sends(message)
-        if who is not None and who == robot.driving.gate.holder(robot.now()):
+        if who is not None and who == robot.driving.gate.holder(robot.now()) and who.source in sources:
             revive(robot)
 
     wrap(robot, "on_ack", around)
+
+
+@breaks("R-SIL-12")
+def acks_of_humans_keep_it_going(robot):
+    acks_keep_it_going(robot, ("teleop",))
+
+
+def rolls_on(robot, state, moves):
+    """In `state` the wheels go on for two seconds if they move so."""
+    gate, last, rolled_us = robot.driving.gate, [STILL], [0]
+
+    def around(inner, goal, elapsed_us):
+        twist = inner(goal, elapsed_us)
+        rolled_us[0] = rolled_us[0] + elapsed_us if gate.state is state else 0
+        if gate.state is state and moves(last[0]) and rolled_us[0] < 2_000_000:
+            twist = last[0]
+        last[0] = twist
+        return twist
+
+    wrap(gate._ramp, "step", around)
+
+
+def backs(twist):
+    return twist.linear_mps < 0 and twist.angular_rad_s == 0
+
+
+def turns(twist):
+    return twist.linear_mps == 0 and twist.angular_rad_s != 0
+
+
+for _case, _state, _moves in (
+    ("R-SIL-10", State.HOLD, backs), ("R-SIL-11", State.HOLD, turns),
+    ("R-STOP-18", State.STOPPED, backs), ("R-STOP-19", State.STOPPED, turns),
+    ("R-ARM-20", State.DISARMED, backs), ("R-ARM-21", State.DISARMED, turns),
+):
+    def _rolls_on(robot, state=_state, moves=_moves):
+        rolls_on(robot, state, moves)
+
+    _rolls_on.__name__ = f"{_moves.__name__}_on_in_{_state.value}"
+    breaks(_case)(_rolls_on)
 
 
 # --- measured motion -------------------------------------------------------------------------------------------------

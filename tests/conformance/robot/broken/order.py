@@ -181,6 +181,24 @@ def any_next_seq_will_do(robot):
     forgives_seq(robot, 1 << 52, lambda last: last >= 0)
 
 
+@breaks("R-SEQ-17")
+def humans_need_not_count(robot):
+    record = record_of(robot)
+    wrap(record, "check", lambda inner, header, now_us: None if header.source == "teleop" else inner(header, now_us))
+
+
+@breaks("R-CAUS-17")
+def humans_cite_the_newest_frame(robot):
+    issued = robot.driving.gate.issued
+
+    def change(fields, message):
+        if message.source == "teleop" and isinstance(fields.get("echo"), dict):
+            seq, t_us = next(reversed(issued._times["frame"].items()))
+            fields["echo"].update(seq=seq, t_us=t_us)
+
+    bend_twists(robot, change)
+
+
 @breaks("R-SEQ-14")
 def any_first_seq_will_do(robot):
     forgives_seq(robot, 1 << 52, lambda last: last < 0)
