@@ -4,6 +4,7 @@ import signal
 import socket
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import pytest
@@ -83,6 +84,24 @@ def process(tmp_path, ends, link):
     made = NetworkProcess(setup, ends[1], link, Camera())
     made._relay = Relay()
     return made
+
+
+IMAGES = (b"", b"\0" * 9, b"jpeg", b"\x9d\x0a\xd9\x6d")
+"""Two of them have a checksum of zero."""
+
+
+@pytest.mark.parametrize("is_live", [True, False])
+@pytest.mark.parametrize("image", IMAGES)
+def test_only_images_of_a_live_camera_have_a_fingerprint_and_each_of_them_has_one(
+    process, ends, monkeypatch, image, is_live
+):
+    monkeypatch.setattr(Camera, "live", is_live)
+    monkeypatch.setattr(Camera, "read", lambda camera, _timeout_s: Picture(image, 1_000))
+    process._stream_one()
+    (packet,) = [one for one in ends[0].packets() if ipc.packet_kind(one) is ipc.PacketKind.ISSUED]
+    fingerprint = ipc.unpack_issued(packet)[2]
+    assert (fingerprint != 0) == is_live
+    assert not is_live or fingerprint == (zlib.crc32(image) or fingerprint)
 
 
 def issued(driver_end):
