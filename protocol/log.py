@@ -22,7 +22,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Final, TextIO
 
-from sightline.protocol.errors import ConfigError
+from sightline.protocol.errors import ConfigError, SightlineError
 
 LOG_FORMAT_VARIABLE: Final = "SIGHTLINE_LOG"
 LOG_FORMATS: Final = ("text", "json")
@@ -239,6 +239,21 @@ def error_text(error: BaseException) -> str:
     except Exception:
         text = ""
     return printable(text) or type(error).__name__
+
+
+def fault_text(part: str, error: BaseException) -> str:
+    """Return the text of an exception for `status`: place and class too, unless it is one of Sightline's own.
+
+    A SightlineError states the fix. Another exception comes from a mistake in the code of a plug-in.
+
+    Args:
+        part: where it was raised, e.g. `camera`.
+        error: the exception.
+    """
+    text, kind = error_text(error), type(error).__name__
+    if isinstance(error, SightlineError):
+        return text
+    return f"{part} raised {kind}" if text == kind else f"{part} raised {kind}: {text}"
 
 
 def printable(text: str) -> str:

@@ -62,6 +62,12 @@ class WheelAngles:
     t_us: int
 
 
+def check_wheels(reading: object) -> None:
+    """Raise TypeError, with what is wrong, for what no `Drive` may return from `wheels`."""
+    if reading is not None and not isinstance(reading, WheelAngles):
+        raise TypeError(f"wheels() returned {type(reading).__name__}; expected WheelAngles or None")
+
+
 @dataclass(frozen=True, slots=True)
 class Ranges:
     """One turn of a range sensor. `ranges_m[i]` is the distance at `angle_min_rad + i * angle_increment_rad`.

@@ -23,6 +23,7 @@ from sightline.protocol.config import PLUGIN_ERRORS
 from sightline.protocol.errors import HardwareError, RejectReason, SightlineError, WireError
 from sightline.protocol.log import (
     RepeatLimiter,
+    fault_text,
     faults,
     report_ending,
     report_fault,
@@ -49,7 +50,7 @@ from sightline.robot_side.guardian.start import GuardianEnd, zero_of
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
 from sightline.robot_side.plugins import BATTERIES, DRIVES, RANGE_SENSORS
-from sightline.robot_side.ports import Battery, Drive, Ranges, RangeSensor, WheelAngles, check_scan
+from sightline.robot_side.ports import Battery, Drive, Ranges, RangeSensor, WheelAngles, check_scan, check_wheels
 from sightline.robot_side.safety.battery import BatteryLevel
 from sightline.robot_side.safety.guard import BlindZoneError, check_blind_zone
 from sightline.robot_side.safety.limits import MIN_TICK_US, TICK_US
@@ -385,6 +386,7 @@ class Driver:
         before, part = self._driver_core.gate.applied, "drive"
         try:
             wheels = self._drive.wheels()
+            check_wheels(wheels)
             part = "range sensor"
             scan = self._scanned()
             part = "control loop"
@@ -406,14 +408,16 @@ class Driver:
             self._fault("drive", error)
 
     def _fault(self, part: str, error: BaseException) -> None:
-        self._driver_core.gate.fault(report_fault(part, error))
+        report_fault(part, error)
+        self._driver_core.gate.fault(fault_text(part, error))
 
     def _without_sensors(self) -> tuple[float, float]:
         """Return the gate's ramp to zero, or zero if the gate cannot step either, because this loop must not end."""
         try:
             return self._driver_core.tick(monotonic_us(), None, None)
         except Exception as error:
-            self._driver_core.gate.halt(report_fault("control loop", error))
+            report_fault("control loop", error)
+            self._driver_core.gate.halt(fault_text("control loop", error))
             return 0.0, 0.0
 
     def _scanned(self) -> Ranges | None:

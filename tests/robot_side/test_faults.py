@@ -97,8 +97,10 @@ class UnprintableError(RuntimeError):
 
 
 @pytest.mark.parametrize(("error", "reason"), [
-    (OSError("pin\udce9\x1b[2J\nis gone"), "pin??[2J is gone"), (UnprintableError(), "UnprintableError"),
-    (SystemExit(3), "3"),
+    (OSError("pin\udce9\x1b[2J\nis gone"), "drive raised OSError: pin??[2J is gone"),
+    (UnprintableError(), "drive raised UnprintableError"), (SystemExit(3), "drive raised SystemExit: 3"),
+    (ZeroDivisionError("division by zero"), "drive raised ZeroDivisionError: division by zero"),
+    (HardwareError("no controller; plug it in"), "no controller; plug it in"), (HardwareError(), "HardwareError"),
 ])
 def test_an_odd_exception_of_a_drive_ends_no_loop_and_is_in_the_status(driver, monkeypatch, error, reason):  # noqa: F811
     monkeypatch.setattr(driver.driver_end, "keep_alive", lambda *_: None)

@@ -96,6 +96,16 @@ def test_a_reading_that_is_not_a_number_stops_the_robot_not_the_loop(driver, rea
     assert BrokenDrive.told == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("reading", [(0.0, 0.0, 1), 0.0, "0", {}])
+def test_a_reading_of_another_type_is_a_fault_that_names_the_drive(driver, reading):
+    BrokenDrive.reading = reading
+    driver._tick(20_000)
+    kind = type(reading).__name__
+    reason = f"drive raised TypeError: wheels() returned {kind}; expected WheelAngles or None"
+    assert (driver._driver_core.gate.state, driver._driver_core.gate.reason) == ("FAULT", reason)
+    assert BrokenDrive.told == (0.0, 0.0)
+
+
 def test_a_gate_that_cannot_be_stepped_is_a_fault_with_the_wheels_at_zero(driver, monkeypatch):
     """Neither with the sensors nor without: nothing that it holds may end the loop."""
     driver._driver_core.gate.applied = Twist(linear_mps=0.3, angular_rad_s=0.0)
