@@ -1,6 +1,5 @@
 """A PyBullet simulation behind the robot's ports.
 
 May import: `protocol`, `robot_side`.
-Interface: `process` is the simulation as a process; `world.world.World` the same in virtual time; `scenario` its
-    data.
+Interface: `process` runs in real time, `world.world.World` in virtual time; `scenario` has their data.
 """

@@ -1,6 +1,6 @@
 """The sockets between robot and simulation: device plug-ins, truth, labels. Shell (sockets).
 
-Imported on the robot: no NumPy, no PyBullet. Each port has its own local SOCK_SEQPACKET socket, so that a slow picture
+Imported on the robot: no NumPy, no PyBullet. Each port has its own local SOCK_SEQPACKET socket, so that a slow image
 never delays a motor. Formats, all little-endian:
 
     motion.sock   robot -> sim  MOTION_SET      left_rad_s, right_rad_s; latched; the first to send owns the motors
@@ -48,7 +48,7 @@ _BATTERY_WAIT_S = 0.1
 
 
 def default_socket_dir() -> str:
-    """A folder of this user's own, short enough for a socket's path."""
+    """Return a folder of this user that is short enough for the path of a socket."""
     return str(Path(tempfile.gettempdir()) / f"sightline-sim-{os.getuid()}")
 
 
@@ -60,7 +60,7 @@ class SimSocketConfig(Config):
 
 
 class BusConnection:
-    """Connects to the simulation, and again after a loss. Never blocks without a timeout."""
+    """Connects to the simulation and reconnects after a loss. Never blocks without a timeout."""
 
     def __init__(self, socket_dir: str, name: str) -> None:
         self._dir, self._name = socket_dir, name
@@ -87,7 +87,7 @@ class BusConnection:
         return fresh
 
     def send(self, data: bytes) -> bool:
-        """Send now; False if the simulation is too busy to take it. Raises HardwareError when it is gone."""
+        """Send now. Returns False if the buffer is full. Raises HardwareError when the simulation has ended."""
         connection = self.open()
         try:
             connection.send(data)
@@ -98,7 +98,7 @@ class BusConnection:
         return True
 
     def receive(self) -> bytes | None:
-        """Return the oldest waiting message, or None. Raises HardwareError when the simulation is gone."""
+        """Return the oldest waiting message, or None. Raises HardwareError when the simulation has ended."""
         connection = self.open()
         try:
             size = connection.recv_into(self._buffer)
@@ -115,14 +115,14 @@ class BusConnection:
         return message
 
     def newest(self) -> bytes | None:
-        """The newest waiting message; older ones are dropped."""
+        """Return the newest waiting message. Drops older ones."""
         newest = None
         while (message := self.receive()) is not None:
             newest = message
         return newest
 
     def wait(self, timeout_s: float) -> bytes | None:
-        """The oldest message, waiting for one up to `timeout_s`."""
+        """Return the oldest message. Waits up to `timeout_s` for one."""
         message = self.receive()
         if message is not None:
             return message
@@ -132,7 +132,7 @@ class BusConnection:
         return self.receive()
 
     def hello(self) -> bytes:
-        """Connect and return the first message. Raises HardwareError when none comes."""
+        """Connect and return the first message. Raises HardwareError if none arrives."""
         hello = self.wait(HELLO_TIMEOUT_S)
         if hello is None:
             self.close()
@@ -140,7 +140,7 @@ class BusConnection:
         return hello
 
     def close(self) -> None:
-        """Idempotent; a later call would connect again."""
+        """Close the connection. Idempotent; a later call connects again."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -154,7 +154,7 @@ class BusConnection:
 
 
 class SimCamera:
-    """The simulated camera. The simulation draws an image only for a call of `read`."""
+    """The simulated camera. The simulation draws an image only on a call of `read`."""
 
     class Config(SimSocketConfig):
         """Address of the simulation."""
@@ -168,12 +168,12 @@ class SimCamera:
         self._greet()
 
     def _greet(self) -> None:
-        """Connect if need be; a new connection begins with the camera's model."""
+        """Connect if needed. A new connection begins with the camera model."""
         if not self._connection.is_open:
             self.model = decode(CameraModel, self._connection.hello(), max_bytes=4096)
 
     def read(self, timeout_s: float) -> Picture | None:
-        """The next capture; None if none came within `timeout_s`. Raises HardwareError when the simulation is gone."""
+        """Return the next capture; None after `timeout_s`. Raises HardwareError when the simulation has ended."""
         deadline_s = time.monotonic() + timeout_s
         self._greet()
         self._connection.newest()  # drops a late answer to an earlier call, which is an old image
@@ -185,17 +185,17 @@ class SimCamera:
         return Picture(message[PICTURE_HEAD.size :], t_us, scale_percent)
 
     def adjust(self, quality_percent: int, scale_percent: int) -> bool:
-        """Encode the next images so, see `sightline.robot_side.ports.Adjustable`."""
+        """Set the encoding of the next images; see `sightline.robot_side.ports.Adjustable`."""
         self._request = PICTURE_REQUEST.pack(quality_percent, scale_percent)
         return True
 
     def close(self) -> None:
-        """Idempotent."""
+        """Close the connection. Idempotent."""
         self._connection.close()
 
 
 class SimDrive:
-    """The simulated wheels: they latch, whatever becomes of this process."""
+    """The simulated wheels. Their speeds latch and outlive this process."""
 
     zero = staticmethod(zero)
 
@@ -208,9 +208,9 @@ class SimDrive:
         self._angles: WheelAngles | None = None
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
-        """Give wheel speeds, forward positive; never blocks.
+        """Set wheel speeds, forward positive; never blocks.
 
-        Raises HardwareError when the simulation is gone or does not take them, ValueError unless both are finite.
+        Raises HardwareError when the simulation has ended or rejects them, ValueError unless both are finite.
         """
         if not (math.isfinite(left_rad_s) and math.isfinite(right_rad_s)):
             raise ValueError(f"wheel speeds {left_rad_s}, {right_rad_s}")
@@ -218,7 +218,7 @@ class SimDrive:
             raise HardwareError("the simulation takes no motor commands; is it stopped? restart `sightline sim`")
 
     def wheels(self) -> WheelAngles | None:
-        """The newest encoder reading received. Raises HardwareError when the simulation is gone.
+        """Return the newest encoder reading received. Raises HardwareError when the simulation has ended.
 
         Call it at 20 Hz or more. After a longer pause the first reading is old, see its `t_us`.
         """
@@ -228,7 +228,7 @@ class SimDrive:
         return self._angles
 
     def close(self) -> None:
-        """Idempotent; the motors keep their last speeds."""
+        """Close the connection. Idempotent; the motors keep their last speeds."""
         self._connection.close()
 
 
@@ -243,7 +243,7 @@ class SimRange:
         self._connection.open()
 
     def read(self) -> Ranges | None:
-        """The newest scan not yet read. Raises HardwareError when the simulation is gone."""
+        """Return the newest unread scan. Raises HardwareError when the simulation has ended."""
         message = self._connection.newest()
         if message is None:
             return None
@@ -252,12 +252,12 @@ class SimRange:
         return Ranges(t_us, first_rad, each_rad, least_m, most_m, ranges_m)
 
     def close(self) -> None:
-        """Idempotent."""
+        """Close the connection. Idempotent."""
         self._connection.close()
 
 
 class SimBattery:
-    """A battery that the simulated wheels drain: from full to empty over the distance that they turn."""
+    """A battery that the turning wheels drain, from full to empty over a distance."""
 
     class Config(SimSocketConfig):
         """Address of the simulation, and the voltages of the battery."""
@@ -265,19 +265,19 @@ class SimBattery:
         full_v: Annotated[float, Field(gt=0, le=100)] = 8.4
         empty_v: Annotated[float, Field(gt=0, le=100)] = 6.0
         range_m: Annotated[float, Field(gt=0, le=1e6)] = 1_000.0
-        """Way of each wheel until it is empty."""
+        """Distance that each wheel rolls until the battery is empty."""
         wheel_radius_m: Annotated[float, Field(gt=0.005, lt=1.0)] = 0.035
 
     def __init__(self, config: Config) -> None:
         self._config = config
         self._connection = BusConnection(config.socket_dir, MOTION)
         self._connection.open()
-        self._angles_rad = (0.0, 0.0)  # of a simulation that has just begun: its battery outlives this process
+        self._angles_rad = (0.0, 0.0)  # of a simulation that has just started: its battery outlives this process
         self._turned_rad = 0.0
 
     def read(self) -> float:
-        """Volts now. Raises HardwareError when the simulation is gone."""
-        self._connection.newest()  # what has waited since the last call is old
+        """Return the voltage now, V. Raises HardwareError when the simulation has ended."""
+        self._connection.newest()  # messages that waited since the last call are old
         message = self._connection.wait(_BATTERY_WAIT_S)
         if message is not None:
             left_rad, right_rad, _ = MOTION_ANGLES.unpack(message)
@@ -288,7 +288,7 @@ class SimBattery:
         return config.full_v - share * (config.full_v - config.empty_v)
 
     def close(self) -> None:
-        """Idempotent."""
+        """Close the connection. Idempotent."""
         self._connection.close()
 
 
@@ -302,38 +302,38 @@ class SimulationInfo(Config):
 
 
 class TruthReader:
-    """Reads what is really so, for displays and scores."""
+    """Reads the true state, for displays and scores."""
 
     def __init__(self, socket_dir: str) -> None:
         self._connection = BusConnection(socket_dir, TRUTH)
         self.simulated = SimulationInfo.model_validate_json(self._connection.hello())
 
     def read(self, timeout_s: float) -> Truth | None:
-        """The next report in order, None if none came in time. Raises HardwareError when the simulation is gone."""
+        """Return the next report; None after `timeout_s`. Raises HardwareError when the simulation has ended."""
         while (message := self._connection.wait(timeout_s)) is not None:
             if b'"t_us"' in message:
                 return Truth.from_json(message)
         return None
 
     def close(self) -> None:
-        """Idempotent."""
+        """Close the connection. Idempotent."""
         self._connection.close()
 
 
-# What a simulation labels in its pictures, written to and read from its bus; `labels.py` makes it. Shell (sockets).
+# Labels of simulated images, written to and read from the bus; `labels.py` makes them. Shell (sockets).
 #
-# They come over the socket of the truth, between its reports. A client of the truth may read labels; a robot reads
+# They share the truth socket, between its reports. A client of that socket may read labels; a robot reads
 # neither.
 
 
 KEPT = 64
-"""Pictures whose labels are remembered: two seconds of them."""
+"""Images whose labels are remembered: two seconds of them."""
 LABELLED_US = "labelled_us"
-"""Key of a labels message: the capture time of the picture that they are of."""
+"""Capture time of the labeled image, in a labels message."""
 
 
 class Label(NamedTuple):
-    """One box, in pixels of the camera's whole picture; it may be encoded smaller."""
+    """One box, in pixels of the full-size image. The image may be encoded smaller."""
 
     label: str
     score: float
@@ -344,12 +344,12 @@ class Label(NamedTuple):
 
 
 def to_json(labels: Iterable[Label], t_us: int, width_px: int) -> bytes:
-    """The labels of the picture captured at `t_us`, `width_px` wide, as they go over the bus."""
+    """Return a labels message: the labels of the image captured at `t_us`, `width_px` wide."""
     return json.dumps({LABELLED_US: t_us, "width_px": width_px, "boxes": [one._asdict() for one in labels]}).encode()
 
 
 class LabelReader:
-    """The labels of the newest pictures, by their capture times."""
+    """The labels of the newest images, by their capture times."""
 
     def __init__(self, socket_dir: str) -> None:
         self._connection = BusConnection(socket_dir, TRUTH)
@@ -357,16 +357,16 @@ class LabelReader:
         self._kept: OrderedDict[int, dict[str, Any]] = OrderedDict()
 
     def of(self, t_us: int, width_px: int) -> list[dict[str, Any]] | None:
-        """The boxes of the picture captured at `t_us`, in pixels of one `width_px` wide; None if they were lost.
+        """Return the boxes of the image captured at `t_us`, in pixels of an image `width_px` wide, or None.
 
-        They come before their picture.
+        Labels arrive before their image; None means that they were lost.
         """
         self.drain()
         table = self._kept.get(t_us)
         return None if table is None else [_scaled(box, width_px / table["width_px"]) for box in table["boxes"]]
 
     def drain(self) -> None:
-        """Take in what waits; often, for a socket holds ten messages. Raises HardwareError without a simulation."""
+        """Read all waiting labels. Call it often: a socket holds ten messages. Raises HardwareError if disconnected."""
         while (message := self._connection.receive()) is not None:
             self._keep(message)
 
@@ -379,7 +379,7 @@ class LabelReader:
             self._kept.popitem(last=False)
 
     def close(self) -> None:
-        """Idempotent."""
+        """Close the connection. Idempotent."""
         self._connection.close()
 
 

@@ -15,43 +15,43 @@ from sightline.protocol.config import Config
 
 IP_HEADER_BYTES: Final = 20
 MAX_WAITING: Final = 400
-"""Packets under way on one leg; more are dropped and counted, as a radio's queue does."""
+"""Packets in flight on one leg. More are dropped and counted, as in the queue of a radio."""
 
 Chance = Annotated[float, Field(ge=0, le=1)]
 Milliseconds = Annotated[float, Field(ge=0, le=60_000)]
 
 
 class LinkShape(Config):
-    """The effect of one direction on packets. The default is a perfect wire."""
+    """The effects of the network on one direction. The default is a perfect link."""
 
     delay_ms: Milliseconds = 0
     jitter_ms: Milliseconds = 0
-    """Uniform, either way; order is kept."""
+    """Uniform, in both directions; order is kept."""
     loss: Chance = 0
     burst_start: Chance = 0
-    """Chance per packet that a burst begins, in which everything is lost ..."""
+    """Probability per packet that a burst begins. A burst loses all packets ..."""
     burst_end: Chance = 1
-    """... and that it ends again."""
+    """... and the probability that it ends."""
     rate_bit_s: Annotated[float, Field(ge=0, le=1e10)] = 0
     """0: unlimited."""
     queue_packets: Annotated[int, Field(ge=1, le=MAX_WAITING)] = 200
     duplicate: Chance = 0
     reorder: Chance = 0
-    """Chance that a packet overtakes all that wait: it skips delay and queue."""
+    """Probability that a packet overtakes all waiting packets: it skips delay and queue."""
     corrupt: Chance = 0
-    """Chance that one bit after the IP header flips."""
+    """Probability that one bit after the IP header flips."""
     cut: bool = False
-    """Nothing passes, and what was under way is lost."""
+    """Nothing passes, and packets in flight are lost."""
 
 
 class LinkShapes(Config):
-    """Both directions: from A to B and back. `half_duplex`: one medium, on which both spend their time."""
+    """Both directions: A to B and back. With `half_duplex` they share one medium."""
 
     ab: LinkShape = LinkShape()
     ba: LinkShape = LinkShape()
     half_duplex: bool = False
     seed: Annotated[int, Field(ge=0)] | None = None
-    """From now on chance is drawn from this seed."""
+    """Seed of all random draws from now on."""
 
 
 @dataclass(slots=True)
@@ -78,7 +78,7 @@ class Medium:
 
 
 class EmulatedLeg:
-    """One direction. The caller puts packets in and takes out what is due; times never go back."""
+    """One direction. The caller puts packets in and takes due ones out. Times must not decrease."""
 
     def __init__(self, seed: str) -> None:
         self.shape = LinkShape()
@@ -91,7 +91,7 @@ class EmulatedLeg:
         self._in_burst = False
 
     def put(self, packet: bytes, now_us: int) -> None:
-        """A packet enters; whether and when it comes out is drawn now."""
+        """Add a packet. Its loss and its delay are drawn now."""
         self.counts.taken += 1
         if self.shape.cut:
             self.counts.cut += 1
@@ -138,7 +138,7 @@ class EmulatedLeg:
         heapq.heappush(self._waiting, (due_us, self._order, packet))
 
     def take_due(self, now_us: int) -> Iterator[bytes]:
-        """Yield the packets that arrive by now, in order. A cut wire loses them."""
+        """Yield the packets that arrive by now, in order. A cut link loses them."""
         while self._waiting and self._waiting[0][0] <= now_us:
             packet = heapq.heappop(self._waiting)[2]
             if self.shape.cut:
@@ -150,7 +150,7 @@ class EmulatedLeg:
 
     @property
     def next_us(self) -> float | None:
-        """When the next packet is due; None when none waits."""
+        """Return when the next packet is due, or None if none waits."""
         return self._waiting[0][0] if self._waiting else None
 
 
@@ -161,13 +161,13 @@ def _flipped(packet: bytes, random: Random) -> bytes:
 
 
 class EmulatedLink:
-    """Two legs and one medium, or two."""
+    """Two legs on one medium, or on one each."""
 
     def __init__(self, seed: int = 1) -> None:
         self.ab, self.ba = EmulatedLeg(f"{seed} ab"), EmulatedLeg(f"{seed} ba")
 
     def shape(self, shapes: LinkShapes) -> None:
-        """From now on packets fare so."""
+        """Apply `shapes` to packets from now on."""
         self.ab.shape, self.ba.shape = shapes.ab, shapes.ba
         if shapes.seed is not None:
             self.ab.random, self.ba.random = Random(f"{shapes.seed} ab"), Random(f"{shapes.seed} ba")

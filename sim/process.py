@@ -48,7 +48,7 @@ _log: Final = logging.getLogger(__name__)
 
 
 class PeriodicTimer:
-    """Ticks exactly at its average rate, for any steps of its caller."""
+    """Ticks exactly at its average rate, for any step of its caller."""
 
     def __init__(self, period_us: float) -> None:
         self._period_us = period_us
@@ -64,14 +64,14 @@ class PeriodicTimer:
 # The motor commands: stamped, logged, latched. Shell (clock, file); `take` is called from the receiving thread, `coast`
 # from the physics loop.
 #
-# The log measures a stop. Each line is with the kernel before its command is applied, so that it survives kill -9.
+# The log measures a stop. Each line is written before its command is applied, so that it survives kill -9.
 
 
 LOG_HEADER = b"t_us,left_rad_s,right_rad_s,left_rad,right_rad\n"
 COASTING_US = 20_000
-"""Between two lines of wheels that roll out without an owner: a tick of the driver."""
+"""Time between two lines of wheels that roll out without an owner: one tick of the driver."""
 COASTING_RAD = 0.003
-"""Smallest way in that time, 5 mm/s at the rim: half of what counts as at rest."""
+"""Smallest roll in that time, 5 mm/s at the rim: half of the limit for standing still."""
 
 
 class MotorPort:
@@ -82,7 +82,7 @@ class MotorPort:
         self.angles_rad = (0.0, 0.0)
         """Total angle of each wheel, from the last physics step."""
         self._lock = threading.Lock()
-        """Lines are in the order of their times."""
+        """Keeps the lines in the order of their times."""
         self._logged_us, self._logged_rad = 0, (0.0, 0.0)
         self._may_roll = False
         self.lines_lost = 0
@@ -96,14 +96,14 @@ class MotorPort:
             self._write(LOG_HEADER)
 
     def take(self, data: bytes) -> None:
-        """Take one packet of a drive. A packet without two finite speeds changes nothing."""
+        """Take one drive packet. A packet without two finite speeds changes nothing."""
         speeds = MOTION_SET.unpack(data) if len(data) == MOTION_SET.size else (math.nan, math.nan)
         if not all(map(math.isfinite, speeds)):
             return
         with self._lock:
             try:
                 self._log_line(monotonic_us(), speeds)
-            except OSError as error:  # the command counts more than its line
+            except OSError as error:  # the command matters more than its line
                 if not self.lines_lost:
                     _log.warning("motor log: %s; commands are applied without a line", error.strerror)
                 self.lines_lost += 1
@@ -111,7 +111,7 @@ class MotorPort:
             self._may_roll = True
 
     def coast(self) -> None:
-        """Log how wheels without an owner roll out: until the next command nothing else shows when they stand."""
+        """Log how wheels without an owner roll out. Nothing else shows when they stop, until the next command."""
         with self._lock:
             now_us = monotonic_us()
             if any(self.speeds_rad_s) or not self._may_roll or now_us - self._logged_us < COASTING_US:
@@ -126,7 +126,7 @@ class MotorPort:
         self._write(b"%d,%.5f,%.5f,%.5f,%.5f\n" % (t_us, *speeds, *self.angles_rad))
 
     def _write(self, line: bytes) -> None:
-        """Write a whole line. Raises OSError; what a full disk took of the line ends before the next line."""
+        """Write a whole line. Raises OSError. A line cut by a full disk gets its newline before the next one."""
         if self._log is None:
             return
         line = b"\n" * self._is_cut + line
@@ -158,7 +158,7 @@ def _opened_log(path: Path) -> FileIO:
 
 
 SEND_BYTES = {MOTION: 4096, RANGE: 16_384, CAMERA: 1 << 20, TRUTH: 1 << 17}
-"""How much may wait for a client that does not read; little where only the newest is worth anything."""
+"""Send buffer for a client that does not read. Small where only the newest message is useful."""
 STOP_POLL_S = 0.2
 
 
@@ -188,7 +188,7 @@ class SocketFolder:
         os.write(self._lock, f"{os.getpid()}\n".encode())
 
     def listen(self, name: str) -> socket.socket:
-        """A listening socket in place of whatever a dead simulation left."""
+        """Return a listening socket. Replaces one that a dead simulation left."""
         place = self.path / name
         place.unlink(missing_ok=True)
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -198,7 +198,7 @@ class SocketFolder:
         return listener
 
     def close(self) -> None:
-        """Remove the sockets, then let go; idempotent."""
+        """Remove the sockets, then release the lock. Idempotent."""
         if self._lock >= 0:
             for name in SEND_BYTES:
                 (self.path / name).unlink(missing_ok=True)
@@ -229,11 +229,11 @@ class BusClients:
         return self._motor_owner is not None
 
     def has(self, name: str) -> bool:
-        """Return True if a client is connected there."""
+        """Return True if a client of this socket is connected."""
         return bool(self._clients[name])
 
     def send(self, name: str, data: bytes) -> None:
-        """Send to every client there that has room."""
+        """Send to every client of this socket that has room."""
         with self._lock:
             for client in self._clients[name]:
                 _send(client, data)
@@ -264,7 +264,7 @@ class BusClients:
         try:
             client, _ = listener.accept()
         except OSError:
-            return  # it went away again
+            return  # it closed in the meantime
         client.setblocking(False)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BYTES[name])
         if name in self._hellos:
@@ -292,7 +292,7 @@ class BusClients:
     def _command(self, client: socket.socket, data: bytes) -> None:
         """Set the motors for the connection that owns them until it closes, as a process owns a pin."""
         while self._motor_owner not in (None, client) and self._receive(self._motor_owner, MOTION):
-            pass  # what the owner sent before, and its end, count first
+            pass  # handle earlier packets and the end of the owner first
         if self._motor_owner not in (None, client):
             _send(client, MOTION_BUSY)
             self._drop(client, MOTION)
@@ -325,7 +325,7 @@ def _received(client: socket.socket) -> bytes | None:
             return client.recv(64)
         except BlockingIOError:
             return None
-        except ConnectionResetError:  # it ended with packets unread; what it sent before follows
+        except ConnectionResetError:  # it ended with unread packets; those that it sent still follow
             continue
         except OSError:
             return b""
@@ -350,14 +350,14 @@ def _wanted(data: bytes) -> tuple[int, int]:
     return max(1, min(100, quality_percent)), max(1, min(100, scale_percent))
 
 
-# The simulation in real time, as a process that stands in for the hardware. Shell.  The main thread steps and draws
-# against absolute deadlines; another receives (`sockets.py`), so that a motor command is stamped and logged while a
-# picture is being drawn. World time and the robot's monotonic clock differ by a constant.
+# The simulation in real time, as a process in place of the hardware. Shell.  The main thread steps and draws
+# against absolute deadlines; another receives, so that a motor command is stamped and logged while a
+# image is being drawn. World time and the robot's monotonic clock differ by a constant.
 
 
 ENCODERS_US, TRUTH_US = 10_000, 20_000
 LAG_LOGGED_US = 100_000
-LAG_GIVEN_UP_US = 1_000_000  # after a suspended machine, time is skipped rather than replayed
+LAG_GIVEN_UP_US = 1_000_000  # after a suspend, time is skipped, not replayed
 
 
 class SimConfig(SimSocketConfig):
@@ -366,11 +366,11 @@ class SimConfig(SimSocketConfig):
     scenario: Annotated[str, Field(min_length=1)] = "circle"
     """A name (`sim/scenarios/`) or the path of a `.toml` file."""
     robot: str = ""
-    """A name (`sim/robots/`) or the path of a `.toml` file; empty for the one that the scenario names."""
+    """A name (`sim/robots/`) or the path of a `.toml` file; empty for the robot of the scenario."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
     """Seed of the start and the noise."""
     fps: Annotated[float, Field(gt=0, le=240)] | None = None
-    """Images per second; those of the robot's camera if not set."""
+    """Images per second; default: the rate of the robot's camera."""
     motor_log: str | None = None
     """CSV file of every motor command, with its arrival time; wheels that roll out without a driver have lines, too."""
     seconds: Annotated[float, Field(gt=0)] | None = None
@@ -412,7 +412,7 @@ class Simulation:
             self._publish(self._world.now_us)
 
     def _wait(self) -> None:
-        """Sleep to the next step's deadline, and mind how late it is."""
+        """Sleep until the deadline of the next step, and record the lag."""
         from sightline.sim.world.world import STEP_US
 
         late_us = monotonic_us() - (self._offset_us + self._world.now_us + STEP_US)
@@ -426,7 +426,7 @@ class Simulation:
             self._offset_us += self._lag_us
 
     def _publish(self, now_us: int) -> None:
-        """Send what is due and wanted."""
+        """Send the data that are due and have a client."""
         t_us = now_us + self._offset_us
         if self._encoders.due(now_us):
             angles = self._world.wheel_angles()

@@ -1,6 +1,6 @@
 """Simulated robots: models of `robots/*.toml`, and their URDF. Pure.
 
-Lengths are metres from the axle's midpoint on the floor: x forward, y left, z up. The body is either written in the
+Lengths are meters from the axle's midpoint on the floor: x forward, y left, z up. The body is either written in the
 TOML (`chassis`, `caster`) or drawn in a URDF that it names, whose wheels and sensors it then only names too.
 """
 
@@ -26,7 +26,7 @@ Degrees = Annotated[float, Field(ge=-360, le=360)]
 
 
 class Wheels(Config):
-    """Two driven wheels and what their motors can do. Imperfections are data, zero when perfect."""
+    """Two driven wheels and their motors. Imperfections are zero by default."""
 
     radius_m: Length
     track_m: Length
@@ -39,30 +39,30 @@ class Wheels(Config):
     """At the rim."""
     max_torque_nm: Annotated[float, Field(gt=0, le=100)]
     lag_s: Annotated[float, Field(ge=0, le=1)]
-    """Time constant of the motor's first-order answer."""
+    """Time constant of the first-order response of the motor."""
     encoder_steps: Annotated[int, Field(ge=1, le=1_000_000)]
     """Per turn of a wheel."""
     mismatch: Annotated[float, Field(ge=-0.2, le=0.2)] = 0.0
     """Left radius less right radius, as a fraction of `radius_m`."""
     slip: Annotated[float, Field(ge=0, le=0.4)] = 0.0
-    """Mean fraction of a wheel's turning that does not become motion; drawn every 0.1 s between 0 and twice this."""
+    """Mean fraction of a wheel's rotation that causes no motion; drawn every 0.1 s between 0 and twice this."""
     left_joint: str = ""
     right_joint: str = ""
-    """The wheels' joints, where the body is a URDF's; radius and track are then measured in it."""
+    """Joints of the wheels if the body is a URDF. Radius and track are then measured in it."""
 
 
 class Chassis(Config):
-    """The plate: a box that may touch things. `*_m` of the centre of mass are from the axle's midpoint."""
+    """The plate: a box that may touch things. Its center of mass is relative to the midpoint of the axle."""
 
     length_m: Length
     width_m: Length
     height_m: Length
     x_m: Place
-    """Centre of the box."""
+    """Center of the box."""
     z_m: Place
     mass_kg: Mass
     mass_x_m: Place
-    """Centre of mass; behind the axle, so that the robot rests on its caster."""
+    """Center of mass; behind the axle, so that the robot rests on its caster."""
     mass_z_m: Place
 
 
@@ -74,10 +74,10 @@ class Caster(Config):
 
 
 class CameraMount(Config):
-    """The camera: where the lens is, what it sees. Straight ahead, no distortion."""
+    """The camera: position and optics. It faces straight ahead and has no distortion."""
 
     link: str = ""
-    """Of a URDF: where the lens is, in place of `x_m` and `z_m`."""
+    """URDF link of the lens, in place of `x_m` and `z_m`."""
     x_m: Place
     z_m: Length
     hfov_deg: Annotated[float, Field(ge=20, le=150)]
@@ -86,7 +86,7 @@ class CameraMount(Config):
     fps: Annotated[float, Field(gt=0, le=60)]
 
     def camera_model(self) -> CameraModel:
-        """The pinhole model, exact: a simulated lens is calibrated by construction."""
+        """Return the exact pinhole model. A simulated lens is calibrated by construction."""
         focal_px = self.width_px / 2 / math.tan(math.radians(self.hfov_deg) / 2)
         return CameraModel(
             width_px=self.width_px, height_px=self.height_px, fx_px=focal_px, fy_px=focal_px,
@@ -137,7 +137,7 @@ class LidarModel(Config):
 
     @property
     def increment_rad(self) -> float:
-        """From one ray to the next."""
+        """Return the angle between two rays."""
         span_rad = math.radians(self.last_deg - self.first_deg)
         return span_rad / (self.rays if self.last_deg - self.first_deg == 360 else self.rays - 1)
 
@@ -148,9 +148,9 @@ class RobotModel(Config):
     name: str
     summary: str = ""
     urdf: str = ""
-    """A URDF or xacro file beside the TOML, in place of `chassis` and `caster`."""
+    """A URDF or xacro file in the folder of the TOML, in place of `chassis` and `caster`."""
     front: Front = "+x"
-    """Which way the URDF's root link drives."""
+    """Direction in which the root link of the URDF drives."""
     wheels: Wheels
     chassis: Chassis | None = None
     caster: Caster | None = None
@@ -166,7 +166,7 @@ class RobotModel(Config):
 
 
 def load_robot(name: str) -> RobotModel:
-    """A robot by its name, or by the path of a `.toml` file. Raises ConfigError with the nearest name."""
+    """Load a robot by name or by the path of a `.toml` file. Raises ConfigError with the nearest name."""
     path = find("robot", name, ROBOTS)
     table = {"name": path.stem, **read_table(path, ROBOTS)}
     if table.get("urdf"):
@@ -178,7 +178,7 @@ def _measure(table: dict[str, Any], path: Path) -> None:
     """Add the wheels and sensors of the URDF. Raises ConfigError."""
     file = path.parent / str(table["urdf"])
     if not is_file(file) and is_file(ROBOTS / str(table["urdf"])):
-        file = ROBOTS / str(table["urdf"])  # it is that of the robot which this one extends
+        file = ROBOTS / str(table["urdf"])  # the URDF of the robot that this one extends
     table["urdf"] = str(file)
     wheels = _table(table, "wheels", path)
     joints = [wheels.get(name) for name in ("left_joint", "right_joint")]
@@ -216,7 +216,7 @@ def _mount(sensor: dict[str, Any], where: Transform, is_small: bool) -> None:
         sensor["z_m"] = where.at[2]
 
 
-# The robot's body as URDF text: written from its TOML, or its own file's. Pure.  The root link of a written one is the
+# The robot's body as URDF text, from its TOML or from its URDF file. Pure.  The root link of a generated URDF is the
 # axle's midpoint on the floor, so that its pose is the robot's pose. Wheels whose radii differ are hung so that both
 # touch the floor and the plate stays level.
 
@@ -234,7 +234,7 @@ class UrdfBody:
 
 
 def urdf_body(robot: RobotModel) -> UrdfBody:
-    """The body of `robot`. Raises ConfigError for a URDF that has gone or changed since."""
+    """Return the body of `robot`. Raises ConfigError for a URDF that is missing or was changed."""
     if not robot.urdf:
         return UrdfBody(urdf_from_model(robot))
     file, wheels = Urdf(urdf_text(Path(robot.urdf)), robot.urdf), robot.wheels
@@ -259,7 +259,7 @@ def outline(robot: RobotModel) -> Outline:
 
 
 def urdf_from_model(robot: RobotModel) -> str:
-    """The body written from its TOML."""
+    """Return the URDF generated from the TOML."""
     wheels = robot.wheels
     left_m = wheels.radius_m * (1 + wheels.mismatch / 2)
     right_m = wheels.radius_m * (1 - wheels.mismatch / 2)

@@ -16,14 +16,14 @@ __all__ = ["Forced", "OnPath", "Pushed", "Scenario", "Start", "Static", "Wall", 
 
 
 class PathLeg(Config):
-    """One piece of a path: its length along the path and how far it turns, left positive."""
+    """One segment of a path: its length and its turn angle, left positive."""
 
     length_m: Annotated[float, Field(gt=0, le=1000)]
     turn_deg: Annotated[float, Field(ge=-3600, le=3600)] = 0.0
 
 
 class Place(NamedTuple):
-    """A point, and the heading at it."""
+    """A point and its heading."""
 
     x_m: float
     y_m: float
@@ -31,7 +31,7 @@ class Place(NamedTuple):
 
 
 class ClosedPath:
-    """Legs walked for ever, starting at `start`. Raises ValueError when the end does not meet the start."""
+    """Segments repeated forever from `start`. Raises ValueError unless the end meets the start."""
 
     def __init__(self, start: Place, legs: tuple[PathLeg, ...]) -> None:
         self._legs = legs
@@ -47,7 +47,7 @@ class ClosedPath:
             raise ValueError(f"the path does not close: it ends {off} from its start")
 
     def at(self, distance_m: float) -> Place:
-        """The place `distance_m` along the path; laps repeat."""
+        """Return the place at `distance_m` along the path. Laps repeat."""
         left_m = distance_m % self.length_m
         for leg, start in zip(self._legs, self._starts, strict=False):
             if left_m <= leg.length_m:
@@ -57,7 +57,7 @@ class ClosedPath:
 
 
 def _along(start: Place, leg: PathLeg, distance_m: float) -> Place:
-    """The place `distance_m` into `leg`: the chord of an arc, which a straight is the limit of."""
+    """Return the place at `distance_m` into `leg`, from the chord of its arc. A straight is an arc of no turn."""
     half_rad = math.radians(leg.turn_deg) * distance_m / leg.length_m / 2
     chord_m = distance_m * (math.sin(half_rad) / half_rad if abs(half_rad) > 1e-9 else 1.0)
     heading_rad = start.heading_rad + half_rad
@@ -68,9 +68,9 @@ def _along(start: Place, leg: PathLeg, distance_m: float) -> Place:
     )
 
 
-# What stands, rolls and walks in a scenario: shapes, and how each moves. Pure.
+# Things in a scenario: shapes, and how each moves. Pure.
 #
-# The target is one of them, and so is whatever else is there: blocks of a lane, a cylinder in the way, other people.
+# The target is one of them. Others are blocks of a lane, a cylinder in the way, other people.
 
 
 Metres = Annotated[float, Field(ge=-100, le=100)]
@@ -92,19 +92,19 @@ Span = Annotated[tuple[Degrees, Degrees], AfterValidator(_ordered)]
 """(lowest, highest); the seed draws between them."""
 Amount = Annotated[float, Field(ge=0, le=100)]
 Amounts = Annotated[tuple[Amount, Amount], AfterValidator(_ordered)]
-"""A span of what cannot be negative."""
+"""A span of values that cannot be negative."""
 
 
 class LegShape(Config):
     """A human from the knees down: two upright cylinders that walk. A foot stands, or swings twice as fast."""
 
     apart_m: Side = 0.20
-    """Between the legs' middles."""
+    """Between the centers of the legs."""
     stride_m: Side = 0.9
-    """Way of one whole step of both legs."""
+    """Length of one full step of both legs."""
 
     def ahead_m(self, way_m: float, is_left: bool) -> float:
-        """Return the lead of a leg after `way_m` of walking: a triangle wave of a quarter stride."""
+        """Return the lead of a leg after `way_m` of walking: a triangle wave, amplitude a quarter stride."""
         turn = (way_m / self.stride_m + (0.0 if is_left else 0.5)) % 1.0
         return self.stride_m * (abs(2.0 * turn - 1.0) - 0.5) / 2.0
 
@@ -114,7 +114,7 @@ class Thing(Config):
 
     renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color"}
     shape: Literal["ball", "box", "cylinder", "legs", "place"] = "ball"
-    """`place` is a point of the floor: nothing to see and nothing to touch."""
+    """`place` is a point of the floor without a body."""
     radius_m: Annotated[float, Field(gt=0, le=1)] = 0.10
     """Of a ball, a cylinder, a leg."""
     size_m: tuple[Side, Side, Side] = (0.266, 0.317, 0.281)
@@ -132,19 +132,19 @@ class Thing(Config):
 
     @property
     def reach_m(self) -> float:
-        """Radius of the circle around it, seen from above."""
+        """Return the radius of the circle around it, seen from above."""
         if self.shape == "box":
             return math.hypot(self.size_m[0], self.size_m[1]) / 2
         return self.radius_m + (self.legs.apart_m / 2 if self.shape == "legs" else 0.0)
 
     @property
     def swept_m(self) -> float:
-        """Radius of the circle that it never leaves, a swinging leg included."""
+        """Return the radius of the circle that contains it at any time, including a swinging leg."""
         return self.reach_m + (self.legs.stride_m / 4 if self.shape == "legs" else 0.0)
 
 
 class Static(Thing):
-    """Does not move; nothing can move it."""
+    """A thing that does not move and cannot be pushed."""
 
     kind: Literal["static"] = "static"
     at_m: Point = (0.0, 0.0)
@@ -154,7 +154,7 @@ class Static(Thing):
 
 
 class OnPath(Thing):
-    """Moves along a closed path at constant speed; nothing can stop it."""
+    """A thing that moves along a closed path at constant speed. Nothing stops it."""
 
     kind: Literal["path"]
     start_m: Point = (0.0, 0.0)
@@ -162,9 +162,9 @@ class OnPath(Thing):
     path: Annotated[tuple[PathLeg, ...], Field(min_length=1, max_length=64)]
     speed_mps: Annotated[float, Field(ge=0, le=5)]
     phase: Amounts = (0.0, 1.0)
-    """Where on the path it begins, as a fraction of a lap."""
+    """Start on the path, as a fraction of a lap."""
     waits_s: Annotated[float, Field(ge=0, le=600)] = 0.0
-    """How long it stands there first."""
+    """Time for which it stands there first."""
 
     @model_validator(mode="after")
     def _closes(self) -> Self:
@@ -172,12 +172,12 @@ class OnPath(Thing):
         return self
 
     def closed_path(self) -> ClosedPath:
-        """The path itself."""
+        """Return the closed path."""
         return ClosedPath(Place(*self.start_m, math.radians(self.heading_deg)), self.path)
 
 
 class Rolling(Thing):
-    """A real ball, which can be bumped."""
+    """A real ball that can be bumped."""
 
     at_m: Point = (0.0, 0.0)
     mass_kg: Annotated[float, Field(gt=0, le=100)] = 0.3
@@ -192,18 +192,18 @@ class Rolling(Thing):
 
 
 class Pushed(Rolling):
-    """Rolls where seeded pushes send it."""
+    """A ball that seeded pushes move."""
 
     kind: Literal["pushed"]
     push_every_s: Amounts = (2.0, 4.0)
     push_mps: Amounts = (0.15, 0.3)
     """Speed that a push gives a resting ball."""
     arena_m: Annotated[float, Field(gt=0, le=100)] = 1.5
-    """Pushes aim at random points within this radius of `at_m`, so that it stays about."""
+    """Pushes aim at random points within this radius of `at_m`, so that it stays near."""
 
 
 class Forced(Rolling):
-    """Rolls under one constant force, for ever; drag gives it a top speed."""
+    """A ball under one constant force, forever. Drag limits its speed."""
 
     kind: Literal["forced"]
     heading_deg: Degrees = 0.0
@@ -214,19 +214,19 @@ class Forced(Rolling):
 
 Moving = Annotated[Static | OnPath | Pushed | Forced, Field(discriminator="kind")]
 Standing = Annotated[Static | OnPath, Field(discriminator="kind")]
-"""What else there is but the target: nothing that the robot could push about."""
+"""Things other than the target. The robot cannot push them."""
 
 
-# A traffic light: what it looks like and when it is which colour. Pure.
+# A traffic light: its look and its schedule. Pure.
 #
-# Three lamps in a housing on a pole, or one box that changes its colour as a whole. It faces the traffic of the
+# Three lamps in a housing on a pole, or one box whose color changes. It faces the traffic of the
 # lane. The stop line crosses the lane `line_m` before it.
 
 
 State = Literal["red", "yellow", "green"]
 
 LIT: dict[str, Color] = {"red": (0.95, 0.10, 0.08), "yellow": (0.98, 0.80, 0.06), "green": (0.06, 0.80, 0.22)}
-UNLIT = 0.22  # of its lit colour: glass that nothing shines behind
+UNLIT = 0.22  # of its lit color: dark glass
 
 
 LINE_WIDE_M = 1.2
@@ -234,15 +234,14 @@ LINE_WIDE_M = 1.2
 
 
 class LightPhase(Config):
-    """One colour for a time."""
+    """One color for a time."""
 
     state: State
     seconds: Annotated[float, Field(gt=0, le=600)]
 
 
 class Part(NamedTuple):
-    """One body of the light: sizes as its shape needs them; `state` is the colour it shows, "" for what never lights.
-    """
+    """One body of the light. Its sizes depend on its shape; `state` is the color it shows, "" if it is never lit."""
 
     shape: Literal["box", "ball"]
     at_m: tuple[float, float, float]
@@ -256,9 +255,9 @@ class Light(Config):
     kind: Literal["lamps", "box"] = "lamps"
     at_m: Point
     faces_deg: Degrees = 180.0
-    """Where it looks: towards those who come."""
+    """Direction that it faces: towards approaching traffic."""
     height_m: Side = 0.34
-    """Of the housing's middle, which must be in the robots' view."""
+    """Height of the housing's center, which must be in the robot's field of view."""
     housing_m: tuple[Side, Side, Side] = (0.06, 0.10, 0.26)
     """Deep, wide, high."""
     lamp_radius_m: Side = 0.033
@@ -271,10 +270,10 @@ class Light(Config):
         LightPhase(state="yellow", seconds=2.0),
     )
     begin: Amounts = (0.0, 1.0)
-    """Where in its cycle it begins, as a fraction; the seed draws."""
+    """Start in its cycle, as a fraction, drawn from the seed."""
 
     def state_at(self, begin: float, now_us: int) -> State:
-        """Which colour is lit at `now_us` of a run that began at `begin` of the cycle."""
+        """Return the color at `now_us` of a run that started at the fraction `begin` of the cycle."""
         cycle_s = math.fsum(phase.seconds for phase in self.schedule)
         left_s = (begin * cycle_s + now_us / 1e6) % cycle_s
         for phase in self.schedule:
@@ -284,7 +283,7 @@ class Light(Config):
         return self.schedule[-1].state
 
     def parts(self) -> list[Part]:
-        """Its bodies, where they are in the world."""
+        """Return its bodies, placed in the world."""
         if self.kind == "box":
             return [Part("box", (*self.at_m, self.box_m[2] / 2), self.box_m, "all")]
         deep, _, high = self.housing_m
@@ -299,7 +298,7 @@ class Light(Config):
         return parts
 
     def ahead(self, way_m: float) -> Point:
-        """The point `way_m` before the light."""
+        """Return the point at `way_m` in front of the light."""
         faces_rad = math.radians(self.faces_deg)
         return self.at_m[0] + way_m * math.cos(faces_rad), self.at_m[1] + way_m * math.sin(faces_rad)
 
@@ -327,7 +326,7 @@ def color_of(part: Part, state: State) -> Color:
     return red * share, green * share, blue * share
 
 
-# How pictures look: light and camera defects as data (`looks.toml`). Pure.
+# The look of images: light and camera defects as data (`looks.toml`). Pure.
 
 
 LOOKS = Path(__file__).parent / "looks.toml"
@@ -347,7 +346,7 @@ class Look(Config):
     """
 
     room_m: Annotated[float, Field(ge=0, le=10)] = 0.0
-    """Walls of a room around the scenario, so far from the area that robot and target need; 0: no room."""
+    """Distance of the walls of a room from the area that robot and target need; 0: no room."""
     clutter: Annotated[int, Field(ge=0, le=40)] = 0
     """Number of other objects, of colors near the target's and others. They stand around that area."""
     floor: TextureName = "boards"
@@ -360,7 +359,7 @@ class Look(Config):
     shadows: Unit = 0.0
     """Share of the light that is missing on the floor in the shadow of an object. Objects shade each other, too."""
     latency_ms: Annotated[int, Field(ge=0, le=500)] = 0
-    """The image shows the world so long before its capture time, as a webcam does that stamps what it has read."""
+    """The image shows the world this long before its capture time, as with a webcam that stamps images late."""
     distortion: Annotated[tuple[Annotated[float, Field(ge=-1, le=1)], ...], Field(max_length=5)] = ()
     """Of the lens: k1, k2, p1, p2, k3 in OpenCV's order."""
     lens_known: bool = False
@@ -372,7 +371,7 @@ class Look(Config):
     exposure: Gain = 1.0
     """Brightness factor; above 1 the bright parts burn out."""
     saturation: Annotated[float, Field(ge=0, le=2)] = 1.0
-    """Colourfulness: 0 is a grey picture."""
+    """Colourfulness: 0 is a gray image."""
     white_balance: tuple[Gain, Gain, Gain] = (1.0, 1.0, 1.0)
     """Factors on red, green, blue."""
     exposure_drift: Annotated[float, Field(ge=0, le=1)] = 0.0
@@ -389,7 +388,7 @@ class Look(Config):
 
 
 def look_named(name: str) -> Look:
-    """A look of `looks.toml`. Raises ConfigError with the nearest name."""
+    """Return a look of `looks.toml`. Raises ConfigError with the nearest name."""
     table = read_table(LOOKS)
     if name not in table:
         near = difflib.get_close_matches(name, table, n=1)
@@ -460,7 +459,7 @@ _CONTRADICTING = (("least_distance_m", "most_distance_m"), ("least_ever_m", "mos
 
 
 def _without_off(given: Any) -> Any:
-    """Drop the bounds that are off, and reject unknown figures."""
+    """Drop the bounds that are off. Rejects unknown figures."""
     if not isinstance(given, Mapping):
         return given
     for name in given:
@@ -471,7 +470,7 @@ def _without_off(given: Any) -> Any:
 
 
 def _consistent(bounds: dict[str, float]) -> dict[str, float]:
-    """Reject bounds that no run can be within."""
+    """Return the bounds. Raises ValueError if no run can satisfy them."""
     if {"reached_s", "given_up_s"} <= bounds.keys():
         raise ValueError(f'reached_s and given_up_s exclude each other; set one to "{OFF}"')
     for lower, upper in _CONTRADICTING:
@@ -487,17 +486,17 @@ Bounds = Annotated[
 """Bound by the name of its figure."""
 
 
-# What happens in a simulated run: the models behind `scenarios/*.toml`. Pure.
+# The events of a simulated run: the models behind `scenarios/*.toml`. Pure.
 
 
 SCENARIOS = Path(__file__).parent / "scenarios"
-_LONGEST_NAME_BYTES = 200  # of the 255 that a file system permits
+_LONGEST_NAME_BYTES = 200  # of the 255 that a file system allows
 
 class Start(Config):
     """The start of the robot, drawn within each span: relative to lens and target, or on the map."""
 
     distance_m: Amounts = (0.0, 0.0)
-    """Lens to the target's middle."""
+    """Lens to the target's center."""
     except_m: Amounts | None = None
     """Distances at which no run starts. One that is drawn within moves to the nearer end."""
     bearing_deg: Span = (0.0, 0.0)
@@ -542,7 +541,7 @@ def _part_of_a_file_name(name: str) -> str:
 
 
 class Scenario(Config):
-    """One scenario. `stand_off_m` is what both the steering and the score go by: lens to the target's middle.
+    """One scenario. Both steering and score use `stand_off_m`: lens to the target's center.
 
     `robot`, `mission` and `vision` (keys of vision.toml) are the settings that an operator chooses for it.
     """
@@ -563,13 +562,13 @@ class Scenario(Config):
     goals_m: Annotated[tuple[Point, ...], Field(max_length=64)] = ()
     """Waypoints on the map, in order, for a robot that is sent to them."""
     reachable: bool = True
-    """Whether there is a way to the last of them."""
+    """True if there is a way to the last of them."""
     labels: Literal["", "legs"] = ""
     """Objects that the simulation labels in each image, for a vision service with the detector `boxes`."""
     acquired_within_deg: Annotated[float, Field(gt=0, le=30)] = 2.0
     """Bearing within which the target counts as acquired."""
     bounds: Bounds = Field(default_factory=dict)
-    """What a run is scored by. Without bounds it is not evaluated."""
+    """Bounds that score a run. Without bounds it is not evaluated."""
 
     @model_validator(mode="after")
     def _has_what_its_bounds_need(self) -> Self:
@@ -588,12 +587,12 @@ _PARTS = {"light": "a [light]", "goals": "goals_m", "legs": 'a target of shape "
 
 
 def scenario_names() -> list[str]:
-    """Scenarios that come with Sightline."""
+    """Return the names of the scenarios that come with Sightline."""
     return names_in(SCENARIOS)
 
 
 def load_scenario(name: str) -> Scenario:
-    """A scenario by its name, or by the path of a `.toml` file. Raises ConfigError with the nearest name."""
+    """Load a scenario by name or by the path of a `.toml` file. Raises ConfigError with the nearest name."""
     path = find("scenario", name, SCENARIOS)
     table = read_table(path, SCENARIOS)
     look = table.get("look", "plain")

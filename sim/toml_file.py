@@ -13,7 +13,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def find(kind: str, name: str, folder: Path) -> Path:
-    """The file that `name` means: a path when it ends in `.toml`, otherwise a file of `folder`.
+    """Return the file of `name`: a path if it ends in `.toml`, otherwise a file of `folder`.
 
     Raises ConfigError with the nearest name and all names for an unknown one.
     """
@@ -26,7 +26,7 @@ def find(kind: str, name: str, folder: Path) -> Path:
 
 
 def is_file(path: Path) -> bool:
-    """Return True if there is such a file: False also for a name that no file can have, e.g. a very long one."""
+    """Return True if the file exists; False for an invalid name, e.g. a very long one."""
     try:
         return path.is_file()
     except OSError:
@@ -34,7 +34,7 @@ def is_file(path: Path) -> bool:
 
 
 def names_in(folder: Path) -> list[str]:
-    """The names that `folder` offers, sorted."""
+    """Return the names of the files of `folder`, sorted."""
     return sorted(path.stem for path in folder.glob("*.toml"))
 
 
@@ -44,7 +44,7 @@ def _nearest(name: str, folder: Path) -> str:
 
 
 def read_table(path: Path, folder: Path | None = None) -> dict[str, Any]:
-    """Read a file as a table, over the one of `folder` that it `extends`, if any.
+    """Read a file as a table, merged over the file of `folder` that it `extends`, if any.
 
     Raises ConfigError with the file and the line of invalid TOML.
     """
@@ -52,13 +52,13 @@ def read_table(path: Path, folder: Path | None = None) -> dict[str, Any]:
         table = tomllib.loads(path.read_text("utf-8-sig"))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}; name a TOML file that you may read") from None
-    except (ValueError, RecursionError) as error:  # also a number of too many digits
+    except (ValueError, RecursionError) as error:  # also a number with too many digits
         raise ConfigError(f"{path}: cannot be read as TOML: {error}") from None
     return _extended(table, path, folder) if folder and "extends" in table else table
 
 
 def _extended(table: dict[str, Any], path: Path, folder: Path) -> dict[str, Any]:
-    """Only a file that comes with Sightline is extended, and it extends none itself: two files to read, no more."""
+    """Merge the extended table. Only a file of Sightline that extends no other file can be extended."""
     name = str(table.pop("extends"))
     if name not in names_in(folder) or name == path.stem:
         raise ConfigError(f"{path}: extends: nothing is called {name!r}{_nearest(name, folder)}")
@@ -69,7 +69,7 @@ def _extended(table: dict[str, Any], path: Path, folder: Path) -> dict[str, Any]
 
 
 def laid_over(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`over` on `under`: tables of one kind are merged, anything else is replaced, and `{}` takes a table away."""
+    """Merge `over` into `under`: tables of one kind are merged, other values replaced, and `{}` removes a table."""
     merged = dict(under)
     for name, value in over.items():
         merged[name] = laid_over(under[name], value) if _is_more_of(under.get(name), value) else value
@@ -83,7 +83,7 @@ def _is_more_of(under: Any, over: Any) -> bool:
 
 
 def check(model: type[Model], table: dict[str, Any], path: Path) -> Model:
-    """`table` as a `model`. Raises ConfigError naming the file, the first wrong key and what is wrong with it."""
+    """Return `table` as a `model`. Raises ConfigError with the file, the first invalid key and its error."""
     try:
         return model.model_validate(table)
     except ValidationError as error:
@@ -109,7 +109,7 @@ def _got(value: Any) -> str:
 
 
 def _fields(model: type[BaseModel]) -> set[str]:
-    """Every field name reachable from `model`, for suggestions."""
+    """Return every field name reachable from `model`, for suggestions."""
     definitions = model.model_json_schema()
     tables = [definitions, *definitions.get("$defs", {}).values()]
     return {name for table in tables for name in table.get("properties", {})}

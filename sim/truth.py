@@ -7,10 +7,10 @@ from typing import Self
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The world at one moment. Positions in metres in the world's frame, counter-clockwise positive."""
+    """The world at one moment. Positions in meters in the world frame, counter-clockwise positive."""
 
     t_us: int
-    """The world's time; over the bus the robot's monotonic clock."""
+    """World time; on the bus, the robot's monotonic clock."""
     x_m: float
     y_m: float
     yaw_rad: float
@@ -21,27 +21,27 @@ class Truth:
     target_y_m: float
     target_z_m: float
     bearing_rad: float
-    """Of the target's middle from the camera's axis, left positive."""
+    """Bearing of the target's center from the camera axis, left positive."""
     distance_m: float
-    """Lens to the target's middle, in the horizontal plane."""
+    """Lens to the target's center, horizontally."""
     visible: bool
-    """The target's middle is within the camera's width and no wall hides it."""
+    """True if the target's center is within the width of the image and no wall hides it."""
     wall_contacts: int
     """Physics steps so far in which the robot touched a wall or another thing in its way."""
     target_contacts: int
     """Physics steps so far in which the robot touched the target."""
     target_contacts_by_robot: int
-    """Those of them in which the robot moved towards the target faster than the target towards it."""
+    """The part of `target_contacts` in which the robot approached the target faster than the target the robot."""
     clearance_m: float | None = None
-    """From the robot's body to the nearest obstacle, at most 1; only where it is sent to waypoints."""
+    """From the robot's body to the nearest obstacle, at most 1; only in scenarios with waypoints."""
     passes: int = 0
-    """How often so far a thing on a path went through between the lens and the target."""
+    """Number of times that a thing on a path passed between the lens and the target."""
     light: str = ""
-    """What the traffic light shows, if there is one."""
+    """State of the traffic light, if there is one."""
     past_line_m: float | None = None
-    """How far the robot's front is beyond the light's stop line, negative before it."""
+    """Distance of the robot's front beyond the stop line of the light, negative before it."""
     lag_us: int = 0
-    """How far the simulation is behind the clock; 0 in lockstep."""
+    """Lag of the simulation behind the clock; 0 in lockstep."""
 
     @property
     def contacts(self) -> int:
@@ -49,7 +49,7 @@ class Truth:
         return self.wall_contacts + self.target_contacts
 
     def to_json(self) -> bytes:
-        """One line of JSON."""
+        """Return one line of JSON."""
         return json.dumps(asdict(self)).encode()
 
     @classmethod

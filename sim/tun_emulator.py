@@ -36,7 +36,7 @@ _TUNSETIFF, _IFF_TUN, _IFF_NO_PI, _CLONE_NEWNET = 0x400454CA, 0x0001, 0x1000, 0x
 
 
 def why_impossible() -> str:
-    """Why this machine can run no wire, "" if it can."""
+    """Return why this machine cannot run a wire, or ""."""
     if os.geteuid() != 0:
         return "needs root"
     return "" if Path("/dev/net/tun").exists() else "needs /dev/net/tun"
@@ -44,7 +44,7 @@ def why_impossible() -> str:
 
 @contextmanager
 def namespaces(*names: str) -> Iterator[None]:
-    """Network namespaces while inside. Raises HardwareError where the kernel gives none."""
+    """Create the network namespaces while inside. Raises HardwareError if the kernel does not permit it."""
     made: list[str] = []
     try:
         for name in names:
@@ -58,7 +58,7 @@ def namespaces(*names: str) -> Iterator[None]:
 
 
 def move_address(namespace: str, old: str, new: str) -> None:
-    """Another address for this end of the wire, as a router gives one after a while."""
+    """Change the address of this end of the wire, as a router may do."""
     _ip("-n", namespace, "addr", "del", f"{old}/24", "dev", DEVICE)
     _ip("-n", namespace, "addr", "add", f"{new}/24", "dev", DEVICE)
 
@@ -71,7 +71,7 @@ def _ip(*arguments: str) -> None:
 
 
 def _open_tun(namespace: str, address: str) -> int:
-    """A TUN device inside `namespace`, its descriptor here."""
+    """Open a TUN device inside `namespace`. Returns its descriptor."""
     libc = ctypes.CDLL(None, use_errno=True)
     ours = os.open("/proc/self/ns/net", os.O_RDONLY)
     theirs = os.open(f"/var/run/netns/{namespace}", os.O_RDONLY)
@@ -107,7 +107,7 @@ def run(namespace_a: str, namespace_b: str) -> int:
 
 
 def _reshape(wire: EmulatedLink) -> bool:
-    """Take a line of stdin; False at its end."""
+    """Apply a line of stdin. Returns False at its end."""
     line = sys.stdin.readline()
     if line:
         wire.shape(_read_shapes(line))
@@ -128,7 +128,7 @@ def _read(tun: int, leg: EmulatedLeg) -> None:
 
 def _write(leg: EmulatedLeg, tun: int) -> None:
     for packet in leg.take_due(monotonic_us()):
-        with suppress(OSError):  # the far end is going away
+        with suppress(OSError):  # the other end is closing
             os.write(tun, packet)
 
 

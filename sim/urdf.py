@@ -1,4 +1,4 @@
-"""Reads and checks a URDF or xacro file. Pure (reads files)."""
+"""Read and check a URDF or xacro file. Pure (reads files)."""
 
 import difflib
 import math
@@ -25,35 +25,35 @@ class Transform(NamedTuple):
     at: Vector = (0.0, 0.0, 0.0)
 
     def point(self, inner: Vector) -> Vector:
-        """A point of this frame, seen from outside."""
+        """Convert a point of this frame to the outer frame."""
         x, y, z = self.direction(inner)
         return x + self.at[0], y + self.at[1], z + self.at[2]
 
     def direction(self, inner: Vector) -> Vector:
-        """A direction of this frame, seen from outside."""
+        """Convert a direction of this frame to the outer frame."""
         x, y, z = (sum(one * other for one, other in zip(row, inner, strict=True)) for row in self.turn)
         return x, y, z
 
     def of(self, inner: "Transform") -> "Transform":
-        """A frame that hangs in this one, seen from outside."""
+        """Convert a frame within this frame to the outer frame."""
         columns = [self.direction(_column(inner.turn, index)) for index in range(3)]
         x, y, z = (_column((columns[0], columns[1], columns[2]), index) for index in range(3))
         return Transform((x, y, z), self.point(inner.at))
 
     def inverse(self) -> "Transform":
-        """The outside, seen from here."""
+        """Return the outer frame, relative to this one."""
         back = Transform((_column(self.turn, 0), _column(self.turn, 1), _column(self.turn, 2)))
         x, y, z = back.direction(self.at)
         return Transform(back.turn, (-x, -y, -z))
 
     @property
     def yaw_rad(self) -> float:
-        """Which way its x axis points, over the floor."""
+        """Return the heading of its x axis over the floor."""
         return math.atan2(self.turn[1][0], self.turn[0][0])
 
 
 def transform(at: Vector, roll_rad: float = 0.0, pitch_rad: float = 0.0, yaw_rad: float = 0.0) -> Transform:
-    """The frame of a URDF's `xyz` and `rpy`: turned about its x, then y, then z axis as they were before."""
+    """Return the frame of a URDF's `xyz` and `rpy`: rotations about the fixed x, then y, then z axis."""
     cr, sr, cp, sp = math.cos(roll_rad), math.sin(roll_rad), math.cos(pitch_rad), math.sin(pitch_rad)
     cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
     return Transform((
@@ -81,16 +81,16 @@ _NUMBERS = {
 }
 _SHAPES = ("box", "cylinder", "sphere")
 _JOINTS = ("fixed", "continuous", "revolute", "prismatic", "floating", "planar", "spherical")
-"""Types of joints. With another one, and with a link below two joints, PyBullet may end the process."""
+"""Types of joints. Other types, and links below two joints, may crash PyBullet."""
 _CHILDREN = {"inertial": ("mass", "inertia"), "collision": ("geometry",)}
 _ATTRIBUTES = {"mass": ("value",), "inertia": ("ixx", "iyy", "izz"), "box": ("size",), "cylinder": ("radius", "length"),
                "sphere": ("radius",)}
 """Of a link, required by PyBullet, whose own lines name no link."""
 _PLACED_WITHIN_M = 0.001
-_ACROSS = 0.999  # cosine: a URDF that writes a quarter turn as 1.57 is meant to be square
+_ACROSS = 0.999  # cosine: a URDF that writes a quarter turn as 1.57 counts as square
 _AHEAD = (Transform().turn, ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
 _TURNED = 0.01  # of any axis: half a degree
-_RIM = 0.03  # of the track width: so narrow a rim turns within 0.1 % of the distance of the joints
+_RIM = 0.03  # of the track width: with so narrow a rim, turns are within 0.1 % of the distance of the joints
 _REST = 0.97  # of the radius
 _FEATHER = (
     '<inertial><mass value="0.001"/><inertia ixx="1e-6" iyy="1e-6" izz="1e-6" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -98,7 +98,7 @@ _FEATHER = (
 
 
 class Wheel(NamedTuple):
-    """One driven wheel: `sign` is -1 where the joint's positive turn rolls backwards."""
+    """One driven wheel. `sign` is -1 if the joint's positive turn rolls backwards."""
 
     joint: str
     place: Vector
@@ -115,7 +115,7 @@ class Outline(NamedTuple):
 
 
 class Urdf:
-    """One file's robot. Raises ConfigError for what cannot be one."""
+    """The URDF of one robot. Raises ConfigError if it cannot be a robot."""
 
     def __init__(self, text: str, name: str) -> None:
         self._name = name
@@ -129,14 +129,14 @@ class Urdf:
     # --- the queries of a robot --------------------------------------------------------------------------------------
 
     def foot(self, left_joint: str, right_joint: str, front: Front) -> Transform:
-        """The axle's midpoint on the floor, x forward, seen from the root link."""
+        """Return the axle's midpoint on the floor, x forward, relative to the root link."""
         left, right = self._wheel_place(left_joint), self._wheel_place(right_joint)
         radius_m = self._wheel_radius(left_joint)
         middle = ((left[0] + right[0]) / 2, (left[1] + right[1]) / 2, (left[2] + right[2]) / 2 - radius_m)
         return transform(middle, yaw_rad=math.pi if front == "-x" else 0.0)
 
     def wheels(self, left_joint: str, right_joint: str, front: Front) -> tuple[Wheel, Wheel]:
-        """Left and right, about the axle's midpoint on the floor."""
+        """Return the left and right wheel, relative to the axle's midpoint on the floor."""
         seen_from = self.foot(left_joint, right_joint, front).inverse()
         left, right = self._wheel(left_joint, seen_from), self._wheel(right_joint, seen_from)
         if left.place[1] <= right.place[1]:
@@ -156,9 +156,9 @@ class Urdf:
         return foot.inverse().of(self._frames[link])
 
     def mount(self, link: str, foot: Transform) -> Transform:
-        """Return the position of a sensor that faces straight ahead in the middle. Raises ConfigError for another one.
+        """Return the position of a centered sensor that faces straight ahead. Raises ConfigError for another one.
 
-        A camera may lie as its optical frame does: z forward, x right.
+        A camera may use its optical frame: z forward, x right.
         """
         where = self.place(link, foot)
         turned = min(max(abs(one - other) for row, rows in zip(where.turn, ahead, strict=True)
@@ -182,9 +182,9 @@ class Urdf:
         )
 
     def text(self, left_joint: str, right_joint: str, mismatch: float) -> str:
-        """The file as PyBullet shall have it: a feather's mass for links without one, radii off by `mismatch`.
+        """Return the URDF for PyBullet: a tiny mass for links without one, radii changed by `mismatch`.
 
-        Wheels roll on a narrow rim: a wide one scrubs, and the robot turns 1 % short. Nothing is drawn, since
+        Wheels roll on a narrow rim, because a wide one scrubs and the robot turns 1 % short. Nothing is drawn, since
         the lens may lie within its housing.
         """
         root = ElementTree.fromstring(ElementTree.tostring(self._root))
@@ -259,7 +259,7 @@ class Urdf:
                                       "<sphere>")
 
     def _link_frames(self) -> dict[str, Transform]:
-        """Every link, seen from the root, joints at zero."""
+        """Return every link relative to the root, joints at zero."""
         above: dict[str, Element] = {}
         for name, joint in self._joints.items():
             for end in ("parent", "child"):
@@ -327,7 +327,7 @@ class Urdf:
 
 
 def _end(joint: Element, name: str) -> str:
-    """The parent or the child of a joint."""
+    """Return the parent or the child link of a joint."""
     found = joint.find(name)
     return found.get("link", "") if found is not None else ""
 
@@ -376,7 +376,7 @@ def _corners(shape: Element) -> Iterable[Vector]:
 
 
 def _grow(root: Element, joint_name: str, share: float) -> None:
-    """Make one wheel larger by a share, and hang it so that it still touches the floor."""
+    """Enlarge one wheel by a share, and mount it so that it still touches the floor."""
     if not share:
         return
     joint = next(one for one in root.findall("joint") if one.get("name") == joint_name)
@@ -390,13 +390,13 @@ def _grow(root: Element, joint_name: str, share: float) -> None:
 
 
 def _child(root: Element, joint_name: str) -> Element:
-    """The link that a joint moves."""
+    """Return the link that a joint moves."""
     joint = next(one for one in root.findall("joint") if one.get("name") == joint_name)
     return next(one for one in root.findall("link") if one.get("name") == _end(joint, "child"))
 
 
 def _narrow(link: Element, rim_m: float) -> None:
-    """Let a wheel stand on a rim in its middle; the rest of its width, a little smaller, still meets what it meets."""
+    """Let a wheel roll on a rim at its center. The rest of its width, a little smaller, keeps its collisions."""
     for shape in link.findall("collision"):
         cylinder = shape.find("geometry/cylinder")
         if cylinder is None or _number(cylinder, "length", 0.0) <= rim_m:
@@ -414,11 +414,11 @@ def _nearest(name: str, names: Iterable[str]) -> str:
     return f", did you mean {near[0]!r}?" if near else ""
 
 
-# A URDF's text, from its file or from the xacro file that writes it. Pure (reads files, keeps no state).
+# The text of a URDF, from its file or expanded from xacro. Pure (reads files, keeps no state).
 
 
 def urdf_text(path: Path) -> str:
-    """The URDF in `path`; a `.xacro` is expanded, which needs the extra. Raises ConfigError."""
+    """Return the text of the URDF in `path`. A `.xacro` is expanded and needs the extra. Raises ConfigError."""
     if not is_file(path):
         raise ConfigError(f"{path}: no such file; `urdf` names a file beside the robot's .toml")
     if path.suffix == ".xacro":
@@ -437,5 +437,5 @@ def _expanded(path: Path) -> str:
                           ) from None
     try:
         return str(XacroDoc.from_file(str(path)).to_urdf_string())
-    except Exception as error:  # the package raises whatever its parser does
+    except Exception as error:  # the package passes on any error of its parser
         raise ConfigError(f"{path}: xacro cannot expand it: {str(error).splitlines()[0][:160]}") from None

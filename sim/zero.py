@@ -1,4 +1,4 @@
-"""The simulated wheels set to zero after the process that had them has died. Shell (a socket).
+"""Set the simulated wheels to zero after their owner process has died. Shell (a socket).
 
 The guardian imports this module alone, so it needs no pydantic.
 """

@@ -16,12 +16,12 @@ from sightline.sim.scenario import Color, State
 SCORED_FROM: Final = 900_000
 """First seed of the scenes for scores only."""
 VALIDATED_FROM: Final = 800_000
-"""Seeds from here up to `JUDGED_FROM` choose thresholds; training draws below."""
+"""Seeds from here up to `SCORED_FROM` choose thresholds; training draws below."""
 LABELS: Final = ("ball", "light-red", "light-yellow", "light-green", "legs")
 LATER_FROM: Final = 20_000
-"""Seeds of training from here on have more families of textures: the second round's."""
+"""Training seeds from here on have more texture families: those of the second round."""
 HARDER_FROM: Final = 40_000
-"""Seeds of training from here on have more legs, and more boxes of the ball's colour: the third round's."""
+"""Training seeds from here on have more legs and more boxes of the ball's color: those of the third round."""
 STATES: Final[tuple[State, ...]] = ("red", "yellow", "green")
 
 WIDTH_PX, HEIGHT_PX = 320, 240
@@ -31,7 +31,7 @@ MOST_HIDDEN = 0.6
 MOST_DISTRACTORS = 5
 WITHOUT_BALL_EVERY = 5
 """Each fifth scored scene has no ball."""
-LIGHT_SIZES: Final = (0.6, 1.4)  # of a traffic light, by the one in the simulated lane
+LIGHT_SIZES: Final = (0.6, 1.4)  # scale of a traffic light; 1 is that of the simulated lane
 
 Random = np.random.Generator
 Span = tuple[float, float]
@@ -45,17 +45,17 @@ class Column:
 
     name: str
     same_colour_boxes: float = 0.0
-    """How likely two boxes of the ball's own colour are about."""
+    """Probability that two boxes of the ball's own color are present."""
     lights: float = 0.15
     legs: float = 0.15
     any_colour: float = 0.0
-    """How likely the ball is of another colour than yellow."""
+    """Probability that the ball is not yellow."""
     gain: Span = (0.9, 1.0)
     white_balance: float = 0.03
-    """Red, green and blue are off by up to this share, each way."""
+    """Largest error of red, green and blue, in both directions."""
     blurred: float = 0.0
     blur_px: Span = (9.0, 21.0)
-    """Across the whole kernel: half of them out of focus, half of them moved."""
+    """Width of the kernel: half of them out of focus, half of them moved."""
     noise: Span = (1.0, 3.0)
     quality: tuple[int, int] = (75, 95)
 
@@ -72,7 +72,7 @@ COLUMNS: Final = {one.name: one for one in (
     Column("all at once", **_HARD),  # type: ignore[arg-type]
 )}
 THINGS: Final = Column("lights and legs", lights=1.0, legs=1.0)
-"""For traffic lights and legs: one of each in every scene, the three states in turn."""
+"""For traffic lights and legs: one of each in every scene. The three states take turns."""
 TRAINED: Final = Column(
     "trained", same_colour_boxes=0.6, lights=0.35, legs=0.4, any_colour=0.2, gain=(0.2, 1.1), white_balance=0.33,
     blurred=0.45, blur_px=(3.0, 21.0), noise=(0.0, 6.0), quality=(25, 95),
@@ -84,8 +84,9 @@ DEFECTS: Final = (
     Column("much at once", gain=(0.22, 1.05), white_balance=0.32, blurred=1.0, blur_px=(7.0, 21.0), noise=(0.5, 4.0),
            quality=(25, 45)),
 )
-"""From the third round on each is as likely, so that scores mean the same in clear pictures and in bad ones: bad ones
-need the higher threshold otherwise, and there is one for all."""
+"""Equally likely from the third round on, so that a score means the same in clear and in bad images. Otherwise bad
+images would need a higher threshold, and all share one.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +97,7 @@ class Lens:
     pitch_rad: float
 
     def axes(self) -> npt.NDArray[np.float64]:
-        """Columns right, down, forward."""
+        """Return the axes as columns: right, down, forward."""
         cos, sin = math.cos(self.pitch_rad), math.sin(self.pitch_rad)
         return np.array([[0.0, -sin, cos], [-1.0, 0.0, 0.0], [0.0, -cos, -sin]])
 
@@ -106,15 +107,15 @@ class Lens:
         return x, y, z
 
     def ray(self, u_px: float, v_px: float) -> npt.NDArray[np.float64]:
-        """The pixel's ray, one metre deep: right, down, forward."""
+        """Return the ray of a pixel to a depth of 1 m: right, down, forward."""
         return np.array([(u_px - WIDTH_PX / 2) / self.focal_px, (v_px - HEIGHT_PX / 2) / self.focal_px, 1.0])
 
     def horizon_px(self) -> float:
-        """The row of what is infinitely far away and level."""
+        """Return the row of the horizon."""
         return HEIGHT_PX / 2 - self.focal_px * math.tan(self.pitch_rad)
 
     def ball_box(self, at_m: Point, radius_m: float) -> Box:
-        """The exact box around a whole ball, as if nothing hid it and the picture had no border."""
+        """Return the exact box around a whole ball, without occlusion and image border."""
         right, down, ahead = np.array(at_m) @ self.axes()
         edges = []
         for aside, middle in ((right, WIDTH_PX / 2), (down, HEIGHT_PX / 2)):
@@ -131,21 +132,21 @@ class Solid:
     shape: str
     """`ball`, `box`, `cylinder`, `legs`, `light`"""
     at_m: Point
-    """Middle of a ball, a box, a cylinder; where legs stand; middle of a light's housing."""
+    """Center of a ball, a box, a cylinder; position of legs; center of a light's housing."""
     size_m: Point
     """Sides of a box; radius, radius, height of a cylinder or a leg; scale of a light."""
     colour: Color
     turn_rad: float = 0.0
     label: str = ""
     step: float = 0.0
-    """Of legs: how far they are in their stride."""
+    """Of legs: position in their stride."""
     is_like_ball: bool = False
-    """A box of the ball's own colour, which its column is named for."""
+    """A box of the ball's own color, as in the name of its column."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """A floor or a wall: family of texture, its own seed, metres that a tile covers."""
+    """A floor or a wall: texture family, seed, and tile size in meters."""
 
     family: str
     seed: int
@@ -154,7 +155,7 @@ class Surface:
 
 @dataclass(frozen=True, slots=True)
 class ScenePlan:
-    """All of one scene before it is drawn."""
+    """All contents of one scene before it is drawn."""
 
     seed: int
     column: Column
@@ -170,7 +171,7 @@ class ScenePlan:
     ambient: float
     solids: tuple[Solid, ...]
     glow: float
-    """How much a lit lamp shines by itself."""
+    """Share of a lit lamp's own light."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,23 +180,23 @@ class LabelledBox:
 
     label: str
     box: Box
-    """Around what is in view of it, from the segmentation mask."""
+    """Box around its visible part, from the segmentation mask."""
     seen: float
-    """Share of it that is in view."""
+    """Visible share."""
     whole: Box | None = None
-    """Of a ball: around all of it."""
+    """Of a ball: box around all of it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A drawn scene before the camera's defects: RGB, what is in it, and the boxes of all else that stands about."""
+    """A drawn scene before camera defects: RGB, the contents, and the boxes of all other things."""
 
     plan: ScenePlan
     rgb: npt.NDArray[np.uint8]
     truths: tuple[LabelledBox, ...]
     others: tuple[Box, ...]
     unclear: tuple[Box, ...]
-    """Labeled objects that are hardly in view. A detection of them is neither right nor wrong."""
+    """Labeled objects that are barely visible. A detection of them is neither right nor wrong."""
 
 
 @dataclass(frozen=True, slots=True)

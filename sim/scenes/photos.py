@@ -15,17 +15,17 @@ Picture = npt.NDArray[np.uint8]
 
 BALL_PX: Final = (9.0, 110.0)
 _SMALL: Final = 0.4
-"""Share of the balls that are at most ..."""
+"""Share of the balls whose width is at most ..."""
 _SMALL_PX: Final = 28.0
-"""... so wide: those are missed most."""
+"""... this. Small balls are missed most often."""
 _WITHOUT_BALL: Final = 0.3
 _MOST_THINGS: Final = 4
 _LEAST_SHARE: Final = 0.35
-"""Of a photograph's largest 4:3 cut: the smallest cut."""
+"""Smallest cut, as a share of the largest 4:3 cut of a photograph."""
 
 
 def photo_scene(photos: Sequence[Picture], seed: int) -> PhotoScene:
-    """Draw the scene of that seed over one of the photographs, RGB. The same for the same photographs."""
+    """Draw the scene of a seed over one of the photographs, RGB. Depends only on seed and photographs."""
     draw = np.random.default_rng([seed, 17])
     canvas = _cut(photos[int(draw.integers(len(photos)))], draw).astype(np.float32) / np.float32(255)
     balls: list[Laid] = []
@@ -50,7 +50,7 @@ def photo_scene(photos: Sequence[Picture], seed: int) -> PhotoScene:
 
 
 def _cut(photo: Picture, draw: Random) -> Picture:
-    """A part of the photograph, 320x240, sometimes turned a little."""
+    """Return a part of the photograph, 320x240, sometimes turned a little."""
     height, width = photo.shape[:2]
     largest = min(width, height * WIDTH_PX / HEIGHT_PX)
     wide = largest * math.sqrt(draw.uniform(_LEAST_SHARE, 1.0))
@@ -62,11 +62,11 @@ def _cut(photo: Picture, draw: Random) -> Picture:
 
 
 Laid = tuple[Array, Box, float]
-"""What is in view of it, (H, W) 0..1; the box around; the share of it in view."""
+"""Visible part, (H, W) 0..1; the box around it; its visible share."""
 
 
 def _laid(canvas: Array, draw: Random, is_ball: bool) -> Laid:
-    """Lay a ball or a thing over the canvas."""
+    """Draw a ball or a thing over the canvas."""
     low, high = BALL_PX
     if is_ball and draw.random() < _SMALL:
         high = _SMALL_PX
@@ -84,7 +84,7 @@ def _laid(canvas: Array, draw: Random, is_ball: bool) -> Laid:
 
 
 def _light_at(canvas: Array, x: float, y: float, width_px: float, draw: Random) -> SpriteLight:
-    """SpriteLight of about the brightness and a little of the color of the place."""
+    """Return light of about the brightness, and a little of the color, of the place."""
     half = max(8, int(width_px))
     rows = slice(max(0, int(y) - half), max(1, min(HEIGHT_PX, int(y) + half)))
     columns = slice(max(0, int(x) - half), max(1, min(WIDTH_PX, int(x) + half)))
@@ -95,7 +95,7 @@ def _light_at(canvas: Array, x: float, y: float, width_px: float, draw: Random) 
 
 
 def _shade_floor(canvas: Array, at: tuple[float, float], width_px: float, draw: Random) -> None:
-    """A soft oval shadow, in place."""
+    """Draw a soft oval shadow, in place."""
     shadow = np.zeros((HEIGHT_PX, WIDTH_PX), np.float32)
     half = (0.5 * width_px * draw.uniform(0.7, 1.2), 0.5 * width_px * draw.uniform(0.15, 0.4))
     aside = draw.uniform(-0.25, 0.25) * width_px
@@ -107,7 +107,7 @@ def _shade_floor(canvas: Array, at: tuple[float, float], width_px: float, draw: 
 
 
 def _cover(canvas: Array, sprite: Sprite, x: float, y: float) -> Array:
-    """Blend the sprite about (x, y), in place. Returns what is in view of it."""
+    """Blend the sprite around (x, y), in place. Returns its visible part."""
     side = sprite.cover.shape[0]
     move = np.array([[1, 0, x - side / 2], [0, 1, y - side / 2]], np.float64)
     size = (WIDTH_PX, HEIGHT_PX)
@@ -118,7 +118,7 @@ def _cover(canvas: Array, sprite: Sprite, x: float, y: float) -> Array:
 
 
 def _hide(canvas: Array, balls: list[Laid], draw: Random) -> None:
-    """Lay a thing or a part of the surroundings over a part of the last ball."""
+    """Cover part of the last ball with a thing or a part of the surroundings."""
     visible, box, seen = balls[-1]
     width_px = box[2] - box[0]
     angle, reach = draw.uniform(0, math.tau), width_px * draw.uniform(0.35, 0.6)
@@ -139,12 +139,12 @@ def _hide(canvas: Array, balls: list[Laid], draw: Random) -> None:
 
 
 def _covers(ball_box: Box, other: Box) -> bool:
-    """Return True if the middle of `other` is behind the ball."""
+    """Return True if the center of `other` is behind the ball."""
     x, y = (other[0] + other[2]) / 2, (other[1] + other[3]) / 2
     return ball_box[0] < x < ball_box[2] and ball_box[1] < y < ball_box[3]
 
 
 def _around(visible: Array) -> Box | None:
-    """Return the box around what is at least half in view, half-open; None if nothing is."""
+    """Return the box around pixels that are at least half visible, half-open; None without any."""
     x, y, width, height = cv2.boundingRect((visible >= 0.5).astype(np.uint8))
     return (float(x), float(y), float(x + width), float(y + height)) if width else None

@@ -1,4 +1,4 @@
-"""Places the things of a scene, and the defects of its picture. Pure."""
+"""Place the things of a scene, and set the defects of its image. Pure."""
 
 import math
 from collections.abc import Iterator
@@ -33,16 +33,16 @@ from sightline.sim.scenes.model import (
 from sightline.sim.scenes.textures import any_rgb, families
 
 _YELLOW = {"saturation": (0.72, 1.0), "value": (0.75, 1.0), "hue_deg": (42.0, 58.0)}
-_SCORED_LIGHT_DEG = ((30.0, 50.0),)  # how high the light stands; between those of training, and never trained on
+_SCORED_LIGHT_DEG = ((30.0, 50.0),)  # elevation of the light; between the bands of training, which never include it
 _TRAINED_LIGHT_DEG = ((10.0, 30.0), (50.0, 85.0))
-_HIGHEST_M, _LOWEST_M = 1.5, 0.04  # of the lens above the floor
+_HIGHEST_M, _LOWEST_M = 1.5, 0.04  # height of the lens above the floor
 _HALF_OCCLUDED = 0.5
-_LAMPS_HIGH_M = 0.26  # of the simulated light's housing
+_LAMPS_HIGH_M = 0.26  # height of the simulated light's housing
 _TRIES = 50
 
 
 def plan_scene(seed: int, column: Column) -> ScenePlan:
-    """The scene of that seed; the same for ever."""
+    """Draw the scene of a seed. The result never changes."""
     draw = np.random.default_rng([seed, 11])
     half_view_rad = math.radians(draw.uniform(25.0, 37.5))
     lens = Lens(WIDTH_PX / 2 / math.tan(half_view_rad), math.radians(draw.uniform(-3.0, 25.0)))
@@ -68,7 +68,7 @@ def plan_scene(seed: int, column: Column) -> ScenePlan:
 
 def with_more_of_the_ball(plan: ScenePlan) -> Iterator[ScenePlan]:
     """Yield simpler scenes for a ball that is hidden too much: first without nearer objects, then with the boxes of its
-    color elsewhere, then without the nearer ones of these."""
+    color moved, then without the nearer ones of these boxes."""
     (ball,) = (one for one in plan.solids if one.label == "ball")
     alike = [one for one in plan.solids if one.is_like_ball]
     others = [one for one in plan.solids if one not in alike and (one == ball or not _is_nearer(one, ball))]
@@ -81,7 +81,7 @@ def with_more_of_the_ball(plan: ScenePlan) -> Iterator[ScenePlan]:
 
 
 def _is_nearer(one: Solid, ball: Solid) -> bool:
-    """Return True if a part of it can be nearer than the ball."""
+    """Return True if a part of the object can be nearer than the ball."""
     return math.dist(one.at_m, (0, 0, 0)) <= math.dist(ball.at_m, (0, 0, 0)) + _reach(one)
 
 
@@ -92,7 +92,7 @@ def _width_px(lens: Lens, ball: Solid) -> float:
 
 
 def _reach(one: Solid) -> float:
-    """No part of it is further from its middle."""
+    """Return a bound on the distance of any part of the object from its center."""
     return {"legs": 0.8, "light": 0.3}.get(one.shape, math.hypot(*one.size_m) / 2 + 0.01)
 
 
@@ -101,7 +101,7 @@ def _log(draw: Random, span: Span) -> float:
 
 
 def _ball(draw: Random, lens: Lens, column: Column) -> tuple[Solid, float, float]:
-    """The ball, the floor below it, its width in pixels."""
+    """Draw the ball, the floor below it, and its width in pixels."""
     width_px, radius_m = _log(draw, BALL_PX), draw.uniform(0.03, 0.15)
     ahead_m = lens.focal_px * math.sqrt(1 + (width_px / 2 / lens.focal_px) ** 2) * 2 * radius_m / width_px
     top = max(lens.horizon_px() + 2, 0.25 * width_px)
@@ -115,7 +115,7 @@ def _ball(draw: Random, lens: Lens, column: Column) -> tuple[Solid, float, float
 
 
 def _like(draw: Random, lens: Lens, floor_m: float, ball: Solid, width_px: float) -> Solid:
-    """A box of the ball's colour, about as large in the picture, beside it."""
+    """Draw a box next to the ball, of its color and of about its size in the image."""
     away_m = float(np.dot(ball.at_m, lens.axes()[:, 2]))
     ahead_m = away_m * draw.uniform(0.7, 1.4)
     sides = [width_px * _log(draw, (0.5, 1.6)) * ahead_m / lens.focal_px * draw.uniform(0.8, 1.25) for _ in range(3)]
@@ -145,7 +145,7 @@ def _any_colour(draw: Random) -> Color:
 
 
 def _light(draw: Random, lens: Lens, seed: int) -> Solid:
-    """A traffic light whose housing is 16 to 110 pixels high, towards the lens or a little aside."""
+    """Draw a traffic light whose housing is 16 to 110 pixels high, facing the lens or a little aside."""
     scale = draw.uniform(*LIGHT_SIZES)
     ahead_m = lens.focal_px * _LAMPS_HIGH_M * scale / _log(draw, (16.0, 110.0))
     at = lens.point(draw.uniform(0.05, 0.95) * WIDTH_PX, draw.uniform(0.12, 0.75) * HEIGHT_PX, ahead_m)
@@ -163,7 +163,7 @@ def _legs(draw: Random, lens: Lens, floor_m: float) -> Solid:
 
 
 def _occluder(draw: Random, ball: Solid) -> Solid:
-    """Something in front of the ball whose edge crosses it."""
+    """Draw an object in front of the ball whose edge crosses the ball."""
     share, side = draw.uniform(0.55, 0.9), 1 if draw.random() < 0.5 else -1
     x, y, z = (part * share for part in ball.at_m)
     seen_m, wide_m = ball.size_m[0] * share, ball.size_m[0] * _log(draw, (0.3, 2.0))
@@ -177,7 +177,7 @@ def _occluder(draw: Random, ball: Solid) -> Solid:
 def _light_from(draw: Random, scored: bool) -> tuple[Point, float]:
     bands = _SCORED_LIGHT_DEG if scored else _TRAINED_LIGHT_DEG
     high = math.radians(draw.uniform(*bands[int(draw.integers(len(bands)))]))
-    around = draw.uniform(math.pi / 2, 3 * math.pi / 2)  # from the lens's side, else all is dark
+    around = draw.uniform(math.pi / 2, 3 * math.pi / 2)  # from the side of the lens, otherwise all is dark
     way = (math.cos(high) * math.cos(around), math.cos(high) * math.sin(around), math.sin(high))
     return way, draw.uniform(0.4, 0.8)
 
@@ -187,16 +187,16 @@ def _surface(draw: Random, seed: int) -> Surface:
     return Surface(known[int(draw.integers(len(known)))], int(draw.integers(1 << 31)), _log(draw, (0.5, 4.0)))
 
 
-# What the camera and the link do to a scene's picture: light, colour cast, blur, noise, JPEG. Pure.
+# Effects of camera and link on the image of a scene: light, color cast, blur, noise, JPEG. Pure.
 
 
 Picture = npt.NDArray[np.uint8]
-_SOFT_PX = (0.3, 0.7)  # standard deviation of any lens's own softness
+_SOFT_PX = (0.3, 0.7)  # standard deviation of the softness of any lens
 _POOL_SIDE = 1024
 
 
 def as_seen(scene: Scene) -> bytes:
-    """The scene's JPEG, with the defects that its seed draws from its column."""
+    """Return the scene as JPEG, with defects that its seed draws from its column."""
     return with_defects(scene.rgb, scene.plan.column, np.random.default_rng([scene.plan.seed, 13]))
 
 
@@ -217,7 +217,7 @@ def with_defects(rgb: Picture, column: Column, draw: Random) -> bytes:
 
 
 def _blurred(picture: Picture, across_px: float, draw: Random) -> Picture:
-    """Out of focus, or moved while it was taken: a kernel that wide."""
+    """Blur by a kernel of this width: out of focus, or motion."""
     if draw.random() < 0.5:
         side = 2 * int(across_px / 2) + 1
         return np.asarray(cv2.GaussianBlur(picture, (side, side), 0), np.uint8)
@@ -225,7 +225,7 @@ def _blurred(picture: Picture, across_px: float, draw: Random) -> Picture:
 
 
 def streak(long_px: float, angle_rad: float) -> npt.NDArray[np.float32]:
-    """Kernel of an even motion over `long_px`, about its middle."""
+    """Return the kernel of a uniform motion over `long_px`, about its center."""
     side = 2 * math.ceil(long_px / 2) + 1
     kernel = np.zeros((side, side), np.float32)
     along = np.linspace(-long_px / 2, long_px / 2, 8 * side)

@@ -31,12 +31,12 @@ from sightline.sim.world.camera import FAR_M, NEAR_M, NOTHING_DEPTH
 from sightline.sim.world.engine import camera_arrays, pybullet
 
 Plane = npt.NDArray[np.float32]
-_SHADED = (0.7, 1.0)  # the wall's brightness, by its turn
+_SHADED = (0.7, 1.0)  # brightness of the wall, by its orientation
 _ABOVE = np.float32(1e6)
 
 
 def backdrop(plan: ScenePlan) -> npt.NDArray[np.uint8]:
-    """RGB picture of the empty room."""
+    """Return the RGB image of the empty room."""
     x, y, z = _rays(plan.lens)
     floor_at = np.where(z < -1e-3, np.float32(plan.floor_m) / np.minimum(z, np.float32(-1e-3)), _ABOVE)
     cos, sin = np.float32(math.cos(plan.wall_turn_rad)), np.float32(math.sin(plan.wall_turn_rad))
@@ -50,7 +50,7 @@ def backdrop(plan: ScenePlan) -> npt.NDArray[np.uint8]:
 
 
 def _rays(lens: Lens) -> tuple[Plane, Plane, Plane]:
-    """Each pixel's ray in the world."""
+    """Return the ray of each pixel in the world."""
     axes = lens.axes().astype(np.float32)
     right = ((np.arange(WIDTH_PX, dtype=np.float32) + 0.5 - WIDTH_PX / 2) / lens.focal_px).astype(np.float32)
     down = ((np.arange(HEIGHT_PX, dtype=np.float32) + 0.5 - HEIGHT_PX / 2) / lens.focal_px).astype(np.float32)[:, None]
@@ -59,27 +59,27 @@ def _rays(lens: Lens) -> tuple[Plane, Plane, Plane]:
 
 
 def _painted(surface: Surface, along: Plane, across: Plane) -> npt.NDArray[np.uint8]:
-    """The surface where each ray meets it. Far away it is smoothed: a tile smaller than a pixel would only flicker."""
+    """Paint the surface where each ray meets it. Far away it is smoothed, because subpixel tiles would flicker."""
     texels = np.float32(SIDE / surface.tile_m)
     tile = texture(surface.family, surface.seed)
     u, v = np.mod(along * texels, SIDE).astype(np.float32), np.mod(across * texels, SIDE).astype(np.float32)
     return np.asarray(cv2.remap(tile, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), np.uint8)
 
 
-# Draws labelled scenes: bodies by TinyRenderer, boxes from its segmentation mask. Shell (PyBullet).
+# Draws labeled scenes: bodies by TinyRenderer, boxes from its segmentation mask. Shell (PyBullet).
 
 
 Mask = npt.NDArray[Any]
 
 _MIN_SIDE_PX = 5
 _MIN_SEEN = 0.4
-"""Of a light or legs, by the area of their box; less is neither right nor wrong."""
+"""Visible share of a light's or legs' box. Below it, a detection is neither right nor wrong."""
 _NO_TURN = (0.0, 0.0, 0.0, 1.0)
 _BLOOM_PX = 1.5
 
 
 class SceneRenderer:
-    """One PyBullet client that draws one scene after the other."""
+    """A PyBullet client that draws one scene after the other."""
 
     def __init__(self) -> None:
         self._client = int(pybullet.connect(pybullet.DIRECT))
@@ -92,10 +92,10 @@ class SceneRenderer:
         pybullet.disconnect(physicsClientId=self._client)
 
     def scene(self, seed: int, column: Column) -> Scene:
-        """Return the scene of a seed. In scenes for scores and validation, a ball is hidden by `MOST_HIDDEN` at most,
+        """Return the scene of a seed. In scored and validation scenes a ball is hidden by `MOST_HIDDEN` at most,
         and boxes of its color stay.
 
-        In training one that shows less is unclear, and nothing is learned there.
+        In training a ball that is hidden more is unclear, and nothing is learned there.
         """
         plan = plan_scene(seed, column)
         drawn = self._drawn(plan)
@@ -137,7 +137,7 @@ class SceneRenderer:
         return picture, which
 
     def _add(self, one: Solid) -> list[tuple[int, str]]:
-        """Its bodies, each with the lamp's state it shows, if any; a body that is not part of its box is negative."""
+        """Add its bodies. Returns each with the lamp's state it shows, if any; negative: not part of its box."""
         if one.shape == "light":
             return self._add_light(one)
         if one.shape == "legs":
@@ -201,7 +201,7 @@ def _state(one: Solid) -> State:
 
 
 def _placed(part: Part, model: Light, one: Solid) -> tuple[float, float, float]:
-    """A part of the model, which stands at the origin and faces backwards, where this light is."""
+    """Return a part of the light model, moved from the origin to the place of this light."""
     ahead_m, scale = -part.at_m[0], one.size_m[0]
     cos, sin = math.cos(one.turn_rad), math.sin(one.turn_rad)
     x, y, z = one.at_m
@@ -209,7 +209,7 @@ def _placed(part: Part, model: Light, one: Solid) -> tuple[float, float, float]:
 
 
 def _feet(one: Solid) -> list[tuple[float, float, float]]:
-    """Middles of both legs."""
+    """Return the centers of both legs."""
     walk, (x, y, z) = LegShape(), one.at_m
     cos, sin = math.cos(one.turn_rad), math.sin(one.turn_rad)
     feet = []
@@ -221,7 +221,7 @@ def _feet(one: Solid) -> list[tuple[float, float, float]]:
 
 
 def _shine(picture: npt.NDArray[np.uint8], which: Mask, bodies: list[list[tuple[int, str]]], plan: ScenePlan) -> None:
-    """A lit lamp is as bright as it is, whatever light falls on it; `glow` is how much of that is seen."""
+    """Draw lit lamps at full brightness regardless of the light on them; `glow` is the visible share."""
     for own in bodies:
         for body, state in own:
             if not state:
@@ -234,7 +234,7 @@ def _shine(picture: npt.NDArray[np.uint8], which: Mask, bodies: list[list[tuple[
 
 
 def _box(mask: Mask) -> Box | None:
-    """Around what the mask marks, half-open; None if it marks nothing."""
+    """Return the half-open box around the marked pixels; None without any."""
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     return (float(x), float(y), float(x + width), float(y + height)) if width else None
 
@@ -250,7 +250,7 @@ def _truth(lens: Lens, solid: Solid, seen: Box | None, which: Mask, own: list[tu
 
 
 def _seen_share(lens: Lens, solid: Solid, seen: Box) -> float:
-    """Area of the box in view, by that of the box around all of it."""
+    """Return the area of the visible box as a share of the box around the whole object."""
     corners = _corners(solid)
     at = (corners @ lens.axes())
     at[:, 2] = np.maximum(at[:, 2], 0.1)
@@ -261,7 +261,7 @@ def _seen_share(lens: Lens, solid: Solid, seen: Box) -> float:
 
 
 def _corners(solid: Solid) -> npt.NDArray[np.float64]:
-    """Points of the world that bound it."""
+    """Return points of the world that bound the object."""
     if solid.shape == "legs":
         radius, _, height = solid.size_m
         return np.array([[x + a * radius, y + b * radius, z + c * height / 2] for x, y, z in _feet(solid)

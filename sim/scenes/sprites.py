@@ -1,4 +1,4 @@
-"""Draws balls of many designs, and other things, as sprites to lay over a photograph. Pure."""
+"""Draw balls of many designs, and other things, as sprites over a photograph. Pure."""
 
 import math
 from collections.abc import Callable
@@ -27,7 +27,7 @@ class Sprite:
     rgb: Array
     """(H, W, 3), 0..1."""
     cover: Array
-    """(H, W), 0..1: the share of each pixel that it covers."""
+    """(H, W), 0..1: covered share of each pixel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class SpriteLight:
     towards: Array
     """Unit vector to the light: right, down, out of the image."""
     ambient: float
-    """Share of the light that comes from all sides, 0..1."""
+    """Ambient share of the light, 0..1."""
     rgb: Array
     """Color and strength, about 1."""
 
@@ -52,7 +52,7 @@ def any_light(draw: Random, rgb: Array) -> SpriteLight:
 
 
 def ball(draw: Random, width_px: float, light: SpriteLight) -> Sprite:
-    """Draw a ball of that width in any color and design."""
+    """Draw a ball of this width in any color and design."""
     side = math.ceil(width_px) + 2
     x, y = _grid(side, width_px)
     off = np.hypot(x, y)
@@ -65,7 +65,7 @@ def ball(draw: Random, width_px: float, light: SpriteLight) -> Sprite:
 
 
 def _grid(side: int, width_px: float) -> tuple[Array, Array]:
-    """Return x and y of each sample about the middle; 1 is the edge of something `width_px` wide."""
+    """Return x and y of each sample from the center; 1 is the edge of an object `width_px` wide."""
     steps = ((np.arange(side * _FINE, dtype=np.float32) + 0.5) / _FINE - side / 2) * np.float32(2 / width_px)
     x, y = np.meshgrid(steps, steps)
     return x.astype(np.float32), y.astype(np.float32)
@@ -78,14 +78,15 @@ def _shrunk(rgb: Array, cover: Array, side: int) -> Sprite:
 
 
 def _turn(draw: Random) -> Array:
-    """Draw a rotation, each as likely (QR of a normal matrix; Stewart, The Efficient Generation of Random Orthogonal
-    Matrices, 1980)."""
+    """Draw a uniform random rotation (QR of a normal matrix; Stewart, The Efficient Generation of Random Orthogonal
+    Matrices, 1980).
+    """
     matrix, upper = np.linalg.qr(draw.normal(size=(3, 3)))
     return np.asarray(matrix * np.sign(np.diag(upper)), np.float32)
 
 
 def _lit(draw: Random, paint: Array, normal: Array, light: SpriteLight) -> Array:
-    """Shade `paint`: light from one side and from all, brighter from above, and on half of the balls a highlight."""
+    """Shade `paint`: directional and ambient light, brighter from above. Half of the balls have a highlight."""
     direct = np.maximum(normal @ light.towards, 0)
     around = light.ambient * (1 - draw.uniform(0.1, 0.45) * (normal[..., 1] + 0.3))
     rgb = paint * (around + (1 - light.ambient) * 1.25 * direct)[..., None]
@@ -102,7 +103,7 @@ def _color(draw: Random, saturation: tuple[float, float], value: tuple[float, fl
 
 
 def _toy(draw: Random) -> Array:
-    """Draw a strong color, as toys have."""
+    """Draw a strong color, as of toys."""
     return _color(draw, (0.55, 1.0), (0.35, 1.0))
 
 
@@ -111,7 +112,7 @@ def _pale(draw: Random) -> Array:
 
 
 def _common(draw: Random) -> Array:
-    """Yellow to orange, any strong color, or nearly white."""
+    """Draw yellow to orange, any strong color, or nearly white."""
     kind = draw.random()
     if kind < 0.35:
         return _color(draw, (0.6, 1.0), (0.65, 1.0), (15.0, 75.0))
@@ -119,17 +120,17 @@ def _common(draw: Random) -> Array:
 
 
 def _plain(draw: Random, at: Array) -> Array:
-    """One color."""
+    """Draw one color."""
     return _common(draw) * _speckle(draw, at, draw.uniform(0, 0.06))
 
 
 def _speckle(draw: Random, at: Array, spread: float) -> Array:
-    """Fine grain about 1."""
+    """Draw fine grain about 1."""
     return np.asarray(1 + spread * draw.standard_normal(at.shape[:2], np.float32), np.float32)[..., None]
 
 
 def _tennis(draw: Random, at: Array) -> Array:
-    """Felt with a seam (x = a cos t + b cos 3t, y = a sin t - b sin 3t, z = 2 sqrt(ab) sin 2t; a + b = 1)."""
+    """Draw felt with a seam (x = a cos t + b cos 3t, y = a sin t - b sin 3t, z = 2 sqrt(ab) sin 2t; a + b = 1)."""
     felt = _color(draw, (0.35, 0.85), (0.6, 1.0), (50.0, 85.0))
     time, a = np.linspace(0, math.tau, _SEAM_POINTS, endpoint=False), draw.uniform(0.68, 0.8)
     b = 1 - a
@@ -145,7 +146,7 @@ def _marked(paint: Array, where: npt.NDArray[np.bool_], rgb: Array) -> Array:
 
 
 def _basketball(draw: Random, at: Array) -> Array:
-    """Orange to brown, or two colors, with dark lines: two great circles and two bows."""
+    """Draw orange to brown, or two colors, with dark lines: two great circles and two bows."""
     first = _color(draw, (0.5, 0.95), (0.4, 0.95), (8.0, 35.0)) if draw.random() < 0.8 else _toy(draw)
     paint = first * _speckle(draw, at, draw.uniform(0.02, 0.12))
     if draw.random() < 0.15:
@@ -163,7 +164,7 @@ def _corners() -> Array:
 
 
 def _football(draw: Random, at: Array) -> Array:
-    """White with dark patches about the corners of an icosahedron, and seams."""
+    """Draw white with dark patches around the corners of an icosahedron, and seams."""
     near = (at.reshape(-1, 3) @ _corners().T).max(axis=1).reshape(at.shape[:2])
     paint = np.broadcast_to(_pale(draw), at.shape).astype(np.float32)
     if draw.random() < 0.6:
@@ -174,19 +175,19 @@ def _football(draw: Random, at: Array) -> Array:
 
 
 def _seams(at: Array, points: Array, wide: float) -> npt.NDArray[np.bool_]:
-    """Return where two of the points are about as near."""
+    """Return where the two nearest points are about equally near."""
     near = np.sort(at.reshape(-1, 3) @ points.T, axis=1)
     return np.asarray((near[:, -1] - near[:, -2] < wide).reshape(at.shape[:2]))
 
 
 def _directions(draw: Random, count: int) -> Array:
-    """Draw unit vectors (count, 3), each direction as likely."""
+    """Draw uniformly distributed unit vectors (count, 3)."""
     points = draw.normal(size=(count, 3))
     return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True), np.float32)
 
 
 def _panels(draw: Random, at: Array) -> Array:
-    """Panels about points that are spread evenly or at random, in two to four colors, often with seams."""
+    """Draw panels around even or random points, in two to four colors, often with seams."""
     points = _directions(draw, int(draw.integers(4, 28)))
     which = (at.reshape(-1, 3) @ points.T).argmax(axis=1).reshape(at.shape[:2])
     base = _pale(draw) if draw.random() < 0.7 else _toy(draw)
@@ -198,7 +199,7 @@ def _panels(draw: Random, at: Array) -> Array:
 
 
 def _stripes(draw: Random, at: Array) -> Array:
-    """Bands, or segments as of a beach ball."""
+    """Draw bands, or segments as of a beach ball."""
     colors = np.stack([_pale(draw) if draw.random() < 0.6 else _toy(draw), _toy(draw), _toy(draw)])
     if draw.random() < 0.5:
         bands = np.floor(np.arctan2(at[..., 1], at[..., 0]) / math.pi * int(draw.integers(2, 5))).astype(int)
@@ -208,7 +209,7 @@ def _stripes(draw: Random, at: Array) -> Array:
 
 
 def _patches(draw: Random, at: Array) -> Array:
-    """Round patches, as dots or a print, on one color."""
+    """Draw round patches, as dots or a print, on one color."""
     points = _directions(draw, int(draw.integers(1, 16)))
     near = (at.reshape(-1, 3) @ points.T).max(axis=1).reshape(at.shape[:2])
     paint = np.asarray(np.broadcast_to(_pale(draw) if draw.random() < 0.4 else _toy(draw), at.shape), np.float32)
@@ -216,7 +217,7 @@ def _patches(draw: Random, at: Array) -> Array:
 
 
 def _marble(draw: Random, at: Array) -> Array:
-    """Two colors that run into each other."""
+    """Draw two colors that blend into each other."""
     waves = sum(np.sin(at @ (draw.normal(size=3) * draw.uniform(1, 6)).astype(np.float32) + draw.uniform(0, math.tau))
                 for _ in range(4))
     share = (0.5 + 0.25 * np.asarray(waves, np.float32)).clip(0, 1)[..., None]
@@ -232,7 +233,7 @@ _WEIGHTS: Final = (0.42, 0.14, 0.10, 0.12, 0.09, 0.05, 0.04, 0.04)
 
 
 def thing(draw: Random, width_px: float, light: SpriteLight) -> Sprite:
-    """Draw another thing than a ball: a box, a cylinder, a cone, an oval plate, a ring, a polygon."""
+    """Draw an object other than a ball: a box, a cylinder, a cone, an oval plate, a ring, a polygon."""
     side = math.ceil(width_px) + 2
     x, y = _grid(side, width_px)
     inside, shade = _SHAPES[int(draw.integers(len(_SHAPES)))](draw, x, y)
@@ -254,7 +255,7 @@ def _turned(draw: Random, x: Array, y: Array, most_rad: float) -> tuple[Array, A
 
 
 def _box(draw: Random, x: Array, y: Array) -> Shape:
-    """A front, a side and a top, each evenly lit."""
+    """Draw a front, a side and a top, each evenly lit."""
     x, y = _turned(draw, x, y, 0.15)
     left, top = draw.uniform(-0.8, 0.0), draw.uniform(-0.75, -0.1)
     slant = draw.uniform(0.2, 0.7)
@@ -265,7 +266,7 @@ def _box(draw: Random, x: Array, y: Array) -> Shape:
 
 
 def _cylinder(draw: Random, x: Array, y: Array) -> Shape:
-    """Upright or lying, round across."""
+    """Draw a cylinder, upright or lying, shaded across."""
     x, y = _turned(draw, x, y, math.pi)
     wide, flat = draw.uniform(0.2, 0.6), draw.uniform(0.0, 0.3)
     bow = flat * np.sqrt(np.maximum(1 - (x / wide) ** 2, 0))
@@ -281,7 +282,7 @@ def _cone(draw: Random, x: Array, y: Array) -> Shape:
 
 
 def _plate(draw: Random, x: Array, y: Array) -> Shape:
-    """An oval that is flat, often with a rim."""
+    """Draw a flat oval, often with a rim."""
     x, y = _turned(draw, x, y, 0.4)
     off = np.hypot(x / 0.97, y / draw.uniform(0.2, 0.68))
     shade = np.where(off > draw.uniform(0.6, 0.95), draw.uniform(0.5, 1.1), draw.uniform(0.7, 1.0))
@@ -294,7 +295,7 @@ def _ring(draw: Random, x: Array, y: Array) -> Shape:
 
 
 def _polygon(draw: Random, x: Array, y: Array) -> Shape:
-    """Three to six corners."""
+    """Draw a polygon of three to six corners."""
     inside = np.ones(x.shape, bool)
     for angle in np.cumsum(np.full(int(draw.integers(3, 7)), 1.0)) * math.tau / draw.uniform(3, 6) + draw.uniform(0, 6):
         inside &= x * math.cos(angle) + y * math.sin(angle) < draw.uniform(0.4, 0.8)

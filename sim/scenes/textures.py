@@ -20,30 +20,30 @@ Field = npt.NDArray[np.float32]
 
 def any_rgb(draw: Random, saturation: tuple[float, float] = (0.0, 1.0), value: tuple[float, float] = (0.2, 1.0),
             hue_deg: tuple[float, float] = (0.0, 360.0)) -> tuple[float, float, float]:
-    """A colour, 0..1."""
+    """Draw a color, 0..1."""
     hsv = np.array([[[draw.uniform(*hue_deg), draw.uniform(*saturation), draw.uniform(*value)]]], np.float32)
     red, green, blue = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0].tolist()
     return red, green, blue
 
 
 def rgb(draw: Random) -> Field:
-    """A floor's or a wall's colour: half of them dull, as most rooms are."""
+    """Draw the color of a floor or a wall. Half of them are dull, as in most rooms."""
     high = 1.0 if draw.random() < 0.5 else 0.3
     return np.array(any_rgb(draw, (0.0, high)), np.float32) * 255
 
 
 def mixed(share: Field, low: Field, high: Field) -> Field:
-    """From one colour to the other by `share` (SIDE, SIDE)."""
+    """Blend two colors by `share` (SIDE, SIDE)."""
     return np.asarray(low + share[..., None] * (high - low), np.float32)
 
 
 def near(draw: Random, colour: Field) -> Field:
-    """The same colour, a little lighter or darker."""
+    """Return the same color, a little lighter or darker."""
     return np.asarray(np.clip(colour * draw.uniform(0.6, 1.3) + draw.uniform(-15, 15, 3), 0, 255), np.float32)
 
 
 def soft(draw: Random, sigma: float) -> Field:
-    """Smooth tileable noise, 0..1."""
+    """Draw smooth tileable noise, 0..1."""
     small = max(4, int(SIDE / max(sigma, 1.0)))
     coarse = np.tile(draw.random((small, small), np.float32), (3, 3))
     big = cv2.resize(coarse, (3 * SIDE, 3 * SIDE), interpolation=cv2.INTER_CUBIC)[SIDE : 2 * SIDE, SIDE : 2 * SIDE]
@@ -55,21 +55,21 @@ def grid() -> tuple[Field, Field]:
     return np.broadcast_to(steps, (SIDE, SIDE)), np.broadcast_to(steps[:, None], (SIDE, SIDE))
 
 
-# More families of textures, beside those of `sim/scenes/textures.py`: what lies about, what is in no room. Pure.
+# Further texture families: scattered objects, and patterns that no room has. Pure.
 
 
 _TEXT: Final = "abcdefghijkmnoprstuvwxyzABCDEFGHKLMNRSTXY0123456789 "
 
 
 def palette(draw: Random) -> Field:
-    """Two to eight colours (N, 3): of all kinds, or all near one."""
+    """Draw two to eight colors (N, 3): of all kinds, or all near one."""
     count, base = int(draw.integers(2, 9)), rgb(draw)
     alike = draw.random() < 0.4
     return np.stack([near(draw, base) if alike else rgb(draw) for _ in range(count)])
 
 
 def leaves(draw: Random) -> Field:
-    """Flat shapes of all sizes, each over those before it (dead leaves: Lee, Mumford and Huang, 2001)."""
+    """Draw flat shapes of all sizes, each over the earlier ones (dead leaves: Lee, Mumford and Huang, 2001)."""
     colours, tile = palette(draw), np.ascontiguousarray(np.broadcast_to(rgb(draw), (SIDE, SIDE, 3)))
     kinds, steep, largest = draw.integers(0, 3, 2), draw.uniform(1.0, 3.0), draw.uniform(6, 50)
     for _ in range(int(draw.integers(20, 200))):
@@ -77,13 +77,13 @@ def leaves(draw: Random) -> Field:
         middle, colour = draw.integers(0, SIDE, 2), colours[int(draw.integers(len(colours)))].tolist()
         turn = draw.uniform(0, 2 * np.pi)
         points = _outline(draw, int(kinds[int(draw.integers(2))]), size, turn) + middle
-        for off in ((0, 0), (-SIDE, 0), (0, -SIDE), (-SIDE, -SIDE)):  # so that the tile's borders meet
+        for off in ((0, 0), (-SIDE, 0), (0, -SIDE), (-SIDE, -SIDE)):  # so that the borders of the tile match
             cv2.fillPoly(tile, [np.rint(points + off).astype(np.int32)], colour)
     return tile
 
 
 def _outline(draw: Random, kind: int, size: float, turn: float) -> Field:
-    """Corners (N, 2) of an ellipse, a rectangle or a crooked polygon about the origin."""
+    """Return corners (N, 2) of an ellipse, a rectangle or an irregular polygon around the origin."""
     count = (16, 4, int(draw.integers(3, 9)))[kind]
     around = np.linspace(0, 2 * np.pi, count, endpoint=False) + np.pi / 4
     far = size * (draw.uniform(0.4, 1.0, count) if kind == 2 else np.ones(count))
@@ -93,7 +93,7 @@ def _outline(draw: Random, kind: int, size: float, turn: float) -> Field:
 
 
 def spectrum(draw: Random) -> Field:
-    """Noise whose strength falls with frequency, along one way faster than along the other, in two or three colours."""
+    """Draw anisotropic noise whose strength falls with frequency, in two or three colors."""
     down, right = np.meshgrid(np.fft.fftfreq(SIDE), np.fft.rfftfreq(SIDE), indexing="ij")
     flat = 2.0 ** draw.uniform(-2, 2)
     far = np.hypot(down * flat, right / flat)
@@ -106,14 +106,14 @@ def spectrum(draw: Random) -> Field:
 
 
 def _wave(draw: Random, strength: Field) -> Field:
-    """Noise (SIDE, SIDE) of that spectrum, 0..1."""
+    """Return noise (SIDE, SIDE) of this spectrum, 0..1."""
     field = np.fft.irfft2(strength * np.exp(2j * np.pi * draw.random(strength.shape)), (SIDE, SIDE))
     low, high = np.quantile(field, (0.02, 0.98))
     return np.asarray(np.clip((field - low) / max(float(high - low), 1e-9), 0, 1), np.float32)
 
 
 def scribbles(draw: Random) -> Field:
-    """Lines that wander, thick and thin."""
+    """Draw wandering lines, thick and thin."""
     tile, colours = np.ascontiguousarray(np.broadcast_to(rgb(draw), (SIDE, SIDE, 3))), palette(draw)
     for _ in range(int(draw.integers(3, 40))):
         turns = np.cumsum(draw.normal(0, 0.4, 40)) + draw.uniform(0, 6.3)
@@ -125,14 +125,14 @@ def scribbles(draw: Random) -> Field:
 
 
 def speckle(draw: Random) -> Field:
-    """Carpet: each small grain of one of a few colours."""
+    """Draw carpet: small grains, each of one of a few colors."""
     colours, count = palette(draw), SIDE // int(draw.integers(1, 4))
     grains = colours[draw.choice(len(colours), (count, count), p=draw.dirichlet(np.ones(len(colours))))]
     return np.asarray(cv2.resize(grains, (SIDE, SIDE), interpolation=cv2.INTER_NEAREST), np.float32)
 
 
 def plaid(draw: Random) -> Field:
-    """Validated only: bands across bands, both seen through each other."""
+    """Draw bands across bands, both translucent. Only for validation."""
     x, y = grid()
     tile, colours = np.broadcast_to(rgb(draw), (SIDE, SIDE, 3)), palette(draw)
     for _ in range(int(draw.integers(3, 9))):
@@ -143,7 +143,7 @@ def plaid(draw: Random) -> Field:
 
 
 def scales(draw: Random) -> Field:
-    """Validated only: rows of discs, each row over the one before it, as on a fish or a roof."""
+    """Draw rows of discs that overlap, as on a fish or a roof. Only for validation."""
     rows, colours = int(draw.integers(3, 9)) * 2, palette(draw)
     tile, step = np.ascontiguousarray(np.broadcast_to(colours[0], (SIDE, SIDE, 3))), SIDE / rows
     rim = (0.6 * colours[0]).tolist()
@@ -157,8 +157,8 @@ def scales(draw: Random) -> Field:
 
 
 def script(draw: Random) -> Field:
-    """Validated only: printed lines."""
-    tile = np.empty((SIDE, SIDE, 3), np.uint8)  # the only kind that OpenCV writes on
+    """Draw printed lines. Only for validation."""
+    tile = np.empty((SIDE, SIDE, 3), np.uint8)  # the only type that OpenCV writes on
     tile[:], ink = rgb(draw), rgb(draw).tolist()
     scale = draw.uniform(0.3, 2.0)
     thick, high = max(1, int(2 * scale)), int(26 * scale)
@@ -169,22 +169,22 @@ def script(draw: Random) -> Field:
 
 
 def ridges(draw: Random) -> Field:
-    """Validated only: slopes that rise and break off, as of a blind or a flight of stairs."""
+    """Draw slopes that rise and break off, as of a blind or a flight of stairs. Only for validation."""
     x, y = grid()
     along = int(draw.integers(1, 8)) * x + int(draw.integers(0, 8)) * y
     return mixed(np.asarray((along % 1.0) ** draw.uniform(0.5, 2.0), np.float32), rgb(draw), rgb(draw))
 
 
-# Floors and walls of scenes: families of tileable textures of any colour. Pure (NumPy, OpenCV).
+# Floors and walls of scenes: families of tileable textures of any color. Pure (NumPy, OpenCV).
 #
 # Three lists: for training, for the choice of thresholds, and for scores only.
 
 
-_FLOORS = 16  # of the simulated room's own; each takes as long to make as a scene
+_FLOORS = 16  # of the simulated room; each takes as long to make as a scene
 
 
 def texture(family: str, seed: int) -> Texture:
-    """A tile (SIDE, SIDE, 3), RGB, of that family."""
+    """Return a tile (SIDE, SIDE, 3), RGB, of this family."""
     draw = np.random.default_rng([seed, 12])
     tile = FAMILIES[family](draw)
     grain = draw.normal(0.0, draw.uniform(0.0, 5.0), (SIDE, SIDE, 1)).astype(np.float32)
@@ -203,7 +203,7 @@ def _clouds(draw: Random) -> Field:
 
 
 def _boards(draw: Random) -> Field:
-    """The simulated room's own floor, in other colours too."""
+    """Draw the floor of the simulated room, also in other colors."""
     whole = _room_floor(int(draw.integers(_FLOORS)))
     down, right = draw.integers(0, len(whole) - SIDE, 2).tolist()
     tile = whole[down : down + SIDE, right : right + SIDE].astype(np.float32)
@@ -235,7 +235,7 @@ def _blots(draw: Random) -> Field:
 
 
 def _dots(draw: Random) -> Field:
-    """Round and flat: not balls."""
+    """Draw flat discs, which are not balls."""
     x, y = grid()
     count, radius = int(draw.integers(2, 8)), draw.uniform(0.15, 0.4)
     off = np.hypot((x * count) % 1.0 - 0.5, (y * count) % 1.0 - 0.5)
@@ -251,7 +251,7 @@ def _bricks(draw: Random) -> Field:
 
 
 def _quilt(draw: Random) -> Field:
-    """Two of the families above, one where the other is not: no two look alike. At times the contrast is low."""
+    """Combine two of the families above by a mask, so that no two tiles are alike. Sometimes the contrast is low."""
     one, two = (FAMILIES[_PIECES[int(draw.integers(len(_PIECES)))]](draw) for _ in range(2))
     share = soft(draw, draw.uniform(4, 40)) if draw.random() < 0.5 else _checks(draw)[..., 0] / 255
     sharp = np.asarray(share > draw.uniform(0.3, 0.7), np.float32)
@@ -260,7 +260,7 @@ def _quilt(draw: Random) -> Field:
 
 
 def _patchwork(draw: Random) -> Field:
-    """Two to four of what is trained on, each where shapes or clouds let it through; at times half seen through."""
+    """Combine two to four trained families through masks of shapes or clouds, sometimes translucent."""
     tile = FAMILIES[_PATCHES[int(draw.integers(len(_PATCHES)))]](draw)
     for _ in range(int(draw.integers(1, 4))):
         over = FAMILIES[_PATCHES[int(draw.integers(len(_PATCHES)))]](draw)
@@ -271,7 +271,7 @@ def _patchwork(draw: Random) -> Field:
 
 
 def _mosaic(draw: Random) -> Field:
-    """Draw small squares of colors around two, with joints. For scores only."""
+    """Draw small squares of colors around two, with joints. Only for scores."""
     count = int(draw.integers(4, 14))
     one, two = rgb(draw), rgb(draw)
     colours = np.stack([near(draw, one if draw.random() < 0.5 else two) for _ in range(count * count)])
@@ -282,7 +282,7 @@ def _mosaic(draw: Random) -> Field:
 
 
 def _stones(draw: Random) -> Field:
-    """Draw cells around random points, which wrap. For scores only."""
+    """Draw cells around random points, which wrap. Only for scores."""
     count = int(draw.integers(8, 40))
     points = draw.random((count, 2)).astype(np.float32)
     x, y = grid()
@@ -293,14 +293,14 @@ def _stones(draw: Random) -> Field:
 
 
 def _weave(draw: Random) -> Field:
-    """Draw two waves across each other. For scores only."""
+    """Draw two crossed waves. Only for scores."""
     x, y = grid()
     waves = [np.sin(2 * np.pi * int(draw.integers(2, 20)) * side + draw.uniform(0, 6)) for side in (x, y)]
     return mixed(np.asarray(0.5 + 0.25 * (waves[0] + waves[1]), np.float32), rgb(draw), rgb(draw))
 
 
 def _marble(draw: Random) -> Field:
-    """Draw veins. For scores only."""
+    """Draw veins. Only for scores."""
     x, y = grid()
     bent = soft(draw, 25) * draw.uniform(1.0, 3.0)
     veins = np.abs(np.sin(np.pi * (int(draw.integers(1, 4)) * x + int(draw.integers(1, 4)) * y + bent)))
@@ -310,18 +310,18 @@ def _marble(draw: Random) -> Field:
 
 _PIECES: Final = ("plain", "clouds", "boards", "checks", "stripes", "blots", "dots", "bricks")
 TRAINED: Final = (*_PIECES, "quilt", "quilt", "quilt")
-"""Thrice the one that is never the same."""
+"""Three times the family that never repeats."""
 _MORE: Final = ("leaves", "spectrum", "scribbles", "speckle")
 _PATCHES: Final = (*_PIECES, *_MORE)
 TRAINED_LATER: Final = (*_MORE, "leaves", "quilt", "patchwork", "patchwork", "patchwork")
-"""Of the scenes that the second round of training adds."""
+"""Families of the scenes that the second round of training adds."""
 TRAINED_HARDER: Final = (
     "plain", "clouds", "boards", "checks", "stripes", "blots", "bricks", "spectrum", "scribbles", "speckle", "quilt",
     "quilt", "patchwork", "patchwork",
 )
-"""Of the third round's. None is of discs alone: with so many flat ones about, balls look less sure than they are."""
+"""Families of the third round. None is of discs alone: among many flat discs, scores of balls fall."""
 VALIDATED: Final = ("plaid", "scales", "script", "ridges")
-"""A threshold that was chosen on textures that training knows is too low for others."""
+"""A threshold chosen on trained textures is too low for others."""
 SCORED: Final = ("mosaic", "stones", "weave", "marble")
 FAMILIES: Final[dict[str, Callable[[Random], Field]]] = {
     "plain": _plain, "clouds": _clouds, "boards": _boards, "checks": _checks, "stripes": _stripes, "blots": _blots,
@@ -335,7 +335,7 @@ FAMILIES: Final[dict[str, Callable[[Random], Field]]] = {
 
 
 def families(seed: int) -> tuple[str, ...]:
-    """Those that the scene of that seed has its floor and wall from."""
+    """Return the texture families for floor and wall of the scene of this seed."""
     if seed >= SCORED_FROM:
         return SCORED
     if seed >= VALIDATED_FROM:

@@ -1,5 +1,5 @@
 """The simulated world on PyBullet: bodies, motors, camera, lidar.
 
 May import: `protocol`, `robot_side`, `sim`.
-Interface: `world.World`, on the clock that its caller steps.
+Interface: `world.World`, on a clock that its caller steps.
 """

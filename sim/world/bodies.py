@@ -34,20 +34,20 @@ Pose = tuple[Vector, tuple[float, float, float, float]]
 
 
 def hull_of(client: int, body: int, own: Points) -> Points:
-    """Return points `own` (N, 3) of a body where it is in the world."""
+    """Return points `own` (N, 3) of a body in world coordinates."""
     at, turn = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
     axes = np.array(pybullet.getMatrixFromQuaternion(turn)).reshape(3, 3)
     return np.asarray(own @ axes.T + np.array(at))
 
 
 def box_points(size_m: tuple[float, float, float]) -> Points:
-    """Return the corners of a box around its middle."""
+    """Return the corners of a box around its center."""
     signs = [(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
     return np.array(signs) * size_m
 
 
 def _thing_points(thing: Thing) -> Points:
-    """Return points around the middle of a body whose convex hull is its shape, or near it."""
+    """Return points around the center of a body. Their convex hull is its shape, or nearly."""
     if thing.shape == "box":
         return box_points(thing.size_m)
     ring = np.stack([np.cos(_AROUND_RAD), np.sin(_AROUND_RAD), np.zeros(len(_AROUND_RAD))], axis=-1) * thing.radius_m
@@ -58,7 +58,7 @@ def _thing_points(thing: Thing) -> Points:
 
 
 class ThingBodies:
-    """One thing with its bodies and its center. Legs are two bodies, a place has no body."""
+    """One thing with its bodies and its center. Legs have two bodies, a place has none."""
 
     def __init__(self, client: int, thing: Thing, place: Place, way_m: float = 0.0, *, is_target: bool) -> None:
         self.thing = thing
@@ -81,7 +81,7 @@ class ThingBodies:
         return [hull_of(self._client, body, self._own_points) for body in self.bodies]
 
     def put(self, place: Place, way_m: float) -> None:
-        """Set it down at `place`, having come `way_m`."""
+        """Place it at `place`, `way_m` along its way."""
         self._middle = (place.x_m, place.y_m, self.thing.middle_m)
         if self.thing.shape == "legs":
             self._walk(place, way_m)
@@ -96,7 +96,7 @@ class ThingBodies:
         return pybullet.getBasePositionAndOrientation(self.bodies[0], physicsClientId=self._client)  # type: ignore[no-any-return]
 
     def put_pose(self, pose: Pose) -> None:
-        """Set a rolling ball down in that pose."""
+        """Place a rolling ball at that pose."""
         self._set(self.bodies[0], *pose)
 
     def _walk(self, place: Place, way_m: float) -> None:
@@ -123,7 +123,7 @@ def _add(client: int, thing: Thing, is_target: bool) -> int:
     if is_target:
         group(client, body, TARGET, FLOOR | ROBOT | WALL)
     else:
-        # FLOOR too, though the two never meet: PyBullet gives every ray group 1, and a body must admit that to be hit.
+        # FLOOR too, although the two never meet: PyBullet gives every ray group 1, and a body must accept it to be hit.
         group(client, body, WALL, FLOOR | ROBOT | TARGET)
     return body
 
@@ -155,7 +155,7 @@ def _visual(client: int, thing: Thing) -> int:
 
 
 def ball_visual(client: int, radius_m: float, colour: Color) -> int:
-    """A smooth ball to look at."""
+    """Create the visual shape of a smooth ball."""
     normals, triangles = round_mesh()
     return int(pybullet.createVisualShape(
         pybullet.GEOM_MESH, vertices=normals, indices=triangles, normals=normals, meshScale=[radius_m] * 3,
@@ -165,7 +165,7 @@ def ball_visual(client: int, radius_m: float, colour: Color) -> int:
 
 @cache
 def round_mesh(rings: int = 24, sides: int = 48) -> tuple[list[Vector], list[int]]:
-    """A unit ball's points and triangles; PyBullet's own is so coarse that it looks 2.5 % too small."""
+    """Return points and triangles of a unit ball. PyBullet's own is so coarse that it looks 2.5 % too small."""
     points: list[Vector] = []
     triangles: list[int] = []
     for ring in range(rings + 1):
@@ -201,7 +201,7 @@ class LightBodies:
 
     @property
     def bodies(self) -> frozenset[int]:
-        """All that could be touched or is lit."""
+        """Return all bodies that can be touched or are lit."""
         return frozenset(body for _, body in self._parts)
 
     def hulls(self) -> list[Points]:
@@ -210,7 +210,7 @@ class LightBodies:
                 if part.shape == "box"]
 
     def move(self, now_us: int) -> None:
-        """Change colour when it is time."""
+        """Change the color when it is due."""
         state = self._light.state_at(self._begin, now_us)
         if state == self.state:
             return
@@ -231,7 +231,7 @@ class LightBodies:
         return body
 
     def _add_line(self) -> None:
-        """A strip that lies on the floor and is only seen."""
+        """Add the stop line, a strip on the floor without collisions."""
         visual = self._box_visual([_LINE_DEEP_M / 2, LINE_WIDE_M / 2, _LINE_HIGH_M / 2], LINE_RGB)
         at = (*self._light.ahead(self._light.line_m), _LINE_HIGH_M / 2)
         pybullet.createMultiBody(0, _NOTHING, visual, at, self._turn, physicsClientId=self._client)
@@ -243,11 +243,11 @@ class LightBodies:
         ))
 
 
-# What moves a thing: nothing, a path, pushes, or one constant force. Shell (PyBullet); reads no clock.
+# Motion of a thing: none, a path, pushes, or one constant force. Shell (PyBullet); reads no clock.
 
 
 PUSH_S = 0.4
-SOLID_BALL = 1.4  # a rolling solid ball resists a push at its centre as 7/5 of its mass would
+SOLID_BALL = 1.4  # a rolling solid ball resists a push at its center as 7/5 of its mass would
 
 
 class Mover(Protocol):
@@ -257,14 +257,14 @@ class Mover(Protocol):
 
 
 class Still:
-    """Leaves it where it is."""
+    """Leaves a thing where it is."""
 
     def move(self, bodies: ThingBodies, now_us: int) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 class PathMover:
-    """Carries it along its path."""
+    """Moves a thing along its path."""
 
     def __init__(self, thing: OnPath, phase: float) -> None:
         self._thing = thing
@@ -280,12 +280,12 @@ class PathMover:
         return self._path.at(self.way_m(now_us))
 
     def move(self, bodies: ThingBodies, now_us: int) -> None:
-        """Put it there."""
+        """Place the thing on its path."""
         bodies.put(self.place(now_us), self.way_m(now_us))
 
 
 class Pusher:
-    """Pushes the ball now and then, towards a random point of its arena."""
+    """Pushes the ball from time to time, towards a random point of its arena."""
 
     def __init__(self, client: int, target: Pushed, seed: int) -> None:
         self._client, self._target = client, target
@@ -294,7 +294,7 @@ class Pusher:
         self._force: Vector | None = None
 
     def move(self, bodies: ThingBodies, now_us: int) -> None:
-        """Push while a push lasts."""
+        """Push during a push."""
         if now_us < self._begin_us:
             return
         place = bodies.middle
@@ -316,7 +316,7 @@ class Pusher:
 
 
 class Force:
-    """Pushes the ball the same way for ever."""
+    """Pushes the ball in one direction forever."""
 
     def __init__(self, client: int, target: Forced) -> None:
         self._client, self._from_us = client, target.from_s * 1e6
@@ -324,7 +324,7 @@ class Force:
         self._force: Vector = (target.force_n * math.cos(heading_rad), target.force_n * math.sin(heading_rad), 0.0)
 
     def move(self, bodies: ThingBodies, now_us: int) -> None:
-        """Push."""
+        """Push once the force has begun."""
         if now_us >= self._from_us:
             _push(self._client, bodies, self._force)
 
@@ -347,7 +347,7 @@ def begin(client: int, target: Static | OnPath | Pushed | Forced, seed: int) -> 
 
 
 def begin_thing(thing: Static | OnPath, number: int, seed: int) -> tuple[Mover, Place, float]:
-    """The same for whatever else there is."""
+    """Return the same for a thing other than the target."""
     if isinstance(thing, OnPath):
         return _on_path(thing, thing_phase(thing, number, seed))
     return Still(), thing_place(thing, number, seed), 0.0

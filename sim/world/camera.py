@@ -1,6 +1,6 @@
 """The simulated camera: renderer, painted floor, shadows and walls. Shell (PyBullet).
 
-One over depth is linear across the picture of a plane, so each face needs one plane equation and one comparison.
+Inverse depth is linear across the image of a plane, so each face needs one plane equation and one comparison.
 """
 
 import math
@@ -18,7 +18,7 @@ from sightline.sim.world.engine import camera_arrays, pybullet
 PoseMatrix = npt.NDArray[np.float64]
 Pattern = npt.NDArray[np.float32]
 SUBPIXEL_BITS = 4
-AMBIENT = 0.62  # of a face turned away from the light
+AMBIENT = 0.62  # of a face that is turned away from the light
 
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
 _FACES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (1, 3, 7, 5))
@@ -26,7 +26,7 @@ _NORMALS = np.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, 1]], d
 
 
 class Face:
-    """One side of a wall: corners and outward normal in the world, colour as lit."""
+    """One side of a wall: corners and outward normal in the world, color as lit."""
 
     def __init__(self, corners: PoseMatrix, normal: PoseMatrix, colour: PoseMatrix, light_from: PoseMatrix) -> None:
         self.corners, self.normal = corners, normal
@@ -38,7 +38,7 @@ class Face:
 
 
 def corners_of(wall: Wall) -> tuple[PoseMatrix, PoseMatrix]:
-    """Return the eight corners of a wall, and the matrix that turns its own axes into the map's."""
+    """Return the eight corners of a wall, and the rotation from its axes to the map."""
     start, end = np.array(wall.start_m), np.array(wall.end_m)
     along = end - start
     length_m = float(np.hypot(*along))
@@ -50,7 +50,7 @@ def corners_of(wall: Wall) -> tuple[PoseMatrix, PoseMatrix]:
 
 
 def faces_of(wall: Wall, light_from: PoseMatrix) -> list[Face]:
-    """The four sides and the top."""
+    """Return the four sides and the top."""
     corners, turn = corners_of(wall)
     colour = np.array(wall.color)
     return [
@@ -60,13 +60,13 @@ def faces_of(wall: Wall, light_from: PoseMatrix) -> list[Face]:
 
 
 class WallPainter:
-    """Paints the faces that the lens sees and remembers how near each pixel's wall is."""
+    """Paints the visible faces and stores the inverse depth of the wall in each pixel."""
 
     def __init__(
         self, walls: tuple[Wall, ...], model: CameraModel, light_from: list[float], near_m: float,
         pattern: Pattern | None = None,
     ) -> None:
-        """`pattern` is the brightness of a tile that covers `WALL_TILE_M` of each wall, about 1."""
+        """Prepare the faces. `pattern`: brightness of a tile that covers `WALL_TILE_M` of each wall, about 1."""
         light = np.array(light_from) / np.linalg.norm(light_from)
         self._faces = [face for wall in walls for face in faces_of(wall, light)]
         self._model, self._near_m = model, near_m
@@ -97,7 +97,7 @@ class WallPainter:
         cv2.copyTo(self._colours, (self._which > 0).view(np.uint8), picture)
 
     def _add_face(self, number: int, corners: PoseMatrix, normal: PoseMatrix) -> None:
-        """Note where this face is the nearest so far; `corners` and `normal` as the camera sees them."""
+        """Store where this face is the nearest so far. `corners` and `normal` are in the camera frame."""
         outline = clipped(corners, self._near_m)
         if len(outline) < 3:
             return
@@ -121,7 +121,7 @@ class WallPainter:
         np.copyto(self._which[box], np.uint16(number), where=in_front)
 
     def _paint_patterns(self, pattern: Pattern, lens: PoseMatrix, seen_axes: PoseMatrix) -> None:
-        """Paint the pattern over each face that is in view. Pixel -> ray -> point of the face is a homography."""
+        """Paint the pattern over each visible face. Pixel -> ray -> point of the face is a homography."""
         seen = np.bincount(self._which.ravel(), minlength=len(self._faces) + 1)
         for number in (np.flatnonzero(seen[1:]) + 1).tolist():
             face, box = self._faces[number - 1], self._boxes[number]
@@ -139,14 +139,14 @@ class WallPainter:
             np.copyto(colours, painted, where=(self._which[box] == number)[..., None])
 
     def _tile(self, rgb: npt.NDArray[np.uint8], pattern: Pattern) -> npt.NDArray[np.uint8]:
-        """Return the tile of a face of that color; most faces share a few."""
+        """Return the tile of a face of this color. Most faces share a few tiles."""
         if rgb.tobytes() not in self._tiles:
             self._tiles[rgb.tobytes()] = np.clip(np.rint(pattern[..., None] * rgb), 0, 255).astype(np.uint8)
         return self._tiles[rgb.tobytes()]
 
 
 class ShadowPainter:
-    """Darkens the floor where objects keep the light off it, with a soft edge."""
+    """Darkens the floor where objects block the light, with a soft edge."""
 
     def __init__(self, model: CameraModel, part: float) -> None:
         self._model, self._part = model, part
@@ -180,7 +180,7 @@ class ShadowPainter:
 
 
 def clipped(corners: PoseMatrix, near_m: float) -> PoseMatrix:
-    """The convex polygon's part at depth (third coordinate) `near_m` or more; may be empty."""
+    """Return the part of a convex polygon at depth (third coordinate) `near_m` or more; may be empty."""
     kept: list[PoseMatrix] = []
     for here, following in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if here[2] >= near_m:
@@ -192,23 +192,23 @@ def clipped(corners: PoseMatrix, near_m: float) -> PoseMatrix:
 
 # The simulated camera: the ball by TinyRenderer, floor and walls painted. Shell (PyBullet).
 #
-# TinyRenderer's time goes into pixels, and floor and walls are most of them: it draws neither.
+# TinyRenderer's time depends on the pixels, and floor and walls are most of them, so it draws neither.
 # Pixel (0, 0) is the top-left corner of the top-left pixel, as in `CameraModel`.
 
 
 NEAR_M, FAR_M = 0.02, 20.0
 WALL_NEAR_M = 0.002  # the lens of a robot that pushes against a wall is nearer to it than `NEAR_M`
-NOTHING_DEPTH = 0.99999  # TinyRenderer leaves 1 where it drew nothing
-FLOOR_SEEN_TO_M = 8.0  # beyond it the floor would only flicker
+NOTHING_DEPTH = 0.99999  # TinyRenderer leaves 1 in empty pixels
+FLOOR_SEEN_TO_M = 8.0  # beyond it the floor would flicker
 TEXELS_PER_M = 128
 TILE_TEXELS = 512
 FLOOR_LEVELS = ((3.0, 0.0), (10.0, 2.0), (math.inf, 8.0))
-"""Of the floor of a look: texels that a pixel may cover, and the blur of the tile that is shown there, texels."""
+"""For the floor of a look: texels that a pixel may cover, and the blur of the tile used there, texels."""
 WALL_TILE_M = 2.0
 SHADOW_EDGE_PX = 1.2
-MOST_FIXED = 1 << 24  # beyond the border of any image, and within what OpenCV takes
+MOST_FIXED = 1 << 24  # beyond the border of any image, and within the limit of OpenCV
 SHADED_AMBIENT, SHADED_DIFFUSE = 0.45, 0.5
-"""Light on objects where shadows are drawn: less from everywhere, more from the lamp."""
+"""Light on objects if shadows are drawn: less ambient, more from the lamp."""
 SKY_RGB = (196, 199, 204)
 LIGHT_FROM = [0.4, 0.3, 1.0]
 
@@ -217,7 +217,7 @@ Matrix = npt.NDArray[np.float64]
 
 
 def floor_tile(seed: int) -> Picture:
-    """Grey-brown boards with specks, tileable: structure for a tracker, no colour that a ball could have."""
+    """Return gray-brown boards with specks, tileable: texture for a tracker, in no color of a ball."""
     draw = np.random.default_rng([seed, 4])
     grey = _blurred(draw.normal(0.0, 88.0, (TILE_TEXELS, TILE_TEXELS)), 2.0)
     boards = np.repeat(draw.normal(0.0, 7.0, 8), TILE_TEXELS // 8)
@@ -228,7 +228,7 @@ def floor_tile(seed: int) -> Picture:
 
 
 class Surfaces(NamedTuple):
-    """The changes of a look to floor and walls; None and 0: none."""
+    """Changes of a look to floor and walls; None or 0: none."""
 
     floor: Picture | None = None
     """Its tile, `TILE_TEXELS` square."""
@@ -246,13 +246,13 @@ def inverse_matrix(model: CameraModel) -> Matrix:
 
 
 class SceneCamera:
-    """Draws one client's bodies and its floor, buffers allocated once."""
+    """Draws the bodies of one client and the floor. Allocates its buffers once."""
 
     def __init__(
         self, client: int, model: CameraModel, walls: tuple[Wall, ...], seed: int, tile: Picture | None = None,
         *, surfaces: Surfaces | None = None,
     ) -> None:
-        """`tile` is the floor, `TILE_TEXELS` square, in place of the boards that robots see."""
+        """Allocate the buffers. `tile` is the floor, `TILE_TEXELS` square, in place of the default boards."""
         surfaces = surfaces or Surfaces()
         self._client, self._model = client, model
         if surfaces.wall_color:
@@ -276,9 +276,9 @@ class SceneCamera:
         self._rays = inverse_matrix(model)
 
     def draw(self, lens: tuple[float, float, float], turn: Any, casters: Sequence[Matrix] = ()) -> Picture:
-        """RGB picture from `lens` with the robot's orientation `turn`; valid until the next call.
+        """Return the RGB image from `lens` with the robot's orientation `turn`; valid until the next call.
 
-        `casters` are points (N, 3) of each object that throws a shadow, if the look has shadows.
+        `casters` are points (N, 3) of each object that casts a shadow, if the look has shadows.
         """
         axes = np.array(pybullet.getMatrixFromQuaternion(turn)).reshape(3, 3)
         seen_axes = np.stack([-axes[:, 1], -axes[:, 2], axes[:, 0]], axis=-1)
@@ -302,7 +302,7 @@ class SceneCamera:
         return self._picture
 
     def _paint_floor(self, lens: Matrix, seen_axes: Matrix) -> None:
-        """Pixel -> ray -> point on the floor is a homography; above the horizon there is the far end of the room."""
+        """Paint the floor: pixel -> ray -> floor point is a homography. Above the horizon is the end of the room."""
         seen = seen_axes @ self._rays
         to_floor = np.stack([lens[0] * seen[2] - lens[2] * seen[0], lens[1] * seen[2] - lens[2] * seen[1], seen[2]])
         to_texel = np.diag([TEXELS_PER_M, TEXELS_PER_M, 1.0]) @ to_floor
@@ -324,7 +324,7 @@ class SceneCamera:
         cv2.fillConvexPoly(self._picture, np.rint(sky).astype(np.int32), SKY_RGB)
 
     def _first_row(self, lens_m: float, texels: float) -> int:
-        """Return the upper row in which a pixel covers this many texels of the floor, away from the lens."""
+        """Return the topmost row in which a pixel covers this many texels of the floor, away from the lens."""
         model = self._model
         ahead_m = math.sqrt(texels / TEXELS_PER_M * lens_m * model.fy_px)
         return max(0, math.ceil(model.cy_px + model.fy_px * lens_m / ahead_m))
@@ -340,14 +340,14 @@ def _blurred(tile: npt.NDArray[Any], sigma: float) -> npt.NDArray[Any]:
 
 
 def _nearness(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    """One over the metres that TinyRenderer's depth (0 near, 1 far) stands for."""
+    """Convert TinyRenderer's depth (0 near, 1 far) to inverse distance, 1/m."""
     return np.float32(1 / NEAR_M) - depth * np.float32(1 / NEAR_M - 1 / FAR_M)
 
 
 def _projection(model: CameraModel) -> list[float]:
-    """OpenGL projection whose pixel centres are where the pinhole model has them.
+    """Return the OpenGL projection whose pixel centers match the pinhole model.
 
-    TinyRenderer samples at a pixel's left and lower edge, hence the half pixel.
+    TinyRenderer samples at the left and lower edge of a pixel, hence the half pixel.
     """
     width, height = model.width_px, model.height_px
     half_up_rad = math.atan(height / 2 / model.fy_px)

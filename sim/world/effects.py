@@ -48,7 +48,7 @@ class DistortedLens:
         self._check(model, look)
 
     def _check(self, model: CameraModel, look: Look) -> None:
-        """Convert the border there and back. A strong distortion folds it, so that no way leads back."""
+        """Convert the border there and back. A strong distortion folds it, so that no inverse exists."""
         border = _border(model)
         there = self.straight(border)
         is_back = np.abs(self.distorted(there) - border).max() < _FIT_PX  # False for nan, too
@@ -74,7 +74,7 @@ class DistortedLens:
         bent = np.asarray((points_px - self._middle_px) / self._focal_px)
         rays = bent
         if self.is_distorted:
-            with np.errstate(over="ignore", invalid="ignore"):  # of what does not converge, which the check finds
+            with np.errstate(over="ignore", invalid="ignore"):  # of values that do not converge, which the check finds
                 for _ in range(_ROUNDS):
                     rays = rays + (bent - self._bent(rays))
         return rays
@@ -86,7 +86,7 @@ class DistortedLens:
 
 
 def _border(model: CameraModel) -> Matrix:
-    """Points along the four sides of the image, px."""
+    """Return points along the four sides of the image, px."""
     across, down = (np.linspace(0, side, 33) for side in (model.width_px, model.height_px))
     return np.concatenate([
         np.column_stack([across, np.full(33, at)]) for at in (0.0, model.height_px)
@@ -94,7 +94,7 @@ def _border(model: CameraModel) -> Matrix:
 
 
 def published_model(model: CameraModel, look: Look) -> CameraModel:
-    """Return the model for the channel `camera`: of a calibrated lens if the look has none or it is known."""
+    """Return the model for the channel `camera`: calibrated if the look has no distortion or it is known."""
     if not any(look.distortion):
         return model
     if look.lens_known:
@@ -112,7 +112,7 @@ class Shutter:
         self._readout_s, self._exposure_s = look.rolling_shutter_ms / 1000, look.motion_blur_ms / 1000
         self._is_ideal = not (self.lens.is_distorted or self._readout_s or self._exposure_s)
         self.canvas = model if self._is_ideal else self._canvas(model)
-        """Pinhole model of the image to draw: larger by what the effects fetch from beyond the border."""
+        """Pinhole model of the image to draw: larger, because the effects use pixels beyond the border."""
         if not self._is_ideal:
             self._prepare(model)
 
@@ -150,7 +150,7 @@ class Shutter:
         focal, middle = np.array([model.fx_px, model.fy_px]), np.array([model.cx_px, model.cy_px])
         if self._is_ideal:
             return np.asarray(middle + focal * ahead[:, :2] / ahead[:, 2:])
-        widest = WIDEST * middle / focal  # further out, the formula of the lens means nothing
+        widest = WIDEST * middle / focal  # beyond it, the lens formula is invalid
         rays = np.clip(ahead[:, :2] / ahead[:, 2:], -widest, widest)
         rows = self.lens.distorted(rays)[:, 1]
         turned_rad = turn_rad_s * self._readout_s * (np.clip(rows / model.height_px, 0, 1) - 0.5)
@@ -202,7 +202,7 @@ def _fading(saturation: float) -> Matrix:
 
 
 class Defects:
-    """Exposure, white balance, blur, noise, JPEG: what stands between a scene and what arrives."""
+    """Exposure, white balance, blur, noise and JPEG between a drawn scene and the delivered image."""
 
     def __init__(self, look: Look, width_px: int, height_px: int, seed: int) -> None:
         self._look = look
@@ -219,7 +219,7 @@ class Defects:
         self._pool = np.rint(self._draw.normal(0.0, look.noise, pool)).astype(np.int16) if look.noise else None
 
     def _gains(self, t_us: int) -> Picture:
-        """Return what each step of red, green and blue becomes at `t_us`."""
+        """Return the value of each level of red, green and blue at `t_us`."""
         look = self._look
         bright = drift(look.exposure_drift, look.exposure_period_s, self._phases[0], t_us)
         warm = drift(look.white_balance_drift, look.white_balance_period_s, self._phases[1], t_us)
@@ -229,7 +229,7 @@ class Defects:
         return np.asarray(np.clip(np.rint(steps), 0, 255), np.uint8).reshape(1, 256, 3)
 
     def jpeg(self, picture: Picture, quality_percent: int = 100, scale_percent: int = 100, t_us: int = 0) -> bytes:
-        """Return `picture` (RGB, changed in place) as the JPEG that the camera gives at `t_us` of the run."""
+        """Return `picture` (RGB, changed in place) as the JPEG of the camera at `t_us` of the run."""
         look = self._look
         if self._fade is not None:
             cv2.transform(picture, self._fade, picture)

@@ -1,4 +1,4 @@
-"""PyBullet, imported without the build time that it prints. Shell (file descriptors).
+"""PyBullet, imported without its printed build time. Shell (file descriptors).
 
 Every file that needs it takes it from here: `from sightline.sim.world.engine import pybullet`.
 """
@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 @contextmanager
 def _silenced() -> Iterator[None]:
-    """The message comes from C, past `sys.stderr`; what fails while silent still raises."""
+    """Hide stdout while PyBullet loads. Its message comes from C, not `sys.stderr`; errors still raise."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:

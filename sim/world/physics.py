@@ -1,7 +1,7 @@
 """One PyBullet client and the bodies in it. Shell (PyBullet); reads no clock, draws no numbers.
 
-Traps that this file steps round: wheels must be implicit cylinders (faceted ones err by percents); the caster must
-have no friction; a body's position is that of its inertial frame; a body without a visual shape is drawn all the same.
+Traps that this file avoids: wheels must be implicit cylinders (faceted ones err by percents); the caster must
+have no friction; a body's position is that of its inertial frame; a body without a visual shape is drawn anyway.
 """
 
 import math
@@ -17,14 +17,14 @@ from sightline.sim.urdf import Transform
 from sightline.sim.world.engine import pybullet
 
 FLOOR, ROBOT, TARGET, WALL = 1, 2, 4, 8
-"""Collision groups; rays choose by them what they may hit."""
+"""Collision groups. Rays select by them the bodies to hit."""
 GRAVITY_MPS2 = 9.81
 
 Vector = tuple[float, float, float]
 
 
 def open_client(step_us: int) -> int:
-    """A new empty world; returns PyBullet's client number."""
+    """Open a new empty world. Returns PyBullet's client number."""
     client = int(pybullet.connect(pybullet.DIRECT))
     pybullet.setGravity(0, 0, -GRAVITY_MPS2, physicsClientId=client)
     pybullet.setPhysicsEngineParameter(
@@ -35,7 +35,7 @@ def open_client(step_us: int) -> int:
 
 
 def _unseen(client: int) -> int:
-    """A shape that costs the renderer nothing; a body without any is drawn in its collision shape."""
+    """Return a shape that costs the renderer nothing. A body without one is drawn by its collision shape."""
     speck = [0.001, 0.001, 0.001]
     return int(pybullet.createVisualShape(
         pybullet.GEOM_BOX, halfExtents=speck, rgbaColor=[0, 0, 0, 0], physicsClientId=client
@@ -43,7 +43,7 @@ def _unseen(client: int) -> int:
 
 
 def add_floor(client: int) -> int:
-    """An endless floor, unseen: the camera paints its own (TinyRenderer's costs 8 ms a picture)."""
+    """Add an infinite invisible floor. The camera paints its own, because TinyRenderer's costs 8 ms an image."""
     shape = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
     floor = int(pybullet.createMultiBody(0, shape, _unseen(client), physicsClientId=client))
     pybullet.changeDynamics(floor, -1, lateralFriction=1.0, restitution=0.0, physicsClientId=client)
@@ -52,20 +52,20 @@ def add_floor(client: int) -> int:
 
 
 def add_wall(client: int, wall: Wall) -> int:
-    """A slab between the wall's two points, unseen as the floor is."""
+    """Add an invisible slab between the wall's two points."""
     (x0, y0), (x1, y1) = wall.start_m, wall.end_m
     half = [math.hypot(x1 - x0, y1 - y0) / 2, wall.thickness_m / 2, wall.height_m / 2]
     turn = pybullet.getQuaternionFromEuler([0, 0, math.atan2(y1 - y0, x1 - x0)])
     shape = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
     middle = [(x0 + x1) / 2, (y0 + y1) / 2, half[2]]
     body = int(pybullet.createMultiBody(0, shape, _unseen(client), middle, turn, physicsClientId=client))
-    # FLOOR too, though the two never meet: PyBullet gives every ray group 1, and a body must admit that to be hit.
+    # FLOOR too, although the two never meet: PyBullet gives every ray group 1, and a body must accept it to be hit.
     group(client, body, WALL, FLOOR | ROBOT | TARGET)
     return body
 
 
 def add_robot(client: int, robot: RobotModel, at: Place) -> "RobotBody":
-    """The robot with its axle's midpoint at `at`, motors off. Raises ConfigError for a URDF that PyBullet rejects."""
+    """Add the robot with its axle's midpoint at `at`, motors off. Raises ConfigError if PyBullet rejects its URDF."""
     body = urdf_body(robot)
     loaded = _load(client, robot, body, at)
     moving = {
@@ -86,7 +86,7 @@ def add_robot(client: int, robot: RobotModel, at: Place) -> "RobotBody":
 
 
 def _load(client: int, robot: RobotModel, body: UrdfBody, at: Place) -> int:
-    """PyBullet reads files only."""
+    """Load the URDF through a file, because PyBullet reads only files."""
     place, turn = (at.x_m, at.y_m, 0.0), pybullet.getQuaternionFromEuler([0, 0, at.heading_rad])
     if body.foot is not None:
         place, turn = pybullet.multiplyTransforms(place, turn, *_as_bullet(body.foot.inverse()))
@@ -112,12 +112,12 @@ def _loosen(client: int, body: int, joints: list[int]) -> None:
 
 
 def _as_bullet(frame: Transform) -> tuple[Vector, tuple[float, float, float, float]]:
-    """A level frame as position and quaternion."""
+    """Return a level frame as position and quaternion."""
     return frame.at, pybullet.getQuaternionFromEuler([0, 0, frame.yaw_rad])
 
 
 def group(client: int, body: int, own: int, meets: int) -> None:
-    """Put a body, all its links, into a collision group."""
+    """Put all links of a body into a collision group."""
     links = pybullet.getNumJoints(body, physicsClientId=client)
     for link in range(-1, links):
         pybullet.setCollisionFilterGroupMask(body, link, own, meets, physicsClientId=client)
@@ -138,7 +138,7 @@ class RobotBody:
             self._from_mass = pybullet.multiplyTransforms(*self._from_mass, *_as_bullet(drawn.foot))
 
     def drive(self, left_rad_s: float, right_rad_s: float) -> None:
-        """Let the wheels' motors strive for these speeds."""
+        """Set the target speeds of the wheel motors."""
         if self._driven == (left_rad_s, right_rad_s):
             return
         self._driven = (left_rad_s, right_rad_s)
@@ -149,7 +149,7 @@ class RobotBody:
         )
 
     def pass_through(self, others: Iterable[int]) -> None:
-        """Let the robot and other bodies overlap. Masks alone do not: one of two that admits the other is enough."""
+        """Let the robot and other bodies overlap. Masks are not enough: either body can still accept the contact."""
         for other in others:
             for link in range(-1, pybullet.getNumJoints(self.body, physicsClientId=self._client)):
                 pybullet.setCollisionFilterPair(self.body, other, link, -1, 0, physicsClientId=self._client)
@@ -160,10 +160,10 @@ class RobotBody:
         return float(left[0]) * self._signs[0], float(right[0]) * self._signs[1]
 
     def pose(self) -> tuple[Vector, Any]:
-        """Axle midpoint on the floor and orientation (quaternion x, y, z, w)."""
+        """Return the axle midpoint on the floor and the orientation (quaternion x, y, z, w)."""
         place, turn = pybullet.getBasePositionAndOrientation(self.body, physicsClientId=self._client)
         return pybullet.multiplyTransforms(place, turn, *self._from_mass)  # type: ignore[no-any-return]
 
     def velocity(self) -> tuple[Vector, Vector]:
-        """(linear m/s, angular rad/s) in the world's frame."""
+        """Return (linear m/s, angular rad/s) in the world frame."""
         return pybullet.getBaseVelocity(self.body, physicsClientId=self._client)  # type: ignore[no-any-return]

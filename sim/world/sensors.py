@@ -1,6 +1,6 @@
 """Lidar and perfect labels by ray casts. Shell (PyBullet).
 
-Reads no clock. Rays are level with the floor; one that starts in a body would hit nothing, so the robot is masked out.
+Reads no clock. Rays are parallel to the floor. A ray that starts in a body hits nothing, so the robot is masked out.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Lidar:
         self._angles_rad: Numbers = self._first_rad + np.arange(model.rays, dtype=np.float64) * model.increment_rad
 
     def scan(self, place: Vector, yaw_rad: float, t_us: int) -> Ranges:
-        """One turn at an instant, the sensor at `place`."""
+        """Return one scan at an instant, the sensor at `place`."""
         model = self._model
         seen = self._merged(place, yaw_rad) if model.sensors else self._cast(place, yaw_rad)
         return Ranges(
@@ -90,13 +90,13 @@ class Lidar:
         return array.array("f", np.where(ranges == np.inf, ranges, np.maximum(ranges, model.range_min_m)).tolist())
 
 
-# What the simulation itself labels in a picture: boxes of walking legs, as a perfect detector's. Shell (PyBullet).
+# Labels that the simulation gives an image: boxes of walking legs, as from a perfect detector. Shell (PyBullet).
 #
 # Reads no clock. One box contains both legs. Its score is their visible share.
 
 
 _NEAR_M = 0.1
-_SEEN_AT = (0.15, 0.4, 0.65, 0.9)  # of a leg's height: where it is looked for
+_SEEN_AT = (0.15, 0.4, 0.65, 0.9)  # share of a leg's height at which its visibility is sampled
 _LEAST_SEEN = 0.25
 _LEAST_PX = 2.0
 _AROUND_RAD = np.linspace(0.0, math.tau, 12, endpoint=False)
@@ -107,7 +107,7 @@ Points = npt.NDArray[np.float64]
 def leg_labels(
     client: int, people: Iterable[ThingBodies], camera: Shutter, moment: Moment
 ) -> tuple[Label, ...]:
-    """The people in view, best seen first, where the camera's image shows them."""
+    """Return the visible people, best visible first, in pixels of the camera's image."""
     axes = np.array(pybullet.getMatrixFromQuaternion(moment.turn)).reshape(3, 3)
     seen_axes = np.stack([-axes[:, 1], -axes[:, 2], axes[:, 0]], axis=-1)
     found = [_label(client, one, camera, moment, seen_axes) for one in people]

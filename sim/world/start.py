@@ -6,7 +6,7 @@ import numpy as np
 
 from sightline.sim.scenario import Light, OnPath, Place, Scenario, Start, Static
 
-# Each draw has a stream of its own, so that one more thing in a scenario moves nothing else.
+# Each draw has its own random stream, so that another thing in a scenario changes nothing else.
 _PATH, _START, _THING_PATH, _JITTER, _LIGHT = 1, 2, 7, 8, 9
 
 
@@ -16,7 +16,7 @@ def target_phase(target: OnPath, seed: int) -> float:
 
 
 def thing_phase(thing: OnPath, number: int, seed: int) -> float:
-    """The same for the thing of that number."""
+    """Return the same for the thing with this number."""
     return float(np.random.default_rng([seed, _THING_PATH, number]).uniform(*thing.phase))
 
 
@@ -53,14 +53,14 @@ def robot_start(start: Start, target: Place, lens_x_m: float, seed: int) -> Plac
 
 
 def _outside(distance_m: float, span_m: tuple[float, float] | None) -> float:
-    """Return the distance, moved to the nearer end of a span at which no run starts."""
+    """Return the distance, moved to the nearer end of the span at which no run starts."""
     if span_m is None or not span_m[0] < distance_m < span_m[1]:
         return distance_m
     return min(span_m, key=lambda end_m: abs(end_m - distance_m))
 
 
 def goals_seen(scenario: Scenario, seed: int) -> list[tuple[float, float]]:
-    """The scenario's waypoints as the robot counts, from where it starts: x ahead, y left."""
+    """Return the scenario's waypoints in the robot's odometry frame, from its start: x ahead, y left."""
     at = robot_start(scenario.start, Place(0.0, 0.0, 0.0), 0.0, seed)
     cos, sin = math.cos(at.heading_rad), math.sin(at.heading_rad)
     aways = [(x_m - at.x_m, y_m - at.y_m) for x_m, y_m in scenario.goals_m]

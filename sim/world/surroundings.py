@@ -1,6 +1,6 @@
 """The additions of a look to a scenario: a room, objects, colors and textures of floor and walls. Pure (NumPy, OpenCV).
 
-All of it stands outside the area that robot and target need, so a scenario has the same ways with a look as without.
+All of it stands outside the area that robot and target need, so a look does not change the paths of a scenario.
 Walls and objects are bodies: a range sensor measures them, and a robot that leaves its way touches them.
 """
 
@@ -35,22 +35,22 @@ NEEDED_M: Final = 1.0
 """Area around each place of target and robot, beside the largest distance at the start."""
 CEILING_M: Final = 2.4
 LEAST_HUE_OFF_DEG: Final = 25.0
-"""From the target's hue: color alone cannot separate an object of its own hue."""
+"""From the target's hue, because color alone cannot separate two objects of one hue."""
 _NEAR_HUE_OFF_DEG: Final = 60.0  # half of the objects are within this
 _ROOM_COLOR: Final[Color] = (0.80, 0.79, 0.77)
-_FLOOR_DARK, _FLOOR_LIGHT = 0.42, 0.66  # HSV value, where a texture is darkest and lightest
+_FLOOR_DARK, _FLOOR_LIGHT = 0.42, 0.66  # HSV value at the darkest and the lightest part of a texture
 _WALL_VALUE: Final = 0.78
 _WALL_CONTRAST: Final = 0.3
-_LEAST_CONTRAST: Final = 16.0  # steps; a texture with less stays as faint as it is
+_LEAST_CONTRAST: Final = 16.0  # steps; a texture with less keeps its contrast
 _ROLLS_S: Final = 60.0
-_FURTHEST_M: Final = 20.0  # a ball that nothing brakes rolls on for ever
+_FURTHEST_M: Final = 20.0  # a ball that nothing brakes rolls forever
 _SOLID_BALL: Final = 1.4
-_REACH_M: Final = 0.32  # of the largest object, from its middle
+_REACH_M: Final = 0.32  # of the largest object, from its center
 _CLUTTER, _FLOOR, _WALLS = 15, 16, 17  # streams of random numbers
 
 
 class Rectangle(NamedTuple):
-    """Along the axes of the map."""
+    """A rectangle along the axes of the map."""
 
     left_m: float
     bottom_m: float
@@ -58,12 +58,12 @@ class Rectangle(NamedTuple):
     top_m: float
 
     def grown(self, by_m: float) -> "Rectangle":
-        """Return it with each side moved outward."""
+        """Return the rectangle with each side moved outward."""
         return Rectangle(self.left_m - by_m, self.bottom_m - by_m, self.right_m + by_m, self.top_m + by_m)
 
     @property
     def corners(self) -> tuple[Point, Point, Point, Point]:
-        """Counter-clockwise, from the lower left."""
+        """Return the corners counter-clockwise, from the lower left."""
         left, bottom, right, top = self
         return (left, bottom), (right, bottom), (right, top), (left, top)
 
@@ -98,7 +98,7 @@ def needed_area(scenario: Scenario) -> Rectangle:
 
 
 def _places(thing: Static | OnPath | Pushed | Forced) -> list[Point]:
-    """Return places that bound the way of a thing."""
+    """Return places that bound the path of a thing."""
     if isinstance(thing, OnPath):
         path = thing.closed_path()
         places = [path.at(share * path.length_m) for share in np.linspace(0, 1, 64, endpoint=False).tolist()]
@@ -166,7 +166,7 @@ def _other_hue(draw: Random, hue_deg: float) -> Color:
 
 
 def _hsv(color: Color) -> tuple[float, float, float]:
-    """Hue in degrees, saturation, value."""
+    """Return hue in degrees, saturation, value."""
     hue, saturation, value = colorsys.rgb_to_hsv(*color)
     return 360 * hue, saturation, value
 
@@ -176,7 +176,7 @@ def _rgb(hue_deg: float, saturation: float, value: float) -> Color:
 
 
 def surfaces(scenario: Scenario, seed: int) -> Surfaces:
-    """Return floor and walls as the look has them; what it leaves as it is, is None."""
+    """Return floor and walls of the look. None means unchanged."""
     look = scenario.look
     hue_deg, saturation, _ = _hsv(scenario.target.color)
     has_floor = look.floor != "boards" or look.floor_likeness
@@ -200,7 +200,7 @@ def _floor(look: Look, hue_deg: float, saturation: float, seed: int) -> Picture:
 
 
 def _wall_pattern(name: TextureName, seed: int) -> Pattern:
-    """Return factors about 1. A finer tile would flicker on walls, which are metres away."""
+    """Return factors about 1. A finer tile would flicker on walls, which are meters away."""
     share = cv2.resize(_pattern(name, seed, _WALLS), (SIDE, SIDE), interpolation=cv2.INTER_AREA)
     return np.asarray(1 + _WALL_CONTRAST * (share - 0.5), np.float32)
 

@@ -1,7 +1,7 @@
-"""The bodies in front of the camera, now or as they were a time ago. Shell (PyBullet); reads no clock.
+"""The bodies in front of the camera, now or some time ago. Shell (PyBullet); reads no clock.
 
-A camera with latency delivers an image of the past. The past is a client of its own with the same bodies. They are put
-where they were: what follows the clock is computed again, what physics moves is recorded.
+A camera with latency delivers an image of the past. The past is another client with the same bodies, put
+where they were. Motion by the clock is recomputed, motion by physics is recorded.
 """
 
 from collections import deque
@@ -42,16 +42,16 @@ class Scenery:
         self._walls = [corners_of(wall)[0] for wall in scenario.walls]
 
     def hulls(self) -> list[Points]:
-        """Return points (N, 3) of each convex body that throws a shadow. The lamp is inside the walls of the room."""
+        """Return points (N, 3) of each convex body that casts a shadow. The lamp is inside the walls of the room."""
         hulls = [hull for thing in self.things for hull in thing.hulls()]
         return [*self._walls, *hulls, *(self._light.hulls() if self._light else ())]
 
 
 class Past:
-    """The scenery a fixed time ago."""
+    """The scenery at a fixed time before now."""
 
     def __init__(self, scenario: Scenario, room: Sequence[Wall], seed: int, step_us: int, latency_us: int) -> None:
-        """`room` are walls beside those of the scenario."""
+        """Build the scenery. `room`: walls in addition to those of the scenario."""
         self._client = client = open_client(step_us)
         for wall in (*scenario.walls, *room):
             add_wall(client, wall)
@@ -76,7 +76,7 @@ class Past:
             self._moments.popleft()
 
     def show(self) -> Moment:
-        """Put all bodies where they were, and return that moment; the first one of the run where none is so old."""
+        """Put all bodies where they were, and return that moment, or the first one of the run."""
         moment = self._moments[0]
         for mover, bodies in self._movers:
             mover.move(bodies, moment.t_us)

@@ -24,7 +24,7 @@ SLIP_EVERY_STEPS = 25  # 0.1 s of 4 ms steps
 
 
 class Motor:
-    """Latches the speed it is given and follows it as a small gear motor does."""
+    """Latches the given speed and follows it as a small gear motor does."""
 
     def __init__(self, model: Wheels, step_s: float, seed: str) -> None:
         self._model = model
@@ -37,14 +37,14 @@ class Motor:
         self._turned_rad = self._shaft_rad = 0.0
 
     def set(self, speed_rad_s: float) -> None:
-        """Latch a speed; beyond the motor's own it gives its own. Raises ValueError unless finite."""
+        """Latch a speed, limited to the motor's own. Raises ValueError unless finite."""
         if not math.isfinite(speed_rad_s):
             raise ValueError(f"wheel speed {speed_rad_s}")
         most = self._model.max_rad_s
         self._wanted_rad_s = max(-most, min(most, speed_rad_s))
 
     def step(self) -> float:
-        """One physics step later: the speed at which the wheel should roll over the floor, rad/s."""
+        """Advance one physics step. Returns the speed at which the wheel should roll over the floor, rad/s."""
         change = self._wanted_rad_s - self._ramped_rad_s
         self._ramped_rad_s += max(-self._most_change_rad_s, min(self._most_change_rad_s, change))
         self._speed_rad_s += (self._ramped_rad_s - self._speed_rad_s) * self._follow
@@ -65,17 +65,17 @@ class Motor:
         return math.floor(self._shaft_rad / step_rad) * step_rad
 
 
-# The simulated world: robot, target, whatever else there is, one clock. Shell (PyBullet); reads no clock of its own.
+# The simulated world: robot, target and other things on one clock. Shell (PyBullet); reads no clock of its own.
 #
-# Bit for bit the same for the same scenario, robot, seed and calls. Lockstep steps it; the real-time service steps it
+# Bitwise the same for the same scenario, robot, seed and calls. Lockstep steps it; the real-time service steps it
 # against deadlines.
 
 
 STEP_US = 4000
 """250 Hz: every time in the world is a whole number of these."""
-STANDING_MPS = 0.01  # a robot slower than this touches nothing by its own doing
+STANDING_MPS = 0.01  # a slower robot does not cause a contact
 CLEARANCE_SEEN_M = 1.0
-"""Further away nothing counts as near."""
+"""Beyond this distance, clearance is not measured."""
 
 
 class World:
@@ -109,7 +109,7 @@ class World:
         self._wall_contacts = self._target_contacts = self._target_contacts_by_robot = 0
 
     def _see(self, client: int) -> None:
-        """Prepare what the camera draws: the bodies now, or those of its own past."""
+        """Prepare the bodies that the camera draws: those of now, or those of its past."""
         things = self.scenario.things + self._surroundings.things
         scenario, room = self.scenario.model_copy(update={"things": things}), self._surroundings.walls
         latency_us = 1000 * scenario.look.latency_ms
@@ -130,7 +130,7 @@ class World:
         return Moment(self.now_us, *self._mounted(camera.x_m, camera.z_m), angular[2], target)
 
     def _add_things(self) -> None:
-        """Floor, walls, target, robot, then the rest."""
+        """Add floor, walls, target, robot, then the rest."""
         client, scenario, robot = self._client, self.scenario, self.robot
         self._floor = add_floor(client)
         self._obstacles += [add_wall(client, wall) for wall in scenario.walls + self._surroundings.walls]
@@ -144,7 +144,7 @@ class World:
             self._add_thing(thing, *begin_thing(thing, number, self.seed))
         for _, bodies in self._movers:
             if isinstance(bodies.thing, OnPath):
-                # It has no mass that could yield, so that it would push a standing robot away.
+                # It has no mass that could yield, so it would push a standing robot away.
                 self._body.pass_through(bodies.bodies)
 
     def _add_thing(self, thing: Thing, mover: Mover, at: Place, way_m: float) -> None:
@@ -153,7 +153,7 @@ class World:
         self._obstacles += bodies.bodies
 
     def set_wheels(self, left_rad_s: float, right_rad_s: float) -> None:
-        """Give wheel speeds, forward positive; they hold until others are given. Raises ValueError unless finite."""
+        """Set wheel speeds, forward positive; they hold until the next call. Raises ValueError unless finite."""
         self._motors[0].set(left_rad_s)
         self._motors[1].set(right_rad_s)
 
@@ -204,7 +204,7 @@ class World:
         }
 
     def _count_passes(self) -> None:
-        """Count each thing on a path that goes through between the lens and the target."""
+        """Count each thing on a path that passes between the lens and the target."""
         camera = self.robot.camera
         (lens_x_m, lens_y_m, _), _ = self._mounted(camera.x_m, camera.z_m)
         x_m, y_m = self._target_at[0] - lens_x_m, self._target_at[1] - lens_y_m
@@ -255,7 +255,7 @@ class World:
         return leg_labels(self._scenery.client, people, self._shutter, moment)
 
     def _mounted(self, x_m: float, z_m: float) -> tuple[Vector, Any]:
-        """Position and orientation of something mounted on the robot."""
+        """Return position and orientation of a part of the robot."""
         return pybullet.multiplyTransforms(*self._body.pose(), (x_m, 0, z_m), (0, 0, 0, 1))  # type: ignore[no-any-return]
 
     def truth(self) -> Truth:
@@ -280,7 +280,7 @@ class World:
         )
 
     def _clearance_m(self) -> float:
-        """From the robot's body to the nearest thing that is in its way; no more than `CLEARANCE_SEEN_M`."""
+        """Return the distance from the robot's body to the nearest obstacle, at most `CLEARANCE_SEEN_M`."""
         nearest_m = CLEARANCE_SEEN_M
         for obstacle in self._obstacles:
             for point in pybullet.getClosestPoints(
