@@ -1,14 +1,14 @@
-"""A check: one figure and its bound; how checks are made, printed and reduced to the worst of several runs. Pure."""
+"""One figure and its bound. Creates, prints and reduces checks to the worst of several runs. Pure."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-_WHOLE_FROM: Final = 999.5  # three digits of what is more have an exponent
+_WHOLE_FROM: Final = 999.5  # larger values have an exponent in three digits
 
 
 def number(value: float | None) -> str:
-    """Three digits, or all before the point; `never` for what did not happen."""
+    """Format with three digits, or all before the point; `never` for a missing value."""
     if value is None:
         return "never"
     return f"{value:.3g}" if abs(value) < _WHOLE_FROM else f"{value:.0f}"
@@ -17,7 +17,7 @@ def number(value: float | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One demanded figure: at most `bound`, or at least, where the name begins so."""
+    """One demanded figure: at most `bound`, or at least, if its name begins with `least`."""
 
     name: str
     value: float | None
@@ -37,13 +37,13 @@ def check_lines(checks: Sequence[Check]) -> list[str]:
 
 
 def _value(check: Check) -> str:
-    """Format a value, with more digits where three would hide the failure."""
+    """Format a value, with more digits if three would hide the failure."""
     text = number(check.value)
     return text if check.value is None or check.ok or text != number(check.bound) else f"{check.value:g}"
 
 
 def to_dict(checks: Iterable[Check]) -> dict[str, Any]:
-    """Return the part of `--json` that every command with checks has."""
+    """Return the common part of `--json` of every command with checks."""
     listed = [asdict(check) for check in checks]
     return {"ok": all(check["ok"] for check in listed), "checks": listed}
 

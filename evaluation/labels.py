@@ -1,4 +1,4 @@
-"""The simulation's labels published as detections, as a detector service would. Shell (a link)."""
+"""Publishes the simulation's labels as detections, in place of a detector service. Shell (a link)."""
 
 import secrets
 from collections import OrderedDict
@@ -24,14 +24,14 @@ SOURCE = "guest"
 def boxes_message(
     header: FrameHeader, labels: Iterable[dict[str, Any]], size: CameraModel | JpegSize, session: str, seq: int
 ) -> tuple[bytes, bytes]:
-    """Header and payload for the channel `detections`: the labels of the frame of `header`, in pixels of its `size`."""
+    """Return header and payload for the channel `detections`: labels of the frame of `header`, in pixels of `size`."""
     boxes = tuple(DetectedBox.model_validate(one) for one in labels)
     stamp = DetectionsHeader(source=SOURCE, session=session, seq=seq, echo=Echo.of(header))
     return encode(stamp), encode(Detections(width_px=size.width_px, height_px=size.height_px, boxes=boxes))
 
 
 class Labels:
-    """In lockstep: labels each frame as it is captured, and reads the boxes as vision does when the frame arrives."""
+    """Labels in lockstep: stores those of each captured frame, and returns its detections when the frame arrives."""
 
     def __init__(self, config: BoxesConfig, camera: CameraModel) -> None:
         self._reader = BoxReader(config)
@@ -39,19 +39,19 @@ class Labels:
         self._kept: OrderedDict[int, tuple[bytes, bytes]] = OrderedDict()
 
     def label(self, header: FrameHeader, labels: Iterable[Any]) -> None:
-        """Store a frame that is sent now, with the labels of the simulation."""
+        """Store the simulation's labels of a frame that is sent now."""
         tables = [one._asdict() for one in labels]
         self._kept[header.seq] = boxes_message(header, tables, self._camera, "00000003", header.seq)
         if len(self._kept) > KEPT:
             self._kept.popitem(last=False)
 
     def of(self, header: FrameHeader) -> tuple[FrameHeader, tuple[Detection, ...]]:
-        """The frame, and what is meant in it."""
+        """Return the frame and its detections."""
         self._reader.remember(header)
         return self._reader.read(*self._kept[header.seq], self._camera)
 
 
-# Publishes the simulation's labels as boxes of a robot's frames, as a detector elsewhere would. Shell.
+# Publishes the simulation's labels as boxes of a robot's frames, in place of a remote detector. Shell.
 #
 # It examines no image. The simulation publishes the contents of each image by its capture time.
 
@@ -61,7 +61,7 @@ _WAIT_S = 0.03
 
 
 def run(robot: str, connect: list[str], secure: str, socket_dir: str, show: Callable[[str], None]) -> int:
-    """Publish until interrupted. Raises HardwareError when the simulation is gone, LinkError as `open_link` does."""
+    """Publish until interrupted. Raises HardwareError when the simulation has ended, LinkError as `open_link` does."""
     labels = LabelReader(socket_dir)
     with open_link(robot, connect=connect, role=SOURCE, secure=secure) as link:
         publisher = LabelPublisher(link, labels)
@@ -76,7 +76,7 @@ def run(robot: str, connect: list[str], secure: str, socket_dir: str, show: Call
 
 
 class LabelPublisher:
-    """One robot's frames in, their boxes out: the newest frame only."""
+    """Receives the frames of one robot and publishes their boxes; the newest frame only."""
 
     def __init__(self, link: Link, labels: LabelReader) -> None:
         self._link, self._labels = link, labels
@@ -85,14 +85,14 @@ class LabelPublisher:
         self._seq = 0
 
     def step(self) -> None:
-        """Publish the boxes of the next frame, if one comes soon."""
+        """Publish the boxes of the next frame, if one arrives in time."""
         frame = self._frames.take(_WAIT_S)
         self._labels.drain()
         if frame is not None:
             self._publish(frame)
 
     def _publish(self, frame: Message) -> None:
-        """Publish the boxes at the size of the image, because on a slow link the robot sends smaller ones."""
+        """Publish the boxes in pixels of the encoded image, because on a slow link the robot sends smaller ones."""
         try:
             header, size = decode(FrameHeader, frame.header), read_jpeg_size(frame.payload)
         except WireError:

@@ -1,6 +1,6 @@
-"""The whole loop in virtual time: the services' own logic, a simulated world, a network in memory. Pure.
+"""The whole loop in virtual time: the logic of the services, a simulated world, a network in memory. Pure.
 
-Nothing here decides anything: robot, driver, stream and vision are the classes the real processes run. Every delay and
+No logic is here: robot, driver, stream and vision are the classes of the real processes. Every delay and
 loss is drawn from the seed, so a run repeats bit for bit, about twenty times faster than real.
 """
 
@@ -35,14 +35,14 @@ from sightline.vision_side.missions.ranges import decode_scan
 from sightline.vision_side.pipeline import SOURCE, Frame, FrameLoss, Pipeline, PipelineAnswer, answer_header
 
 COMPUTE_US = 4_000
-"""What one frame costs the vision side in virtual time: one step of the world, above what it takes in truth."""
+"""Virtual compute time of one frame: one step of the world, more than it takes in reality."""
 _SAMPLE_US = 20_000
 _ROBOT_SESSION, _VISION_SESSION = "00000001", "00000002"
 
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """The network: total added latency (half on each leg), total jitter, loss on each leg."""
+    """Network conditions: total added latency (half on each leg), total jitter, loss on each leg."""
 
     latency_ms: float = 0.0
     loss: float = 0.0
@@ -54,14 +54,14 @@ class Run(RunRecord):
     """The result of a run."""
 
     twists: list[bytes] = field(default_factory=list)
-    """Every twist the vision side sent, in order."""
+    """Every twist of the vision service, in order."""
     states: set[State] = field(default_factory=set)
     news: list[str] = field(default_factory=list)
     """Lines of the detector for the operator."""
 
 
 class Lockstep:
-    """One robot, one vision, one world. `step` advances all by one step of the world."""
+    """One robot, one vision service, one world. `step` advances all by one step of the world."""
 
     def __init__(
         self,
@@ -168,7 +168,7 @@ class Lockstep:
     # --- vision --------------------------------------------------------------------------------------------------
 
     def _see(self) -> None:
-        """Send what is computed, then take the newest frame: one at a time, as the real service does."""
+        """Send computed answers, then take the newest frame: one at a time, as the real service does."""
         if self._computed and self._computed[0][0] > self._now_us:
             return
         if self._computed:
@@ -218,7 +218,7 @@ def run_lockstep(
 ) -> Run:
     """Run `scenario` for `seconds` (default: its own length), or until `is_over`, which is called each second.
 
-    `vision` and `mission` stand in for what the scenario names. `seams` are those of a sabotage.
+    `vision` and `mission` replace those of the scenario. `seams` belong to a sabotage.
     """
     vision = vision or vision_config(scenario, model, seed, mission)
     with World(scenario, model, seed) as world:

@@ -1,4 +1,4 @@
-"""Reads a folder of photographs, and compares them by a hash of what they show. Shell (files)."""
+"""Read a folder of photographs, and compare them by a perceptual hash. Shell (files)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,15 +19,15 @@ FEWEST: Final = 20
 """Photographs in a folder, at least."""
 _MOST_PIXELS: Final = 50_000_000
 _LONGEST_PX: Final = 1024
-"""Of the longer side, once it has been read: larger ones are scaled down."""
+"""Longest side; larger photographs are scaled down after reading."""
 _SAME_BITS: Final = 8
-"""Two hashes of 64 bits that differ in so many are of one photograph."""
+"""Largest number of different bits, of 64, in two hashes of one photograph."""
 _ENDINGS: Final = (".jpg", ".jpeg", ".png")
 
 
 @dataclass(frozen=True, slots=True)
 class Photograph:
-    """One photograph: its file's name, RGB (H, W, 3), upright."""
+    """One photograph: file name and upright RGB (H, W, 3)."""
 
     name: str
     rgb: npt.NDArray[np.uint8]
@@ -64,7 +64,7 @@ def _read(path: Path) -> npt.NDArray[np.uint8]:
 
 
 def _size(path: Path, data: bytes) -> tuple[int, int]:
-    """Return width and height from the head of a JPEG or PNG, before anything large is decoded."""
+    """Read width and height from the head of a JPEG or PNG, before the image is decoded."""
     if data.startswith(b"\x89PNG\r\n\x1a\n") and len(data) >= 24:
         return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
     try:
@@ -75,7 +75,7 @@ def _size(path: Path, data: bytes) -> tuple[int, int]:
 
 
 def shared(first: Sequence[Photograph], second: Sequence[Photograph]) -> list[tuple[str, str]]:
-    """Return the names of photographs that show the same in both, also under another name or size."""
+    """Return the pairs of photographs that show the same, also under another name or size."""
     hashes = [(one.name, show_hash(one.rgb)) for one in second]
     return [(one.name, name) for one in first for own in [show_hash(one.rgb)] for name, other in hashes
             if (own ^ other).bit_count() <= _SAME_BITS]

@@ -1,4 +1,4 @@
-"""The path of a run and its figures over time as a picture. Shell (writes a file)."""
+"""Draw the path of a run and its figures over time. Shell (writes a file)."""
 
 import math
 import warnings
@@ -24,7 +24,7 @@ _SCALE_LENGTHS_M: Final = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 
 
 class StatusAt(NamedTuple):
-    """State and frame age that the robot published; the age is None without a command in force."""
+    """State and frame age that the robot published. The age is None without a command in force."""
 
     t_us: int
     state: str
@@ -32,7 +32,7 @@ class StatusAt(NamedTuple):
 
 
 class AgeLimits(NamedTuple):
-    """Frame ages of the robot, in ms: up to the first full speed, from the second none."""
+    """Frame ages of the robot, in ms: full speed up to the first, none from the second on."""
 
     full_ms: float
     zero_ms: float
@@ -74,8 +74,8 @@ def plot_run(
         _plot_age(figure.add_subplot(grid[2, 1]), samples, statuses, limits)
     figure.suptitle(title, parse_math=False)  # names may contain a dollar sign
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing from")  # letters that the font lacks become boxes
-        canvas.draw()  # type: ignore[no-untyped-call]  # equal scales change the numbers; what room those take shows now
+        warnings.filterwarnings("ignore", "Glyph .* missing from")  # missing glyphs become boxes
+        canvas.draw()  # type: ignore[no-untyped-call]  # equal scales change the tick labels; their size is known now
         canvas.print_png(path)  # type: ignore[no-untyped-call]
 
 
@@ -114,7 +114,7 @@ def _plot_ways(axes: "Axes", samples: Sequence[Truth], scenario: Scenario) -> No
 
 
 def _plot_scale(axes: "Axes") -> None:
-    """Draw a bar of a round length above the view, where nothing else is."""
+    """Draw a bar of a round length above the view, where the plot is empty."""
     from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
 
     axes.apply_aspect()  # equal scales change the limits
@@ -128,7 +128,7 @@ def _plot_scale(axes: "Axes") -> None:
 
 
 def _plot_things(axes: "Axes", scenario: Scenario) -> None:
-    """Draw what stands about, but for what the seed moved it by; waypoints; the light and its line."""
+    """Draw the things without the offset of the seed, the waypoints, the light and its line."""
     standing = [thing for thing in scenario.things if isinstance(thing, Static)]
     for number, thing in enumerate(standing):
         circle = _circle(thing.at_m, thing.reach_m, WALL_COLOR)
@@ -163,7 +163,7 @@ def _plot_distance(axes: "Axes", times_s: list[float], samples: Sequence[Truth],
 
 
 def _plot_age(axes: "Axes", samples: Sequence[Truth], statuses: Sequence[StatusAt], limits: AgeLimits) -> None:
-    """Frame age over time, its limits, and the state as the color behind it."""
+    """Plot frame age over time, its limits, and the state as background color."""
     begin_us, end_us = samples[0].t_us, samples[-1].t_us
     during = [one for one in statuses if begin_us <= one.t_us <= end_us]
     times_s = [(one.t_us - begin_us) / 1e6 for one in during]

@@ -1,4 +1,4 @@
-"""Processes and worker pools that end together whatever happens, each process with its log. Shell."""
+"""Processes and worker pools that always end together, each process with its log. Shell."""
 
 import multiprocessing
 import os
@@ -38,21 +38,21 @@ def terminated_like_interrupted() -> Iterator[None]:
 
 # Processes started together and ended together, each with its log. Shell.
 #
-# Waits are for facts (a printed line), never for time alone; whatever happens, nothing is left behind.
+# Waits are for facts (a printed line), never for time alone. Nothing is left running in any case.
 
 
 COMMAND_LINE: Final = "sightline.operator_side.cli.app"
 READY_S: Final = 30.0
-"""For one process to print that it is ready; a first start reads hundreds of megabytes from disk."""
+"""Time for one process to print that it is ready. A first start reads hundreds of megabytes from disk."""
 _END_S: Final = 4.0
-"""A process that has not ended this long after SIGTERM is killed; the robot takes up to 2 s to bring wheels to zero."""
+"""Time from SIGTERM to a kill. The robot takes up to 2 s to bring the wheels to zero."""
 _POLL_S: Final = 0.02
 _MARK: Final = re.compile(r"^(error: |\S+Z (info|warning|error) )")
 _REAPER: Final = Path(__file__).with_name("reaper.py")
 
 
 class ProcessError(HardwareError):
-    """A process ended by itself, with an exit code that is passed on, or is not ready in time."""
+    """A process ended by itself, with an exit code that is passed on, or was not ready in time."""
 
     def __init__(self, text: str, code: int = 1) -> None:
         super().__init__(text)
@@ -60,13 +60,13 @@ class ProcessError(HardwareError):
 
 
 class Processes:
-    """Use it in a `with`. Each process has its own session, so that Ctrl-C reaches only the process that starts them.
+    """A context manager. Each process has its own session, so that Ctrl-C reaches only the process that starts them.
 
     However this program ends, within 2 s no process and no folder of `temporary_folder` is left.
     """
 
     def __init__(self, folder: Path, *, oldest_first: bool = False) -> None:
-        """`oldest_first` is the order of ending."""
+        """Start empty. With `oldest_first`, processes end in the order of their start."""
         self._folder = folder
         self._oldest_first = oldest_first
         self._running: dict[str, subprocess.Popen[bytes]] = {}
@@ -78,7 +78,7 @@ class Processes:
     ) -> int:
         """Run `sightline ARGUMENTS`, or another module, inside a network namespace if one is named.
 
-        Its output goes to `<name>.log`, as text, for the process that starts them. Returns its process id.
+        Its output goes to `<name>.log` as text. Returns its process id.
         """
         entering = ["ip", "netns", "exec", namespace] if namespace else []
         with self.log(name).open("wb") as log:
@@ -91,19 +91,19 @@ class Processes:
         return self.pid(name)
 
     def temporary_folder(self) -> str:
-        """Make a folder that is removed when these processes have ended."""
+        """Create a folder that is removed when these processes have ended."""
         folder = tempfile.mkdtemp(prefix="sightline-")
         self._note(f"folder {folder}")
         return folder
 
     def _note(self, line: str) -> None:
-        """Send the reaper one line; start it with the first."""
+        """Send the reaper one line. The first line starts it."""
         if self._reaper is None:
             self._reaper = subprocess.Popen(
                 [sys.executable, "-I", "-S", str(_REAPER)], stdin=subprocess.PIPE, bufsize=0, start_new_session=True,
             )
         assert self._reaper.stdin is not None
-        with suppress(BrokenPipeError):  # ended from outside: the processes still end with this `with`
+        with suppress(BrokenPipeError):  # it ended; the processes still end with this `with`
             self._reaper.stdin.write(line.encode() + b"\n")
 
     def log(self, name: str) -> Path:
@@ -128,11 +128,11 @@ class Processes:
 
     @property
     def names(self) -> list[str]:
-        """Those that were started and not ended here, the oldest first."""
+        """Return the names of the started processes that were not ended here, the oldest first."""
         return list(self._running)
 
     def wait_line(self, name: str, text: str, timeout_s: float = READY_S) -> None:
-        """Wait until a line of `name` contains `text`. Raises ProcessError if one ends or it takes longer."""
+        """Wait until a line of `name` contains `text`. Raises ProcessError if a process ends or it takes longer."""
         deadline_s = time.monotonic() + timeout_s
         while text not in self.log(name).read_text("utf-8", "replace"):
             self.check()
@@ -142,7 +142,7 @@ class Processes:
             time.sleep(_POLL_S)
 
     def check(self, wait_s: float = 0.0) -> None:
-        """Raise ProcessError with its last words if one has ended, or does so within `wait_s`."""
+        """Raise ProcessError with its last output if a process has ended or ends within `wait_s`."""
         deadline_s = time.monotonic() + wait_s
         while True:
             for name, process in self._running.items():
@@ -155,7 +155,7 @@ class Processes:
             time.sleep(_POLL_S)
 
     def signal(self, name: str, number: signal.Signals) -> None:
-        """Send a signal."""
+        """Send a signal to a process."""
         self._running[name].send_signal(number)
 
     def exit_code(self, name: str, timeout_s: float) -> int | None:
@@ -168,7 +168,7 @@ class Processes:
         return code
 
     def kill(self, name: str) -> None:
-        """SIGKILL, and forget it."""
+        """Kill a process with SIGKILL, and forget it."""
         process = self._running[name]
         process.kill()
         process.wait()
@@ -178,7 +178,7 @@ class Processes:
         self._note(f"-{self._running.pop(name).pid}")
 
     def end_one(self, name: str) -> bool:
-        """SIGTERM, and forget it; whether it had to be killed."""
+        """End a process with SIGTERM, and forget it. Returns True if it had to be killed."""
         self.signal(name, signal.SIGTERM)
         if self.exit_code(name, _END_S) is not None:
             return False
@@ -186,10 +186,10 @@ class Processes:
         return True
 
     def end(self) -> list[str]:
-        """Wake those that are stopped and end one after the other; idempotent.
+        """Continue stopped processes and end all in turn. Idempotent.
 
-        The newest first, so that no process observes the end of another, or the oldest, so that a robot writes its
-        events before its peer ends. Returns the names of those that had to be killed.
+        The newest ends first, so that no process observes the end of another, or the oldest first, so that a robot
+        writes its events before its peer ends. Returns the names of killed processes.
         """
         for name in self._running:
             self.signal(name, signal.SIGCONT)
@@ -204,12 +204,12 @@ class Processes:
     ) -> None:
         self.end()
         if self._reaper is not None:
-            with self._reaper:  # closes its pipe, and waits until it has removed the folders
+            with self._reaper:  # closes its pipe and waits until it has removed the folders
                 self._reaper = None
 
 
 def children_of(pid: int) -> list[int]:
-    """Process ids of the children that its main thread started, the oldest first."""
+    """Return the process ids of the children of a main thread, the oldest first."""
     try:
         return [int(text) for text in Path(f"/proc/{pid}/task/{pid}/children").read_text("ascii").split()]
     except OSError:  # it has ended
@@ -221,7 +221,7 @@ def driver_of(guardian: int) -> int:
     with suppress(OSError):
         own = _command(guardian)
         for pid in reversed(children_of(guardian)):
-            command = _command(pid)  # ours while it is a fork; no line once it is dead
+            command = _command(pid)  # our own while it is a fork; no line after its end
             if command not in (b"", own) and not _is_stop(pid):
                 return pid
     return 0
@@ -235,7 +235,7 @@ def _is_stop(pid: int) -> bool:
 
 
 def is_running(pid: int) -> bool:
-    """Return True unless the process has ended; one without a parent that waits for it has ended too."""
+    """Return True unless the process has ended. A zombie has ended."""
     with suppress(OSError):
         return bool(_command(pid))
     return False
@@ -270,10 +270,10 @@ def free_port() -> int:
 
 @contextmanager
 def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
-    """So many, for as long as the context lasts. Left by an error, what has not begun never does: a pool by itself
-    would first do all of it. Ctrl-C at the terminal reaches every process and ends them immediately.
+    """Run a pool of `jobs` workers within the context. On an error, queued work never starts; a plain pool
+    would do all of it first. Ctrl-C at the terminal reaches every process and ends them immediately.
 
-    Spawned, since a forked child would share PyBullet's state. Raises HardwareError when something else ends one.
+    Workers are spawned, since a fork would share PyBullet's state. Raises HardwareError if one is ended from outside.
     """
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _begin_worker) as pool:
         try:
@@ -283,12 +283,12 @@ def worker_pool(jobs: int) -> Iterator[ProcessPoolExecutor]:
             ended = f"a worker (of {jobs}) was ended from outside, perhaps as memory ran out{fewer}"
             raise HardwareError(ended) from None
         except BaseException:
-            pool.shutdown(cancel_futures=True)  # waits: the pool's own end would take it back
+            pool.shutdown(cancel_futures=True)  # waits; the exit of the pool would undo the cancellation
             raise
 
 
 def _begin_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an exception would only end the present work, and begin the next
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # an exception would end only the present work and start the next
     threading.Thread(target=_end_with_parent, name="parent's end", daemon=True).start()
 
 

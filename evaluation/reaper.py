@@ -2,8 +2,8 @@
 
     python -I -S reaper.py    lines on standard input: +PID, -PID, folder PATH
 
-Standard input is a pipe whose other end only the program holds, so the kernel closes it even after SIGKILL. Nothing of
-ours is imported, because every demo and bench starts this process. `processes.py` starts it.
+Standard input is a pipe whose other end only the program holds, so the kernel closes it even after SIGKILL. It imports
+no module of Sightline, because every demo and bench starts this process. `processes.py` starts it.
 """
 
 import os
@@ -15,11 +15,11 @@ import time
 from contextlib import suppress
 
 ENDS_WITHIN_S = 0.8
-"""For all but the oldest process after SIGTERM. The oldest is the simulation, where the robot brings wheels to zero."""
+"""Time for all but the oldest process after SIGTERM. The oldest is the simulation, which the robot still needs."""
 KILLED_AFTER_S = 1.2
-"""From the end of the program to SIGKILL for each process that is left, with all that it started.
+"""Time from the end of the program to SIGKILL for each remaining process and its children.
 
-On a busy machine a vision service does not end within this, and a killed process takes 0.5 s to be gone.
+On a busy machine a vision service does not end within this, and a killed process takes 0.5 s to end.
 """
 
 
@@ -35,14 +35,14 @@ class Reaper:
         if line.startswith("folder "):
             self._folders.append(line.removeprefix("folder "))
         elif line.startswith("+"):
-            with suppress(OSError):  # it ended already
+            with suppress(OSError):  # it has already ended
                 pid = int(line)
                 self._running[pid] = os.pidfd_open(pid)
         elif (pidfd := self._running.pop(-int(line), -1)) >= 0:
             os.close(pidfd)
 
     def end(self) -> None:
-        """End what still runs, the oldest last, then remove the folders."""
+        """End the remaining processes, the oldest last, then remove the folders."""
         ended_s = time.monotonic()
         pids = list(self._running)
         for pid in pids[1:]:
@@ -51,7 +51,7 @@ class Reaper:
         for pid in pids[:1]:
             self._terminate(pid)
         self._wait(pids, ended_s + KILLED_AFTER_S)
-        for pid in pids:  # each leads a group; one that ended may have left a child
+        for pid in pids:  # each leads a group; an ended one may have left a child
             with suppress(OSError):
                 os.killpg(pid, signal.SIGKILL)
         for folder in self._folders:
@@ -71,7 +71,7 @@ class Reaper:
 
 
 def main() -> None:
-    """Follow the program until its end."""
+    """Follow the program until it ends."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     reaper = Reaper()

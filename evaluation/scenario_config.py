@@ -1,4 +1,4 @@
-"""The robot's and vision's configuration for a simulated scenario. Pure.
+"""Create the configuration of robot and vision service for a simulated scenario. Pure.
 
 All settings are visible: `sightline demo` writes both files to its run folder.
 """
@@ -24,8 +24,8 @@ from sightline.vision_side.config import VisionConfig
 Table = dict[str, Any]
 Model = TypeVar("Model", bound=BaseModel)
 
-_KEPT_BACK = 0.88  # of a wheel's top speed: what is left lets a motor catch up
-_MARGIN_M = 0.01  # around the outline as it is drawn
+_KEPT_BACK = 0.88  # of a wheel's top speed: the rest lets a motor catch up
+_MARGIN_M = 0.01  # around the drawn outline
 
 
 def robot_of(scenario: Scenario, model: str | None = None) -> RobotModel:
@@ -53,7 +53,7 @@ def robot_table(model: RobotModel) -> Table:
 def vision_table(scenario: Scenario, model: RobotModel, seed: int = 0, mission: str | None = None) -> Table:
     """Return vision.toml of this scenario: target, limits of the robot, mission, and the settings of its file.
 
-    Another `mission` than the scenario's own starts with its own options, waypoints included if there are any.
+    Another `mission` than the scenario's starts with its default options and the waypoints, if any.
     """
     kind = mission or scenario.mission
     waypoints = {"waypoints": [[round(x_m, 4), round(y_m, 4)] for x_m, y_m in goals_seen(scenario, seed)]}
@@ -98,7 +98,7 @@ def robot_config(model: RobotModel, *, auto_arm: bool = False) -> RobotConfig:
 
 
 def _check_sight(config: RobotConfig, model: RobotModel) -> None:
-    """Check the blind zone before the first scan, as the driver process does with it."""
+    """Check the blind zone before the first scan, as the driver process does."""
     lidar = model.lidar
     free = array.array("f", [math.inf] * lidar.rays)
     scan = Ranges(0, math.radians(lidar.first_deg), lidar.increment_rad, lidar.range_min_m, lidar.range_max_m, free)

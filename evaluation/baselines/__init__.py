@@ -1,4 +1,4 @@
-"""Controllers of older systems, only for comparison. Pure.
+"""Legacy controllers, only for comparison. Pure.
 
 May import: `protocol`, `vision_side`.
 Interface: Missions for `sightline score --mission`.

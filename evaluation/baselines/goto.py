@@ -1,8 +1,8 @@
 """Go-to-goal with wall following. Pure.
 
-Two PD laws, never both at once, and a machine of three states (to the goal, left contour, right contour) at 10 Hz.
-What is wrong in it stays: differences per step instead of per second, an angle that wraps wrongly near half a turn, a
-turn by the clock, gaps between its conditions, and no memory, so that it can go round for ever.
+Two PD laws, one at a time, and a machine of three states (to the goal, left contour, right contour) at 10 Hz.
+Its faults are kept: differences per step instead of per second, an angle that wraps wrongly near half a turn, a
+turn by the clock, gaps between its conditions, and no memory, so that it can circle forever.
 """
 
 import math
@@ -21,12 +21,12 @@ _STEP_US = 100_000  # it ran at 10 Hz
 _REACH_M = 0.2
 _RAY_RAD = 0.25  # 13 rays over 3 rad
 _SENSORS = {"front": (0.077, 0.0, -1.5), "left": (0.065, 0.053, 0.0708), "right": (0.065, -0.053, -3.0708)}
-"""Of its robot: how far each stands ahead and to the left of the axle's midpoint, and where its rays begin."""
+"""Sensors of its robot: position ahead and left of the axle's midpoint, and the angle of the first ray."""
 _SAME_RAY_RAD = 0.2
 
 
 class GotoBaselineConfig(Config):
-    """Its numbers; gains per step of 0.1 s, lengths in meters, speeds in m/s and rad/s."""
+    """Numbers of the legacy law: gains per step of 0.1 s, lengths in meters, speeds in m/s and rad/s."""
 
     waypoints: Annotated[tuple[tuple[Meters, Meters], ...], Field(min_length=1, max_length=64)]
     position_kp: float = 0.3
@@ -37,11 +37,11 @@ class GotoBaselineConfig(Config):
     tolerance_rad: Annotated[float, Field(gt=0, le=1)] = 0.05
     max_linear_mps: Annotated[float, Field(gt=0, le=2)] = 0.5
     wall_m: float = 0.13
-    """The distance that it keeps from a wall, and at which it turns before one."""
+    """Distance that it keeps from a wall, and at which it turns away from one."""
     too_near_m: float = 0.12
     off_from_m: float = 0.05
     off_to_m: float = 0.08
-    """It turns while the distance is off by more than the first and by less than the second."""
+    """It turns while the distance error is above the first value and below the second."""
     contour_mps: Annotated[float, Field(gt=0, le=2)] = 0.1
     contour_rad_s: Annotated[float, Field(gt=0, le=6)] = 1.0
     turn_us: Annotated[int, Field(ge=0)] = 1_500_000
@@ -59,13 +59,13 @@ class GotoBaseline:
         self._reached = 0
         self._side = 0.0  # 0 to the goal, 1 left contour (the wall on the right), -1 right contour
         self._turned = False
-        self._error = (10.0, 10.0, 10.0)  # x, y, angle: what it began with
+        self._error = (10.0, 10.0, 10.0)  # x, y, angle: its initial values
         self._linear = self._angular = 0.0
         self._next_us = 0
         self._rays: dict[str, list[float]] = {}
 
     def step(self, view: View) -> Plan:
-        """Return the twist of its last step. It computes a new one every 0.1 s."""
+        """Return the twist of the last step. A new step is computed every 0.1 s."""
         if view.scan is None:
             return Plan(STILL, "no ranges", "the range sensors are silent")
         if view.header.t_us >= self._next_us:
@@ -89,7 +89,7 @@ class GotoBaseline:
             self._navigate(header.pose)
 
     def _errors(self, pose: Pose) -> tuple[float, float, float]:
-        """x, y and angle, with its way of wrapping."""
+        """Return the errors in x, y and angle, with the angle wrap of the legacy law."""
         goal = self._config.waypoints[self._reached]
         dx, dy = goal[0] - pose[0], goal[1] - pose[1]
         yaw = abs(pose[2]) if abs(pose[2]) > 3 else pose[2]
@@ -115,7 +115,7 @@ class GotoBaseline:
         self._meet()
 
     def _meet(self) -> None:
-        """Something ahead: stop, and choose the contour by which of the two middle rays is shorter."""
+        """Stop for an obstacle ahead, and choose the contour by the shorter of the two center rays."""
         front = self._rays["front"]
         if min(front[6], front[7]) < _REACH_M:
             self._linear = self._angular = 0.0
@@ -123,7 +123,7 @@ class GotoBaseline:
             self._side = -1.0 if front[6] > front[7] else 1.0
 
     def _contour(self, header: FrameHeader) -> None:
-        """Approach, turn away by the clock, then keep the wall at its distance until the goal is on the wall's side."""
+        """Approach, turn for a fixed time, then follow the wall until the goal is on its side."""
         config, front = self._config, self._rays["front"]
         if self._turned:
             self._follow_wall()
@@ -162,7 +162,7 @@ def _three_sensors(scan: RangeScan) -> dict[str, list[float]]:
 
 
 def _rays(x_m: NDArray[Any], y_m: NDArray[Any], first_rad: float) -> list[float]:
-    """Its 13 rays, each the echo nearest to its direction; none near or within reach: nothing seen."""
+    """Return the 13 rays of a sensor, each the echo nearest to its direction. Without a near echo a ray has no hit."""
     away_m, angles = np.hypot(x_m, y_m), np.arctan2(y_m, x_m)
     rays = [math.inf] * 13
     for index in range(13):

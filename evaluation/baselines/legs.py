@@ -1,8 +1,8 @@
-"""The older leg follower. Pure.
+"""The legacy leg follower. Pure.
 
 It takes 70 of a lidar's rays, one a degree, from 39 degrees left to 30 right, and indexes them with the box's edges as
-shares of the image. The middle of the image is ray 35, straight ahead is ray 39, and the law steers for ray 30: the
-field is lopsided. The integrals know neither time nor bounds; there is no memory. All of that stays.
+shares of the image. The image center is ray 35, straight ahead is ray 39, and the law steers for ray 30.
+The integrals ignore time and have no bounds; there is no memory. All of that is kept.
 """
 
 import math
@@ -17,16 +17,16 @@ from sightline.vision_side.detect.port import Detection
 from sightline.vision_side.missions.port import Plan, RangeScan, View
 
 _RAYS = 70
-_FIRST_DEG = 39.0  # the leftmost ray; each next one is a degree further right
+_FIRST_DEG = 39.0  # the leftmost ray; each next ray is one degree further right
 _AHEAD_RAY = 30
 
 
 class LegsBaseline:
-    """One step for each answer of the detector, as it was."""
+    """One step of the legacy law for each answer of the detector."""
 
     class Config(Settings):
-        """Its numbers; gains per step, ranges in meters, angles in rays. A sane preset halves `angular_kp` and has no
-        integrals: `linear_ki = 0`, `angular_ki = 0`.
+        """Numbers of the legacy law; gains per step, ranges in meters, angles in rays. A sane preset halves
+        `angular_kp` and has no integrals: `linear_ki = 0`, `angular_ki = 0`.
         """
 
         label: Annotated[str, Field(max_length=64)] = "legs"
@@ -35,7 +35,7 @@ class LegsBaseline:
         angular_kp: float = -0.0145
         angular_ki: float = -0.0005
         driving_share: float = 0.4
-        """While it drives it turns with this share of `angular_kp`."""
+        """Share of `angular_kp` that it applies while it drives."""
         far_m: Annotated[float, Field(gt=0)] = 2.5
         drive_from_m: Annotated[float, Field(gt=0)] = 0.65
         turn_from_m: Annotated[float, Field(gt=0)] = 0.35
@@ -48,7 +48,7 @@ class LegsBaseline:
         self._linear_sum = self._angular_sum = 0.0
 
     def step(self, view: View) -> Plan:
-        """Nearest ray of all boxes, then forward and turn, turn only, or stop."""
+        """Find the nearest ray in all boxes, then drive and turn, only turn, or stop."""
         config = self._config
         boxes = [one for one in view.detections if config.label in ("", one.label)]
         ray, away_m = self._nearest(boxes, view.scan)
@@ -66,12 +66,12 @@ class LegsBaseline:
         return Plan(self._twist(linear, ray * config.angular_kp * config.driving_share), "driving", distance_m=away_m)
 
     def _twist(self, linear: float, angular: float) -> Twist:
-        """Its integral has no bound; a twist's text has 64 bytes, so a thousand of anything is where it ends here."""
+        """Return the twist, limited to 1000, because the integral has no bound and the text of a twist has 64 bytes."""
         angular += self._config.angular_ki * self._angular_sum
         return Twist(linear_mps=min(linear, 1000.0), angular_rad_s=max(-1000.0, min(1000.0, angular)))
 
     def _nearest(self, boxes: list[Detection], scan: RangeScan | None) -> tuple[int, float]:
-        """(ray from its "ahead", range) of the nearest echo within any box."""
+        """Return the nearest echo in any box: its ray relative to the law's "ahead", and its range."""
         best = 0, self._config.far_m
         rays = _seventy(scan) if scan is not None else []
         for one in boxes:
@@ -84,8 +84,8 @@ class LegsBaseline:
 
 
 def _seventy(scan: RangeScan) -> list[float]:
-    """The 70 rays it looked at, each the scan's nearest by angle; inf beyond an arc's ends."""
-    if not scan.angle_increment_rad:  # one ray only: no arc
+    """Return the 70 rays, each the nearest ray of the scan by angle; inf outside of the arc."""
+    if not scan.angle_increment_rad:  # a single ray has no arc
         return [math.inf] * _RAYS
     angles = np.radians(_FIRST_DEG - np.arange(_RAYS))
     turned = np.remainder(angles - scan.angle_min_rad, math.tau)

@@ -44,13 +44,13 @@ class NaiveOptions(Config):
 
 @dataclass(slots=True)
 class LastCommand:
-    """The newest command and how old its frame was on arrival. Nothing removes it."""
+    """The newest command, and the age of its frame on arrival. Nothing removes it."""
 
     twist: Twist = STILL
     latency_us: int | None = None
 
     def take(self, message: Message) -> None:
-        """Store the command of `message`; store nothing if it is invalid."""
+        """Store the command of `message` unless it is invalid."""
         try:
             twist, header = parse_twist(message.payload), decode(AnswerHeader, message.header)
         except WireError:
@@ -60,7 +60,7 @@ class LastCommand:
 
 
 class NaiveRobot:
-    """Camera to link, link to wheels."""
+    """Passes images from the camera to the link, and commands from the link to the wheels."""
 
     def __init__(self, link: Link, camera: SimCamera, drive: SimDrive) -> None:
         self._link, self._camera, self._drive = link, camera, drive
@@ -71,7 +71,7 @@ class NaiveRobot:
         link.subscribe(TWIST, self._command.take)
 
     def stream(self, ending: threading.Event) -> None:
-        """Send each frame until `ending`; runs on a thread of its own."""
+        """Send each frame until `ending`, on a separate thread."""
         while not ending.is_set():
             picture = self._camera.read(_FRAME_WAIT_S)
             self._announce()
@@ -85,7 +85,7 @@ class NaiveRobot:
             self._link.publish(FRAME, encode(header), picture.jpeg)
 
     def drive(self, ending: threading.Event) -> None:
-        """Give the last command to the wheels at 50 Hz until `ending`, then zero."""
+        """Apply the last command to the wheels at 50 Hz until `ending`, then zero."""
         while not ending.wait(PERIOD_S):
             turned = self._drive.wheels()
             if turned is not None:

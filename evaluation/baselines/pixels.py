@@ -15,7 +15,7 @@ from sightline.vision_side.missions.port import Plan, View
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """In pixels of the encoded image; without a circle the box's middle and half of its longer side."""
+    """Position and radius in pixels of the encoded image. Without a circle: box center and half of its longer side."""
 
     detection: Detection
     x_px: float
@@ -37,10 +37,10 @@ def _blob(one: Detection) -> Blob:
     return Blob(one, one.center_px[0], max(width, height) / 2, width * height)
 
 
-# Band steering, a baseline: one of three fixed twists, by where the target is and how large it looks. Pure.
+# Band steering, a baseline: one of three fixed twists, by the position and size of the target in the image. Pure.
 #
-# The law of an older Gazebo robot, its numbers as defaults. `centre_share` is of the image's whole width, as it was
-# there, so that the robot turns only when the target almost leaves the image; docs/how-to/missions.md has sane numbers.
+# The law of a legacy Gazebo robot, its numbers as defaults. `centre_share` is a share of the whole width, as there.
+# The robot therefore turns only if the target almost leaves the image; docs/how-to/missions.md has sane numbers.
 
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -53,16 +53,16 @@ class BandConfig(Config):
     max_radius_share: Share = 1 / 3
     """A target that looks smaller or larger than this is not followed."""
     centre_share: Share = 0.30
-    """Within this to either side of the middle the robot drives straight on."""
+    """Within this share on either side of the center the robot drives straight on."""
     averaged: Annotated[int, Field(ge=1, le=100)] = 5
     """Positions of the target that are averaged."""
     linear_mps: Annotated[float, Field(ge=0, le=5)] = 0.1
-    """Straight on and while turning alike."""
+    """Speed straight on and while turning."""
     angular_rad_s: Annotated[float, Field(ge=0, le=10)] = 0.5
 
 
 class Band:
-    """Forward, left or right at fixed speeds, or stop."""
+    """Drives forward, left or right at fixed speeds, or stops."""
 
     Config = BandConfig
 
@@ -71,7 +71,7 @@ class Band:
         self._seen_px: deque[float] = deque(maxlen=config.averaged)
 
     def step(self, view: View) -> Plan:
-        """The plan for one frame."""
+        """Return the plan for one frame."""
         blob = largest(view)
         if blob is None:
             return Plan(STILL, "no target")
@@ -88,8 +88,8 @@ class Band:
                     target=blob.detection)
 
 
-# P steering in pixels at five commands a second, a baseline. Pure.  The law of an older ball-chasing car, its numbers
-# as defaults: whatever it decided holds for 0.2 s, however the target moves meanwhile. docs/how-to/missions.md has
+# P steering in pixels at five commands a second, a baseline. Pure.  The law of a legacy ball-chasing car, its numbers
+# as defaults: each decision holds for 0.2 s, however the target moves in that time. docs/how-to/missions.md has
 # sane numbers.
 
 
@@ -103,17 +103,17 @@ class PixelPConfig(Config):
     min_radius_px: Pixels = 10.0
     """Smallest radius of a target."""
     stop_radius_px: Pixels = 50.0
-    """A target that looks larger is near enough: only turn."""
+    """Radius from which a target is near enough: only turn."""
     centred_px: Pixels = 20.0
-    """Nearer to the middle than this: drive fast."""
+    """Offset from the center below which it drives fast."""
     fast_mps: Annotated[float, Field(ge=0, le=5)] = 0.5
     slow_mps: Annotated[float, Field(ge=0, le=5)] = 0.2
     period_s: Annotated[float, Field(ge=0, le=5)] = 0.2
-    """From one decision to the next; 0: with each image."""
+    """Time between two decisions; 0: one per image."""
 
 
 class PixelP:
-    """Turns by the pixels off the middle; two speeds."""
+    """Turns by the pixel offset from the center; two speeds."""
 
     Config = PixelPConfig
 
@@ -123,7 +123,7 @@ class PixelP:
         self._plan = Plan(STILL, "no target")
 
     def step(self, view: View) -> Plan:
-        """Compute a new plan when it is time, else return the last one."""
+        """Compute a new plan when it is due, else return the last one."""
         t_us = view.header.t_us
         if self._decided_us is None or t_us - self._decided_us >= self._config.period_s * 1e6:
             self._decided_us = t_us
@@ -134,7 +134,7 @@ class PixelP:
         config = self._config
         if blob is None or blob.radius_px <= config.min_radius_px:
             return Plan(STILL, "no target")
-        off_px = self._width_px // 2 - int(blob.x_px)  # left positive, whole pixels, as there
+        off_px = self._width_px // 2 - int(blob.x_px)  # left positive, whole pixels, as in the legacy code
         turn = config.angular_rad_s_per_px * off_px
         if blob.radius_px > config.stop_radius_px:
             return Plan(Twist(linear_mps=0.0, angular_rad_s=turn), "near", target=blob.detection)
@@ -144,10 +144,10 @@ class PixelP:
                     target=blob.detection)
 
 
-# PI steering in pixels, a baseline: the nearer the target looks the slower, and an integral without time. Pure.  The
-# law of an older robot that was split over a WebSocket, its numbers as defaults: speed 200 / area, whatever that comes
-# to, and an integral per image that nothing bounds. What else was wrong there (the position of another outline than
-# the largest, an integral that started again with each image) is not repeated.
+# PI steering in pixels, a baseline: slower for a nearer target, and an integral that ignores time. Pure.  The
+# law of a legacy robot that was split over a WebSocket, its numbers as defaults: speed 200 / area without a limit,
+# and an unbounded integral per image. Its other faults (the position of another outline than
+# the largest, an integral that restarted with each image) are not repeated.
 # docs/how-to/missions.md has sane numbers.
 
 
@@ -164,16 +164,16 @@ class PixelPiConfig(Config):
     dead_band_rad_s: Annotated[float, Field(ge=0, le=10)] = 0.1
     """Smaller corrections become zero. The integral continues."""
     min_area_px: Annotated[float, Field(ge=0, le=1e6)] = 40.0
-    """A target that looks no larger is not followed."""
+    """A smaller target is not followed."""
     stop_area_px: Bound = None
-    """From this area on only turn."""
+    """Area from which it only turns."""
     max_linear_mps: Bound = None
     max_integral_rad_s: Bound = None
-    """Of the sum of all corrections."""
+    """Bound of the sum of all corrections."""
 
 
 class PixelPi:
-    """Turns by proportion and sum of the pixels off the middle."""
+    """Turns by proportion and sum of the pixel offset from the center."""
 
     Config = PixelPiConfig
 
@@ -182,7 +182,7 @@ class PixelPi:
         self._sum_rad_s = 0.0
 
     def step(self, view: View) -> Plan:
-        """The plan for one frame."""
+        """Return the plan for one frame."""
         blob, config = largest(view), self._config
         if blob is None or blob.area_px <= config.min_area_px:
             return Plan(STILL, "no target")
@@ -196,7 +196,7 @@ class PixelPi:
         return Plan(twist, "straight" if steady else "turning", target=blob.detection)
 
 
-_SANITY = 100.0  # rad/s: an integral that grew for an hour is still a number that fits on the wire
+_SANITY = 100.0  # rad/s: an integral that grew for an hour still fits on the wire
 
 
 def _bounded(value: float, limit: float | None) -> float:

@@ -2,7 +2,7 @@
 
     python -m sightline.evaluation.demo.relay LISTEN_PORT ROBOT_PORT
 
-Every byte between the two passes this process. SIGSTOP stops the bytes without closing a connection, as a radio does
+All bytes between them pass this process. SIGSTOP stops the bytes without closing a connection, as a radio does
 out of range. SIGCONT lets them pass again, the old ones first.
 """
 
@@ -15,7 +15,7 @@ from typing import Final
 READY: Final = "relay is on"
 LOOPBACK: Final = "127.0.0.1"
 _CHUNK_BYTES: Final = 65_536
-# Small: what waits here when the radio is gone is old when it comes back.
+# Small, because data that wait here during an outage are old when the link returns.
 _BUFFER_BYTES: Final = 16_384
 
 

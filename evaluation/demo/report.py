@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from sightline.evaluation.plots import StatusAt
 
 REAL_TIME_FACTOR: Final = 1.5
-"""The bounds are those of lockstep; a real machine is granted this much more."""
+"""Factor on the bounds of lockstep for a real machine."""
 HOLDS_A_MINUTE: Final = 1.0
-"""At most, up to this loss on each leg and this latency."""
+"""Most HOLDs a minute, up to this loss on each leg and this latency."""
 HOLDS_LOSS, HOLDS_LATENCY_MS = 0.2, 50.0
 
 
@@ -77,7 +77,7 @@ def report(run: DemoRun) -> DemoReport:
         raise CheckError(f"ended before the robot drove; the logs are in {run.folder}")
     recording = run.folder / RECORDING
     answered: list[AnsweredFrame] = []
-    try:  # the same pipeline produces the same for the same frames
+    try:  # the same pipeline gives the same results for the same frames
         replayed = replay(
             recording, lambda step: answered.append(AnsweredFrame.of(step.frame.header.t_us, step.answer.seen)))
     except ConfigError:

@@ -49,23 +49,23 @@ def _lines(status: Status | None, truth: Truth, stand_off_m: float) -> list[str]
     ]
 
 
-# `sightline demo`: simulation, robot and vision as processes of their own, armed, watched, ended. Shell.
+# `sightline demo`: starts, arms, watches and ends simulation, robot and vision service. Shell.
 #
-# The three run what `sightline sim`, `robot` and `vision` run by hand; their configuration lies in the run folder.
+# They are `sightline sim`, `robot` and `vision`; their configuration lies in the run folder.
 
 
 ROBOT: Final = "r1"
 ARM_S: Final = 15.0
 _DYING_S: Final = 1.0
 _SILENT_S: Final = 2.0
-"""Without a word from the simulation: longer than a busy machine keeps it from its turn."""
+"""Time without data from the simulation; longer than a busy machine delays it."""
 RECORDING: Final = "run.mcap"
 MOTOR_LOG: Final = "motors.csv"
 _MARKS: Final = ("sim.log", "sightline/sim.log")
-"""Files of an earlier run and of an earlier story, which the next one in the same folder replaces."""
+"""Files of an earlier run or story. The next one in the same folder replaces them."""
 _RESULTS: Final = ("score.json", "trajectory.png", "run.mp4", RECORDING, MOTOR_LOG, "robot.log", "vision.log",
                    "labels.log")
-"""Files of an earlier run that the next one removes first: if it fails, they are not to pass for its own."""
+"""Results that the next run removes first. If it fails, they must not pass for its own."""
 OTHER_FOLDER: Final = "free some space or pass another folder with --out"
 TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{}", "legacy": "ws-legacy://127.0.0.1:{}"}
 """Endpoint of the vision service by transport. The operator and the recorder always use Zenoh."""
@@ -83,11 +83,11 @@ class DemoOptions:
     out: Path | None = None
     transport: str = "zenoh"
     mission: str | None = None
-    """In place of the scenario's own."""
+    """Mission in place of the scenario's own."""
     detector: str | None = None
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for what cannot be run."""
+        """Raise ConfigError for options that cannot run."""
         for option, value, is_valid, expected in (
             ("--seconds", self.seconds, 0 <= self.seconds <= 3600, "0 to 3600"),
             ("--latency-ms", self.latency_ms, 0 <= self.latency_ms <= 10_000, "0 to 10000"),
@@ -117,7 +117,7 @@ class DemoRun:
 
 
 def run_demo(options: DemoOptions, print_line: Callable[[str], None]) -> DemoRun:
-    """Run it. Raises ConfigError, LinkError, CheckError, the failure of a process, or KeyboardInterrupt at the start.
+    """Run a demo. Raises ConfigError, LinkError, CheckError, the failure of a process, or an early KeyboardInterrupt.
 
     Nothing is left running in any case.
     """
@@ -144,7 +144,7 @@ def run_demo(options: DemoOptions, print_line: Callable[[str], None]) -> DemoRun
 
 
 def _check_vision(options: DemoOptions, scenario: Scenario) -> None:
-    """Raise ConfigError for a mission or detector that the vision service would reject, before any start."""
+    """Raise ConfigError before any start for a mission or detector that the vision service would reject."""
     config = vision_config(scenario, robot_of(scenario), options.seed, options.mission)
     configured_mission(config)
     kind = options.detector
@@ -189,7 +189,7 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, print_line: Callabl
 
 
 def arm_robot(operator: Operator, processes: Processes) -> None:
-    """Repeat the arm request until the robot receives live commands. Raises with the robot's reason otherwise."""
+    """Repeat the arm request until the robot receives live commands. Otherwise raises with the robot's reason."""
     deadline_s = time.monotonic() + ARM_S
     while True:
         processes.check()
@@ -204,7 +204,7 @@ def arm_robot(operator: Operator, processes: Processes) -> None:
 
 
 def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthReader, block: LiveBlock) -> None:
-    """Collect truth and show it until the time is over."""
+    """Collect and show the truth until the time is over."""
     _discard_old(truth)
     started_s = time.monotonic()
     seconds = run.options.seconds
@@ -231,7 +231,7 @@ def _discard_old(truth: TruthReader) -> None:
         pass
 
 
-# --- what the processes are given --------------------------------------------------------------------------------
+# --- inputs of the processes -------------------------------------------------------------------------------------
 
 
 def _write_configuration(run: DemoRun, sockets: str) -> None:
@@ -278,9 +278,9 @@ def _about(run: DemoRun) -> dict[str, str]:
 
 
 def run_folder(out: Path | None, name: str) -> Path:
-    """Make the folder of a run: `out`, or a new one below `runs`.
+    """Create the folder of a run: `out`, or a new one in `runs`.
 
-    Raises ConfigError if it cannot be made, has files and none of them is of a run, or is of a run in progress.
+    Raises ConfigError if it cannot be created, has files but none of a run, or belongs to a run in progress.
     """
     dated = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
     folder = home_path(out or Path("runs") / dated).absolute()
@@ -312,7 +312,7 @@ def _lock(folder: Path) -> int:
 
 @contextmanager
 def open_truth(sockets: str) -> Iterator[TruthReader]:
-    """Read what is really so in the simulation of this folder."""
+    """Open the truth of the simulation of this folder."""
     reader = TruthReader(sockets)
     try:
         yield reader

@@ -24,7 +24,7 @@ from sightline.vision_side.pipeline import SOURCE
 from sightline.vision_side.serving.process import serve
 
 MAX_WAITING: Final = 256
-"""Messages under way on one leg; more are dropped and counted: 8 s of frames at 30 fps."""
+"""Messages in flight on one leg. More are dropped and counted: 8 s of frames at 30 fps."""
 
 
 @dataclass(slots=True)
@@ -46,7 +46,7 @@ class DelayLine:
         self.count = Count()
 
     def put(self, deliver: Callable[[], Any], now_us: int) -> None:
-        """Send: `deliver` becomes due after the leg's delay, or never."""
+        """Queue a message: `deliver` is due after the delay of the leg, or never."""
         self.count.sent += 1
         if self._random.random() < self._leg.loss:
             self.count.lost += 1
@@ -56,7 +56,7 @@ class DelayLine:
             self._waiting.append((now_us + self._leg.delay_us, deliver))
 
     def take_due(self, now_us: int) -> list[Callable[[], Any]]:
-        """Remove and return what is due, in order."""
+        """Remove and return the due messages, in order."""
         due = []
         while self._waiting and self._waiting[0][0] <= now_us:
             due.append(self._waiting.popleft()[1])
@@ -102,7 +102,7 @@ class ShapedLink(LinkWrapper):
         )
 
     def close(self) -> None:
-        """End it; what is under way is lost."""
+        """End the link. Messages in flight are lost."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -158,7 +158,7 @@ class Shape:
 
 
 def run_shaped(config: VisionConfig, shape: str) -> int:
-    """Serve until SIGTERM or SIGINT, with `shape` between the link and the service. Raises as the service does."""
+    """Serve until SIGTERM or SIGINT, with `shape` between link and service. Raises the errors of the service."""
     wanted = Shape.parse(shape)
     ending = threading.Event()
 

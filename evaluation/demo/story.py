@@ -1,6 +1,6 @@
 """The story of two runs: events, figures from the motor log, captions and the order of scenes. Pure.
 
-`Take` is what one run left. `scenes` cuts two takes into a film, `shot` gives what one image of it shows.
+`Take` holds the records of one run. `scenes` cuts two takes into a film, `shot` describes one image of it.
 Every speed, time and distance comes from the motor log. The age bar alone uses the time stamps of the frames.
 """
 
@@ -22,28 +22,28 @@ Tone = Literal["calm", "lost", "safe", "bad"]
 SAFE_NAME: Final = "Sightline"
 NAIVE_NAME: Final = "Naive robot"
 LIMITS: Final = SafetyConfig()
-"""The age limits of the robot as it comes."""
+"""Default age limits of the robot."""
 BEFORE_S: Final = 3.5
-"""Following, before the first event of a take."""
+"""Time of following before the first event of a take."""
 AFTER_S: Final = 2.9
-"""After an event whose consequence is a stop."""
+"""Time shown after an event that leads to a stop."""
 AGAIN_S: Final = 3.4
-"""Following again."""
+"""Time of following again."""
 WALL_S: Final = 1.4
-"""At the wall."""
+"""Time at the wall."""
 LOST_AT_X_M: Final = 1.1
-"""The radio is lost where the robot has passed this, on its way to the east wall ..."""
+"""The radio is lost when the robot passes this on its way to the east wall ..."""
 _FAST_MPS: Final = 0.3
 """... while its speed and its newest command are at least this fast ..."""
 _TOWARD_RAD: Final = 0.5
-"""... at most this far aside."""
+"""... and its heading differs by at most this."""
 _ALONGSIDE_S: Final = 0.6
-"""Before the vision service is killed."""
+"""Time before the vision service is killed."""
 _NAIVE_BEFORE_S: Final = 2.4
 
 
 class Arrival(NamedTuple):
-    """A command that reached the robot, and when the frame behind it was captured."""
+    """A command that reached the robot, and the capture time of its frame."""
 
     t_us: int
     frame_us: int
@@ -78,14 +78,14 @@ class Take:
 
 
 class StopFigure(NamedTuple):
-    """From an event until the wheels are at zero, by the motor log."""
+    """Time and distance from an event until the wheels are at zero, by the motor log."""
 
     ms: float
     m: float
 
     @property
     def text(self) -> str:
-        """Milliseconds and centimeters."""
+        """Format in milliseconds and centimeters."""
         return f"{self.ms:.0f} ms, {100 * self.m:.0f} cm"
 
 
@@ -98,12 +98,12 @@ def stop_after(take: Take, event: Event, until: Event) -> StopFigure:
 
 
 def driven_m(take: Take, since_us: int, until_us: int) -> float:
-    """Distance that the wheels rolled between two times."""
+    """Return the distance that the wheels rolled between two times, m."""
     return measure_stop(take.motors, since_us, until_us).distance_m
 
 
 def wall_us(truths: Sequence[Truth], since_us: int) -> int | None:
-    """When the robot touched a wall after `since_us`; None if it never did."""
+    """Return when the robot first touched a wall after `since_us`; None if it never did."""
     return next((now.t_us for before, now in pairwise(truths)
                  if now.t_us > since_us and now.wall_contacts > before.wall_contacts), None)
 
@@ -118,14 +118,14 @@ class Story:
     vision: StopFigure
     stop: StopFigure
     naive_m: float
-    """From the loss of the radio to the wall."""
+    """Distance from the loss of the radio to the wall."""
     naive_ms: float
     naive_mps: float
-    """What the naive robot commands its wheels at the wall."""
+    """Commanded wheel speed of the naive robot at the wall."""
 
     @property
     def checks(self) -> list[Check]:
-        """Give the claims of the film with their bounds."""
+        """Return the claims of the film with their bounds."""
         stops = (("Wi-Fi lost", self.wifi), ("vision killed", self.vision), ("STOP", self.stop))
         checks = [at_most(f"{name}: wheels at zero", figure.ms, "ms", ZERO_MS) for name, figure in stops]
         checks += [at_most(f"{name}: distance", figure.m, "m", DISTANCE_M) for name, figure in stops]
@@ -135,8 +135,9 @@ class Story:
 
 
 def heads_for_wall(now: Truth, arrivals: Sequence[Arrival]) -> bool:
-    """Return True where a robot that keeps its newest command meets the east wall within the outage: it drives fast
-    toward it, and its newest command is as fast. On a busy machine the two differ."""
+    """Return True if a robot that keeps its newest command hits the east wall within the outage: it drives fast
+    toward it, and its newest command is as fast. On a busy machine the two differ.
+    """
     is_on_the_way = now.x_m >= LOST_AT_X_M and abs(now.yaw_rad) < _TOWARD_RAD and now.linear_mps >= _FAST_MPS
     return is_on_the_way and has_fast_command(arrivals)
 
@@ -147,7 +148,7 @@ def has_fast_command(arrivals: Sequence[Arrival]) -> bool:
 
 
 def compose(safe: Take, naive: Take) -> Story:
-    """Compute the figures of both takes. Raises CheckError where one of them did not end as the film shows."""
+    """Compute the figures of both takes. Raises CheckError if one of them did not end as the film shows."""
     lost_us = naive.events["wifi lost"]
     if "wall" not in naive.events:
         raise CheckError("the naive robot met no wall while the radio was gone, as its last command was slow; "
@@ -161,13 +162,13 @@ def compose(safe: Take, naive: Take) -> Story:
 
 
 def speed_mps(motors: Sequence[MotorRow], t_us: int) -> float:
-    """Speed of the faster wheel as commanded at `t_us`; 0 before the first command."""
+    """Return the commanded speed of the faster wheel at `t_us`; 0 before the first command."""
     index = bisect_right(motors, t_us, key=lambda row: row.t_us)
     return wheel_mps(motors[index - 1]) if index else 0.0
 
 
 def age_us(arrivals: Sequence[Arrival], t_us: int) -> int | None:
-    """Age at `t_us` of the newest frame behind any command that had reached the robot; None before the first."""
+    """Return the age at `t_us` of the newest frame behind any command that had arrived; None before the first."""
     newest = max((one.frame_us for one in arrivals[: bisect_right(arrivals, t_us, key=lambda one: one.t_us)]),
                  default=None)
     return None if newest is None else max(0, t_us - newest)
@@ -177,20 +178,20 @@ def age_us(arrivals: Sequence[Arrival], t_us: int) -> int | None:
 
 
 class FilmScene(NamedTuple):
-    """A piece of one take in real time."""
+    """A part of one take in real time."""
 
     take: Take
     from_us: int
     to_us: int
 
     def times_us(self, fps: float) -> list[int]:
-        """When its images are taken."""
+        """Return the times of its images."""
         return [self.from_us + round(number * 1e6 / fps)
                 for number in range(round((self.to_us - self.from_us) * fps / 1e6))]
 
 
 def scenes(story: Story) -> list[FilmScene]:
-    """Cut both takes; what is left out is waiting."""
+    """Cut both takes. Waiting times are left out."""
     safe, naive = story.safe.events, story.naive.events
     return [
         FilmScene(story.safe, safe["wifi lost"] - _us(BEFORE_S), safe["wifi lost"] + _us(AFTER_S)),
@@ -207,7 +208,7 @@ def _us(seconds: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class FilmShot:
-    """The content of one image of the film beside the two views."""
+    """The content of one image of the film next to the two views."""
 
     name: str
     caption: str
@@ -274,7 +275,7 @@ def _naive_caption(story: Story, t_us: int) -> tuple[str, Tone]:
 
 
 def closing_lines(story: Story) -> list[tuple[str, str, Tone]]:
-    """The last image: what happened, the figure, how it is colored."""
+    """Return the lines of the last image: event, figure, color."""
     return [
         ("Wi-Fi lost", f"stops after {story.wifi.text}", "safe"),
         ("Vision service killed", f"stops after {story.vision.text}", "safe"),

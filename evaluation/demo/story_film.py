@@ -50,14 +50,14 @@ Color = tuple[int, int, int]
 _STEP_US: Final = 4000
 _BACK_M, _UP_M, _DOWN_RAD = 0.82, 0.54, math.radians(27)
 _FOLLOW_S: Final = 0.45
-"""Time in which the chase camera turns after the robot: a view that turns as fast as the robot is hard to watch."""
+"""Time constant of the turning chase camera. A view that turns as fast as the robot is hard to watch."""
 _LEVEL: Final = (0.0, 0.0, 0.0, 1.0)
 _DARK, _DECK, _PLATE, _LENS = (0.10, 0.10, 0.12), (0.13, 0.30, 0.62), (0.20, 0.45, 0.85), (0.92, 0.94, 0.96)
 _ORIGIN: Final = (0.0, 0.0, 0.0)
 
 
 class Piece(NamedTuple):
-    """One box or cylinder of the drawn robot, seen from the middle of its axle on the floor."""
+    """One box or cylinder of the drawn robot, relative to the midpoint of its axle on the floor."""
 
     body: int
     at_m: Vector
@@ -65,7 +65,7 @@ class Piece(NamedTuple):
 
 
 class ChaseCamera:
-    """Draws a recorded scene from behind and above the robot. Use it in a `with`."""
+    """Draws a recorded scene from behind and above the robot. Use it as a context manager."""
 
     def __init__(self, scenario: Scenario, robot: RobotModel, width_px: int, height_px: int) -> None:
         self._client = open_client(_STEP_US)
@@ -80,7 +80,7 @@ class ChaseCamera:
         self._t_us = 0
 
     def draw(self, truth: Truth) -> Pixels:
-        """RGB image at `truth`; the camera turns smoothly from call to call."""
+        """Return the RGB image at `truth`. The camera turns smoothly from call to call."""
         self._follow(truth)
         turn = pybullet.getQuaternionFromEuler([0, 0, truth.yaw_rad])
         for piece in self._pieces:
@@ -105,14 +105,14 @@ class ChaseCamera:
 
 
 def checkered_tile() -> Pixels:
-    """Gray squares of 0.5 m: motion shows, and plain areas need few bytes."""
+    """Return gray squares of 0.5 m: they show motion and compress well."""
     squares = np.arange(TILE_TEXELS) // (TEXELS_PER_M // 2) % 2
     value = np.where(squares[:, None] == squares[None, :], 138, 154)
     return np.repeat(value[..., None], 3, axis=2).astype(np.uint8)
 
 
 def _drawn_robot(client: int, robot: RobotModel) -> list[Piece]:
-    """Plate, deck, camera and wheels in colors: the physics has no need of them."""
+    """Add plate, deck, camera and wheels in colors, which the physics lacks."""
     wheels, camera = robot.wheels, robot.camera
     across = pybullet.getQuaternionFromEuler([math.pi / 2, 0, 0])
     boxes = [((0.16, 0.15, 0.012), (-0.02, 0.0, 0.042), _PLATE), ((0.10, 0.11, 0.035), (-0.035, 0.0, 0.068), _DECK),
@@ -150,14 +150,14 @@ _BAR_MS: Final = 800.0
 
 
 def age_color(age_us: int | None) -> Color:
-    """Green up to the full-speed age of the robot, yellow up to the zero-speed age, red beyond and without a frame."""
+    """Return green up to the full-speed age of the robot, yellow up to its zero-speed age, else red."""
     if age_us is None or age_us > LIMITS.zero_speed_age_ms * 1000:
         return RED
     return GREEN if age_us <= LIMITS.full_speed_age_ms * 1000 else YELLOW
 
 
 class Fonts:
-    """DejaVu Sans, which Matplotlib brings."""
+    """The DejaVu Sans fonts of Matplotlib."""
 
     def __init__(self) -> None:
         with needs("report"):
@@ -181,7 +181,7 @@ class Page:
         self._pillow, self._drawing, self._fonts = Image, ImageDraw, Fonts()
 
     def compose(self, chase: Pixels, view: Pixels, about: FilmShot) -> "Pillow.Image":
-        """RGB image of `WIDTH_PX` x `HEIGHT_PX`."""
+        """Return the RGB image, `WIDTH_PX` x `HEIGHT_PX`."""
         image, draw = self._paper()
         for left_px, pixels in ((0, chase), (VIEW_PX[0] + _GAP_PX, view)):
             image.paste(self._pillow.fromarray(pixels), (left_px, _TOP_PX))
@@ -192,11 +192,11 @@ class Page:
         return image
 
     def caption_px(self, text: str) -> float:
-        """Width of a caption."""
+        """Return the width of a caption, px."""
         return self._fonts.large.getlength(text)
 
     def close_with(self, lines: Sequence[tuple[str, str, Tone]]) -> "Pillow.Image":
-        """The last image: a table of what happened."""
+        """Return the last image: a table of events."""
         image, draw = self._paper()
         draw.text((24, 34), "Real processes, simulated robot. Figures: motor log.", _INK, self._fonts.bold)
         for row, (cause, result, tone) in enumerate(lines):
@@ -213,7 +213,7 @@ class Page:
         return image, self._drawing.Draw(image)
 
     def _top(self, draw: "ImageDraw.ImageDraw", about: FilmShot) -> None:
-        """Which robot, and on the right what works."""
+        """Draw the name of the robot, and on the right the state of its parts."""
         draw.text((14, _TOP_PX / 2), about.name, _INK, self._fonts.large, anchor="lm")
         chips = [(about.state, _STATES.get(about.state, RED)),
                  ("vision on" if about.vision else "vision killed", GREEN if about.vision else RED),
@@ -242,7 +242,7 @@ class Page:
         draw.text((at[0] + 6, at[1] + 4), text, _INK, font)
 
     def _age_bar(self, draw: "ImageDraw.ImageDraw", age_us: int | None) -> None:
-        """Age of the newest frame behind a command, against the limits of the robot."""
+        """Draw the age of the newest frame behind a command, against the limits of the robot."""
         top_px, left_px, right_px = _TOP_PX + VIEW_PX[1] + 7, 112, WIDTH_PX - 14
         draw.text((14, top_px + 9), "frame age", _INK, self._fonts.plain, anchor="lm")
         draw.rounded_rectangle((left_px, top_px, right_px, top_px + 18), 4, (52, 58, 70))
@@ -267,7 +267,7 @@ FPS: Final = 12.5
 CLOSING_S: Final = 3.0
 _QUALITY: Final = 65
 _FINE: Final = 2
-"""The chase camera draws this many pixels for one, in each direction: its renderer has jagged edges."""
+"""Factor by which the chase camera draws larger, because its renderer has no smooth edges."""
 
 
 def robot_view(take: Take, t_us: int) -> Pixels:

@@ -57,7 +57,7 @@ from sightline.sim.truth import Truth
 
 SCENE: Final[dict[str, Any]] = {
     "summary": "a ball goes round a room, close to its walls", "stand_off_m": 0.6, "look": "plain", "seconds": 120.0,
-    # The ball waits until the robot is armed; then it goes along the south wall and turns before the east wall.
+    # The ball waits until the robot is armed. Then it moves along the south wall and turns before the east wall.
     "target": {
         "kind": "path", "speed_mps": 0.4, "waits_s": 14.0, "phase": [0.0, 0.0], "start_m": [-1.0, -1.35],
         "color": [0.95, 0.78, 0.05],
@@ -78,9 +78,9 @@ SCENE: Final[dict[str, Any]] = {
 }
 SCENARIO: Final = "scenario.toml"
 OUTAGE_S: Final = 3.6
-"""How long the radio is gone: a robot that drives on meets the wall within it."""
+"""Duration of the radio outage. A robot that drives on hits the wall within it."""
 _IN_FLIGHT_S: Final = 0.1
-"""Within it, a command that passed the relay before it was stopped has arrived."""
+"""Time in which a command that passed the relay before its stop arrives."""
 _FOLLOWS_MPS: Final = 0.2
 _MOVES_S: Final = 60.0
 _AGAIN_WITHIN_S: Final = 40.0
@@ -90,7 +90,7 @@ _STEADY_US: Final = 700_000
 
 
 class Witness:
-    """Stores what passes on a robot's link. Callbacks only append."""
+    """Stores the messages on a robot's link. Callbacks only append."""
 
     def __init__(self, link: Link, take: Take) -> None:
         self._take = take
@@ -114,7 +114,7 @@ class Witness:
 
 
 class TakeProcesses:
-    """The processes of one take. Use it in a `with`: inside, simulation, robot, relay and vision service run."""
+    """The processes of one take, as a context manager: simulation, robot, relay and vision service."""
 
     def __init__(self, take: Take, folder: Path, seed: int) -> None:
         self.take, self._folder, self._seed = take, folder, seed
@@ -170,7 +170,7 @@ class TakeProcesses:
                                         "--connect", f"tcp/127.0.0.1:{self._relay_port}"])
 
     def mark(self, event: Event) -> None:
-        """Note that `event` happens now."""
+        """Record that `event` happens now."""
         self.take.events[event] = monotonic_us()
 
     def watch(self, seconds: float) -> None:
@@ -179,7 +179,7 @@ class TakeProcesses:
         self.until(lambda now: now.t_us >= ends_us, seconds + 5.0, "the end of a scene")
 
     def until(self, happened: Callable[[Truth], bool], seconds: float, what: str) -> None:
-        """Store truth until `happened`. Raises CheckError naming `what` if it takes longer."""
+        """Store truth until `happened`. Raises CheckError with `what` after the time limit."""
         deadline_s = time.monotonic() + seconds
         while True:
             self.processes.check()
@@ -194,7 +194,7 @@ class TakeProcesses:
                                  f"{self._folder}; run it again on a machine with less load")
 
     def follows(self, since_us: int) -> Callable[[Truth], bool]:
-        """Give a condition: the robot has followed the visible ball for a while, all of it after `since_us`."""
+        """Return a condition: the robot has followed the visible ball for a while, all of it after `since_us`."""
         def happened(now: Truth) -> bool:
             late = [one for one in self.take.truths if one.t_us > max(since_us, now.t_us - _STEADY_US)]
             return now.t_us - since_us > _STEADY_US and all(
@@ -207,7 +207,7 @@ class TakeProcesses:
 
 
 def write_configuration(folder: Path, sockets: str, seed: int) -> Scenario:
-    """Leave the files of all services in `folder`, so that a user can start the same by hand."""
+    """Write the files of all services to `folder`, so that a user can start the same services."""
     (folder / SCENARIO).write_text(toml_text(SCENE), "utf-8")
     scenario = load_scenario(str(folder / SCENARIO))
     device, model = {"kind": "sim", "options": {"socket_dir": sockets}}, robot_of(scenario)
@@ -228,7 +228,7 @@ def _lose_radio(stage: TakeProcesses) -> None:
     stage.mark("moving")
     while True:
         stage.until(lambda now: heads_for_wall(now, stage.take.arrivals), _MOVES_S, "way to the wall")
-        stage.mark("wifi lost")  # before the signal: the figures include what it takes
+        stage.mark("wifi lost")  # before the signal, so that the figures include its duration
         stage.processes.signal("relay", signal.SIGSTOP)
         stage.watch(_IN_FLIGHT_S)
         if has_fast_command(stage.take.arrivals):
@@ -282,7 +282,7 @@ def run_naive(folder: Path, seed: int) -> Take:
 def run_takes(folder: Path, seed: int, show: Callable[[str], None]) -> tuple[Take, Take]:
     """Run both takes in `folder`.
 
-    Raises ConfigError, LinkError or the failure of a process; nothing is left running in any case.
+    Raises ConfigError, LinkError or the failure of a process; nothing is left running.
     """
     takes = []
     for number, (name, run) in enumerate((("sightline", run_safe), ("naive", run_naive)), start=1):
@@ -298,7 +298,7 @@ def run_takes(folder: Path, seed: int, show: Callable[[str], None]) -> tuple[Tak
 
 FILM: Final = "story.webp"
 SPACE_BYTES: Final = 10_000_000
-"""Logs and film of a story take a third of this."""
+"""Logs and film of a story need a third of this."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +310,7 @@ class StoryResult:
     images: int
 
     def to_dict(self) -> dict[str, Any]:
-        """Give what `--json` prints and story.json contains."""
+        """Return the content of `--json` and story.json."""
         story = self.story
         stops = {"wifi_lost": story.wifi, "vision_killed": story.vision, "stop": story.stop}
         return {
@@ -321,14 +321,14 @@ class StoryResult:
         }
 
     def lines(self) -> list[str]:
-        """Give the closing lines: figures with bounds, and where everything is."""
+        """Return the closing lines: figures with bounds, and paths of the files."""
         return [*check_lines(self.story.checks), f"left in {self.folder}: {FILM} story.json sightline naive"]
 
 
 def make_story(out: Path | None, seed: int, show: Callable[[str], None]) -> StoryResult:
     """Run both takes and write the film.
 
-    Raises ConfigError for a place that cannot be written or is too small, before any run where that can be known.
+    Raises ConfigError for a place that cannot be written or is too small, if possible before any run.
     """
     with needs("report"):
         from sightline.evaluation.demo.story_film import write_story
@@ -348,7 +348,7 @@ def make_story(out: Path | None, seed: int, show: Callable[[str], None]) -> Stor
 
 
 def check_space(folder: Path, free_bytes: int) -> None:
-    """Raise ConfigError where the logs and the film would not fit."""
+    """Raise ConfigError if the logs and the film would not fit."""
     if free_bytes < SPACE_BYTES:
         raise ConfigError(f"run folder {folder}: {free_bytes / 1e6:.1f} MB free, the story needs "
                           f"{SPACE_BYTES / 1e6:.0f} MB; free some space or pass another folder with --out")

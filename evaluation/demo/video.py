@@ -1,4 +1,4 @@
-"""run.mp4: the robot's view beside the world from above. Shell (files)."""
+"""run.mp4: the robot's view next to the world from above. Shell (files)."""
 
 import math
 from bisect import bisect_right
@@ -27,10 +27,10 @@ _SHIFT = 4  # OpenCV draws at sixteenths of a pixel
 
 
 class TopView:
-    """A square image that grows a way: call `draw` with the index of each next sample."""
+    """A square image with a growing path: call `draw` with the index of each next sample."""
 
     def __init__(self, samples: Sequence[Truth], scenario: Scenario, size_px: int) -> None:
-        """Raises ValueError for no samples."""
+        """Draw the fixed parts. Raises ValueError without samples."""
         self._samples, self._radius_m, self._size_px = samples, scenario.target.reach_m, size_px
         corners = [corner for wall in scenario.walls for corner in wall_corners(wall)]
         xs = [x for t in samples for x in (t.x_m, t.target_x_m)] + [x for x, _ in corners]
@@ -91,14 +91,14 @@ class TopView:
         cv2.line(self._paper, self._at(*start), self._at(*end), color, 1, cv2.LINE_AA, _SHIFT)
 
     def _at(self, x_m: float, y_m: float) -> Point:
-        """World to sixteenths of pixels: x right, y up."""
+        """Convert world coordinates to sixteenths of pixels: x right, y up."""
         half = self._size_px / 2
         x_px = half + (x_m - self._middle[0]) * self._scale
         y_px = half - (y_m - self._middle[1]) * self._scale
         return round(x_px * 2**_SHIFT), round(y_px * 2**_SHIFT)
 
 
-# run.mp4: the robot's view with what vision saw in it, beside the world from above. Shell (reads and writes files).
+# run.mp4: the robot's view with the detections, next to the world from above. Shell (reads and writes files).
 #
 # It is made after the run from its recording, so it does not slow the run. The pipeline processes the frames again.
 
@@ -123,18 +123,18 @@ def film_run(
 
 
 def _thinned(recording: Path, start_us: int) -> Iterator[Step]:
-    """Steps of the run at no more than `FPS`."""
+    """Yield the steps of the run at `FPS` at most."""
     due_us = start_us
     for step in replay_steps(recording):
         t_us = step.frame.header.t_us
         if t_us >= due_us:
-            # At least one tick on: a frame that was acknowledged and then answered comes twice, and is shown once.
+            # At least one tick on, because a frame that was acknowledged and then answered comes twice.
             due_us = max(due_us, t_us - 1_000_000 // FPS + 1) + 1_000_000 // FPS
             yield step
 
 
 def newest_status(statuses: Sequence[StatusAt], t_us: int) -> StatusAt | None:
-    """Give the newest status by `t_us`; None before the first."""
+    """Return the newest status by `t_us`; None before the first."""
     index = bisect_right(statuses, t_us, key=lambda one: one.t_us)
     return statuses[index - 1] if index else None
 
@@ -148,7 +148,7 @@ def status_text(status: StatusAt | None) -> str:
 
 
 def _robot_view(step: Step, status: StatusAt | None) -> Image:
-    """The image with detections, phase, state, frame age and twist; `HEIGHT_PX` high, an even number of pixels wide."""
+    """Draw the image with detections, phase, state, frame age and twist, `HEIGHT_PX` high, its width even."""
     decoded = cv2.imdecode(np.frombuffer(step.frame.jpeg, np.uint8), cv2.IMREAD_COLOR)
     if decoded is None:
         decoded = np.zeros((HEIGHT_PX, HEIGHT_PX * 4 // 3, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""The fault bench: real processes, injected faults, evaluated from the simulated motors' own log.
+"""The fault bench: real processes, injected faults, evaluated from the log of the simulated motors.
 
 May import: the four sides, `operator_side`, `evaluation`.
 Interface: `runner` runs the rows of `cases`; `report` writes them.

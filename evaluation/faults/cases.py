@@ -34,7 +34,7 @@ AGAIN_MPS: Final = 0.2
 BETWEEN_S: Final = 0.05
 AGAIN_S: Final = 20.0
 LEFT_OVER_US: Final = 500_000
-"""A driver may still answer frames that it had when the network process died; a new one takes longer than this."""
+"""Time in which a driver may still answer old frames after the network process died. A new process takes longer."""
 BUSY: Final = 4
 FREE_MS: Final = 2000.0
 
@@ -80,14 +80,14 @@ def _restart_vision(rig: RobotFixture) -> Injected:
 def _hurt(rig: RobotFixture, part: str, number: signal.Signals) -> Injected:
     """Send the network or driver process a signal that ends or stops it. Its parent starts a new one.
 
-    The new network process sends frames at once, so the robot may drive from the first command on, whenever that is.
+    The new network process sends frames at once, so the robot may drive from the first command on.
     """
     pid = partial(getattr(rig.processes, part), "robot")
     before, at_us = pid(), monotonic_us()
     os.kill(before, number)
     rig.until(lambda: pid() not in (0, before), AGAIN_S, f"a new {part} process")
     rig.watch(SETTLED_S)
-    if part == "driver":  # a new one never arms itself
+    if part == "driver":  # a new driver process never arms itself
         rig.processes.start("arm", ["arm", "--connect", rig.endpoint, "--wait", str(AGAIN_S)])
     again = drives_again(rig)
     first_us = min((one.t_us for one in rig.sent() if one.t_us > at_us + LEFT_OVER_US), default=None)
@@ -119,13 +119,13 @@ def _kill_driver_and_guardian(rig: RobotFixture) -> Injected:
     time.sleep(BETWEEN_S)
     rig.processes.signal("robot", signal.SIGKILL)
     rig.until(lambda: wheel_mps(rig.motors()[-1]) == 0.0, SETTLED_S, "zero, set by the guardian")
-    rig.probe_motors()  # at once: the log has a line for each command only, and the wheels still roll
+    rig.probe_motors()  # immediately: the log has lines for commands only, and the wheels still roll
     rig.watch(SETTLED_S)
     return Injected(2, at_us)
 
 
 def _kill_guardian_and_driver(rig: RobotFixture) -> Injected:
-    """Nothing that runs in a process covers this; then the command that systemd runs sets the motors to zero."""
+    """Kill guardian and driver. No process covers this; then the command that systemd runs sets the motors to zero."""
     driver = rig.processes.driver("robot")
     rig.processes.signal("robot", signal.SIGKILL)
     time.sleep(BETWEEN_S)
@@ -226,7 +226,7 @@ PROCESS_CASES: Final = (
 )
 
 
-# Rows: what a radio does to packets, through the wire between two network namespaces. Shell.
+# Rows: radio effects on packets, through the wire between two network namespaces. Shell.
 
 DISTURBED_S: Final = 6.0
 CUT: Final = LinkShape(cut=True)
@@ -236,13 +236,13 @@ FLAPS: Final = 6
 
 
 def shape(rig: RobotFixture, shapes: LinkShapes) -> int:
-    """Put `shapes` in force; returns how many packets were harmed so far."""
+    """Apply `shapes`. Returns how many packets were harmed so far."""
     assert rig.wire is not None
     return rig.wire.shape(shapes)
 
 
 def _cut(rig: RobotFixture, shapes: LinkShapes, seconds: float) -> Injected:
-    """Cut the wire for a while: no command from after the cut is applied until the wire is restored."""
+    """Cut the wire for a while. No command from after the cut is applied until the wire is restored."""
     before = shape(rig, shapes)
     at_us = monotonic_us()
     rig.watch(seconds)
@@ -251,7 +251,7 @@ def _cut(rig: RobotFixture, shapes: LinkShapes, seconds: float) -> Injected:
 
 
 def _worsen(rig: RobotFixture, both: LinkShape, harms: Sequence[str]) -> Injected:
-    """Bad for a while, but not cut: frames that are still young may be driven on.
+    """Degrade the wire for a while without a cut. The robot may drive on young frames.
 
     Each of the `harms` must occur in each direction.
     """
@@ -324,13 +324,13 @@ LOADED_S: Final = 6.0
 TICK_MS: Final = 40.0
 STARVED_S: Final = 24.0
 TICKS: Final = 1000
-"""Fewer have no 99.9th percentile."""
+"""Fewer ticks have no 99.9th percentile."""
 HONEST_MS: Final = 10.0
-"""The simulation stamps what it receives up to so much late while its own physics holds the interpreter."""
+"""Largest delay of the simulation's stamps, while its physics holds the interpreter."""
 
 
 def _load(rig: RobotFixture, kind: str, at_least_times: int) -> Injected:
-    """The clients connect while the robot drives, and stay. Then the driver dies."""
+    """Let the clients connect while the robot drives, and stay. Then the driver dies."""
     came_us = monotonic_us()
     rig.start_load(kind)
     rig.processes.wait_line("crowd", READY)
@@ -380,13 +380,13 @@ def _tick_checks(rows: Sequence[MotorRow], holes: Sequence[Hole], published_us: 
 
 
 def undisturbed_gaps_us(rows: Sequence[MotorRow], holes: Sequence[Hole]) -> list[int]:
-    """Times between two motor commands, without those in which this machine itself stood still."""
+    """Return the times between two motor commands, without those in which this machine stalled."""
     pairs = itertools.pairwise(row.t_us for row in rows)
     return [b - a for a, b in pairs if not any(hole.from_us < b and hole.to_us > a for hole in holes)]
 
 
 def permille_us(gaps_us: Sequence[int], ticks: int) -> int:
-    """The gap that one tick in a thousand exceeds. Commands that arrive make more, shorter gaps; they do not count."""
+    """Return the gap that one tick in a thousand exceeds. Commands add only shorter gaps, which do not count."""
     return sorted(gaps_us, reverse=True)[ticks // 1000] if gaps_us else 0
 
 
@@ -428,7 +428,7 @@ def _spoil_camera(rig: RobotFixture, mode: str) -> Injected:
 
 
 def _lose_camera(rig: RobotFixture, mode: str) -> Injected:
-    """The camera gives no image until its process was started again and `status` names it."""
+    """Stop the images until the camera's process was restarted and `status` names it."""
     before = rig.processes.network("robot")
     at_us = rig.camera_mode(mode)
     rig.until(lambda: rig.processes.network("robot") not in (0, before), AGAIN_S, "a new network process")
@@ -442,7 +442,7 @@ def _lose_camera(rig: RobotFixture, mode: str) -> Injected:
 
 
 def _fail_drive(rig: RobotFixture) -> Injected:
-    """The drive plug-in raises at each tick: zero at once, and FAULT until an operator resets it."""
+    """Let the drive plug-in raise at each tick: zero immediately, and FAULT until an operator resets it."""
     at_us = rig.fail_drive("wheels")
     rig.watch(BAD_S)
     status, times = rig.status(), rig.injected("drive")
@@ -454,7 +454,7 @@ def _fail_drive(rig: RobotFixture) -> Injected:
 
 
 def _reject_speeds(rig: RobotFixture) -> Injected:
-    """The drive takes no more speeds, neither zero: the guardian stops the wheels, and a new driver process waits."""
+    """Let the drive reject all speeds, also zero: the guardian stops the wheels, and a new driver process waits."""
     at_us = rig.fail_drive("set")
     rig.watch(BAD_S)
     ends = rig.logged("killed: its drive took no speeds")
@@ -468,7 +468,7 @@ def _one_traceback(rig: RobotFixture, text: str) -> tuple[Check, Check]:
 
 
 def _fill_disk(rig: RobotFixture) -> Injected:
-    """No process of the robot can write a byte to a file any more. It drives on, and stops when vision dies."""
+    """Let all file writes of the robot's processes fail. It drives on, and stops when vision dies."""
     guardian = rig.processes.pid("robot")
     for pid in (guardian, *_descendants(guardian)):
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, 0))
@@ -483,7 +483,7 @@ def _fill_disk(rig: RobotFixture) -> Injected:
 
 
 def _kill_demo(rig: RobotFixture) -> Injected:
-    """A demo beside the robot is killed while it drives; what it started must end by itself."""
+    """Kill a demo next to the robot while it drives. The processes that it started must end by themselves."""
     folder = rig.folder / "demo"
     rig.processes.start("demo", ["demo", "--seconds", "600", "--out", str(folder)])
     vision = folder / "vision.log"
@@ -504,7 +504,7 @@ def _descendants(pid: int) -> Iterator[int]:
 
 
 def _blacken(rig: RobotFixture) -> Injected:
-    """Nothing is seen, on young frames: vision may coast and then turn to search, but not drive on."""
+    """Send black images on young frames: vision may coast and then turn to search, but not drive on."""
     at_us = rig.camera_mode("black")
     rig.watch(BAD_S)
     forward = [row.t_us for row in rig.motors() if row.t_us > at_us and abs(_forward_mps(row)) > 0.02]
@@ -522,7 +522,7 @@ def _forward_mps(row: MotorRow) -> float:
 
 
 def _send_stop(rig: RobotFixture, fault: str = "") -> int:
-    """An operator sends STOP. Returns the time of the first message."""
+    """Send STOP as an operator. Returns the time of the first message."""
     rig.start_peer("person", "operator", fault=fault)
     rig.processes.wait_line("person", "person ready", AGAIN_S)
     rig.trigger("person")
@@ -569,7 +569,7 @@ def _stop_then_restart(rig: RobotFixture) -> Injected:
 
 
 def _reset_moving(rig: RobotFixture) -> Injected:
-    """Reset while the wheels still turn; the wheels must come to zero and vision must not take it up again."""
+    """Reset while the wheels still turn. They must come to zero, and vision must not resume."""
     injected = _stop(rig, "reset")
     refused = "reset False" in rig.processes.log("person").read_text("utf-8")
     return Injected(injected.count, injected.at_us, checks=(at_least("reset rejected", refused, "", 1),))
@@ -579,7 +579,7 @@ def _reset_moving(rig: RobotFixture) -> Injected:
 
 
 def _suspend(rig: RobotFixture) -> Injected:
-    """The robot's clock leaps while commands go on: each cites a frame from before the suspend."""
+    """Let the robot's clock leap while commands continue. Each cites a frame from before the suspend."""
     rig.prepare_operator()
     at_us = rig.suspend()
     rig.watch(ATTACKED_S)
@@ -678,7 +678,7 @@ OPERATOR_CASES: Final = (
 )
 
 
-# All rows of the fault bench, and the choice among them. Shell (what the rows inject is).
+# All rows of the fault bench, and their selection. Shell (the rows inject faults).
 
 CASES: Final[tuple[FaultCase, ...]] = (
     *PROCESS_CASES, *NETWORK_CASES, *COMMAND_CASES, *CLIENT_CASES, *OPERATOR_CASES, *STOP_CASES,
@@ -686,7 +686,7 @@ CASES: Final[tuple[FaultCase, ...]] = (
 
 
 def chosen(only: Sequence[str], *, short: bool) -> list[FaultCase]:
-    """The rows named by id or by what comes before the dot; all without names. Raises ConfigError for no such row."""
+    """Return the rows named by id or by the part before the dot; all without names. Raises ConfigError for no row."""
     rows = [row for row in CASES if row.short or not short]
     for name in only:
         if not any(_is_named(row, name) for row in rows):

@@ -1,6 +1,6 @@
 """A camera and a drive, plug-ins that fail on command. Shell (files, signals).
 
-Every image that was spoiled is noted in `camera.events` beside it, every failure of the drive in `drive.events`.
+Spoiled images are logged in `camera.events` in the same folder, failures of the drive in `drive.events`.
 """
 
 import ctypes
@@ -21,23 +21,23 @@ from sightline.sim.bus import SimCamera, SimDrive, SimSocketConfig
 MODE: Final = "camera.mode"
 EVENTS: Final = "camera.events"
 DRIVE_MODE: Final = "drive.mode"
-"""While this file exists, the method of the drive that it names raises an exception of its own."""
+"""While this file exists, the drive method that it names raises an exception."""
 DRIVE_EVENTS: Final = "drive.events"
 DRIVE_ERROR: Final = "no answer (injected by the bench)"
 GIL_HELD_S: Final = 1
 SLOW_S: Final = 0.2
 LOOP: Final = signal.SIGUSR2
-"""To a driver process with a `FaultyDrive`: an endless loop begins."""
+"""Starts an endless loop in a driver process with a `FaultyDrive`."""
 HEAVY_BYTES: Final = 16_700
 """At 30 fps, 4 Mbit/s."""
 RESIZED_PERCENT: Final = 50
 SPARE: Final = {"black": (320, 240), "bomb": (64, 64)}
-"""Images that `write_spares` leaves in the folder, so that the robot's process needs no encoder."""
+"""Images that `write_spares` writes to the folder, so that the robot's process needs no encoder."""
 _SOF0: Final = b"\xff\xc0\x00\x11\x08"
 
 
 class FaultyCamera:
-    """A `Camera`. Modes: see FAULTS; anything else leaves it as it is."""
+    """A `Camera`. Modes: see FAULTS; any other mode changes nothing."""
 
     class Config(SimSocketConfig):
         """`folder` holds the mode and the event log."""
@@ -54,7 +54,7 @@ class FaultyCamera:
         self._held = False
 
     def read(self, timeout_s: float) -> Picture | None:
-        """Return the next image after the effect of the mode, see `Camera`."""
+        """Return the next image as changed by the mode, see `Camera`."""
         mode = self._mode.read_text("ascii") if self._mode.exists() else ""
         self._camera.adjust(100, RESIZED_PERCENT if mode == "resized" else 100)
         picture = self._camera.read(timeout_s)
@@ -76,7 +76,7 @@ class FaultyCamera:
 
 
 class FaultyDrive(SimDrive):
-    """The simulated wheels. They raise as in the file DRIVE_MODE. The signal LOOP begins an endless loop."""
+    """The simulated wheels. They raise as the file DRIVE_MODE states. The signal LOOP starts an endless loop."""
 
     class Config(SimSocketConfig):
         """`folder` holds the mode and the event log."""
@@ -89,7 +89,7 @@ class FaultyDrive(SimDrive):
         signal.signal(LOOP, _loop)
 
     def set(self, left_rad_s: float, right_rad_s: float) -> None:
-        """Give wheel speeds, see `Drive`."""
+        """Set wheel speeds, see `Drive`."""
         self._fail("set")
         super().set(left_rad_s, right_rad_s)
 
@@ -106,7 +106,7 @@ class FaultyDrive(SimDrive):
 
 
 def _hold_gil(now: Picture, _last: Picture) -> Picture:
-    ctypes.PyDLL(None).sleep(GIL_HELD_S)  # PyDLL does not let go of the interpreter's lock
+    ctypes.PyDLL(None).sleep(GIL_HELD_S)  # PyDLL keeps the interpreter's lock
     return now
 
 
@@ -124,7 +124,7 @@ def _slow(now: Picture, _last: Picture) -> Picture:
 
 
 def _resized(now: Picture, _last: Picture) -> Picture:
-    return replace(now, scale_percent=100)  # the robot announces the full size still
+    return replace(now, scale_percent=100)  # the robot still announces the full size
 
 
 def _heavy(now: Picture, _last: Picture) -> Picture:
@@ -140,7 +140,7 @@ FAULTS: Final[dict[str, Callable[[Picture, Picture], Picture | None]]] = {
     "resized": _resized, "hangs": lambda now, _last: now,
 }
 def _loop(_number: int, _frame: FrameType | None) -> None:
-    # On a core of its own the guardian would need no higher priority than this loop.
+    # With a core for each, the guardian would need no higher priority than this loop.
     core = {min(os.sched_getaffinity(0))}
     for process in (0, os.getppid()):
         os.sched_setaffinity(process, core)

@@ -34,7 +34,7 @@ _STOPS_MOVING: Final = f"then STOP: zero <= {ZERO_MS:g} ms after the first packe
 
 
 def _attack(rig: RobotFixture, at_least_times: int = ENOUGH) -> Injected:
-    """From the trigger on, send only commands that must be rejected."""
+    """Send only commands that must be rejected, from the trigger on."""
     at_us = rig.trigger()
     rig.watch(ATTACKED_S)
     rig.until(lambda: rig.injected() >= at_least_times, 2 * ATTACKED_S, f"an attack with {at_least_times} commands")
@@ -66,7 +66,7 @@ def _replay_earlier(rig: RobotFixture) -> Injected:
 
 
 def _two_visions(rig: RobotFixture) -> Injected:
-    """A second vision service sends the opposite commands; then both die."""
+    """Start a second vision service that sends the opposite commands; then both die."""
     rig.start_peer("second", "driver", linear_mps=-0.5, angular_rad_s=0.0)
     rig.until(lambda: len(rig.sent("second")) > 30, 15.0, "a second vision service")
     last = [row for row in rig.motors() if row.t_us >= rig.sent("second")[0].t_us]
@@ -84,7 +84,7 @@ def _two_visions(rig: RobotFixture) -> Injected:
 
 
 def _impersonate(rig: RobotFixture, fault: str = "copied", **attacker: Any) -> Injected:
-    """An attacker that knows the driver's session sends the opposite commands; the driver dies; then comes STOP."""
+    """Attack with the driver's session and opposite commands. Then the driver dies, then comes STOP."""
     rig.prepare_operator()
     rig.start_peer("attacker", "driver", fault=fault, linear_mps=-0.5, angular_rad_s=0.0, **attacker)
     rig.until(lambda: bool(rig.sent("attacker")), 15.0, "the attacker's link")
@@ -97,7 +97,7 @@ def _impersonate(rig: RobotFixture, fault: str = "copied", **attacker: Any) -> I
     at_us = monotonic_us()
     rig.processes.kill("peer")
     rig.watch(LEASE_US / 2e6)
-    rig.processes.kill("attacker")  # once the lease is over it may drive, in its own name
+    rig.processes.kill("attacker")  # after the lease it may drive under its own name
     rig.watch(SETTLED_S)
     _, stopped = rig.stop_by_operator(moving=False)
     checks = (
@@ -108,7 +108,7 @@ def _impersonate(rig: RobotFixture, fault: str = "copied", **attacker: Any) -> I
 
 
 def _replay_driver(rig: RobotFixture) -> Injected:
-    """Replay what an operator sent while it drives and afterwards. Vision, which an `arm` would let drive, goes on."""
+    """Replay an operator's messages while it drives and afterwards. An `arm` would let vision drive."""
     rig.prepare_operator()
     recording = rig.folder / "driver.txt"
     rig.start_peer("person", "driver", source="teleop", session=PERSON, recording=recording, fault="turn_round",
@@ -135,7 +135,7 @@ def _replay_driver(rig: RobotFixture) -> Injected:
 
 
 def _forge_frames(rig: RobotFixture) -> Injected:
-    """Frames of the future in the robot's name for three seconds: vision drives again within one second after."""
+    """Send frames of the future in the robot's name for three seconds. Vision drives within one second after."""
     rig.prepare_operator()
     rig.start_peer("attacker", "driver", source="guest", fault="future_frames")
     rig.until(lambda: bool(rig.sent("attacker")), 15.0, "the attacker's link")
@@ -153,7 +153,7 @@ def _forge_frames(rig: RobotFixture) -> Injected:
 
 
 def _take_over(rig: RobotFixture) -> Injected:
-    """An operator takes over at full speed and drives back, then is lost: a stop that vision does not end."""
+    """Let an operator take over at full speed and drive back, then lose it. Vision must not end this stop."""
     rig.start_peer("person", "driver", source="teleop", linear_mps=-0.4, angular_rad_s=0.0)
     rig.until(lambda: _goes_back(rig), 15.0, "a takeover")
     took_ms = (monotonic_us() - rig.sent("person")[0].t_us) / 1000
@@ -171,7 +171,7 @@ def _goes_back(rig: RobotFixture) -> bool:
 
 
 def _holder_dies(rig: RobotFixture) -> Injected:
-    """The driver dies while another waits: a stop first, the other only when the lease is over."""
+    """Kill the driver while another waits: a stop first, the other drives only after the lease."""
     rig.start_peer("second", "driver", linear_mps=0.3)
     rig.until(lambda: len(rig.sent("second")) > 10, 15.0, "a second driver")
     at_us = monotonic_us()
@@ -215,7 +215,7 @@ def handover_checks(
         sent: commands of all drivers, from before the first change on.
         changes: changes of the driver.
         gap_ms: longest time between two commands.
-        until_us: end of the measurement; the robot may stand later.
+        until_us: end of the measurement; later the robot may stand.
     """
     driven = [row for row in rows if sent[0].t_us <= row.t_us <= until_us]
     times = [*(one.t_us for one in sent if one.t_us <= until_us), until_us]
@@ -242,7 +242,7 @@ def _sent_from(rig: RobotFixture, from_us: int) -> list[SentCommand]:
 
 
 def _kill_owner(rig: RobotFixture) -> Injected:
-    """Kill the driving one of two services; the other one drives on."""
+    """Kill the driving one of two services. The other one drives on."""
     _join(rig, STANDBY, "stands by")
     rig.watch(SETTLED_S)
     at_us = monotonic_us()
@@ -254,7 +254,7 @@ def _kill_owner(rig: RobotFixture) -> Injected:
 
 
 def _hand_over(rig: RobotFixture) -> Injected:
-    """A better choice joins and drives; then it ends by SIGTERM, and the former one drives again."""
+    """Let a better choice join and drive, then end it by SIGTERM. The former service drives again."""
     from_us = monotonic_us()
     _join(rig, OWNER, "drives it")
     rig.until(lambda: _goes(rig, -1), 5.0, "the second service driving")
@@ -275,7 +275,7 @@ def _hand_over(rig: RobotFixture) -> Injected:
 
 
 def _drive_without_token(rig: RobotFixture) -> Injected:
-    """A driver ends its token and goes on; a service drives. Then that one is killed, and the former still goes on."""
+    """End the token of a driver that continues; a service drives. Then kill the service; the driver continues."""
     _join(rig, STANDBY, "shares robots")
     rig.watch(LEASE_US / 2e6)
     ended_us = rig.trigger()

@@ -1,6 +1,6 @@
 """Compare the motor log and the event logs of a stop with the bounds. Pure except for the logs.
 
-It does not trust the software under test. The simulation stamps the motor log, and each sender stamps its event log.
+It trusts no software under test. The simulation stamps the motor log, and each sender stamps its event log.
 """
 
 import itertools
@@ -32,12 +32,12 @@ _AT_REST_MPS: Final = 0.01
 bound that the robot computes."""
 _RAMPED_OUT_US: Final = RAMPED_US + 2 * TICK_US
 HELD_US: Final = 100_000
-"""A robot sets its motors every 20 ms. From so long a pause on, each tick of it counts as a line."""
+"""The robot sets its motors every 20 ms. In a pause of this length or longer, each tick counts as a line."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotorRow:
-    """One line of the motor log: the set speeds, and the true angles of the wheels."""
+    """One line of the motor log: commanded speeds, and true wheel angles."""
 
     t_us: int
     left_rad_s: float
@@ -48,7 +48,7 @@ class MotorRow:
 
 @dataclass(frozen=True, slots=True)
 class SentCommand:
-    """One good command, as its sender noted it: when it left and when the frame behind it was captured."""
+    """One good command by its sender's log: send time, and capture time of its frame."""
 
     t_us: int
     frame_us: int
@@ -58,7 +58,7 @@ class SentCommand:
 class Blind:
     """From `from_us` to `until_us` (None: to the end) no new command is based on a fresh frame.
 
-    With `by_frame`, nothing that is captured: where only images are cut off, one under way may still be answered.
+    With `by_frame` this applies to captured frames: if only images are cut, one in flight may still be answered.
     """
 
     from_us: int
@@ -76,7 +76,7 @@ class Blind:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Counted from the last valid command. None: never in the window."""
+    """Figures counted from the last valid command. None: not within the window."""
 
     falls_ms: float | None
     zero_ms: float | None
@@ -84,25 +84,25 @@ class Stop:
 
 
 def read_motors(text: str) -> list[MotorRow]:
-    """Whole lines of `motors.csv`; a line that is still being written is left out."""
+    """Return the complete lines of `motors.csv`. A line that is still being written is left out."""
     lines = text.split("\n")[1:-1]
     parts = [line.split(",") for line in lines]
     return [MotorRow(int(t), float(left), float(right), float(a), float(b)) for t, left, right, a, b in parts]
 
 
 def wheel_mps(row: MotorRow) -> float:
-    """Return the set speed of the faster wheel at its rim, m/s."""
+    """Return the commanded speed of the faster wheel at its rim, m/s."""
     return max(abs(row.left_rad_s), abs(row.right_rad_s)) * DiffDriveConfig().wheel_radius_m
 
 
 def _rim_m(before: MotorRow, after: MotorRow) -> float:
-    """Way of the faster wheel between two rows."""
+    """Return the distance that the faster wheel rolls between two rows, m."""
     turned_rad = max(abs(after.left_rad - before.left_rad), abs(after.right_rad - before.right_rad))
     return turned_rad * DiffDriveConfig().wheel_radius_m
 
 
 def _axle_m(before: MotorRow, after: MotorRow) -> float:
-    """Way of the middle of the axle between two rows."""
+    """Return the distance that the midpoint of the axle moves between two rows, m."""
     turned_rad = (after.left_rad - before.left_rad + after.right_rad - before.right_rad) / 2
     return abs(turned_rad) * DiffDriveConfig().wheel_radius_m
 
@@ -138,7 +138,7 @@ def _zero_ms(window: Sequence[MotorRow], since_us: int) -> float | None:
 
 
 def _thinned(window: Sequence[MotorRow]) -> list[MotorRow]:
-    """Rows at least a tick apart: the angles in the log come in physics steps of 4 ms, rows as often as commands."""
+    """Return rows at least a tick apart: angles change with physics steps of 4 ms, rows come with commands."""
     kept = list(window[:1])
     for row in window:
         if row.t_us - kept[-1].t_us >= TICK_US:
@@ -151,7 +151,7 @@ def _ms_after(window: Sequence[MotorRow], index: int, since_us: int) -> float | 
 
 
 def last_valid_us(sent: Iterable[SentCommand], blind: Blind) -> int | None:
-    """When the last command left that still counted when the blindness began; None without one."""
+    """Return when the last command left that counted at the start of the blindness; None without one."""
     return max((one.t_us for one in sent if blind.is_earlier(one)), default=None)
 
 
@@ -164,7 +164,7 @@ def held_rows(rows: Sequence[MotorRow], from_us: int, until_us: int) -> list[Mot
 def held_us(lines_us: Sequence[int], from_us: int, until_us: int) -> Iterator[Sequence[int]]:
     """Yield for each line its own time, and each tick of a long pause after it, us.
 
-    Motors keep the speed of the last command, so a robot that sets none any more may drive on without a line.
+    Motors keep the speed of the last command, so a robot that stops sending may drive on without a line.
     """
     for t_us, end_us in zip(lines_us, [*lines_us[1:], until_us], strict=False):
         is_held = t_us >= from_us and end_us - t_us > HELD_US
@@ -172,10 +172,10 @@ def held_us(lines_us: Sequence[int], from_us: int, until_us: int) -> Iterator[Se
 
 
 def moved_on_old_sight(rows: Sequence[MotorRow], sent: Sequence[SentCommand], blind: Blind | None) -> int:
-    """Log lines whose motion no young frame allows.
+    """Count the log lines whose motion no young frame allows.
 
-    With the newest frame behind any valid command older than 400 ms (and one tick, for which a decision holds) the
-    wheels must not gain speed; when even the ramp must be at its end, they must stand.
+    If the newest frame of any valid command is older than 400 ms (and one tick, for which a decision holds), the
+    wheels must not accelerate. Once the ramp must have ended, they must stand.
     """
     return sum(
         (age_us > OLD_US + TICK_US and wheel_mps(row) > wheel_mps(before) + _FASTER_MPS)
@@ -217,7 +217,7 @@ def stop_checks(stop: Stop, zero_ms: float = ZERO_MS, distance_m: float = DISTAN
     ]
 
 
-# What the bench's own processes note while they run, whatever becomes of them: one line per event. Shell (files).
+# The event logs of the bench's processes while they run: one line per event. Shell (files).
 #
 # `good,T_US,FRAME_US`    a command that the robot must apply was sent, citing the frame captured at FRAME_US
 # `injected,T_US,0`       the fault was injected once more
@@ -227,18 +227,18 @@ def stop_checks(stop: Stop, zero_ms: float = ZERO_MS, distance_m: float = DISTAN
 GOOD: Final = "good"
 INJECTED: Final = "injected"
 FLOOD_AT_LEAST: Final = 20_000
-"""Commands of a flood. It lasts longer where a process cannot send 10,000 a second."""
+"""Commands of a flood. It lasts longer if a process cannot send 10,000 a second."""
 REQUESTED: Final = "requested"
 
 
 class EventLog:
-    """Appends; a line is in the file when `note` returns."""
+    """Appends events. A line is in the file when `note` returns."""
 
     def __init__(self, path: Path) -> None:
         self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
 
     def note(self, kind: str, frame_us: int = 0) -> None:
-        """Note one event, now."""
+        """Append one event with the time now."""
         os.write(self._file, f"{kind},{monotonic_us()},{frame_us}\n".encode())
 
 

@@ -1,4 +1,4 @@
-"""One robot at speed, ready to be harmed: its processes, network namespaces and logs. Shell."""
+"""One robot at speed before a fault: its processes, network namespaces and logs. Shell."""
 
 import json
 import os
@@ -44,7 +44,7 @@ _RESIDENT: Final = "RssAnon:"
 
 
 def memory_kib(processes: Processes, names: Iterable[str]) -> dict[tuple[str, str], int]:
-    """Return the private memory of each running process and of what it started. A restarted one counts as the same."""
+    """Return the private memory of each running process and its children. A restarted child counts as the same."""
     which = {"itself": processes.pid, "driver": processes.driver, "network": processes.network, "stop": processes.stop}
     pids = {(name, role): pid_of(name) for name in names if name in processes.names for role, pid_of in which.items()}
     return {who: held for who, pid in pids.items() if pid and (held := _resident_kib(pid)) is not None}
@@ -59,7 +59,7 @@ def _resident_kib(pid: int) -> int | None:
 
 
 def raise_priority(pid: int) -> bool:
-    """Real-time scheduling for every thread of a process, where this user may; whether it was granted."""
+    """Set real-time scheduling for every thread of a process. Returns True if it was permitted."""
     try:
         for thread in Path(f"/proc/{pid}/task").iterdir():
             os.sched_setscheduler(int(thread.name), os.SCHED_RR, os.sched_param(1))
@@ -70,7 +70,7 @@ def raise_priority(pid: int) -> bool:
 
 @contextmanager
 def busy_processes(count: int) -> Iterator[None]:
-    """Run processes that want all the processor they can get."""
+    """Run processes that use all available processor time."""
     busy = [subprocess.Popen([sys.executable, "-P", "-c", "while True: pass"]) for _ in range(count)]
     try:
         yield
@@ -88,7 +88,7 @@ _PLAIN: Final = ("taken", "delivered", "delivered_bytes")
 
 
 class BenchWire:
-    """`ab` is from the robot, `ba` toward it. Use it in a `with`."""
+    """`ab` is from the robot, `ba` toward it. Use it as a context manager."""
 
     def __init__(self, log: Path) -> None:
         self.robot_side, self.far_side = (f"sightline-{os.getpid()}-{end}" for end in "ab")
@@ -118,7 +118,7 @@ class BenchWire:
         self._ending.close()
 
     def shape(self, shapes: LinkShapes) -> int:
-        """Put `shapes` in force; returns how many packets the wire has harmed so far."""
+        """Apply `shapes`. Returns how many packets the wire has harmed so far."""
         assert self._process is not None
         stdin = _file(self._process.stdin)
         stdin.write(shapes.model_dump_json() + "\n")
@@ -141,11 +141,11 @@ def _file(pipe: IO[str] | None) -> IO[str]:
     return pipe
 
 
-# A wall clock that is wrong, in every Python process that starts with this folder on its path. Shell (files).
+# A wrong wall clock in every Python process with this folder on its path. Shell (files).
 
 
 def write_wrong_clock(folder: Path, offset_s: str) -> None:
-    """Leave a `sitecustomize` that adds the Python expression `offset_s` to `time.time`; each process notes it."""
+    """Write a `sitecustomize` that adds the Python expression `offset_s` to `time.time` and logs one event."""
     (folder / "sitecustomize.py").write_text(
         f"""import time
 right, right_ns = time.time, time.time_ns
@@ -159,11 +159,11 @@ with open({str(folder / "clock.events")!r}, "a") as log:
 
 
 ASLEEP: Final = "asleep"
-"""While this file exists, the clock of the robot that counts suspend is a minute ahead."""
+"""While this file exists, the robot's clock that counts suspend is a minute ahead."""
 
 
 def write_sleeping_clock(folder: Path) -> None:
-    """Leave a `sitecustomize` for the robot, whose clock leaps as after a suspend when the file ASLEEP appears."""
+    """Write a `sitecustomize` whose robot clock leaps as after a suspend, when the file ASLEEP appears."""
     (folder / "sitecustomize.py").write_text(
         f"""import os, time
 right_ns = time.clock_gettime_ns
@@ -191,7 +191,7 @@ _PROBED_S: Final = 0.5
 _OPERATOR_READY_S: Final = 30.0
 STOP_ENDS_S: Final = 20.0
 KEPT_MPS: Final = 0.4
-"""A scripted driver sends 0.5 m/s; a robot that is slower than this lost commands."""
+"""A scripted driver sends 0.5 m/s. A slower robot lost commands."""
 _CHASE: Final[dict[str, Any]] = {
     "summary": "a ball on a circle at 0.4 m/s", "stand_off_m": 0.8, "look": "plain",
     "target": {"kind": "path", "speed_mps": 0.4, "path": [{"length_m": 12.566371, "turn_deg": 360.0}]},
@@ -223,15 +223,15 @@ class Setup:
     secure: bool = False
     """The links have keys, and the driver has the session `SESSION`, which an attacker knows."""
     web: bool = False
-    """The robot listens for WebSocket clients too."""
+    """The robot also listens for WebSocket clients."""
     legacy: str | None = None
-    """In place of the robot a legacy one, with this text format in its address. `fault` names its library."""
+    """Replaces the robot by a legacy one, with this text format in its address. `fault` names its library."""
     guests: bool = False
     """It also accepts legacy clients, in place of WebSocket ones."""
     share: str = ""
-    """The name that the first driver has in its token; "" without one."""
+    """Name in the token of the first driver; "" without one."""
     routed: bool = False
-    """The robot connects to a router, and all others know only that one."""
+    """The robot connects to a router, and all others connect only to that router."""
 
     @property
     def at_speed_mps(self) -> float:
@@ -254,7 +254,7 @@ def moving_stop(
 
 
 class RobotFixture:
-    """Use it in a `with`: everything runs, and the wheels are at speed, once inside."""
+    """A context manager. Inside, everything runs and the wheels are at speed."""
 
     def __init__(self, folder: Path, setup: Setup) -> None:
         self.folder, self.setup = folder, setup
@@ -310,7 +310,7 @@ class RobotFixture:
         self._before_kib = memory_kib(self.processes, self._measured)
 
     def _start_legacy(self) -> None:
-        """Start a legacy robot, and vision by the README's line. Its address is the only option."""
+        """Start a legacy robot, and vision by the line of the README. Its address is the only option."""
         self.start_peer("robot", "legacy", fault=self.setup.fault, sockets=self._sockets)
         self.processes.wait_line("robot", f"robot {ROBOT}: on")
         self.processes.start("vision", ["vision", "--robot", self.web_endpoint, "--listen", self.endpoint])
@@ -358,7 +358,7 @@ class RobotFixture:
 
     @property
     def keys(self) -> str:
-        """The folder of keys, or "" without them."""
+        """Return the folder of keys, or "" without them."""
         return str(self.folder / "keys") if self.setup.secure else ""
 
     def start_peer(self, name: str, role: Role, **changes: Any) -> None:
@@ -379,7 +379,7 @@ class RobotFixture:
     def stop_by_operator(self, *, moving: bool) -> tuple[int, tuple[Check, ...]]:
         """Let the new operator send STOP. Returns the time of its first packet, and the checks of the stop.
 
-        Only a robot that is `moving` by then shows how soon its wheels reach zero.
+        Only a robot that is `moving` shows how soon its wheels reach zero.
         """
         self.trigger("operator")
         code = self.processes.exit_code("operator", STOP_ENDS_S)
@@ -389,7 +389,7 @@ class RobotFixture:
         return at_us, (*(moving_stop(self.motors(), at_us, self.setup.kept_mps) if moving else ()), ended)
 
     def start_load(self, kind: str, endpoint: str = "") -> None:
-        """Let many clients come, WebSocket ones by default; what they do is noted as by a peer called `crowd`."""
+        """Start many clients, by default over WebSocket. Their events are those of a peer called `crowd`."""
         arguments = [kind, endpoint or self.web_endpoint, str(self.folder / "crowd.events")]
         self.processes.start("crowd", arguments, module="sightline.evaluation.faults.load_clients")
 
@@ -403,7 +403,7 @@ class RobotFixture:
         return at_us
 
     def trigger(self, name: str = "peer") -> int:
-        """Let a peer's fault begin; returns when that was."""
+        """Start a peer's fault. Returns its time."""
         at_us = monotonic_us()
         self.processes.signal(name, signal.SIGUSR1)
         return at_us
@@ -422,7 +422,7 @@ class RobotFixture:
         return at_us
 
     def signal_network(self, number: signal.Signals) -> int:
-        """Send the robot's network process a signal; returns when that was."""
+        """Send a signal to the robot's network process. Returns its time."""
         at_us = monotonic_us()
         os.kill(self.processes.network("robot"), number)
         return at_us
@@ -430,11 +430,11 @@ class RobotFixture:
     # --- waiting -------------------------------------------------------------------------------------------------
 
     def watch(self, seconds: float) -> None:
-        """Let it run on."""
+        """Let the processes run for this time."""
         time.sleep(seconds)
 
     def until(self, happened: Callable[[], bool], seconds: float, what: str) -> None:
-        """Wait for a fact. Raises SightlineError naming `what` when it takes longer."""
+        """Wait for a fact. Raises SightlineError with `what` after the time limit."""
         deadline_s = time.monotonic() + seconds
         while not happened():
             if time.monotonic() > deadline_s:
@@ -482,7 +482,7 @@ class RobotFixture:
             return read_motors(log.read().decode("ascii"))  # its first line, cut or a heading, is left out
 
     def sent(self, name: str | None = None) -> list[SentCommand]:
-        """Good commands by one peer, or by all, oldest first."""
+        """Return the good commands of one peer, or of all, oldest first."""
         names = self._peers if name is None else [name]
         return sorted((one for peer in names for one in self.noted(peer, GOOD)), key=lambda one: one.t_us)
 
@@ -496,7 +496,7 @@ class RobotFixture:
 
     @property
     def _measured(self) -> tuple[str, ...]:
-        """Sightline's own processes; what a scripted driver needs to send 10 MB is its own affair."""
+        """Return the processes of Sightline. The memory of a scripted driver that sends 10 MB does not count."""
         if self.setup.legacy is not None:  # its robot is a third-party server
             return ("sim", "vision")
         peer = ("peer",) if self.setup.driver in ("vision", "shared") else ()
@@ -504,7 +504,7 @@ class RobotFixture:
         return ("sim", "robot", *peer, *router)
 
     def status(self) -> dict[str, Any]:
-        """Return what `sightline status --json` prints."""
+        """Return the output of `sightline status --json`."""
         self.processes.start("status", ["status", ROBOT, "--connect", self.endpoint, "--json"])
         self.processes.exit_code("status", AT_SPEED_S)
         printed = self.processes.log("status").read_text("utf-8")
@@ -528,5 +528,5 @@ class RobotFixture:
         return stalled_us(self.holes(), from_us, to_us)
 
     def holes(self) -> list[Hole]:
-        """When this machine stood still."""
+        """Return when this machine stalled."""
         return read_holes(self.folder / "holes.csv")

@@ -1,9 +1,9 @@
-"""Floods: many viewers, connections that are begun and abandoned, sessions, and invalid STOP datagrams. Shell.
+"""Floods: many viewers, abandoned connections, sessions, and invalid STOP datagrams. Shell.
 
     python -m sightline.evaluation.faults.load_clients KIND ENDPOINT LEDGER
 
 It represents other machines, so it uses little of this processor. A client that is rejected or dropped connects again,
-forever. The first viewers have the role of an operator, for which places are reserved.
+forever. The first viewers are operators, which have reserved places.
 """
 
 import itertools
@@ -48,7 +48,7 @@ _BEGUN: Final = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgr"
 
 
 class LoadViewer:
-    """One viewer; `reads` is False for the one that takes nothing but the hello out of its connection."""
+    """One viewer. With `reads` False it reads only the hello from its connection."""
 
     def __init__(self, event_log: EventLog, role: str, *, reads: bool) -> None:
         self._event_log, self._reads = event_log, reads
@@ -74,7 +74,7 @@ class LoadViewer:
 
 
 def view(endpoint: str, event_log: EventLog) -> None:
-    """All viewers, for ever."""
+    """Keep all viewers connected forever."""
     roles = ["operator"] * RESERVED_SLOTS + ["viewer"] * (VIEWERS - RESERVED_SLOTS)
     viewers = [LoadViewer(event_log, role, reads=number != RESERVED_SLOTS) for number, role in enumerate(roles)]
     dialers = [Client(parse_websocket_endpoint(endpoint), viewer.watch, lambda _reason: None) for viewer in viewers]
@@ -90,7 +90,7 @@ def view(endpoint: str, event_log: EventLog) -> None:
 
 
 def leave_handshakes(endpoint: str, event_log: EventLog) -> None:
-    """Begin them, and begin again what the robot has closed."""
+    """Open half-finished handshakes, and reopen those that the robot has closed."""
     end = parse_websocket_endpoint(endpoint)
     begun: list[socket.socket] = []
     logged = False
@@ -163,7 +163,7 @@ def client_hello() -> bytes:
 
 
 def leave_half_open(endpoint: str, event_log: EventLog, first: bytes = b"") -> None:
-    """Open connections, send no more than `first`, and open again what the other end closes."""
+    """Open connections, send no more than `first`, and reopen those that the other end closes."""
     begun: list[socket.socket] = []
     is_reported = False
     while True:
@@ -184,7 +184,7 @@ def leave_half_open(endpoint: str, event_log: EventLog, first: bytes = b"") -> N
 
 
 def open_sessions(endpoint: str, event_log: EventLog) -> None:
-    """Hold as many Zenoh sessions as the other end accepts beside one more."""
+    """Open as many Zenoh sessions as the other end accepts."""
     from sightline.protocol.transports.zenoh.session import open_session
 
     sessions = []
@@ -228,7 +228,7 @@ FLOOD_S: Final = 10.0
 
 
 def send_garbage(endpoint: str, event_log: EventLog) -> None:
-    """Send datagrams of every length, for another robot, with a wrong HMAC, and an answer back; print the rate."""
+    """Send datagrams of every length, for another robot, with a wrong HMAC, and a returned answer. Prints the rate."""
     [place] = stop_addresses([endpoint])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         one.connect(place)
@@ -249,7 +249,7 @@ def send_garbage(endpoint: str, event_log: EventLog) -> None:
 
 
 def replay_stops(endpoint: str, event_log: EventLog) -> None:
-    """Send the recorded datagrams of an earlier STOP, and such of another robot with the same keys, repeatedly."""
+    """Repeat the recorded datagrams of an earlier STOP, and some for another robot with the same keys."""
     [place] = stop_addresses([endpoint])
     folder = Path(sys.argv[3]).parent
     datagrams = [bytes.fromhex(line) for line in (folder / STOPS).read_text("ascii").splitlines()]
@@ -257,7 +257,7 @@ def replay_stops(endpoint: str, event_log: EventLog) -> None:
     of_other = pack_stop(StopDatagram(Kind.STOP, "r2", 7, challenge), secret)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
         print(READY, flush=True)
-        # As it is, and under this robot's name.
+        # Unchanged, and under the name of this robot.
         for data in itertools.cycle([*datagrams, of_other, of_other.replace(b"r2", b"r1", 1)]):
             one.sendto(data, place)
             event_log.note(INJECTED)
@@ -265,7 +265,7 @@ def replay_stops(endpoint: str, event_log: EventLog) -> None:
 
 
 STOPS: Final = "stops.txt"
-"""The recording, beside the event log."""
+"""The recording, in the folder of the event log."""
 _KINDS: Final[dict[str, Callable[[str, EventLog], None]]] = {
     "viewers": view,
     "handshakes": leave_handshakes,
@@ -281,7 +281,7 @@ _KINDS: Final[dict[str, Callable[[str, EventLog], None]]] = {
 
 
 def main(kind: str, endpoint: str, event_log: str) -> None:
-    """Be a crowd until killed."""
+    """Run one kind of load until killed."""
     os.nice(_POLITE)
     _KINDS[kind](endpoint, EventLog(Path(event_log)))
 

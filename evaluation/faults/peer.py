@@ -1,8 +1,8 @@
-"""A process that speaks to the robot: the vision service, a scripted driver with its attacks, or an operator. Shell.
+"""A peer of the robot: the vision service, a scripted driver with its attacks, or an operator. Shell.
 
     python -m sightline.evaluation.faults.peer OPTIONS_AS_JSON
 
-It does its part until SIGUSR1, and from then on what `fault` names.
+It behaves normally until SIGUSR1, then as `fault` states.
 """
 
 import asyncio
@@ -68,33 +68,33 @@ class PeerOptions(Config):
     role: Role
     endpoint: str
     web_endpoint: str = ""
-    """Of a guest, and of a legacy robot. Its query names the text format."""
+    """Endpoint of a guest or of a legacy robot. Its query names the text format."""
     sockets: str = ""
-    """Of a legacy robot: the folder of the simulation's sockets. `fault` names its library."""
+    """Of a legacy robot: folder of the simulation's sockets. `fault` names its library."""
     event_log: Path
     robot: str = "r1"
     source: str = "vision"
     """The role that a scripted driver takes on the wire."""
     fault: str = ""
     config: Path | None = None
-    """Vision's own configuration file."""
+    """Configuration file of the vision service."""
     linear_mps: float = 0.5
     angular_rad_s: float = 0.4
     recording: Path | None = None
-    """A driver writes what it sent here; a replay reads it."""
+    """A driver writes its messages here; a replay reads them."""
     secure: str = ""
     """Folder of keys, and the role of the certificate, if it differs from `source`."""
     certificate: str = ""
     session: str = ""
-    """The session to drive with; random without one."""
+    """Session to drive with; random if empty."""
     share: str = ""
     """Name of a service that shares robots, or of a scripted driver with a token."""
     seconds: float | None = None
-    """End by itself after this long."""
+    """Time after which the peer ends by itself."""
 
 
 class Trigger:
-    """Set by SIGUSR1."""
+    """Becomes set by SIGUSR1."""
 
     def __init__(self) -> None:
         self.pulled = threading.Event()
@@ -111,7 +111,7 @@ def main() -> int:
     return ROLES[options.role](options, trigger.pulled, event_log)
 
 
-# A driver by script: answers each frame with one twist, citing it properly, until its fault is triggered. Shell.
+# A scripted driver: answers each frame with one twist, citing it properly, until its fault is triggered. Shell.
 
 KEPT: Final = 256
 WAIT_S: Final = 0.05
@@ -120,7 +120,7 @@ _REQUESTS_EVERY: Final = 15
 
 
 class SentMessage(NamedTuple):
-    """A message as it left, for a replay."""
+    """A sent message, for a replay."""
 
     channel: Channel
     header: bytes
@@ -128,7 +128,7 @@ class SentMessage(NamedTuple):
 
 
 def read_recording(path: Path) -> list[SentMessage]:
-    """Read the messages of a recording. The last line may still be written."""
+    """Read the messages of a recording, whose last line may still be incomplete."""
     rows = [line.split() for line in path.read_text("ascii").split("\n")[:-1]]
     return [SentMessage(CHANNELS[name], bytes.fromhex(header), bytes.fromhex(text)) for name, header, text in rows]
 
@@ -151,12 +151,12 @@ class Script:
         self._recording = options.recording.open("a") if options.recording and options.fault != "replay" else None
 
     def frame(self, wait_s: float = WAIT_S) -> FrameHeader | None:
-        """The header of the newest frame not yet taken, waiting a little for one."""
+        """Return the header of the newest unread frame. Waits briefly for one."""
         message = self._frames.take(wait_s)
         return decode(FrameHeader, message.header) if message else None
 
     def answer(self, frame: FrameHeader, **changes: object) -> AnswerHeader:
-        """The header of a command that answers `frame`; `changes` falsify what it cites."""
+        """Return the header of a command that answers `frame`; `changes` falsify its fields."""
         cited = {"session": frame.session, "seq": frame.seq, "t_us": frame.t_us, **changes}
         echo = Echo.model_validate({"channel": "frame", **cited})
         self.seq += 1
@@ -192,18 +192,18 @@ class Script:
         self.link.publish(*message, self.options.source)
 
     def attack(self, header: AnswerHeader | bytes, text: bytes | None = None) -> None:
-        """Send what must not move the wheels."""
+        """Send a command that must not move the wheels."""
         data = header if isinstance(header, bytes) else encode(header)
         self._event_log.note(INJECTED)
         self.link.publish(TWIST, data, format_twist(self.twist) if text is None else text, self.options.source)
 
     def injected(self) -> None:
-        """Note that the fault was done in another way than by `attack`."""
+        """Record an injection other than by `attack`."""
         self._event_log.note(INJECTED)
 
     @property
     def key(self) -> str:
-        """The exact key of this driver's twists."""
+        """Return the exact key of this driver's twists."""
         return key_for(self.link.robot, TWIST, self.options.source)
 
 
@@ -216,7 +216,7 @@ def _declare_driver(options: "PeerOptions", proofs: ProofChain, ending: ExitStac
 
 
 def run_driver(options: "PeerOptions", pulled: threading.Event, event_log: EventLog) -> int:
-    """Drive, then do what `options.fault` names, for ever or for `options.seconds`."""
+    """Drive, then do `options.fault`, forever or for `options.seconds`."""
     end_s = time.monotonic() + options.seconds if options.seconds else float("inf")
     proofs = ProofChain(secrets.token_bytes)
     with ExitStack() as ending:
@@ -240,7 +240,7 @@ GUEST_HZ: Final = 20
 
 
 def run_guest(options: "PeerOptions", pulled: threading.Event, event_log: EventLog) -> int:
-    """Change the command each time; after the trigger repeat one command. It counts while the robot may apply it."""
+    """Vary the command; after the trigger repeat one. Commands count while the robot may apply them."""
     ends_us = SafetyConfig().guest_unchanged_ms * 1000
     with open_link(options.robot, connect=[options.web_endpoint], role="guest", timeout_s=15) as link:
         repeats_since_us = None
@@ -266,7 +266,7 @@ _IMAGE_S: Final = 0.05
 
 
 class LegacyRobot:
-    """Reads texts as legacy robots do: what it cannot read raises an error, and the library closes the connection."""
+    """Reads text as legacy robots do: invalid text raises an error, and the library closes the connection."""
 
     def __init__(self, options: "PeerOptions", event_log: EventLog) -> None:
         config = SimSocketConfig(socket_dir=options.sockets)
@@ -331,7 +331,7 @@ def _serve_article(module: Any, robot: LegacyRobot, port: int) -> None:
         while True:
             text = robot.image()
             for client in list(clients):
-                with suppress(Exception):  # gone meanwhile
+                with suppress(Exception):  # closed in the meantime
                     client.sendMessage(text)
             time.sleep(_IMAGE_S)
 
@@ -383,7 +383,7 @@ LEGACY_LIBRARIES: Final[dict[str, Callable[[Any, LegacyRobot, int], None]]] = {
 
 
 def run_legacy_robot(options: "PeerOptions", _pulled: threading.Event, event_log: EventLog) -> int:
-    """Serve for ever with the library that `fault` names."""
+    """Serve forever with the library that `fault` names."""
     robot = LegacyRobot(options, event_log)
     print("robot r1: on", flush=True)
     port = parse_websocket_endpoint(options.web_endpoint).port
@@ -391,7 +391,7 @@ def run_legacy_robot(options: "PeerOptions", _pulled: threading.Event, event_log
     return 0
 
 
-# Commands that must not move the wheels, and good ones that must not hurt: what a scripted driver sends. Shell.
+# Commands of a scripted driver: those that must not move the wheels, and good ones that must do no harm. Shell.
 
 LATE_S: Final = 0.5
 HOUR_US: Final = 3_600_000_000
@@ -408,7 +408,7 @@ OVERSIZED: Final = (b"0" * 63 + b"|0", b"0.5|" + b"0" * 253, b"0.5|" + b"0" * HU
 
 
 def _frames(script: Script) -> Iterator[FrameHeader]:
-    """Yield every new frame; without one the last again, 20 times a second, since a sender of nonsense receives few."""
+    """Yield every new frame, otherwise the last one 20 times a second: a sender of invalid commands receives few."""
     last: FrameHeader | None = None
     while True:
         last = script.frame() or last
@@ -417,7 +417,7 @@ def _frames(script: Script) -> Iterator[FrameHeader]:
 
 
 def late(script: Script) -> None:
-    """Each command half a second after its frame, or later where no newer frame is as old as that."""
+    """Send each command half a second after its frame, or later if no newer frame is as old."""
     waiting: deque[FrameHeader] = deque(maxlen=64)
     while True:
         frame = script.frame()
@@ -451,26 +451,26 @@ def turn_round(script: Script) -> None:
 
 
 def never_issued(script: Script) -> None:
-    """Frames that the robot never sent."""
+    """Cite frames that the robot never sent."""
     for frame in _frames(script):
         script.attack(script.answer(frame, seq=frame.seq + 1000))
 
 
 def from_future(script: Script) -> None:
-    """The frame's own number with a time to come, and the next frame before it is issued."""
+    """Cite the number of a frame with a future time, and the next frame before it is issued."""
     for frame in _frames(script):
         script.attack(script.answer(frame, t_us=frame.t_us + 1_000_000))
         script.attack(script.answer(frame, seq=frame.seq + 1, t_us=frame.t_us + 33_333))
 
 
 def wrapped(script: Script) -> None:
-    """The highest number of all, and numbers from zero again."""
+    """Send the highest number, and numbers from zero again."""
     for count, frame in enumerate(_frames(script)):
         script.seq = MAX_INTEGER - 1 if count % 2 else min(count, 10) - 1
         script.attack(script.answer(frame))
 
 def copied(script: Script) -> None:
-    """Commands in the driver's name: with a chain of proofs of its own, without one, and with a far number."""
+    """Send commands in the driver's name: with another chain of proofs, without one, and with a far number."""
     for frame in _frames(script):
         header = script.answer(frame)
         for changes in ({}, {"proof": None, "next_proof": None}, {"seq": header.seq + 2**19}):
@@ -478,7 +478,7 @@ def copied(script: Script) -> None:
 
 
 def copied_requests(script: Script) -> None:
-    """Requests in the driver's name, each with an echo of the newest status: with a foreign proof, and without one."""
+    """Send requests in the driver's name, each citing the newest status: with a foreign proof, and without one."""
     reports = script.link.latest(STATUS)
     for number in itertools.count(1):
         report = reports.take(1.0)
@@ -495,7 +495,7 @@ def copied_requests(script: Script) -> None:
 
 
 def future_frames(script: Script) -> None:
-    """Frames in the robot's name: the largest time, an hour ahead, and the largest number."""
+    """Send frames in the robot's name: the largest time, an hour ahead, and the largest number."""
     with open_session((), [script.options.endpoint], 5.0) as third_party:
         for frame in _frames(script):
             for changes in ({"t_us": MAX_INTEGER}, {"t_us": frame.t_us + HOUR_US}, {"seq": MAX_INTEGER}):
@@ -519,7 +519,7 @@ def malformed(script: Script) -> None:
 
 
 def flood(script: Script) -> None:
-    """One old command at 10 kHz, or as fast as this process can."""
+    """Send one old command at 10 kHz, or as fast as this process can."""
     _, header, text = script.sent[0]
     started_s, batches = time.monotonic(), 0
     while time.monotonic() - started_s < FLOOD_S or batches * FLOOD_BATCH < FLOOD_AT_LEAST:
@@ -530,7 +530,7 @@ def flood(script: Script) -> None:
 
 
 def reversal(script: Script) -> None:
-    """Full speed ahead and back at 50 Hz, citing properly; then silence."""
+    """Drive full speed ahead and back at 50 Hz, citing properly; then go silent."""
     end_s, sign = time.monotonic() + 2.0, 1.0
     frame = next(_frames(script))
     while time.monotonic() < end_s:
@@ -541,14 +541,14 @@ def reversal(script: Script) -> None:
 
 
 def heartbeat(script: Script) -> None:
-    """Acknowledges every frame, stays connected, commands nothing."""
+    """Acknowledge every frame and stay connected without commands."""
     for frame in _frames(script):
         script.injected()
         script.link.publish(ACK, encode(script.answer(frame)), b"", script.options.source)
 
 
 def thousand(script: Script) -> None:
-    """A thousand good commands, quickly, then on as before."""
+    """Send a thousand good commands quickly, then continue as before."""
     frame = next(_frames(script))
     for _ in range(1000):
         frame = script.frame(0.0) or frame
@@ -559,7 +559,7 @@ def thousand(script: Script) -> None:
 
 
 def after_token(script: Script) -> None:
-    """End the token of this driver; repeat its last twist, and send newer ones of its session on young frames."""
+    """End the token of this driver. Repeat its last twist, and send newer ones of its session on young frames."""
     last = script.sent[-1]
     script.withdraw()
     for frame in _frames(script):
@@ -599,7 +599,7 @@ def run_operator(options: "PeerOptions", pulled: threading.Event, event_log: Eve
     return 0
 
 
-# A new operator: what `sightline stop` runs, in this process so that its first packet is noted. Shell.
+# A new operator: runs the code of `sightline stop` in this process, so that its first packet is logged. Shell.
 
 def run_stop(options: "PeerOptions", pulled: threading.Event, event_log: EventLog) -> int:
     """Wait for the trigger, stop the robot, and exit as the command does. A recording gets the datagrams."""
@@ -627,7 +627,7 @@ def run_stop(options: "PeerOptions", pulled: threading.Event, event_log: EventLo
         code = error.exit_code
         print(error, flush=True)
     print(f"stop ended with {code} after {sent} datagrams", flush=True)
-    os._exit(code)  # the link may still be opened
+    os._exit(code)  # the link may still be opening
 
 
 ROLES: Final[dict[Role, Callable[[PeerOptions, threading.Event, EventLog], int]]] = {

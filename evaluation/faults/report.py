@@ -12,7 +12,7 @@ _COUNTED_FROM: Final = 1000
 
 
 def passed(results: Results) -> bool:
-    """Return True if at least one row ran, and all that ran are within bounds. Skipped rows do not count."""
+    """Return True if at least one row ran and all of them are within bounds. Skipped rows do not count."""
     ran = [outcome for outcomes in results for outcome in outcomes if not outcome.skipped]
     return bool(ran) and all(outcome.ok for outcome in ran)
 
@@ -46,12 +46,12 @@ def figure_text(name: str, value: float | None, unit: str) -> str:
 
 
 def value_text(value: float | None) -> str:
-    """Three digits, or all of a large count."""
+    """Format three digits, or all of a large count."""
     return f"{value:.0f}" if value is not None and value >= _COUNTED_FROM else number(value)
 
 
 def to_dict(results: Results) -> dict[str, Any]:
-    """Return the object that every checking command prints with `--json`."""
+    """Return the `--json` object of a command with checks."""
     checks = [
         asdict(check) | {"name": f"{outcomes[0].row.id}: {check.name}"}
         for outcomes in results

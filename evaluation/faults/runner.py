@@ -40,47 +40,47 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Injected:
-    """The record of an injection: count, start, and the time when frames or commands were valid again."""
+    """Record of an injection: count, start, and the time when frames or commands were valid again."""
 
     count: int
     at_us: int
     resumed_us: int | None = None
     again: bool | None = None
-    """Whether the robot drove again, where that is demanded."""
+    """True if the robot drove again, where that is demanded."""
     checks: tuple[Check, ...] = ()
-    """What only this row demands."""
+    """Checks of this row only."""
     from_us: int | None = None
-    """The time of the first measurement of `checks`, where that is before `at_us`."""
+    """Time of the first measurement of `checks`, if before `at_us`."""
 
 
 @dataclass(frozen=True, slots=True)
 class FaultCase:
-    """One fault. `inject` is given a robot at speed and returns when there is nothing more to see."""
+    """One fault. `inject` receives a robot at speed and returns after the last observation."""
 
     id: str
     what: str
     inject: "Callable[[RobotFixture], Injected]"
     setup: "Setup"
     blind: bool = False
-    """True if commands continue but must not be applied: from the injection on, none counts as good."""
+    """True if commands continue but must not be applied. None counts as good from the injection on."""
     by_frame: bool = False
-    """It is images that end, not commands: one under way may still be answered."""
+    """True if images end, not commands. A frame in flight may still be answered."""
     stops: bool = True
-    """A stop is demanded after the last valid command."""
+    """True if a stop is demanded after the last valid command."""
     again: bool = False
     zero_ms: float = ZERO_MS
     distance_m: float = DISTANCE_M
     memory_mb: float = MEMORY_MB
     also: str = ""
-    """In words, what `Injected.checks` demand."""
+    """Demand of `Injected.checks` in words."""
     short: bool = False
-    """Part of the short set."""
+    """True for a row of the short set."""
     alone: bool = False
-    """It takes the whole machine: no other row runs beside it."""
+    """True if no other row may run next to it."""
 
     @property
     def demanded(self) -> str:
-        """In words."""
+        """Describe the bounds in words."""
         stop = f"falls <= {min(FALLS_MS, self.zero_ms):g} ms, zero <= {self.zero_ms:g} ms, <= {self.distance_m:g} m"
         parts = [
             stop if self.stops else f"no motion on frames older than {OLD_US // 1000} ms",
@@ -98,7 +98,7 @@ class FaultOutcome:
     checks: tuple[Check, ...] = ()
     skipped: str = ""
     trouble: str = ""
-    """Why there are no figures."""
+    """Reason for missing figures."""
 
     @property
     def ok(self) -> bool:
@@ -112,11 +112,11 @@ class FaultOutcome:
 MOST_TRIES: Final = 3
 _TO_THE_END_US: Final = 10**9
 _WATCHED_US: Final = 1_000_000
-"""After the injection: the time in which a stop is measured, and a stalled sampler spoils it."""
+"""Time after the injection in which a stop is measured and a stalled sampler spoils it."""
 
 
 def run_case(row: FaultCase, folder: Path, run: int = 1) -> FaultOutcome:
-    """Run a row, again while its sampler stalled; its files stay in `folder` unless all was well."""
+    """Run a row, again if its sampler stalled. Its files stay in `folder` if it failed."""
     if row.setup.legacy is not None and find_spec(row.setup.fault) is None:
         return FaultOutcome(row, skipped=f"needs the package {row.setup.fault}; run `pip install {row.setup.fault}`")
     if row.setup.wired and (why := why_impossible()):
@@ -126,7 +126,7 @@ def run_case(row: FaultCase, folder: Path, run: int = 1) -> FaultOutcome:
         shutil.rmtree(place, ignore_errors=True)
         try:
             checks, stalled_us = _run_once(row, place)
-        except (SightlineError, OSError) as error:  # OSError: a process that was to be hurt is gone
+        except (SightlineError, OSError) as error:  # OSError: the process to harm has ended
             return FaultOutcome(row, trouble=" ".join(str(error).split()))
         if stalled_us <= STALL_US:
             break
@@ -153,9 +153,9 @@ def _run_once(row: FaultCase, place: Path) -> tuple[tuple[Check, ...], int]:
 
 
 def watched_us(injected: Injected, checks: Sequence[Check]) -> tuple[int, int]:
-    """Return the begin and end of the time with exact stamps: that of a stop, or of all measurements after a failure.
+    """Return the period that needs exact stamps: that of a stop, or of all measurements after a failure.
 
-    A motor's log is stamped by the simulation, which may have stood still between a command and its stamp.
+    The simulation stamps the motor log, and may have stalled between a command and its stamp.
     """
     if all(check.ok for check in checks):
         return injected.at_us, injected.at_us + _WATCHED_US
@@ -176,12 +176,12 @@ def _motion_checks(row: FaultCase, rig: RobotFixture, injected: Injected) -> Ite
         yield at_least("drives again", bool(injected.again), "", 1)
 
 
-# Rows side by side, each in a separate process, with an estimate of the remaining time. Shell (processes).
+# Rows in parallel, each in a separate process, with an estimate of the remaining time. Shell (processes).
 
 
-_FORK: Final = multiprocessing.get_context("fork")  # nothing is open here that a copy could spoil: no link, no thread
+_FORK: Final = multiprocessing.get_context("fork")  # safe to copy: no link or thread is open here
 _END_S: Final = 30.0
-"""A row that was interrupted ends its own processes within this."""
+"""Time in which an interrupted row ends its processes."""
 
 
 class FaultProgress(NamedTuple):
@@ -211,10 +211,10 @@ class _Running:
 def run_cases(
     rows: Sequence[FaultCase], repeat: int, folder: Path, jobs: int, show: Callable[[FaultOutcome, FaultProgress], None]
 ) -> list[list[FaultOutcome]]:
-    """Every row `repeat` times, `jobs` at once, those that want it alone last. What is skipped is not repeated."""
+    """Run every row `repeat` times, `jobs` in parallel, rows with `alone` last. Skipped rows are not repeated."""
     results: list[list[FaultOutcome]] = [[] for _ in rows]
     turns = [_Turn(index, row, number) for index, row in enumerate(rows) for number in range(1, repeat + 1)]
-    turns.sort(key=lambda turn: turn.row.alone)  # stable: otherwise in the report's order
+    turns.sort(key=lambda turn: turn.row.alone)  # stable: otherwise in the order of the report
     began_s, done, total = time.monotonic(), 0, len(turns)
     with terminated_like_interrupted(), closing(_outcomes(turns, folder, jobs, results)) as outcomes:
         for turn, outcome in outcomes:
@@ -264,7 +264,7 @@ def _start(turn: _Turn, folder: Path) -> _Running:
 
 
 def _run(turn: _Turn, folder: Path, answer: connection.Connection) -> None:
-    """Run a row in its process, and send its result to the parent in every case."""
+    """Run a row in its process, and always send its result to the parent."""
     with suppress(KeyboardInterrupt), terminated_like_interrupted():
         outcome = run_case(turn.row, folder, turn.number)
         answer.send((outcome.checks, outcome.skipped, outcome.trouble))

@@ -1,8 +1,8 @@
-"""Records when this machine did not run what should run, so that stamps of that time are not trusted. Shell.
+"""Records when this machine stalled, so that stamps of that time are not trusted. Shell.
 
     python -m sightline.evaluation.faults.sampler FILE
 
-A process of its own beside the simulation's receiving thread and at its priority. One line per hole: `from_us,to_us`.
+A separate process at the priority of the simulation's receiving thread. One line per hole: `from_us,to_us`.
 """
 
 import os
@@ -19,14 +19,14 @@ STALL_US: Final = 20_000
 
 
 class Hole(NamedTuple):
-    """Nothing ran here from `from_us` to `to_us`."""
+    """A period in which nothing ran here."""
 
     from_us: int
     to_us: int
 
 
 def sample(path: Path) -> None:
-    """Wake every 5 ms, for ever, and note every pause over 20 ms."""
+    """Wake every 5 ms, forever, and log every pause over 20 ms."""
     file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
     last_us = monotonic_us()
     print("sampling", flush=True)

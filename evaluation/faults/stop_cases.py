@@ -50,7 +50,7 @@ that end within a millisecond leave nothing to count, so `connect_500` is report
 
 
 def _flood(rig: RobotFixture, kind: str, after_s: float | None = None) -> Injected:
-    """Send STOP during a flood, or some time after its end."""
+    """Send STOP during a flood, or some time after it."""
     rig.prepare_operator()
     rig.start_load(kind, rig.web_endpoint or rig.endpoint)
     rig.processes.wait_line("crowd", READY, READY_S)
@@ -68,12 +68,12 @@ _CAME: Final = {
     "connect_25": 0.8 * FEW_HZ * AT_WORK_S, "connect_500": 0.8 * MANY_HZ * AT_WORK_S, "sessions": SESSIONS,
     **dict.fromkeys(_HALF_OPEN, HALF_OPEN),
 }
-"""Connections or sessions within `AT_WORK_S`. A machine that is too busy for so many does not show the row."""
+"""Connections or sessions within `AT_WORK_S`. A machine that is too busy for them cannot run the row."""
 PUBLISHED_LEAST_HZ: Final = 0.9 * PUBLISHED_HZ
 
 
 def _load_checks(rig: RobotFixture, kind: str) -> Iterator[Check]:
-    """Check that the flood was what its row states, and that the log has one line of it."""
+    """Check that the flood was as strong as its row states, and that the log has one line about it."""
     if kind == "publisher":
         yield at_least("published", _rate_hz(rig.noted("crowd", INJECTED)), "1/s", PUBLISHED_LEAST_HZ)
     if kind == "handshake":
@@ -90,7 +90,7 @@ def _rate_hz(noted: Sequence[SentCommand]) -> float:
 
 
 def _garbage(rig: RobotFixture) -> Injected:
-    """Invalid datagrams for 10 s have no effect; a valid one among them stops the robot."""
+    """Send invalid datagrams for 10 s without effect. A valid one among them stops the robot."""
     rig.prepare_operator()
     came_us = monotonic_us()
     rig.start_load("garbage", rig.endpoint)
@@ -114,7 +114,7 @@ def _replay(rig: RobotFixture) -> Injected:
     rig.trigger("operator")
     rig.processes.exit_code("operator", STOP_ENDS_S)
     rig.processes.end_one("robot")
-    (rig.folder / "state" / "r1.stopped").unlink()  # in place of an operator that resets and arms
+    (rig.folder / "state" / "r1.stopped").unlink()  # in place of an operator's reset and arm
     rig.start_robot()
     rig.wait_speed(rig.setup.at_speed_mps)
     since_us = monotonic_us()
@@ -133,7 +133,7 @@ def _replay(rig: RobotFixture) -> Injected:
 
 TYPED_FALLS_MS: Final = 200.0
 TYPED_ZERO_MS: Final = {0.5: 550.0, 0.2: 350.0}
-"""From the start of the command until the wheels stand, for each speed before it. The ramp takes most of it."""
+"""Time from the start of the command until the wheels stand, for each speed before it. The ramp takes most of it."""
 TYPED_CPU_S: Final = 0.2
 
 
@@ -160,7 +160,7 @@ BUSY: Final = 8
 
 
 def _busy(rig: RobotFixture) -> Injected:
-    """Send STOP while more processes than processors want all of them."""
+    """Send STOP while more processes than processors are busy."""
     rig.prepare_operator()
     with busy_processes(BUSY):
         rig.watch(AT_WORK_S)
@@ -169,14 +169,14 @@ def _busy(rig: RobotFixture) -> Injected:
 
 
 def _no_descriptors(rig: RobotFixture) -> Injected:
-    """Send STOP while no process of the robot may open a file or a socket."""
+    """Send STOP while no process of the robot can open a file or a socket."""
     rig.prepare_operator()
-    (rig.folder / MODE).unlink()  # or the camera of the bench would open a file for each image
+    (rig.folder / MODE).unlink()  # otherwise the camera of the bench would open a file for each image
     guardian = rig.processes.pid("robot")
     for pid in (guardian, *children_of(guardian), *children_of(rig.processes.driver("robot"))):
         held = max(int(link.name) for link in Path(f"/proc/{pid}/fd").iterdir()) + 1
         resource.prlimit(pid, resource.RLIMIT_NOFILE, (held, held))
-    rig.watch(ZERO_MS / 1000)  # a robot that loses its images by this would stand by now
+    rig.watch(ZERO_MS / 1000)  # a robot that lost its images would stand by now
     at_us, checks = rig.stop_by_operator(moving=True)
     return Injected(1, at_us, checks=checks)
 
@@ -187,7 +187,7 @@ _BRAKING_M, _BRAKING_MS = 0.05, 700.0
 
 
 def _repeat_as_guest(rig: RobotFixture, name: str) -> tuple[Check, ...]:
-    """Let a guest repeat its command on one image, for longer than it may. Then it dies."""
+    """Let a guest repeat its command on one image for longer than permitted. Then it dies."""
     at_us = rig.trigger(name)
     rig.watch(_GUEST.guest_unchanged_ms / 1000 + 2.0)
     stop = measure_stop(rig.motors(), at_us)
@@ -199,7 +199,7 @@ def _repeat_as_guest(rig: RobotFixture, name: str) -> tuple[Check, ...]:
 
 
 def _guests(rig: RobotFixture) -> Injected:
-    """Guests answer one image for seconds: one drives ahead, one turns. The next one drives when STOP comes."""
+    """Let guests answer one image for seconds: one drives ahead, one turns. STOP arrives while the next one drives."""
     checks = list(_repeat_as_guest(rig, "peer"))
     rig.start_peer("turning", "guest", linear_mps=0.0, angular_rad_s=1.0)
     rig.wait_speed(_TURNING_MPS)
@@ -223,7 +223,7 @@ def _end_vision(rig: RobotFixture) -> Injected:
 
 
 DISARM_ZERO_MS: Final = 1000.0
-"""`disarm` starts first; the zero command comes at once then."""
+"""`disarm` starts first; the zero command follows immediately."""
 
 
 def _disarm_legacy(rig: RobotFixture) -> Injected:
@@ -253,7 +253,8 @@ CUT_ITS_POWER: Final = "cut its power by hand"
 
 def _stop_offline(rig: RobotFixture) -> Injected:
     """Run `sightline stop` while the legacy robot applies nothing, as without Wi-Fi. It cannot stop, and no line may
-    state that it did."""
+    claim that it did.
+    """
     at_us = monotonic_us()
     rig.processes.signal("robot", signal.SIGSTOP)
     rig.processes.start("stop", ["stop", ROBOT, "--connect", rig.endpoint])
@@ -304,7 +305,7 @@ _FLOODS: Final = {
     "web500": ("connect_500", f"{MANY_HZ} WebSocket connections a second", False),
 }
 HALF_OPEN_MB: Final = 16.0
-"""Zenoh holds about 10 kB for each TLS connection that it has accepted; the descriptors of the process bound them."""
+"""Zenoh holds about 10 kB for each accepted TLS connection; the descriptors of the process bound them."""
 _DEMANDED: Final = f"zero <= {ZERO_MS:g} ms after the first packet; exit code 0"
 
 

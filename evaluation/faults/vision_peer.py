@@ -1,6 +1,6 @@
-"""The vision service as a peer: alone with a detector that fails on command, or with others that share robots. Shell.
+"""The vision service as a peer: alone with a detector that fails on command, or among services that share. Shell.
 
-An event log has each twist before it leaves.
+The event log gets each twist before it is sent.
 """
 
 import os
@@ -30,7 +30,7 @@ SLOW_S: Final = 0.33
 
 
 class LoggingLink(LinkWrapper):
-    """A link that notes every twist before it leaves."""
+    """A link that logs every twist before it is sent."""
 
     def __init__(self, link: Link, event_log: EventLog) -> None:
         super().__init__(link)
@@ -53,7 +53,7 @@ FAULTS: Final[dict[str, Callable[[], None]]] = {
 
 
 def _spoil_detector(fault: str, pulled: threading.Event, event_log: EventLog) -> None:
-    """Every detector built from now on does `fault` before it detects, once the trigger is pulled."""
+    """Let every new detector do `fault` before it detects, once triggered."""
     detect = AutoDetector.detect
 
     def spoiled(self: AutoDetector, *given: Any) -> Any:
@@ -66,7 +66,7 @@ def _spoil_detector(fault: str, pulled: threading.Event, event_log: EventLog) ->
 
 
 def run_vision(endpoint: str, file: Path | None, fault: str, pulled: threading.Event, event_log: EventLog) -> int:
-    """Serve for ever. The detector does `fault` once the trigger is pulled."""
+    """Serve forever. The detector does `fault` once triggered."""
     if fault:
         _spoil_detector(fault, pulled, event_log)
     loaded = load_service("vision", file=str(file) if file else None, options={"connect": (endpoint,)},
@@ -92,7 +92,7 @@ class CircleConfig(Config):
 
 
 class CircleMission:
-    """A mission: one circle. The motor log shows by its direction which service drives."""
+    """A mission that drives a circle. Its direction in the motor log shows which service drives."""
 
     Config = CircleConfig
 
@@ -105,7 +105,7 @@ class CircleMission:
 
 
 def run_shared(endpoint: str, name: str, linear_mps: float, angular_rad_s: float, event_log: EventLog) -> int:
-    """Run what `sightline vision --share --name NAME` runs, until SIGTERM. The wheels of its robots make a circle."""
+    """Run `sightline vision --share --name NAME` until SIGTERM. The wheels of its robots make a circle."""
     publish = ZenohLink.publish
 
     def noted(self: ZenohLink, channel: Channel, header: bytes, payload: bytes, source: str = "") -> bool:

@@ -1,4 +1,4 @@
-"""The looks of balls: albedo and bumps over the unit sphere, and how they shine. Pure."""
+"""The surfaces of balls: albedo, bumps and highlights over the unit sphere. Pure."""
 
 import colorsys
 from collections.abc import Callable
@@ -38,17 +38,17 @@ class BallSurface:
     shininess: float
     """Exponent of the highlight."""
     wrap: float = 0.0
-    """How far light reaches behind the edge: felt scatters it."""
+    """Reach of light beyond the terminator, because felt scatters it."""
     rim: float = 0.0
     """Brightness of the fibers at the edge."""
     fuzz: float = 0.0
-    """Depth of the uneven edge, in radii."""
+    """Depth of the irregular edge, in radii."""
     bump: float = 0.0
     """Slope of the bumps."""
     bumps_per_radian: float = 1.0
 
     def at(self, normals: Floats) -> tuple[Floats, Floats]:
-        """Albedo, and normals with bumps, both (n, 3), at normals of the camera frame."""
+        """Return albedo and bumped normals, both (n, 3), at normals of the camera frame."""
         points = normals @ self.turn.T
         if not self.bump:
             return self.texture(points), normals
@@ -73,7 +73,7 @@ def surface(kind: str, rng: np.random.Generator) -> BallSurface:
 
 
 def _rotation(rng: np.random.Generator) -> Floats:
-    """A random rotation, (3, 3), from a random unit quaternion."""
+    """Draw a random rotation, (3, 3), from a random unit quaternion."""
     w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
     return np.array(
         [
@@ -90,13 +90,13 @@ def _linear(hue_deg: float, saturation: float, value: float) -> Floats:
 
 
 def _draw(kind: str, rng: np.random.Generator) -> Floats:
-    """A linear color of a kind, (3,)."""
+    """Draw a linear color of a kind, (3,)."""
     hue, saturation, value = (float(rng.uniform(*limits)) for limits in _PLAIN[kind])
     return _linear(hue, saturation, value)
 
 
 def _mottle(rng: np.random.Generator, strength: float, waves: float) -> Texture:
-    """Smooth unevenness around 1, (n, 1): dirt, wear, fibers."""
+    """Draw smooth unevenness around 1, (n, 1): dirt, wear, fibers."""
     along, phase = rng.normal(0, waves, (3, 12)).astype(np.float32), rng.uniform(0, 6.28, 12).astype(np.float32)
 
     def at(points: Floats) -> Floats:
@@ -106,7 +106,7 @@ def _mottle(rng: np.random.Generator, strength: float, waves: float) -> Texture:
 
 
 def _mix(base: Floats, other: Floats, share: Floats) -> Floats:
-    """`base` with `share`, (n,), of `other`."""
+    """Blend `other` over `base` by `share`, (n,)."""
     return (base + (other - base) * np.clip(share, 0, 1)[:, None]).astype(np.float32)
 
 
@@ -116,7 +116,7 @@ def _plain(kind: str, rng: np.random.Generator) -> Texture:
 
 
 def _tennis(rng: np.random.Generator) -> Texture:
-    """Felt with the curved white seam: a (a cos t + b cos 3t, a sin t - b sin 3t, 2 sqrt(ab) sin 2t) with a + b = 1."""
+    """Draw felt with a curved white seam: a (a cos t + b cos 3t, a sin t - b sin 3t, 2 sqrt(ab) sin 2t), a + b = 1."""
     color, fibers, wear = _draw("tennis", rng), _mottle(rng, 0.35, 25), _mottle(rng, 0.2, 3)
     t = np.linspace(0, 2 * np.pi, 160, endpoint=False)
     a, b = 0.73, 0.27
@@ -132,7 +132,7 @@ def _tennis(rng: np.random.Generator) -> Texture:
 
 
 def _basketball(rng: np.random.Generator) -> Texture:
-    """Two great circles and two bent seams around the x axis."""
+    """Draw two great circles and two bent seams around the x axis."""
     color, wear, black = _draw("basketball", rng), _mottle(rng, 0.25, 4), _linear(0, 0, float(rng.uniform(0.08, 0.2)))
     pebbles, half_width = _mottle(rng, 0.3, 45), float(rng.uniform(0.02, 0.035))
 
@@ -149,7 +149,7 @@ def _basketball(rng: np.random.Generator) -> Texture:
 
 
 def _icosahedron() -> tuple[Floats, Floats]:
-    """Directions of the 12 pentagons and the 20 hexagons of a football: an icosahedron's vertices and faces."""
+    """Return the directions of a football's 12 pentagons and 20 hexagons: vertices and faces of an icosahedron."""
     golden = (1 + 5**0.5) / 2
     signs = [(s, t) for s in (-1, 1) for t in (-1, 1)]
     vertices = np.array([np.roll([0, s, t * golden], k) for k in range(3) for s, t in signs])
@@ -167,12 +167,12 @@ _PENTAGON_DISTANCE, _HEXAGON_DISTANCE = 2.3274, 2.2673
 
 
 def _bright(rng: np.random.Generator) -> Floats:
-    """A printed color, (3,)."""
+    """Draw a printed color, (3,)."""
     return _linear(float(rng.uniform(0, 360)), float(rng.uniform(0.6, 1)), float(rng.uniform(0.3, 0.95)))
 
 
 def _football(rng: np.random.Generator) -> Texture:
-    """One of five designs: classic, colored hexagons, panels, stripes, spots."""
+    """Draw one of five designs: classic, colored hexagons, panels, stripes, spots."""
     design = rng.choice(["classic", "hexagons", "panels", "stripes", "spots"], p=[0.4, 0.15, 0.15, 0.15, 0.15])
     white = _linear(float(rng.uniform(30, 230)), float(rng.uniform(0, 0.06)), float(rng.uniform(0.82, 0.97)))
     black, first, second = _linear(220, 0.2, float(rng.uniform(0.07, 0.2))), _bright(rng), _bright(rng)
@@ -191,7 +191,7 @@ def _football(rng: np.random.Generator) -> Texture:
 
 
 def _panels(normals: Floats, colors: Floats) -> Texture:
-    """Flat-faced panels projected onto the sphere: `normals` over the distances of the faces, with a color each."""
+    """Return flat panels projected onto the sphere: `normals` over the distances of the faces, and their colors."""
 
     def at(points: Floats) -> Floats:
         near = points @ normals.T
@@ -204,7 +204,7 @@ def _panels(normals: Floats, colors: Floats) -> Texture:
 
 
 def _stripes(base: Texture, first: Floats, second: Floats, rng: np.random.Generator) -> Texture:
-    """Two waved bands over `base`."""
+    """Return two wavy bands over `base`."""
     waves, height, width = int(rng.integers(2, 5)), float(rng.uniform(0.05, 0.25)), float(rng.uniform(0.1, 0.25))
 
     def at(points: Floats) -> Floats:
@@ -216,7 +216,7 @@ def _stripes(base: Texture, first: Floats, second: Floats, rng: np.random.Genera
 
 
 def _spots(base: Texture, first: Floats, black: Floats, rng: np.random.Generator) -> Texture:
-    """Printed figures around the middles of the hexagons or pentagons over `base`: a dark one in a colored one."""
+    """Return printed figures around the centers of hexagons or pentagons over `base`: a dark one in a colored one."""
     middles, size = (_HEXAGONS, 0.28) if rng.random() < 0.5 else (_PENTAGONS, 0.4)
     lobes, depth = int(rng.integers(3, 6)), float(rng.uniform(0.1, 0.5))
 

@@ -1,4 +1,4 @@
-"""Detectors on labelled scenes: runs, bounds and tables. Shell (draws scenes).
+"""Scores detectors on labeled scenes: runs, bounds and tables. Shell (draws scenes).
 
 Every detector receives the same JPEGs through the port of the vision service, each scene in a new session. Its answers
 pass the same checks as in the vision service.
@@ -40,8 +40,8 @@ from sightline.vision_side.detect.registry import build_detector, check_takes_pi
 _FRAME_US: Final = 33_333
 _ROBOT: Final = "score"
 LIGHT_SHARE: Final = 2.5
-"""As many scenes of lights and legs as of each column's: the three states share them."""
-_MOST_NOTICES: Final = 2  # lines from a detector next to the cause of a missing answer
+"""Scenes of lights and legs, relative to those of a column: the three states share them."""
+_MOST_NOTICES: Final = 2  # lines of a detector in addition to the cause of a missing answer
 LABELLED: Final = LABELS[1:]
 """Labels with a score of average precision. The ball has separate columns."""
 
@@ -53,11 +53,11 @@ class Subject:
     name: str
     detector: Detector
     label: str = ""
-    """The one that the vision service is configured to follow; empty for any."""
+    """Label that the vision service is configured to follow; empty for any."""
 
     @property
     def balls(self) -> tuple[str, ...]:
-        """Labels that it may give a ball."""
+        """Return the labels that it may give a ball."""
         return (*BALL_LABELS, self.label) if self.label else BALL_LABELS
 
     def follows(self, label: str) -> bool:
@@ -73,12 +73,12 @@ class ScoredScene:
     jpeg: bytes
     answers: tuple[DetectionResult | None, ...]
     whys: tuple[str, ...]
-    """Why there is no answer; empty where there is one."""
+    """Reason for a missing answer; empty if there is one."""
 
 
 @dataclass(frozen=True, slots=True)
 class Silence:
-    """The number of scenes without an answer of a detector, and the cause."""
+    """Number of scenes without an answer of a detector, and the cause."""
 
     scenes: int
     of: int
@@ -87,13 +87,13 @@ class Silence:
 
 @dataclass(frozen=True, slots=True)
 class DetectorReport:
-    """Figures by column and subject; average precision by subject and label; what each ran on."""
+    """Figures by column and subject; average precision by subject and label; the device of each."""
 
     first_seed: int
     frames: int
     columns: dict[str, dict[str, DetectorFigures]]
     precision: dict[str, dict[str, tuple[int, float | None]]]
-    """Objects, AP50."""
+    """Number of objects, AP50."""
     made_by: dict[str, dict[str, str]]
     silent: dict[str, Silence]
     """Detectors with missing answers. A missing answer counts as missed, as an empty one does."""
@@ -101,7 +101,7 @@ class DetectorReport:
     """Detectors with unknown labels, and these labels. They are usually those of another model."""
 
     def to_dict(self) -> dict[str, Any]:
-        """For --json."""
+        """Return the object for `--json`."""
         return asdict(self)
 
 
@@ -122,14 +122,14 @@ def subjects(
 
 
 def close_subjects(tested: Sequence[Subject]) -> None:
-    """All of them."""
+    """Close all detectors."""
     with ExitStack() as ending:
         for one in tested:
             ending.callback(close_detector, one.detector)
 
 
 def shown(column: Column, seeds: Iterable[int], tested: Sequence[Subject], looks: int) -> Iterable[ScoredScene]:
-    """Each scene of the column in turn, in front of every subject, `looks` times in a row: some have to make sure.
+    """Show each scene of the column to every subject, `looks` times in a row, since some confirm a detection first.
 
     A mission follows the ball, except in scenes of lights and legs.
     """
@@ -145,9 +145,9 @@ def shown(column: Column, seeds: Iterable[int], tested: Sequence[Subject], looks
 
 def answer_of(subject: Subject, seed: int, jpeg: bytes, decoder: Decoder, looks: int, *, follows: bool = True,
               expected_px: tuple[float, float] | None = None) -> DetectionResult | str:
-    """Return the answer of the last call, in a session of its own, or the cause of a missing one.
+    """Return the answer of the last call, in a new session, or the cause of a missing one.
 
-    With `follows` a mission uses what the subject follows, as in the vision service, otherwise each label.
+    With `follows` a mission uses the label that the subject follows, as in the vision service, otherwise each label.
     """
     result: DetectionResult | str = ""
     for look in range(looks):
@@ -164,7 +164,7 @@ def score_scenes(
     tested: Sequence[Subject], frames: int, first_seed: int = SCORED_FROM, *, looks: int = 1,
     columns: Sequence[str] = tuple(COLUMNS), each: Callable[[ScoredScene], None] = lambda _seen: None,
 ) -> DetectorReport:
-    """All columns, `frames` scenes each, and `LIGHT_SHARE` times as many of lights and legs.
+    """Score all columns, `frames` scenes each, and `LIGHT_SHARE` times as many of lights and legs.
 
     `each` is called for every scene.
     """
@@ -193,7 +193,7 @@ def score_scenes(
 
 
 class _Count:
-    """All that one subject answered."""
+    """All answers of one subject."""
 
     def __init__(self, subject: Subject, columns: Sequence[str]) -> None:
         self.name = subject.name
@@ -220,7 +220,7 @@ class _Count:
 
 
 def detections(result: DetectionResult | None) -> tuple[Detection, ...]:
-    """No answer shows nothing."""
+    """Return the detections, none without an answer."""
     return () if result is None else result.detections
 
 
@@ -233,37 +233,37 @@ def scene_result(result: DetectionResult | None, scene: Scene, balls: Sequence[s
     )
 
 
-# The bounds of a learned detector, and their check. Pure.
+# The bounds of a learned detector, and their checks. Pure.
 #
 # They apply to `FRAMES` scenes per column, without training or tuning on them. Other detectors are not checked: a color
 # detector, for example, finds no traffic lights.
 
 
 FRAMES: Final = 1000
-"""A fifth shows no ball. Decision 14 has the reason for the number."""
+"""A fifth shows no ball. Decision 14 gives the reason for the number."""
 LEAST_HITS: Final = {
     "nominal": 0.85, "same-color boxes": 0.78, "changed light": 0.80, "blur": 0.75, "quality 30": 0.78,
     "all at once": 0.68,
 }
 MOST_WRONG: Final = 0.05
-"""Wrong objects, and false alarms, in every column: going for either is what must not happen."""
+"""Wrong objects and false alarms in every column. Driving to either is the unsafe failure."""
 CLEAN: Final = "nominal"
-"""The column of clean images, for the score of the center."""
+"""Column of clean images, for the score of the center."""
 CENTRE_PX: Final = 1.0
-"""The median."""
+"""Bound of the median."""
 LEAST_AP50: Final = 0.80
 LEAST_OBJECTS: Final = 300
 """Smallest number of objects per label for a score."""
 
 
 def all_detector_checks(report: DetectorReport) -> list[Check]:
-    """The checks of every detector, by name."""
+    """Return the checks of every detector, by name."""
     names = dict.fromkeys(name for own in report.columns.values() for name in own)
     return [replace(check, name=f"{name}: {check.name}") for name in names for check in detector_checks(report, name)]
 
 
 def detector_checks(report: DetectorReport, name: str) -> list[Check]:
-    """Hold one detector's figures against all that is demanded, in the columns that were shown."""
+    """Return the checks of one detector in the scored columns."""
     checks = [check for column, own in report.columns.items() for check in _of_column(column, own[name])]
     return checks + [check for label in LABELLED for check in _of_label(label, report.precision[name].get(label))]
 
@@ -277,7 +277,7 @@ def _of_column(column: str, one: DetectorFigures) -> Iterator[Check]:
 
 
 def _of_label(label: str, found: tuple[int, float | None] | None) -> Iterator[Check]:
-    """None: the detector found neither lights nor legs anywhere."""
+    """Yield the checks of a label. None: the detector found neither lights nor legs anywhere."""
     yield _least(f"AP50, {label}", found[1] if found else None, LEAST_AP50)
     if found:
         yield at_least(f"least objects, {label}", found[0], "", LEAST_OBJECTS)
@@ -301,7 +301,7 @@ _MOST_LABELS = 3
 
 
 def rows(report: DetectorReport) -> list[tuple[str, ...]]:
-    """One for each column and detector."""
+    """Return a row for each column and detector."""
     return [(column, name, *_cells(one)) for column, own in report.columns.items() for name, one in own.items()]
 
 
@@ -316,7 +316,7 @@ def _cells(one: DetectorFigures) -> tuple[str, ...]:
 
 
 def precision_lines(report: DetectorReport) -> list[str]:
-    """One for each detector that finds more than balls."""
+    """Return a line for each detector that finds more than balls."""
     lines = []
     for name, labels in report.precision.items():
         if labels:
@@ -326,7 +326,7 @@ def precision_lines(report: DetectorReport) -> list[str]:
 
 
 def text(report: DetectorReport) -> str:
-    """For a terminal."""
+    """Format the table for a terminal."""
     table = [_HEAD, *rows(report)]
     widths = [max(len(row[place]) for row in table) for place in range(len(_HEAD))]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table]
@@ -334,7 +334,7 @@ def text(report: DetectorReport) -> str:
 
 
 def markdown(report: DetectorReport) -> str:
-    """For a page."""
+    """Format the table for a page."""
     lines = [_line(_HEAD), _line(["---"] * len(_HEAD)), *(_line(row) for row in rows(report))]
     return "\n".join([*lines, "", *(f"- {line}" for line in precision_lines(report))])
 

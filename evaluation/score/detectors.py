@@ -1,4 +1,4 @@
-"""Hits, misses, localisation and average precision of a detector. Pure.
+"""Hits, misses, localization and average precision of a detector. Pure.
 
 The answer to a frame is the best detection with the label of a ball, as the mission `follow` uses it. A detection on
 another object is the unsafe failure, and is counted separately.
@@ -14,16 +14,16 @@ from sightline.vision_side.detect.port import Detection, corners, overlap
 
 BALL_LABELS: Final = ("ball", "sports ball", "target")
 HIT_OVERLAP: Final = 0.5
-"""Intersection by union, with the box of what is in view or of the whole ball, whichever is nearer."""
+"""Intersection over union with the box of the visible part or of the whole ball, whichever is better."""
 CENTRED_FROM: Final = 0.98
-"""Seen share from which a hit's centre is compared with the ball's: the rest is cut off or behind something."""
+"""Visible share from which the center of a hit is compared with the ball's."""
 
 Answer = Literal["hit", "wrong object", "nowhere", "none"]
 
 
 @dataclass(frozen=True, slots=True)
 class FrameResult:
-    """One frame: was there a ball, what was the answer, how sure, how far off, how long it took (None: no answer)."""
+    """One frame: ball or not, answer, score, offset, and compute time (None: no answer)."""
 
     has_ball: bool
     outcome: Answer
@@ -33,7 +33,7 @@ class FrameResult:
 
 
 def ball_of(scene: Scene) -> LabelledBox | None:
-    """The ball, if there is one."""
+    """Return the ball, if there is one."""
     return next((one for one in scene.truths if one.label == "ball"), None)
 
 
@@ -66,7 +66,7 @@ def is_hit(one: Detection, ball: LabelledBox) -> bool:
 
 
 def _off_px(one: Detection, ball: LabelledBox) -> float | None:
-    """From the ball's centre, where all of it is in view."""
+    """Return the distance from the ball's center, if all of it is visible."""
     if ball.whole is None or ball.seen < CENTRED_FROM:
         return None
     x, y = (ball.whole[0] + ball.whole[2]) / 2, (ball.whole[1] + ball.whole[3]) / 2
@@ -76,7 +76,7 @@ def _off_px(one: Detection, ball: LabelledBox) -> float | None:
 
 
 def _is_on_another(one: Detection, scene: Scene) -> bool:
-    """Return True if its center is in the box of another object."""
+    """Return True if the center of the detection is in the box of another object."""
     x, y = one.center_px
     others = [*scene.others, *(truth.box for truth in scene.truths if truth.label != "ball")]
     return any(box[0] <= x <= box[2] and box[1] <= y <= box[3] for box in others)
@@ -89,23 +89,23 @@ class DetectorFigures:
     frames: int
     balls: int
     hits: float
-    """Of the frames with a ball."""
+    """Share of the frames with a ball."""
     missed: float
-    """Of the frames with a ball: those without any answer."""
+    """Share of the frames with a ball that have no answer."""
     wrong_object: float
-    """Of all frames: those whose answer is another object."""
+    """Share of all frames whose answer is another object."""
     false_alarms: float
-    """Of the frames without a ball: those with any answer at all."""
+    """Share of the frames without a ball that have any answer."""
     centre_p50_px: float | None
-    """Of hits on balls that are wholly in view."""
+    """Of hits on fully visible balls."""
     centre_p95_px: float | None
     compute_p50_us: float | None
     nowhere: float
-    """Of the frames with a ball: those whose answer is neither on it nor on another object."""
+    """Share of the frames with a ball whose answer is neither on it nor on another object."""
 
 
 def figures(frames: Sequence[FrameResult]) -> DetectorFigures:
-    """Count them."""
+    """Compute the figures of many frames."""
     balls = [one for one in frames if one.has_ball]
     empty = [one for one in frames if not one.has_ball]
     off = [one.off_px for one in balls if one.off_px is not None]
@@ -130,13 +130,13 @@ def _quantile(values: Sequence[float], share: float) -> float | None:
 
 @dataclass
 class LabelMatches:
-    """One label over many frames: how many there are, and every detection of it with whether it was right."""
+    """One label over many frames: number of objects, and every detection, marked right or wrong."""
 
     objects: int = 0
     marks: list[tuple[float, bool]] = field(default_factory=list)
 
     def add(self, label: str, detections: Sequence[Detection], scene: Scene) -> None:
-        """One frame: each object is found once, by the surest; what lies on something unclear does not count."""
+        """Add one frame. The surest detection counts once per object; one on an unclear object does not count."""
         left = [one.box for one in scene.truths if one.label == label]
         self.objects += len(left)
         for one in sorted((one for one in detections if one.label == label), key=lambda one: -one.score):
@@ -154,7 +154,7 @@ class LabelMatches:
         self.marks += more.marks
 
     def average_precision(self) -> float | None:
-        """AP50: the area under precision by recall, precision never rising again; None without objects."""
+        """Return AP50, the area under the non-increasing precision over recall; None without objects."""
         if not self.objects:
             return None
         right, points = 0, []

@@ -1,4 +1,4 @@
-"""The figures of a run from world truth, and their checks against the scenario's bounds. Pure."""
+"""Compute the figures of a run from world truth, and check them against the scenario's bounds. Pure."""
 
 import math
 from bisect import bisect_right
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 ACQUIRED_WITHIN_M = 0.05
 ACQUIRED_FOR_S = 1.0
-"""So long without a break the target must be within both: a target that only passes through is not acquired."""
+"""Time for which the target must be within both limits. A target that only passes through is not acquired."""
 FOUND_WITHIN_DEG = 10.0
 
 WRONG_BY_M = 0.3
-"""A target that the mission reports further than this from the true one is another object."""
+"""A reported target further than this from the true one is another object."""
 
 
 class AnsweredFrame(NamedTuple):
@@ -41,7 +41,7 @@ class AnsweredFrame(NamedTuple):
 
 
 class RimSpeeds(NamedTuple):
-    """Speeds of the wheels at the rim, which the robot commanded from `t_us` until the next command."""
+    """Rim speeds of the wheels that the robot commanded from `t_us` until the next command."""
 
     t_us: int
     left_mps: float
@@ -62,10 +62,10 @@ class RunRecord:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """One run. From the acquisition to the end, coasting included; None where it was never acquired."""
+    """The score of one run, from acquisition to the end, coasting included; None if never acquired."""
 
     acquired_s: float | None
-    """Begin of the first second, after the first accepted twist, in which the target stayed in view within
+    """Start of the first second, after the first accepted twist, in which the target stayed in view within
     `acquired_within_deg` and 0.05 m. It counts from the first sample."""
     found_s: float | None
     """When the target was first in view within 10 degrees."""
@@ -76,7 +76,7 @@ class Score:
     wall_contacts: int
     """Physics steps in contact with a wall or another thing in the way, over the whole run."""
     travelled_m: float
-    """Way of the axle's midpoint, over the whole run."""
+    """Distance that the axle's midpoint moved over the whole run."""
     seconds: float
     unseen_percent: float = 0.0
     """Share of the whole run in which the target was out of view."""
@@ -86,14 +86,14 @@ class Score:
     """The other figures of this scenario; see `figures_of`."""
 
     def figure(self, name: str) -> float | None:
-        """One figure by its name, whichever kind it is."""
+        """Return one figure by its name, of either kind."""
         own = name.removeprefix(AT_LEAST)
         value: float | None = self.figures[name] if name in self.figures else getattr(self, own, None)
         return value
 
 
 def score(scenario: Scenario, run: RunRecord) -> Score:
-    """Score a run of `scenario` by its evenly spaced samples. Raises ValueError for none at all."""
+    """Score a run of `scenario` by its evenly spaced samples. Raises ValueError without samples."""
     samples = run.samples
     if not samples:
         raise ValueError("a run without samples has no score")
@@ -145,7 +145,7 @@ def _rms(values: Sequence[float]) -> float | None:
 
 
 def median_and_worst(results: Sequence[Score], name: str) -> tuple[float | None, float | None]:
-    """Median and worst of one figure over runs; None where a run has none, for then it is worst of all."""
+    """Return median and worst of a figure over runs. None if a run has none, which is worst of all."""
     values = [result.figure(name) for result in results]
     numbers = [value for value in values if value is not None]
     worst = min if name.startswith(AT_LEAST) else max
@@ -153,9 +153,9 @@ def median_and_worst(results: Sequence[Score], name: str) -> tuple[float | None,
     return (median(numbers) if numbers else None), whole
 
 
-# The figures of scenarios that are more than following one ball: legs, waypoints, traffic lights. Pure.
+# Figures of scenarios with more than one ball to follow: legs, waypoints, traffic lights. Pure.
 #
-# From world truth alone, except for the wheel commands and the reports of a mission: an unreachable waypoint, and the
+# From world truth alone, except for the wheel commands and two reports of a mission: an unreachable waypoint, and the
 # color of the light.
 
 
@@ -163,16 +163,16 @@ Figures = dict[str, float | None]
 STEP_S = 0.004
 """A physics step: contacts are counted in these."""
 REACHED_WITHIN_M = 0.06
-"""The mission's 0.05 and what odometry may be off by then."""
+"""The mission's 0.05 and the possible error of odometry."""
 STANDING_MPS = 0.02
 WAITS_WITHIN_M = 0.5
-"""A robot that stands no further than this before the line waits for the light."""
+"""A robot that stands within this distance before the line waits for the light."""
 HARDEST_MPS2, ANSWER_S = 1.2, 0.25
-"""What counts as being able to stop when the light turns yellow: this braking, after this time to see it and answer."""
+"""The robot can stop at yellow with this braking, after this time to detect and answer."""
 READ_WITHIN_M = 2.0
-"""So near before the line every picture must be read."""
+"""Distance before the line within which every image must be read."""
 SETTLED_S = 0.35
-"""After a change of colour: a frame's way there and back, and a second look."""
+"""After a change of color: round trip of a frame, and a second look."""
 
 
 def figures_of(scenario: Scenario, run: RunRecord, followed: Sequence[Truth]) -> Figures:
@@ -195,7 +195,7 @@ def figures_of(scenario: Scenario, run: RunRecord, followed: Sequence[Truth]) ->
 
 
 def commanded_m(wheels: Sequence[RimSpeeds], begin_us: int, end_us: int) -> float:
-    """Return the way that the commands alone would roll the faster wheel, whatever pushes the robot."""
+    """Return the distance that the commands alone would roll the faster wheel, regardless of pushes."""
     ends_us = [*(command.t_us for command in wheels[1:]), end_us]
     return sum(
         max(abs(command.left_mps), abs(command.right_mps)) * max(0, until_us - max(command.t_us, begin_us)) / 1e6
@@ -272,7 +272,7 @@ def _around_deg(samples: Sequence[Truth], goal_m: tuple[float, float]) -> float:
 
 
 def _most_aside_m(scenario: Scenario, samples: Sequence[Truth]) -> float:
-    """Return the largest distance from the middle of the lane, which runs from the start to the target."""
+    """Return the largest distance from the center of the lane, which runs from the start to the target."""
     (x_m, y_m), first = scenario.start.at_m or (0.0, 0.0), samples[0]
     along_rad = math.atan2(first.target_y_m - y_m, first.target_x_m - x_m)
     cos, sin = math.cos(along_rad), math.sin(along_rad)
@@ -280,7 +280,7 @@ def _most_aside_m(scenario: Scenario, samples: Sequence[Truth]) -> float:
 
 
 def light_figures(samples: Sequence[Truth], answers: Sequence[AnsweredFrame]) -> Figures:
-    """Crossings of the stop line and what the light showed, how soon it starts, and how often it misread the light."""
+    """Return the stop line crossings by light, the start delay, and how often the light was misread."""
     crossings = list(_crossings(samples))
     starts = list(_starts(samples))
     return {
@@ -356,26 +356,26 @@ BOUNDS_UP_TO_MS = 200
 STANDS_STILL_FROM_MS = SafetyConfig().zero_speed_age_ms
 """Added latency from which every frame is too old. The robot must stand still, and the score checks it."""
 _STANDS_STILL = {"commanded_m": 0.05, "wall_contacts": 0.0}
-"""Then the wheel commands are checked. A target that pushes a standing robot is not its doing."""
+"""Bounds of the wheel commands. A target may push a standing robot."""
 EXACT = tuple(name for name, figure in FIGURES.items() if figure.is_exact)
-"""Figures that leave no room."""
+"""Figures without a margin."""
 
 
 def bounds_of(scenario: Scenario, latency_ms: float = 0.0) -> Mapping[str, float]:
-    """Return the bounds of `scenario` with that latency; none if it is not evaluated."""
+    """Return the bounds of `scenario` with that latency; empty if it is not evaluated."""
     if latency_ms <= BOUNDS_UP_TO_MS:
         return scenario.bounds
     return _STANDS_STILL if scenario.bounds and latency_ms >= STANDS_STILL_FROM_MS else {}
 
 
 def checks_of(scenario: Scenario, result: Score, latency_ms: float = 0.0, factor: float = 1.0) -> list[Check]:
-    """Hold `result` against the bounds of `scenario`, each times `factor` but for those that leave no room."""
+    """Check `result` against the bounds of `scenario`, each times `factor` unless it is exact."""
     bounds = bounds_of(scenario, latency_ms)
     return [_check(name, result, granted(name, bound, factor)) for name, bound in bounds.items()]
 
 
 def granted(name: str, bound: float, factor: float) -> float:
-    """Return `bound` with that much room; a figure that leaves no room gets none."""
+    """Return `bound` times `factor`; unchanged for an exact figure."""
     if FIGURES[name].is_exact:
         return bound
     return bound / factor if name.startswith(AT_LEAST) else bound * factor
@@ -387,12 +387,12 @@ def _check(name: str, result: Score, bound: float) -> Check:
 
 
 def is_within(name: str, value: float | None, bound: float) -> bool:
-    """Return True if a figure keeps its bound. One without a value does not."""
+    """Return True if a figure is within its bound. A missing value is not."""
     return value is not None and (value >= bound if name.startswith(AT_LEAST) else value <= bound)
 
 
 def broken(scenario: Scenario, so_far: Score, seconds: float) -> list[str]:
-    """Return the bounds that a run of `seconds` has broken already, whatever happens in the rest of it."""
+    """Return the bounds that a run of `seconds` has already broken for good."""
     return [name for name, bound in scenario.bounds.items() if _is_beyond_repair(name, bound, so_far, seconds)]
 
 
@@ -405,6 +405,6 @@ def _is_beyond_repair(name: str, bound: float, so_far: Score, seconds: float) ->
     if course in ("rms", "share"):
         begin_s = so_far.acquired_s or 0.0
         share = min(1.0, (so_far.seconds - begin_s) / max(seconds - begin_s, 1e-9))
-        # The best rest of the run has no error at all.
+        # The best possible rest of the run has no error at all.
         value *= share if course == "share" else math.sqrt(share)
     return not is_within(name, value, bound)

@@ -1,7 +1,7 @@
-"""Puts a ray-cast ball into a photograph, to score detectors. Pure.
+"""Render a ray-cast ball into a photograph, to score detectors. Pure.
 
-Camera frame: x right, y down, z forward. Light is computed in linear values, 0 to 1. Written for scores only, never
-for training: it shares no code with what makes training images.
+Camera frame: x right, y down, z forward. Light is computed in linear values, 0 to 1. For scores only: it
+shares no code with the generator of training images.
 """
 
 from collections.abc import Callable
@@ -17,10 +17,10 @@ Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
 WIDTH, HEIGHT = 320, 240
-"""Size of a picture, px."""
+"""Size of an image, px."""
 MIN_RADIUS_PX, MAX_RADIUS_PX = 5.0, 45.0
 COVERED_SHARE = 0.15
-"""Share of the balls that something partly covers."""
+"""Share of the balls that are partly covered."""
 _FOCAL_PX = 280.0
 _FINE = 4
 """Rays per pixel and axis."""
@@ -32,7 +32,7 @@ __all__ = ["KINDS", "PhotoBall", "photo_with_ball", "photo_without_ball"]
 
 @dataclass(frozen=True, slots=True)
 class PhotoBall:
-    """A picture with one ball."""
+    """An image with one ball."""
 
     rgb: Bytes
     """(240, 320, 3)."""
@@ -41,12 +41,12 @@ class PhotoBall:
     kind: str
     radius_px: float
     seen: float
-    """Share of the ball's disk that is not covered."""
+    """Visible share of the ball's disk."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Pose:
-    """The place of the ball: image position and radius in px; center and radius in units of its depth; up."""
+    """Place of the ball: image position and radius in px; center and radius in units of its depth; up direction."""
 
     u: float
     v: float
@@ -58,7 +58,7 @@ class _Pose:
 
 @dataclass(frozen=True, slots=True)
 class _Light:
-    """Direction to the light, linear RGB of it, of the sky (the surroundings above) and of the floor."""
+    """Direction to the light, and linear RGB of the light, of the sky (the surroundings above) and of the floor."""
 
     toward: Floats
     sun: Floats
@@ -68,7 +68,7 @@ class _Light:
 
 @dataclass(frozen=True, slots=True)
 class _Patch:
-    """The rendered ball in a part of the picture: its origin (x, y) px, linear RGB times alpha, alpha, and cover."""
+    """The rendered ball in a part of the image: its origin (x, y) px, linear RGB times alpha, alpha, and cover."""
 
     x: int
     y: int
@@ -80,7 +80,7 @@ class _Patch:
 
 
 def photo_with_ball(photo: Bytes, kind: str, seed: int) -> PhotoBall:
-    """Put a ball of `kind` into a window of `photo`, (height, width, 3) RGB. The same arguments give the same picture.
+    """Put a ball of `kind` into a window of `photo`, (height, width, 3) RGB. The same arguments give the same image.
 
     Raises ValueError for an unknown kind.
     """
@@ -93,7 +93,7 @@ def photo_with_ball(photo: Bytes, kind: str, seed: int) -> PhotoBall:
     shaded = linear * _shadow(pose, light, rng)[..., None]
     pasted, alpha = _paste(shaded, linear, patch, _softness(window), rng)
     noise = rng.normal(0, _noise_level(window), pasted.shape).astype(np.float32)
-    # Where nothing changed, the photograph's own values stay, unrounded by the way to linear light and back.
+    # Unchanged pixels keep the values of the photograph, without rounding by the conversion to linear light.
     same = (alpha < 1e-3) & (np.abs(pasted - linear).max(axis=2) < 1e-3)
     rgb = np.where(same[..., None], window.astype(np.float32), _encode(pasted) + noise * alpha[..., None])
     return PhotoBall(finish(rgb), patch.box, kind, pose.radius_px, patch.seen)
@@ -106,11 +106,11 @@ def photo_without_ball(photo: Bytes, seed: int) -> Bytes:
 
 
 def _view(photo: Bytes, seed: int) -> tuple[Bytes, Callable[[Floats], Bytes]]:
-    """Cut the window, and return it with the function that applies gain and white balance to the finished picture."""
+    """Cut the window, and return it with the function that applies gain and white balance to the finished image."""
     rng = np.random.default_rng([seed, 0])
     tall, wide = photo.shape[:2]
     largest = min(tall / 3, wide / 4)
-    # At least half of the photograph's area, as far as its shape permits.
+    # At least half of the area of the photograph, as far as its shape permits.
     smallest = min(largest, (tall * wide / 24) ** 0.5)
     unit = rng.uniform(smallest, largest)
     height, width = int(3 * unit), int(4 * unit)
@@ -129,17 +129,17 @@ def _floats(values: ArrayLike) -> Floats:
 
 
 def _decode(rgb: Bytes) -> Floats:
-    """8-bit values to linear ones."""
+    """Convert 8-bit values to linear ones."""
     return _floats((rgb.astype(np.float32) / 255) ** np.float32(_GAMMA))
 
 
 def _encode(linear: Floats) -> Floats:
-    """Linear values to 0..255; what is too bright saturates."""
+    """Convert linear values to 0..255. Bright values saturate."""
     return _floats(np.clip(linear, 0, 1) ** np.float32(1 / _GAMMA) * 255)
 
 
 def _place(linear: Floats, rng: np.random.Generator) -> _Pose:
-    """Choose radius and place: larger when lower, and of three places the one with the smoothest ground."""
+    """Choose radius and place: larger when lower, and the smoothest ground of three places."""
     radius = float(np.exp(rng.uniform(np.log(MIN_RADIUS_PX), np.log(MAX_RADIUS_PX))))
     size = np.log(radius / MIN_RADIUS_PX) / np.log(MAX_RADIUS_PX / MIN_RADIUS_PX)
     lowest = HEIGHT - radius - 4
@@ -153,13 +153,13 @@ def _place(linear: Floats, rng: np.random.Generator) -> _Pose:
     _, u, v = min(spots)
     pitch = np.radians(rng.uniform(12, 30))
     center = np.array([(u - WIDTH / 2) / _FOCAL_PX, (v - HEIGHT / 2) / _FOCAL_PX, 1], np.float32)
-    # A ball off the axis looks larger (an ellipse): this keeps the area of its disk.
+    # A ball off the axis looks larger (an ellipse). This keeps the area of its disk.
     depth = radius / _FOCAL_PX / float(np.linalg.norm(center)) ** 0.5
     return _Pose(u, v, radius, center, depth, np.array([0, -np.cos(pitch), -np.sin(pitch)], np.float32))
 
 
 def _estimate_light(linear: Floats, pose: _Pose, rng: np.random.Generator) -> _Light:
-    """Estimate the light at the ball from what surrounds it."""
+    """Estimate the light at the ball from its surroundings."""
     reach = max(8.0, pose.radius_px)
     smooth = _floats(cv2.GaussianBlur(linear, (0, 0), reach))
     row, column = int(pose.v), int(pose.u)
@@ -177,7 +177,7 @@ def _estimate_light(linear: Floats, pose: _Pose, rng: np.random.Generator) -> _L
 
 
 def _tint(rgb: Floats, share: float) -> Floats:
-    """The color of `rgb` at luminance 1, mixed with gray."""
+    """Return the color of `rgb` at luminance 1, mixed with gray."""
     return _floats(share * np.clip(rgb / max(1e-3, float(rgb @ _LUMA)), 0.4, 1.8) + 1 - share)
 
 
@@ -186,13 +186,13 @@ def _unit(vectors: Floats) -> Floats:
 
 
 def _rays(x: Floats, y: Floats) -> Floats:
-    """Unit directions through image points, px; shape of x by y, and 3."""
+    """Return unit directions through image points, px; shape of x by y, and 3."""
     grid_x, grid_y = np.meshgrid((x - WIDTH / 2) / _FOCAL_PX, (y - HEIGHT / 2) / _FOCAL_PX)
     return _unit(np.stack([grid_x, grid_y, np.ones_like(grid_x)], axis=-1).astype(np.float32))
 
 
 def _shadow(pose: _Pose, light: _Light, rng: np.random.Generator) -> Floats:
-    """The factor, (240, 320), by which the ball darkens the floor: the light it covers, and the sky it covers."""
+    """Return the factor, (240, 320), by which the ball darkens the floor: blocked light and blocked sky."""
     rays = _rays(np.arange(WIDTH) + np.float32(0.5), np.arange(HEIGHT) + np.float32(0.5))
     contact = pose.center - pose.radius * pose.up
     downward = rays @ pose.up
@@ -238,12 +238,12 @@ def _render(pose: _Pose, light: _Light, ball: BallSurface, rng: np.random.Genera
 
 
 def _shade(normals: Floats, to_camera: Floats, ball: BallSurface, light: _Light, up: Floats) -> Floats:
-    """Linear RGB, (n, 3), of points with these normals: Lambert, sky and floor, highlight and reflection."""
+    """Return linear RGB, (n, 3), of points with these normals: Lambert, sky and floor, highlight and reflection."""
     albedo, bumpy = ball.at(normals)
     toward_light = bumpy @ light.toward
     diffuse = np.clip((toward_light + ball.wrap) / (1 + ball.wrap), 0, 1)[:, None]
     above = (0.5 + 0.5 * (bumpy @ up))[:, None]
-    # Near the floor the ball sees only the shadow below it.
+    # Near the floor the ball sees only its own shadow.
     dim = 1 - 0.6 * np.clip(-(normals @ up), 0, 1)[:, None] ** 1.5
     ambient = (light.sky * above + light.floor * (1 - above)) * dim
     facing = np.clip((bumpy * to_camera).sum(axis=1), 0, 1)
@@ -261,7 +261,7 @@ def _shade(normals: Floats, to_camera: Floats, ball: BallSurface, light: _Light,
 def _cover(
     disk: NDArray[np.bool_], x: Floats, y: Floats, pose: _Pose, rng: np.random.Generator
 ) -> tuple[NDArray[np.bool_], float]:
-    """Choose the rays that something in front of the ball stops, most often none; and the share of the disk left."""
+    """Choose the rays that an occluder blocks, most often none. Returns them and the visible share of the disk."""
     angle = rng.choice([np.pi / 2, np.pi / 2, 0, np.pi]) + rng.normal(0, 0.12)
     share = rng.uniform(0.6, 0.95)
     if rng.random() >= COVERED_SHARE:
@@ -277,14 +277,14 @@ def _cover(
 def _paste(
     shaded: Floats, plain: Floats, patch: _Patch, softness: float, rng: np.random.Generator
 ) -> tuple[Floats, Floats]:
-    """Put the ball and what covers it into the picture; return that, linear, and the ball's visible alpha."""
+    """Blend ball and occluder into the image. Returns it, linear, and the visible alpha of the ball."""
     tall, wide = patch.alpha.shape
     rgb, alpha, cover = np.zeros_like(shaded), np.zeros_like(shaded[..., 0]), np.zeros_like(shaded[..., 0])
     area = (slice(patch.y, patch.y + tall), slice(patch.x, patch.x + wide))
     rgb[area], alpha[area], cover[area] = patch.rgb, patch.alpha, patch.cover
     rgb, alpha, cover = (_floats(cv2.GaussianBlur(one, (0, 0), softness)) for one in (rgb, alpha, cover))
     with_ball = shaded * (1 - alpha[..., None]) + rgb
-    # The cover shows what is beside the ball.
+    # The occluder shows the surroundings of the ball.
     step = wide if patch.x + wide / 2 < WIDTH / 2 else -wide
     step = int(step * rng.uniform(0.8, 1.1))
     beside = np.roll(plain, -step, axis=1)
@@ -292,16 +292,16 @@ def _paste(
 
 
 def _edges(window: Bytes) -> Floats:
-    """Size of the second derivative of the gray window, levels."""
+    """Return the absolute second derivative of the gray window, levels."""
     gray = cv2.cvtColor(window, cv2.COLOR_RGB2GRAY).astype(np.float32)
     return _floats(np.abs(cv2.filter2D(gray, -1, _floats([[1, -2, 1], [-2, 4, -2], [1, -2, 1]]))))
 
 
 def _softness(window: Bytes) -> float:
-    """Blur, sigma in px, with which a ball is as sharp as the photograph."""
+    """Return the blur, sigma in px, that makes a ball as sharp as the photograph."""
     return float(np.interp(np.quantile(_edges(window), 0.98), [15, 100], [0.8, 0.3]))
 
 
 def _noise_level(window: Bytes) -> float:
-    """The photograph's noise, sigma in levels, within what cameras have."""
+    """Return the noise of the photograph, sigma in levels, limited to that of cameras."""
     return float(np.clip(np.median(_edges(window)) / 0.6745 / 6, 1, 4))

@@ -1,6 +1,6 @@
-"""Detectors on photographs: a ball of each kind in turn, then each photograph without one. Shell (runs detectors).
+"""Scores detectors on photographs: with a ball of each kind, then without one. Shell (runs detectors).
 
-The balls are ray-cast by `photo_balls.py`, of which training has nothing.
+`photo_balls.py` renders the balls. Training shares no code with it.
 """
 
 import math
@@ -23,23 +23,23 @@ from sightline.vision_side.detect.port import Detection, DetectionResult
 
 QUALITY: Final = 85
 SMALL_PX: Final = 12.0
-"""Balls of a smaller radius have a column of their own."""
+"""Balls of a smaller radius have a separate column."""
 COLORS: Final = {
     "yellow": (38, 66, 0.5), "tennis": (50, 85, 0.35), "orange": (10, 36, 0.5), "blue": (195, 250, 0.4),
     "green": (85, 165, 0.35), "red": (340, 15, 0.5),
 }
-"""Hue from and to, degrees, and the least saturation, as a user would set them for a ball of that kind."""
+"""Hue limits, degrees, and smallest saturation, as a user would set them for a ball of that kind."""
 _OFF_PX: Final = 20.0
 _OF_EMPTY: Final = 500_000
 _SEEDS: Final = 1_000_003
-"""Between the first pictures of two seeds."""
+"""Distance between the first images of two seeds."""
 
 Outcome = Literal["hit", "wrong", "missed"]
 
 
 @dataclass(frozen=True, slots=True)
 class PhotoPicture:
-    """One JPEG, and the ball in it."""
+    """One JPEG and its ball."""
 
     number: int
     kind: str
@@ -50,7 +50,7 @@ class PhotoPicture:
 
 @dataclass(slots=True)
 class BallTally:
-    """Number of balls, and of those found, taken for something elsewhere, and missed."""
+    """Number of balls, by outcome: found, wrong object, missed."""
 
     balls: int = 0
     hit: int = 0
@@ -58,7 +58,7 @@ class BallTally:
     missed: int = 0
 
     def add(self, outcome: Outcome) -> None:
-        """Count one picture."""
+        """Count one image."""
         self.balls += 1
         setattr(self, outcome, getattr(self, outcome) + 1)
 
@@ -70,18 +70,18 @@ class PhotoFigures:
     kinds: dict[str, BallTally]
     small: BallTally
     large: BallTally
-    """From `SMALL_PX` up."""
+    """Balls of a radius of `SMALL_PX` or more."""
     empty: int = 0
     false_alarms: int = 0
     """Photographs without a ball, and those of them with a detection."""
     unanswered: int = 0
-    """Pictures without an answer, which count as missed."""
+    """Images without an answer, which count as missed."""
     why: str = ""
-    """The cause of the first one."""
+    """Cause of the first missing answer."""
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The share of false alarms with a probability of 95 %, low and high, 0..1."""
+        """Return the 95 % interval of the share of false alarms, low and high, 0..1."""
         return wilson(self.false_alarms, self.empty)
 
 
@@ -91,21 +91,21 @@ class PhotoReport:
 
     photographs: int
     each: int
-    """Pictures of each kind."""
+    """Images of each kind."""
     seed: int
     tracked: bool
-    """True if each detector knew where a track would expect the ball."""
+    """True if each detector received the place where a track would expect the ball."""
     figures: dict[str, PhotoFigures]
     column: str = ""
-    """Name of the column whose camera took the pictures, or empty."""
+    """Name of the column whose camera took the images, or empty."""
 
     def to_dict(self) -> dict[str, Any]:
-        """For --json."""
+        """Return the object for `--json`."""
         return {**asdict(self), "false_alarm_interval": {name: one.interval for name, one in self.figures.items()}}
 
 
 def wilson(count: int, total: int) -> tuple[float, float]:
-    """95 % interval of a share (Wilson, Probable Inference, 1927)."""
+    """Return the 95 % interval of a share (Wilson, Probable Inference, 1927)."""
     if not total:
         return 0.0, 1.0
     z, share = 1.96, count / total
@@ -116,7 +116,7 @@ def wilson(count: int, total: int) -> tuple[float, float]:
 
 def photo_pictures(photographs: Sequence[Photograph], each: int, seed: int,
                    kinds: Sequence[str] = KINDS, column: Column | None = None) -> Iterator[PhotoPicture]:
-    """Render `each` pictures of every kind, over the photographs in turn, then each photograph without a ball.
+    """Render `each` images of every kind, over the photographs in turn, then each photograph without a ball.
 
     All are taken with the camera of `column`, if there is one.
     """
@@ -142,7 +142,7 @@ def _jpeg(rgb: Any, number: int, column: Column | None) -> bytes:
 def score_photos(tested: Sequence[Subject], photographs: Sequence[Photograph], each: int, seed: int, *, looks: int = 1,
                  tracked: bool = False, kinds: Sequence[str] = KINDS, column: Column | None = None,
                  advance: Callable[[], None] = lambda: None) -> PhotoReport:
-    """Show every picture to every detector, `looks` times in a row; with `tracked`, as if a track expected the ball."""
+    """Score every image with every detector, `looks` times in a row; `tracked`: as if a track expected the ball."""
     decoder = Decoder(WIDTH_PX, HEIGHT_PX, WIDTH_PX * HEIGHT_PX)
     found = {one.name: PhotoFigures({kind: BallTally() for kind in kinds}, BallTally(), BallTally()) for one in tested}
     for picture in photo_pictures(photographs, each, seed, kinds, column):
@@ -158,7 +158,7 @@ def score_photos(tested: Sequence[Subject], photographs: Sequence[Photograph], e
 
 
 def _expected(picture: PhotoPicture) -> tuple[float, float]:
-    """Return the ball's place, off by up to `_OFF_PX` each way; a random place in a picture without a ball."""
+    """Return the ball's place with an error of up to `_OFF_PX`; a random place in an image without a ball."""
     draw = np.random.default_rng([picture.number, 19])
     if picture.ball is None:
         return draw.uniform(0, WIDTH_PX), draw.uniform(0, HEIGHT_PX)
@@ -186,7 +186,7 @@ def _count(figures: PhotoFigures, picture: PhotoPicture, best: Detection | None)
 
 
 def photo_lines(report: PhotoReport) -> list[str]:
-    """For a terminal and, indented, for a page."""
+    """Format the table for a terminal, or indented for a page."""
     rows: list[tuple[str, ...]] = [("balls", "detector", "pictures", "hits", "wrong", "missed")]
     for kind in (*KINDS, "small", "large"):
         for name, figures in report.figures.items():
@@ -208,7 +208,7 @@ def color_setting(kind: str) -> str:
 
 
 def colored_lines(reports: Mapping[str, PhotoReport]) -> list[str]:
-    """The same for one report for each kind, of detectors that were given its color."""
+    """Return the same lines for one report per kind, of detectors that received its color."""
     rows: list[tuple[str, ...]] = [("balls", "detector", "pictures", "hits", "wrong", "missed", "false alarms")]
     for kind, report in reports.items():
         for name, one in report.figures.items():
@@ -219,7 +219,7 @@ def colored_lines(reports: Mapping[str, PhotoReport]) -> list[str]:
 
 
 def _aligned(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """Return one line for each row, with the cells of a column below one another."""
+    """Return one line for each row, with aligned columns."""
     widths = [max(len(row[place]) for row in rows) for place in range(len(rows[0]))]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 

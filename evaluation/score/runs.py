@@ -1,6 +1,6 @@
 """`sightline score`: many lockstep runs, scored and compared with their bounds. Shell (processes, a terminal).
 
-Each run is a process's own, so that they share the machine's cores; a run itself repeats bit for bit.
+Each run is in a separate process, so that they use all cores. A run repeats bit for bit.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -32,12 +32,12 @@ Result = TypeVar("Result")
 BOUNDS_UP_TO_LOSS: Final = 0.1
 """Loss on each leg up to which the bounds of the scenarios apply."""
 MOST_NOTICES: Final = 3
-"""Of each group: later ones repeat the first with higher counts."""
+"""Of each group; later ones repeat the first with higher counts."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScoreCase:
-    """One run to make. `seconds` None is the scenario's own length."""
+    """One run to score. `seconds` None: the length of the scenario."""
 
     scenario: str
     latency_ms: float
@@ -45,7 +45,7 @@ class ScoreCase:
     seed: int
     seconds: float | None
     mission: str | None = None
-    """In place of the scenario's own, as the robot, the look and the detector are."""
+    """Mission in place of the scenario's, as are the robot, the look and the detector."""
     robot: str | None = None
     look: str | None = None
     detector: str | None = None
@@ -74,7 +74,7 @@ class ScoredFigure:
 
 @dataclass(frozen=True, slots=True)
 class ScoreReport:
-    """All runs, and what was demanded of them."""
+    """All runs and their checks."""
 
     runs: list[tuple[ScoreCase, Score]]
     scored: list[ScoredFigure]
@@ -91,7 +91,7 @@ class ScoreReport:
         return None if self.unevaluated else True
 
     def to_dict(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return the object for `--json`."""
         return {
             "ok": self.ok,
             "checks": [
@@ -110,7 +110,7 @@ def cases(
     seconds: float | None, *, mission: str | None = None, robot: str | None = None, look: str | None = None,
     detector: str | None = None,
 ) -> list[ScoreCase]:
-    """Every combination once, those of one group together. Raises ConfigError for an invalid name or number."""
+    """Return every combination once, grouped. Raises ConfigError for an invalid name or number."""
     if mission is not None:
         REGISTRY.load(mission)
     for name in scenarios:
@@ -137,7 +137,7 @@ def cases(
 
 
 def run_case(case: ScoreCase) -> tuple[Score, list[str]]:
-    """One run in lockstep, scored, and the detector's news."""
+    """Run one case in lockstep. Returns its score and the notices of the detector."""
     scenario, run = run_of(case)
     return score(scenario, run), run.news
 
@@ -158,7 +158,7 @@ def run_of(case: ScoreCase, is_over: Callable[[Run], bool] = lambda _run: False)
 
 
 def run_cases(wanted: Sequence[ScoreCase], jobs: int, on_done: Callable[[ScoreCase], None]) -> ScoreReport:
-    """Run `wanted` on `jobs` processes, in any order, and score them. `on_done` is called after each."""
+    """Run `wanted` on `jobs` processes, in any order, and score them. Calls `on_done` after each."""
     results = _run_each(run_case, wanted, jobs, on_done)
     runs = [(case, results[case][0]) for case in wanted]
     news: dict[str, list[str]] = {}
@@ -186,7 +186,7 @@ def _run_each(
 
 
 def scored_figures(runs: Sequence[tuple[ScoreCase, Score]]) -> list[ScoredFigure]:
-    """Each group's figures: median, worst, and whether every run of it is within the bound."""
+    """Return the figures of each group: median, worst, and whether every run is within the bound."""
     scored = []
     for name, members in groupby(runs, key=lambda run: run[0].group):
         group = list(members)
@@ -212,9 +212,9 @@ class SabotagedRun:
 
     case: ScoreCase
     broken: tuple[str, ...]
-    """The bounds that it broke, without those that the healthy run breaks too."""
+    """Bounds that it broke and the healthy run does not."""
     seconds: float
-    """When it ended: a bound that is broken for good ends it early."""
+    """Time of its end. A bound that is broken for good ends it early."""
     unchanged: bool = False
 
 
@@ -272,7 +272,7 @@ class SabotageReport:
         return False if False in results else None if None in results else True
 
     def to_dict(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return the object for `--json`."""
         checks = [
             {"name": f"{pair.group}: runs that fail", "value": pair.failed, "unit": "runs",
              "bound": 0 if pair.is_unchanged else len(pair.runs), "ok": pair.ok}
@@ -288,7 +288,7 @@ class SabotageReport:
 
 
 def sabotaged(wanted: Sequence[ScoreCase], names: Sequence[str]) -> list[ScoreCase]:
-    """Return each case with each sabotage, those of one group together; one case if the sabotage changes nothing."""
+    """Return each case with each sabotage, grouped; one case if the sabotage changes nothing."""
     groups = [list(group) for _, group in groupby(wanted, key=lambda case: case.group)]
     return [
         replace(case, sabotage=name) for members in groups for name in names
@@ -297,10 +297,10 @@ def sabotaged(wanted: Sequence[ScoreCase], names: Sequence[str]) -> list[ScoreCa
 
 
 def run_sabotaged(case: ScoreCase) -> SabotagedRun:
-    """Run until a bound is broken for good, or to the end. Compare it with the healthy run, where that may fail too."""
+    """Run until a bound is broken for good, or to the end. Compare with the healthy run if that may fail too."""
     scenario = load_scenario(case.scenario)
     seconds = case.seconds or scenario.seconds
-    is_own = bounds_of(scenario, case.latency_ms) == scenario.bounds  # others apply to the end of the run
+    is_own = bounds_of(scenario, case.latency_ms) == scenario.bounds  # other bounds apply only at the end of the run
 
     def is_over(run: Run) -> bool:
         return is_own and bool(broken(scenario, score(scenario, run), seconds))
@@ -334,7 +334,7 @@ def run_all_sabotaged(
     ])
 
 
-# How `sightline score` shows its results: a table of median and worst. Pure.
+# The output of `sightline score`: a table of median and worst. Pure.
 
 
 def score_text(report: ScoreReport) -> str:
@@ -359,7 +359,7 @@ def _result(report: ScoreReport) -> str:
 
 
 def _unevaluated_lines(results: Sequence[Score]) -> Iterator[str]:
-    """Yield the figures that happened, without bounds."""
+    """Yield the figures of runs without bounds."""
     for name, figure in FIGURES.items():
         median, worst = median_and_worst(results, name)
         if median is not None:

@@ -19,7 +19,7 @@ from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionR
 
 LATE_US = 1_000_000
 """Delay of each answer under `answers-late`."""
-_ASIDE = 0.25  # of the image's width: how far the wrong object is beside the right one
+_ASIDE = 0.25  # of the image's width: offset of the wrong object from the right one
 _TURNED_RAD = 100.0
 
 Detections = tuple[Detection, ...]
@@ -27,7 +27,7 @@ Detections = tuple[Detection, ...]
 
 @dataclass(frozen=True, slots=True)
 class Seams:
-    """The places at which a sabotage replaces something. By default each returns what it receives.
+    """Places at which a sabotage replaces a part. By default each returns its input.
 
     Args:
         wheels: commanded speeds (left, right) to those that the motors receive.
@@ -72,7 +72,7 @@ def _aside(one: Detection, away_px: float) -> Detection:
 
 
 def _wrong_object(found: Detections, size_px: tuple[int, int]) -> Detections:
-    """Return objects that stand beside the real ones."""
+    """Return objects next to the real ones."""
     moved = (clipped(_aside(one, _ASIDE * size_px[0]), *size_px) for one in found)
     return tuple(one for one in moved if one is not None)
 
@@ -148,11 +148,11 @@ def sabotages_named(names: Sequence[str]) -> list[str]:
 
 
 def _likeness(given: str, name: str) -> float:
-    """Return how much a text is like a name or one of its words, 0 to 1."""
+    """Return the similarity of a text to a name or one of its words, 0 to 1."""
     return max(difflib.SequenceMatcher(None, given, part).ratio() for part in (name, *name.split("-")))
 
 
 def reason_of(sabotage: str, scenario: str) -> str | None:
-    """Return the reason why a sabotage changes nothing in a scenario, or None if it must break a bound."""
+    """Return why a sabotage changes nothing in a scenario, or None if it must break a bound."""
     reason, scenarios = UNAFFECTED.get(sabotage, ("", frozenset[str]()))
     return reason if scenario in scenarios else None
