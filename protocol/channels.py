@@ -69,7 +69,7 @@ class Channel:
     """True if the robot forwards the message unchanged to every other peer that wants it."""
     while_watched: bool = False
     """True if a peer publishes it only while a viewer subscribes, which saves the encoding."""
-    said_by: tuple[str, ...] = ()
+    published_by: tuple[str, ...] = ()
     """Sources that may publish it on links with keys. Empty for every source."""
 
     @property
@@ -97,10 +97,10 @@ KNOWN_SOURCES: Final = frozenset(source for sources in SOURCES_OF_ROLE.values() 
 FRAME = Channel("frame", _OUT, FrameHeader, None, JPEG, Priority.DATA, "camera rate, by credit", 1_000_000,
                 "an image, JPEG and nothing else", "no image is captured without credit; a newer message replaces it")
 TWIST = Channel("twist", _IN, AnswerHeader, None, "text/plain", Priority.REAL_TIME, "one per frame answered",
-                MAX_TWIST_BYTES, "`linear|angular` in m/s and rad/s", said_by=DRIVERS)
+                MAX_TWIST_BYTES, "`linear|angular` in m/s and rad/s", published_by=DRIVERS)
 ACK = Channel("ack", _IN, AnswerHeader, None, "application/octet-stream", Priority.REAL_TIME,
               "one per frame seen but not answered by a twist", 0, "returns credit, drives nothing; empty payload",
-              said_by=DRIVERS)
+              published_by=DRIVERS)
 REQUEST = Channel("request", _IN, RequestHeader, Request, _JSON, Priority.REAL_TIME, "on demand", 256,
                   "arm, disarm, stop, reset, acquire, release", "a newer message replaces it; the requester repeats it")
 REPLY = Channel("reply", _OUT, Stamp, Reply, _JSON, Priority.INTERACTIVE_HIGH, "one per request", 1024,
@@ -117,16 +117,16 @@ DETECTIONS = Channel("detections", _IN, DetectionsHeader, Detections, _JSON, Pri
                      passed_on=True)
 MISSION = Channel("mission", _IN, RequestHeader, MissionRequest, _JSON, Priority.INTERACTIVE_HIGH, "on demand",
                   4096, "the requested mission; the robot passes it on", passed_on=True,
-                  said_by=("operator", "teleop"))
+                  published_by=("operator", "teleop"))
 REPORT = Channel("report", _IN, DetectionsHeader, MissionReport, _JSON, Priority.INTERACTIVE_HIGH,
                  "2 Hz, 10 Hz with a target, and on a change", 2048, "the state of the mission; the robot passes it on",
-                 passed_on=True, said_by=("vision",))
+                 passed_on=True, published_by=("vision",))
 OVERLAY = Channel("overlay", _IN, DetectionsHeader, None, JPEG, Priority.DATA_LOW, "15 Hz at most, while watched",
                   250_000, "the image with the detections drawn on it; the robot passes it on",
-                  passed_on=True, while_watched=True, said_by=("vision",))
+                  passed_on=True, while_watched=True, published_by=("vision",))
 PREVIEW = Channel("preview", _IN, DetectionsHeader, None, JPEG, Priority.DATA_LOW, "10 Hz at most, while watched",
                   100_000, "the image at a small size; the robot passes it on", passed_on=True, while_watched=True,
-                  said_by=("vision",))
+                  published_by=("vision",))
 
 CHANNELS: dict[str, Channel] = {
     channel.name: channel

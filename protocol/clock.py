@@ -38,7 +38,7 @@ class _Timeline:
 
     def __init__(self, seq: int, t_us: int, now_us: int) -> None:
         self.offset_us = now_us - t_us
-        self.heard_us = self._begun_us = now_us
+        self.received_us = self._begun_us = now_us
         self._undrifted_us = 0
         """Time without its drift yet: between two messages the drift may be less than 1 us."""
         self._begun_t_us = self._t_us = t_us
@@ -46,19 +46,19 @@ class _Timeline:
 
     def fits(self, seq: int, t_us: int, now_us: int) -> bool:
         """Return True unless a message runs ahead, or goes back further than a link delays."""
-        most = self._seq + _FRAMES_PER_S + (now_us - self.heard_us) * _FRAMES_PER_S // 1_000_000
+        most = self._seq + _FRAMES_PER_S + (now_us - self.received_us) * _FRAMES_PER_S // 1_000_000
         return self._t_us - AHEAD_US <= t_us <= now_us - self.offset_us + AHEAD_US and seq <= most
 
     def extend(self, seq: int, t_us: int, now_us: int) -> None:
-        drift_us, self._undrifted_us = divmod(self._undrifted_us + now_us - self.heard_us, _DRIFT)
+        drift_us, self._undrifted_us = divmod(self._undrifted_us + now_us - self.received_us, _DRIFT)
         self.offset_us = min(self.offset_us + drift_us, now_us - t_us)
-        self.heard_us = now_us
+        self.received_us = now_us
         self._t_us, self._seq = max(self._t_us, t_us), max(self._seq, seq)
 
     @property
     def is_proven(self) -> bool:
         """Return True if time passed in its messages as it passed here."""
-        return min(self.heard_us - self._begun_us, self._t_us - self._begun_t_us) >= _PROVEN_US
+        return min(self.received_us - self._begun_us, self._t_us - self._begun_t_us) >= _PROVEN_US
 
 
 class RobotClock:
@@ -97,7 +97,7 @@ class RobotClock:
         if self._other is None or not self._other.fits(seq, t_us, now_us):
             self._other = _Timeline(seq, t_us, now_us)
         self._other.extend(seq, t_us, now_us)
-        if not self._other.is_proven or now_us - current.heard_us < _PROVEN_US:
+        if not self._other.is_proven or now_us - current.received_us < _PROVEN_US:
             return False
         self._current, self._other = self._other, None
         self.replaced += 1

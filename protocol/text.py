@@ -43,14 +43,14 @@ def parse_twist(data: bytes) -> Twist:
         raise WireError(RejectReason.MALFORMED, f"twist text is {len(data)} bytes, at most {MAX_TWIST_BYTES}")
     match = _TWIST.fullmatch(data)
     if match is None:
-        raise _refuse(data)
+        raise _rejection(data)
     linear, angular = float(match[1]), float(match[2])
     if not (math.isfinite(linear) and math.isfinite(angular)):
         raise WireError(RejectReason.NOT_FINITE, f"twist {data!r} overflows")
     return Twist(linear_mps=linear, angular_rad_s=angular)
 
 
-def _refuse(data: bytes) -> WireError:
+def _rejection(data: bytes) -> WireError:
     fields = data.split(b"|")
     if len(fields) == 2 and any(_NON_FINITE.fullmatch(field) for field in fields):
         return WireError(RejectReason.NOT_FINITE, f"twist {data!r} is not finite")

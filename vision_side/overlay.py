@@ -149,11 +149,11 @@ StyledText = Sequence[tuple[str, Color]]
 
 def _what_it_does(shown: OverlayData) -> StyledText:
     seen, header = shown.seen, shown.header
-    told = [f"{shown.mission}: {seen.phase}" if shown.mission else seen.phase]
-    told += [f"{seen.distance_m:.2f} m"] if seen.distance_m is not None else []
-    told += [f"{math.degrees(seen.bearing_rad):+.1f} deg"] if seen.bearing_rad is not None else []
-    told += [seen.note] if seen.note else []
-    return [(f"frame {header.seq}  age {_age_text(shown)}", TEXT_COLOR), (_GAP.join(told), TEXT_COLOR)]
+    words = [f"{shown.mission}: {seen.phase}" if shown.mission else seen.phase]
+    words += [f"{seen.distance_m:.2f} m"] if seen.distance_m is not None else []
+    words += [f"{math.degrees(seen.bearing_rad):+.1f} deg"] if seen.bearing_rad is not None else []
+    words += [seen.note] if seen.note else []
+    return [(f"frame {header.seq}  age {_age_text(shown)}", TEXT_COLOR), (_GAP.join(words), TEXT_COLOR)]
 
 
 def _age_text(shown: OverlayData) -> str:

@@ -318,7 +318,7 @@ def reads_fragments(bench: Bench) -> None:
 
 
 @SUITE.should("V-SOCK-22", "19.2 Only while watched", real=True)
-def draws_for_nobody(bench: Bench) -> None:
+def draws_without_subscriber(bench: Bench) -> None:
     """To a robot whose hello does not want them it sends no overlay and no preview."""
     with server_of(bench) as server:
         client = met(bench, server)

@@ -146,7 +146,7 @@ def _print_channel(inbox: ChannelInbox, shown: Callable[[Message], str], count: 
 
 
 def _silence_fix(channel: Channel) -> str:
-    if channel.said_by == ("vision",):
+    if channel.published_by == ("vision",):
         return "run `sightline vision` for the robot"
     if channel.name == "scan":
         return "check that the robot has a range sensor"

@@ -51,7 +51,7 @@ class VisionMetrics:
         yield gauge("vision_robots", "robots that it drives", {(): sum(one.drives for one in rows)})
         yield gauge("vision_busy_ratio", "share of the time since the scrape before in which it answered frames; of "
                     "several threads that of the busiest", {(): self._busy_ratio(rows)})
-        yield gauge("vision_hears", "whether frames arrive", each(lambda one: float(one.heard)), "robot")
+        yield gauge("vision_hears", "whether frames arrive", each(lambda one: float(one.receives)), "robot")
         yield gauge("vision_drives", "whether it drives the robot; 0 while it stands by", each(lambda one: one.drives),
                     "robot")
         yield counter("vision_frames_received", "frames that came, also those without an answer",

@@ -191,8 +191,8 @@ def _gather_cited(path: Path, answers: _Answers) -> int:
                 answers.scans[stamp.session, stamp.seq] = message
         elif message.channel is MISSION:
             request = decode(MissionRequest, message.payload, MISSION.max_payload_bytes)
-            asked = RequestId(digest=decode(RequestHeader, message.header).digest, id=request.id)
-            answers.missions.setdefault(asked, request)
+            requested = RequestId(digest=decode(RequestHeader, message.header).digest, id=request.id)
+            answers.missions.setdefault(requested, request)
     return len(scans - set(answers.scans)) + len(missions - set(answers.missions))
 
 

@@ -16,7 +16,7 @@ from typing import Any, Final
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from sightline.protocol import errors as refusals
+from sightline.protocol import errors as rejections
 from sightline.protocol.channels import CHANNELS, key_for
 from sightline.protocol.errors import CLAMPED, RejectReason
 from sightline.protocol.spec import golden
@@ -75,7 +75,7 @@ def channel_table() -> str:
 def reject_reason_table() -> str:
     """Every reason for not obeying and what it means, as a Markdown table."""
     rows = ["| reason | meaning |", "|---|---|"]
-    meanings = dict(re.findall(r'"(\w+)"  # (.*)', inspect.getsource(refusals)))
+    meanings = dict(re.findall(r'"(\w+)"  # (.*)', inspect.getsource(rejections)))
     rows += [f"| `{reason}` | {meanings[reason]} |" for reason in RejectReason]
     rows.append(f"| `{CLAMPED}` | not a rejection: the command was accepted, and reduced to the robot's limits |")
     return "\n".join(rows) + "\n"

@@ -29,7 +29,7 @@ FRAME_HEADER = STAMP | MOVED | {"applied": [0.2, -0.35], "latency_us": 52_000}
 SCAN_HEADER = STAMP | {"angle_min_rad": -3.14, "angle_increment_rad": 0.5, "range_min_m": 0.1, "range_max_m": 8.0}
 ECHO: dict[str, Any] = {"channel": "frame", "session": SESSION, "seq": 41, "t_us": 1_500_000}
 ANSWER: dict[str, Any] = {"v": 1, "source": "vision", "session": PEER, "seq": 7, "echo": ECHO, "compute_us": 2300}
-ASK = {"v": 1, "source": "teleop", "session": PEER, "seq": 0, "echo": ECHO | {"channel": "status"}}
+REQUESTED = {"v": 1, "source": "teleop", "session": PEER, "seq": 0, "echo": ECHO | {"channel": "status"}}
 CAMERA = {"width_px": 640, "height_px": 480, "fx_px": 381.4, "fy_px": 381.4, "cx_px": 320.0, "cy_px": 240.0}
 BOX = {"label": "person", "score": 0.91, "x1_px": 280.0, "y1_px": 120.5, "x2_px": 360.0, "y2_px": 330.0}
 DETECTIONS: dict[str, Any] = {"width_px": 640, "height_px": 480, "boxes": [BOX]}
@@ -97,14 +97,14 @@ USUAL: dict[str, tuple[str, dict[str, Any], dict[str, Any] | bytes]] = {
     "frame": ("", FRAME_HEADER, jpeg(640, 480)),
     "twist": ("vision", ANSWER, b"0.2000|-0.3500"),
     "ack": ("vision", ANSWER, b""),
-    "request": ("teleop", ASK, {"id": 3, "verb": "arm"}),
+    "request": ("teleop", REQUESTED, {"id": 3, "verb": "arm"}),
     "reply": ("", STAMP, REPLY),
     "status": ("", STAMP, {"state": "HOLD", "reason": "armed; no command yet"}),
     "odometry": ("", STAMP, MOVED),
     "scan": ("", SCAN_HEADER, struct.pack("<4f", 0.5, 1.25, float("inf"), 8.0)),
     "camera": ("", STAMP, CAMERA),
     "detections": ("guest", ANSWER | {"source": "guest"}, DETECTIONS),
-    "mission": ("operator", ASK | {"source": "operator"}, MISSION),
+    "mission": ("operator", REQUESTED | {"source": "operator"}, MISSION),
     "report": ("vision", ANSWER, REPORT),
     "overlay": ("vision", ANSWER, jpeg(640, 480)),
     "preview": ("vision", ANSWER, jpeg(320, 240)),
@@ -265,8 +265,8 @@ def payloads() -> list[MessageCase]:
     counted = status | {"refused": {"STALE": 3}, "last_refusal": last}
     stop = {"id": 1, "verb": "stop"}
     return [
-        case("request", "stop_without_echo", "stop needs no echo", header=without(ASK, "echo"), payload=stop),
-        case("request", "with_proof", "of the driver", header=ASK | {"proof": "0f" * 16}),
+        case("request", "stop_without_echo", "stop needs no echo", header=without(REQUESTED, "echo"), payload=stop),
+        case("request", "with_proof", "of the driver", header=REQUESTED | {"proof": "0f" * 16}),
         case("request", "unknown_verb", "verbs are a closed list", MALFORMED, payload={"id": 1, "verb": "dance"}),
         case("request", "verb_upper", "verbs are lower-case", MALFORMED, payload={"id": 1, "verb": "STOP"}),
         case("request", "no_id", "a request has an id", MALFORMED, payload={"verb": "stop"}),
@@ -335,7 +335,7 @@ def missions() -> list[MessageCase]:
     name, most = "mission", {"options": {f"option_{number}": 1 for number in range(16)}}
     return [
         case(name, "name_alone", "what a mission needs is its own default", payload={"id": 1, "name": "follow"}),
-        case(name, "of_teleop", "another role", header=ASK, key="sightline/r1/mission/teleop"),
+        case(name, "of_teleop", "another role", header=REQUESTED, key="sightline/r1/mission/teleop"),
         case(name, "options", "of every kind", payload=MISSION | {"options": {"a": True, "b.c": 0.5, "d": "left"}}),
         case(name, "option_number_1", "a number, not a truth", payload=MISSION | {"options": {"confirm": 1}}),
         case(name, "options_16", "as many as may be", payload=MISSION | most),

@@ -135,8 +135,8 @@ def may_publish(role: str) -> list[str]:
 def may_subscribe(role: str) -> list[str]:
     """List the key expressions, for any robot, to which a certificate of `role` may subscribe."""
     own = Direction.TO_ROBOT if role == ROBOT_ROLE else Direction.FROM_ROBOT
-    heard = [one for one in CHANNELS.values() if one.direction is own or (one.passed_on and role != ROBOT_ROLE)]
-    return [_pattern(channel) for channel in heard]
+    received = [one for one in CHANNELS.values() if one.direction is own or (one.passed_on and role != ROBOT_ROLE)]
+    return [_pattern(channel) for channel in received]
 
 
 def _published(role: str, channel: Channel) -> list[str]:
@@ -144,7 +144,7 @@ def _published(role: str, channel: Channel) -> list[str]:
         return [_pattern(channel)] if channel.direction is Direction.FROM_ROBOT else []
     if channel.direction is Direction.FROM_ROBOT or (channel is REQUEST and role != "operator"):
         return []
-    sources = [source for source in SOURCES_OF_ROLE[role] if not channel.said_by or source in channel.said_by]
+    sources = [source for source in SOURCES_OF_ROLE[role] if not channel.published_by or source in channel.published_by]
     return [f"{KEY_PREFIX}/*/{channel.name}/{source}" for source in sources]
 
 
@@ -154,13 +154,13 @@ def _pattern(channel: Channel) -> str:
 
 def _rules(role: str) -> list[dict[str, Any]]:
     """Return the access rules for a peer of `role`, in both directions."""
-    said, heard = may_publish(role), may_subscribe(role)
+    published, received = may_publish(role), may_subscribe(role)
     # A publisher must learn of subscriptions. Otherwise `has_listener` is False, and it publishes nothing.
-    listeners = sorted({_pattern(CHANNELS[key.split("/")[2]]) for key in said})
+    listeners = sorted({_pattern(CHANNELS[key.split("/")[2]]) for key in published})
     rows = [
-        ("publishes", "ingress", ["put"], said),
-        ("subscribes", "ingress", ["declare_subscriber"], heard),
-        ("receives", "egress", ["put"], heard),
+        ("publishes", "ingress", ["put"], published),
+        ("subscribes", "ingress", ["declare_subscriber"], received),
+        ("receives", "egress", ["put"], received),
         ("is received", "egress", ["declare_subscriber"], listeners),
         *_presence_rows(role),
         *_token_rows(role),

@@ -45,7 +45,7 @@ from sightline.robot_side.driver.supervision import (
     limit_core_dump,
     request_real_time,
 )
-from sightline.robot_side.guardian.core import AT_REST, ENDING, FAILED, LOST, MOVING, REFUSES_US
+from sightline.robot_side.guardian.core import AT_REST, ENDING, FAILED, LOST, MOVING, REJECTS_US
 from sightline.robot_side.guardian.start import GuardianEnd, zero_of
 from sightline.robot_side.guardian.stop_core import DriverReport, pack_report, unpack_ignored, unpack_number
 from sightline.robot_side.pipe import DriverEnd
@@ -253,7 +253,7 @@ class Driver:
         self._commanded_us = 0
         """Time of the last tick for a command."""
         self._speeds_are_set = False
-        self._refuses_since_us = 0
+        self._rejects_since_us = 0
         """Time since which the drive takes no speeds; 0 if it took the last ones."""
         self._scan_layout: tuple[float, ...] = ()
         self._command_acks: list[ipc.CommandAck] = []
@@ -330,8 +330,8 @@ class Driver:
 
     def _heartbeat(self) -> bytes:
         """Return what the guardian must know of the wheels."""
-        refuses = self._refuses_since_us and heartbeat_us() - self._refuses_since_us >= REFUSES_US
-        if refuses and not self._driver_core.at_rest:
+        rejects = self._rejects_since_us and heartbeat_us() - self._rejects_since_us >= REJECTS_US
+        if rejects and not self._driver_core.at_rest:
             return LOST if self._ending_since_us is None else FAILED
         return AT_REST if self._is_at_rest else MOVING
 
@@ -400,11 +400,11 @@ class Driver:
             speeds = self._without_sensors()
         try:
             self._drive.set(*speeds)
-            self._speeds_are_set, self._refuses_since_us = True, 0
+            self._speeds_are_set, self._rejects_since_us = True, 0
             self._driver_core.gate.note_drive(before, is_taken=True)
         except PLUGIN_ERRORS as error:
             self._driver_core.gate.note_drive(before, is_taken=False)
-            self._refuses_since_us = self._refuses_since_us or heartbeat_us()
+            self._rejects_since_us = self._rejects_since_us or heartbeat_us()
             self._fault("drive", error)
 
     def _fault(self, part: str, error: BaseException) -> None:

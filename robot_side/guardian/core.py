@@ -28,7 +28,7 @@ LATE_US: Final = 25_000
 """Silence of a driver that is late, and then the time between two looks; the loop sends a heartbeat within 20 ms."""
 HUNG_US: Final = 200_000
 """Silence in the driver's own time after which it counts as hung."""
-REFUSES_US: Final = 100_000
+REJECTS_US: Final = 100_000
 """Time in which a drive takes no speeds after which turning wheels count as out of control."""
 STARVED_US: Final = 500_000
 """Silence of a driver without a processor after which moving wheels are stopped: zero follows within 700 ms."""

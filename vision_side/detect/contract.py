@@ -82,10 +82,10 @@ def _time_size(make: Make, size: tuple[int, int], frames: int, seed: int) -> Tim
         result = detector.detect([frame], NO_DEADLINE)[0]
         took.append(result.compute_us / 1000 if result else math.nan)
     close_detector(detector)
-    told = sorted(one for one in took[frames // 4 :] if not math.isnan(one))
-    if not told:
+    known = sorted(one for one in took[frames // 4 :] if not math.isnan(one))
+    if not known:
         return Times(*size, math.nan, math.nan)
-    return Times(*size, median(told), told[min(len(told) - 1, round(0.95 * len(told)))])
+    return Times(*size, median(known), known[min(len(known) - 1, round(0.95 * len(known)))])
 
 
 # --- the promises ----------------------------------------------------------------------------------------------------

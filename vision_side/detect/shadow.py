@@ -41,7 +41,7 @@ class Agreement:
     def __init__(self) -> None:
         self.compared = self.differed = 0
         self._window: deque[bool] = deque(maxlen=WINDOW)
-        self._told_us: int | None = None
+        self._reported_us: int | None = None
 
     @property
     def share(self) -> float:
@@ -54,9 +54,9 @@ class Agreement:
         self.compared += 1
         self.differed += bool(what)
         self._window.append(not what)
-        if not what or (self._told_us is not None and 0 <= driving.t_us - self._told_us < REPORT_EVERY_US):
+        if not what or (self._reported_us is not None and 0 <= driving.t_us - self._reported_us < REPORT_EVERY_US):
             return ""
-        self._told_us = driving.t_us
+        self._reported_us = driving.t_us
         return (f"{what}; {shadow.detector} agreed with {driving.detector} in {self.share:.0%} of the last "
                 f"{len(self._window)} frames")
 

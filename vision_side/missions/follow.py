@@ -71,7 +71,7 @@ class Follow:
         """Compute the plan for one frame."""
         self._camera = view.camera
         places, gap_s = self._places(view), self._gap_s(view)
-        self._hear(view)
+        self._receive(view)
         seen = self._track.step(gap_s, view.header.pose, self._sightings(places, view, gap_s),
                                 view.header.seq)
         plan = self._act(view, seen)
@@ -86,7 +86,7 @@ class Follow:
             return view.dt_s
         return max(view.dt_s, (view.header.t_us - last_us) / 1e6)
 
-    def _hear(self, view: View) -> None:
+    def _receive(self, view: View) -> None:
         """Let the delay estimate and the integrals know what the robot did."""
         header, dt_s = view.header, view.dt_s
         self._motion_predictor.measure(header.latency_us, dt_s)

@@ -185,7 +185,7 @@ class Assignment:
         if state.serving:
             return Duty.SERVE
         stands_by = len(before) <= _STANDING_BY
-        if now_us - self._heard_us(state, before) < len(before) * (_silent_us(state) if stands_by else SILENT_US):
+        if now_us - self._received_us(state, before) < len(before) * (_silent_us(state) if stands_by else SILENT_US):
             state.frames_since_us = None
             return Duty.STAND_BY if stands_by else Duty.NOTHING
         if not _is_unanswered(state, now_us, self._unanswered_us):
@@ -234,7 +234,7 @@ class Assignment:
         fit = {name: one.weight for name, one in self._services.items() if fnmatchcase(robot, one.robots)}
         return ranked(robot, fit)
 
-    def _heard_us(self, state: _Robot, before: list[str]) -> int:
+    def _received_us(self, state: _Robot, before: list[str]) -> int:
         """Return the time of the newest answer that counts for this robot."""
         if len(before) <= _STANDING_BY:
             return _answered_us(state)

@@ -263,7 +263,7 @@ class SharedFleet(Fleet):
         """Each with its presence and the time when that was noted."""
         self._ends_us: dict[Token, int] = {}
         """Tokens that ended and whose end does not count yet: when they ended."""
-        self._newest_end_us = self._heard_us = 0
+        self._newest_end_us = self._received_us = 0
         self._second_watch = SecondWatch(_MAX_TOKENS)
         self._end_second_watch: Callable[[], None] | None = None
         self._is_up, self._losses = True, fleet_link.losses
@@ -359,8 +359,8 @@ class SharedFleet(Fleet):
         """Return when the end of a token counts."""
         ended_us = self._ends_us[token]
         if not isinstance(token, RobotToken):
-            if self._heard_us > ended_us:
-                return self._heard_us
+            if self._received_us > ended_us:
+                return self._received_us
             return min(self._newest_end_us + _QUIET_US, ended_us + _COUNTS_WITHIN_US)
         if self.sharing.is_named(token.robot):
             return _NEVER_US
@@ -369,7 +369,7 @@ class SharedFleet(Fleet):
         return ended_us + (_MISSION_ENDS_AFTER_US if has_request else _ROBOT_ENDS_AFTER_US)
 
     def _on_message(self) -> None:
-        self._heard_us = monotonic_us()
+        self._received_us = monotonic_us()
         super()._on_message()
 
     def _turn_of(self, robot: str) -> None:

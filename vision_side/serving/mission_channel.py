@@ -79,8 +79,9 @@ def _check(header: RequestHeader, source: str, frame: FrameHeader, waited_us: in
     """Raise WireError unless the source is permitted, the session is current and the status is recent."""
     if header.source != source:
         raise WireError(RejectReason.UNKNOWN_SOURCE, "key and header disagree on the source")
-    if source not in MISSION.said_by:
-        raise WireError(RejectReason.UNKNOWN_SOURCE, f"{source} chooses no mission; {' and '.join(MISSION.said_by)} do")
+    if source not in MISSION.published_by:
+        permitted = " and ".join(MISSION.published_by)
+        raise WireError(RejectReason.UNKNOWN_SOURCE, f"{source} chooses no mission; {permitted} do")
     echo = header.echo
     if echo is None or echo.channel != "status":
         raise WireError(RejectReason.NOT_ALLOWED, "a mission cites the newest status of the robot")
@@ -162,11 +163,11 @@ class Reporter:
         """Return the detector, its device and its time."""
         name = result.detector if result else self._detector
         more = f", {beside}" if beside else ""
-        said = {"detector": _line(name[: _NAME_LENGTH - len(more)] + more, _NAME_LENGTH)}
+        fields = {"detector": _line(name[: _NAME_LENGTH - len(more)] + more, _NAME_LENGTH)}
         if result is None:
-            return {**said, "device": self._device}
-        return {**said, "device": _line(result.device, _DEVICE_LENGTH), "model": _line(result.model_hash, _NAME_LENGTH),
-                "inference_us": max(0, result.compute_us)}
+            return {**fields, "device": self._device}
+        return {**fields, "device": _line(result.device, _DEVICE_LENGTH),
+                "model": _line(result.model_hash, _NAME_LENGTH), "inference_us": max(0, result.compute_us)}
 
 
 def _line(text: str, most: int) -> str:

@@ -35,7 +35,7 @@ class ServiceCounts:
     """The counters of one robot, which never decrease. Times are those of the newest frame, or None."""
 
     robot: str
-    heard: bool
+    receives: bool
     """Whether frames came within the last seconds."""
     answered: int
     steered: int
@@ -120,15 +120,15 @@ KEPT: Final = 8
 class _Earlier:
     """A session that another replaced: first frame after that on both clocks, and last frame."""
 
-    heard_us: int
+    received_us: int
     again_us: int = 0
     captured_us: int = 0
 
     def goes_on(self, captured_us: int, now_us: int) -> bool:
         """Return True if its frames continue for so long that the session cannot be over."""
-        if not self.again_us or now_us - self.heard_us > SILENT_US:
+        if not self.again_us or now_us - self.received_us > SILENT_US:
             self.again_us, self.captured_us = now_us, captured_us
-        self.heard_us = now_us
+        self.received_us = now_us
         return min(now_us - self.again_us, captured_us - self.captured_us) >= GOES_ON_US
 
 
@@ -137,7 +137,7 @@ class SessionSelector:
 
     def __init__(self) -> None:
         self.current = ""
-        self._heard_us = 0
+        self._received_us = 0
         self._is_proven = False
         """True if the current session continued next to another one, which is then no sign of its end."""
         self._earlier: dict[str, _Earlier] = {}
@@ -155,7 +155,7 @@ class SessionSelector:
             self._follow(stamp.session)
         if not self.clock.update(stamp.session, stamp.t_us, now_us, stamp.seq):
             raise WireError(RejectReason.FROM_FUTURE, "frame disagrees with this clock")
-        self._heard_us = now_us
+        self._received_us = now_us
 
     @property
     def proven(self) -> str:
@@ -163,7 +163,7 @@ class SessionSelector:
         return self.current if self._is_proven else ""
 
     def _replaces(self, session: str, captured_us: int, now_us: int) -> bool:
-        if self._is_proven and now_us - self._heard_us <= SILENT_US:
+        if self._is_proven and now_us - self._received_us <= SILENT_US:
             return False
         earlier = self._earlier.get(session)
         if earlier is not None and not earlier.goes_on(captured_us, now_us):
@@ -174,9 +174,9 @@ class SessionSelector:
     def _follow(self, session: str) -> None:
         self._earlier.pop(session, None)
         if self.current:
-            self._earlier[self.current] = _Earlier(self._heard_us)
+            self._earlier[self.current] = _Earlier(self._received_us)
         if len(self._earlier) > KEPT:
-            del self._earlier[min(self._earlier, key=lambda name: self._earlier[name].heard_us)]
+            del self._earlier[min(self._earlier, key=lambda name: self._earlier[name].received_us)]
         self.current = session
 
 
@@ -271,7 +271,7 @@ class Service:
         self._changes = RepeatLimiter()
         if config.camera is not None:
             self._use(config.camera)
-        self._heard_s = self._waited_s = time.monotonic()
+        self._received_s = self._waited_s = time.monotonic()
         self._blind_since_s = 0.0
         self._newest: tuple[int, int | None] = (0, None)
         self.answered = self.steered = 0
@@ -301,7 +301,7 @@ class Service:
 
     def begin(self) -> None:
         """Answer frames from now on, first the newest one. Those before were not lost."""
-        self._loss, self._heard_s = FrameLoss(), time.monotonic()
+        self._loss, self._received_s = FrameLoss(), time.monotonic()
         self.listen()
         if (newest := self._ahead.take()) is not None:
             self._frames.put(newest)
@@ -344,20 +344,20 @@ class Service:
 
     def _note_silence(self, now_s: float) -> None:
         # After a turn this late, e.g. of a suspended computer, frames may wait here: their silence begins now.
-        if now_s - max(self._waited_s, self._heard_s) > _SILENCE_S / 2:
-            self._heard_s = now_s
+        if now_s - max(self._waited_s, self._received_s) > _SILENCE_S / 2:
+            self._received_s = now_s
         self._waited_s = now_s
-        if now_s - self._heard_s > _NO_FRAMES_S:
+        if now_s - self._received_s > _NO_FRAMES_S:
             self._mission_channel.report(self._now_us() / 1e6, self._acknowledge(NO_FRAMES), None)
-        if now_s - self._heard_s > _SILENCE_S:
+        if now_s - self._received_s > _SILENCE_S:
             self._robot_session = ""
             self._log_change("link", f"no frames from robot {self._config.robot} at {endpoints_text(self._config)}; is "
                                "`sightline robot` running there, with this robot id?")
 
     def counts(self) -> ServiceCounts:
         """Return the counters. Safe from any thread."""
-        heard, (compute_us, latency_us) = time.monotonic() - self._heard_s <= _SILENCE_S, self._newest
-        return ServiceCounts(self._config.robot, heard and self.answered > 0, self.answered, self.steered,
+        receives, (compute_us, latency_us) = time.monotonic() - self._received_s <= _SILENCE_S, self._newest
+        return ServiceCounts(self._config.robot, receives and self.answered > 0, self.answered, self.steered,
                       dict(self.skipped.copy()), self._frames.dropped, compute_us, latency_us,
                       received=self._received, busy_us=self._busy_us, thread=self._thread,
                       queue_p95_us=percentile_95(self._queue_ages_us))
@@ -396,7 +396,7 @@ class Service:
             return
         if not self._is_of_robot(header, self._frames.dropped):
             return
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         self._note_session(header.session)
         if self._pipeline is None or not self._pipeline.fits(message.payload):
             self._find_camera(message.payload)
@@ -597,7 +597,7 @@ class BoxesService(Service):
     ) -> None:
         self._inbox = BoxesInbox(config.boxes.source)
         self._reader = BoxReader(config.boxes)
-        self._boxes_heard_s = time.monotonic()
+        self._boxes_received_s = time.monotonic()
         self._rejected_boxes = SkipCounter()
         super().__init__(config, link, report, detector, is_standby=is_standby)
 
@@ -613,20 +613,20 @@ class BoxesService(Service):
         header = self._remember(message.header)
         if header is None:
             return
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         self._note_session(header.session)
         self._publish(header, PipelineAnswer(None, Observation("no image", note="another service detects")), 0)
         self._viewing.keep(header, message.payload)
         if self._pipeline is None or (self._is_legacy and not self._pipeline.fits(message.payload)):
             self._find_camera(message.payload)
-        elif time.monotonic() - self._boxes_heard_s > _BOXES_SILENCE_S:
+        elif time.monotonic() - self._boxes_received_s > _BOXES_SILENCE_S:
             self._mission_channel.report(self._now_us() / 1e6, self._acknowledge(_NO_BOXES), header)
             source = self._config.boxes.source
             self._log_change("boxes", f"frames come, but no boxes from {source}; does its detector run?")
 
     def _boxes(self, message: Message, started_ns: int) -> None:
         self._remember_replaced()
-        self._boxes_heard_s = time.monotonic()
+        self._boxes_received_s = time.monotonic()
         if self._pipeline is None or self._camera is None:
             return
         try:

@@ -54,17 +54,17 @@ class Keepalive:
     """Decides on pings and on the end of one connection. It reads the send path only of a silent peer."""
 
     def __init__(self, now_us: int) -> None:
-        self._heard_us = self._pinged_us = self._taken_us = now_us
+        self._received_us = self._pinged_us = self._taken_us = now_us
         self._full_us = _LONG_AGO_US
         self._taken_bytes = -1
 
-    def hear(self, now_us: int) -> None:
+    def note_data(self, now_us: int) -> None:
         """Note that data arrived."""
-        self._heard_us = now_us
+        self._received_us = now_us
 
     def is_ping_due(self, now_us: int) -> bool:
         """Return True if a ping is due. The next one is due a second later."""
-        due = now_us - max(self._pinged_us, self._heard_us) >= PING_EVERY_US
+        due = now_us - max(self._pinged_us, self._received_us) >= PING_EVERY_US
         if due:
             self._pinged_us = now_us
         return due
@@ -76,18 +76,18 @@ class Keepalive:
             now_us: monotonic clock.
             look: reads the send path.
         """
-        if now_us - self._heard_us < _LOOK_AFTER_US:
+        if now_us - self._received_us < _LOOK_AFTER_US:
             return False
         way = look()
         if way.taken_bytes != self._taken_bytes:
             self._taken_bytes, self._taken_us = way.taken_bytes, now_us
         if way.full:
             self._full_us = now_us
-        if now_us - self._heard_us < SILENCE_US:
+        if now_us - self._received_us < SILENCE_US:
             return False
         # A reader with a full send path gets no chance to answer a ping in time. It is slow, not gone.
         is_slow = now_us - self._full_us < SILENCE_US
-        return way.lost or not is_slow or now_us - max(self._heard_us, self._taken_us) >= STALLED_LIMIT_US
+        return way.lost or not is_slow or now_us - max(self._received_us, self._taken_us) >= STALLED_LIMIT_US
 
 
 # The kernel's state of a TCP send path (Linux; elsewhere only the data that still waits here). Shell.
@@ -116,8 +116,8 @@ def send_path(near: socket.socket, full: bool) -> SendPath:
     except (OSError, struct.error):  # closed, or an older kernel
         return SendPath(full, 0, False)
     # A machine with a slow reader still answers a probe of its full window. Two probes without an answer mean a loss.
-    is_asked = fields.unacked_packets > 0 or fields.probes >= 2
-    lost = is_asked and fields.last_ack_ms * 1000 >= SILENCE_US
+    is_requested = fields.unacked_packets > 0 or fields.probes >= 2
+    lost = is_requested and fields.last_ack_ms * 1000 >= SILENCE_US
     return SendPath(full or fields.unsent_bytes > 0, fields.acked_bytes, lost)
 
 
@@ -248,7 +248,7 @@ class Connection:
         self.lock = threading.Lock()
         self.granted: frozenset[tuple[str, ...]] | None = None
         """(channel, source) pairs that the other end may publish, None for all. Set with the check of its token."""
-        self.heard_us = heartbeat_us()
+        self.received_us = heartbeat_us()
         """Time of the last data from the other end."""
         self._unheard_bytes = 0
         self._near = near
@@ -338,7 +338,7 @@ class Connection:
         except OSError:
             return False
         if data:
-            self.heard_us, self._unheard_bytes = heartbeat_us(), 0
+            self.received_us, self._unheard_bytes = heartbeat_us(), 0
             self._messages.feed(data)
         return bool(data)
 

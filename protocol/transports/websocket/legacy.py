@@ -63,7 +63,7 @@ class LegacyClient(NamedTuple):
 
     who: str
     driver_slot: DriverSlot
-    tell: Callable[[str], None]
+    log: Callable[[str], None]
 
 
 class LegacyToVision:
@@ -79,8 +79,8 @@ class LegacyToVision:
     def __init__(self, robot: str, options: LegacyOptions, now_us: Callable[[], int], client: LegacyClient) -> None:
         """Create the codec. `now_us` reads a monotonic clock."""
         self._robot, self._options, self._now_us = robot, options, now_us
-        self._who, self._driver_slot, self._tell = client
-        self._told = ""
+        self._who, self._driver_slot, self._log = client
+        self._logged = ""
         self._sent: tuple[bytes, int] | None = None
         self._looked_at: tuple[bytes, bytes] | None = None
         self._answers = 0
@@ -130,9 +130,9 @@ class LegacyToVision:
     def _claim_driver_slot(self) -> None:
         """Raise WireError if another client drives. Each new driver is logged once."""
         driver = self._driver_slot.claim(self._who, self._now_us())
-        if driver != self._told:
-            self._told = driver
-            self._tell(f"{self._who} drives" if driver == self._who else f"{self._who} only watches: {driver} drives")
+        if driver != self._logged:
+            self._logged = driver
+            self._log(f"{self._who} drives" if driver == self._who else f"{self._who} only watches: {driver} drives")
         if driver != self._who:
             raise WireError(RejectReason.NOT_HOLDER, f"{driver} drives")
 
@@ -186,9 +186,9 @@ class LegacyCommands:
     Such a robot has no watchdog: it applies its last command for ever.
     """
 
-    def __init__(self, endpoint: str, options: LegacyOptions, tell: Callable[[str], None]) -> None:
+    def __init__(self, endpoint: str, options: LegacyOptions, log: Callable[[str], None]) -> None:
         """Create the record for the robot at `endpoint`. `tell` writes a log line."""
-        self._endpoint, self.options, self._tell = endpoint, options, tell
+        self._endpoint, self.options, self._log = endpoint, options, log
         self.zero = b"" if options.boxes else as_text(options, b"0.0000|0.0000")
         """The text that stops the robot."""
         # A link that never sent a command belongs to a viewer. It must not stop the robot of another driver.
@@ -218,7 +218,7 @@ class LegacyCommands:
         self._closed_by_text = self._closed_by_text + 1 if now_us - self._last_us <= CLOSED_BY_TEXT_US else 0
         if self._closed_by_text == CLOSED_BY_TEXT:
             self._closed_by_text = 0
-            self._tell(
+            self._log(
                 f"robot at {self._endpoint} closed {CLOSED_BY_TEXT} connections within {CLOSED_BY_TEXT_US // 1000} ms "
                 f"after '{last.decode('ascii')}'; use the text format that it reads, probably {self._alternative(last)}"
             )

@@ -59,7 +59,7 @@ class Subscriber(Protocol):
         """Limit incoming messages to the largest payload that this end wants."""
         ...
 
-    def tell(self, hello: str) -> None:
+    def send_hello(self, hello: str) -> None:
         """Send the hello of this end."""
         ...
 
@@ -93,10 +93,10 @@ class Subscriptions:
         """Return the largest payload of all announced channels, in bytes."""
         return max((self._rules.payload_bound(CHANNELS[name]) for name in self.announced), default=0)
 
-    def tell(self, peer: Subscriber) -> None:
+    def send_hello(self, peer: Subscriber) -> None:
         """Send the newest announcement to one peer."""
         peer.limit(self.bound())
-        peer.tell(self.hello())
+        peer.send_hello(self.hello())
 
     def announce(self, peers: Sequence[Subscriber], passing_on: bool) -> None:
         """Announce a changed list of channels to all `peers`. `passing_on` is True at a listening end."""
@@ -106,7 +106,7 @@ class Subscriptions:
         if names != self.announced:
             self.announced = names
             for peer in peers:
-                self.tell(peer)
+                self.send_hello(peer)
 
 
 # WebSocket as a `Link`: `sightline.v1` or the legacy protocol, with threads, newest-only per peer. Shell.
@@ -249,15 +249,15 @@ class WebSocketLink(BaseLink):
 
     def open(self, near: Sequence[WebSocketEndpoint], far: Sequence[WebSocketEndpoint], secure: str) -> None:
         """Listen on `near` and begin to connect to `far`. Raises the errors of `open_websocket`."""
-        refuse, keys = self._rules.reject, KeyFolder(secure, self._rules.role)
+        reject, keys = self._rules.reject, KeyFolder(secure, self._rules.role)
         for end in near:
-            self._listeners.append(Server(end, partial(self._serve, end), refuse, self._tell, keys))
+            self._listeners.append(Server(end, partial(self._serve, end), reject, self._log_line, keys))
         for end in far:
             max_bytes = MAX_HELLO_BYTES
             if end.legacy is not None:  # a legacy robot may send its first image at once
                 max_bytes = text_bound(self._rules.payload_bound(FRAME))
-                self._commands[end.text] = LegacyCommands(end.text, end.legacy, self._tell)
-            self._dialers.append(Dialer(end, partial(self._serve, end), refuse, keys, max_bytes))
+                self._commands[end.text] = LegacyCommands(end.text, end.legacy, self._log_line)
+            self._dialers.append(Dialer(end, partial(self._serve, end), reject, keys, max_bytes))
 
     def wait_connected(self, timeout_s: float) -> None:
         """Wait for the first peer. Raises LinkError with the cause after `timeout_s`."""
@@ -287,14 +287,14 @@ class WebSocketLink(BaseLink):
             PeerError: the hello is invalid, or no place is free.
             ConnectionClosed: the peer closed before its hello.
         """
-        dialect = self._dialect(end, settle is not None, "{}:{}".format(*wire.address))
+        codec = self._codec(end, settle is not None, "{}:{}".format(*wire.address))
         with self._joining:
             announced, hello = self._subscriptions.announced, self._subscriptions.hello()
             wanted_bytes = self._subscriptions.bound()
-        peer = Peer(wire, dialect, self._on_change, self._commands.get(end.text) if settle is None else None)
+        peer = Peer(wire, codec, self._on_change, self._commands.get(end.text) if settle is None else None)
         peer.limit(wanted_bytes)
-        if isinstance(dialect, SightlineV1):
-            exchange_hellos(wire, dialect, hello, settle)
+        if isinstance(codec, SightlineV1):
+            exchange_hellos(wire, codec, hello, settle)
         elif settle is not None:
             settle("")
         if self._join(peer, announced):
@@ -302,7 +302,7 @@ class WebSocketLink(BaseLink):
                 peer.run(self._deliver, self._rules.reject)
             finally:
                 self._leave(peer)
-                dialect.note_gone()
+                codec.note_gone()
 
     def _join(self, peer: Peer, announced: tuple[str, ...]) -> bool:
         with self._joining:
@@ -311,7 +311,7 @@ class WebSocketLink(BaseLink):
             self._peers = (*self._peers, peer)
             # The hello that this peer received lacks a subscription since then.
             if announced != self._subscriptions.announced:
-                self._subscriptions.tell(peer)
+                self._subscriptions.send_hello(peer)
             self._announce()
         self._joined.set()
         return True
@@ -344,16 +344,16 @@ class WebSocketLink(BaseLink):
             if peer is not sender:
                 peer.offer(post)
 
-    def _dialect(self, end: WebSocketEndpoint, listening: bool, who: str) -> PeerCodec:
+    def _codec(self, end: WebSocketEndpoint, listening: bool, who: str) -> PeerCodec:
         if end.legacy is None:
             return SightlineV1(self.robot, self._rules.role, connects=not listening)
         if listening:
-            client = LegacyClient(who, self._driver_slot, self._tell)
+            client = LegacyClient(who, self._driver_slot, self._log_line)
             return LegacyToVision(self.robot, end.legacy, monotonic_us, client)
         bound = self._rules.payload_bound(FRAME)
         return LegacyToRobot(self.robot, self._commands[end.text], monotonic_us, secrets.token_hex(4), bound)
 
-    def _tell(self, text: str) -> None:
+    def _log_line(self, text: str) -> None:
         with self._joining:
             count = self._repeat_limiter.due(text, monotonic_us())
         if count:
@@ -364,7 +364,7 @@ class WebSocketLink(BaseLink):
         if parsed is None:
             self._rules.reject(INEXACT_KEY)
             return
-        if not peer.admits(packet.key, self._rules.reject, self._tell):
+        if not peer.admits(packet.key, self._rules.reject, self._log_line):
             return
         # A peer that sends twists drives, so its next frame must not wait behind the copies for the viewers.
         if parsed[1] is TWIST and self._peers[0] is not peer:

@@ -49,12 +49,12 @@ class Publication:
         self.message = message
         self._written: dict[Hashable, tuple[bytes, ...]] = {}
 
-    def written(self, dialect: WireFormat) -> tuple[bytes, ...]:
+    def written(self, codec: WireFormat) -> tuple[bytes, ...]:
         """Return the bytes for a peer of `dialect`."""
         # Without a lock: two threads may both encode, with the same result.
-        data = self._written.get(dialect.form)
+        data = self._written.get(codec.form)
         if data is None:
-            data = self._written[dialect.form] = dialect.write(self.message)
+            data = self._written[codec.form] = codec.write(self.message)
         return data
 
 
@@ -88,7 +88,7 @@ class Peer:
     """An open connection to a known peer, with its codec."""
 
     def __init__(
-        self, wire: Connection, dialect: PeerCodec, on_change: Callable[[], None] = lambda: None,
+        self, wire: Connection, codec: PeerCodec, on_change: Callable[[], None] = lambda: None,
         commands: LegacyCommands | None = None,
     ) -> None:
         """Create a peer. The reading thread calls `on_change` when the peer changes its wants.
@@ -99,96 +99,96 @@ class Peer:
         self._commands = commands
         self._ended = False
         self._on_change = on_change
-        self._wire, self._dialect = wire, dialect
+        self._wire, self._codec = wire, codec
         self._reader = threading.current_thread()
         self._gone = threading.Event()
         self._look_us = 0
 
     def subscribes_to(self, channel: Channel) -> bool:
         """Return True if the peer wants `channel`."""
-        return self._dialect.subscribes_to(channel)
+        return self._codec.subscribes_to(channel)
 
-    def admits(self, key: str, refuse: Callable[[str], None], tell: Callable[[str], None]) -> bool:
+    def admits(self, key: str, reject: Callable[[str], None], log: Callable[[str], None]) -> bool:
         """Return True if the token of the peer permits `key`. Otherwise count and log the rejection."""
-        said = tuple(key.split("/")[2:])
-        if self._wire.granted is None or said in self._wire.granted:
+        named = tuple(key.split("/")[2:])
+        if self._wire.granted is None or named in self._wire.granted:
             return True
-        refuse(NOT_GRANTED)
+        reject(NOT_GRANTED)
         # A viewer that acknowledges is harmless, and would fill the log.
-        if said[0] != ACK.name:
+        if named[0] != ACK.name:
             who = self._wire.address[0] or "a client"
-            tell(f"rejected {'/'.join(said)} from {who}: the role of its token does not permit it "
-                 "(docs/how-to/secure-the-link.md)")
+            log(f"rejected {'/'.join(named)} from {who}: the role of its token does not permit it "
+                "(docs/how-to/secure-the-link.md)")
         return False
 
     def offer(self, post: Publication) -> None:
         """Send a publication if the peer wants it, now or later. A newer one replaces it. Never blocks."""
-        if self._dialect.subscribes_to(post.message.channel):
+        if self._codec.subscribes_to(post.message.channel):
             self.queue.put(post.message, post)
             self._send()
 
-    def tell(self, hello: str) -> None:
+    def send_hello(self, hello: str) -> None:
         """Send the hello of this end, except in the legacy protocol."""
-        if isinstance(self._dialect, SightlineV1):
+        if isinstance(self._codec, SightlineV1):
             self.queue.put_first(hello)
             self._send()
 
     def limit(self, wanted_bytes: int) -> None:
         """Limit incoming messages to the largest payload that this end wants."""
         with self._wire.lock:
-            self._wire.protocol.max_message_size = self._dialect.bound(wanted_bytes)
+            self._wire.protocol.max_message_size = self._codec.bound(wanted_bytes)
         # A thread that found the lock taken left its message to this one.
         self._send()
 
-    def run(self, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]) -> None:
+    def run(self, deliver: Callable[[Peer, IncomingMessage], None], reject: Callable[[str], None]) -> None:
         """Read until the connection ends. A peer that breaks the rules is closed with the reason."""
         from websockets.exceptions import ConnectionClosed
 
         keepalive = Keepalive(heartbeat_us())
         try:
-            while self._turn(keepalive, deliver, refuse):
+            while self._turn(keepalive, deliver, reject):
                 self._wire.wait((_TICK_US if self._commands is None else _REST_TICK_US) / 1e6)
-            refuse(SILENT)
+            reject(SILENT)
             self._end(1011, "silent for too long")
-        except PeerError as refusal:
-            refuse(refusal.counted)
-            self._end(refusal.code, str(refusal))
+        except PeerError as rejection:
+            reject(rejection.counted)
+            self._end(rejection.code, str(rejection))
             self._wire.linger()
         except ConnectionClosed as closed:
-            count_close(closed, refuse)
+            count_close(closed, reject)
         finally:
             self._wire.shut()
             self._gone.set()
 
     def _turn(
-        self, keepalive: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]
+        self, keepalive: Keepalive, deliver: Callable[[Peer, IncomingMessage], None], reject: Callable[[str], None]
     ) -> bool:
         """Read all available messages, and send. Returns False if the connection has to end."""
         # Before reading, so that data counts that arrived during a pause of this process.
         now_us = heartbeat_us()
         for message in self._wire.receive():
-            self._read(message, deliver, refuse)
+            self._read(message, deliver, reject)
         # The receiver of a message runs only when this thread waits, so this turn ends early.
         if now_us < self._look_us:
             self._send()
             return True
         self._look_us = now_us + _TICK_US
-        keepalive.hear(self._wire.heard_us)
+        keepalive.note_data(self._wire.received_us)
         if keepalive.is_ping_due(now_us):
             self._wire.ping()
         self._send()
         return not keepalive.is_over(now_us, self._wire.send_path)
 
     def _read(
-        self, message: Any, deliver: Callable[[Peer, IncomingMessage], None], refuse: Callable[[str], None]
+        self, message: Any, deliver: Callable[[Peer, IncomingMessage], None], reject: Callable[[str], None]
     ) -> None:
-        before = self._dialect.wants
+        before = self._codec.wants
         try:
-            packets = self._dialect.read(message)
+            packets = self._codec.read(message)
         except WireError as error:
-            refuse(error.reason)
+            reject(error.reason)
             return
-        if self._dialect.wants != before:
+        if self._codec.wants != before:
             self._on_change()
         for packet in packets:
             deliver(self, packet)
@@ -235,12 +235,12 @@ class Peer:
             return None
         if isinstance(item, str):
             return (item.encode("utf-8"),), True
-        pieces = item.written(self._dialect)
-        self._dialect.note_sent(item.message)
-        return pieces, self._dialect.text
+        pieces = item.written(self._codec)
+        self._codec.note_sent(item.message)
+        return pieces, self._codec.text
 
 
-def exchange_hellos(wire: Connection, dialect: SightlineV1, hello: str, settle: Promote | None) -> None:
+def exchange_hellos(wire: Connection, codec: SightlineV1, hello: str, settle: Promote | None) -> None:
     """Exchange hellos. The connecting end, which has no places to assign, sends first."""
     if settle is None:
         wire.send_text(hello)
@@ -250,14 +250,14 @@ def exchange_hellos(wire: Connection, dialect: SightlineV1, hello: str, settle: 
         raise PeerError(BAD_HELLO, 1008, f"no hello within {OPEN_S:g} s") from None
     if not isinstance(answer, str):
         raise PeerError(BAD_HELLO, 1003, "the first message must be a hello, as text")
-    dialect.accept(answer)
+    codec.accept(answer)
     if settle is not None:
-        settle(dialect.peer_role)
+        settle(codec.peer_role)
         wire.send_text(hello)
 
 
-def count_close(closed: ConnectionClosed, refuse: Callable[[str], None]) -> None:
+def count_close(closed: ConnectionClosed, reject: Callable[[str], None]) -> None:
     """Count a connection that this end closed after a broken rule. A close by the peer does not count."""
     counted = _COUNTED_FOR_CODE.get(closed.sent.code) if closed.sent and not closed.rcvd_then_sent else None
     if counted is not None:
-        refuse(counted)
+        reject(counted)

@@ -81,8 +81,8 @@ class ConnectionLimits:
     def admit(self, address: str) -> Slot | None:
         """Assign a place for an unidentified connection from `address`, or None without a free one."""
         with self._lock:
-            strangers = [one.address for one in self._taken if one.acts is None]
-            if len(strangers) >= MAX_HANDSHAKES or strangers.count(address) >= MAX_HANDSHAKES_PER_ADDRESS:
+            unknown = [one.address for one in self._taken if one.acts is None]
+            if len(unknown) >= MAX_HANDSHAKES or unknown.count(address) >= MAX_HANDSHAKES_PER_ADDRESS:
                 return None
             slot = Slot(address)
             self._taken.add(slot)

@@ -414,7 +414,7 @@ class ZenohFleet(FleetLink):
         self._links: dict[str, ZenohLink] = {}
         self._ending = ExitStack()
         self._ending.callback(session.close)
-        self._heard_s: dict[str, float] = {}
+        self._received_s: dict[str, float] = {}
         self._is_full_logged = False
         self._on_new_robot: Callable[[], None] = lambda: None
         self._peers = _ConnectedPeers(session, self._ending)
@@ -436,9 +436,9 @@ class ZenohFleet(FleetLink):
     def robots(self) -> list[str]:
         """Return the ids of the robots with a status within `LEFT_AFTER_S`, in the order of their first one."""
         now_s = time.monotonic()
-        for robot in [one for one, heard_s in self._heard_s.copy().items() if now_s - heard_s > LEFT_AFTER_S]:
-            del self._heard_s[robot]
-        return list(self._heard_s)
+        for robot in [one for one, received_s in self._received_s.copy().items() if now_s - received_s > LEFT_AFTER_S]:
+            del self._received_s[robot]
+        return list(self._received_s)
 
     def on_new_robot(self, callback: Callable[[], None]) -> None:
         """Call `callback` on a thread of Zenoh at the first status of each robot, again after it had left."""
@@ -506,11 +506,11 @@ class ZenohFleet(FleetLink):
         parsed = parse_key(str(sample.key_expr))
         if parsed is None or not fnmatchcase(parsed[0], self._pattern):
             return
-        is_new = parsed[0] not in self._heard_s
-        if is_new and len(self._heard_s) >= MAX_ROBOTS:
+        is_new = parsed[0] not in self._received_s
+        if is_new and len(self._received_s) >= MAX_ROBOTS:
             self._log_full(parsed[0])
             return
-        self._heard_s[parsed[0]] = time.monotonic()
+        self._received_s[parsed[0]] = time.monotonic()
         if is_new:
             self._on_new_robot()
 

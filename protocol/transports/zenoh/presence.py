@@ -66,7 +66,9 @@ def presence_key(role: str, session: str) -> str:
     return f"{PRESENCE_PREFIX}/{certificate_role(role)}/{session}"
 
 
-def parse_presence_reply(key: str, payload: bytes, asked_us: int, answered_us: int, clock_us: int) -> PeerInfo | None:
+def parse_presence_reply(
+    key: str, payload: bytes, requested_us: int, answered_us: int, clock_us: int
+) -> PeerInfo | None:
     """Parse a presence reply.
 
     Args:
@@ -85,7 +87,7 @@ def parse_presence_reply(key: str, payload: bytes, asked_us: int, answered_us: i
         return None
     if key != presence_key(presence.role, presence.session):
         return None
-    round_trip_us = max(0, answered_us - asked_us)
+    round_trip_us = max(0, answered_us - requested_us)
     return PeerInfo(presence, round_trip_us, presence.clock_us + round_trip_us // 2 - clock_us)
 
 
@@ -190,7 +192,7 @@ def query_presence(session: zenoh.Session, timeout_s: float = REPLY_TIMEOUT_S) -
     import zenoh
 
     answers: list[PeerInfo] = []
-    asked_us = monotonic_us()
+    requested_us = monotonic_us()
     replies = session.get(
         PRESENCE_PATTERN, zenoh.handlers.FifoChannel(MAX_PEERS), target=zenoh.QueryTarget.ALL,
         consolidation=zenoh.ConsolidationMode.NONE, timeout=timeout_s,
@@ -202,7 +204,7 @@ def query_presence(session: zenoh.Session, timeout_s: float = REPLY_TIMEOUT_S) -
         sample = reply.ok
         if sample is None or len(answers) >= MAX_PEERS:
             continue
-        peer = parse_presence_reply(str(sample.key_expr), sample.payload.to_bytes(), asked_us, monotonic_us(),
+        peer = parse_presence_reply(str(sample.key_expr), sample.payload.to_bytes(), requested_us, monotonic_us(),
                            time.time_ns() // 1000)
         if peer is not None:
             answers.append(peer)

@@ -42,7 +42,7 @@ class PiCamera:
         self._config = config
         self._newest = LatestPicture()
         self._stamps = CaptureClock(round(config.delay_ms * 1000))
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         self.model = camera_model(config, JpegSize(config.width_px, config.height_px, 3))
         self._camera = _opened(config)
         try:
@@ -70,13 +70,13 @@ class PiCamera:
         first_us = getattr(self._encoder, "firsttimestamp", None)
         stamp_us = 0 if first_us is None or since_first_us is None else first_us + since_first_us
         t_us = self._stamps.captured_us(stamp_us, read_clocks())
-        self._heard_s = time.monotonic()
+        self._received_s = time.monotonic()
         self._newest.put(Picture(jpeg, t_us))
 
     def read(self, timeout_s: float) -> Picture | None:
         """Wait for the next capture. Returns None if none comes in time. Raises HardwareError for a frozen camera."""
         picture = self._newest.take(timeout_s)
-        if picture is None and time.monotonic() - self._heard_s > self._config.frozen_after_s:
+        if picture is None and time.monotonic() - self._received_s > self._config.frozen_after_s:
             raise HardwareError(
                 f"Raspberry Pi camera {self._config.index} delivered no image for {self._config.frozen_after_s:g} s; "
                 "check its ribbon cable and restart the robot service"

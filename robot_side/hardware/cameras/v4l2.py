@@ -262,7 +262,7 @@ class V4l2Camera:
         self._wish = (100, 100)
         self._fault: HardwareError | None = None
         self._ending = threading.Event()
-        self._asked_s = self._heard_s = time.monotonic()
+        self._requested_s = self._received_s = time.monotonic()
         self._device: V4l2Device | None = V4l2Device(config, opening)
         self.model: CameraModel = self._model(self._device)
         self._thread = threading.Thread(target=self._run, name="v4l2 camera", daemon=True)
@@ -279,7 +279,7 @@ class V4l2Camera:
     def _await_first(self) -> None:
         deadline_s = time.monotonic() + _FIRST_PICTURE_S
         while time.monotonic() < deadline_s and self._fault is None:
-            self._asked_s = time.monotonic()
+            self._requested_s = time.monotonic()
             if self._newest.take(0.1):
                 return
         self.close()
@@ -291,11 +291,11 @@ class V4l2Camera:
         Raises:
             HardwareError: the camera is gone or frozen.
         """
-        self._asked_s = time.monotonic()
+        self._requested_s = time.monotonic()
         picture = self._newest.take(timeout_s)
         if picture is None and self._fault is not None:
             raise self._fault
-        if picture is None and time.monotonic() - self._heard_s > self._config.frozen_after_s:
+        if picture is None and time.monotonic() - self._received_s > self._config.frozen_after_s:
             raise self._frozen()
         return picture
 
@@ -335,12 +335,12 @@ class V4l2Camera:
             self._device = V4l2Device(self._config, self._opening)
         self._device.wish = self._wish
         self._device.wait()
-        asked = time.monotonic() - self._asked_s < _INTEREST_S
-        picture = self._device.picture() if asked else None
+        requested = time.monotonic() - self._requested_s < _INTEREST_S
+        picture = self._device.picture() if requested else None
         if picture is not None:
             self._newest.put(picture)
-        if picture is not None or not asked:
-            self._heard_s = time.monotonic()
+        if picture is not None or not requested:
+            self._received_s = time.monotonic()
             self._fault = None
 
     def _release(self) -> None:

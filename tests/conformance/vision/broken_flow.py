@@ -157,10 +157,10 @@ class DrivesOn(BrokenVision):
 class Stately(BrokenVision):
     """Reads the status; `quiet` while it holds what this one does not like."""
 
-    quiet, heard_us = False, 0
+    quiet, received_us = False, 0
 
     def on_status(self, message):
-        self.heard_us = self.now_us
+        self.received_us = self.now_us
         try:
             status = json.loads(message.payload)
         except ValueError:
@@ -200,7 +200,7 @@ class NeedsStatus(Stately):
         return False
 
     def decides(self, header, answer):
-        return answer if self.now_us - self.heard_us < 300_000 else None
+        return answer if self.now_us - self.received_us < 300_000 else None
 
 
 # --- connections -----------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from sightline.robot_side.guardian.core import (
     MAX_RESTARTS,
     MOVING,
     PERIOD_US,
-    REFUSES_US,
+    REJECTS_US,
     RESTART_WINDOW_US,
     STARTS_WITHIN_US,
     STARVED_US,
@@ -101,7 +101,7 @@ def test_driver_whose_drive_did_not_take_zero_is_killed_at_once():
 
 
 def test_driver_whose_drive_takes_no_speeds_while_the_wheels_turn_is_killed_at_once():
-    assert beaten(LOST).look(1_000_000) == "its drive took no speeds for 100 ms" and REFUSES_US == 100_000
+    assert beaten(LOST).look(1_000_000) == "its drive took no speeds for 100 ms" and REJECTS_US == 100_000
     assert not beaten(LOST).drive_failed, "a new driver process starts"
 
 

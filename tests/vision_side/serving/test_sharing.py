@@ -21,7 +21,7 @@ class Robot:
     """A robot with the rules of its gate: one holder, a fence behind each token, succession of a silent one."""
 
     holder: str = ""
-    heard_us: int = 0
+    received_us: int = 0
     accepted: int = 0
     fenced: set = field(default_factory=set)
     gaps: list = field(default_factory=list)
@@ -42,18 +42,18 @@ class Robot:
             self.rejected += 1
             return
         if self.holder and self.holder != session:
-            if now_us - self.heard_us <= SILENT_US:
+            if now_us - self.received_us <= SILENT_US:
                 self.rejected += 1
                 return
             self.fenced.add(self.holder)
         if self.accepted:
-            self.gaps.append((self.heard_us, now_us - self.heard_us))
+            self.gaps.append((self.received_us, now_us - self.received_us))
         if session != self.holder:
             self.sessions.append((now_us, session))
-        self.holder, self.heard_us, self.accepted = session, now_us, self.accepted + 1
+        self.holder, self.received_us, self.accepted = session, now_us, self.accepted + 1
 
     def status(self, now_us):
-        holds = self.holder and now_us - self.heard_us < LEASE_US
+        holds = self.holder and now_us - self.received_us < LEASE_US
         shown = LeaseHolder(source="vision", digest=self.holder) if holds else None
         stream = StreamStatus(sent=self.sent, credit_timeouts=self.unanswered)
         return Status(state=self.state, reason="", holder=shown, accepted=self.accepted,
@@ -346,7 +346,7 @@ def test_a_service_that_never_answers_keeps_no_robot():
     site.declare(None, DriverToken("r1", "x", "e" * 32))
     site.run(4_000)
     assert site.drivers()["r1"] in (["a"], ["b"]), "also with the token of a driver that sends nothing"
-    assert site.robots["r1"].accepted > 0 and site.now_us - site.robots["r1"].heard_us < 200 * MS
+    assert site.robots["r1"].accepted > 0 and site.now_us - site.robots["r1"].received_us < 200 * MS
 
 
 def test_robots_that_join_without_a_working_owner_are_driven_within_three_seconds():
@@ -465,12 +465,12 @@ def test_after_any_events_the_owners_drive(seed):
     for service in site.services.values():
         service.hangs = False
     site.run(6_000).assert_owners_drive()
-    assert all(site.now_us - robot.heard_us < 200 * MS for robot in site.robots.values())
+    assert all(site.now_us - robot.received_us < 200 * MS for robot in site.robots.values())
 
 
 def assert_each_is_driven_by_one(site):
     assert all(len(drivers) == 1 for drivers in site.drivers().values()), site.drivers()
-    assert all(site.now_us - robot.heard_us < 200 * MS for robot in site.robots.values())
+    assert all(site.now_us - robot.received_us < 200 * MS for robot in site.robots.values())
 
 
 @pytest.mark.parametrize("first", ["owner", "standby", "both"])
@@ -482,7 +482,7 @@ def test_when_the_owner_and_the_standby_hang_another_service_drives_within_three
         site.named(name).hangs = True
         site.run(0 if first == "both" else 1_000)
     site.run(3_000)
-    assert all(site.now_us - robot.heard_us < 200 * MS for robot in site.robots.values())
+    assert all(site.now_us - robot.received_us < 200 * MS for robot in site.robots.values())
     awake = [drivers for one in site.robots if len(drivers := set(site.drivers()[one]) - {*pair}) != 1]
     assert not awake, "one that works drives each robot"
     assert site.worst_gap_ms(began_us) <= 3_000
@@ -514,7 +514,7 @@ def test_a_silent_service_with_the_name_of_another_keeps_no_robot(services):
     for name in set(services):
         site.declare(None, VisionToken(name, 1.0, "00000000"))
     site.run(1_000)
-    began_us, site.robots["new"] = site.now_us, Robot(heard_us=site.now_us)
+    began_us, site.robots["new"] = site.now_us, Robot(received_us=site.now_us)
     site.declare(None, RobotToken("new"))
     site.run(3_000)
     assert_each_is_driven_by_one(site)

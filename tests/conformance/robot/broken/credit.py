@@ -299,12 +299,12 @@ def dies_of_surrogates(robot):
 
 @breaks("R-HOST-09")
 def drowns(robot):
-    heard_us = []
+    received_us = []
 
     def around(inner, message):
-        heard_us.append(robot.now())
-        del heard_us[:-200]
-        if len(heard_us) < 200 or heard_us[-1] - heard_us[0] > 1_000_000:
+        received_us.append(robot.now())
+        del received_us[:-200]
+        if len(received_us) < 200 or received_us[-1] - received_us[0] > 1_000_000:
             inner(message)
 
     wrap(robot, "on_twist", around)

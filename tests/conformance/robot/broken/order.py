@@ -168,8 +168,8 @@ def remembers_three_seconds(robot):
     record = record_of(robot)
 
     def around(inner, header, now_us):
-        for sender, (_seq, heard_us) in list(record._drivers.items()):
-            if now_us - heard_us > 3_000_000:
+        for sender, (_seq, received_us) in list(record._drivers.items()):
+            if now_us - received_us > 3_000_000:
                 del record._drivers[sender]
         inner(header, now_us)
 

@@ -36,7 +36,7 @@ def gives_up_at(way, heard_at=(), until_us=60_000_000) -> int | None:
     life, heard = Keepalive(0), sorted(heard_at)
     for now_us in range(0, until_us, TICK_US):
         while heard and heard[0] <= now_us:
-            life.hear(heard.pop(0))
+            life.note_data(heard.pop(0))
         if life.is_over(now_us, lambda: way(now_us)):  # noqa: B023
             return now_us
     return None
@@ -46,7 +46,7 @@ def test_silence_with_a_free_send_path_ends_after_exactly_two_seconds():
     life = Keepalive(5)
     assert not life.is_over(5 + SILENCE_US - 1, lambda: CLEAR)
     assert life.is_over(5 + SILENCE_US, lambda: CLEAR)
-    life.hear(6)
+    life.note_data(6)
     assert not life.is_over(5 + SILENCE_US, lambda: CLEAR)
     assert life.is_over(6 + SILENCE_US, lambda: CLEAR)
 
@@ -54,13 +54,13 @@ def test_silence_with_a_free_send_path_ends_after_exactly_two_seconds():
 def test_send_path_of_an_active_peer_is_not_read():
     life = Keepalive(0)
     for now_us in range(0, 20_000_000, 100_000):
-        life.hear(now_us)
+        life.note_data(now_us)
         assert not life.is_over(now_us + 499_999, pytest.fail)
 
 
 def test_a_ping_is_due_after_a_second_of_silence_and_each_second_of_it():
     life = Keepalive(0)
-    life.hear(300_000)
+    life.note_data(300_000)
     due = [now_us for now_us in range(0, 4_000_000, 100_000) if life.is_ping_due(now_us)]
     assert due == [1_300_000, 2_300_000, 3_300_000]
     assert PING_EVERY_US * 2 <= SILENCE_US
