@@ -147,7 +147,7 @@ class TrackConfig(Config):
     gate_m: Annotated[float, Field(gt=0, le=5)] = 0.35
     """A detection further than this from the expected position is another object."""
     gate_growth_mps: Annotated[float, Field(ge=0, le=10)] = 1.5
-    """Growth of this gate while the target is not detected."""
+    """Growth of this gate while the target is not detected, up to three sigma of the expected position."""
     apart_m: Annotated[float, Field(ge=0, le=5)] = 0.15
     """A detection nearer than this to an object is a part of it, or the same object found twice."""
     coast_s: Annotated[float, Field(ge=0, le=5)] = 0.5

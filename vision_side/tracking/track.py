@@ -113,6 +113,10 @@ class _Object:
         """Return the distance of a sighting from the expected position."""
         return _apart_m(self.state, place)
 
+    def three_sigma_m(self, place: "_Place") -> float:
+        """Return the distance of a sighting from the expected position that the filter still expects."""
+        return math.sqrt(_SURPRISE * (self.variance[0] + place.noise_m2))
+
     def unlike(self, place: "_Place") -> float:
         """Return the difference of the looks of the object and of a sighting."""
         return difference(self.look, place.sighting.look)
@@ -227,7 +231,8 @@ class Track:
 
     def _is_near(self, one: _Object, place: _Place) -> bool:
         # The gate grows while an object is hidden, because its position becomes less certain. Its look does not.
-        gate_m = self._config.gate_m + self._config.gate_growth_mps * one.state.unseen_us / 1e6
+        grown_m = self._config.gate_growth_mps * one.state.unseen_us / 1e6
+        gate_m = self._config.gate_m + min(grown_m, one.three_sigma_m(place))
         is_there = one.state.unseen_us <= _BRIEFLY_US and one.away_m(place) < self._config.apart_m
         return one.away_m(place) < gate_m and (is_there or one.unlike(place) < OTHER)
 

@@ -176,6 +176,30 @@ def test_gate_widens_with_the_time_without_a_sighting(off_m, inside):
     assert (track.step(DT_S, HERE, [at(2.0, off_m)]) is not None) == inside
 
 
+@pytest.mark.parametrize("hidden", [0, 3, 9])
+@pytest.mark.parametrize(("share", "inside"), [(0.999, True), (1.001, False)])
+def test_gate_widens_no_further_than_three_sigma(hidden, share, inside):
+    """Of the difference of place and sighting: 0.3 m/s and 0.35 m/s2 are those of a target that was seen once."""
+    track, noise, hidden_s = started((2.0, 0.0), gate_m=0.2, gate_growth_mps=10.0), 0.032**2, DT_S * (hidden + 1)
+    for _ in range(hidden):
+        track.step(DT_S, HERE, [])
+    sigma_m = math.sqrt(2 * noise + 0.3**2 * hidden_s**2 + 0.35**2 * hidden_s**3 / 3)
+    place = about(share * (0.2 + 3 * sigma_m))
+    assert (track.step(DT_S, HERE, [at(*place)]) is not None) == inside
+
+
+@pytest.mark.parametrize(("fps", "hidden_s", "off_m"), [(30, 0.4, 0.8), (30, 1.1, 1.4), (60, 0.7, 1.0), (5, 0.6, 1.1)])
+def test_twin_that_appears_far_from_the_target_while_that_is_hidden_is_not_the_target(fps, hidden_s, off_m):
+    track, dt_s = Track(TrackConfig()), 1 / fps
+    for _ in range(3 * fps):
+        assert track.step(dt_s, HERE, [at(*TARGET)]) is not None
+    for frame in range(round(hidden_s * fps)):
+        assert track.step(dt_s, HERE, [at(2.0, off_m)] if frame >= hidden_s * fps / 2 else []) is None
+    for _ in range(fps):
+        seen = track.step(dt_s, HERE, [at(2.0, off_m), at(*TARGET)])
+        assert seen is not None and seen.y_m == 0.0
+
+
 def test_sighting_at_the_very_edge_of_the_gate_is_outside():
     track = started((2.0, 0.0), gate_m=0.25, gate_growth_mps=0.0)
     assert track.step(DT_S, HERE, [at(2.25, 0.0)]) is None
