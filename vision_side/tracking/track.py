@@ -168,6 +168,8 @@ class Track:
         self._config = config
         self._followed: _Object | None = None
         self._others: list[_Object] = []
+        self._lost: _Object | None = None
+        """The last target, for a while after its loss. Its sighting is not of a rival."""
         self._lost_look: Look | None = None
         self._unsure_us = 0
         """Time in doubt, or since the loss of the target."""
@@ -195,13 +197,13 @@ class Track:
         if dt_s > _GAP_S:
             self._forget_hidden()
         fits = self._fits(places)
-        in_doubt = self._in_doubt(self._followed, fits) if self._followed else set()
+        in_doubt = self._in_doubt(fits)
         sure = {one: place for one, place in fits.items() if one not in in_doubt}
         for one, place in [(one, self._inexact(place) if self._is_in_line(one, pose) else place)
                            for one, place in sure.items()]:
             one.correct(place)
         if self._followed is None:
-            seen = self._start(dt_s, places, fits, number)
+            seen = self._start(dt_s, places, fits, in_doubt, number)
         else:
             seen = None if in_doubt else fits.get(self._followed)
             self._unsure_us = self._unsure_us + round(dt_s * 1e6) if in_doubt else 0
@@ -216,13 +218,14 @@ class Track:
         self._others = [one for one in self._others if not one.is_forgotten]
 
     def _objects(self) -> list[_Object]:
-        return [self._followed, *self._others] if self._followed else self._others
+        target = self._followed or self._lost
+        return [target, *self._others] if target else self._others
 
     def _fits(self, places: list[_Place]) -> dict[_Object, _Place]:
         """Assign places to objects: first to the target and those beside it; the best fit that looks alike first."""
-        fits, apart_m = dict[_Object, _Place](), self._config.apart_m
+        fits, apart_m, target = dict[_Object, _Place](), self._config.apart_m, self._followed or self._lost
         for is_first in (True, False):
-            objects = [one for one in self._objects() if (one is self._followed or one.was_beside) == is_first]
+            objects = [one for one in self._objects() if (one is target or one.was_beside) == is_first]
             pairs = [(one, place) for one in objects for place in places if self._is_near(one, place)]
             for one, place in sorted(pairs, key=lambda pair: pair[0].rank(pair[1])):
                 if one not in fits and all(_apart_m(place, taken) > apart_m for taken in fits.values()):
@@ -250,9 +253,14 @@ class Track:
         # The outline is of a part, or of both.
         return replace(place, noise_m2=max(place.noise_m2, _MOST_NOISE_M2))
 
-    def _in_doubt(self, target: _Object, fits: dict[_Object, _Place]) -> set[_Object]:
+    def _in_doubt(self, fits: dict[_Object, _Place]) -> set[_Object]:
         """Return the target and the rivals that could as well have its sighting, and it theirs; empty if none could."""
-        found = {one for one in self._others if one.is_rival and self._could_exchange(target, one, fits)}
+        target = self._followed or self._lost
+        if target is None:
+            return set()
+        # Where both are seen, the lost target is the one that is not at the place of the other.
+        rivals = [one for one in self._others if one.is_rival and (self._followed or not {target, one} <= fits.keys())]
+        found = {one for one in rivals if self._could_exchange(target, one, fits)}
         return {target, *found} if found else found
 
     def _could_exchange(self, one: _Object, other: _Object, fits: dict[_Object, _Place]) -> bool:
@@ -262,18 +270,20 @@ class Track:
         return bool(exchanged) and worse < _ODDS and all(self._is_near(thief, place) for place, _, thief in exchanged)
 
     def _start(
-        self, dt_s: float, places: list[_Place], fits: dict[_Object, _Place], number: int
+        self, dt_s: float, places: list[_Place], fits: dict[_Object, _Place], in_doubt: set[_Object], number: int
     ) -> _Place | None:
         """Follow the best sighting; for a while none of a rival of the last target, and none that looks other."""
         self._unsure_us += round(dt_s * 1e6)
         if self._unsure_us <= _MEMORY_US:
-            taken = [fits[one] for one in self._others if one.is_rival and one in fits]
+            taken = [place for one, place in fits.items() if one.is_rival or one in in_doubt]
             places = [one for one in places if difference(self._lost_look, one.sighting.look) < OTHER
                       and all(_apart_m(one, two) > self._config.apart_m for two in taken)]
+        else:
+            self._lost = None
         chosen = next(iter(places), None)
         if chosen is not None:
-            known = next((one for one, place in fits.items() if place is chosen), None)
-            self._followed, self._unsure_us = known or self._new(chosen), 0
+            known = next((one for one in self._others if fits.get(one) is chosen), None)
+            self._followed, self._lost, self._unsure_us = known or self._new(chosen), None, 0
             self._followed.state = replace(self._followed.state, number=number)
         return chosen
 
@@ -283,7 +293,7 @@ class Track:
         followed.was_beside = self._unsure_us > _DOUBT_US
         if followed.was_beside or followed.state.unseen_us > self._config.give_up_s * 1e6:
             self._others += [followed] if followed.was_beside else []
-            self._lost_look = followed.look
+            self._lost, self._lost_look = None if followed.was_beside else followed, followed.look
             self._followed, self._unsure_us = None, 0
 
     def _update_others(self, places: list[_Place], fits: dict[_Object, _Place], target: _Object | None) -> None:

@@ -345,6 +345,42 @@ def test_best_sighting_that_is_of_no_such_object_is_followed_first():
     assert others(track) == [(1.0, -0.5), pytest.approx((2.0, 0.5))]
 
 
+def lost_beside(place, hidden):
+    """Return a track that lost its target, and whose other object was not seen for so many frames either."""
+    track = beside(place, frames=20, give_up_s=0.4)
+    for _ in range(hidden):
+        track.step(DT_S, HERE, [])
+    assert track.target is None
+    return track
+
+
+@pytest.mark.parametrize(("hidden", "y_m"), [(5, 0.45), (5, -0.5), (8, 0.6), (15, -1.1)])
+def test_lost_target_that_is_seen_again_at_its_place_is_followed_though_the_other_is_hidden(y_m, hidden):
+    """The other one could be there by now, but not as well."""
+    track = lost_beside((2.0, y_m), hidden)
+    assert track.step(DT_S, HERE, [at(*TARGET)]) is not None
+    assert (track.target.sightings, others(track)) == (1, [pytest.approx((2.0, y_m))])
+
+
+@pytest.mark.parametrize("hidden", [8, 15])
+def test_sighting_between_a_lost_target_and_the_other_is_of_neither_until_the_other_is_seen(hidden):
+    track = lost_beside((2.0, 0.5), hidden)
+    for _ in range(3):
+        assert track.step(DT_S, HERE, [at(2.0, 0.25)]) is None
+        assert others(track) == [pytest.approx((2.0, 0.5))]
+    assert track.step(DT_S, HERE, [at(2.0, 0.52), at(2.0, 0.22)]).y_m == 0.22
+
+
+def test_lost_target_is_remembered_for_three_seconds():
+    """Then it takes no sighting from the other object, whatever fits better."""
+    track = lost_beside((2.0, 0.5), 5)
+    for number in range(30):
+        assert (number, track.step(DT_S, HERE, [at(2.0, 0.5)])) == (number, None)
+    assert track._lost is not None
+    assert track.step(DT_S, HERE, [at(2.0, 0.5)]) is not None
+    assert track._lost is None
+
+
 def look(share):
     """Return a look that differs by so much from that of a target with look(0)."""
     looks = np.zeros(64, np.float32)
