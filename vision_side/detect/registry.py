@@ -15,7 +15,7 @@ from sightline.protocol.errors import ConfigError
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.detect.filters import ColorFilter, LabelFilter, TrackIds
 from sightline.vision_side.detect.plugin_calls import OLD_NOTICES, labels_of, plugin_guard
-from sightline.vision_side.detect.port import Detector, NoDetector
+from sightline.vision_side.detect.port import COLOR_LABEL, Detector, NoDetector
 from sightline.vision_side.detect.remote.client import EXAMPLES
 from sightline.vision_side.missions.registry import MissionSpec, check_missions, configured_mission
 from sightline.vision_side.plugins import shared_options
@@ -98,6 +98,7 @@ def _check_labels(place: str, kind: str, wanted: Sequence[str], known: Sequence[
         if label not in known:
             nearest = difflib.get_close_matches(label, known, n=1)
             hint = f"; did you mean {nearest[0]!r}?" if nearest else f"; it gives {', '.join(known[:_MOST_NAMED])}"
+            hint = "; only a color detector gives it, e.g. --detector hsv" if label == COLOR_LABEL else hint
             raise ConfigError(f"{place}: {kind} has no label {label!r}{hint}")
 
 

@@ -189,6 +189,8 @@ def test_every_mistake_is_one_line(detector: dict, words: str) -> None:
         ({"target": {"label": "bal"}}, "mission 'follow': onnx has no label 'bal'; did you mean 'ball'?"),
         ({"mission": {"kind": "follow", "options": {"target": {"label": "bal"}}}}, "mission 'follow': onnx has no"),
         ({"mission": {"kind": "legs", "options": {"label": "person"}}}, "mission 'legs': onnx has no label 'person'"),
+        ({"mission": {"kind": "traffic-light"}},
+         "mission 'traffic-light': onnx has no label 'target'; only a color detector gives it, e.g. --detector hsv"),
         ({"detector": {"kind": "onnx", "labels": ["bal"]}}, "detector.labels: onnx has no label 'bal'"),
         ({"detector": {"kind": "onnx", "labels": ["bal"], "fallback": "hsv"}}, "detector.labels: onnx has no label"),
         ({"detector": {"kind": "hsv", "labels": ["target"], "shadow": "onnx"}}, "detector.labels: onnx has no label"),
