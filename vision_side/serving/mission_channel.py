@@ -90,7 +90,8 @@ def _check(header: RequestHeader, source: str, frame: FrameHeader, waited_us: in
                                                f"{frame.session}; repeat the request")
     age_us = frame.t_us - echo.t_us
     if age_us < -AHEAD_US - waited_us:  # while a frame waits for a slow detector, newer statuses come
-        raise WireError(RejectReason.FROM_FUTURE, "cites a status from the future")
+        raise WireError(RejectReason.FROM_FUTURE,
+                        f"cites a status {-age_us / 1e6:.1f} s newer than the newest frame here; repeat the request")
     if age_us > MAX_AGE_US:
         raise WireError(RejectReason.STALE, f"requested {age_us / 1e6:.1f} s ago; repeat the request")
 

@@ -334,7 +334,9 @@ def late(request, monkeypatch):
 def test_mission_that_cites_a_status_of_the_future_is_rejected(late):
     bench, waited_us = late
     bench.frames(2).ask(age_us=-600_000 - waited_us)
-    assert bench.report().refused.startswith("FROM_FUTURE")
+    newer_s = (600_000 + waited_us - FRAME_US) / 1e6
+    assert bench.report().refused == (f"FROM_FUTURE: cites a status {newer_s:.1f} s newer than the newest frame here; "
+                                      "repeat the request")
     assert bench.ask(number=2, age_us=-400_000 - waited_us).report().refused == ""
 
 
