@@ -39,7 +39,7 @@ _TWIST = Twist(linear_mps=0.2, angular_rad_s=-0.35)
 
 
 def measure_codec() -> list[Check]:
-    """Medians over 200 rounds of 50 calls in a hot loop; after idling 33 ms the same calls cost several times more."""
+    """Return medians over 200 rounds of 50 calls in a hot loop. After 33 ms of idling calls cost several times more."""
     took_us = {"frame header": _median_us(_frame), "answer header and twist": _median_us(_answer)}
     return [at_most(name, one_us, "us", CODEC_BOUND_US) for name, one_us in took_us.items()]
 
@@ -71,7 +71,7 @@ _SESSION: Final = "0000aaaa"
 
 
 def measure_gate(commands: int = 5_000) -> float:
-    """Median microseconds of `offer` and `step` together, driving: each command cites a frame of its own."""
+    """Return the median of `offer` and `step` together while driving, us. Each command cites its own frame."""
     gate, took_us = SafetyGate(SafetyConfig(auto_arm=True), _SESSION), []
     twist = Twist(linear_mps=0.3, angular_rad_s=0.2)
     for number in range(commands):
@@ -92,7 +92,7 @@ PROOF_BOUND_US: Final = 100.0
 
 
 def measure_proof() -> float:
-    """Median microseconds to check the proof of a command, after as many lost commands as may be lost in a row."""
+    """Return the median time to check the proof of a command after the longest permitted run of lost ones, us."""
     chain = ProofChain(secrets.token_bytes)
     last, *_, newest = [chain.next() for _ in range(MAX_LOST + 1)]
     if not continues(newest.proof, last):

@@ -33,17 +33,17 @@ from sightline.vision_side.detect.port import DetectFrame, Detection, DetectionR
 
 
 class SlowDetector:
-    """`--serve sightline.benchmarks.detector:SlowDetector`."""
+    """A detector with a chosen delay, for `--serve sightline.benchmarks.detector:SlowDetector`."""
 
     class Config(Settings):
         """Time per frame and per batch."""
 
         each_us: Annotated[int, Field(ge=0, le=1_000_000)] = 1_667
-        """The time that one frame takes, in a batch or alone: 600 a second."""
+        """Time for one frame, in a batch or alone: 600 a second."""
         batch_us: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-        """The time that a batch takes in addition, as on a GPU."""
+        """Additional time for a batch, as on a GPU."""
         pixels: bool = False
-        """True if it decodes each image before."""
+        """True to decode each image first."""
 
     def __init__(self, config: Config) -> None:
         self._each_s, self._batch_s, self._pixels = config.each_us / 1e6, config.batch_us / 1e6, config.pixels
@@ -57,10 +57,10 @@ class SlowDetector:
         return [result_of(frame, self._found, Maker("slow", device="cpu")) for frame in frames]
 
 
-# The cost of a remote detector against the same one in this process: time from frame to result. Shell (the clock).
+# The added cost of a remote detector, from frame to result, against the same one in this process. Shell (the clock).
 #
-# Both receive the same frames in turns, so that other load on the machine affects both: hot, one frame after the other,
-# and paced as a robot sends them, with cold caches.
+# Both receive the same frames in turns, so that other load affects both. They run hot, one frame right after the other,
+# and paced as a robot sends frames, with cold caches.
 
 
 PACED_S: Final = 1 / 30
@@ -71,13 +71,13 @@ _DEADLINE_US: Final = 500_000
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Microseconds for one frame, medians; `unanswered` counts frames without a valid remote answer."""
+    """Medians for one frame, us. `unanswered` counts frames without a valid remote answer."""
 
     here_us: float
     there_us: float
     unanswered: int
     why: str = ""
-    """The cause of the first missing answer, where it is known."""
+    """Cause of the first missing answer, if known."""
 
     @property
     def added_us(self) -> float:
@@ -116,10 +116,10 @@ def _header(number: int) -> FrameHeader:
     return FrameHeader(session="0000abcd", seq=number, t_us=monotonic_us())
 
 
-# Many streams at one or several detector services: rate, age, fairness, memory, double answers. Shell (processes, the
+# Many streams at one or several detector services: rate, age, fairness, memory, repeated answers. Shell (processes, a
 # clock).
 #
-# The services are the real ones, in processes of their own; robots are links of this process, which is where all meet.
+# The services are real processes. The robots are links of this process, where all results arrive.
 
 
 DEADLINE_MS: Final = 100.0
@@ -131,18 +131,18 @@ LONGEST_GAP_MS: Final = 250.0
 LEAST_SHARE: Final = 0.75
 """Of the frames that the robots send."""
 BATCH_P95_MS: Final = 60.0
-"""Beside two batches: a frame waits for the one before its own."""
+"""Longer than two batches: a frame waits for the batch before its own."""
 _FPS: Final = 30
 _WARM_S: Final = 5.0
 _STATUS_S: Final = 0.1
 _READY_S: Final = 60.0
 _REMEMBERED: Final = 64
-"""Frames of a robot whose answers are counted; a second answer comes within a deadline."""
+"""Frames of a robot whose answers are counted; a second answer arrives within a deadline."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamPlan:
-    """A run: robots with 30 frames per second each, and services that look at the same frames."""
+    """A run: robots with 30 frames per second each, and services that examine the same frames."""
 
     streams: int = 40
     seconds: float = 60.0
@@ -152,10 +152,10 @@ class StreamPlan:
     arguments: tuple[str, ...] = ()
     """Further arguments of each service."""
     kill: bool = False
-    """True to kill the last service in the middle of the run."""
+    """True to kill the last service halfway through the run."""
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for a run that would have no service at its end."""
+        """Raise ConfigError for a run without a service at its end."""
         if self.kill and self.services < 2:
             raise ConfigError("--kill needs a service that remains; add --services 2")
 
@@ -175,10 +175,10 @@ class Load:
     offered: int = 0
     answered: Counter[str] = field(default_factory=Counter)
     repeated: int = 0
-    """Answers to frames that were answered before."""
+    """Answers to frames that had an answer."""
     ages_ms: list[float] = field(default_factory=list)
     answered_us: dict[str, int] = field(default_factory=dict)
-    """Time of the newest answer to a robot, at first the begin of the run."""
+    """Time of the newest answer to a robot, initially the start of the run."""
     gap_us: int = 0
     """Longest time without an answer to a robot."""
     memory_mb: list[float] = field(default_factory=list)
@@ -188,7 +188,7 @@ class Load:
     seconds: float = 0.0
 
     def begin(self, robots: Iterable[str], now_us: int) -> None:
-        """Forget the memory of the time before, and wait for the first answer to each robot."""
+        """Drop the earlier memory samples, and wait for the first answer to each robot."""
         self.memory_mb.clear()
         self.answered_us = dict.fromkeys(robots, now_us)
 
@@ -200,7 +200,7 @@ class Load:
         self.ages_ms.append((now_us - frame_us) / 1000)
 
     def end(self, now_us: int) -> None:
-        """Count the time since the newest answer to each robot, too."""
+        """Count the time since the newest answer to each robot."""
         for robot in self.answered_us:
             self._close_gap(robot, now_us)
 
@@ -243,7 +243,7 @@ class Load:
 
 
 def stream_checks(load: Load, plan: StreamPlan) -> list[Check]:
-    """Check the result of a run. With a time for a batch the rate counts, otherwise the overload."""
+    """Check the result of a run: with a time per batch the rate, otherwise the overload."""
     checks = [
         at_most("furthest from an equal share", load.unfair_percent, "%", FAIRNESS_PERCENT),
         at_most("robots without an answer", plan.streams - len(load.answered), "", 0),
@@ -269,12 +269,12 @@ def stream_checks(load: Load, plan: StreamPlan) -> list[Check]:
 
 
 class _Streams:
-    """The robots."""
+    """The robots of a run."""
 
     def __init__(self, links: list[ZenohLink], jpeg: bytes) -> None:
         self._links, self._jpeg, self.load = links, jpeg, Load()
         self._sent_us: dict[tuple[str, int], int] = {}
-        """Of each frame of each robot. An answer is not trusted: it may cite another time, or no frame at all."""
+        """Send time of each frame of each robot. Answers may cite another time or no frame at all."""
         self._seq = 0
         self._published_s = 0.0
         self.counting = False
@@ -302,7 +302,7 @@ class _Streams:
         return note
 
     def publish_status(self) -> None:
-        """Publish each robot's status, once a second: a robot without one has left."""
+        """Publish the status of each robot once a second; a robot without one counts as gone."""
         if time.monotonic() - self._published_s < _STATUS_S:
             return
         self._published_s = time.monotonic() + 1.0 - _STATUS_S if self.counting else time.monotonic()
@@ -319,7 +319,7 @@ class _Streams:
 
 
 def measure_streams(endpoint: str, folder: Path, plan: StreamPlan) -> Load:
-    """Offer streams to services as planned. Raises SightlineError if a service does not start, or ends by itself."""
+    """Run the planned streams and services. Raises SightlineError if a service does not start or ends by itself."""
     write_pictures(folder, 320, 240)
     jpeg = sorted(folder.glob("*.jpg"))[0].read_bytes()
     with terminated_like_interrupted(), ExitStack() as ending:
@@ -327,7 +327,7 @@ def measure_streams(endpoint: str, folder: Path, plan: StreamPlan) -> Load:
         links = [ZenohLink(session, LinkRules(f"s{index}", "robot"), shared=True) for index in range(plan.streams)]
         for link in links:
             ending.callback(link.close)
-            ending.callback(declare_token(session, RobotToken(link.robot)))  # services that share find it by this
+            ending.callback(declare_token(session, RobotToken(link.robot)))  # services that share find it by this token
         services = ending.enter_context(Processes(folder))
         for index in range(plan.services):
             services.start(f"detector-{index}", plan.command(endpoint))
@@ -370,7 +370,7 @@ def _wait_ready(robots: _Streams, plan: StreamPlan, services: Processes) -> None
 
 
 def _offer(robots: _Streams, streams: int, seconds: float, services: Processes) -> None:
-    """Frames of one stream after the other, evenly spaced; the newest of each, as robots send them."""
+    """Publish the newest frame of each stream in turn, evenly spaced, as robots send them."""
     began_s = time.monotonic()
     for index in range(round(seconds * streams * _FPS)):
         due_s = began_s + index / (streams * _FPS)

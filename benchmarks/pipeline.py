@@ -1,4 +1,4 @@
-"""Measure one `Pipeline.step` hot, paced, and its decode; and the detectors `hsv` and `onnx`. Shell (a clock)."""
+"""Measure `Pipeline.step`, hot and paced, its decode, and the detectors `hsv` and `onnx`. Shell (a clock)."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -31,12 +31,12 @@ _FRAME_US = 33_333
 
 @dataclass(frozen=True, slots=True)
 class StepTime:
-    """One size of image, medians; `phase` at their end shows that all steps ran.
+    """Medians for one image size; the last `phase` shows that all steps ran.
 
-    `median_us`: hot, one frame right after the other; the bound holds for this one. `alone_us`: of its rounds, the
-    best. `paced_us`: 30 frames a second with sleep between, when caches and clock speed have to be regained each time.
-    `decode_us`: the decode alone, hot, of the same images, which is the floor: its best round. `hsv_us`: the decode
-    and the detector `hsv`, hot, which the bound holds for too, and `hsv_alone_us` of its rounds the best.
+    `median_us`: hot, one frame right after the other; it has a bound. `alone_us`: the best of its
+    rounds. `paced_us`: 30 frames a second with sleep between, with cold caches and a low clock each time.
+    `decode_us`: the decode alone, hot, of the same images (the floor), best round. `hsv_us`: the decode
+    and the detector `hsv`, hot, also with a bound. `hsv_alone_us`: the best of its rounds.
     """
 
     width_px: int
@@ -53,18 +53,18 @@ class StepTime:
 
 
 def time_steps(frames: int = 900, paced_frames: int = 60) -> list[StepTime]:
-    """Medians over `frames` frames of each size, and over `paced_frames` at 30 a second."""
+    """Return medians over `frames` frames of each size, and over `paced_frames` at 30 a second."""
     return [_time_size(size, frames, paced_frames) for size in BOUNDS_US]
 
 
 @dataclass(frozen=True, slots=True)
 class LearnedTime:
-    """The detector `onnx` as it ships on one thread at 320x240, hot, medians.
+    """Medians of the shipped detector `onnx` on one thread at 320x240, hot.
 
-    `network_us`: the network alone, overlaps removed and boxes decoded; the bound holds for this. `alone_us`: of its
-    rounds, the best. `whole_us`: from JPEG to detections. `two_us`: the same for images without a ball where one is
-    expected, which are looked at twice; with a bound. `decode_us`: the JPEG's decode alone, its best round. `missed`:
-    the images in which it found no ball. `false`: those without a ball in which it found one, looked at once.
+    `network_us`: the network alone, with boxes decoded and overlaps removed; it has a bound. `alone_us`: the best
+    of its rounds. `whole_us`: from JPEG to detections. `two_us`: the same for images without a ball where one is
+    expected, which are examined twice; it has a bound. `decode_us`: the decode alone, best round. `missed`:
+    images in which it found no ball. `false`: images without a ball in which it found one, examined once.
     """
 
     engine: str
@@ -78,7 +78,7 @@ class LearnedTime:
 
 
 def time_learned(frames: int = 600) -> LearnedTime:
-    """Raises ConfigError without a model that runs here."""
+    """Measure the learned detector. Raises ConfigError without a model that runs here."""
     size = (320, 240)
     pictures, decoder = _pictures(*size), Decoder(*size, size[0] * size[1])
     config = OnnxDetector.Config(device="cpu")
@@ -141,9 +141,10 @@ def _took_us(call: Callable[[Any], object], inputs: Iterable[Any]) -> list[float
 
 
 def _alone(took_us: list[float]) -> float:
-    """The least median of the rounds: what it takes when the machine is least disturbed. On a shared machine the same
-    work was seen to take a third longer in most half-seconds, for which no counter gave a reason. (Python's `timeit`
-    recommends the minimum, too.)
+    """Return the smallest median of the rounds, from when the machine was least disturbed.
+
+    On a shared machine the same work took a third longer in most half-seconds, and no counter showed why. Python's
+    `timeit` also recommends the minimum.
     """
     return min(median(took_us[first : first + _ROUND]) for first in range(0, len(took_us), _ROUND))
 
@@ -155,9 +156,9 @@ def _camera(width_px: int, height_px: int) -> CameraModel:
 
 
 def _pictures(width_px: int, height_px: int, balls: int = 1) -> list[bytes]:
-    """Textured rooms with the ball of the scenarios, or none, of about the size that the bounds were set for.
+    """Draw textured rooms with the ball of the scenarios, or without one, for image sizes like those of the bounds.
 
-    Many, since a processor learns the branches of one image that is decoded over and over: 20 % of the decode.
+    Many images, since branch prediction learns a single repeated image, which saves 20 % of its decode.
     """
     drawn = [_drawn(width_px, height_px, seed, balls) for seed in range(_PICTURES)]
     quality = min(range(40, 96), key=lambda one: abs(len(_encode(drawn[0], one)) - _JPEG_BYTES[width_px, height_px]))

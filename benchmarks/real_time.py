@@ -16,17 +16,17 @@ _SCORED: Final = (0, 5)
 
 @dataclass(frozen=True, slots=True)
 class Kinds:
-    """The figures with another check than a median below its bound."""
+    """Figures whose check is not a median below its bound."""
 
     at_least: str
-    """How the names of those begin that must not fall below it."""
+    """Prefix of the figures that must not fall below their bound."""
     exact: Collection[str]
     """Figures without tolerance: every run is checked."""
 
 
 @dataclass(frozen=True, slots=True)
 class DemoFigure:
-    """One figure over the seeds of a scenario, held against its bound."""
+    """One figure over the seeds of a scenario, and its bound."""
 
     name: str
     median: float | None
@@ -39,9 +39,9 @@ class DemoFigure:
 def measure_demos(
     scenarios: Sequence[str], seeds: Sequence[int], seconds: float | None, kinds: Kinds, show: Callable[[str], None]
 ) -> list[DemoFigure]:
-    """Run every scenario with every seed, for as long as a demo takes if `seconds` is None.
+    """Run every scenario with every seed; `seconds` None is the length of a demo.
 
-    Raises ProcessError with the last words and the exit code of a demo that cannot run.
+    Raises ProcessError with the last output and the exit code of a demo that cannot run.
     """
     figures: list[DemoFigure] = []
     for scenario in scenarios:
@@ -75,7 +75,7 @@ def _figures(scenario: str, results: Sequence[dict[str, Any]], kinds: Kinds) -> 
 
 
 def _differing(replayed: dict[str, Any]) -> int:
-    """Count the answers that differ, and all that is not in the recording: without it, no answer can be compared."""
+    """Count the different answers and the missing records, without which an answer cannot be compared."""
     lost: int = replayed["gaps"] + replayed["missing_frames"]
     return lost + int(replayed["total"]) - int(replayed["equal"])
 

@@ -16,7 +16,7 @@ _IDLE, _IOWAIT, _STEAL = 3, 4, 7  # columns of /proc/stat, proc(5)
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The kernel's counters at one moment. `busy_s` is of all processes together, `steal_s` is the hypervisor's."""
+    """Counters of the kernel at one moment. `busy_s` is of all processes, `steal_s` of the hypervisor."""
 
     cpu_s: Mapping[str, float]
     own_s: float
@@ -25,7 +25,7 @@ class Reading:
 
 
 def read_machine(pids: Mapping[str, int]) -> Reading:
-    """Read now. Raises HardwareError if a process is gone."""
+    """Read all counters now. Raises HardwareError if a process has ended."""
     columns = [int(text) / _TICKS_PER_S for text in Path("/proc/stat").read_text().splitlines()[0].split()[1:9]]
     return Reading(
         cpu_s={name: _cpu_s(pid) for name, pid in pids.items()},
@@ -36,26 +36,26 @@ def read_machine(pids: Mapping[str, int]) -> Reading:
 
 
 def taken_percent(before: Reading, after: Reading, seconds: float) -> float:
-    """Share of the machine's time that neither we nor idleness had: stolen by the hypervisor, or of other processes."""
+    """Return the share of the machine's time taken by the hypervisor or by other processes."""
     ours_s = after.own_s - before.own_s + sum(after.cpu_s[name] - before.cpu_s[name] for name in after.cpu_s)
     others_s = max(0.0, after.busy_s - before.busy_s - ours_s) + after.steal_s - before.steal_s
     return 100 * others_s / (seconds * (os.cpu_count() or 1))
 
 
 def high_water_mb(pid: int) -> float:
-    """Return the most memory that the process used so far, in MB of 2**20 bytes. Raises HardwareError if it is gone."""
+    """Return the peak memory of the process, in MB of 2**20 bytes. Raises HardwareError if it has ended."""
     return _memory_mb(pid, "VmHWM:")
 
 
 def resident_mb(pid: int) -> float:
-    """Return the memory that the process uses, in MB of 2**20 bytes. Raises HardwareError if it is gone."""
+    """Return the memory of the process, in MB of 2**20 bytes. Raises HardwareError if it has ended."""
     return _memory_mb(pid, "VmRSS:")
 
 
 def _memory_mb(pid: int, field: str) -> float:
     lines = _read(pid, "status").splitlines()
     held_kib = next((int(line.split()[1]) for line in lines if line.startswith(field)), None)
-    if held_kib is None:  # it has ended, and its parent has not noticed
+    if held_kib is None:  # it has ended, and its parent has not reaped it
         raise _gone(pid)
     return held_kib / 1024
 
@@ -72,18 +72,18 @@ def _gone(pid: int) -> HardwareError:
 
 
 def _cpu_s(pid: int) -> float:
-    # The command's name stands in brackets and may hold anything; what is numbered from 3 on follows it.
+    # The command name is in parentheses and may contain anything; the fields from number 3 on follow it.
     fields = _read(pid, "stat").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
 
 
-# Bytes that TCP connections on loopback have carried, as the kernel counts them for each. Shell (netlink, Linux).  The
-# counters of the loopback interface include all programs; these are only of the sockets of a contestant. sock_diag(7)
+# Bytes that TCP connections on loopback have carried, per connection. Shell (netlink, Linux).  The
+# counters of the loopback interface include all programs; these are of a contestant's sockets only. sock_diag(7)
 # describes the query and the reply; tcp_info is that of linux/tcp.h.
 
 
 Connection = tuple[int, int]
-"""(port listened on, port of the peer)."""
+"""(listening port, port of the peer)."""
 
 _NETLINK_SOCK_DIAG: Final = 4
 _SOCK_DIAG_BY_FAMILY, _REQUEST_DUMP, _INET_DIAG_INFO, _ESTABLISHED = 20, 0x301, 2, 1
@@ -111,7 +111,7 @@ def carried_bytes(ports: Collection[int]) -> dict[Connection, int]:
 def carried_between(before: Mapping[Connection, int], after: Mapping[Connection, int]) -> int | None:
     """Count the bytes between two readings. Of several connections to one port the busiest counts.
 
-    The others are those of viewers. None without counters.
+    The others belong to viewers. None without counters.
     """
     busiest: dict[int, int] = {}
     for connection, count in after.items():

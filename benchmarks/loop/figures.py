@@ -18,18 +18,18 @@ OLDER: Final = "older"
 """The pipeline of the legacy articles, detector included. All others use Sightline's detector and steering."""
 ZENOH: Final = ("callback", "ring", "newest")
 PEERS: Final = ("tcp", *ZENOH, "openpi", "lekiwi", OLDER)
-"""What a user would build, one by one."""
+"""Designs that a user would build."""
 MAX_FPS: Final = 240.0
-"""As much as the robot service takes."""
+"""Limit of the robot service."""
 MAX_ANGULAR_RAD_S: Final = 8.0
-"""Turn rate that no command for these images reaches, rad/s. At a limit, one command would equal the next."""
+"""Turn rate above all commands for these images, rad/s. At a limit, one command would equal the next."""
 TAKEN_BOUND_PERCENT: Final = 5.0
-"""More of the machine's time than this in other hands makes a sample inconclusive."""
+"""Share of time of other programs above which a sample is inconclusive."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopSetting:
-    """The same for every contestant. `pictures` is a folder of JPEGs of the given size."""
+    """Settings of all contestants. `pictures` is a folder of JPEGs of the given size."""
 
     pictures: Path
     width_px: int = 640
@@ -37,18 +37,18 @@ class LoopSetting:
     fps: float = 30.0
     transport: str = "zenoh"
     detector_delay_ms: float = 0.0
-    """Every detector waits so much longer, as for an accelerator."""
+    """Additional time of every detector, as for an accelerator."""
     overload: float = 0.0
-    """How many times more images come than can be detected; 0 leaves the rate as it is."""
+    """Ratio of offered to detectable images; 0 leaves the rate unchanged."""
     busy_ms: float = 0.0
-    """Every detector works at least so long on an image, as on a slower processor; follows from `overload`."""
+    """Smallest time of every detector for an image, as on a slower processor; follows from `overload`."""
     seconds: float = 10.0
     peers: tuple[str, ...] = PEERS
     tries: int = 3
-    """A sample that others disturbed is taken again, so often at most."""
+    """Most samples that are taken in place of disturbed ones."""
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for what cannot be run."""
+        """Raise ConfigError for settings that cannot run."""
         if not 1 <= self.fps <= MAX_FPS or not 2 <= self.seconds <= 600 or not 0 <= self.detector_delay_ms <= 300:
             raise ConfigError("--fps 1 to 240, --seconds 2 to 600 and --detector-delay-ms 0 to 300, e.g. --fps 30")
         if self.overload and (not 1 < self.overload <= 10 or self.detector_delay_ms):
@@ -86,18 +86,18 @@ def peers_of(text: str) -> tuple[str, ...]:
     return names
 
 
-# What became of the images of one sample: how many were captured, how many answered, and how late. Pure.
+# The outcome of the images of one sample: counts of captured and answered ones, and the ages. Pure.
 
 
 Header = tuple[int, int, int | None]
-"""Of a frame: (seq, t_us, latency_us of the command accepted last before it)."""
+"""Of a frame: (seq, t_us, latency_us of the last command accepted before it)."""
 Accepted = tuple[int, int]
-"""Of a status: (t_us, commands accepted so far). A command that is sent twice is accepted twice."""
+"""Of a status: (t_us, number of accepted commands). A command sent twice is accepted twice."""
 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """`ages_us` are (time of the result, age of the image at the result), in the order of time.
+    """Results of one contestant. `ages_us` are (time of the result, age of the image then), in order.
 
     The result of the services is the first `drive.set` with other speeds after the validation of a command;
     `validated_us` are the ages at the validation. A peer has no wheels: its result is the command in its robot process.
@@ -117,7 +117,7 @@ class Course:
 class LoopSample:
     """The measurements of `name` within `seconds`. Processor time and memory are per process.
 
-    `taken_percent` is the share of the machine's time that others had; `hot_us` one step without pauses (floor only);
+    `taken_percent` is the share of time that other programs had; `hot_us` is one step without pauses (floor only);
     `carried_bytes` are the bytes on the contestant's sockets, None without kernel support.
     """
 
@@ -133,7 +133,7 @@ class LoopSample:
 
 
 def joined(samples: Sequence[LoopSample]) -> LoopSample:
-    """Join several turns of one contestant into one sample. Memory and disturbance are the worst."""
+    """Join several turns of one contestant into one sample. Memory and disturbance are the worst of them."""
     first, courses = samples[0], [sample.course for sample in samples]
     captured = sum(course.captured for course in courses)
     answered = sum(course.captured * course.answered_percent for course in courses) / max(1, captured)
@@ -154,10 +154,10 @@ def joined(samples: Sequence[LoopSample]) -> LoopSample:
 def course_of_tally(
     captured_us: Sequence[int], commands_us: Sequence[Sequence[int]], begin_us: int, end_us: int
 ) -> Course:
-    """Return the course of a contestant that recorded everything itself.
+    """Return the course of a contestant by its tally.
 
-    Ages are those of results within the time, so that a growing queue shows. An image captured within it counts as
-    answered even with a late result.
+    Ages are of results within the period, so that a growing queue shows. An image captured within it counts as
+    answered even if its result is late.
     """
     captured = {t_us for t_us in captured_us if begin_us <= t_us < end_us}
     answered = captured & {t_us for t_us, _ in commands_us}
@@ -166,7 +166,7 @@ def course_of_tally(
 
 
 class WheelCommand(NamedTuple):
-    """One line of the log drive's file."""
+    """One line of the log drive."""
 
     t_us: int
     left_rad_s: float
@@ -179,21 +179,21 @@ class WheelCommand(NamedTuple):
 
 
 def read_wheel_commands(text: str) -> list[WheelCommand]:
-    """Whole lines; one that is still being written is left out."""
+    """Return the complete lines. A line that is still being written is left out."""
     parts = [line.split(",") for line in text.split("\n")[:-1]]
     return [WheelCommand(int(t), float(left), float(right)) for t, left, right in parts]
 
 
 def changes_us(rows: Sequence[WheelCommand]) -> list[int]:
-    """Return the times of the lines that set other speeds than the line before: only those carry a new command."""
+    """Return the times of the lines that change the speeds: only those carry a new command."""
     return [row.t_us for before, row in pairwise(rows) if row[1:] != before[1:]]
 
 
 def repeats_us(commands: Sequence[tuple[int, str]]) -> set[int]:
     """Return the times of the images whose command equals the one before.
 
-    `commands` are (time of the image, `linear|angular`), in order. A repeated command sets the speeds that the wheels
-    have, so that no line of the motor log shows when: the next change is that of the next command.
+    `commands` are (time of the image, `linear|angular`), in order. A repeated command does not change the speeds, so
+    the motor log does not show its time. The next change belongs to the next command.
     """
     return {t_us for (_, before), (t_us, command) in pairwise(commands) if command == before}
 
@@ -209,8 +209,8 @@ class WheelAge(NamedTuple):
 def wheel_ages(headers: Sequence[Header], sets_us: Sequence[int]) -> Iterator[WheelAge]:
     """Yield the ages of the accepted commands: from frame headers, and from the times of `drive.set`.
 
-    A header contains the age at the last validation before it, of the newest frame that is so old by then. A header
-    whose latency is the one before it brings no news: nothing was accepted in between.
+    A header contains the age of a frame at the last validation before it: of the newest frame that has this age then.
+    If its latency equals the previous one, no command was accepted in between.
     """
     times_us = [t_us for _, t_us, _ in headers]
     for (_, _, before_us), (_, t_us, latency_us) in pairwise(headers):
@@ -237,7 +237,7 @@ def course_of_headers(
         return Course(0, 0.0, ())
     lag_us = round(median(age.validated_us for age in ages))
     statuses = [status for status in accepted if begin_us <= status[0] < end_us]
-    captured = inside[-1][0] - inside[0][0] + 1  # by number: those that never arrived count too
+    captured = inside[-1][0] - inside[0][0] + 1  # by number, so that lost frames count too
     return Course(captured, min(100.0, _accepted_percent(headers, statuses, lag_us) / copies),
                   tuple((age.set_us, age.age_us) for age in ages), tuple(age.validated_us for age in ages))
 
@@ -245,7 +245,7 @@ def course_of_headers(
 def _accepted_percent(headers: Sequence[Header], statuses: Sequence[Accepted], lag_us: int) -> float:
     """Return the commands per hundred frames captured between the first and the last status.
 
-    Results lag captures by `lag_us`. A result at the boundary may count on its other side.
+    Results lag captures by `lag_us`. A result near a boundary may count on either side.
     """
     times_us = [t_us for _, t_us, _ in headers]
     seqs = [headers[max(0, bisect_right(times_us, t_us - lag_us) - 1)][0] for t_us, _ in statuses]
@@ -254,7 +254,7 @@ def _accepted_percent(headers: Sequence[Header], statuses: Sequence[Accepted], l
     return 100 * (statuses[-1][1] - statuses[0][1]) / (seqs[-1] - seqs[0])
 
 
-# The figures of `bench loop` and the bounds they are held against. Pure.
+# The figures of `bench loop` and their bounds. Pure.
 
 
 P50_OVER_FLOOR_MS: Final = 1.5
@@ -262,20 +262,21 @@ P95_OVER_FLOOR_MS: Final = 5.0
 TIMES_FLOOR: Final = 1.5
 BEHIND_ZENOH_MS: Final = 0.3
 MOST_WAIT_MS: Final = 5.0
-"""Of a command for `drive.set`, from its validation."""
+"""Wait of a command from its validation to `drive.set`."""
 KNOWN_WAIT_SHARE: Final = 0.9
-"""Of the captured images: so many commands must have a known wait. Of two between two headers only one is known; of one
-that repeats the command before, none."""
+"""Share of the captured images whose command must have a known wait. Of two commands between two headers only one is
+known; of one that repeats the command before, none.
+"""
 CPU_MS: Final = 1.5
-"""Per image: of all processes of the robot, and of vision."""
+"""CPU time per image of all processes of robot and vision service."""
 CPU_OVER_FLOOR_MS: Final = 0.6
 ANSWERED_PERCENT: Final = 99.0
-"""Of the captured images, and of those that the camera offers while nothing is overloaded."""
+"""Share of the captured images, and of those that the camera offers without overload."""
 LOADED_FPS_SHARE: Final = 0.9
-"""Of the best rival that lets no image wait in a queue: a queue may answer all images, but late."""
+"""Share of the best rival without a queue. A queue may answer all images, but late."""
 _QUEUES: Final = ("tcp", "callback")
 OVERLOADED_LIKE_MS: Final = 80.0
-"""A detector overloaded by the rate is allowed the same ages as one with this delay."""
+"""With a detector overloaded by the rate, the permitted ages are those for a detector with this delay."""
 TIMES_BEST: Final = 1.02
 LOADED_P50_OVER_DELAY_MS: Final = 10.0
 LOADED_P99_OVER_DELAY_MS: Final = 40.0
@@ -284,19 +285,19 @@ _WHOLE: Final = 0.99
 """Share of the requested seconds that a sample must have."""
 _PART_US: Final = 10_000_000
 _PARTS: Final = 5
-"""Drift is from the first ten seconds to the last, of a shorter time from its first fifth to its last."""
+"""Drift is from the first ten seconds to the last, or from the first fifth of a shorter time to its last."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopFigures:
     """One contestant. `answered_percent` is of the images that the camera offers, `accepted_percent` of the captured
     ones. Sightline captures only with credit, most rivals capture each image. Times are from capture to the result,
-    `validated_ms` (median) to the validation of the services; `most_wait_ms` is the longest time between the two of so
-    many `commands`. None without an answer.
+    `validated_ms` (median) to the validation of the services; `most_wait_ms` is the longest time between these two, of
+    `commands` commands. None without an answer.
 
     `first_ms` and `last_ms` are medians of the first and the last ten seconds, or fifths of a shorter time; `cpu_ms` is
-    per answered image and process, `memory_mb` the high-water mark, `bytes_per_picture` what went over the sockets,
-    both ways.
+    per answered image and process, `memory_mb` the high-water mark, `bytes_per_picture` the bytes on the
+    sockets, both ways.
     """
 
     name: str
@@ -322,7 +323,7 @@ class LoopFigures:
 
     @property
     def is_disturbed(self) -> bool:
-        """Return True if others had too much of the machine's time, or left too little for the sample."""
+        """Return True if other programs took too much of the machine's time, or left too little for the sample."""
         return self.taken_percent > TAKEN_BOUND_PERCENT or self.is_short
 
 
@@ -367,7 +368,7 @@ def figures_of(sample: LoopSample, setting: LoopSetting) -> LoopFigures:
 
 
 def _parts(ages_us: Sequence[tuple[int, int]]) -> tuple[float | None, float | None]:
-    """Medians, in milliseconds, of the first and the last part of the time."""
+    """Return the medians of the first and of the last part of the time, ms."""
     if not ages_us:
         return None, None
     begin_us, end_us = ages_us[0][0], ages_us[-1][0]
@@ -378,7 +379,7 @@ def _parts(ages_us: Sequence[tuple[int, int]]) -> tuple[float | None, float | No
 
 
 def loop_checks(figures: Mapping[str, LoopFigures], setting: LoopSetting) -> list[Check]:
-    """Hold Sightline against the floor and the rivals of the same run, or against the delay of a slow detector.
+    """Check Sightline against the floor and the rivals of the same run, or against the delay of a slow detector.
 
     `figures` has at least the floor and Sightline.
     """

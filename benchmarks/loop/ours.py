@@ -32,7 +32,7 @@ TRANSPORTS: Final = {"zenoh": "tcp/127.0.0.1:{}", "websocket": "ws://127.0.0.1:{
 
 @dataclass(slots=True)
 class Ours:
-    """The services, running."""
+    """The running services."""
 
     pids: dict[str, int]
     ports: tuple[int, ...]
@@ -65,7 +65,7 @@ def endpoint_of(transport: str, port: int) -> str:
 
 @contextmanager
 def running_services(setting: LoopSetting, folder: Path, processes: Processes) -> Iterator[Ours]:
-    """Robot and vision, seen working. Raises HardwareError with a service's own words if one does not start."""
+    """Run robot and vision service until both work. Raises HardwareError with the error of a failed start."""
     port = free_port()
     endpoint = endpoint_of(setting.transport, port)
     guardian = processes.start("robot", ["robot", "--config", str(_robot_toml(setting, folder, endpoint))])
@@ -84,9 +84,9 @@ def running_services(setting: LoopSetting, folder: Path, processes: Processes) -
 
 
 def _robot_toml(setting: LoopSetting, folder: Path, endpoint: str) -> Path:
-    """JSON's strings and numbers are TOML's too.
+    """Write robot.toml; strings and numbers of JSON are valid TOML.
 
-    The ramp is as fast as it may be. It ends before the next command, so that only a new command changes the speeds.
+    The ramp is as fast as permitted. It ends before the next command, so that only a new command changes the speeds.
     """
     path = folder / "robot.toml"
     path.write_text(

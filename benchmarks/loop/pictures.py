@@ -1,4 +1,4 @@
-"""The recorded images of `bench loop`: a ball going round in a textured room. Shell (files).
+"""The recorded images of `bench loop`: a ball moving in a circle in a textured room. Shell (files).
 
 Their size is that of a camera's own JPEG (about 46 kB at 640x480), because the transport has to carry this size.
 """

@@ -23,7 +23,7 @@ _PAUSE_US: Final = 2_000_000
 
 
 def draw_race(path: Path, race: Race) -> None:
-    """Write a PNG: left the share of results by age, right the age over time."""
+    """Write a PNG: on the left the share of results by age, on the right the age over time."""
     figure = Figure(figsize=(12, 5), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     shares, times = figure.subplots(1, 2)
@@ -63,7 +63,7 @@ def _draw_one(shares: "Axes", times: "Axes", name: str, ages_us: tuple[tuple[int
 
 
 def _over_time(ages_us: tuple[tuple[int, int], ...]) -> tuple[list[float], list[float]]:
-    """Seconds and milliseconds; the line is broken where others had their turn."""
+    """Return seconds and milliseconds. The line is broken during the turns of other contestants."""
     seconds, ages_ms = [], []
     before_us = begin_us = ages_us[0][0]
     for at_us, age_us in ages_us:

@@ -1,7 +1,7 @@
 """One race: each contestant is started, sampled with the kernel's counters, and ended. Shell (processes).
 
-A sample during which others had the machine's time is marked and taken again, as often as the setting allows and the
-time of the run permits.
+A sample that other programs disturbed is marked and repeated, as often as the setting and the time of the run
+permit.
 """
 
 import json
@@ -46,17 +46,17 @@ _SETTLE_S: Final = 1.5
 _DRAIN_S: Final = 0.3
 _LEAST_SAMPLE_S: Final = 2.0
 _RUN_S: Final = 225.0
-"""For the samples of a run of `_RUN_OF_S` for each contestant, which ends within 240 s; a longer one gets more."""
+"""Time for the samples of a run of `_RUN_OF_S` per contestant, which ends within 240 s. A longer run gets more."""
 _RUN_OF_S: Final = 10.0
 _MODULE: Final = "sightline.benchmarks.peers"
 
 
 class Contestant(Protocol):
-    """Processes that run, and what they noted once they have ended."""
+    """Running processes, and their records once they have ended."""
 
     @property
     def pids(self) -> dict[str, int]:
-        """Process ids by role."""
+        """Return the process ids by role."""
         ...
 
     @property
@@ -71,29 +71,29 @@ class Contestant(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Contestants:
-    """A peer, or the floor, running."""
+    """A running peer, or the floor."""
 
     pids: dict[str, int]
     ports: Sequence[int]
     tally: Path
 
     def course(self, begin_us: int, end_us: int) -> Course:
-        """By its own notes."""
+        """Return the course by its own tally."""
         noted = json.loads(self.tally.read_text())
         return course_of_tally(noted["captured_us"], noted["commands_us"], begin_us, end_us)
 
 
 @dataclass(slots=True)
 class Budget:
-    """Time of a run: until `end_s`, with `samples` still to take. On a busy machine samples get shorter."""
+    """Time of a run: until `end_s`, for the remaining `samples`. On a busy machine samples get shorter."""
 
     end_s: float
     samples: int
     beside_s: float = _SETTLE_S + _DRAIN_S
-    """What a sample takes beside its seconds: to start, settle and end."""
+    """Time of a sample in addition to its seconds: to start, settle and end."""
 
     def seconds(self) -> float:
-        """Return the time that is left for each sample."""
+        """Return the time that remains for each sample."""
         return (self.end_s - time.monotonic()) / self.samples - self.beside_s
 
 
@@ -173,7 +173,7 @@ _LEAST_TURN_S: Final = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Race:
-    """Everything measured in one run; `figures` and `samples` by contestant."""
+    """All measurements of one run; `figures` and `samples` by contestant."""
 
     setting: LoopSetting
     jpeg_bytes: float
@@ -183,9 +183,9 @@ class Race:
 
 
 def run_race(setting: LoopSetting, show: Callable[[str], None]) -> Race:
-    """Measure every contestant, one after the other, on the same images; `setting.pictures` is filled in.
+    """Measure the contestants in turn on the same images. Sets `setting.pictures`.
 
-    Raises ConfigError for an unknown transport, HardwareError with its last words for a process that does not run.
+    Raises ConfigError for an unknown transport, HardwareError with its last output for a process that does not run.
     """
     endpoint_of(setting.transport, 1)
     with terminated_like_interrupted(), tempfile.TemporaryDirectory(prefix="sightline-loop-") as name:

@@ -1,7 +1,7 @@
 """Measure the cost of viewers for the driver of a robot: the bench, and the process of the viewers. Shell (processes).
 
-Opens COUNT links, each with its own connection, and takes every frame; with NAP_S it sleeps so long over each one, on
-the transport's thread, so that its connection is read no faster than that.
+Opens COUNT links, each with its own connection, and reads every frame. With NAP_S it sleeps that long for each one on
+the transport's thread, so that its connection is read no faster.
 """
 
 import os
@@ -35,7 +35,7 @@ from sightline.protocol.transports.open import open_link
 
 
 def main(endpoint: str, count: int, nap_s: float) -> None:
-    """Watch until killed. It prints `watching` when each viewer has seen a frame."""
+    """Watch until killed. Prints `watching` when each viewer has received a frame."""
 
     def watch(seen: threading.Event, _message: Message) -> None:
         seen.set()
@@ -54,7 +54,7 @@ def main(endpoint: str, count: int, nap_s: float) -> None:
 
 # `sightline bench watchers`: the cost of viewers for the driver; one never reads, one slowly. Shell (processes).
 #
-# First the loop alone, then with viewers who take the control stream itself: the worst that a viewer may do.
+# First the loop alone, then with viewers that read the control stream itself, which is the worst case.
 
 
 P95_GROWTH_MS: Final = 3.0
@@ -65,7 +65,7 @@ _SETTLE_S: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class ViewedStretch:
-    """When it was, the network process's high-water mark at its end, and what others took of the machine."""
+    """Its time, the peak memory of the network process at its end, and the time that other programs took."""
 
     begin_us: int
     end_us: int
@@ -75,7 +75,7 @@ class ViewedStretch:
 
 @dataclass(frozen=True, slots=True)
 class Watch:
-    """A stretch whose frames were looked at."""
+    """The same with viewers."""
 
     course: Course
     fps: float
@@ -84,9 +84,9 @@ class Watch:
 
 
 def measure_watchers(setting: LoopSetting, viewers: int, show: Callable[[str], None]) -> list[Check]:
-    """Run `setting.seconds` without, and again with `viewers` (2 to 12); `setting.pictures` is filled in.
+    """Run `setting.seconds` without viewers, then with `viewers` (2 to 12). Sets `setting.pictures`.
 
-    Taken again, `setting.tries` times at most, while others have the machine. Raises ConfigError for an unknown
+    Repeats disturbed samples, `setting.tries` times at most. Raises ConfigError for an unknown
     transport, HardwareError for a process that does not run.
     """
     with terminated_like_interrupted(), tempfile.TemporaryDirectory(prefix="sightline-watchers-") as name:
@@ -115,7 +115,7 @@ def _measure(setting: LoopSetting, viewers: int, folder: Path, show: Callable[[s
 
 
 def start_viewers(processes: Processes, endpoint: str, viewers: int) -> dict[str, int]:
-    """Start them, each seen watching: one stopped by the kernel, one slow, the rest quick. Returns process ids."""
+    """Start viewers until each receives: one stopped by the kernel, one slow, the rest fast. Returns process ids."""
     parts = {"stalled": (1, 0.0), "slow": (1, _SLOW_NAP_S), "quick": (viewers - 2, 0.0)}
     pids = {}
     for name, (count, nap_s) in parts.items():

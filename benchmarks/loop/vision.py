@@ -1,4 +1,4 @@
-"""The vision service with a tap, and a pipeline whose detector is as slow as requested. Shell."""
+"""The vision service with a tap, and a pipeline with a chosen detector time. Shell."""
 
 import json
 import signal
@@ -27,9 +27,9 @@ from sightline.vision_side.serving.service import Service
 
 
 class DelayedDetector:
-    """A detector that takes longer: it waits `delay_s`, as for an accelerator, and then works for at least `busy_s`.
+    """A slowed detector. It waits `delay_s`, as for an accelerator, and then computes for at least `busy_s`.
 
-    It works by detecting the same again and again, as the same code on a slower processor.
+    It repeats the detection, so that it acts like the same code on a slower processor.
     """
 
     def __init__(self, detector: Detector, delay_s: float, busy_s: float) -> None:
@@ -47,7 +47,7 @@ class DelayedDetector:
 
 
 def contestant_config(**settings: object) -> VisionConfig:
-    """Return these settings with detector and steering of all contestants: the service, the floor and the rivals."""
+    """Return the settings of detector and steering of all contestants: the service, the floor and the rivals."""
     steer = {"max_angular_rad_s": MAX_ANGULAR_RAD_S}
     return VisionConfig.model_validate({**settings, "detector": {"kind": "hsv"}, "steer": steer})
 
@@ -59,7 +59,7 @@ def delayed_detector(config: VisionConfig, delay_ms: float, busy_ms: float) -> D
 
 
 class PipelineVision:
-    """Images in, `linear|angular` out."""
+    """Converts images to `linear|angular`."""
 
     def __init__(self, width_px: int, height_px: int, delay_ms: float = 0.0, busy_ms: float = 0.0) -> None:
         config = contestant_config()
@@ -76,7 +76,7 @@ class PipelineVision:
         return format_twist(answer.twist).decode()
 
 
-# More images than can be detected, by a chosen factor: by their rate, else by a slower detector. Shell (a clock).
+# More images than can be detected, by a chosen factor: by their rate, otherwise by a slower detector. Shell (a clock).
 # The robot service takes at most `MAX_FPS` images a second. If the pipeline is faster, the rate stays
 # unchanged, and every contestant's detector works for the time that the factor requires.
 
@@ -86,7 +86,7 @@ _FRAME_US: Final = 33_333
 
 
 def overloaded(setting: LoopSetting, show: Callable[[str], None]) -> LoopSetting:
-    """Return `setting` with the rate, or the detector's time, for its `overload`. Its images are written."""
+    """Return `setting` with the rate or the detector time for its `overload`. Writes its images."""
     step_ms = _step_ms(PipelineVision(setting.width_px, setting.height_px), setting.pictures)
     found = with_overload(setting, step_ms)
     show(f"overload {setting.overload:g}: one step takes {step_ms:.2f} ms; {found.fps:g} pictures a second, "
@@ -95,7 +95,7 @@ def overloaded(setting: LoopSetting, show: Callable[[str], None]) -> LoopSetting
 
 
 def with_overload(setting: LoopSetting, step_ms: float) -> LoopSetting:
-    """For a pipeline that takes `step_ms`, decoding included."""
+    """Return the setting for a pipeline that takes `step_ms`, decoding included."""
     fps = 1000 * setting.overload / step_ms
     if fps <= MAX_FPS:
         return replace(setting, fps=round(fps, 1))
@@ -103,7 +103,7 @@ def with_overload(setting: LoopSetting, step_ms: float) -> LoopSetting:
 
 
 def _step_ms(vision: PipelineVision, pictures: Path) -> float:
-    """Return the median without pauses, because an overloaded service never pauses."""
+    """Return the median time of a step without pauses, because an overloaded service never pauses."""
     jpegs = [path.read_bytes() for path in sorted(pictures.glob("*.jpg"))]
     took_ms = []
     for number in range(_STEPS):
@@ -114,8 +114,8 @@ def _step_ms(vision: PipelineVision, pictures: Path) -> float:
 
 
 # The vision service with a tap: it records frame headers and commands, and may be slow. Shell.  `python -m
-# sightline.benchmarks.loop.vision SETTINGS`. The service is `sightline.vision_side.serving.service.Service` as it is;
-# the tap costs an append per frame, and only a detector made slow is put into its pipeline.
+# sightline.benchmarks.loop.vision SETTINGS`. The service is `sightline.vision_side.serving.service.Service` unchanged;
+# the tap costs an append per frame, and only a slowed detector is put into its pipeline.
 
 
 _WAIT_S = 0.2
@@ -126,7 +126,7 @@ def _show(line: str) -> None:
 
 
 class TappedService(Service):
-    """Remembers the header of every frame it was given, and its own commands."""
+    """Stores the headers of all received frames, and its own commands."""
 
     def __init__(self, config: VisionConfig, link: Link, delay_ms: float, busy_ms: float) -> None:
         super().__init__(config, link, _show, delayed_detector(config, delay_ms, busy_ms))

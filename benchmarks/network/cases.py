@@ -1,4 +1,4 @@
-"""The rows of `bench network`: what the wire does, when, and what is demanded then. Pure."""
+"""The rows of `bench network`: wire shapes over time, and their bounds. Pure."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class NetworkPhase:
     shapes: LinkShapes
     seconds: float | None = None
     settle_s: float = 0.0
-    """How long after its beginning its bounds hold."""
+    """Time after its start from which its bounds apply."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ def _steady(**changes: float | bool) -> tuple[NetworkPhase, ...]:
 
 _NEAR: Final = both(delay_ms=1)
 _SITE: Final = (ZENOH,)
-"""Rows with a router, or with one vision for many robots, which WebSocket has not."""
+"""Rows with a router, or with one vision service for many robots. WebSocket has neither."""
 
 CASES: Final = (
     NetworkCase("rtt40", "40 ms round trip", _steady(delay_ms=20), least_fps=28, p50_ms=40 + 15),
@@ -204,7 +204,7 @@ CASES: Final = (
 
 
 def chosen(only: Iterable[str], transport: str = ZENOH) -> tuple[NetworkCase, ...]:
-    """The rows named, all where none is, of those that `transport` can do. Raises ConfigError for another name."""
+    """Return the rows named, all without a name, that `transport` supports. Raises ConfigError for another name."""
     names = tuple(only)
     possible = tuple(row for row in CASES if transport in row.transports)
     known = [row.name for row in possible]

@@ -16,21 +16,21 @@ _LATE_US: Final = 2 * TICK_US
 """A decision holds for one tick. The recorder of a twist may receive it slightly after the robot."""
 _OLD_US: Final = OLD_US + _LATE_US
 _RAMPED_OUT_US: Final = (RAMPED_US + 2 * _LATE_US) // TICK_US * TICK_US
-"""Age of a frame, in whole ticks, at which even the ramp that it left behind is at its end; its answer and the zero may
-both be late."""
+"""Age of a frame, in whole ticks, at which even its ramp has ended; both its answer and the zero may
+be late.
+"""
 _TENTH_US: Final = 100_000
 _LEAST_MOVING_PERCENT: Final = 90.0
-"""A robot that never leaves HOLD keeps to the bounds of ages and holds."""
+"""Against a robot that never leaves HOLD, which would satisfy the bounds of ages and holds."""
 _FASTER_RAD_S: Final = 0.15
 """Smallest gain of speed. The conversion of a twist to wheel speeds rounds."""
 
 
 def on_old_sight(rows: Sequence[WheelCommand], answers: Sequence[Sequence[int]], until_us: int = 0) -> int:
-    """Lines that no young frame allows; `answers` are (heard_us, t_us of the frame answered) of every command sent.
+    """Count lines that no young frame allows. `answers`: (received_us, t_us of the answered frame) of every command.
 
-    With the youngest frame that was answered by then older than is driven on, no wheel may turn faster than before;
-    when even the ramp is at its end, none may turn. Wheels keep a speed without a line, too, and the last one up to
-    `until_us`.
+    Once the youngest frame answered so far is too old to drive on, no wheel may accelerate. When also the ramp has
+    ended, none may turn. Wheels keep their speed between lines, and the last one up to `until_us`.
     """
     times_us = held_us([row.t_us for row in rows], 0, until_us)
     rows = [row._replace(t_us=t_us) for row, each_us in zip(rows, times_us, strict=True) for t_us in each_us]
@@ -51,7 +51,7 @@ def _is_faster(before: WheelCommand, row: WheelCommand) -> bool:
 def moves_again_s(rows: Sequence[WheelCommand], since_us: int, until_us: int) -> float | None:
     """Return the time from `since_us` to the end of the longest standstill that ends after it, up to `until_us`, s.
 
-    0 if the wheels never stood; None if they did not turn again, or nothing is known.
+    0 if the wheels never stood; None if they did not turn again or the log is empty.
     """
     inside = [row for row in rows if row.t_us < until_us]
     if not inside or not inside[-1].moves:
@@ -61,7 +61,7 @@ def moves_again_s(rows: Sequence[WheelCommand], since_us: int, until_us: int) ->
 
 
 def _stands(rows: Sequence[WheelCommand]) -> Iterator[tuple[int, int]]:
-    """When each standstill began, and when it was over."""
+    """Yield the begin and the end of each standstill."""
     begin_us: int | None = None
     for row in rows:
         if not row.moves:
@@ -71,7 +71,7 @@ def _stands(rows: Sequence[WheelCommand]) -> Iterator[tuple[int, int]]:
             begin_us = None
 
 
-# The figures of a row of `bench network` from the robot's records, and their check. Pure.
+# The figures of a row of `bench network` from the robot's records, and their checks. Pure.
 
 
 DRIVING: Final = ("ACTIVE", "DEGRADED")
@@ -79,7 +79,7 @@ DRIVING: Final = ("ACTIVE", "DEGRADED")
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """One phase as it went: `[begin_us, end_us)`, bounds in force from `judged_us`."""
+    """One phase as it ran: `[begin_us, end_us)`, bounds in force from `bounded_us`."""
 
     begin_us: int
     bounded_us: int
@@ -95,14 +95,14 @@ class NetworkFigures:
     p95_ms: float | None
     validated_ms: float | None
     fps: float
-    """Frames with an accepted command. The counter of accepted commands counts a twist that is sent twice two times."""
+    """Frames with an accepted command per second. A twist that is sent twice counts twice."""
     moving_percent: float
-    """Share of the tenths of a second with moving wheels."""
+    """Share of the tenths of a second in which the wheels move."""
     executed_ms: float | None
-    """The oldest frame that was driven on, as ten statuses a second show it. None without a status."""
+    """Age of the oldest frame that was driven on, by ten statuses a second. None without a status."""
     holds_s: tuple[float, ...]
     flows_after_s: float | None
-    """From the beginning of the stretch to the first command accepted of a frame of it."""
+    """Time from the start of the stretch to the first accepted command for one of its frames."""
     window: int
     bytes_per_frame: float
     quality_percent: float
@@ -153,7 +153,7 @@ def sent_between(statuses: Sequence[Sequence[Any]], begin_us: int, end_us: int) 
 
 
 def _count_at(counts: Sequence[tuple[int, int]], at_us: int) -> float:
-    """Between two counts it grew evenly."""
+    """Return the count at a time, by linear interpolation."""
     for (before_us, before), (after_us, after) in pairwise(counts):
         if before_us <= at_us < after_us:
             return before + (after - before) * (at_us - before_us) / (after_us - before_us)
@@ -175,7 +175,7 @@ def _holds_s(statuses: Sequence[Mapping[str, Any]]) -> Iterator[float]:
 
 
 def _flows_after_s(frames: Sequence[Sequence[Any]], stretch: Stretch) -> float | None:
-    """A command was accepted by the time a frame carries a latency that the one before did not."""
+    """Return the time until the first accepted command: until a frame has another latency than the one before."""
     for before, frame in pairwise(frames):
         accepted_us = before[1] if frame[2] != before[2] else None
         if accepted_us is not None and before[1] >= stretch.begin_us:
@@ -192,7 +192,7 @@ _CAUSES: Final[tuple[tuple[str, tuple[str, ...], Callable[[list[float]], float]]
     ("lost", ("loss",), min), ("lost", ("burst_start",), sum), ("cut", ("cut",), sum),
     ("duplicated", ("duplicate",), min), ("reordered", ("reorder",), min), ("corrupted", ("corrupt",), min),
 )
-"""A counter of the wire, the fields of a `LinkShape` that let it grow, and how the directions with one count together.
+"""A counter of the wire, the fields of a `LinkShape` that increase it, and how the counts of both directions combine.
 Bursts are rare, and a cut ends the answers: few packets go toward the robot, so these may harm none of them."""
 
 
@@ -206,7 +206,7 @@ def injected_checks(row: NetworkCase, counts: Mapping[str, Mapping[str, int]]) -
 
 
 def network_checks(row: NetworkCase, figures: Sequence[NetworkFigures]) -> Iterator[Check]:
-    """Hold the last phase of a row against its bounds; `figures` are those of all its phases."""
+    """Check the last phase of a row against its bounds; `figures` are those of all its phases."""
     last, first = figures[-1], figures[0]
     if row.p50_ms is not None:
         yield at_most("age p50", last.p50_ms, "ms", row.p50_ms)

@@ -23,7 +23,7 @@ from sightline.robot_side.safety.limits import TICK_US, SafetyConfig
 
 
 class GatedRobot(PlayedRobot):
-    """A played robot whose commands go through the driver core."""
+    """A simulated robot whose commands pass the driver core."""
 
     def __init__(self, name: str, link: Link, settings: Settings, due_us: int) -> None:
         super().__init__(name, link, settings, due_us)
@@ -39,12 +39,12 @@ class GatedRobot(PlayedRobot):
 
     @property
     def record(self) -> dict[str, Any]:
-        """Return what is written of this robot."""
+        """Return the record of this robot."""
         return {"accepted": self.accepted, "holds": self.holds, "answers": self._answers,
                 "began_us": self._began_us, "sent_us": self._sent_us}
 
     def play(self, at_us: int) -> int:
-        """Do the due work, also the gate's."""
+        """Do the due work, including that of the gate."""
         if at_us >= self._tick_due_us:
             self._tick_due_us = max(self._tick_due_us + TICK_US, at_us)
             with self._lock:

@@ -2,8 +2,8 @@
 
     python -m sightline.benchmarks.network.robots SETTINGS_AS_JSON
 
-A robot's own two processes, forty times on two cores, would measure themselves. Each robot here has its session, its
-credit and its 10 Hz status; it has no driver, so it takes every answer for accepted. Ages are from capture to the
+Forty robots with two processes each would overload two cores. Each robot here has its session, its
+credit and its 10 Hz status; without a driver it counts every answer as accepted. Ages are from capture to the
 answer's arrival. Written at SIGTERM as JSON: for each robot the answers (captured_us, age_us).
 """
 
@@ -41,7 +41,7 @@ class Settings(Config):
     """Number, rate, images and endpoints of the robots."""
 
     endpoint: str
-    """With a comma between several."""
+    """Several are separated by commas."""
     robots: int
     fps: float
     pictures: Path
@@ -54,7 +54,7 @@ class Settings(Config):
 
 
 class PlayedRobot:
-    """One robot: `play` does the due work and returns the time of its next call."""
+    """One robot. `play` does the due work and returns the time of its next call."""
 
     def __init__(self, name: str, link: Link, settings: Settings, due_us: int) -> None:
         self.name = name
@@ -74,7 +74,7 @@ class PlayedRobot:
 
     @property
     def record(self) -> Any:
-        """Return what is written of this robot."""
+        """Return the record of this robot."""
         return self.answers
 
     def play(self, at_us: int) -> int:
@@ -101,7 +101,7 @@ class PlayedRobot:
                 self._link.publish(message.channel, message.header, message.payload)
 
     def _on_sent(self, seq: int, t_us: int) -> None:
-        """Note a frame before it leaves."""
+        """Record a frame before it is sent."""
 
     def _publish(self, at_us: int) -> None:
         self._statuses += 1

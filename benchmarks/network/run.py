@@ -54,7 +54,7 @@ _SETTLE_S: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class NetworkProgress:
-    """Receives the progress: the start of each run, and its result."""
+    """Receives the start of each run, and its result."""
 
     begins: Callable[[str], None]
     ended: Callable[[NetworkRun], None]
@@ -69,7 +69,7 @@ def run_network(
 ) -> list[NetworkRun]:
     """Run every row, rows with losses with every seed. `scenes` extend `SCENES`.
 
-    Raises ConfigError without root; a process that does not run is a check that fails.
+    Raises ConfigError without root; a process that does not run is a failed check.
     """
     why = why_impossible()
     if why:
@@ -109,9 +109,9 @@ def _run(row: NetworkCase, stage: Stage, scenes: Mapping[str, Scene]) -> Network
 
 
 def _course(row: NetworkCase, stage: Stage) -> NetworkRun:
-    """One robot and one vision, the wire shaped phase by phase."""
+    """Run one robot and one vision service, with the wire shaped phase by phase."""
     with stage.wire() as wire, stage.processes("processes") as processes:
-        # From the first packet on: what TCP learned of a better wire would be what is measured.
+        # From the first packet on. Otherwise the figures would depend on TCP's estimate of a better wire.
         before, counts_before = wire.shape(stage.seeded(row.phases[0].shapes)), wire.counts
         _start(row, wire, processes, stage)
         stretches = []
@@ -145,7 +145,7 @@ def wheel_checks(
 
 
 def _start(row: NetworkCase, wire: ShapedWire, processes: Processes, stage: Stage) -> None:
-    """Robot and watcher on one side, vision on the other, seen driving over the wire as it is."""
+    """Start robot and recorder on one side and vision on the other, and wait until the robot drives."""
     start_robot(stage, processes, wire.robot_side, passes_through=row.passes_through)
     arguments = [stage.form.format("127.0.0.1"), str(stage.folder / "notes.json")]
     processes.start("watch", arguments, module="sightline.benchmarks.network.watch", namespace=wire.robot_side)

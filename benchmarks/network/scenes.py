@@ -1,4 +1,4 @@
-"""Cases with a course of their own: takeover, uplink, forty robots, STOP through a full medium. Shell (processes).
+"""Cases with separate scenes: takeover, uplink, forty robots, STOP through a full medium. Shell (processes).
 
 The score uses the wheel commands: they stop, and turn again.
 """
@@ -44,16 +44,16 @@ from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B, move_address
 
 TAKES_OVER_S: Final = 1.5
 BACK_S: Final = 3.0
-"""A dead link is noticed by its lease of 2 s; then it is tried again every 0.2 to 1 s."""
+"""The lease of 2 s reveals a dead link. Then connections are tried every 0.2 to 1 s."""
 DOWN_S: Final = 1.0
 _STEADY_S: Final = 1.5
-"""Before the next harm: whatever was to come back has come."""
+"""Time before the next harm, for everything to recover."""
 _PATIENCE_S: Final = 10.0
 _OTHER_ADDRESS: Final = "10.213.77.3"
 
 
 def standby(row: NetworkCase, stage: Stage) -> NetworkRun:
-    """Run two vision services. The driving one is killed and a new one stands by, until the end of the time."""
+    """Run two vision services. Repeatedly kill the driving one and start a new standby, until the end of the time."""
     endpoint = stage.form.format(ADDRESS_A)
     with _on_site(row, stage) as (wire, ending):
         start_robot(stage, ending.enter_context(stage.processes("robot")), wire.robot_side)
@@ -96,7 +96,7 @@ def router(row: NetworkCase, stage: Stage) -> NetworkRun:
 
 
 def moved(row: NetworkCase, stage: Stage) -> NetworkRun:
-    """The robot's end of the wire gets another address, and the one before back the next time."""
+    """Change the address of the robot's end of the wire, and change it back the next time."""
     addresses = [ADDRESS_A, _OTHER_ADDRESS]
     with _on_site(row, stage) as (wire, ending):
 
@@ -134,7 +134,7 @@ def _start_clients(stage: Stage, wire: ShapedWire, ending: ExitStack) -> None:
 def _checks(
     row: NetworkCase, stage: Stage, harm: Callable[[], int], bound_s: float, *, stands: bool = False
 ) -> NetworkRun:
-    """Do `harm` until the time is over; the worst of the times until the wheels turned again."""
+    """Do `harm` until the time is over. The score is the longest time until the wheels turned again."""
     _wait_moving(stage)
     end_s = time.monotonic() + stage.setting.seconds
     took_s: list[float | None] = []
@@ -146,7 +146,7 @@ def _checks(
 
 
 def again_checks(took_s: Sequence[float | None], bound_s: float, *, stands: bool) -> tuple[Check, Check]:
-    """Check the times until the wheels turned again. Where the harm `stands`, wheels that never stood show no harm."""
+    """Check the times until the wheels turned again. If the harm `stands`, wheels that never stood show no harm."""
     harmed = [one for one in took_s if one != 0.0 or not stands]
     return (
         at_least("injected", float(len(harmed)), "times", float(len(took_s))),
@@ -168,7 +168,7 @@ def _wait_moving(stage: Stage) -> None:
 
 
 def _wait_again(stage: Stage, harmed_us: int) -> float | None:
-    """Until the wheels have stood and turned again, or it has taken too long."""
+    """Wait until the wheels have stood and turned again, or the time limit is over."""
     deadline_s = time.monotonic() + _PATIENCE_S
     again_s = None
     while time.monotonic() < deadline_s and not again_s:
@@ -181,28 +181,28 @@ def _wheel_commands(stage: Stage) -> list[WheelCommand]:
     return read_wheel_commands(stage.wheels.read_text("ascii")) if stage.wheels.exists() else []
 
 
-# A row of `bench network`: what crosses the radio when many look at what one robot sees. Shell (processes).
+# A row of `bench network`: the radio traffic when several clients watch one robot. Shell (processes).
 #
-# Vision and all others are at a router beyond the radio. First vision alone, then a standby, a second reader and a
-# viewer.
+# Vision and all other clients are at a router beyond the radio. First vision alone, then with a standby, another reader
+# and a viewer.
 
 
 MOST_SHARE: Final = 1.05
 UPLINK_LEAST_FPS: Final = 25.0
-"""With fewer, what is sent besides frames would weigh more on each."""
+"""At a lower rate, traffic other than frames would weigh more on each frame."""
 READERS: Final = 2
 _AT_ROUTER: Final = "tcp/127.0.0.1:7447"
 _UPLINK_SETTLE_S: Final = 2.0
 
 
 def uplink(row: NetworkCase, stage: Stage) -> NetworkRun:
-    """Bytes from the robot for each frame it sent, crowded over alone."""
+    """Compare the bytes from the robot per sent frame with several clients and with vision alone."""
     shapes = stage.seeded(row.phases[0].shapes)
     with stage.wire() as wire, ExitStack() as ending:
         before = wire.shape(shapes)
         groups = {name: ending.enter_context(stage.processes(name)) for name in ("site", "standby")}
         start_router(groups["site"], wire)
-        # The camera's own JPEGs: none is smaller than another because the machine had more to do.
+        # The camera's own JPEGs, so that their size does not depend on the load of the machine.
         start_robot(stage, groups["site"], wire.robot_side, connect=f"tcp/{ADDRESS_B}:7447", passes_through=True)
         start_vision(stage, groups["site"], wire.far_side, _AT_ROUTER)
         _start_notes(groups["site"], wire, stage)
@@ -227,7 +227,7 @@ def _start_notes(processes: Processes, wire: ShapedWire, stage: Stage) -> None:
 
 
 def _stretch(wire: ShapedWire, shapes: LinkShapes, seconds: float) -> tuple[int, int, int]:
-    """(from, until, bytes that came from the robot in between)."""
+    """Return (from, until, bytes from the robot in between)."""
     time.sleep(_UPLINK_SETTLE_S)
     wire.shape(shapes)
     begin_us, begin_bytes = monotonic_us(), wire.counts["ab"]["delivered_bytes"]
@@ -237,7 +237,7 @@ def _stretch(wire: ShapedWire, shapes: LinkShapes, seconds: float) -> tuple[int,
 
 
 def _stream_of(notes: Mapping[str, Sequence[Sequence[Any]]], stretch: tuple[int, int, int]) -> tuple[float, float]:
-    """(bytes that crossed for each frame, frames per second)."""
+    """Return (bytes on the radio per frame, frames per second)."""
     begin_us, end_us, carried = stretch
     sent = sent_between(notes["statuses"], begin_us, end_us)
     return carried / max(1.0, sent), sent * 1e6 / (end_us - begin_us)
@@ -254,7 +254,7 @@ def _uplink_run(row: NetworkCase, stage: Stage, injected: int, streams: Sequence
     return NetworkRun(row, stage.seed, injected, (), checks, facts)
 
 
-# A row of `bench network`: forty robots and one vision for all of them. Shell (processes).
+# A row of `bench network`: forty robots and one vision service for all of them. Shell (processes).
 
 
 ROBOTS: Final = 40
@@ -294,7 +294,7 @@ def fleet(row: NetworkCase, stage: Stage) -> NetworkRun:
 def fleet_checks(
     answers: Mapping[str, Sequence[Sequence[int]]], begin_us: int, end_us: int
 ) -> tuple[Check, Check, Check]:
-    """The robot with the fewest answers, and the one with the oldest. `answers`: (captured_us, age_us) of each."""
+    """Check the robot with the fewest answers, and the one with the oldest. `answers`: (captured_us, age_us)."""
     seconds = (end_us - begin_us) / 1e6
     ages_ms = [[age_us / 1000 for at_us, age_us in seen if begin_us <= at_us < end_us] for seen in answers.values()]
     least_fps = min((len(one) / seconds for one in ages_ms), default=0.0)
@@ -308,19 +308,19 @@ def fleet_checks(
     )
 
 
-# A row of `bench network`: one half-duplex medium, full of video, and an operator beyond it who sends STOP. Shell.
+# A row of `bench network`: one half-duplex medium full of video, and an operator beyond it that sends STOP. Shell.
 #
 # The score uses the log of the simulated motors, with the robot and the checks of the fault bench.
 
 
 REACHES_MS: Final = 300.0
 REPORTED_MS: Final = REACHES_MS + 100.0
-"""By the robot's own status, ten times a second: as frames age, wheels slow down by themselves, before any STOP."""
+"""By the robot's status, ten times a second: as frames age, wheels slow down by themselves, before any STOP."""
 _BESIDE_S: Final = 60.0
 
 
 def medium(row: NetworkCase, stage: Stage) -> NetworkRun:
-    """STOP, reset and so on for as long as there is time. Raises HardwareError if anything does not run."""
+    """Repeat STOP and reset until the time is over. Raises HardwareError if a process does not run."""
     try:
         with RobotFixture(stage.folder / "rig", Setup(wired=True, camera="heavy")) as rig:
             return _medium_run(row, stage, rig)
@@ -352,7 +352,7 @@ def _medium_run(row: NetworkCase, stage: Stage, rig: RobotFixture) -> NetworkRun
 
 
 def stop_checks_of(rows: Sequence[MotorRow], sent_us: Sequence[int], reset_us: Sequence[int]) -> Sequence[Check]:
-    """Check the times from each STOP, sent at `told_us`, to the motor commands and to zero speed. Each must last until
+    """Check the times from each STOP, sent at `sent_us`, to the motor commands and to zero speed. Each must last until
     the wheels turn after its reset.
     """
     ends_us = [_again_us(rows, at_us) for at_us in reset_us]
@@ -373,7 +373,7 @@ def reported_check(sent_us: Sequence[int], stopped_us: Sequence[int]) -> Check:
 
 
 def _again_us(rows: Sequence[MotorRow], reset_us: int) -> int:
-    """Just before the wheels turn after the reset; the end of the log if they do not."""
+    """Return the time just before the wheels turn after the reset; the end of the log if they do not."""
     return next((row.t_us - 1 for row in rows if row.t_us > reset_us and wheel_mps(row) > 0), rows[-1].t_us)
 
 

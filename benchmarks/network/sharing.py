@@ -1,6 +1,6 @@
 """Rows of `bench network` with several vision services that share their robots: their harms and checks. Shell.
 
-The robots have their real gates (`gated_robots.py`). The score is theirs: accepted commands, and times without motion.
+The robots have their real gates (`gated_robots.py`). They give the score: accepted commands, and times without motion.
 """
 
 import json
@@ -28,8 +28,9 @@ from sightline.sim.tun_emulator import ADDRESS_A, ADDRESS_B
 
 WIDTH_PX, HEIGHT_PX = 320, 240
 MOST_LOOKS: Final = 1.05
-"""Most answers for each frame, and most services that receive it. Two services that look at the same frames make
-two."""
+"""Most answers per frame, and most services that receive it. Two services that examine the same frames make
+two.
+"""
 LOADED_FPS: Final[Mapping[int, float]] = {1: 0.0, 2: 8.0, 4: 14.5}
 """Number of services with a detector of 8 ms -> least answered frames of each robot. One service is for comparison."""
 LOADED_ROBOTS: Final = 20
@@ -39,13 +40,13 @@ ENDS_S: Final = 1.0
 JOINS_S: Final = 0.5
 """Longest time from the first image of a robot that joins to its first accepted command."""
 _LAST_US: Final = 1_000_000
-"""Of the run. All robots drive then, for each harm leaves them more time than that after it."""
+"""Last part of the run. All robots drive then, because each harm leaves them more time after it."""
 _SETTLE_S: Final = 4.0
 _PORTS: Final = (7447, 7450)
 _FROZEN_S: Final = 3.0
 _HEALED_S: Final = 5.0
 _ROBOT_PROCESSES: Final = 5
-"""With all robots in one process, its sessions wait for each other: 40 ms for each when they lose a router."""
+"""With all robots in one process, its sessions wait for each other: 40 ms each when they lose a router."""
 _RECEIVED: Final = "sightline_vision_frames_received_total{"
 _READ_METRICS: Final = """import sys, time, urllib.request
 pages = [urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics").read().decode() for port in sys.argv[1:]]
@@ -60,20 +61,20 @@ class SharingBounds:
     services: int
     stands_s: float | None
     gap_ms: float | None = None
-    """Longest time between two accepted commands of a robot, after the last of the row's harms."""
+    """Longest time between two accepted commands of a robot, after the last harm of the row."""
     routers: int = 1
     beyond: tuple[str, ...] = ()
-    """What runs beyond the shaped wire. All else is on the robots' side."""
+    """Processes beyond the shaped wire. All others are on the robots' side."""
     robots: int = 20
     fps: float = 15.0
     harm_s: float = 10.0
-    """Longest time of the harms in turn: so many are demanded as the time of the run has room for."""
+    """Longest time of a harm. The run must have as many harms as fit."""
     least_changes: int = 0
-    """Of the driver, of all robots, for each harm."""
+    """Least changes of the driver per harm, over all robots."""
     each_us: int = 0
-    """Time of a slow detector for a frame, or 0 for the cheapest detector."""
+    """Time of a slow detector for a frame; 0: the cheapest detector."""
     again_s: float | None = None
-    """Longest time from the last of the harms to the next command of a robot."""
+    """Longest time from the last harm to the next command of a robot."""
 
 
 BOUNDS: Final[Mapping[str, SharingBounds]] = {
@@ -107,7 +108,7 @@ def worst_gap_ms(records: Mapping[str, Record], begin_us: int, end_us: int) -> f
 def longest_stand_s(records: Mapping[str, Record], begin_us: int, end_us: int) -> float:
     """Return the longest time without motion of one robot that overlaps `begin_us` to `end_us`, in full up to the end.
 
-    A robot that stands since before the first harm must not pass: its time counts from its own beginning.
+    A robot that stands since before the first harm must not pass, so its time counts from its own start.
     """
     holds = ((begin, min(end or end_us, end_us)) for record in records.values() for begin, end in record["holds"])
     return max((end - begin for begin, end in holds if begin < end_us and end > begin_us), default=0) / 1e6
@@ -121,7 +122,7 @@ def slowest_again_s(records: Mapping[str, Record], since_us: int) -> float:
 
 
 def drivers_that_return(records: Mapping[str, Record]) -> int:
-    """Count the sessions that drove a robot again after another one had driven it: two drivers at once."""
+    """Count the sessions that drove a robot again after another one had driven it: two drivers at one time."""
     count = 0
     for record in records.values():
         former: set[str] = set()
@@ -135,13 +136,13 @@ def drivers_that_return(records: Mapping[str, Record]) -> int:
 
 
 def changes_of_driver(records: Mapping[str, Record]) -> int:
-    """Count the changes of the driver, of all robots."""
+    """Count the changes of the driver over all robots."""
     return sum(before != after for record in records.values()
                for (_, before, _), (_, after, _) in pairwise(record["accepted"]))
 
 
 def looks_per_frame(records: Mapping[str, Record]) -> float:
-    """Return the answers of all services over the frames of all robots."""
+    """Return the number of answers of all services per frame of all robots."""
     sent = sum(len(record["sent_us"]) for record in records.values())
     return sum(int(record["answers"]) for record in records.values()) / max(1, sent)
 
@@ -149,7 +150,7 @@ def looks_per_frame(records: Mapping[str, Record]) -> float:
 def loaded_checks(
     records: Mapping[str, Record], services: int, begin_us: int, end_us: int, received: float
 ) -> Iterator[Check]:
-    """Yield the checks of so many services with a slow detector. They `received` frames from `begin_us` to `end_us`."""
+    """Yield the checks of several services with a slow detector. They `received` frames from `begin_us` to `end_us`."""
 
     def within(times_us: Iterable[int]) -> int:
         return sum(begin_us <= at_us < end_us for at_us in set(times_us))
@@ -164,7 +165,7 @@ def loaded_checks(
 
 
 def least_harms(bounds: SharingBounds, seconds: float, each: int = 1) -> int:
-    """Return the number of harms that a run of so many seconds has room for, with `each` harms in turn."""
+    """Return the smallest number of harms in a run of this length, with `each` harms in turn."""
     return each * max(1, int(seconds // bounds.harm_s))
 
 
@@ -206,10 +207,10 @@ class Site:
     bounds: SharingBounds
     settings: Settings
     running: dict[str, str] = field(default_factory=dict)
-    """The name of each router and service -> that of its process."""
+    """Name of each router and service -> name of its process."""
     ended_s: list[float] = field(default_factory=list)
     joined_s: list[float] = field(default_factory=list)
-    """Of each robot that joined: from its first image, also while it still connects, to its first accepted command."""
+    """Time of each robot that joined, from its first image, connected or not, to its first accepted command."""
     _starts: int = 0
 
     def start_router(self, number: int) -> None:
@@ -219,8 +220,8 @@ class Site:
         self._start(f"router{number}", "router: on", "router", "--listen", listen, *_connect(others))
 
     def start_service(self, name: str) -> None:
-        """Start a service that shares. It has its name at the next start too."""
-        # To the router on its side first.
+        """Start a service that shares. Its name is the same at the next start."""
+        # First the router on its side.
         near = ADDRESS_B if name in self.bounds.beyond else ADDRESS_A
         endpoints = sorted(_endpoints(self.bounds), key=lambda endpoint: near not in endpoint)
         self._start(name, "shares robots", "vision", "--share", "--name", name, *self._detector(name),
@@ -236,14 +237,14 @@ class Site:
         return name
 
     def records(self) -> dict[str, Record]:
-        """Return what the robots wrote that were there from the beginning."""
+        """Return the records of the robots that existed from the start."""
         records: dict[str, Record] = {}
         for notes in self.stage.folder.glob("robots-*.json"):
             records |= json.loads(notes.read_text("utf-8"))
         return {name: record for name, record in records.items() if int(name[1:]) <= self.bounds.robots}
 
     def received(self) -> tuple[int, float]:
-        """Return the time, and the frames that came to the services on the robots' side, by their own counters."""
+        """Return the time, and the frames that the services on the robots' side received, by their own counters."""
         ports = [_metrics_port(name) for name in self.running if name.startswith("v")]
         command = ["ip", "netns", "exec", self.wire.robot_side, sys.executable, "-P", "-c", _READ_METRICS, *ports]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -263,17 +264,17 @@ class Site:
         self.joined_s.append((first_us - record["began_us"]) / 1e6)
 
     def kill(self, name: str) -> None:
-        """End a process with -9."""
+        """Kill a process with SIGKILL."""
         self.processes.kill(self.running.pop(name))
 
     def end(self, name: str) -> None:
-        """End a process in order, and note the time that it takes."""
+        """End a process with SIGTERM, and record the time that it takes."""
         began_s = time.monotonic()
         self.processes.end_one(self.running.pop(name))
         self.ended_s.append(time.monotonic() - began_s)
 
     def freeze(self, name: str, seconds: float) -> None:
-        """Stop a process for a while."""
+        """Suspend a process for a while."""
         self.processes.signal(self.running[name], signal.SIGSTOP)
         time.sleep(seconds)
         self.processes.signal(self.running[name], signal.SIGCONT)
@@ -286,7 +287,7 @@ class Site:
                 "--metrics", _metrics_port(name))
 
     def _start(self, name: str, line: str, *arguments: str) -> None:
-        # Each start has a log of its own, whose first line is waited for.
+        # Each start has a separate log, because the start waits for its first line.
         self._starts += 1
         process = self.running[name] = f"{name}-{self._starts}"
         namespace = self.wire.far_side if name in self.bounds.beyond else self.wire.robot_side
@@ -321,7 +322,7 @@ def _restarted(end: Callable[[Site, str], None]) -> Callable[[Site, int], None]:
 
 
 def _scaled(site: Site, _number: int) -> None:
-    """Three services, five, three."""
+    """Scale from three services to five and back to three."""
     for name in ("v3", "v4"):
         site.start_service(name)
         time.sleep(1.5)
@@ -372,7 +373,7 @@ HARMS: Final[Mapping[str, Sequence[Callable[[Site, int], None]]]] = {
     "shared-router": (_router_killed,), "shared-router-frozen": (_router_frozen,), "shared-parted": (_parted, _healed),
     "shared-joined": (Site.join,), "shared-200": (_nothing,),
 }
-"""What is done in turn."""
+"""Harms in turn."""
 
 
 def shared(row: NetworkCase, stage: Stage) -> NetworkRun:
@@ -400,7 +401,7 @@ def shared(row: NetworkCase, stage: Stage) -> NetworkRun:
 
 
 def loaded(row: NetworkCase, stage: Stage) -> NetworkRun:
-    """Load one, two and four services, one number after the other, with a detector that one of them is too slow for."""
+    """Load one, two and four services in turn with a detector that is too slow for one of them."""
     checks: list[Check] = []
     for services in LOADED_FPS:
         part = replace(stage, folder=stage.folder / f"services-{services}")

@@ -33,7 +33,7 @@ class ShapedWire(Protocol):
     counts: dict[str, Counter[str]]
 
     def shape(self, shapes: LinkShapes) -> int:
-        """Put `shapes` in force; returns how many packets were harmed so far."""
+        """Apply `shapes`. Returns how many packets were harmed so far."""
         ...
 
 
@@ -42,14 +42,14 @@ Wiring = Callable[[Path], AbstractContextManager[ShapedWire]]
 
 @dataclass(frozen=True, slots=True)
 class NetworkSetting:
-    """`seconds` are shared among a row's phases; `seeds` draw what the wire loses."""
+    """`seconds` are shared among the phases of a row; `seeds` draw the losses of the wire."""
 
     transport: str = ZENOH
     seconds: float = 20.0
     seeds: tuple[int, ...] = (1,)
 
     def __post_init__(self) -> None:
-        """Raise ConfigError for what cannot be run."""
+        """Raise ConfigError for settings that cannot run."""
         if self.transport not in PORTS:
             raise ConfigError(f"--transport {self.transport!r}: {', '.join(PORTS)}")
         if not 4 <= self.seconds <= 600:
@@ -60,7 +60,7 @@ class NetworkSetting:
 
 @dataclass(frozen=True, slots=True)
 class NetworkRun:
-    """One row with one seed; `injected` packets or processes were harmed. `facts` are what was seen besides."""
+    """One row with one seed. `injected` counts harmed packets or processes; `facts` are further observations."""
 
     row: NetworkCase
     seed: int
@@ -72,7 +72,7 @@ class NetworkRun:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """One run of a row: what the camera plays, a folder of its own, what makes the wire."""
+    """One run of a row: the images of the camera, a folder, and the wire."""
 
     film: Path
     pictures: Path
@@ -90,14 +90,14 @@ class Stage:
         return shapes.model_copy(update={"seed": self.seed})
 
     def processes(self, name: str) -> Processes:
-        """Processes with a folder of their own: some may be killed while the others are looked after."""
+        """Return processes in a separate folder, because some may be killed while others continue."""
         folder = self.folder / name
         folder.mkdir()
         return Processes(folder, oldest_first=True)
 
     @property
     def form(self) -> str:
-        """An endpoint, its host left out."""
+        """Return an endpoint with a placeholder for the host."""
         return PORTS[self.setting.transport]
 
     @property
@@ -129,7 +129,7 @@ def start_vision(stage: Stage, processes: Processes, namespace: str, endpoint: s
 
 
 def _robot_toml(stage: Stage, connect: str, passes_through: bool) -> Path:
-    """JSON's strings and numbers are TOML's too."""
+    """Write robot.toml; strings and numbers of JSON are valid TOML."""
     path = stage.folder / "robot.toml"
     where = {"connect": [connect]} if connect else {"listen": [stage.form.format(EVERYWHERE)]}
     top: dict[str, Any] = {"robot": ROBOT, **where, "state_dir": str(stage.folder)}

@@ -1,6 +1,6 @@
-"""A process that sends STOP, reset and arm again and again. Shell.
+"""Send STOP, reset and arm repeatedly, from a separate process. Shell.
 
-    python -m sightline.benchmarks.network.stop_client ENDPOINT ROBOT LEDGER SECONDS SEED
+python -m sightline.benchmarks.network.stop_client ENDPOINT ROBOT LEDGER SECONDS SEED
 """
 
 import sys
@@ -17,17 +17,17 @@ from sightline.protocol.messages import Reply, State, Status, Verb
 from sightline.protocol.transports.zenoh.link import open_zenoh
 
 STOPPED: Final = "stopped"
-"""Recorded with the stamp of the first status that reports it."""
+"""Event with the stamp of the first status that reports it."""
 RESET: Final = "reset"
 """Recorded just before the request. The wheels stay at zero until then."""
 DRIVES_MPS: Final = 0.2
 _PATIENCE_S: Final = 20.0
 _PAUSE_S: Final = 0.2, 0.8
-"""Between driving and STOP, drawn: a STOP meets the video in every phase."""
+"""Random pause between driving and STOP, so that STOP meets every phase of the video."""
 
 
 def run(endpoint: str, robot: str, event_log: EventLog, seconds: float, seed: int) -> None:
-    """Until the time is over. Raises LinkError when the robot does not answer."""
+    """Run until the time is over. Raises LinkError if the robot does not answer."""
     chance = Random(seed)
     with open_zenoh(robot, connect=[endpoint], role=SOURCE, timeout_s=15) as link:
         operator = Operator(link)

@@ -2,10 +2,9 @@
 
     python -m sightline.benchmarks.network.watch ENDPOINT FILE [statuses]
 
-It runs beside the robot, on the near side of the wire, so that watching costs the wire nothing, and acknowledges
-nothing. Written at SIGTERM as JSON: frames (seq, t_us, latency_us, bytes), statuses (t_us and what `NOTED` names), and
-over Zenoh, where peers receive each other's messages, twists (`heard_us`, t_us of the frame). With `statuses` only
-those.
+It runs on the robot's side of the wire, so that it puts no load on the wire, and acknowledges nothing. Written at
+SIGTERM as JSON: frames (seq, t_us, latency_us, bytes), statuses (t_us and the fields of `NOTED`), and over Zenoh, where
+peers receive each other's messages, twists (`received_us`, t_us of the frame). With `statuses` only statuses.
 """
 
 import json
@@ -28,7 +27,7 @@ NOTED: Final = ("t_us", "state", "frame_age_us", "accepted", "stale", "window", 
 
 
 class Notes:
-    """All received messages, not decoded."""
+    """All received messages, undecoded."""
 
     def __init__(self) -> None:
         self.frames: list[tuple[bytes, int]] = []
@@ -41,11 +40,11 @@ class Notes:
         self.frames.append((message.header, len(message.payload)))
 
     def twist(self, message: Message) -> None:
-        """When it came, by the clock of all processes of this machine."""
+        """Store a twist with its arrival time, by the common clock of all processes of this machine."""
         self.twists.append((monotonic_us(), message.header))
 
     def status(self, message: Message) -> None:
-        """Kept undecoded: decoding is for the end."""
+        """Store a status undecoded, to decode it at the end."""
         self.statuses.append((message.header, message.payload))
         self.received.set()
 
@@ -78,7 +77,7 @@ def _status_row(header: bytes, payload: bytes) -> tuple[Any, ...]:
 
 
 def main(endpoint: str, path: Path, only: str = "") -> None:
-    """Until SIGTERM."""
+    """Record until SIGTERM."""
     ending, notes = threading.Event(), Notes()
     signal.signal(signal.SIGTERM, lambda *_: ending.set())
     secure = str(path.parent) if endpoint.startswith("ws") else ""

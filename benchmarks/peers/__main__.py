@@ -19,7 +19,7 @@ from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 _RETRY_S: Final = 0.1
 _ZENOH: Final = ("callback", "ring", "newest")
-"""Peers of one module; each name is its vision."""
+"""Peers of one module; each is named for its vision function."""
 
 
 def main(name: str, role: str, settings: dict[str, Any]) -> None:
@@ -46,7 +46,7 @@ def _part(peer: ModuleType, role: str, vision: str, settings: dict[str, Any]) ->
 
 
 def _vision(settings: dict[str, Any]) -> Vision:
-    """A robot has no use for any, and they are large; nor has a peer with its own for what ours import and set."""
+    """Import and build the detector only where it is needed, because the imports are large."""
     if settings["vision"] == "legacy":
         from sightline.benchmarks.peers.classic_detector import ClassicVision
 
@@ -57,7 +57,7 @@ def _vision(settings: dict[str, Any]) -> Vision:
 
 
 def _end(tally: Tally) -> None:
-    """At once, whatever the transport's threads are doing."""
+    """Save and exit immediately, regardless of the transport's threads."""
     tally.save()
     os._exit(0)
 

@@ -1,7 +1,7 @@
 """Run the color pipeline of the legacy articles, as a detector that a user would build. Shell (a clock).
 
-Whole image decoded, blurred, turned to HSV, thresholded, opened; the largest outline's middle steers, in pixels, with
-an integral that has neither time nor bound. Constants are theirs. OpenCV's threads are left as they come.
+The whole image is decoded, blurred, converted to HSV, thresholded and opened. The center of the largest outline
+steers, in pixels, with an integral without time and bound. The constants are theirs. OpenCV uses its default threads.
 """
 
 import time
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 _BLUR_PX: Final = (11, 11)
 _LOWER_HSV: Final = (20, 25, 25)
 _UPPER_HSV: Final = (64, 255, 255)
-_SQUARE: Final = np.ones((3, 3), np.uint8)  # what OpenCV takes for the `None` that they give
+_SQUARE: Final = np.ones((3, 3), np.uint8)  # OpenCV's default for the `None` that they pass
 _MIN_AREA_PX: Final = 40
 _LINEAR: Final = 200.0
 _ANGULAR: Final = -0.005
@@ -23,7 +23,7 @@ _DEAD_BAND: Final = 0.1
 
 
 class ClassicVision:
-    """Images in, `linear|angular` out, slowed by a pause (`delay_ms`) or by work (`busy_ms`)."""
+    """Converts images to `linear|angular`, slowed by a pause (`delay_ms`) or by work (`busy_ms`)."""
 
     def __init__(self, delay_ms: float, busy_ms: float) -> None:
         self._delay_s, self._busy_s = delay_ms / 1000, busy_ms / 1000
@@ -61,5 +61,5 @@ def largest_outline(picture: NDArray[Any]) -> NDArray[Any] | None:
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     largest = max(outlines, key=cv2.contourArea, default=None)
     if largest is not None:
-        cv2.minEnclosingCircle(largest)  # their measure of distance, which they compute and then do not use
+        cv2.minEnclosingCircle(largest)  # their measure of distance, which they compute and do not use
     return largest

@@ -9,16 +9,16 @@ from sightline.protocol.clock import monotonic_us
 
 
 class Vision(Protocol):
-    """Images in, `linear|angular` out."""
+    """Converts images to `linear|angular`."""
 
     def answer(self, t_us: int, jpeg: bytes, /) -> str:
         """Return the command for an image captured at `t_us`. Raises ValueError for an image without an answer."""
         ...
 
 
-# A camera for the peers of `bench loop`: the recorded images at their pace, stamped when shown. Shell (a clock).
+# A camera for the peers of `bench loop`: recorded images at their pace, stamped when shown. Shell (a clock).
 #
-# The caller sleeps itself (`film.next_in_s()`), as its own loop does: a thread's sleep or a coroutine's. Missed
+# The caller sleeps (`film.next_in_s()`) as its own loop does, in a thread or in a coroutine. Missed
 # images are not repeated, as with the folder camera of the robot service.
 
 
@@ -38,12 +38,12 @@ class RecordedFrames:
         return self._due_s - now_s
 
     def shoot(self) -> tuple[int, bytes]:
-        """(capture time in microseconds, JPEG)."""
+        """Return (capture time in microseconds, JPEG)."""
         self._shown += 1
         return time.monotonic_ns() // 1000, self._jpegs[self._shown % len(self._jpegs)]
 
 
-# The captures of one contestant of `bench loop`, and the time of each result. Shell.  Kept in memory, at the cost of
+# The captures of one contestant of `bench loop`, and the time of each result. Shell.  Stored in memory, at the cost of
 # an append, and written at the end. All processes of a machine share its monotonic clock.
 
 
@@ -55,14 +55,14 @@ class Tally:
         self._captured_us: list[int] = []
         self._commands_us: list[tuple[int, int]] = []
         self.hot_us: float | None = None
-        """Median of one step without pacing, where it was measured."""
+        """Median of one step without pacing, if measured."""
 
     def capture(self, t_us: int) -> None:
-        """Note that an image was captured at `t_us`."""
+        """Record that an image was captured at `t_us`."""
         self._captured_us.append(t_us)
 
     def validate(self, t_us: int) -> None:
-        """Note that the answer to the image of `t_us` is parsed and ready for the motors."""
+        """Record that the answer to the image of `t_us` is parsed and ready for the motors."""
         self._commands_us.append((t_us, monotonic_us()))
         if len(self._commands_us) == 1:
             print("first answer", flush=True)

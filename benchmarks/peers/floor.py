@@ -1,4 +1,4 @@
-"""The floor: no transport at all. Sleep until the image's time, then decode and step, in one process. Shell."""
+"""The floor, without a transport: sleep until the image's time, then decode and step, in one process. Shell."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _HOT_STEPS: Final = 150
 
 
 def alone(film: RecordedFrames, detector: Vision, tally: Tally, *, hot: bool) -> None:
-    """Answer images at their pace for ever; before that, `hot` measures steps without any pause."""
+    """Answer images at their pace forever. Before that, `hot` measures steps without pauses."""
     if hot:
         tally.hot_us = statistics.median(_step_us(film, detector) for _ in range(_HOT_STEPS))
     while True:

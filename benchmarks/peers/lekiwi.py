@@ -1,6 +1,6 @@
 """ZeroMQ as LeKiwi uses it: PUSH and PULL with short queues; commands are read once a tick. Shell.
 
-An image goes as the second part of a message, as raw JPEG after a JSON header, and the receiver drains its queue to the
+An image is the second part of a message, raw JPEG after a JSON header, and the receiver drains its queue to the
 newest one: `src/lerobot/robots/lekiwi` of github.com/huggingface/lerobot at 7427f318. The command that a tick reads
 answers an earlier tick.
 """
@@ -28,7 +28,7 @@ def _socket(context: zmq.Context[Socket], kind: int, option: int, value: int) ->
 
 
 def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
-    """Tick at the images' pace: command in, image out."""
+    """Tick at the pace of the images: read a command, send an image."""
     context = zmq.Context()
     commands = _socket(context, zmq.PULL, zmq.CONFLATE, 1)
     observations = _socket(context, zmq.PUSH, zmq.SNDHWM, QUEUE)

@@ -1,6 +1,6 @@
 """Run the pattern of the legacy article: base64 text over WebSocket, every second image, commands every 55.1 ms. Shell.
 
-The robot's server is an asyncio one here; that of the article polled every 100 ms and was slower still. The vision
+The robot's server uses asyncio here; that of the article polled every 100 ms and was even slower. The vision
 function stores the newest text in a variable, which its main loop polls without a pause, as in the article.
 """
 
@@ -22,7 +22,7 @@ COMMAND_PERIOD_S: Final = 0.0551
 
 
 class RepeatedCommand:
-    """The newest command, given to the motors again and again by a thread."""
+    """The newest command, which a thread sends to the motors repeatedly."""
 
     def __init__(self, tally: Tally) -> None:
         self.command = ""
@@ -67,7 +67,7 @@ async def _serve(film: RecordedFrames, tally: Tally, port: int) -> None:
 
 
 class Newest:
-    """The newest text, and whether it was looked at."""
+    """The newest text, and whether it was processed."""
 
     def __init__(self, connection: ClientConnection) -> None:
         self.text = ""

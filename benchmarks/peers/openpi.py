@@ -2,8 +2,8 @@
 
 The vision is an asyncio server that computes inside its handler; compression is off and messages are binary, as in
 `packages/openpi-client/src/openpi_client/websocket_client_policy.py` and
-`src/openpi/serving/websocket_policy_server.py` of github.com/Physical-Intelligence/openpi at 15a9616a. There msgpack
-packs the fields, here `struct` does.
+`src/openpi/serving/websocket_policy_server.py` of github.com/Physical-Intelligence/openpi at 15a9616a. openpi
+packs the fields with msgpack, this file with `struct`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ANSWER: Final = struct.Struct("<Qdd")
 
 
 def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
-    """Send one image after the other to the vision service at `port`."""
+    """Send one image at a time to the vision service at `port`."""
     connection = connect(f"ws://127.0.0.1:{port}", compression=None, max_size=None)
     while True:
         time.sleep(film.next_in_s())

@@ -1,7 +1,7 @@
 """A bare TCP exchange: length and stamp, JPEG out; a line of text back. Shell.
 
-The robot sends from one thread and listens in another; the vision answers one image after the other. It follows no
-project: it is the least code with Python's `socket` module.
+The robot sends from one thread and receives in another; the vision service answers one image at a time. It follows no
+project: it is the shortest code with Python's `socket` module.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from sightline.benchmarks.peers.contest import RecordedFrames, Tally, Vision
 
 HEAD: Final = struct.Struct("<IQ")
-"""Bytes of JPEG, and the capture time in microseconds, which identifies the answer."""
+"""Size of the JPEG, and the capture time in microseconds, which identifies the answer."""
 
 
 def robot(film: RecordedFrames, tally: Tally, port: int) -> None:
-    """Serve one vision."""
+    """Serve one vision service."""
     with socket.create_server(("127.0.0.1", port)) as server:
         connection, _ = server.accept()
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -1,4 +1,4 @@
-"""Zenoh without Sightline's protocol: publish every image, and three usual ways to receive them. Shell.
+"""Zenoh without Sightline's protocol: publish every image, and three common ways to receive them. Shell.
 
 `callback` computes in the subscriber's callback, as the example `z_sub` of github.com/eclipse-zenoh/zenoh-python at
 116b38cd does. `ring` reads a ring channel of one image, which drops the older one, as the example `z_pull` there; that
@@ -6,7 +6,7 @@ one polls, `ring` waits. `newest` keeps the newest image in a variable and compu
 `computer-vision/object-detection` of github.com/eclipse-zenoh/zenoh-demos at c7d28557 does; there a pause of 50 ms
 comes after each image, here the callback wakes the computation.
 
-Default session but for the endpoint; shared memory is off, as for every contestant.
+The session has defaults except for the endpoint; shared memory is off, as for every contestant.
 """
 
 from __future__ import annotations
