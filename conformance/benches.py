@@ -14,12 +14,12 @@ from sightline.protocol.transports.memory import MemoryLink, MemoryNetwork
 from sightline.protocol.transports.security import certificate_role
 from sightline.protocol.transports.tokens import DriverToken, RobotToken
 
-_WAITING: Final = 1024  # messages that a case has not yet looked at; it looks every few milliseconds
+_WAITING: Final = 1024  # messages that a case has not yet handled; it handles them every few milliseconds
 _NAP_S: Final = 0.005
 
 
 class LiveBench(Bench):
-    """Use it in a `with`. Callbacks of the link only store; the case's thread handles what was stored."""
+    """A context manager. Callbacks of the link only store messages; the thread of the case handles them."""
 
     def __init__(
         self,
@@ -34,12 +34,12 @@ class LiveBench(Bench):
         legacy: str = "",
         access: Access | None = None,
     ) -> None:
-        """`open_it(role)` opens a link, again after each `leave`; `put_it` sends what a link rejects.
+        """`open_it(role)` opens a link, also after each `leave`; `put_it` sends messages that a link rejects.
 
         `third_party` declares tokens.
 
-        Each of `roles` has a link of its own, where keys decide what a source may send; the first receives, and sends
-        what no other may send. Raises what `open_it` raises.
+        With keys for sources, each of `roles` has a separate link. The first one receives, and sends everything that
+        no other may send. Raises the errors of `open_it`.
         """
         super().__init__(robot, endpoint, legacy, access)
         self._open_it, self._channels, self._put_it, self._roles = open_it, channels, put_it, roles
@@ -119,28 +119,28 @@ class LiveBench(Bench):
 
 # A bench in virtual time: the peer is an object, the network is memory, a second takes milliseconds. Pure.
 # network = MemoryNetwork()     bench = VirtualBench(network, [MyPeer(network)], receives=FROM_ROBOT, robot="r1")  The
-# peer makes links of its own in that network; its `tick` is called at every step, its subscriptions as messages come.
+# peer creates links in that network. Its `tick` runs at every step, its subscriptions as messages arrive.
 
 
 STEP_US: Final = 5_000
-"""Fine enough for ticks of 20 ms and frames of 33 ms, coarse enough that a second costs 200 steps."""
+"""Fine enough for ticks of 20 ms and frames of 33 ms; a second takes 200 steps."""
 FROM_ROBOT: Final = tuple(one for one in CHANNELS.values() if one.direction is Direction.FROM_ROBOT)
-"""What a kit that tests a robot receives."""
+"""Channels that a kit receives when it tests a robot."""
 TO_ROBOT: Final = tuple(one for one in CHANNELS.values() if one.direction is Direction.TO_ROBOT)
-"""What a kit that plays a robot receives."""
-_MOST_ANSWERS = 8  # messages that go to and fro within one step, before time goes on
+"""Channels that a kit receives when it plays a robot."""
+_MOST_ANSWERS = 8  # messages back and forth within one step
 
 
 class Ticking(Protocol):
     """A peer in virtual time."""
 
     def tick(self, now_us: int) -> None:
-        """Do what is due."""
+        """Do the due work."""
         ...
 
 
 class VirtualBench(Bench):
-    """See the module."""
+    """A bench in virtual time; see the module."""
 
     def __init__(
         self, network: MemoryNetwork, peers: Sequence[Ticking], channels: Sequence[Channel], robot: str = "r1",

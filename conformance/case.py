@@ -12,9 +12,9 @@
     })
 
 The id is side, group and number; the first docstring line is the title; the clause is a heading of the specification.
-`begin` brings the peer to where the case begins; the case gets what it returns. Cases of one shape are rows of a table.
+`begin` brings the peer to the start of the case and returns the case's second argument. Similar cases are table rows.
 A case returns when the peer conforms and raises `ConformanceError` (through `bench.expect`) when it does not. It
-raises `NotApplicableError` (through `bench.need`) when what it builds on is missing: that has a case of its own, or is
+raises `NotApplicableError` (through `bench.need`) when a requirement is missing: that has a separate case, or is
 a choice.
 """
 
@@ -58,11 +58,11 @@ GROUPS: Final = {
     "REP": "reports",
     "CODEC": "codec",
 }
-"""Code in an id -> the group's name, as `--group` takes it."""
+"""Code in an id -> name of the group, as in `--group`."""
 
 
 NOT_DRIVING: Final = "it does not answer plain frames with twists"
-"""Why a case is not applicable that builds on twists of a vision service. `passed` counts it as untested."""
+"""Reason why a case that needs twists of a vision service is not applicable. `passed` counts it as untested."""
 
 
 class Level(StrEnum):
@@ -73,11 +73,11 @@ class Level(StrEnum):
 
 
 class ConformanceError(Exception):
-    """The peer does not conform; the text reports what was expected and what was seen."""
+    """The peer does not conform. The text reports the expected and the observed behavior."""
 
 
 class NotApplicableError(Exception):
-    """A requirement of the case is missing here; the text names it."""
+    """A requirement of the case is missing. The text names it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,11 +90,11 @@ class Case:
     title: str
     run: "Callable[[Bench], None]"
     real: bool = False
-    """Whether it needs real sockets, so that it cannot run in virtual time."""
+    """True if it needs real sockets, so that it cannot run in virtual time."""
 
     @property
     def group(self) -> str:
-        """The group's name."""
+        """Return the name of the group."""
         return GROUPS[self.id.split("-")[1]]
 
 
@@ -104,30 +104,30 @@ Subject = TypeVar("Subject")
 
 
 class Suite:
-    """The cases of one file. `side` is the letter their ids begin with: R robot, V vision, C codec."""
+    """The cases of one file. `side` is the first letter of their ids: R robot, V vision, C codec."""
 
     def __init__(self, side: str) -> None:
         self.side = side
         self.cases: list[Case] = []
 
     def must(self, number: str, clause: str, begin: "Begin | None" = None, *, real: bool = False) -> Adding:
-        """Decorator: a case that every peer has to pass: `run(bench, begin(bench))`, `run(bench)` without `begin`."""
+        """Add a case that every peer must pass, as a decorator of `run(bench, begin(bench))` or `run(bench)`."""
         return self._adding(number, Level.MUST, clause, begin, real)
 
     def should(self, number: str, clause: str, begin: "Begin | None" = None, *, real: bool = False) -> Adding:
-        """Decorator: a case that a peer may fail for a good reason."""
+        """Add a case that a peer may fail for a good reason, as a decorator."""
         return self._adding(number, Level.SHOULD, clause, begin, real)
 
     def must_all(
         self, begin: "Callable[[Bench], Subject]", rows: Mapping[str, tuple[str, str, Callable[[Subject], None]]],
         *, level: Level = Level.MUST, real: bool = False,
     ) -> None:
-        """Add a case for each row: id -> clause, title, and what is done with what `begin` returns."""
+        """Add a case for each row: id -> clause, title, and a function of the result of `begin`."""
         for number, (clause, title, check) in rows.items():
             self.add(Case(number, level, clause, title, _joined(begin, check), real))
 
     def add(self, case: Case) -> None:
-        """Add a case made otherwise, e.g. from a table. Raises ValueError for a bad or double id."""
+        """Add a case without a decorator, e.g. from a table. Raises ValueError for an invalid or duplicate id."""
         parts = case.id.split("-")
         if len(parts) != 3 or parts[0] != self.side or parts[1] not in GROUPS or not parts[2].isdigit():
             raise ValueError(f"{case.id}: write {self.side}-GROUP-NN with a group of {', '.join(GROUPS)}")
@@ -149,17 +149,17 @@ def _joined(begin: "Callable[[Bench], Subject]", check: Callable[[Subject], None
 
 
 def itself(bench: "Bench") -> "Bench":
-    """Begin rows that need nothing but the bench."""
+    """Begin rows that need only the bench."""
     return bench
 
 
 Begin = Callable[["Bench"], Any]
 
 
-# What a case sees of the world: messages, time, and words for what it expects. Pure; `benches.py` brings it to life:
+# The interface of a case: messages, time and expectations. Pure; `benches.py` implements it:
 # `VirtualBench` runs a peer in virtual time without sleeping, `LiveBench` a real one over the network. A case is
-# written in blocking style; only `wait` and `rest` let time pass, and callbacks (`on`, `after`) run inside them, never
-# beside.
+# written in blocking style. Only `wait` and `rest` let time pass, and callbacks (`on`, `after`) run inside them, never
+# in parallel.
 
 
 _SHOWN_MESSAGES: Final = 3
@@ -185,7 +185,7 @@ class Access:
 
     @property
     def watcher(self) -> str:
-        """A role that may request and may not drive: where keys are demanded, a viewer may send nothing at all."""
+        """Return a role that may request and may not drive; with keys, a viewer may send nothing at all."""
         return "operator" if self.is_guarded else "viewer"
 
     def may_request(self, source: str) -> bool:
@@ -199,14 +199,14 @@ class Access:
 
 @dataclass(frozen=True, slots=True)
 class Received:
-    """A message from the peer: when it arrived on the kit's clock, and its number among all that were received."""
+    """A message from the peer: arrival time on the kit's clock, and its number among all received messages."""
 
     number: int
     at_us: int
     message: Message
 
     def header(self, model: type[Model]) -> Model | None:
-        """The header as `model`; None for an invalid one (a case of its own tests that)."""
+        """Return the header as `model`; None for an invalid one, which another case tests."""
         return _read(model, self.message.header, len(self.message.header))
 
     def payload(self, model: type[Model]) -> Model | None:
@@ -222,18 +222,18 @@ def _read(model: type[Model], data: bytes, max_bytes: int) -> Model | None:
 
 
 class Bench(ABC):
-    """One peer under test. `robot` is the robot's id: the peer's own, or the one that the kit plays."""
+    """One peer under test. `robot` is the id of the tested robot, or of the one that the kit plays."""
 
     def __init__(self, robot: str, endpoint: str = "", legacy: str = "", access: Access | None = None) -> None:
-        """`endpoint` is where the peer is, `legacy` where it serves the legacy protocol, `access` the keys and tokens.
+        """Store the addresses (`endpoint` of the peer, `legacy` of its legacy protocol) and `access`, keys and tokens.
 
-        These three are for cases with sockets of their own.
+        These three are for cases with separate sockets.
         """
         self.robot, self.endpoint, self.legacy, self.access = robot, endpoint, legacy, access or Access()
         self.motor_rows: Callable[[], Sequence[WheelRow]] = tuple
-        """Returns the rows of the robot's motor log so far; none without such a log."""
+        """Returns the rows of the robot's motor log so far; empty without a log."""
         self.played: dict[str, object] = {}
-        """The peers that the kit plays, by the digest of their session: a robot shows no more of a driver."""
+        """Peers that the kit plays, by the digest of their session. A robot shows only the digest of a driver."""
         self._log: dict[str, deque[Received]] = {}
         self._reactions: list[tuple[Channel, Callable[[Received], None]]] = []
         self._timers: list[tuple[int, int, Callable[[], None]]] = []
@@ -241,17 +241,17 @@ class Bench(ABC):
         self._newest_number = 0
         self._sent: deque[str] = deque(maxlen=_SHOWN_MESSAGES)
 
-    # --- to be brought to life -----------------------------------------------------------------------------------
+    # --- to be implemented ---------------------------------------------------------------------------------------
 
     @property
     @abstractmethod
     def now_us(self) -> int:
-        """The kit's clock, monotonic. Never compare it with a robot's `t_us`."""
+        """Return the kit's clock, monotonic. Never compare it with a robot's `t_us`."""
 
     @property
     @abstractmethod
     def dropped_here(self) -> Counter[str]:
-        """Messages of the peer that the kit's link turned away, by reason: OVERSIZE, INEXACT_KEY ..."""
+        """Count the peer's messages that the kit's link rejected, by reason: OVERSIZE, INEXACT_KEY ..."""
 
     @abstractmethod
     def send(self, channel: Channel, header: bytes, payload: bytes, source: str) -> None:
@@ -259,18 +259,18 @@ class Bench(ABC):
 
     @abstractmethod
     def put(self, key: str, header: bytes, payload: bytes) -> None:
-        """Publish anything under any key, as a third party could. Raises NotApplicableError where that cannot be."""
+        """Publish anything under any key, as a third party could. Raises NotApplicableError if that is impossible."""
 
     @abstractmethod
     def declare_token(self, token: str) -> Callable[[], None]:
         """Declare the token of a driver; it ends with the returned function.
 
-        Raises NotApplicableError where links have no tokens, and for a robot that declares none of its own.
+        Raises NotApplicableError if links have no tokens, or if the robot declares none.
         """
 
     @abstractmethod
     def leave(self) -> None:
-        """Close the kit's connection; nothing is received and nothing can be sent until `join`."""
+        """Close the kit's connection. Until `join` nothing is received and nothing can be sent."""
 
     @abstractmethod
     def join(self) -> None:
@@ -278,23 +278,23 @@ class Bench(ABC):
 
     @abstractmethod
     def _pass_time(self, until_us: int) -> None:
-        """Let some time pass, at most until `until_us`, and hand what arrived meanwhile to `_hear`."""
+        """Let time pass, at most until `until_us`, and pass messages that arrive to `_hear`."""
 
     # --- messages ------------------------------------------------------------------------------------------------
 
     def publish(
         self, channel: Channel, header: WireModel | bytes, payload: WireModel | bytes = b"", source: str = ""
     ) -> None:
-        """Send a message; `source` is the role in the key, for channels towards the robot."""
+        """Send a message. `source` is the role in the key, for channels towards the robot."""
         self._sent.append(_shown("sent", channel, _bytes(header), _bytes(payload)))
         self.send(channel, _bytes(header), _bytes(payload), source)
 
     def mark(self) -> int:
-        """A point in what was received, for `received`."""
+        """Return the position in the received messages, for `received`."""
         return self._newest_number
 
     def number(self) -> int:
-        """A number that this bench gives only once."""
+        """Return a number that this bench has not returned before."""
         return next(self._numbers)
 
     def received(self, channel: Channel, since: int = 0) -> list[Received]:
@@ -312,11 +312,11 @@ class Bench(ABC):
         return log[-1] if log else None
 
     def on(self, channel: Channel, react: Callable[[Received], None]) -> None:
-        """From now on call `react` for every message of `channel`, inside `wait` and `rest`."""
+        """Call `react` for every later message of `channel`, inside `wait` and `rest`."""
         self._reactions.append((channel, react))
 
     def forget(self) -> None:
-        """Drop the log, the reactions and the timers: between two cases."""
+        """Drop the log, the reactions and the timers between two cases."""
         self._log.clear()
         self._sent.clear()
         self._reactions.clear()
@@ -331,23 +331,23 @@ class Bench(ABC):
                 react(one)
 
     def evidence(self) -> tuple[str, ...]:
-        """Format the last messages that it sent, and the last of each channel that it received, as bytes and text."""
+        """Format the last sent messages, and the last message of each received channel, as bytes and text."""
         newest = sorted((log[-1] for log in self._log.values() if log), key=lambda one: one.number)
         parts = ((one.message.channel, one.message.header, one.message.payload) for one in newest)
         return (*self._sent, *(_shown("received", *part) for part in parts))
 
     def restore(self) -> None:
-        """Connect again if the case before ended without a connection. Raises LinkError."""
+        """Connect again if the last case ended without a connection. Raises LinkError."""
         return
 
     # --- time ----------------------------------------------------------------------------------------------------
 
     def after(self, delay_us: int, call: Callable[[], None]) -> None:
-        """Call once, `delay_us` from now, inside `wait` and `rest`."""
+        """Call once after `delay_us`, inside `wait` and `rest`."""
         heapq.heappush(self._timers, (self.now_us + delay_us, next(self._numbers), call))
 
     def wait(self, until: Callable[[], object], within_us: int) -> bool:
-        """Let time pass until `until()` is true, at most `within_us`. Whether it became true."""
+        """Let time pass until `until()` is true, at most `within_us`. Returns its last value."""
         deadline_us = self.now_us + within_us
         while not until():
             if self.now_us >= deadline_us:
@@ -358,7 +358,7 @@ class Bench(ABC):
         return True
 
     def rest(self, for_us: int) -> None:
-        """Let `for_us` pass."""
+        """Let time pass for `for_us`."""
         self.wait(lambda: False, for_us)
 
     def _ring(self) -> None:

@@ -1,11 +1,11 @@
 """The codec suite: golden vectors sent to any program over a line protocol. Shell (a process).
 
     {"id", "kind": "message", "key", "header", "payload"}      header and payload in base64
-    {"id", "kind": "hello" | "websocket" | "older_...", fields}  a vector of that folder, in its own words
+    {"id", "kind": "hello" | "websocket" | "older_...", fields}  a vector of that folder, with its fields
     {"id", "kind": "write_twist", "linear_mps", "angular_rad_s"}
     -> `{"id", "ok": ...}`  or  `{"id", "refusal": reason}`  or  `{"id", "unsupported": true}`
 
-The order of answers is free; each question gets exactly one.
+Answers may come in any order; each question gets exactly one.
 """
 
 import base64
@@ -38,20 +38,20 @@ _RESULTS: Final = ("ok", "refusal", "unsupported")
 
 
 class ProgramError(Exception):
-    """The program does not keep to the line protocol, or is gone; the text is one line for people."""
+    """The program violates the line protocol, or has ended. The text is one line for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One line to the program, but for its id, and what the answer must be, as in a golden vector."""
+    """One line to the program, without its id, and the expected answer, as in a golden vector."""
 
     kind: str
     fields: Fields
-    """As in the line; bytes stand for base64."""
+    """As in the line; bytes become base64."""
     expected: Fields
     """The expected answer with "ok", or with the reason of a rejection."""
     permitted: str = ""
-    """A reason that is right as well: the specification leaves the choice."""
+    """A reason that is also correct, because the specification leaves the choice."""
 
     def line(self, number: int) -> bytes:
         """Return the line as sent, with its line end."""
@@ -61,14 +61,14 @@ class Question:
 
 
 def read_question(line: str | bytes) -> tuple[int, str, dict[str, Any]]:
-    """The other end's: id, kind and fields, as they came. Raises ValueError for what is not a question."""
+    """Return id, kind and fields of a received line. Raises ValueError unless it is a question."""
     fields = json.loads(line)
     number, kind = fields.pop("id"), fields.pop("kind")
     return number, kind, fields
 
 
 def read_answer(line: bytes) -> tuple[int, dict[str, Any]]:
-    """The id and the rest of an answer. Raises ProgramError for an invalid one."""
+    """Return the id and the rest of an answer. Raises ProgramError for an invalid one."""
     try:
         answer = json.loads(line)
     except (ValueError, RecursionError):
@@ -82,7 +82,7 @@ def read_answer(line: bytes) -> tuple[int, dict[str, Any]]:
 
 
 def shown(line: bytes) -> str:
-    """The line's beginning, without anything that could confuse a terminal."""
+    """Return the beginning of the line, without characters that could disturb a terminal."""
     text = line[:_PRINTED].decode("utf-8", "replace")
     return ascii(text) + ("..." if len(line) > _PRINTED else "")
 
@@ -114,23 +114,23 @@ def _short(value: Any) -> str:
     return text if len(text) <= _PRINTED else text[:_PRINTED] + "..."
 
 
-# A third-party codec as a process: questions to its stdin, answers from its stdout, in time. Shell.
+# A third-party codec as a process: questions to its stdin, answers from its stdout, with time limits. Shell.
 
 
 START_S: Final = 10.0
-"""Until the first answer: an interpreter may have to start and compile."""
+"""Time until the first answer: an interpreter may have to start and compile."""
 ANSWER_S: Final = 2.0
-"""From then on until the next answer, whichever it is."""
+"""Time between later answers, in any order."""
 END_S: Final = 2.0
 _READ_BYTES: Final = 65_536
 _STDERR_TAIL: Final = 200
 
 
 class CodecProgram:
-    """Use it in a `with`; whatever happens, the program and what it started have ended afterwards."""
+    """A context manager. After it, the program and its children have ended in any case."""
 
     def __init__(self, command: Sequence[str]) -> None:
-        """Raises ConfigError if `command` cannot be started."""
+        """Start the program. Raises ConfigError if `command` cannot be started."""
         try:
             self._process = subprocess.Popen(
                 list(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
@@ -146,7 +146,7 @@ class CodecProgram:
         threading.Thread(target=self._listen, args=(self._process.stderr,), name="codec-stderr", daemon=True).start()
 
     def request(self, questions: Iterator[Question]) -> Iterator[tuple[Question, dict[str, Any]]]:
-        """Send all of them, and yield each with its answer as it comes. Raises ProgramError."""
+        """Send all questions, and yield each with its answer on arrival. Raises ProgramError."""
         lines: list[bytes] = []
         waiting: dict[int, Question] = {}
         for question in questions:
@@ -161,7 +161,7 @@ class CodecProgram:
             yield waiting.pop(number), answer
 
     def finish(self) -> None:
-        """End its input, and wait for it to end. Raises ProgramError if it does not, or not well."""
+        """Close its input, and wait for its end. Raises ProgramError unless it ends well and in time."""
         assert self._process.stdin is not None
         self._process.stdin.close()
         try:
@@ -182,7 +182,7 @@ class CodecProgram:
     # --- pipes -------------------------------------------------------------------------------------------------------
 
     def _write(self, data: bytes) -> None:
-        """On a thread: a program may answer before it has read all. One that is gone is noticed by the reader."""
+        """Write on a thread, because a program may answer before it has read everything. The reader detects its end."""
         assert self._process.stdin is not None
         try:
             self._process.stdin.write(data)
@@ -191,12 +191,12 @@ class CodecProgram:
             return
 
     def _listen(self, stderr: IO[bytes]) -> None:
-        """On a thread: read what it complains of, and keep the end."""
+        """Read stderr on a thread, and keep the end of it."""
         while data := os.read(stderr.fileno(), _READ_BYTES):
             self._stderr_tail = (self._stderr_tail + data)[-_STDERR_TAIL:]
 
     def _line(self) -> bytes:
-        """The next line, without its end. Raises ProgramError if none comes in time, or ever."""
+        """Return the next line, without its end. Raises ProgramError if none arrives in time or at all."""
         deadline_s = time.monotonic() + (ANSWER_S if self._answered else START_S)
         while b"\n" not in self._buffer:
             if len(self._buffer) > MAX_ANSWER_BYTES:
@@ -223,7 +223,7 @@ class CodecProgram:
             return "closed its output"
 
     def _stderr_line(self) -> str:
-        """Its last words on stderr, as one line."""
+        """Return the end of its stderr, as one line."""
         words = self._stderr_tail.strip().splitlines()
         return f"; it printed {shown(words[-1])}" if words else ""
 
@@ -232,17 +232,17 @@ def _ended(code: int) -> str:
     return f"was ended by signal {-code}" if code < 0 else f"ended with {code}"
 
 
-# The questions to a codec: every golden vector, every accepted one cut short and with bits flipped, and twists to
-# write. Pure.  A vector's outcome is in its file; what a cut or flipped message must come to is what our own decoders
-# return. The files alone decide the questions: a new vector is a new case.
+# The questions to a codec: every golden vector, every accepted one cut and with flipped bits, and twists to
+# write. Pure.  A vector's outcome is in its file; that of a cut or flipped message is the result of our own decoders.
+# Only the files define the questions: a new vector is a new case.
 
 
 VECTORS: Final = Path(__file__).parent.parent / "protocol" / "vectors"
 _HEX: Final = "_hex"
 _CUT_EVERY: Final = 8
-"""Of all but a channel's usual message: each is much like that one, and a kit should not take minutes."""
+"""Of all but the usual message of a channel, because all are similar and a kit should not take minutes."""
 _MOST_CUTS: Final = 512
-"""Of one payload: each cut sends its beginning again, 90 MB for one of 32 KB that is cut at every 8th byte."""
+"""Cuts of one payload. Each cut sends its beginning again: 90 MB for one of 32 KB that is cut at every 8th byte."""
 _COMPONENT_BYTES: Final = 3
 """Of each component in a JPEG's frame header."""
 _VECTORS_FROM, _CUTS_FROM, _WRITES_FROM, _FLIPS_FROM = 1001, 2001, 3001, 4001
@@ -262,7 +262,7 @@ _WRITTEN: Final = {
 
 @dataclass(frozen=True, slots=True)
 class CodecCase:
-    """One line of the report: all of its questions must be answered rightly; `family` is vector, cut, write or flip."""
+    """One line of the report, passed if all questions are answered correctly. `family`: vector, cut, write, flip."""
 
     number: int
     family: str
@@ -270,11 +270,11 @@ class CodecCase:
     must: bool
     clause: str
     questions: Callable[[], Iterator[Question]]
-    """Made again each time: there are tens of thousands."""
+    """Created again each time, because there are tens of thousands."""
 
 
 def codec_cases(vectors: Path = VECTORS) -> list[CodecCase]:
-    """Every case: one per vector, two per accepted one that can be cut and flipped, one per twist to write."""
+    """Return every case: one per vector, two per accepted one that can be cut and flipped, one per twist to write."""
     read = [(path.relative_to(vectors).with_suffix("").as_posix(), json.loads(path.read_text("utf-8")))
             for path in sorted(vectors.rglob("*.json"))]
     able = [(name, vector) for name, vector in read if "accept" in vector and "key" in vector]
@@ -356,7 +356,7 @@ def _write_case(number: int, name: str, twist: tuple[str, float, float, str]) ->
                      lambda: iter((requested,)))
 
 
-# Every case for a codec, and running them against a program on a pipe. Shell.
+# All cases for a codec, run against a program on a pipe. Shell.
 #
 # results = run_codec(["node", "codec_adapter.mjs"], CASES)
 
@@ -387,7 +387,7 @@ def run_codec(
 ) -> list[Result]:
     """Test the program of `command` with each of `cases`.
 
-    One that dies, hangs or answers what is not an answer fails the case it was in; the cases after it are not
+    A program that dies, hangs or sends an invalid answer fails the current case; later cases are not
     applicable. Raises ConfigError if it cannot be started.
     """
     results: list[Result] = []
@@ -408,7 +408,7 @@ def run_codec(
 
 
 def _result(program: CodecProgram, case: Case) -> tuple[Outcome, str]:
-    """Send one case's questions. Raises ProgramError."""
+    """Send the questions of one case. Raises ProgramError."""
     if case.id == END:
         program.finish()
         return Outcome.PASSED, ""

@@ -1,4 +1,4 @@
-"""Runs cases in several processes at once, each against a peer of its own that the kit starts. Shell (processes)."""
+"""Run cases in several parallel processes, each against a separate peer that the kit starts. Shell (processes)."""
 
 import os
 import re
@@ -31,7 +31,7 @@ _POLL_S: Final = 0.02
 
 @dataclass(frozen=True, slots=True)
 class Jobs:
-    """`start` is a command line with {endpoint}, and {job} for folders of its own; `options` go to each kit."""
+    """`start` is a command line with {endpoint}, and {job} for separate folders; `options` go to each kit."""
 
     side: str
     endpoint: str
@@ -47,7 +47,7 @@ class Jobs:
         return f"{found[1]}{int(found[2]) + job}{found[3]}"
 
     def command_of(self, job: int) -> list[str]:
-        """Return the command of a peer. Raises ConfigError for one that has no place for the endpoint."""
+        """Return the command of a peer. Raises ConfigError if it has no placeholder for the endpoint."""
         if "{endpoint}" not in self.start:
             raise ConfigError("--jobs needs --start COMMAND with {endpoint}, "
                               "e.g. --start 'sightline robot --listen {endpoint} --set state_dir=/tmp/state-{job}'")
@@ -114,7 +114,7 @@ class Jobs:
 
 
 def _check_free(endpoint: str) -> None:
-    """Raise ConfigError if something listens there: it would be tested in place of the peer that the kit starts."""
+    """Raise ConfigError if the endpoint is in use: that server would be tested in place of the kit's peer."""
     host, _, port = endpoint.rstrip("/").rpartition("/")[2].rpartition(":")
     with suppress(OSError, ValueError, OverflowError):
         socket.create_connection((host.strip("[]"), int(port)), _END_S).close()

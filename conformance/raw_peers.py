@@ -1,4 +1,4 @@
-"""Clients that send what no library would: raw WebSocket bytes, any Zenoh key. Shell (sockets).
+"""Clients without the limits of a library: raw WebSocket bytes, any Zenoh key. Shell (sockets).
 
     with RawWebSocket("ws://127.0.0.1:9090") as raw:
         raw.send(TEXT, hello)
@@ -25,7 +25,7 @@ from sightline.protocol.transports.zenoh.session import open_session
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 CONTINUED: Final = 0
 LATE_PONG_S: Final = 1.3
-"""Later than a ping interval, and within two seconds."""
+"""Later than a ping interval, but within two seconds."""
 LOST: Final = (1006, "")
 """The end of a connection without a close frame: RFC 6455, 7.1.5."""
 _SIZES: Final = {126: 2, 127: 8}
@@ -36,7 +36,7 @@ _PATIENCE_S: Final = 3.0
 
 
 class RawFrame(NamedTuple):
-    """One WebSocket frame as it came, unmasked."""
+    """One received WebSocket frame, unmasked."""
 
     fin: bool
     opcode: int
@@ -44,7 +44,7 @@ class RawFrame(NamedTuple):
 
 
 def frame_bytes(opcode: int, data: bytes, *, fin: bool = True, masked: bool = True) -> bytes:
-    """Return one frame as RFC 6455, 5.2 lays it out."""
+    """Return one frame in the layout of RFC 6455, 5.2."""
     size = len(data)
     short = size if size < 126 else 126 if size < 65_536 else 127
     head = bytes([(0x80 if fin else 0) | opcode, (0x80 if masked else 0) | short])
@@ -76,7 +76,7 @@ def xor(data: bytes, mask: bytes) -> bytes:
 
 
 class RawConnection:
-    """Either end of a WebSocket; use it in a `with`. It answers pings unless `answers_pings` is false."""
+    """Either end of a WebSocket, as a context manager. It answers pings unless `answers_pings` is false."""
 
     masks = True
 
@@ -103,11 +103,11 @@ class RawConnection:
     # --- sending -------------------------------------------------------------------------------------------------
 
     def send(self, opcode: int, data: bytes, *, fin: bool = True, masked: bool | None = None) -> None:
-        """Send one frame; the end of the connection is not an error here."""
+        """Send one frame. An ended connection is not an error."""
         self.write(frame_bytes(opcode, data, fin=fin, masked=self.masks if masked is None else masked))
 
     def write(self, data: bytes) -> None:
-        """Send bytes as they are."""
+        """Send raw bytes."""
         with suppress(OSError):
             self._socket.settimeout(_PATIENCE_S)
             self._socket.sendall(data)
@@ -133,7 +133,7 @@ class RawConnection:
                 self._pongs.append((time.monotonic() + self.pongs_after_s, frame.data))
 
     def frame_that(self, wanted: Callable[[RawFrame], bool], within_s: float) -> RawFrame | None:
-        """Return the next frame for which `wanted` holds; None when none comes."""
+        """Return the next frame for which `wanted` is true; None without one."""
         deadline_s = time.monotonic() + within_s
         while (left_s := deadline_s - time.monotonic()) > 0 and not self._ended:
             frame = self.frame(left_s)
@@ -216,7 +216,7 @@ class RawWebSocket(RawConnection):
 
 
 def split_url(url: str) -> tuple[bool, str, int]:
-    """(TLS, address, port) of `ws://`, `wss://` or the legacy protocol's endpoint. Raises ConfigError."""
+    """Return (TLS, address, port) of `ws://`, `wss://` or the legacy protocol's endpoint. Raises ConfigError."""
     scheme, _, rest = url.partition("://")
     address, _, port = rest.split("/")[0].split("?")[0].rpartition(":")
     if scheme.split("-")[0] not in ("ws", "wss") or not port.isdigit():
@@ -225,36 +225,36 @@ def split_url(url: str) -> tuple[bool, str, int]:
 
 
 def _unverified() -> ssl.SSLContext:
-    """The kit tests the protocol, not the certificate: that of a third party is accepted as it is."""
+    """Return a TLS context that accepts any certificate, because the kit tests the protocol only."""
     context = ssl.create_default_context()
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
     return context
 
 
-# Puts anything under any key, past every bound of a well-behaved link, as a third party on Zenoh could. Shell (Zenoh).
+# Publishes anything under any key, beyond the limits of a link, as a third party on Zenoh could. Shell (Zenoh).
 
 
 _OPEN_S: Final = 5.0
 
 
 class RawZenoh:
-    """A session of its own at `endpoint`, opened when it is first needed; use it in a `with`."""
+    """A separate session at `endpoint`, opened on first use. A context manager."""
 
     def __init__(self, endpoint: str, folder: str = "", source: str = "vision") -> None:
-        """`folder` holds the keys to come in with, those of `source`."""
+        """Store the arguments. `folder` has the keys of `source` for the connection."""
         self._endpoint, self._folder, self._source = endpoint, folder, source
         self._session: Any = None
         self._ending = ExitStack()
 
     def put(self, key: str, header: bytes, payload: bytes) -> None:
-        """Send it. Raises LinkError without an answer."""
+        """Publish the message. Raises LinkError without an answer."""
         self._opened().put(key, payload, attachment=header or None)
 
     def declare_token(self, token: Token) -> Callable[[], None]:
         """Declare a token. It ends with the returned function. Raises LinkError without an answer."""
         withdraw = declare_token(self._opened(), token)
-        self._ending.callback(withdraw)  # keeps it: without a reference Zenoh ends the token
+        self._ending.callback(withdraw)  # keeps a reference, without which Zenoh ends the token
         return withdraw
 
     def has_token(self, token: Token) -> bool:

@@ -22,7 +22,7 @@ def _counted_as(one: Result) -> str:
 
 
 def summary(results: Sequence[Result]) -> str:
-    """One line: does the peer conform, how many of what, and why a MUST was left untested."""
+    """Return one line: whether the peer conforms, the counts, and why a MUST was not tested."""
     found = counts(results)
     names = (Outcome.PASSED.value, Outcome.FAILED.value, "SHOULD failed", Outcome.SKIPPED.value)
     figures = ", ".join(f"{found[name]} {name}" for name in names if found[name] or name == Outcome.PASSED.value)
@@ -32,7 +32,7 @@ def summary(results: Sequence[Result]) -> str:
 
 
 def to_dict(results: Sequence[Result], side: str, peer: str) -> dict[str, Any]:
-    """One object for scripts, as every command that validates prints it."""
+    """Return the JSON object for scripts, as of every validating command."""
     return {
         "ok": passed(results),
         "side": side,
@@ -43,7 +43,7 @@ def to_dict(results: Sequence[Result], side: str, peer: str) -> dict[str, Any]:
 
 
 def from_lines(text: str, cases: Sequence[Case], side: str, peer: str, file: str) -> list[Result]:
-    """Read the results of an earlier run of the same peer, one JSON object a line; the last may be cut.
+    """Read the results of an earlier run of the same peer, one JSON object a line. The last line may be cut.
 
     Raises ConfigError for a damaged file and for another peer.
     """
@@ -68,7 +68,7 @@ def from_lines(text: str, cases: Sequence[Case], side: str, peer: str, file: str
 
 
 LINE_START: Final = '{"name": '
-"""Each line of `to_line` begins with it."""
+"""Start of each line of `to_line`."""
 
 
 def to_line(one: Result, side: str, peer: str) -> str:
@@ -77,7 +77,7 @@ def to_line(one: Result, side: str, peer: str) -> str:
 
 
 def to_check(one: Result) -> dict[str, Any]:
-    """Return the result of one case as the report has it."""
+    """Return the result of one case in the form of the report."""
     case = one.case
     return {
         "name": case.id,
@@ -96,7 +96,7 @@ def to_check(one: Result) -> dict[str, Any]:
 
 
 def to_junit(results: Sequence[Result], side: str, peer: str) -> str:
-    """JUnit XML: a failed MUST is a failure; a failed SHOULD and what is not applicable are skipped, with a reason."""
+    """Return JUnit XML: a failed MUST is a failure; failed SHOULD and not applicable cases are skipped."""
     found = counts(results)
     skipped = str(found["SHOULD failed"] + found[Outcome.SKIPPED.value])
     seconds = f"{sum(one.took_us for one in results) / 1e6:.3f}"

@@ -1,4 +1,4 @@
-"""Runs cases one after another and collects their results. Pure."""
+"""Run cases one after another and collect their results. Pure."""
 
 import re
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -22,7 +22,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """A case that ran. `reason` is empty when it passed at once."""
+    """A case that ran. `reason` is empty if it passed the first time."""
 
     case: Case
     outcome: Outcome
@@ -33,7 +33,7 @@ class Result:
 
 
 def run_case(case: Case, bench: Bench, prepare: Callable[[Bench], None] = lambda _bench: None) -> Result:
-    """Run one case; whatever a peer makes it raise is a result."""
+    """Run one case. Any exception is a result."""
     bench.forget()
     began_us = bench.now_us
     outcome, reason = Outcome.PASSED, ""
@@ -45,14 +45,14 @@ def run_case(case: Case, bench: Bench, prepare: Callable[[Bench], None] = lambda
         outcome, reason = Outcome.SKIPPED, str(missing)
     except (ConformanceError, LinkError) as failed:
         outcome, reason = Outcome.FAILED, str(failed)
-    except Exception as error:  # a peer's nonsense must not end the run
+    except Exception as error:  # invalid data of a peer must not end the run
         outcome, reason = Outcome.FAILED, f"{type(error).__name__}: {error}"
     evidence = tuple(map(printable, bench.evidence())) if outcome is Outcome.FAILED else ()
     return Result(case, outcome, printable(reason), bench.now_us - began_us, evidence)
 
 
 def printable(text: str) -> str:
-    """`text` as a terminal, XML and UTF-8 can hold it: a reason may quote any bytes of a peer."""
+    """Return `text` in a form for terminals, XML and UTF-8, because a reason may quote any bytes of a peer."""
     return "".join(char if char.isprintable() else "?" for char in text)
 
 
@@ -63,10 +63,10 @@ def run_cases(
     on_result: Callable[[Result], None] = lambda _result: None,
     tries: int = 1,
 ) -> list[Result]:
-    """Run `cases` in order against one peer; `prepare` brings it to where each begins.
+    """Run `cases` in order against one peer; `prepare` sets its initial state.
 
-    Over a network nothing may be relied on to arrive: with `tries` above 1 a case fails that fails so often in a row,
-    and one that passes later reports how it failed before.
+    A network may lose messages. With `tries` above 1 a case fails only after that many failures in a row, and a
+    later pass reports the earlier failure.
     """
     results: list[Result] = []
     for case in cases:
@@ -101,9 +101,9 @@ def passed(results: Sequence[Result]) -> bool:
 
 
 def untested(results: Sequence[Result]) -> list[Result]:
-    """MUST cases that could not run, though a case of what they need passed, or for want of twists.
+    """Return MUST cases that could not run although a case of their requirement passed, or for lack of twists.
 
-    A robot that can be armed for one driver and not for another has no choice behind that.
+    A robot that can be armed for one driver but not for another has no such choice.
     """
     good = {one.case.id for one in results if one.outcome is Outcome.PASSED and one.case.level is Level.MUST}
     return [one for one in results if one.outcome is Outcome.SKIPPED and one.case.level is Level.MUST
@@ -117,7 +117,7 @@ def _needs_one_of(result: Result, ids: Collection[str]) -> bool:
 
 
 def chosen(cases: Sequence[Case], only: Sequence[str] = (), groups: Sequence[str] = ()) -> list[Case]:
-    """The cases named by id (or the beginning of one) and by group; all if nothing is named. Raises ConfigError."""
+    """Return the cases named by id (or its beginning) and by group; all without names. Raises ConfigError."""
     for name in only:
         if not any(case.id.startswith(name.upper()) for case in cases):
             raise ConfigError(f"--only {name}: no case begins so; `--list` names them, e.g. --only {cases[0].id}")

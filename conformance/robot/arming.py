@@ -22,16 +22,16 @@ from sightline.protocol.messages import State, Status
 
 SUITE: Final = Suite("R")
 _WHEELS_STOP_US: Final = 700_000 + SETTLES_US
-"""From STOP until the wheels are measured to be at rest."""
+"""From STOP until the wheels are measured at rest."""
 _LOST_US: Final = 1_300_000
-"""Silence after which a human's lease has ended, while what it cites is younger than two seconds."""
+"""Silence after which a human's lease has ended, while the cited status is younger than two seconds."""
 
 _YOUNG_US: Final = 1_800_000
 """Age below which a request that cites a `status`, sent after the next one, is not older than two seconds."""
 
 
 def _driven(bench: Bench, twists: int = 8) -> Sender:
-    """A driver whose last twists were all good; the robot is not armed."""
+    """Return a driver with good last twists only. The robot is not armed."""
     driver = Sender(Robot(bench))
     driver.need_good()
     driver.drive()
@@ -41,7 +41,7 @@ def _driven(bench: Bench, twists: int = 8) -> Sender:
 
 
 def _send_more(driver: Sender, twists: int) -> None:
-    """Wait until the driver has sent so many more twists; not applicable where too few frames come."""
+    """Wait until the driver has sent that many more twists. Not applicable with too few frames."""
     target = driver.seq + twists
     driver.bench.need(driver.bench.wait(lambda: driver.seq >= target, 3_000_000), "too few frames")
 
@@ -115,7 +115,7 @@ def arming_after_disarm(bench: Bench, driver: Sender) -> None:
 
 
 def _human(bench: Bench) -> Sender:
-    """A human that holds the lease of a robot that is not armed."""
+    """Return a human that holds the lease of a robot that is not armed."""
     human = teleop(bench)
     human.need_good()
     return human
@@ -212,11 +212,11 @@ def row_ends_with_the_lease(bench: Bench) -> None:
     driver.expect_rejected("arm", "NOT_ALLOWED", "one twist, 1.5 s after twelve")
 
 
-# Cases on the STOP latch and its reset: what ends motion, and what alone may permit it again. Pure.
+# Cases on the STOP latch and its reset: the end of motion, and the only way to permit it again. Pure.
 
 
 def _stopped(bench: Bench) -> Sender:
-    """An operator whose STOP has worked."""
+    """Return an operator whose STOP took effect."""
     operator = Sender(Robot(bench), "operator")
     operator.send_request("stop")
     bench.need(operator.robot.becomes(State.STOPPED), "STOP does not stop this robot (R-STOP-01)")
@@ -231,7 +231,7 @@ def _state(robot: Robot, state: State, what: str) -> Status:
 
 
 def _lifts_nothing(operator: Sender, verb: str, what: str, **changes: Any) -> None:
-    """Fail the case unless the robot is STOPPED after the request too."""
+    """Fail the case unless the robot is still STOPPED after the request."""
     operator.request(verb, **changes)
     _state(operator.robot, State.STOPPED, f"after {what}")
 
@@ -279,7 +279,7 @@ def stops(bench: Bench, driver: Sender) -> None:
 
 
 def _at_full_speed(bench: Bench) -> Sender:
-    """A driver of a robot that drives as fast as it may."""
+    """Return a driver of a robot at its full speed."""
     limit = Robot(bench).status().max_linear_mps
     bench.need(limit > 0, "the robot reports no limit (R-LIM-02)")
     driver = armed(bench, text=f"{min(limit, 10.0):.4f}|0.0000".encode())

@@ -1,4 +1,4 @@
-"""All cases for robots in the order of the report, and the state in which each begins. Pure."""
+"""All cases for robots in the order of the report, and the initial state of each. Pure."""
 
 from typing import Final
 
@@ -22,7 +22,7 @@ _PARTS: Final = (arming, frames, hostile, lease, legacy, motion, requests, twist
 _SETTLES_US: Final = 6_000_000
 _FIRST_US: Final = 5_000_000
 _COASTS_US: Final = 500_000
-"""Wheels with the command zero may turn a little longer. Those that go on are left to the cases about it."""
+"""Wheels with the command zero may turn a little longer. If they continue, the cases about that fail."""
 _ORDER: Final = tuple(GROUPS)
 
 CASES: Final[tuple[Case, ...]] = tuple(
@@ -39,9 +39,9 @@ def is_there(bench: Bench) -> bool:
 
 
 def prepare(bench: Bench) -> None:
-    """Bring the robot to where a case begins: DISARMED, no holder, wheels at zero. Raises ConformanceError."""
+    """Bring the robot to the initial state: DISARMED, no holder, wheels at zero. Raises ConformanceError."""
     robot = Robot(bench)
-    is_there(bench)  # one that hung in the case before may need time to connect again
+    is_there(bench)  # a robot that hung in the last case may need time to connect again
     robot.status()
     operator = Sender(robot, "operator", acks=False)
     robot.next_status()
@@ -60,7 +60,7 @@ def prepare(bench: Bench) -> None:
 
 
 def _release(robot: Robot) -> None:
-    """Give the lease of the case before back: to wait for its end costs a second a case."""
+    """Release the lease of the last case, because waiting for its end would cost a second per case."""
     holder = robot.status().holder
     if holder is not None and robot.bench.access.may_request(holder.source):
         driver = robot.bench.played.get(holder.digest)

@@ -1,6 +1,6 @@
-"""The kit as a peer of a robot: what it receives and what it sends. Pure.
+"""The kit as a peer of a robot: received and sent messages. Pure.
 
-Headers towards the robot are made of plain dicts, so that a case can also send what no model permits.
+Headers towards the robot are plain dicts, so that a case can also send invalid ones.
 """
 
 import json
@@ -23,20 +23,20 @@ GOOD: Final = "GOOD"
 NOT_COUNTED: Final = "not counted"
 """The result of a command that the robot did not count."""
 CRAWL: Final = b"0.1000|0.0000"
-"""What the kit drives with where the speed does not matter."""
+"""Command of the kit if the speed does not matter."""
 ANSWER_US: Final = 1_000_000
-"""Until the effect of a command is in a `status` (10 Hz) that has been received, with room for a slow machine."""
+"""Time until a received `status` (10 Hz) shows the effect of a command, with a margin for a slow machine."""
 FRAME_US: Final = 1_500_000
-"""Until a frame comes to a peer that answers; without an answer credit comes back within 500 ms."""
+"""Time until a peer that answers receives a frame; without an answer credit returns within 500 ms."""
 REPLY_US: Final = 1_000_000
-"""After which a peer may request again."""
+"""Time after which a peer may request again."""
 DRIVEN: Final = (State.ACTIVE, State.DEGRADED)
 SETTLES_US: Final = 200_000
-"""From a command of zero until a motor and its measurement are at rest."""
+"""Time from a zero command until a motor and its measurement are at rest."""
 WATCHED_AT_REST_US: Final = 500_000
 """Long enough for several poses that are apart (measured.py)."""
 _STEADY_US: Final = 225_000
-"""Between two frames, so that the speed of a robot hardly falls by their age (5.3) and not by silence (5.4)."""
+"""Longest time between two frames at which a robot hardly slows down by their age (5.3) or by silence (5.4)."""
 _STAMPED: Final = (STATUS, ODOMETRY, FRAME)
 _SENT_AGAIN: Final = 2
 
@@ -48,7 +48,7 @@ class Robot:
         self.bench = bench
 
     def status(self) -> Status:
-        """The newest status that can be read. Raises ConformanceError after two seconds without one."""
+        """Return the newest valid status. Raises ConformanceError after two seconds without one."""
         self.bench.expect_within(lambda: self._newest_status() is not None, 2_000_000, "no readable status came")
         status = self._newest_status()
         assert status is not None
@@ -59,7 +59,7 @@ class Robot:
         return next((status for status in readable if status is not None), None)
 
     def next_status(self, count: int = 1) -> Status:
-        """The newest status once `count` more have come: what happened before the call is in it."""
+        """Return the newest status after `count` more have arrived, so that it includes earlier events."""
         mark = self.bench.mark()
         came = self.bench.wait(lambda: len(self.bench.received(STATUS, mark)) >= count, 1_000_000 * count)
         self.bench.expect(came, f"no {count} status within {count} s")
@@ -95,13 +95,13 @@ class Robot:
     # --- measured motion ---------------------------------------------------------------------------------------------
 
     def clock_us(self) -> int:
-        """The robot's clock now, at most the link's delay behind it."""
+        """Return the robot's clock now, at most the delay of the link behind it."""
         self.status()
         stamps = ((one.at_us, one.header(Stamp)) for channel in _STAMPED for one in self.bench.received(channel))
         return self.bench.now_us - min(at_us - stamp.t_us for at_us, stamp in stamps if stamp is not None)
 
     def readings(self, since_us: int = 0, until_us: int = MAX_INTEGER) -> dict[str, list[MeasuredMotion]]:
-        """The motion that it published, by channel, between two times of its clock; no channel that has none."""
+        """Return the published motion by channel, between two times of its clock. Channels without any are left out."""
         found: dict[str, list[MeasuredMotion]] = {ODOMETRY.name: [], FRAME.name: []}
         for one in self.bench.received(ODOMETRY):
             stamp, odometry = one.header(Stamp), one.payload(Odometry)
@@ -114,31 +114,31 @@ class Robot:
         return {name: series for name, series in recent.items() if series}
 
     def evidence_of_motion(self, since_us: int = 0) -> Evidence | None:
-        """The newest proof by odometry, frames or motor log that it moved after this time of its clock."""
+        """Return the newest evidence from odometry, frames or motor log that it moved after this time of its clock."""
         rows = self.bench.motor_rows()
         found = [*evidence_of(self.readings(since_us)), *(evidence_in_log(rows, self.clock_us()) if rows else ())]
         return max((one for one in found if one.t_us >= since_us), key=lambda one: one.t_us, default=None)
 
     def expect_unmoved(self, what: str, since_us: int = 0) -> None:
-        """Fail the case if the robot has measured motion since this time of its clock, or since the case began."""
+        """Fail the case if the robot measured motion since this time of its clock, or since the start of the case."""
         moved = self.evidence_of_motion(since_us or self._first_t_us())
         self.bench.expect(moved is None, f"{what} the wheels turn: {moved.words if moved else ''}")
 
     def expect_rest(self, what: str) -> None:
-        """Fail the case unless wheels that now have the command zero come to rest, and stay there for a while."""
+        """Fail the case unless wheels with the command zero come to rest, and stay there for a while."""
         rests_us = self.clock_us() + SETTLES_US
         self.bench.rest(SETTLES_US + WATCHED_AT_REST_US)
         self.expect_unmoved(what, rests_us)
 
     def expect_at_speed(self, holds: bool, reason: str) -> None:
-        """Fail the case unless `holds`; leave it where frames are so far apart that a robot slows down before each."""
+        """Fail the case unless `holds`. Not applicable if frames are so rare that a robot slows down between them."""
         times_us = [one.at_us for one, _ in self.frames()[-5:]]
         steady = all(then - was <= _STEADY_US for was, then in pairwise(times_us))
         self.bench.need(holds or steady, "too few frames for a steady speed")
         self.bench.expect(holds, reason)
 
     def _first_t_us(self) -> int:
-        """The robot's clock at the first message of the case: a motor log reaches back further."""
+        """Return the robot's clock at the first message of the case, because a motor log begins earlier."""
         stamps = [stamp for channel in _STAMPED for one in self.bench.received(channel)[:1]
                   if (stamp := one.header(Stamp))]
         return min((stamp.t_us for stamp in stamps), default=0)
@@ -150,7 +150,7 @@ class Robot:
         return self.reaches(lambda status: status.refused.get(reason, 0) > before, within_us)
 
     def stamp(self) -> Stamp:
-        """The header of the newest status that can be read. Raises ConformanceError as `status` does."""
+        """Return the header of the newest valid status. Raises ConformanceError as `status` does."""
         self.status()
         stamps = (one.header(Stamp) for one in reversed(self.bench.received(STATUS)))
         stamp = next((stamp for stamp in stamps if stamp is not None), None)
@@ -159,7 +159,7 @@ class Robot:
         return stamp
 
     def frame(self, within_us: int = FRAME_US) -> FrameHeader:
-        """The header of the next frame. Raises NotApplicableError when none comes."""
+        """Return the header of the next frame. Raises NotApplicableError without one."""
         mark = self.bench.mark()
         self.bench.wait(lambda: self.frames(mark), within_us)
         frames = self.frames(mark)
@@ -167,13 +167,13 @@ class Robot:
         return frames[0][1]
 
     def frames(self, since: int = 0) -> list[tuple[Received, FrameHeader]]:
-        """Frames since a mark, with headers that can be read."""
+        """Return the frames since a mark that have a valid header."""
         return [
             (one, header) for one in self.bench.received(FRAME, since) if (header := one.header(FrameHeader))
         ]
 
     def each_frame(self, react: Callable[[FrameHeader], None]) -> None:
-        """From now on call `react` for every frame whose header can be read."""
+        """Call `react` for every later frame with a valid header."""
 
         def read(received: Received) -> None:
             header = received.header(FrameHeader)
@@ -183,16 +183,16 @@ class Robot:
         self.bench.on(FRAME, read)
 
     def camera(self) -> CameraModel | None:
-        """The newest camera model."""
+        """Return the newest camera model."""
         received = self.bench.newest(CAMERA)
         return received.payload(CameraModel) if received else None
 
 
 class Sender:
-    """A peer of the robot that the kit plays: one source and session, counting its own messages."""
+    """A peer of the robot that the kit plays: one source and session, with a count of its messages."""
 
     def __init__(self, robot: Robot, source: str = "vision", *, acks: bool = True) -> None:
-        """`acks`: acknowledge every frame at once that is not answered by a twist, so that frames flow."""
+        """Create the session. `acks`: immediately acknowledge every frame without a twist, so that frames continue."""
         self.robot, self.bench, self.source = robot, robot.bench, source
         # A robot remembers sessions of earlier runs of the kit, so theirs must differ: by the kit's clock.
         draw = (self.bench.now_us + 7919 * self.bench.number() + id_of(source)) * 2_654_435_761
@@ -211,14 +211,14 @@ class Sender:
         robot.each_frame(self._on_frame)
 
     def _draw(self, count: int) -> bytes:
-        """Draw bytes for a chain of proofs. A kit in virtual time must repeat its runs, so they are not random."""
+        """Draw bytes for a chain of proofs. They are not random, because a kit in virtual time must repeat its runs."""
         self._draws += 1
         return sha256(f"{self.session}/{self._draws}".encode()).digest()[:count]
 
     # --- headers -------------------------------------------------------------------------------------------------
 
     def header(self, frame: FrameHeader, **changes: Any) -> dict[str, Any]:
-        """An answer's header for `frame`; `changes` replace fields, `echo_...` those of the echo, None removes one."""
+        """Return the header of an answer to `frame`. `changes` replace fields, `echo_...` in the echo; None removes."""
         echo = {"channel": "frame", "session": frame.session, "seq": frame.seq, "t_us": frame.t_us}
         echo.update({name[5:]: changes.pop(name) for name in list(changes) if name.startswith("echo_")})
         fields = {"v": 1, "source": self.source, "session": self.session, "seq": self.seq, "echo": echo}
@@ -229,7 +229,7 @@ class Sender:
     # --- twists and acks -----------------------------------------------------------------------------------------
 
     def twist(self, frame: FrameHeader, text: bytes = CRAWL, **changes: Any) -> None:
-        """Send a twist that cites `frame`; its `seq` is the next unless `changes` send otherwise."""
+        """Send a twist that cites `frame`. Its `seq` is the next one unless `changes` replace it."""
         self.seq += 1
         self.sent_us = self.bench.now_us
         self.bench.publish(TWIST, as_json(self.header(frame, **changes)), text, self.source)
@@ -245,11 +245,11 @@ class Sender:
         return self.bench.declare_token(self.proofs.token)
 
     def drive(self, text: bytes | None = CRAWL) -> None:
-        """From now on answer every frame with this twist; None: go back to acknowledging."""
+        """Answer every later frame with this twist; None: acknowledge again."""
         self.driving = text
 
     def fall_silent(self) -> None:
-        """Answer nothing any more."""
+        """Stop answering."""
         self.driving, self.acks = None, False
 
     def _on_frame(self, frame: FrameHeader) -> None:
@@ -267,7 +267,7 @@ class Sender:
             self.ack(frame)
 
     def result_of(self, send: Callable[[], None]) -> str:
-        """Return what became of the one command that `send` sends: GOOD, a rejection's reason, or NOT_COUNTED."""
+        """Return the result of the one command that `send` sends: GOOD, a rejection's reason, or NOT_COUNTED."""
         before = self.robot.status()
         send()
         self.robot.reaches(lambda status: _counts(status) != _counts(before), ANSWER_US)
@@ -289,21 +289,21 @@ class Sender:
         self.bench.expect(result == expected, f"{what}: {result}, expected {expected}")
 
     def twist_result(self, text: bytes = CRAWL, **changes: Any) -> str:
-        """The result on a twist that answers the next frame."""
+        """Return the result of a twist that answers the next frame."""
         return self.result_on_next(lambda frame: self.twist(frame, text, **changes))
 
     def result_on_next(self, send: Callable[[FrameHeader], None]) -> str:
-        """The result on what `send` sends about the next frame; sent once more if it was lost, as messages may be."""
+        """Return the result of a message by `send` about the next frame. A lost message is sent again."""
         result = NOT_COUNTED
         for _ in range(_SENT_AGAIN):
-            self.robot.status()  # whatever has to be waited for comes before the frame
+            self.robot.status()  # waits, if necessary, before the frame
             result = self.result_of(partial(send, self._frame_to_answer()))
             if result != NOT_COUNTED:
                 break
         return result
 
     def _frame_to_answer(self) -> FrameHeader:
-        """The next frame, not acknowledged beside the answer that it is about to get."""
+        """Return the next frame. It is not acknowledged, because an answer follows."""
         acks, self.acks = self.acks, False
         try:
             return self.robot.frame()
@@ -311,12 +311,12 @@ class Sender:
             self.acks = acks
 
     def need_good(self) -> None:
-        """Leave the case unless an ordinary twist is accepted: R-CAUS-01 tests that."""
+        """Leave the case unless an ordinary twist is accepted; R-CAUS-01 tests that."""
         result = self.twist_result()
         self.bench.need(result == GOOD, f"an ordinary twist is not accepted here, but {result}")
 
     def need_unknown(self) -> None:
-        """Leave the case unless a twist on a frame never issued is rejected so: R-CAUS-02 tests that."""
+        """Leave the case unless a twist on a frame never issued is rejected as such; R-CAUS-02 tests that."""
         self.robot.status()
         frame = self.robot.frame()
         result = self.result_of(lambda: self.twist(frame, echo_seq=frame.seq + 5000))
@@ -325,7 +325,7 @@ class Sender:
     # --- requests ------------------------------------------------------------------------------------------------
 
     def request(self, verb: str, *, cite: Stamp | bool = True, **changes: Any) -> Reply | None:
-        """Send a request and return the next reply, whomever it names; None when none comes within a second.
+        """Send a request and return the next reply, to any requester; None after a second.
 
         `cite` is the status to cite: True the newest, False none. `changes` replace fields of the header.
         """
@@ -336,7 +336,7 @@ class Sender:
         return replies[0] if replies else None
 
     def send_request(self, verb: str, *, cite: Stamp | bool = True, **changes: Any) -> None:
-        """Send a request and wait for nothing. Where keys forbid this source to request, an operator does it."""
+        """Send a request without waiting. If keys forbid this source to request, an operator does it."""
         if not self.bench.access.may_request(self.source):
             self.bench.need(verb not in ("acquire", "release"), f"with its keys {self.source} may request nothing")
             Sender(self.robot, "operator", acks=False).send_request(verb, cite=cite, **changes)
@@ -351,7 +351,7 @@ class Sender:
         self.bench.publish(REQUEST, as_json({**fields, **changes}), as_json(payload), self.source)
 
     def reply(self, verb: str, **changes: Any) -> Reply:
-        """Send a request and return its reply; the case is not applicable without one: R-REQ-01 tests that."""
+        """Send a request and return its reply. Not applicable without a reply; R-REQ-01 tests that."""
         reply = self.request(verb, **changes)
         self.bench.need(reply is not None, f"no reply to {verb} (R-REQ-01)")
         assert reply is not None
@@ -371,7 +371,7 @@ class Sender:
         self.bench.expect(counted, f"{what}: rejected with {reply.detail!r}, expected {reason}")
 
     def granted(self, verb: str, **changes: Any) -> bool:
-        """Send a request and return whether it was granted."""
+        """Send a request. Returns True if it was granted."""
         reply = self.request(verb, **changes)
         return reply is not None and reply.ok
 
@@ -381,25 +381,25 @@ def _counts(status: Status) -> Counter[str]:
 
 
 def id_of(name: str) -> int:
-    """A number for a name, the same on every run."""
+    """Return a number for a name, the same in every run."""
     return int.from_bytes(name.encode()[:8])
 
 
 def as_json(fields: dict[str, Any]) -> bytes:
-    """Compact JSON."""
+    """Return compact JSON."""
     return json.dumps(fields, separators=(",", ":")).encode()
 
 
-# --- how a case begins -----------------------------------------------------------------------------------------------
+# --- initial states of cases -----------------------------------------------------------------------------------------
 
 
 def vision(bench: Bench) -> Sender:
-    """A sender that acknowledges frames as `vision`."""
+    """Return a sender that acknowledges frames as `vision`."""
     return Sender(Robot(bench))
 
 
 def ready(bench: Bench) -> Sender:
-    """A sender whose first twist was good, so that it holds the lease."""
+    """Return a sender whose first twist was good, so that it holds the lease."""
     sender = vision(bench)
     sender.need_good()
     return sender
@@ -430,7 +430,7 @@ def watcher(bench: Bench) -> Sender:
 
 
 def armed(bench: Bench, source: str = "vision", text: bytes = CRAWL) -> Sender:
-    """A driver that the robot follows, driving with `text`; R-ARM-03 tests that this is possible."""
+    """Return a driver that the robot follows, driving with `text`; R-ARM-03 tests that this is possible."""
     driver = Sender(Robot(bench), source)
     driver.drive(text)
     if not bench.wait(lambda: driver.seq >= 8, 3_000_000):
@@ -440,14 +440,14 @@ def armed(bench: Bench, source: str = "vision", text: bytes = CRAWL) -> Sender:
 
 
 def moving(bench: Bench, source: str = "vision") -> Sender:
-    """A driver of a robot whose wheels turn, so that there is something to stop."""
+    """Return a driver of a robot whose wheels turn, for cases that stop it."""
     driver = armed(bench, source)
     driver.robot.reaches(lambda status: status.applied[0] > 0.05, 1_000_000)
     return driver
 
 
 def arm(driver: Sender) -> None:
-    """Arm the robot that `driver` is driving; not applicable where it will not."""
+    """Arm the robot of `driver`. Not applicable if that fails."""
     bench = driver.bench
     for _ in range(5):
         if driver.granted("arm"):

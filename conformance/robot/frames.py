@@ -1,4 +1,4 @@
-"""Cases on what a robot publishes and on credit: frames, status, odometry, rates. Pure."""
+"""Cases on published messages and on credit: frames, status, odometry, rates. Pure."""
 
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -28,12 +28,12 @@ from sightline.protocol.transports.link import INEXACT_KEY, OVERSIZE
 
 SUITE: Final = Suite("R")
 _WATCHED_US: Final = 2_000_000
-_SLACK: Final = 0.7  # of a stated rate: a loaded machine and a link that drops may cost so much
+_SLACK: Final = 0.7  # of a stated rate: cost of a loaded machine and of a link that drops messages
 _MAX_OVERHEAD_BYTES: Final = 320
 
 
 def watched(bench: Bench) -> Robot:
-    """A robot whose frames were all acknowledged for two seconds."""
+    """Return a robot whose frames were all acknowledged for two seconds."""
     robot = Robot(bench)
     Sender(robot)
     bench.rest(_WATCHED_US)
@@ -229,32 +229,32 @@ def one_clock(bench: Bench, robot: Robot) -> None:
     bench.expect(apart_us <= 500_000, f"frames and status of {robot.bench.robot} are {apart_us / 1e6:.1f} s apart")
 
 
-# Cases on credit: when a robot may send a frame, and whose answers let it. Pure.
+# Cases on credit: when a robot may send a frame, and whose answers return credit. Pure.
 #
-# How long credit stays out depends on how quick its owner was before. So most cases answer slowly for a while, saying
-# that they compute (which widens no window), and then look at what comes while they do not answer.
+# The timeout of credit depends on how fast its owner answered before. Most cases therefore answer slowly for a time and
+# report it as compute time, which widens no window. Then they stop answering and count the frames.
 
 
 SLOW_US: Final = 90_000
 """A slow detector: some frames at 30 fps."""
 _LATE_US: Final = 180_000
-"""So late that a picture which waited for the answer differs from one taken after it."""
+"""Delay at which an image that waited for the answer differs from one taken after it."""
 OWNED_US: Final = 1_600_000
-"""Credit is its owner's for a second after the last answer: also that of the peer that answered in the case before."""
+"""A peer owns the credit for a second after its last answer; so does the peer of the last case."""
 TAUGHT: Final = 14
 """Answers after which a robot expects slow ones."""
 _OF_QUICK: Final = 0.8
-"""A share of the full rate that no credit leaves to the silent, and no credit at all exceeds."""
+"""Share of the full frame rate: below it for a silent peer with credit, above it for a robot without credit."""
 _LEASE_LASTS_US: Final = 700_000
-"""Within the second that a lease lasts: afterwards a twist with another proof takes it."""
+"""Within the second of a lease. Afterwards a twist with another proof takes it."""
 _COUNTED_US: Final = 600_000
-"""Within the second for which credit is its owner's."""
+"""Within the second in which a peer owns the credit."""
 QUICK_FPS: Final = 15
 """Below this, camera and credit cannot be distinguished."""
 
 
 def taught(bench: Bench, answers: int = TAUGHT) -> Sender:
-    """A watcher that has answered slowly for a while and now answers nothing; its last answer was to the last frame."""
+    """Return a watcher that answered slowly and does not answer now. Its last answer was to the last frame."""
     watcher = Sender(Robot(bench))
     watcher.delay_us = watcher.compute_us = SLOW_US
     bench.need(bench.wait(lambda: watcher.ack_seq >= answers, 6_000_000), "too few frames")
@@ -263,7 +263,7 @@ def taught(bench: Bench, answers: int = TAUGHT) -> Sender:
 
 
 def _quick_fps(bench: Bench, what: str = "to a quick peer") -> float:
-    """Frames a second, which must be more than the camera alone could explain."""
+    """Return the frames per second, which must exceed those of the camera alone."""
     fps = fps_of(bench)
     bench.need(fps >= QUICK_FPS, f"only {fps:.0f} fps {what}")
     return fps
@@ -281,7 +281,7 @@ def fps_of(bench: Bench, for_us: int = 1_000_000) -> float:
 
 
 def _rates(bench: Bench) -> tuple[Sender, float, float]:
-    """A watcher that answered quickly, then slowly, then not at all: it, and frames a second at first and at last."""
+    """Return a watcher that answered fast, then slowly, then not at all, and the first and last frame rate."""
     watcher = Sender(Robot(bench))
     bench.rest(OWNED_US)
     quick = _quick_fps(bench)
@@ -309,7 +309,7 @@ def slow_detector_widens_nothing(bench: Bench) -> None:
     bench.expect(fps <= 1.25e6 / SLOW_US, f"{fps:.0f} fps to a peer that computes {SLOW_US // 1000} ms for each")
 
 
-# On a quick link credit times out almost as soon as it is answered, so both cases answer slowly. A timeout is then at
+# On a fast link credit times out almost as soon as it is answered, so both cases answer slowly. A timeout is then at
 # least half as long again as an answer. The median of the gaps is compared: one stall of a machine must not count.
 _LONGER: Final = 1.4
 
@@ -363,7 +363,7 @@ def lost_credit_times_out(bench: Bench) -> None:
     bench.rest(2_500_000)
     gaps_us = _gaps_us(bench, mark)
     bench.expect(len(gaps_us) >= 2, "without an answer no frames came any more")
-    # A slow camera delivers its next picture up to an interval after the timeout.
+    # A slow camera delivers its next image up to an interval after the timeout.
     most_us = max(650_000, 550_000 + usual_us)
     bench.expect(max(gaps_us) <= most_us, f"without an answer {max(gaps_us) / 1e3:.0f} ms passed between two frames")
 
@@ -416,7 +416,7 @@ def _silent_for(bench: Bench, for_us: int) -> bool:
 
 
 def again(watcher: Sender) -> Sender:
-    """The same peer, answering by hand."""
+    """Return the same peer, which answers by hand."""
     again = Sender(watcher.robot, acks=False)
     again.session, again.proofs, again.ack_seq = watcher.session, watcher.proofs, watcher.ack_seq
     again.compute_us = SLOW_US
@@ -441,7 +441,7 @@ def never_stored(bench: Bench, robot: Robot) -> None:
 
 
 def _second_hastens_nothing(first: Sender) -> None:
-    """Fail the case if a quick second peer makes frames come faster than the slow `first` answers."""
+    """Fail the case if a fast second peer makes frames come faster than the slow `first` answers."""
     bench = first.bench
     alone = fps_of(bench)
     Sender(first.robot, bench.access.watcher)
@@ -451,14 +451,14 @@ def _second_hastens_nothing(first: Sender) -> None:
 
 
 def _returns_nothing(watcher: Sender, what: str, forge: Callable[[Sender, FrameHeader], None]) -> None:
-    """Fail the case if what `forge` sends about each frame returns credit to a peer that has been slow."""
+    """Fail the case if a message by `forge` about each frame returns credit to a slow peer."""
     bench = watcher.bench
     silent = fps_of(bench, _COUNTED_US)
     bench.need(silent < QUICK_FPS, f"{silent:.0f} fps without any answer (R-FLOW-01)")
     forger = again(watcher)
     watcher.robot.each_frame(partial(forge, forger))
     fps = fps_of(bench, _COUNTED_US)
-    most = max(1.5 * silent, silent + 2e6 / _COUNTED_US)  # one frame more or less is chance
+    most = max(1.5 * silent, silent + 2e6 / _COUNTED_US)  # a difference of one frame is chance
     bench.expect(fps < most, f"{fps:.0f} fps with {what}, {silent:.0f} without")
 
 
@@ -517,7 +517,7 @@ def stopped_twists_return_credit(bench: Bench, driver: Sender) -> None:
 
 _ALONE_US: Final = 6_000_000
 _AT_THE_EDGES: Final = 8
-"""Frames that are sent before the robot knows that the kit has gone, or has come."""
+"""Frames sent before the robot detects that the kit has disconnected or connected."""
 
 
 @SUITE.must("R-FLOW-13", "7.3 Owner", vision)

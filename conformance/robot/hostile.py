@@ -1,4 +1,4 @@
-"""Cases on guests, on what no peer should send, and on peers that come and go. Pure."""
+"""Cases on guests, on invalid messages, and on peers that connect and disconnect. Pure."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ SUITE: Final = Suite("R")
 _GUEST_MPS: Final = 0.2
 _GUEST_RAD_S: Final = 1.0
 _GUEST_M: Final = 0.3
-"""By one twist, after the first status that shows it: 0.25 m, and the way of a stop from 0.2 m/s."""
+"""Distance on one twist after the first status that shows it: 0.25 m, and a stop from 0.2 m/s."""
 _GUEST_EVERY_US: Final = 50_000
 _HOLDS_US: Final = 600_000
 """From a guest's last twist until a `status` shows HOLD, with room for a slow machine."""
@@ -38,7 +38,7 @@ def _bare(bench: Bench, text: bytes = CRAWL) -> None:
 
 
 def _guest(bench: Bench) -> Sender:
-    """A watcher beside a robot that receives guests."""
+    """Return a watcher at a robot that accepts guests."""
     watcher = Sender(Robot(bench), bench.access.watcher)
     result = watcher.result_of(lambda: _bare(bench))
     bench.need(result == GOOD, f"guests are not received here: {result}")
@@ -81,7 +81,7 @@ class _Guest:
     sent: int = 0
 
     def send(self) -> None:
-        """Send the next twist, and go on every 50 ms."""
+        """Send the next twist, and continue every 50 ms."""
         bench = self.watcher.bench
         if self.twists:
             _bare(bench, self.twists[self.sent % len(self.twists)])
@@ -89,7 +89,7 @@ class _Guest:
         bench.after(_GUEST_EVERY_US, self.send)
 
     def expect_held(self, most_us: int, text: bytes) -> None:
-        """Fail the case unless a robot that receives only this twist holds, with its wheels at zero, in time."""
+        """Fail the case unless a robot that receives only this twist holds in time, with its wheels at zero."""
         self.twists = (text,)
         robot, bench = self.watcher.robot, self.watcher.bench
         bench.rest(most_us + _BRAKES_US)
@@ -98,7 +98,7 @@ class _Guest:
 
 
 def _sending_guest(bench: Bench) -> _Guest:
-    """A guest that sends twists that change; the robot is not armed."""
+    """Return a guest that sends changing twists. The robot is not armed."""
     guest = _Guest(_guest(bench))
     guest.send()
     bench.rest(700_000)
@@ -106,7 +106,7 @@ def _sending_guest(bench: Bench) -> _Guest:
 
 
 def _drives(guest: _Guest) -> bool:
-    """Arm the robot for a guest, and return whether it follows."""
+    """Arm the robot for a guest. Returns True if the robot follows it."""
     robot = guest.watcher.robot
     for _ in range(5):
         if guest.watcher.granted("arm"):
@@ -116,7 +116,7 @@ def _drives(guest: _Guest) -> bool:
 
 
 def _driving_guest(bench: Bench) -> _Guest:
-    """A guest that drives the robot, by twists that change."""
+    """Return a guest that drives the robot with changing twists."""
     guest = _sending_guest(bench)
     bench.need(_drives(guest), "guests do not drive here (R-DIAL-09)")
     turns = guest.watcher.robot.reaches(lambda status: status.applied[0] > 0.05, 1_000_000)
@@ -131,8 +131,8 @@ def guests_are_armed(bench: Bench, guest: _Guest) -> None:
 
 
 def _expect_crawl(robot: Robot, drive: Callable[[tuple[bytes, ...]], None]) -> None:
-    """Fail the case unless the guest whose twists `drive` sets drives, and turns, within its limits."""
-    # A robot may stop a guest that repeats one twist, also one that differs only above the limit.
+    """Fail the case unless the guest whose twists `drive` sets drives and turns within its limits."""
+    # A robot may stop a guest that repeats one twist, also twists that differ only above the limit.
     fast, turning = (b"3.0|0.0", b"3.0|0.3"), (b"0.0|9.0", b"0.1|9.0")
     for texts, axis, most in ((fast, 0, _GUEST_MPS), (turning, 1, _GUEST_RAD_S)):
         drive(texts)
@@ -220,11 +220,11 @@ def _oversize(sender: Sender, extra: bytes, text: bytes) -> None:
     sender.expect(GOOD, what="after it an ordinary twist")
 
 
-# --- nonsense and floods ---------------------------------------------------------------------------------------------
+# --- invalid messages and floods -----------------------------------------------------------------------------------
 
 
 def _survives(sender: Sender, *messages: tuple[bytes, bytes]) -> None:
-    """After each (header, payload) as a twist and as a request the robot still publishes and validates."""
+    """Check that the robot still publishes and validates after each (header, payload) as a twist and as a request."""
     bench = sender.bench
     for header, payload in messages:
         for channel in (TWIST, REQUEST):
@@ -291,7 +291,7 @@ def many_peers(bench: Bench, robot: Robot) -> None:
     second.expect("NOT_HOLDER", what="then the twist of a second driver")
 
 
-# --- coming and going ------------------------------------------------------------------------------------------------
+# --- connecting and disconnecting ----------------------------------------------------------------------------------
 
 
 def _away(bench: Bench, for_us: int) -> None:

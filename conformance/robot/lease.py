@@ -1,4 +1,4 @@
-"""Cases on the lease: who drives, by rank, for how long, and what happens when the driver is gone. Pure."""
+"""Cases on the lease: the driver, its rank, the duration, and the loss of the driver. Pure."""
 
 from collections.abc import Callable
 from typing import Any, Final
@@ -31,7 +31,7 @@ _SUCCESSION_US: Final = 450_000
 
 
 def _result_while_held(first: Sender, second: Sender, **changes: Any) -> str:
-    """The result of the next twist of `second`, in the second that the lease lasts after the last of `first`."""
+    """Return the result of the next twist of `second`, within a second of the last twist of `first`."""
     held_us = first.sent_us
     result = second.twist_result(**changes)
     in_time = second.sent_us - held_us < _LEASE_US * 9 // 10
@@ -46,7 +46,7 @@ def _expect_while_held(expected: str, first: Sender, second: Sender, what: str =
 
 
 def _held_alone(bench: Bench) -> tuple[Sender, Sender]:
-    """The source that holds the lease, and a second driver that is rejected."""
+    """Return the holder of the lease, and a second driver that is rejected."""
     first = ready(bench)
     second = Sender(first.robot)
     bench.need(second.twist_result() == "NOT_HOLDER", "a second driver is not kept out (R-LEASE-02)")
@@ -55,7 +55,7 @@ def _held_alone(bench: Bench) -> tuple[Sender, Sender]:
 
 
 def _held_for_a_while(bench: Bench) -> Sender:
-    """The source that holds the lease, at a robot where it ends by silence."""
+    """Return the holder of the lease, at a robot where silence ends the lease."""
     first = ready(bench)
     first.fall_silent()
     bench.rest(_LEASE_US * 3 // 2)
@@ -65,7 +65,7 @@ def _held_for_a_while(bench: Bench) -> Sender:
 
 
 def _with_token(bench: Bench) -> tuple[Sender, Callable[[], None]]:
-    """The source that holds the lease with a token, and a function that ends the token."""
+    """Return the holder of a lease with a token, and a function that ends the token."""
     robot = ready(bench).robot
     bench.rest(_LEASE_US * 3 // 2)
     first = Sender(robot)
@@ -286,7 +286,7 @@ _FORGED: Final = "ab" * 16
 
 
 def _copied(bench: Bench) -> tuple[Sender, Sender]:
-    """The driver, and a peer that has read its session and its last number, and has a chain of its own."""
+    """Return the driver, and a peer that knows its session and last number and has another chain."""
     return _copy_of(ready(bench))
 
 
@@ -447,7 +447,7 @@ def other_tokens_end_nothing(bench: Bench, held: tuple[Sender, Callable[[], None
 
 
 def _result_after_silence(first: Sender, second: Sender) -> str:
-    """The result of a twist of `second` after the holder was silent for 0.45 s, in the second that its lease lasts."""
+    """Return the result of a twist of `second` after 0.45 s of silence of the holder, within its lease."""
     first.twist(first.robot.frame())
     first.fall_silent()
     first.bench.rest(_SUCCESSION_US)

@@ -27,7 +27,7 @@ def _legacy(bench: Bench, **options: Any) -> Iterator[RawWebSocket]:
 
 
 def _picture(text: bytes) -> bytes:
-    """The JPEG in a message; empty without one."""
+    """Return the JPEG in a message; empty without one."""
     try:
         data = binascii.a2b_base64(text)
         read_jpeg_size(data)

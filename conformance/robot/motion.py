@@ -1,6 +1,6 @@
-"""Cases on what the wheels do: limits, ramps, silence and ageing frames, in `applied` and measured motion. Pure.
+"""Cases on wheel motion: limits, ramps, silence and ageing frames, in `applied` and measured motion. Pure.
 
-The duration of a stop is the time between two arrivals at the kit, so that the link's delay is in both ends of it.
+A stop is timed between two arrivals at the kit, so that the link's delay affects both.
 """
 
 import math
@@ -21,7 +21,7 @@ _TOLERANCE: Final = 0.01
 _ZERO: Final = (0.0, 0.0)
 _OFF_MPS: Final = 0.04
 _OFF_RAD_S: Final = 0.15
-"""How far measured motion may be off, besides a share: a wheel slips, an encoder has steps."""
+"""Error limit of measured motion in addition to a share: a wheel slips, an encoder has steps."""
 _OVERSHOOT: Final = 1.15
 _MEASURED_US: Final = 600_000
 
@@ -40,7 +40,7 @@ def _driven(bench: Bench, text: bytes) -> tuple[Status, Planar]:
 
 
 def _within_limits(status: Status, most: Planar) -> tuple[bytes, Planar]:
-    """A twist of these signs, as text and as numbers: at most so fast, and half as fast as the robot may."""
+    """Return a twist with these signs, as text and as numbers, limited to `most` and to half the robot's maximum."""
     linear, angular = (math.copysign(min(abs(speed), limit / 2), speed)
                        for speed, limit in zip(most, _limits(status), strict=True))
     return f"{linear:.4f}|{angular:.4f}".encode(), (linear, angular)
@@ -164,20 +164,20 @@ def ramps_up(bench: Bench, robot: Robot) -> None:
 
 
 def _reports(bench: Bench, since: int) -> list[tuple[int, Planar, State]]:
-    """(time of arrival, applied, state) of each status since a mark."""
+    """Return (time of arrival, applied, state) of each status since a mark."""
     read = ((one.at_us, one.payload(Status)) for one in bench.received(STATUS, since))
     return [(at_us, status.applied, status.state) for at_us, status in read if status]
 
 
 def _zero_us(bench: Bench, since: int) -> int | None:
-    """When a status first reports that the wheels are at zero, where they stay."""
+    """Return when a status first reports that the wheels are at zero, if they stay there."""
     reported = [(at_us, applied) for at_us, applied, _ in _reports(bench, since)]
     last_moving = max((number for number, one in enumerate(reported) if one[1] != _ZERO), default=-1)
     return reported[last_moving + 1][0] if last_moving + 1 < len(reported) else None
 
 
 def _driving(bench: Bench, source: str = "vision", way: Planar = (1.0, 0.0)) -> Sender:
-    """The driver of a robot that moves this way, in shares of its limits, as fast as it may."""
+    """Return the driver of a robot at full speed in this direction, in shares of its limits."""
     limits = _limits(Robot(bench).status())
     linear, angular = (share * min(limit, 10.0) for share, limit in zip(way, limits, strict=True))
     driver = armed(bench, source, f"{linear:.4f}|{angular:.4f}".encode())
@@ -192,7 +192,7 @@ def _axis_of(way: Planar) -> int:
 
 
 def _stopping(bench: Bench) -> Sender:
-    """The driver of a robot that drives as fast as it may, and has stopped once by silence."""
+    """Return the driver of a robot at its full speed that has stopped once after silence."""
     driver = _driving(bench)
     robot = driver.robot
     text, driver.driving, driver.acks = driver.driving, None, False
@@ -206,7 +206,7 @@ def _stopping(bench: Bench) -> Sender:
 
 
 def _silent(driver: Sender) -> tuple[int, FrameHeader]:
-    """The driver answers nothing any more: a mark when the first frame came that was not answered, and that frame."""
+    """Silence the driver. Returns a mark at the first unanswered frame, and that frame."""
     driver.fall_silent()
     cited = driver.robot.frame()
     return driver.bench.mark(), cited
@@ -251,7 +251,7 @@ def others_keep_nothing_alive(bench: Bench, driver: Sender) -> None:
     kept_out = driver.robot.counts("NOT_HOLDER", rejected, 1_000_000)
     bench.need(kept_out, "a second driver is not kept out (R-LEASE-02)")
     mark, _cited = _silent(driver)
-    for number in range(20):  # until before the lease of the first could end
+    for number in range(20):  # until just before the lease of the first could end
         bench.after(number * 20_000, lambda: other.twist(driver.robot.frames()[-1][1]))
     other.fall_silent()
     _expect_stop(bench, mark, "another's twists")

@@ -215,7 +215,7 @@ def holder_is_none(bench: Bench, first: Sender) -> None:
     bench.expect(free, f"{first.robot.status().holder} is reported to drive")
 
 
-# Cases on requests that cannot be read or cite the wrong thing, and on counters that never fall. Pure.
+# Cases on requests that are invalid or cite the wrong message, and on counters that never decrease. Pure.
 
 
 @SUITE.must("R-REQ-12", "8.1 Requests and replies", operator)

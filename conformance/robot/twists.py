@@ -1,4 +1,4 @@
-"""Cases on single twists: header, grammar, what they cite, their order. Pure.
+"""Cases on single twists: header, grammar, cited message, order. Pure.
 
 A robot that is not armed validates every command too and counts a good one as DISARMED, so no wheel turns here.
 """
@@ -39,7 +39,7 @@ def _echo(**changes: Any) -> Making:
 
 
 def _again(name: str, first: str) -> Making:
-    """`name` given twice: `first`, then as it was."""
+    """Return `name` given twice: `first`, then the original."""
     return lambda fields: b'{"%b":%b,' % (name.encode(), first.encode()) + as_json(fields)[1:]
 
 
@@ -188,7 +188,7 @@ def source_disagrees(bench: Bench, sender: Sender) -> None:
     bench.expect(result == "UNKNOWN_SOURCE", f"a header of vision under the key of teleop: {result}")
 
 
-# --- what a twist cites, over time -----------------------------------------------------------------------------------
+# --- the cited message, over time ------------------------------------------------------------------------------------
 
 
 @SUITE.must("R-CAUS-04", "5.3 Age", ready)
@@ -250,7 +250,7 @@ def reasons_in_order(bench: Bench, sender: Sender) -> None:
     sender.expect("OTHER_SESSION", echo_session="fffffff0", seq=0)
 
 
-# --- a sender's own seq ----------------------------------------------------------------------------------------------
+# --- the sender's seq ------------------------------------------------------------------------------------------------
 
 
 @SUITE.must("R-SEQ-07", "5.1 Order", ready)
@@ -281,22 +281,22 @@ def rejected_seq_bars_no_driver(bench: Bench, sender: Sender) -> None:
     sender.expect(GOOD)
 
 
-# Cases on the order in which a twist is validated, and on how much a robot remembers for it. Pure.
+# Cases on the order of the validation of a twist, and on the memory of a robot for it. Pure.
 
 
 _REMEMBERED_FRAMES: Final = 256
 _APART_US: Final = 8_000
-"""Twists on one frame: apart enough for none to replace another, and all before the frame is too old."""
+"""Time between twists on one frame: none may replace another, and all must come before the frame is too old."""
 _OTHERS: Final = 80
 """Rejected senders between a twist and its replay; they must not displace the one that held the lease."""
 _OF_ONE_FRAME: Final = 16
-"""Senders that cite one frame, so that all have sent before the memory of the driver may end."""
+"""Senders that cite one frame, so that all have sent before the robot may forget the driver."""
 _REMEMBERED_US: Final = 9_000_000
 """Within the ten seconds for which a robot remembers a driver."""
 
 
 def _watcher(bench: Bench) -> Sender:
-    """A peer that may not drive, at a robot that rejects it as UNKNOWN_SOURCE."""
+    """Return a peer that may not drive, at a robot that rejects it as UNKNOWN_SOURCE."""
     watcher = Sender(Robot(bench), bench.access.watcher)
     result = watcher.twist_result()
     bench.need(result == "UNKNOWN_SOURCE", f"a watcher's twist is {result} (R-HOST-01)")

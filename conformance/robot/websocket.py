@@ -1,4 +1,4 @@
-"""Cases on `sightline.v1` with sockets of their own: handshake, hello, framing, tokens. Shell (sockets)."""
+"""Cases on `sightline.v1` with raw sockets: handshake, hello, framing, tokens. Shell (sockets)."""
 
 import socket
 import time
@@ -35,7 +35,7 @@ SUITE: Final = Suite("R")
 SWITCHED: Final = 101
 SOON_S: Final = 2.5
 PASSING_S: Final = 1.2
-"""Long enough for what is published ten times a second to come several times."""
+"""Long enough to receive a 10 Hz message several times."""
 SESSION: Final = "5eed5eed"
 
 
@@ -45,14 +45,14 @@ def endpoint_of(bench: Bench) -> str:
 
 
 def hello(bench: Bench, *wants: str, **changes: Any) -> bytes:
-    """A good hello, or one with other fields."""
+    """Return a valid hello, or one with other fields."""
     fields = {"v": 1, "robot": bench.robot, "role": bench.access.watcher, "session": SESSION, "wants": list(wants)}
     return as_json({**fields, **changes})
 
 
 @contextmanager
 def spoken(bench: Bench, *wants: str, **changes: Any) -> Iterator[RawWebSocket]:
-    """A connection on which both have sent hello."""
+    """Open a connection on which both ends have sent hello."""
     with RawWebSocket(endpoint_of(bench), offered(bench, source=changes.get("role", ""))) as raw:
         bench.need(raw.status == SWITCHED, f"the handshake fails with {raw.status} (R-SOCK-01)")
         raw.send(TEXT, hello(bench, *wants, **changes))
@@ -62,18 +62,18 @@ def spoken(bench: Bench, *wants: str, **changes: Any) -> Iterator[RawWebSocket]:
 
 
 def offered(bench: Bench, *others: str, source: str = "") -> tuple[str, ...]:
-    """The sub-protocol entries of a client that may come in, as a watcher unless it names another, after `others`."""
+    """Return the sub-protocol entries of a permitted client, by default a watcher, after `others`."""
     token = bench.access.token_of(source or bench.access.watcher)
     return (*others, SUBPROTOCOL, *([entry_of(token)] if token else ()))
 
 
 def entry_of(token: str) -> str:
-    """The sub-protocol entry that shows `token`."""
+    """Return the sub-protocol entry that shows `token`."""
     return f"sightline.token.{token}"
 
 
 def put_over_websocket(bench: Bench, key: str, header: bytes, payload: bytes) -> None:
-    """Send a message past every bound of a well-behaved end. Raises NotApplicableError for keys that cannot be sent."""
+    """Send a message beyond the limits of a link. Raises NotApplicableError for keys that cannot be sent."""
     parts = key.split("/")
     if "*" in key or len(parts) != 4 or parts[1] != bench.robot:
         raise NotApplicableError("over WebSocket nothing is sent under a key")
@@ -87,7 +87,7 @@ def block(fields: bytes, payload: bytes = b"") -> bytes:
 
 
 def disarm_request(bench: Bench) -> bytes:
-    """A request for `disarm` as one message: it changes nothing here, and it is answered."""
+    """Return a request for `disarm` as one message. It changes nothing here and is answered."""
     header = {"channel": "request", "v": 1, "source": bench.access.watcher, "session": SESSION, "seq": 1}
     return block(as_json(header), as_json({"id": 4711, "verb": "disarm"}))
 
@@ -121,7 +121,7 @@ def ends_with(raw: RawWebSocket, bench: Bench, codes: tuple[int, ...], what: str
 
 
 def _answers(bench: Bench, status: int, what: str, **options: Any) -> None:
-    """Fail the case unless a client that connects so gets `status`."""
+    """Fail the case unless a client that connects this way gets `status`."""
     with RawWebSocket(endpoint_of(bench), **{"protocols": offered(bench), **options}) as raw:
         bench.expect(raw.status == status, f"{what}: HTTP {raw.status or 'nothing'}, expected {status}")
 
@@ -248,7 +248,7 @@ def unknown_wants(bench: Bench) -> None:
         bench.expect("status" in names, f"there came {sorted(names)}")
 
 
-# Cases on the messages of `sightline.v1` after hello: framing, pings, and how a bad one ends. Shell (sockets).
+# Cases on the messages of `sightline.v1` after hello: framing, pings, and the end of an invalid one. Shell (sockets).
 
 
 @SUITE.must("R-SOCK-16", "14.6 Messages", real=True)
@@ -390,10 +390,10 @@ def sixteen_clients(bench: Bench) -> None:
         for _ in range(17):
             raw = ending.enter_context(RawWebSocket(endpoint_of(bench), offered(bench)))
             statuses.append(raw.status)
-            raw.send(TEXT, hello(bench, role="operator"))  # of those who only watch, fewer may come in
+            raw.send(TEXT, hello(bench, role="operator"))  # fewer clients that only watch may be admitted
             opened.append(raw)
             for earlier in opened:
-                earlier.frame(0.001)  # answers its pings: on a slow machine the first may wait for seconds
+                earlier.frame(0.001)  # answers its pings: on a slow machine the first client may wait for seconds
             if raw.status != SWITCHED:
                 break
         bench.expect(statuses[-1] == 503, f"seventeen more clients: {statuses}")
@@ -418,15 +418,15 @@ def role_is_the_source(bench: Bench) -> None:
         bench.expect(not bench.received(REPLY)[1:], "it was answered")
 
 
-# Cases on what `sightline.v1` reports of blocks, hellos, late handshakes and detections. Shell (raw sockets).
+# Cases on reports of `sightline.v1` about blocks, hellos, late handshakes and detections. Shell (raw sockets).
 
 
 _HANDSHAKE_S: Final = 4.0
-"""Two seconds by the specification, and room for a slow machine."""
+"""Two seconds by the specification, and a margin for a slow machine."""
 
 
 def _reason_given(bench: Bench, send: Callable[[], None]) -> tuple[str, str]:
-    """Return the result of the message that `send` sends, and the sender that the robot assumed."""
+    """Return the result of a message by `send`, and the sender that the robot assumed."""
     watcher = Sender(Robot(bench), bench.access.watcher, acks=False)
     result = watcher.result_of(send)
     last = watcher.robot.status().last_refusal
@@ -462,13 +462,13 @@ def passes_missions_on_as_they_came(bench: Bench) -> None:
 
 
 def _passed_on(bench: Bench, channel: str, role: str, payload: bytes) -> None:
-    """Fail the case unless what `role` reports on `channel` comes to another, once and as it was, and not back."""
+    """Fail the case unless a message of `role` reaches another client once, unchanged, and is not returned."""
     _relay(bench, channel, role, payload).expect_as_sent(bench)
 
 
 @dataclass(frozen=True, slots=True)
 class _Relayed:
-    """One message that a peer sent, what came of it to another peer, and what came back to the sender."""
+    """One message of a peer, its copies at another peer, and those returned to the sender."""
 
     channel: str
     header: bytes
@@ -477,7 +477,7 @@ class _Relayed:
     returned: list[IncomingMessage]
 
     def expect_as_sent(self, bench: Bench) -> None:
-        """Fail the case unless it came once, as it was, and not back."""
+        """Fail the case unless it arrived once and unchanged, and did not return."""
         count = len(self.received)
         bench.expect(count == 1, f"another peer that wants `{self.channel}` gets {count} of one sent")
         came = self.received[0]
@@ -487,7 +487,7 @@ class _Relayed:
 
 
 def _relay(bench: Bench, channel: str, role: str, payload: bytes) -> _Relayed:
-    """Send one message of `role` beside another peer that wants it."""
+    """Send one message of `role` while another peer wants it."""
     header = as_json({"v": 1, "source": role, "session": SESSION, "seq": 7, "note": "as it came"})
     with spoken(bench, channel) as other, spoken(bench, channel, role=role) as speaker:
         speaker.send(BINARY, block(b'{"channel":"%b",' % channel.encode() + header[1:], payload))
@@ -582,7 +582,7 @@ def header_that_is_no_json(bench: Bench) -> None:
 
 _CLAUSE: Final = "14.3 Token"
 _WRONG_TOKENS: Final = "AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA"
-"""A token by its form that no role has."""
+"""A valid token that no role has."""
 
 
 def _token(bench: Bench) -> str:

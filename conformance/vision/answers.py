@@ -1,4 +1,4 @@
-"""Cases on a vision service's answers: framing, headers, grammar, and where it steers. Pure."""
+"""Cases on a vision service's answers: framing, headers, grammar, and steering. Pure."""
 
 import json
 import math
@@ -23,12 +23,12 @@ SUITE = Suite("V")
 _SESSION: Final = re.compile(r"[0-9a-f]{8}")
 _ECHO: Final = {"channel", "session", "seq", "t_us"}
 _LAST_US: Final = 200_000
-"""So far ahead of a robot's other messages a frame may be: from 500 ms on it is forged (2.6)."""
+"""Lead of a frame over the robot's other messages; from 500 ms on it is forged (2.6)."""
 _FOUR_DECIMALS: Final = re.compile(rb"[+-]?[0-9]+\.[0-9]{4}\|[+-]?[0-9]+\.[0-9]{4}")
 
 
 def _sample(bench: Bench, junk: int = 0) -> list[VisionAnswer]:
-    """Answers to six views, of a target beside and ahead and of none, and to so many that are not pictures."""
+    """Return the answers to six views, with a target at the side, ahead and absent, and to images that are invalid."""
     robot = RobotPlayed(bench)
     for name in ("left", "left", "centre", "centre", "right", "absent"):
         robot.is_driven(robot.frame(name))
@@ -43,7 +43,7 @@ def _sample(bench: Bench, junk: int = 0) -> list[VisionAnswer]:
 
 
 def _every(bench: Bench, good: Callable[[dict[str, Any]], object], reason: str) -> None:
-    """Every answer's header is as it must be."""
+    """Check the header of every answer."""
     for answer in _sample(bench):
         bench.expect(good(answer.fields), f"{reason}: {answer.received.message.header[:200]!r}")
 
@@ -66,7 +66,7 @@ def every_frame_is_answered(_bench: Bench, robot: RobotPlayed) -> None:
 def one_answer(bench: Bench, robot: RobotPlayed) -> None:
     """A frame that a twist answered is not acknowledged as well."""
     for sent in robot.film("centre", 5, 100_000):
-        # An ack before its twist is how a peer answers that steers by this frame later.
+        # An ack before its twist means that a peer steers by this frame later.
         kinds = [one.is_twist for one in robot.answers_to(sent)]
         bench.expect(kinds == sorted(kinds), f"frame {sent.seq} got an ack after its twist")
 
@@ -106,7 +106,7 @@ def drives_as_vision(bench: Bench) -> None:
         bench.expect(answer.received.message.source == "vision", f"it came as {answer.received.message.source!r}")
 
 
-# --- frames' headers, as a robot may write them ----------------------------------------------------------------------
+# --- headers of frames, as a robot may write them --------------------------------------------------------------------
 
 _READS: Final[dict[str, tuple[str, str, Callable[[dict[str, Any]], bytes]]]] = {
     "V-FRAM-11": ("2.8 Fields", "A frame with nothing but its stamp is read: the rest has defaults.",
@@ -142,7 +142,7 @@ SUITE.must_all(met, {
 def largest_integers(bench: Bench) -> None:
     """`seq` and `t_us` up to 2^53 - 1 come back as they were."""
     robot = RobotPlayed(bench, first_seq=MAX_INTEGER - 40, first_t_us=MAX_INTEGER - _LAST_US)
-    robot.stop()  # its clock is about to end
+    robot.stop()  # its clock is near its end
     answer = robot.answer_to(robot.frame(seq=MAX_INTEGER, t_us=MAX_INTEGER))
     got = (answer.echo.get("seq"), answer.echo.get("t_us"))
     bench.expect(got == (MAX_INTEGER, MAX_INTEGER), f"it cites seq {got[0]} and t_us {got[1]}")
@@ -261,20 +261,20 @@ def no_minus_zero(bench: Bench) -> None:
                      f"{twist.text!r}")
 
 
-# Cases about where a vision service steers: towards its target, and nowhere without one. Pure.
+# Cases about steering: towards the target, and no motion without one. Pure.
 #
-# Which target it follows is its own choice. Order and signs of the axes are not: they are MUST for each service whose
-# twists depend on where the kit's yellow ball is, as those of ours do unless configured otherwise.
+# The choice of the target is free. Order and signs of the axes are not: they are MUST for each service whose
+# twists depend on the kit's yellow ball, as those of our services do by default.
 
 
 _SECOND: Final = 20
 _LOOKS: Final = 12
 _EVERY_US: Final = 50_000
 _AHEAD_RAD_S: Final = 0.2
-"""Less than this is not a turn: a target straight ahead."""
+"""Smaller rates are not a turn, for a target straight ahead."""
 _STILL_MPS: Final = 0.001
 _SAME: Final = 0.01
-"""Speeds that differ by less, in m/s or rad/s, are the same."""
+"""Speeds with a smaller difference, in m/s or rad/s, are the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +304,7 @@ class _Steering:
 
 
 def _steering(bench: Bench) -> _Steering:
-    """Look at three places of the target. Not applicable to a service that follows something else."""
+    """Return the answers to three places of the target. Not applicable to a service that follows another object."""
     found = _Steering(bench, *(_toward(bench, name) for name in ("far", "near_left", "near_right")))
     apart = max(abs(one - other) for side in (found.left, found.right)
                 for one, other in zip(side, found.ahead, strict=True))
@@ -313,7 +313,7 @@ def _steering(bench: Bench) -> _Steering:
 
 
 def _toward(bench: Bench, name: str) -> Planar:
-    """Return (m/s, rad/s) of its last answer to a robot that starts, and shows one image only."""
+    """Return (m/s, rad/s) of its last answer to a new robot that shows one image only."""
     robot = RobotPlayed(bench)
     robot.is_driven(robot.film(name, _LOOKS, _EVERY_US)[-1])
     robot.stop()
@@ -385,7 +385,7 @@ def same_frames_same_twists(bench: Bench) -> None:
 
 
 def _replayed(bench: Bench, every_us: int) -> list[bytes]:
-    """The twists for one sequence of frames, as text; empty for a frame without one."""
+    """Return the twists for one sequence of frames, as text; empty for a frame without one."""
     robot = RobotPlayed(bench).met()
     robot.stop()
     robot = RobotPlayed(bench)

@@ -1,4 +1,4 @@
-"""All cases for vision services in the order of the report, and the state in which each begins. Pure."""
+"""All cases for vision services in the order of the report, and the initial state of each. Pure."""
 
 from typing import Final
 
@@ -7,9 +7,9 @@ from sightline.conformance.vision import answers, causality, flow, hostile, repo
 from sightline.conformance.vision.fixture import ANSWER_US, RobotPlayed
 
 _FIRST_US: Final = 20_000_000
-"""A vision service may still be starting, or be started now."""
+"""A vision service may still be starting."""
 _AGAIN_US: Final = 3_000_000
-"""One that lost its robot in the last case tries again every second."""
+"""A vision service that lost its robot in the last case tries again every second."""
 _EVERY_US: Final = 100_000
 _PARTS: Final = (answers, causality, flow, reports, hostile, websocket)
 
@@ -17,16 +17,16 @@ CASES: Final[tuple[Case, ...]] = tuple(case for part in _PARTS for case in part.
 
 
 def is_there(bench: Bench) -> bool:
-    """Return True if a vision service answers. It may have just been started, or be started now."""
+    """Return True if a vision service answers. It may be starting."""
     prepare(bench)
     return bool(bench.mark() or bench.dropped_here.total())
 
 
 def prepare(bench: Bench) -> None:
-    """Wait until the vision receives the kit's robot: some answer, even one that this end turns away.
+    """Wait until the vision service answers the kit's robot, even if this end rejects the answer.
 
-    The robot names no camera: a case is about what happens then. A slow vision service may still compute for the last
-    frame; the answer to it is awaited, so that the first frame of the case is the next that it takes.
+    The robot publishes no camera model; a case tests that. A slow vision service may still compute for the last
+    frame. This waits for its answer, so that the service takes the first frame of the case next.
     """
     robot = RobotPlayed(bench, camera=None)
     before = bench.dropped_here.total()

@@ -1,4 +1,4 @@
-"""Cases about what an answer cites, in which order, and whose it is: causality, sequence, proof. Pure."""
+"""Cases about answers: the cited frame, the order, the sender: causality, sequence, proof. Pure."""
 
 import itertools
 import re
@@ -66,7 +66,7 @@ SUITE.must_all(itself, {
 @SUITE.must("V-CAUS-05", "4.5 Echo", RobotPlayed)
 def nothing_before_a_frame(bench: Bench, robot: RobotPlayed) -> None:
     """Before a frame came there is nothing to answer: camera and status alone drive nothing."""
-    bench.rest(ANSWER_US)  # the last answer to the start before may come late
+    bench.rest(ANSWER_US)  # the last answer to the earlier start may be late
     mark = bench.mark()
     bench.rest(1_500_000)
     bench.expect(not robot.answers(mark), "it answered before it was sent a frame")
@@ -90,14 +90,14 @@ def newest_wins(bench: Bench, robot: RobotPlayed) -> None:
     bench.rest(1_000_000)
     answers = [one for one in robot.answers(mark) if one.echo.get("seq") in burst]
     twists, acks = ([one.echo["seq"] for one in answers if one.is_twist is kind] for kind in (True, False))
-    # A twist may cite a frame again that was acknowledged before (7.1), so only its first answer counts among all.
+    # A twist may cite a frame again that was acknowledged before (7.1), so only the first answer to a frame counts.
     firsts = [*dict.fromkeys(one.echo["seq"] for one in answers)]
     for cited in (twists, acks, firsts):
         bench.expect(cited == sorted(cited), f"it answered in the order {cited}")
 
 
 def _no_twist_for(bench: Bench, robot: RobotPlayed, sent: Sent, what: str) -> None:
-    """Nothing that drives cites `sent`, alone in its seq and its time, within the time of an answer."""
+    """Check that no twist cites `sent`, whose seq and time are unique, within the time of an answer."""
     bench.rest(ANSWER_US)
     bench.expect(not robot.twists_to(sent), f"it drove by {what}")
 
@@ -127,7 +127,7 @@ def repeated_frame(bench: Bench, robot: RobotPlayed) -> None:
 
 
 def _no_twist_later(robot: RobotPlayed, later_us: int, what: str) -> None:
-    """Fail the case if a frame of a higher `seq` whose time is `later_us` after the last one's drives."""
+    """Fail the case if a frame of a higher `seq` drives whose time is `later_us` after that of the last one."""
     sent = robot.frame()
     robot.answer_to(sent)
     robot.frame("left", seq=sent.seq + 50, t_us=sent.t_us + later_us)
@@ -162,7 +162,7 @@ def gaps_are_fine(_bench: Bench, robot: RobotPlayed) -> None:
 
 
 def _forged_frame(robot: RobotPlayed, **changes: Any) -> None:
-    """Send a frame that is the robot's next but for these fields; `ahead_us` is added to its time."""
+    """Send a frame with these changes to the robot's next one; `ahead_us` is added to its time."""
     fields = robot.next_fields()
     t_us = min(fields["t_us"] + changes.pop("ahead_us", 0), MAX_INTEGER)
     robot.frame("left", **{"seq": fields["seq"], "t_us": t_us, **changes})
@@ -176,7 +176,7 @@ def _forged_stamps(robot: RobotPlayed, channel: Channel, payload: bytes, **field
 
 
 def _drives_on(forge: Callable[[RobotPlayed], None], robot: RobotPlayed) -> None:
-    """Fail the case if what `forge` sends keeps the robot's own frames from driving for a second."""
+    """Fail the case if messages by `forge` keep the robot's own frames from driving for a second."""
     bench = robot.bench
     forge(robot)
     bench.rest(FRAME_US)
@@ -198,7 +198,7 @@ _FORGED: Final[dict[str, tuple[str, Callable[[RobotPlayed], None]]]] = {
     "V-CAUS-19": ("A `scan` of another session or an hour ahead",
                   partial(_forged_stamps, channel=SCAN, payload=bytes(16), **_RAYS)),
 }
-"""What must not blind it: title, how it is sent."""
+"""Forged messages that must not stop the service: title, function that sends them."""
 SUITE.must_all(met, {
     number: ("2.6 Clock", f"{title} is forged: the robot's own frames drive within a second.",
              partial(_drives_on, forge))
@@ -206,7 +206,7 @@ SUITE.must_all(met, {
 })
 
 
-# --- its own sequence ------------------------------------------------------------------------------------------------
+# --- the service's sequence ------------------------------------------------------------------------------------------
 
 
 def _rises(bench: Bench, answers: list[VisionAnswer], what: str) -> None:
@@ -292,21 +292,21 @@ _FEW: Final = 20
 
 
 class _Chain:
-    """Validates the proof of each twist from now on, as a robot does whose lease this driver holds."""
+    """Validates the proof of each later twist, as a robot does whose lease this driver holds."""
 
     def __init__(self, robot: RobotPlayed) -> None:
         self.fault = ""
-        """What is wrong with the first proof that does not continue those before it."""
+        """Error of the first proof that does not continue the earlier ones."""
         self.twists = 0
         self.announcing: int | None = None
-        """How many twists in a row announced the chain that the last one ended in; None before a chain ended."""
+        """Number of twists in a row that announced the next chain; None before a chain ended."""
         self._robot, self._bench, self._announced = robot, robot.bench, 0
         self._session: Any = None
         self._last = Proof(None)
         self._bench.on(TWIST, self._read)
 
     def _read(self, received: Received) -> None:
-        """Read a twist. Nothing is raised here: a link would log it."""
+        """Read a twist. It raises nothing, because a link would log it."""
         self.twists += 1
         fields = read_answer(received).fields
         proof, following = (self._element(fields.get(name)) for name in ("proof", "next_proof"))
@@ -329,7 +329,7 @@ class _Chain:
         return None
 
     def follow(self, frames: int) -> None:
-        """Show so many frames, each when a twist answers the last, until a proof is wrong or the chain has ended."""
+        """Show that many frames, each after a twist answers the last, until a proof is wrong or the chain has ended."""
         deadline_us = self._bench.now_us + _MOST_US
         for _ in range(frames):
             self._robot.is_driven(self._robot.frame("left"))

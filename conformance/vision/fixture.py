@@ -1,12 +1,12 @@
-"""The robot that the kit plays for a vision service, and the vision's answers. Pure.
+"""The robot that the kit plays for a vision service, and the answers of the service. Pure.
 
     robot = RobotPlayed(bench).met()
     sent = robot.frame("left")
     answer = robot.answer_to(sent)
 
-An answer belongs to a frame if its echo has that frame's `seq` or its `t_us`: so one wrong field fails the case about
-that field, and no other. What the kit's own link had to turn away is known only by its count; a case that misses such
-an answer is not applicable, since another one names what was wrong with it.
+An answer belongs to a frame if its echo has the `seq` or the `t_us` of that frame. One wrong field then fails only the
+case about that field. The kit's link only counts rejected answers; a case that misses such an answer is not
+applicable, since another case reports its fault.
 """
 
 import itertools
@@ -23,12 +23,12 @@ from sightline.protocol.codec import encode
 from sightline.protocol.messages import CameraModel, FrameHeader, Stamp, State, Status
 
 ANSWER_US: Final = 500_000
-"""Credit that is not returned times out within this: later is as good as never."""
+"""Credit that is not returned times out within this; later answers are useless."""
 FRAME_US: Final = 33_333
 _CAMERA_US: Final = 500_000
 _STATUS_US: Final = 100_000
 _FIRST_T_US: Final = 7_000_000_123
-"""A robot's clock is not a clock of the kit's: each start has its own."""
+"""A robot's clock differs from the kit's: each start has another one."""
 _SEQ_APART: Final = 10_000
 _MEETING_FRAMES: Final = 30
 ARMED: Final = Status(state=State.ACTIVE, reason="driving")
@@ -37,7 +37,7 @@ _STARTS = itertools.count(1)
 
 @dataclass(frozen=True, slots=True)
 class Sent:
-    """A frame as it went out, on the robot's clock and on the kit's."""
+    """A sent frame, with its time on the robot's clock and on the kit's."""
 
     session: str
     seq: int
@@ -65,12 +65,12 @@ class VisionAnswer:
 
     @property
     def text(self) -> bytes:
-        """The payload."""
+        """Return the payload."""
         return self.received.message.payload
 
     @property
     def speeds(self) -> tuple[float, float]:
-        """(linear_mps, angular_rad_s), however they are written; zeros for what cannot be read."""
+        """Return (linear_mps, angular_rad_s) in any notation; zeros for an invalid text."""
         try:
             linear, angular = (float(part) for part in self.text.split(b"|"))
         except ValueError:
@@ -87,7 +87,7 @@ class VisionAnswer:
 
 
 def read_answer(received: Received) -> VisionAnswer:
-    """`heard` with its header read as any JSON object."""
+    """Return the answer in `received`, its header read as any JSON object."""
     try:
         fields = json.loads(received.message.header)
     except (ValueError, RecursionError):
@@ -101,13 +101,13 @@ def met(bench: Bench) -> "RobotPlayed":
 
 
 class RobotPlayed:
-    """One start of a robot: a session, a clock, a count. It announces itself until the next case, or `stop`."""
+    """One start of a robot: session, clock, count. It publishes camera and status until the case ends or `stop`."""
 
     def __init__(
         self, bench: Bench, *, camera: CameraModel | None = LENS, status: Status | bytes | None = ARMED,
         first_seq: int | None = None, first_t_us: int | None = None,
     ) -> None:
-        """`camera` and `status` are announced at their rates; None: not at all.
+        """Start the robot. `camera` and `status` are published at their rates; None: not at all.
 
         The first `seq` and `t_us` differ from those of every other start unless given.
         """
@@ -124,34 +124,34 @@ class RobotPlayed:
         self._announce_camera()
         self._announce_status()
 
-    # --- what it sends ------------------------------------------------------------------------------------------------
+    # --- sending ------------------------------------------------------------------------------------------------------
 
     def stop(self) -> None:
         """Fall silent for good."""
         self._stopped = True
 
     def stamp(self) -> Stamp:
-        """The header of anything but a frame."""
+        """Return the header of any message but a frame."""
         return Stamp(session=self.session, seq=next(self._stamps), t_us=self._clock_us())
 
     def show(self, camera: CameraModel | None) -> None:
-        """Have another camera from now on."""
+        """Use another camera from now on."""
         self.camera = camera
         if camera is not None:
             self.bench.publish(CAMERA, self.stamp(), camera)
 
     def publish(self, channel: Channel, payload: bytes, header: bytes | None = None) -> None:
-        """Any bytes on a channel of the robot's, with a good header unless configured otherwise."""
+        """Publish bytes on a channel of the robot, by default with a valid header."""
         self.bench.publish(channel, encode(self.stamp()) if header is None else header, payload)
 
     def frame(self, name: str = "centre", *, jpeg: bytes | None = None, header: bytes | None = None,
               **fields: Any) -> Sent:
-        """Send a picture at once; `fields` replace those of its header, `header` all of it."""
+        """Send an image now; `fields` replace those of its header, `header` all of it."""
         t_us = max(self._clock_us(), self._last_t_us + 1)
         known = FrameHeader(session=self.session, seq=self._next_seq, t_us=t_us).model_copy(update=fields)
         if not fields.keys() & {"seq", "t_us", "session"}:
             self._next_seq, self._last_t_us = known.seq + 1, known.t_us
-        # The time before it leaves: sending takes time, and a quick peer answers meanwhile.
+        # The time before sending, because sending takes time and a fast peer answers meanwhile.
         sent = Sent(known.session, known.seq, known.t_us, self.bench.now_us)
         if header is None:
             self._plain.append(sent)
@@ -159,14 +159,14 @@ class RobotPlayed:
         return sent
 
     def next_fields(self) -> dict[str, Any]:
-        """The fields of the frame that comes next, as a dictionary; the frame itself does not come."""
+        """Return the header fields of the next frame as a dictionary, without sending it."""
         self._last_t_us = max(self._clock_us(), self._last_t_us + 1)
         self._next_seq += 1
         known = FrameHeader(session=self.session, seq=self._next_seq - 1, t_us=self._last_t_us)
         return known.model_dump(mode="json", exclude_none=True)
 
     def film(self, name: str, frames: int, every_us: int = FRAME_US) -> list[Sent]:
-        """Send so many pictures at a steady rate, or each when its credit is back (7.2), whichever is later."""
+        """Send that many images at a steady rate, or each when its credit has returned (7.2), whichever is later."""
         sent = []
         for _ in range(frames):
             sent.append(self.frame(name))
@@ -189,10 +189,10 @@ class RobotPlayed:
                 self.bench.publish(STATUS, self.stamp(), self.status)
             self.bench.after(_STATUS_US, self._announce_status)
 
-    # --- what it receives ---------------------------------------------------------------------------------------------
+    # --- receiving ----------------------------------------------------------------------------------------------------
 
     def answers(self, since: int | None = None) -> list[VisionAnswer]:
-        """Twists and acks since this robot began, or since a mark, in the order of their arrival."""
+        """Return twists and acks since the start of this robot, or since a mark, in order of arrival."""
         since = self._mark if since is None else since
         received = [*self.bench.received(TWIST, since), *self.bench.received(ACK, since)]
         for one in received:
@@ -201,11 +201,11 @@ class RobotPlayed:
         return [self._read[number] for number in sorted(one.number for one in received)]
 
     def twists(self, since: int | None = None) -> list[VisionAnswer]:
-        """Only what drives."""
+        """Return only the twists."""
         return [one for one in self.answers(since) if one.is_twist]
 
     def answers_to_others(self, since: int) -> list[VisionAnswer]:
-        """Twists and acks since a mark that answer something else than a frame with a good header.
+        """Return twists and acks since a mark that do not answer a frame with a valid header.
 
         An answer may come late, and twice while frames are lost (7.1).
         """
@@ -214,7 +214,7 @@ class RobotPlayed:
         return [one for one in self.answers(since) if [one.echo.get(name) for name in names] not in plain]
 
     def answers_to(self, sent: Sent) -> list[VisionAnswer]:
-        """Whatever cites `sent`."""
+        """Return all answers that cite `sent`."""
         return [one for one in self.answers() if one.cites(sent)]
 
     def is_answered(self, sent: Sent, within_us: int = ANSWER_US) -> bool:
@@ -222,7 +222,7 @@ class RobotPlayed:
         return self.bench.wait(lambda: self.answers_to(sent), within_us)
 
     def answer_to(self, sent: Sent, within_us: int = ANSWER_US) -> VisionAnswer:
-        """The answer to `sent`; the case fails if none comes in time."""
+        """Return the answer to `sent`. Fails the case if none arrives in time."""
         if not self.is_answered(sent, within_us):
             self.need_nothing_dropped()
             self.bench.expect(False, f"no answer to frame {sent.seq} within {within_us / 1e6:g} s")
@@ -242,22 +242,22 @@ class RobotPlayed:
         self.bench.expect(self.is_driven(*sent), "no twist came")
 
     def twists_to(self, sent: Sent) -> list[VisionAnswer]:
-        """Whatever cites `sent` and drives."""
+        """Return the twists that cite `sent`."""
         return [one for one in self.answers_to(sent) if one.is_twist]
 
     def need_nothing_dropped(self) -> None:
-        """Leave the case if this end's link turned something away: another case reports what."""
+        """Leave the case if this end's link rejected a message; another case reports it."""
         dropped = self.bench.dropped_here
         self.bench.need(dropped.total() == self._dropped, f"answers came that break the rules of keys or sizes: "
                         f"{', '.join(sorted(dropped))}")
 
     def met(self) -> Self:
-        """Go on once the vision drives by these pictures; a case that builds on that is not applicable otherwise."""
+        """Wait until the vision service drives by these images. Cases that need that are otherwise not applicable."""
         self.bench.need(self._drives(_MEETING_FRAMES), NOT_DRIVING)
         return self
 
     def _drives(self, frames: int) -> bool:
-        """Return True once a twist cites one of so many plain frames."""
+        """Return True once a twist cites one of that many plain frames."""
         sent: list[Sent] = []
         for _ in range(frames):
             sent.append(self.frame())
@@ -266,7 +266,7 @@ class RobotPlayed:
         return self.is_driven(*sent)
 
     def expect_driven(self, after: str) -> None:
-        """One of three plain frames is answered by a twist; the case fails otherwise."""
+        """Fail the case unless a twist answers one of three plain frames."""
         if not self._drives(3):
             self.need_nothing_dropped()
             self.bench.expect(False, f"after {after}, plain frames get no twist any more")

@@ -17,7 +17,7 @@ _FLOOD: Final = 1_000
 _CATCH_UP_US: Final = 1_000_000
 _STEADY: Final = 60
 _STEADY_ANSWERED: Final = 0.9
-"""Of frames one at a time: a scheduler has bad moments."""
+"""Share of the frames, one at a time: a scheduler may delay some."""
 
 
 SUITE.must_all(met, {
@@ -130,11 +130,11 @@ def silent_about_no_pictures(bench: Bench, robot: RobotPlayed) -> None:
     bench.expect(not robot.twists(mark), f"{len(robot.twists(mark))} twists answered what is not picture")
 
 
-# --- what the robot reports -------------------------------------------------------------------------------------------
+# --- reports of the robot ---------------------------------------------------------------------------------------------
 
 
 def _goes_on(status: Status | bytes, what: str, robot: RobotPlayed, *, twists: bool = True) -> None:
-    """With `status` published at 10 Hz, frames continue to be answered."""
+    """Check that frames are still answered while `status` is published at 10 Hz."""
     bench = robot.bench
     robot.status = status
     bench.rest(250_000)
@@ -202,15 +202,15 @@ def requests_nothing(bench: Bench) -> None:
     bench.expect(not requests, f"it requested: {[one.message.payload for one in requests][:3]}")
 
 
-# Cases about a robot that goes away and comes back. Pure.
+# Cases about a robot that disconnects and returns. Pure.
 
 
 _BACK_US: Final = 5_000_000
-"""A second at most between two tries, two seconds until a silent peer is given up, and time to send hello."""
+"""At most a second between two tries, two seconds until a silent peer is given up, and time to send hello."""
 
 
 def _answered_again(bench: Bench, robot: RobotPlayed, what: str) -> None:
-    """Within the time of a reconnection some frame is answered."""
+    """Check that a frame is answered within the time of a reconnection."""
     deadline_us = bench.now_us + _BACK_US
     mark = bench.mark()
     while bench.now_us < deadline_us and not robot.answers(mark):

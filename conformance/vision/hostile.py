@@ -1,4 +1,4 @@
-"""Cases on invalid headers, cameras, keys and pictures. Pure."""
+"""Cases on invalid headers, cameras, keys and images. Pure."""
 
 from collections.abc import Callable
 from functools import partial
@@ -61,7 +61,7 @@ HEADERS: Final[dict[str, tuple[str, str, Callable[[Fields], bytes]]]] = {
     "V-HOST-24": ("Brackets in brackets, 150 deep, and one left open", _JSON,
                   lambda it: packed(it)[:-1] + b',"x":' + b"[" * 150 + b"]" * 149 + b"}"),
 }
-"""What makes a frame no frame: title, clause, header."""
+"""Headers that make a frame invalid: title, clause, header."""
 
 
 def _header_drives_nothing(write: Callable[[Fields], bytes], title: str, robot: RobotPlayed) -> None:
@@ -109,7 +109,7 @@ def noise(bench: Bench) -> None:
 
 
 def _damaged(random: Random, data: bytes) -> bytes:
-    """Some bytes replaced, or cut, or all of them random."""
+    """Replace some bytes, cut the data, or randomize all of it."""
     kind = random.randrange(3)
     if kind == 0:
         return random.randbytes(random.randrange(200))
@@ -145,13 +145,13 @@ CAMERAS: Final[dict[str, tuple[str, str, bytes, Fields]]] = {
     "V-HOST-47": ("A camera model of version 2", _VERSION, packed(_SMALL), {"v": 2}),
     "V-HOST-48": ("A camera model with a negative `seq` in its header", _NUMBERS, packed(_SMALL), {"seq": -1}),
 }
-"""What must not be believed, or pictures would no longer fit: title, clause, payload, what differs in the header."""
+"""Camera models that must be rejected, since images would not fit: title, clause, payload, changes of the header."""
 
 
 def _not_believed(payload: bytes, header: Fields, title: str, robot: RobotPlayed) -> None:
-    robot.camera = None  # the good one is not repeated
+    robot.camera = None  # the valid model is not repeated
     robot.publish(CAMERA, payload, packed(robot.stamp().model_dump() | header))
-    robot.film("centre", 4, 80_000)  # it may look at cameras between frames only
+    robot.film("centre", 4, 80_000)  # it may process cameras between frames only
     robot.expect_driven(title[0].lower() + title[1:])
 
 
@@ -195,7 +195,7 @@ SUITE.must_all(met, {
 })
 
 
-# Cases about pictures: those that must be rejected before a decoder sees them, and odd ones that are good. Pure.
+# Cases about images: those that must be rejected before decoding, and unusual valid ones. Pure.
 
 
 _CHECK: Final = "3.2 Bounds check"
@@ -230,11 +230,11 @@ REJECTED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
     "V-LIM-19": ("A picture of another size than the camera's", lambda: picture("left_half")),
     "V-LIM-18": ("A JPEG of zeros after its start", lambda: b"\xff\xd8" + bytes(4_000)),
 }
-"""What must not be driven by: title, payload."""
+"""Images that must not drive: title, payload."""
 DOUBTED: Final[dict[str, tuple[str, Callable[[], bytes]]]] = {
     "V-LIM-21": ("A JPEG cut in the middle of its pixels", lambda: _cut(0.5)),
 }
-"""The same, where a decoder may see it otherwise."""
+"""The same, for images that a decoder may accept."""
 
 
 def _image_drives_nothing(jpeg: Callable[[], bytes], title: str, robot: RobotPlayed) -> None:
@@ -268,7 +268,7 @@ def scan_bomb(bench: Bench, robot: RobotPlayed) -> None:
     plain_us = robot.answer_to(plain).received.at_us - plain.at_us
     robot.frame(jpeg=many_scans(picture("left_progressive"), _SCANS))
     bench.rest(50_000)
-    # The next frame waits while the bomb is looked at, which may take as long as a plain image and no longer.
+    # The next frame waits during the decoding of the bomb, which may take as long as that of a plain image.
     robot.answer_to(robot.frame(), ANSWER_US + plain_us)
 
 

@@ -14,7 +14,7 @@ from sightline.protocol.messages import CameraModel
 FOLDER: Final = Path(__file__).parent / "pictures"
 CAMERA: Final = CameraModel(width_px=320, height_px=240, fx_px=190.7, fy_px=190.7, cx_px=160.0, cy_px=120.0,
                             x_m=0.055, z_m=0.06, calibrated=True)
-"""80 degrees wide. A ball of 0.1 m radius at one metre has a radius of 20 px."""
+"""80 degrees wide. A ball of 0.1 m radius at one meter has a radius of 20 px."""
 HALF_CAMERA: Final = CAMERA.model_copy(update={"width_px": 160, "height_px": 120, "fx_px": 95.35, "fy_px": 95.35,
                                                "cx_px": 80.0, "cy_px": 60.0})
 
@@ -35,24 +35,24 @@ def claiming(width_px: int, height_px: int, *, bits: int = 8, components: int = 
 
 
 def commented(jpeg: bytes, comments: int, size: int = 0) -> bytes:
-    """Return `jpeg` with so many comments of `size` bytes before its first segment."""
+    """Return `jpeg` with that many comments of `size` bytes before its first segment."""
     return jpeg[:2] + (b"\xff\xfe" + (size + 2).to_bytes(2) + bytes(size)) * comments + jpeg[2:]
 
 
 def filled(jpeg: bytes, fill: int) -> bytes:
-    """Return `jpeg` with so many fill bytes before its first segment."""
+    """Return `jpeg` with that many fill bytes before its first segment."""
     return jpeg[:2] + b"\xff" * fill + jpeg[2:]
 
 
 def many_scans(jpeg: bytes, scans: int) -> bytes:
-    """A progressive `jpeg` whose last scan comes over and over: each costs a decoder a pass over the whole picture."""
+    """Return a progressive `jpeg` whose last scan repeats. Each scan costs a decoder a pass over the whole image."""
     last = jpeg.rfind(b"\xff\xda")
     empty = jpeg[last : last + 2 + int.from_bytes(jpeg[last + 2 : last + 4])]
     return jpeg[:-2] + empty * scans + jpeg[-2:]
 
 
 def png() -> bytes:
-    """One grey pixel, in a format that is not the protocol's."""
+    """Return one gray pixel as PNG, a format outside of the protocol."""
     parts = ((b"IHDR", (1).to_bytes(4) * 2 + b"\x08\0\0\0\0"), (b"IDAT", zlib.compress(b"\0\x80")), (b"IEND", b""))
     chunks = (len(body).to_bytes(4) + kind + body + zlib.crc32(kind + body).to_bytes(4) for kind, body in parts)
     return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)

@@ -1,7 +1,4 @@
-"""Cases about missions, reports and detections: how often, the followed target, the result for each image. Pure.
-
-All are optional. A service that publishes none leaves nothing to test here.
-"""
+"""Cases about missions, reports and detections: rate, followed target, result for each image. Pure."""
 
 import math
 from typing import Any, Final
@@ -27,9 +24,9 @@ SUITE = Suite("V")
 _EVERY_US: Final = 50_000
 _SECOND: Final = 20
 _PERIOD_US: Final = 750_000
-"""Twice a second, and the time of a slow image."""
+"""Two per second, and the time of a slow image."""
 _MOST_PER_S: Final = 12
-"""Ten, and two that a link brings closer together."""
+"""Ten, and two for jitter of the link."""
 _TARGETS_PER_S: Final = 5
 """Of ten: each comes with an answer, so a service at 20 images per second may wait for the next one."""
 _AT_ONCE_US: Final = 300_000
@@ -37,10 +34,10 @@ _TARGET_RADIUS_PX: Final = 20.0
 _NEAR_PX: Final = 8.0
 _NEAR_RAD: Final = 0.05
 _PLACES_PX: Final = (("left", 104, 112), ("right", 216, 112))
-"""Pictures, and the center of their ball."""
+"""Images, and the center of their ball."""
 _OLD_US: Final = 3_000_000
 _REST_US: Final = 800_000
-"""Less than the second for which a service waits for the wheels."""
+"""Below the second for which a service waits for the wheels."""
 
 
 def _parsed(bench: Bench, received: list[Received], model: type[Model]) -> list[tuple[Received, Model]]:
@@ -211,14 +208,14 @@ def _request(
 
 
 def _starts(bench: Bench, robot: RobotPlayed, asked: RequestId, name: str = "absent") -> bool:
-    """Return True if a report in the next second states that the requested mission was started."""
+    """Return True if a report of the next second states that the requested mission was started."""
     mark = bench.mark()
     robot.film(name, _SECOND, _EVERY_US)
     return any(one.asked == asked and not one.refused for _, one in _reports(bench, mark))
 
 
 def _knows_missions(bench: Bench) -> RobotPlayed:
-    """Begin the cases about missions: an operator's request is one that it starts."""
+    """Begin the cases about missions. Not applicable unless an operator's request starts one."""
     robot = met(bench)
     bench.need(_starts(bench, robot, _request(bench, robot)), "it does not start its mission on request")
     return robot

@@ -1,6 +1,6 @@
 """Cases on a vision service's WebSocket, with a server that can misbehave. Shell (sockets).
 
-It knows just enough of RFC 6455 to accept one client at a time, and leaves everything else to the case.
+It implements only the part of RFC 6455 that accepts one client at a time. The case does the rest.
 """
 
 import base64
@@ -39,16 +39,16 @@ from sightline.protocol.transports.websocket.framing import MAX_HELLO_BYTES, SUB
 from sightline.protocol.transports.websocket.tls import server_tls_context
 
 SESSION_BEGINS: Final = "5ca1"
-"""So the tests' broken vision services report this server from the kit's own link."""
+"""Distinguishes this server from the kit's own link in the tests."""
 _GUID: Final = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 _SEND_S: Final = 2.0
 
 
 class RawServer:
-    """Listens on an address until left; use it in a `with`."""
+    """Listens on an address; a context manager."""
 
     def __init__(self, host: str, port: int, tls: ssl.SSLContext | None = None) -> None:
-        """Raises LinkError for an address that cannot be listened on."""
+        """Listen. Raises LinkError for an invalid or used address."""
         self._tls = tls
         self._socket = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -61,7 +61,7 @@ class RawServer:
         self._clients: list[AcceptedClient] = []
 
     def accept(self, within_s: float) -> "AcceptedClient | None":
-        """The next client, after the opening handshake; None if none came in time."""
+        """Return the next client after the opening handshake; None if none arrives in time."""
         deadline_s = time.monotonic() + within_s
         while (left_s := deadline_s - time.monotonic()) > 0:
             self._socket.settimeout(left_s)
@@ -88,10 +88,10 @@ class RawServer:
 
 
 class AcceptedClient(RawConnection):
-    """The server's end. `offered` are the client's sub-protocols; `session` is of the robot played on it.
+    """The server's end. `offered` are the client's sub-protocols; `session` is that of the robot played on it.
 
     `request` is the first line of the client's head, `headers` are the others.
-    Each connection is to a robot started again: a vision service may treat an earlier session as ended.
+    Each connection is to a restarted robot, because a vision service may treat an earlier session as ended.
     """
 
     masks = False
@@ -119,26 +119,26 @@ class AcceptedClient(RawConnection):
         return frame
 
     def drop(self) -> None:
-        """End the connection as a lost one: without a close frame, with a reset."""
+        """Drop the connection without a close frame, with a reset."""
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self._socket.close()
 
 
-# Cases on a vision service's WebSocket itself: opening, hello, liveness, ends; with a server that can misbehave. Shell.
+# Cases on a vision service's WebSocket itself: opening, hello, liveness, ends; with a misbehaving server. Shell.
 
 
 SUITE = Suite("V")
 BACK_S: Final = 5.0
-"""A second at most between two tries, two until a silent peer is given up."""
+"""At most a second between two tries, and two until a silent peer is given up."""
 _HELLO_S: Final = 2.0
 _END_S: Final = 3.0
 _ANSWER_S: Final = 1.0
 _DRAWN: Final = 8
 _DRAWN_S: Final = 0.15
-"""So many frames, and so long after the last message to each."""
+"""Number of frames, and the time to wait after the last message to each."""
 Fields = dict[str, Any]
 _TOO_LARGE_BYTES: Final = 3_000_000
-"""Above what any peer can want: a frame has at most a million."""
+"""Above the limit of any peer: a frame has at most a million."""
 
 
 def need_websocket(bench: Bench) -> None:
@@ -148,7 +148,7 @@ def need_websocket(bench: Bench) -> None:
 
 @contextmanager
 def server_of(bench: Bench) -> Iterator[RawServer]:
-    """A server of our own in the place of the kit's."""
+    """Run a raw server at the address of the kit's."""
     need_websocket(bench)
     secure = bench.endpoint.startswith("wss://")
     end = parse_websocket_endpoint(bench.endpoint)
@@ -169,7 +169,7 @@ def client_of(bench: Bench, server: RawServer) -> AcceptedClient:
 
 
 def _hello(client: AcceptedClient) -> tuple[int, bytes]:
-    """Its first message; (0, b"") without one."""
+    """Return its first message; (0, b"") without one."""
     frame = client.frame(_HELLO_S)
     return (frame.opcode, frame.data) if frame else (0, b"")
 
@@ -197,7 +197,7 @@ def _frame(client: AcceptedClient, seq: int) -> bytes:
 
 
 def met(bench: Bench, server: RawServer) -> AcceptedClient:
-    """A client that has sent hello, was greeted, and knows the camera."""
+    """Return a client that has sent hello, was greeted, and has the camera model."""
     client = client_of(bench, server)
     _hello(client)
     _greet(client, bench.robot)
@@ -206,13 +206,13 @@ def met(bench: Bench, server: RawServer) -> AcceptedClient:
 
 
 def _answer(client: AcceptedClient) -> bytes | None:
-    """The next binary message; None if none comes."""
+    """Return the next binary message; None if none arrives."""
     frame = client.frame_that(lambda one: one.opcode == BINARY, _ANSWER_S)
     return frame.data if frame else None
 
 
 def _channel(data: bytes) -> object:
-    """The channel that a binary message names; None for none."""
+    """Return the channel that a binary message names, or None."""
     return _fields(data[2 : 2 + int.from_bytes(data[:2])]).get("channel")
 
 
@@ -409,7 +409,7 @@ def _token(bench: Bench) -> str:
 
 
 def _shown(client: AcceptedClient) -> list[str]:
-    """Every token that the client showed, in either way."""
+    """Return every token that the client showed, in either form."""
     bearers = (value for name, value in client.headers if name == "authorization")
     shown = [text[len(_BEARER) :].strip() for text in bearers if text.lower().startswith(_BEARER)]
     return shown + [entry[len(_ENTRY) :] for entry in client.offered if entry.startswith(_ENTRY)]
