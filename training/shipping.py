@@ -1,4 +1,4 @@
-"""Thresholds, golden outputs, final report and model card of the file that ships. Shell (files, processes)."""
+"""Set thresholds, golden outputs, final report and model card of the shipped file. Shell (files, processes)."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import as_completed
@@ -39,14 +39,14 @@ from sightline.vision_side.detect.registry import build_detector
 
 MOST_FALSE: Final = 0.03
 """Share of false alarms and of wrong objects, in every column. An acceptance test allows 5 of a hundred frames without
-a ball: a detector with 3 % exceeds that once in twelve such hundreds, one with 2 % once in sixty. The files that ship
-have stricter thresholds, or others; their cards name them."""
+a ball: a detector with 3 % exceeds that once in twelve such hundreds, one with 2 % once in sixty. Shipped files
+may have other thresholds; their cards name them."""
 _TRIED: Final = tuple(round(float(one), 2) for one in np.arange(0.06, 0.95, 0.01))
-_DEFAULT_THRESHOLD: Final = 0.3  # for a label that no scene showed
+_DEFAULT_THRESHOLD: Final = 0.3  # for a label that no scene contained
 
 
 def ball_threshold(columns: Mapping[str, Sequence[FrameResult]]) -> float:
-    """Return the least score that keeps every column within `MOST_FALSE`, else the nearest one."""
+    """Return the lowest score that keeps every column within `MOST_FALSE`, otherwise the nearest one."""
     worst = {least: max(_worst(frames, least) for frames in columns.values()) for least in _TRIED}
     within = [least for least, share in worst.items() if share <= MOST_FALSE]
     return within[0] if within else min(_TRIED, key=lambda least: worst[least])
@@ -61,8 +61,8 @@ def _worst(frames: Sequence[FrameResult], least: float) -> float:
 
 
 def label_threshold(found: LabelMatches) -> float:
-    """The score with the best balance of found objects and right answers, the former twice as important (F2; van
-    Rijsbergen, Information Retrieval, 1979): legs or a light that is overlooked is worse than one too many."""
+    """Return the score with the best F2, in which found objects weigh twice as much as right answers (van
+    Rijsbergen, Information Retrieval, 1979): a missed object is worse than a false one."""
     if not found.objects or not found.marks:
         return _DEFAULT_THRESHOLD
     marks = sorted(found.marks, reverse=True)
@@ -75,12 +75,12 @@ def label_threshold(found: LabelMatches) -> float:
     return float(np.clip(chosen, _TRIED[0], _TRIED[-1]))
 
 
-# The model card: what the file is, how it was made, how good it is. Pure.
+# The model card: the file, its training, its scores. Pure.
 
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """All that stands on it."""
+    """The contents of a model card."""
 
     training: Training
     source: SceneSource
@@ -94,7 +94,7 @@ class Card:
 
 
 def card_text(card: Card) -> str:
-    """Markdown."""
+    """Return the card as Markdown."""
     return "\n".join([
         "# A detector of balls, traffic lights and legs", "",
         f"Finds {', '.join(f'`{label}`' for label in LABELS)} in a picture: a heat-map network of {card.parameters} "
@@ -186,24 +186,24 @@ def _demanded(report: DetectorReport) -> list[str]:
     return [f"{kept}; these are not:", "", "```", *check_lines(broken), "```"] if broken else [f"{kept}."]
 
 
-# Trained weights into the file that ships: thresholds, golden answer, score. Shell (files, processes).
+# Write trained weights to the shipped file: thresholds, golden answer, score. Shell (files, processes).
 
 
 COUNTS_FROM: Final = 0.5
-"""The score from which a detection counts, once each label's threshold has been worked into the model."""
+"""Score from which a detection counts, after each label's threshold has been built into the model."""
 Progress = Callable[[int, str], AbstractContextManager[Callable[[int], None]]]
-"""Takes a total and a noun; the context's function takes the number of those done since its last call."""
+"""Takes a total and a noun. The function of the context takes the number of items done since its last call."""
 
-_ALL: Final = 0.02  # scores below are noise, and are not looked at when thresholds are chosen
+_ALL: Final = 0.02  # lower scores are noise and ignored in the choice of thresholds
 _LABELS: Final = (*COLUMNS.values(), THINGS)
 _SLICE: Final = 100
-"""Scenes that one process detects in between two reports of progress."""
+"""Scenes that one process detects between two reports of progress."""
 
 
 def written(path: Path, weights: Weights) -> None:
     """Write the ONNX file, with its answer to the test image in its metadata."""
     properties = {"min_score": str(COUNTS_FROM)}
-    beside = path.with_suffix(".part")  # the model of an earlier run stays until this one is whole
+    beside = path.with_suffix(".part")  # keep the model of an earlier run until this one is complete
     beside.write_bytes(onnx_bytes(weights, properties))
     engine = open_engine(beside, "cpu", 1)
     form = model_format(engine.header, (), "auto")
@@ -215,7 +215,7 @@ def written(path: Path, weights: Weights) -> None:
 
 
 def chosen_thresholds(path: Path, weights: Weights, frames: int, jobs: int, progress: Progress) -> tuple[float, ...]:
-    """Choose the threshold of each label by `frames` scenes per column. The model without thresholds goes to `path`."""
+    """Choose each label's threshold by `frames` scenes per column. Writes the model without thresholds to `path`."""
     path.write_bytes(onnx_bytes(weights, {"min_score": str(_ALL)}))
     last = VALIDATED_FROM + frames
     slices = [range(first, min(first + _SLICE, last)) for first in range(VALIDATED_FROM, last, _SLICE)]
@@ -243,7 +243,7 @@ def _seen(path: Path, column: Column, seeds: Sequence[int]) -> tuple[str, list[F
 
 
 def final_report(path: Path, frames: int, progress: Progress) -> DetectorReport:
-    """Score the model on the seeds that no training and no choice uses."""
+    """Score the model on seeds that no training and no choice uses."""
     with progress(int((len(COLUMNS) + LIGHT_SHARE) * frames), "scenes for the score") as advance:
         return score_scenes([_subject(path)], frames, each=lambda _: advance(1))
 
