@@ -34,7 +34,7 @@ class LiveBench(Bench):
         legacy: str = "",
         access: Access | None = None,
     ) -> None:
-        """`open_it(role)` opens a link, also after each `leave`; `put_it` sends messages that a link rejects.
+        """Set up links. `open_it(role)` opens one, also after each `leave`; `put_it` sends messages that links reject.
 
         `third_party` declares tokens.
 

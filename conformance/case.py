@@ -210,7 +210,7 @@ class Received:
         return _read(model, self.message.header, len(self.message.header))
 
     def payload(self, model: type[Model]) -> Model | None:
-        """The payload as `model`; None for an invalid one."""
+        """Return the payload as `model`; None for an invalid one."""
         return _read(model, self.message.payload, len(self.message.payload))
 
 
@@ -307,7 +307,7 @@ class Bench(ABC):
         return newer[::-1]
 
     def newest(self, channel: Channel) -> Received | None:
-        """The newest message of `channel`."""
+        """Return the newest message of `channel`."""
         log = self._log.get(channel.name)
         return log[-1] if log else None
 

@@ -122,7 +122,7 @@ def _check_free(endpoint: str) -> None:
 
 
 def _start(command: list[str]) -> tuple[subprocess.Popen[str], Callable[[], str]]:
-    """Return the peer, and what returns its last line of errors after its end. Raises ConfigError."""
+    """Return the peer, and a function that returns its last line of errors after its end. Raises ConfigError."""
     try:
         peer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
                                 errors="replace", start_new_session=True)

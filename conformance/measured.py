@@ -1,6 +1,6 @@
-"""The motion that a robot measures, and what its motor log shows, on the robot's own clock. Pure.
+"""The motion that a robot measures, and the contents of its motor log, on the robot's clock. Pure.
 
-`applied` is what a robot reports to have commanded. Whether the wheels follow is seen in `moving` and `pose`, wherever
+`applied` is the command that a robot reports. Whether the wheels follow is visible in `moving` and `pose`, if
 the robot publishes them, and in a motor log. A single reading above the tolerance is noise of an encoder, not motion.
 """
 
@@ -36,7 +36,7 @@ class MeasuredMotion:
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """The robot moves at this time: `t_us` on its clock, and the words for it."""
+    """The robot moves at this time: `t_us` on its clock, with a description."""
 
     t_us: int
     words: str
@@ -103,7 +103,7 @@ def mean_travel(readings: Mapping[str, Sequence[MeasuredMotion]]) -> Planar | No
 
 
 def _step(one: Pose, then: Pose) -> tuple[float, float]:
-    """Return meters along the mean heading, and radians."""
+    """Return the step in meters along the mean heading, and in radians."""
     turned_rad = math.remainder(then[2] - one[2], math.tau)
     heading_rad = one[2] + turned_rad / 2
     along_m = (then[0] - one[0]) * math.cos(heading_rad) + (then[1] - one[1]) * math.sin(heading_rad)

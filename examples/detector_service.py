@@ -1,9 +1,9 @@
-"""A detector in a process of its own: a robot's frames in, boxes out, for any vision to steer by. Shell.
+"""A detector in a separate process: a robot's frames in, boxes out, for any vision service. Shell.
 
     python examples/detector_service.py tcp/127.0.0.1:7447 r1
     sightline vision --detector boxes --set boxes.source=detector --set boxes.height_m=0.2
 
-Put your network into `look`; this one finds the largest yellow thing by its color. It does not drive: boxes name their
+Put your network into `look`; this one finds the largest yellow object by its color. It does not drive: boxes name their
 frame, the vision service answers that frame, and the robot validates its age.
 """
 
@@ -27,14 +27,14 @@ from sightline.protocol.transports.open import open_link
 
 SOURCE, SESSION = "detector", secrets.token_hex(4)
 YELLOW = (18, 128, 40), (34, 255, 255)
-"""Hue (0 to 180), saturation, value (0 to 255), as OpenCV counts them: two-sided, so that green and skin stay out."""
+"""Hue (0 to 180), saturation, value (0 to 255) in OpenCV's units: limited on both sides, to exclude green and skin."""
 SMALLEST_PX = 6
 
 Pixels = NDArray[Any]
 
 
 def look(bgr: Pixels) -> tuple[DetectedBox, ...]:
-    """Find objects in an image, best first. An empty result means "looked, and saw nothing"."""
+    """Find objects in an image, best first. An empty result means that the image has none."""
     mask = cv2.inRange(cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV), np.array(YELLOW[0]), np.array(YELLOW[1]))
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     x, y, width, height = cv2.boundingRect(max(outlines, key=cv2.contourArea)) if outlines else (0, 0, 0, 0)
@@ -44,7 +44,7 @@ def look(bgr: Pixels) -> tuple[DetectedBox, ...]:
 
 
 def boxes_of(jpeg: bytes) -> Detections:
-    """Find objects in a JPEG. Raises WireError for other data, before a decoder reads it."""
+    """Find objects in a JPEG. Raises WireError for other data, before it is decoded."""
     size = read_jpeg_size(jpeg)
     bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
     if bgr is None:
@@ -53,7 +53,7 @@ def boxes_of(jpeg: bytes) -> Detections:
 
 
 def answer(message: Message, seq: int) -> tuple[bytes, bytes]:
-    """Header and payload of the boxes in a frame. Raises WireError if it cannot be read."""
+    """Return header and payload of the boxes in a frame. Raises WireError if it is invalid."""
     started_ns = time.perf_counter_ns()
     frame = decode(FrameHeader, message.header)
     found = boxes_of(message.payload)
@@ -63,7 +63,7 @@ def answer(message: Message, seq: int) -> tuple[bytes, bytes]:
 
 
 def serve(endpoint: str, robot: str) -> None:
-    """Look at the newest frame, for ever; while one is looked at, newer ones replace each other in one place."""
+    """Process the newest frame, forever. Newer frames replace each other in one slot meanwhile."""
     with open_link(robot, connect=[endpoint], role=SOURCE) as link:
         print(f"detector: detecting in the images of {robot} at {endpoint}", flush=True)
         frames, seq = link.latest(FRAME), itertools.count(1)
@@ -73,7 +73,7 @@ def serve(endpoint: str, robot: str) -> None:
                 continue
             try:
                 header, payload = answer(message, next(seq))
-            except WireError as error:  # a bad picture ends nothing
+            except WireError as error:  # an invalid image ends nothing
                 print(f"detector: {error}", flush=True)
                 continue
             link.publish(DETECTIONS, header, payload)

@@ -3,8 +3,8 @@
     uvicorn --app-dir examples http_detector:app --port 8080
     sightline vision --detector http+jpeg://127.0.0.1:8080/detect
 
-A JPEG comes as the body of a POST, JSON goes back. FastAPI, Ray Serve and BentoML answer the same way: put your own
-network into `look`. The headers X-Sightline-Session and X-Sightline-Seq name the frame; to send them back is optional.
+The request is a POST with a JPEG, the reply is JSON. FastAPI, Ray Serve and BentoML answer the same way: put your own
+network into `look`. The headers X-Sightline-Session and X-Sightline-Seq name the frame; returning them is optional.
 """
 
 import json
@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 
 YELLOW = (18, 128, 40), (34, 255, 255)
-"""Hue (0 to 180), saturation, value (0 to 255), as OpenCV counts them: two-sided, so that green and skin stay out."""
+"""Hue (0 to 180), saturation, value (0 to 255) in OpenCV's units: limited on both sides, to exclude green and skin."""
 SMALLEST_PX = 6
 MAX_JPEG_BYTES = 1_000_000
 
 
 def look(bgr: Any) -> list[dict[str, Any]]:
-    """Boxes, best first; x2 and y2 are exclusive. Empty is "looked, and saw nothing"."""
+    """Return boxes, best first; x2 and y2 are exclusive. An empty list means that the image has none."""
     mask = cv2.inRange(cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV), np.array(YELLOW[0]), np.array(YELLOW[1]))
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     x, y, width, height = cv2.boundingRect(max(outlines, key=cv2.contourArea)) if outlines else (0, 0, 0, 0)
@@ -38,7 +38,7 @@ def answer(jpeg: bytes) -> tuple[int, dict[str, Any]]:
 
 
 async def _body(receive: Any) -> bytes | None:
-    """All of it; None for more than a picture has."""
+    """Return the whole body; None if it is larger than an image."""
     body, more = b"", True
     while more and len(body) <= MAX_JPEG_BYTES:
         message = await receive()
@@ -48,7 +48,7 @@ async def _body(receive: Any) -> bytes | None:
 
 
 async def app(scope: Any, receive: Any, send: Any) -> None:
-    """The ASGI application."""
+    """Serve requests as an ASGI application."""
     if scope["type"] != "http":
         return
     body = await _body(receive) if scope["method"] == "POST" else b""

@@ -14,14 +14,14 @@ SESSION = secrets.token_hex(4)
 FULL_SPEED_US, MAX_AGE_US, SILENCE_US, LEASE_US, STATUS_US = 150_000, 400_000, 300_000, 1_000_000, 2_000_000
 MAX_LINEAR_MPS, MAX_ANGULAR_RAD_S = 0.3, 1.5
 MAX_FIRST_SEQ, MAX_JUMP = 2**32, 2**20
-NOTHING = (0.0, 0.0, -MAX_AGE_US, -SILENCE_US)  # linear, angular, when the frame was captured, when it came
+NOTHING = (0.0, 0.0, -MAX_AGE_US, -SILENCE_US)  # linear, angular, capture time of the frame, arrival time
 NUMBER = rb"([+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?)"
 TWIST = re.compile(NUMBER + rb"\|" + NUMBER)  # 4.1
 Header = dict[str, Any]
 
 
 def digest_of(source: str, session: str) -> str:
-    """6.7: what others see of a driver or requester."""
+    """Return the public name of a driver or requester (6.7)."""
     return hashlib.sha256(f"{source}/{session}".encode()).hexdigest()[:8]
 
 
@@ -30,10 +30,10 @@ class Gate:
 
     def __init__(self) -> None:
         self.issued: dict[tuple[str, int], int] = {}  # 5.2: (channel, seq) -> t_us
-        self.denied = -1  # 8.3: no status up to this one lets anything move
+        self.denied = -1  # 8.3: requests that cite a status up to this one permit no motion
         self.last_seq: dict[tuple[str, str], int] = {}
         self.holder, self.held_us, self.good = ("", ""), -LEASE_US, 0
-        self.proof = (None, None)  # 6.6: the last of the holder, and the first of its next chain
+        self.proof = (None, None)  # 6.6: the last proof of the holder, and the first of its next chain
         self.stopped, self.armed, self.arms_itself = False, False, True
         self.command = NOTHING
         self.accepted, self.refused = 0, Counter[str]()
@@ -47,7 +47,7 @@ class Gate:
         self.accepted += not reason
 
     def validate(self, header: Header, text: bytes, now: int) -> str:
-        """The reason of 5.1 that stands against a twist, or "" with the command taken over."""
+        """Return the reason of 5.1 to reject a twist, or "" if it is accepted."""
         match, echo, who = TWIST.fullmatch(text[:65]), header["echo"], (header["source"], header["session"])
         linear, angular = (float(match[1]), float(match[2])) if match else (math.nan, math.nan)
         last = self.last_seq.get(who, -1)
@@ -64,7 +64,7 @@ class Gate:
         return wrong or self.take(who, header, (linear, angular, echo["t_us"], now))
 
     def proven(self, header: Header, now: int) -> bool:
-        """6.6: a message that states the driver's session continues its chain of proofs."""
+        """Return True if a message with the driver's session continues its chain of proofs (6.6)."""
         element = header.get("proof")
         if not (self.live(now) and self.holder == (header["source"], header["session"]) and self.proof[0]):
             return element is None or len(bytes.fromhex(element)) == 16
@@ -79,7 +79,7 @@ class Gate:
         self.issued = dict([*self.issued.items(), ((channel, seq), t_us)][-512:])
 
     def young(self, echo: Header, channel: str, now: int, most_us: int) -> dict[str, bool]:
-        """By this robot's own record and clock: the checks of 5.1 on what a message cites."""
+        """Return the checks of 5.1 on the cited message, by this robot's own record and clock."""
         own = self.issued.get((channel, echo["seq"])) == echo["t_us"]
         return {
             "OTHER_SESSION": echo["session"] == SESSION,
@@ -91,7 +91,7 @@ class Gate:
     def take(self, who: tuple[str, str], header: Header, command: tuple[float, float, int, int]) -> str:
         others = [one for one in self.last_seq.items() if one[0] not in (who, self.holder)]
         kept = [one for one in self.last_seq.items() if one[0] == self.holder]
-        self.last_seq = dict([*others[-62:], *kept, (who, header["seq"])])  # 5.1: whom it rejects displaces no driver
+        self.last_seq = dict([*others[-62:], *kept, (who, header["seq"])])  # 5.1: a rejected sender displaces no driver
         linear, angular, frame_us, now = command
         live = self.live(now)
         if self.stopped or (live and who != self.holder):  # 6.5, 6.1
@@ -152,7 +152,7 @@ class Gate:
         return ""
 
     def wheels(self, now: int) -> tuple[float, float]:
-        """Linear and angular velocity for now: less the older the frame, none after silence (5.3, 5.4)."""
+        """Return linear and angular velocity for now: reduced for an older frame, zero after silence (5.3, 5.4)."""
         linear, angular, frame_us, came_us = self.command
         share = min(1.0, max(0.0, (MAX_AGE_US - (now - frame_us)) / (MAX_AGE_US - FULL_SPEED_US)))
         if not self.armed or now - came_us > SILENCE_US or share == 0.0:
@@ -161,7 +161,7 @@ class Gate:
         return linear * factor, angular * factor
 
     def status(self, now: int) -> Header:
-        """Clause 9, the least of it."""
+        """Return the smallest valid status (clause 9)."""
         linear, angular = self.wheels(now)
         commanded = now - self.command[3] <= SILENCE_US
         state = "STOPPED" if self.stopped else "DISARMED" if not self.armed else "ACTIVE" if commanded else "HOLD"

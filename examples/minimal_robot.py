@@ -33,12 +33,12 @@ def now_us() -> int:
 
 
 class Robot:
-    """Messages in and out, on any transport."""
+    """Processes messages on any transport."""
 
     def __init__(self, pictures: list[bytes]) -> None:
         self.gate, self.pictures, self.lock = Gate(), itertools.cycle(pictures), threading.Lock()
         self.seq, self.due_us = Counter[str](), dict.fromkeys(PERIOD_US, 0)
-        self.sent: tuple[int, int] | None = None  # the frame under way and since when: no credit (7.2)
+        self.sent: tuple[int, int] | None = None  # the frame in flight, and its time: no credit (7.2)
 
     def due(self) -> Iterator[Message]:
         """Yield the messages that are due now."""
@@ -61,7 +61,7 @@ class Robot:
         return {"v": 1, "session": SESSION, "seq": self.seq[channel], "t_us": now}
 
     def receive(self, channel: str, header: Header, payload: bytes) -> Iterator[Message]:
-        """Take in a message; gives the reply, if there is one."""
+        """Handle a message. Yields the reply, if there is one."""
         with self.lock:
             if channel == "twist":
                 self.gate.offer(header, payload, now_us())
@@ -71,13 +71,13 @@ class Robot:
                 yield from self.answer(header, json.loads(payload))
 
     def credit(self, echo: Any) -> None:
-        """7.2: what cites a frame of ours, this one or a newer."""
+        """Return the credit for a message that cites this frame or a newer one (7.2)."""
         ours = isinstance(echo, dict) and echo.get("session") == SESSION
         if ours and self.sent and self.sent[0] <= echo["seq"] <= self.seq["frame"]:
             self.sent = None
 
     def answer(self, header: Header, request: Header) -> Iterator[Message]:
-        """8.1: one reply to each request that can be read."""
+        """Yield one reply to each valid request (8.1)."""
         now = now_us()
         wrong = self.gate.request(request["verb"], header, now)
         self.gate.refused[wrong.partition(":")[0]] += bool(wrong)
@@ -88,7 +88,7 @@ class Robot:
 
 
 def unpack(message: bytes, role: str) -> Message:
-    """14.6: a block with the channel in the header, or with the channel's own object before it."""
+    """Split a block with the channel in the header, or with a separate object for the channel (14.6)."""
     size = int.from_bytes(message[:2], "big")
     block = message[2 : 2 + size].decode()
     first, end = json.JSONDecoder().raw_decode(block)
@@ -99,7 +99,7 @@ def unpack(message: bytes, role: str) -> Message:
 
 
 def serve_websocket(robot: Robot, port: int) -> None:
-    """Clause 14, for one client at a time."""
+    """Serve one client at a time (clause 14)."""
     from websockets.exceptions import ConnectionClosed
     from websockets.sync.server import ServerConnection, serve
     from websockets.typing import Subprotocol
@@ -124,7 +124,7 @@ def serve_websocket(robot: Robot, port: int) -> None:
                 message = connection.recv(timeout=0.005)
             except TimeoutError:
                 continue
-            if isinstance(message, bytes):  # a text is a new hello: this robot sends the same in any case
+            if isinstance(message, bytes):  # a text is a new hello, which changes nothing for this robot
                 try:
                     send_all(connection, robot.receive(*unpack(message, hello.get("role", ""))))
                 except (KeyError, RecursionError, TypeError, ValueError):
@@ -147,7 +147,7 @@ def serve_websocket(robot: Robot, port: int) -> None:
 
 
 def serve_zenoh(robot: Robot, port: int) -> None:
-    """Clause 16."""
+    """Serve on Zenoh (clause 16)."""
     import zenoh
 
     prefix = f"sightline/{ROBOT}/"
@@ -187,7 +187,7 @@ def main() -> None:
     carry = {"ws": serve_websocket, "zenoh": serve_zenoh}[kind]
     threading.Thread(target=carry, args=(robot, int(port)), daemon=True).start()
     before = (0.0, 0.0)
-    while True:  # the wheels have a loop of their own: whatever the network does, they stop
+    while True:  # the wheels have a separate loop: whatever the network does, they stop
         wheels = robot.gate.wheels(now_us())
         if wheels != before:
             print(f"wheels {wheels[0]:.3f} {wheels[1]:.3f}", flush=True)

@@ -20,8 +20,8 @@ from typing import Any
 
 ROBOT, SOURCE, SESSION = "r1", "vision", secrets.token_hex(4)
 MAX_PIXELS = 1920 * 1080
-OTHER_SOF = {*range(0xC3, 0xD0)} - {0xC4, 0xC8, 0xCC}  # lossless, arithmetic ...: not for us (3.1)
-COUNT = itertools.count(1)  # over connections: one session, one count (2.5)
+OTHER_SOF = {*range(0xC3, 0xD0)} - {0xC4, 0xC8, 0xCC}  # lossless, arithmetic ...: not supported (3.1)
+COUNT = itertools.count(1)  # for all connections: one session, one count (2.5)
 Header = dict[str, Any]
 Answer = Callable[[str, Header, bytes], None]
 
@@ -29,7 +29,7 @@ Answer = Callable[[str, Header, bytes], None]
 def look(jpeg: bytes) -> tuple[float, float] | None:
     """Map an image to (m/s, rad/s), or to None to acknowledge it only. This one turns slowly on the spot."""
     width, height = jpeg_size(jpeg)
-    return (0.0, 0.3) if 0 < width * height <= MAX_PIXELS else None  # 3.2: before any decoder sees it
+    return (0.0, 0.3) if 0 < width * height <= MAX_PIXELS else None  # 3.2: before any decoder reads it
 
 
 def jpeg_size(jpeg: bytes) -> tuple[int, int]:
@@ -48,7 +48,7 @@ def jpeg_size(jpeg: bytes) -> tuple[int, int]:
 
 
 def unpack(message: bytes) -> tuple[Header, bytes]:
-    """14.6: a block with the channel in the header, or with the channel's own object before it."""
+    """Split a block with the channel in the header, or with a separate object for the channel (14.6)."""
     size = int.from_bytes(message[:2], "big")
     block = message[2 : 2 + size].decode()
     first, end = json.JSONDecoder().raw_decode(block)
@@ -83,7 +83,7 @@ class Vision:
 
 
 def run_websocket(url: str) -> None:
-    """Clause 14."""
+    """Run on a WebSocket (clause 14)."""
     from websockets.sync.client import connect
     from websockets.typing import Subprotocol
 
@@ -99,7 +99,7 @@ def run_websocket(url: str) -> None:
         print("robot sent", robot.recv(timeout=2), flush=True)
         for message in robot:
             if isinstance(message, bytes):
-                with suppress(KeyError, RecursionError, TypeError, ValueError):  # a bad message ends nothing
+                with suppress(KeyError, RecursionError, TypeError, ValueError):  # an invalid message ends nothing
                     header, payload = unpack(message)
                     if header["channel"] == "frame":
                         vision.frame(header, payload)

@@ -1,4 +1,4 @@
-"""A detector of one's own: the brightest spot in the picture. Shell (a clock).
+"""A custom detector: the brightest spot in the image. Shell (a clock).
 
     sightline detector check examples.my_detector:BrightestSpot
     sightline vision --detector examples.my_detector:BrightestSpot --set detector.options.least=220
@@ -19,7 +19,7 @@ WHO = Maker("brightest-spot", device="cpu")
 
 
 class BrightestSpot:
-    """Whatever is brightest, if it is bright enough."""
+    """Finds the brightest spot, if it is bright enough."""
 
     class Config(Settings):
         """`[detector.options]`."""
@@ -30,7 +30,7 @@ class BrightestSpot:
         self.config = config
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:  # noqa: ARG002
-        """One result for each frame, in order; None is "no answer"."""
+        """Return one result for each frame, in order; None is "no answer"."""
         return [self.look(frame) for frame in frames]
 
     def look(self, frame: DetectFrame) -> DetectionResult | None:
@@ -47,5 +47,5 @@ class BrightestSpot:
         return result_of(frame, inside, WHO, (time.perf_counter_ns() - started_ns) // 1000)
 
     def spot(self, x_px: float, y_px: float, brightness: float) -> Detection:
-        """A box around it, in pixels of the encoded picture."""
+        """Return a box around the spot, in pixels of the encoded image."""
         return Detection(x_px - SPOT_PX, y_px - SPOT_PX, x_px + SPOT_PX, y_px + SPOT_PX, brightness / 255, "spot")

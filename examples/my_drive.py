@@ -1,4 +1,4 @@
-"""A drive plug-in to copy: two wheels on a motor controller that takes `left right` lines over a serial port.
+"""A drive plug-in to copy: two wheels on a motor controller that reads `left right` lines from a serial port.
 
 A drive is a class with a `Config`, `set`, `wheels`, `close` and `zero` (robot_side/ports.py defines the promises of
 each).
@@ -18,19 +18,19 @@ from sightline.robot_side.ports import WheelAngles
 
 
 class MyDriveConfig(Config):
-    """`port` is where the motor controller listens."""
+    """Settings of the drive. `port` is the serial port of the motor controller."""
 
     port: Path
 
 
 BAUD = termios.B115200
-"""As the motor controller is set."""
+"""Baud rate of the motor controller."""
 
 
 def opened(port: Path) -> TextIO:
     """Open the port to write lines."""
     try:
-        # Without O_CREAT: where the port is missing, the user root would create a file and drive that.
+        # Without O_CREAT: if the port is missing, root would create a file and drive that.
         descriptor = os.open(port, os.O_WRONLY | os.O_NOCTTY)
     except OSError as error:
         raise HardwareError(f"motor controller {port}: {error.strerror}; is it plugged in?") from None
@@ -41,7 +41,7 @@ def opened(port: Path) -> TextIO:
 
 def set_up(descriptor: int) -> None:
     """Set the speed of a serial port, and send bytes as they are."""
-    # By default a port echoes what it receives: the controller would get its own answers back as commands.
+    # By default a port echoes its input. The controller would receive its own answers as commands.
     tty.setraw(descriptor, termios.TCSANOW)
     settings = termios.tcgetattr(descriptor)
     settings[4] = settings[5] = BAUD  # both directions
@@ -81,5 +81,5 @@ class MyDrive:
         return WheelAngles(self._angles.left_rad + left * seconds, self._angles.right_rad + right * seconds, now_us)
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._port.close()

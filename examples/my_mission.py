@@ -1,4 +1,4 @@
-"""A mission of one's own: keep looking at the target, and back away while it is near.
+"""A custom mission: keep turning to the target, and back away while it is near.
 
     sightline vision --mission examples.my_mission:Shy --set mission.options.near_px=30
 """
@@ -13,7 +13,7 @@ from sightline.vision_side.missions.port import Plan, View
 
 
 class Shy:
-    """Nothing here knows of networks, threads or clocks: a view in, a plan out."""
+    """Maps a view to a plan, without networks, threads or clocks."""
 
     class Config(Config):
         near_px: float = Field(default=40.0, gt=0, le=2000)

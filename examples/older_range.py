@@ -2,8 +2,8 @@
 
     sightline score detectors hsv examples.older_range:OlderRange
 
-It is (20, 25, 25) to (64, 255, 255) in OpenCV's units: half degrees, and 25 of 255. All else is that of `hsv`, also its
-test for round objects, which the article did not have.
+It is (20, 25, 25) to (64, 255, 255) in OpenCV's units: half degrees, and 25 of 255. The rest is as in `hsv`, including
+the test for round objects, which the article did not have.
 """
 
 from sightline.vision_side.config import HsvRange

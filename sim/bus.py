@@ -8,7 +8,7 @@ never delays a motor. Formats, all little-endian:
     range.sock    sim -> robot  RANGE_HEAD + float32 ranges
     camera.sock   sim -> robot  first the CameraModel as JSON, then per request PICTURE_HEAD (t_us, scale_percent), JPEG
                   robot -> sim  PICTURE_REQUEST (quality_percent, scale_percent): for the next capture
-    truth.sock    sim -> reader first what is simulated, then Truth as JSON; 50 Hz
+    truth.sock    sim -> reader first SimulationInfo, then Truth as JSON; 50 Hz
 """
 
 from __future__ import annotations
@@ -320,7 +320,7 @@ class TruthReader:
         self._connection.close()
 
 
-# Labels of simulated images, written to and read from the bus; `labels.py` makes them. Shell (sockets).
+# Labels of simulated images, written to and read from the bus; `world/sensors.py` makes them. Shell (sockets).
 #
 # They share the truth socket, between its reports. A client of that socket may read labels; a robot reads
 # neither.

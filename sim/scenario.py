@@ -342,7 +342,7 @@ TextureName = Literal["plain", "boards", "clouds", "bricks", "marble", "mosaic",
 class Look(Config):
     """The look of a scene and of its images. Every option is off by default.
 
-    First the room: what is drawn, and the objects that it adds. Then the camera, in the order of its effects.
+    First the room: its surfaces and added objects. Then the camera, in the order of its effects.
     """
 
     room_m: Annotated[float, Field(ge=0, le=10)] = 0.0
@@ -397,7 +397,7 @@ def look_named(name: str) -> Look:
     return check(Look, table[name], LOOKS)
 
 
-# What a scenario evaluates: its figures and their bounds. Pure.
+# The evaluation of a scenario: its figures and their bounds. Pure.
 
 
 AT_LEAST = "least_"

@@ -45,7 +45,7 @@ class Truth:
 
     @property
     def contacts(self) -> int:
-        """Physics steps so far in which the robot touched anything but the floor (both at once count twice)."""
+        """Return the physics steps so far with any contact but the floor's. Two contacts in one step count twice."""
         return self.wall_contacts + self.target_contacts
 
     def to_json(self) -> bytes:
@@ -54,5 +54,5 @@ class Truth:
 
     @classmethod
     def from_json(cls, data: bytes) -> Self:
-        """Read what `to_json` wrote. Raises ValueError or TypeError for anything else."""
+        """Read the output of `to_json`. Raises ValueError or TypeError for anything else."""
         return cls(**json.loads(data))

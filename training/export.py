@@ -107,7 +107,7 @@ def weights_in(data: bytes) -> Weights:
 
 
 def _image(graph: Graph) -> str:
-    """uint8 NHWC -> float, scaled to the same mean brightness: one plane whose columns are blue, green, red in turn.
+    """Convert uint8 NHWC to float of the same mean brightness: one plane whose columns are blue, green, red in turn.
 
     This copies no data: the first convolution moves three columns for each pixel.
     """

@@ -208,7 +208,7 @@ def onnx_bytes(text: bytes, weights: bytes, properties: Mapping[str, str]) -> by
     Args:
         text: its graph, JSON.
         weights: its binary weights.
-        properties: metadata of the file, beside its labels.
+        properties: metadata of the file, in addition to its labels.
     """
     source = _Source(text, weights)
     count = _decoded(source.graph, source.heads)

@@ -74,7 +74,7 @@ class DrawnScenes:
 
     @property
     def own(self) -> int:
-        """Number of scenes that the simulator has drawn."""
+        """Return the number of scenes that the simulator has drawn."""
         return len(self.truths) if self.simulated is None else self.simulated
 
     def digest(self) -> str:

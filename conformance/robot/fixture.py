@@ -406,14 +406,14 @@ def ready(bench: Bench) -> Sender:
 
 
 def operator(bench: Bench) -> Sender:
-    """An operator that has received a status."""
+    """Return an operator that has received a status."""
     operator = Sender(Robot(bench), "operator")
     operator.robot.status()
     return operator
 
 
 def teleop(bench: Bench) -> Sender:
-    """A human driver that acknowledges frames."""
+    """Return a human driver that acknowledges frames."""
     return Sender(Robot(bench), "teleop")
 
 
@@ -425,7 +425,7 @@ def ready_human(bench: Bench) -> Sender:
 
 
 def watcher(bench: Bench) -> Sender:
-    """A peer of a role that may not drive."""
+    """Return a peer of a role that may not drive."""
     return Sender(Robot(bench), bench.access.watcher)
 
 

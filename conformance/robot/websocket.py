@@ -577,7 +577,7 @@ def header_that_is_no_json(bench: Bench) -> None:
         bench.expect(raw.end(0.3) is None, "the connection ended")
 
 
-# Cases on tokens: which client may connect to a robot that demands one, and what a role may send. Shell (raw sockets).
+# Cases on tokens: clients that may connect to a robot that demands one, and messages of a role. Shell (raw sockets).
 
 
 _CLAUSE: Final = "14.3 Token"

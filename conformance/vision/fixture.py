@@ -127,7 +127,7 @@ class RobotPlayed:
     # --- sending ------------------------------------------------------------------------------------------------------
 
     def stop(self) -> None:
-        """Fall silent for good."""
+        """Stop sending."""
         self._stopped = True
 
     def stamp(self) -> Stamp:

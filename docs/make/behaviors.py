@@ -42,50 +42,50 @@ if TYPE_CHECKING:
 PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "behaviors.md"
 LATENCY_MS, LOSS = 50.0, 0.1
 LOOKS: Final = ("dim", "bright", "warm", "desaturated", "quality30")
-"""The light in which a traffic light must be read, beside the ordinary."""
+"""Further light conditions in which a traffic light must be read."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One behavior: a scenario, and a law in place of its own if it is a baseline's."""
+    """One behavior: a scenario, and a law in place of its own for a baseline."""
 
     scenario: str
     baseline: str = ""
     robot: str | None = None
     looks: tuple[str, ...] = ()
-    """In what other light it is run too."""
+    """Further light conditions of its runs."""
     seconds: float | None = None
-    """The length of each run; None: the scenario's own."""
+    """Length of each run; None: the scenario's own."""
 
     @property
     def law(self) -> str:
-        """The mission that drives."""
+        """Return the mission that drives."""
         return self.baseline or load_scenario(self.scenario).mission
 
     @property
     def title(self) -> str:
-        """Its heading."""
+        """Return the heading."""
         extra = f", baseline `{self.baseline}`" if self.baseline else ""
         return self.scenario + (f", robot `{self.robot}`" if self.robot else "") + extra
 
     @property
     def anchor(self) -> str:
-        """The anchor of that heading."""
+        """Return the anchor of that heading."""
         return self.title.replace("`", "").replace(",", "").replace(" ", "-")
 
     @property
     def default(self) -> "Row":
-        """The row to which a baseline is compared."""
+        """Return the row that a baseline is compared with."""
         return Row(self.scenario, "", self.robot, seconds=self.seconds)
 
     def cases(self, seeds: Sequence[int], look: str | None = None) -> list[ScoreCase]:
-        """Its runs in one light, the scenario's own if None."""
+        """Return the runs in one light; None: the scenario's own."""
         mission, detector = self.baseline or None, color_detector(self.scenario)
         return [ScoreCase(self.scenario, LATENCY_MS, LOSS, seed, self.seconds, mission, self.robot, look, detector)
                 for seed in seeds]
 
     def all_cases(self, seeds: Sequence[int]) -> list[ScoreCase]:
-        """Its runs in every light."""
+        """Return the runs in every light."""
         return [case for look in (None, *self.looks) for case in self.cases(seeds, look)]
 
 
@@ -106,7 +106,7 @@ ROWS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Some figures of scenarios in several looks, by the detector that a user has without a choice."""
+    """Some figures of scenarios in several looks, with the default detector."""
 
     title: str
     summary: str
@@ -157,20 +157,20 @@ CHARACTER: Final = {
 """The character of each legacy controller, and the reason of its failures."""
 
 
-# How the Thymio speeds up and slows down on a free way, by the default mission and by the legacy one. Pure.
+# Speed of the Thymio on a free path, with the default mission and with the legacy one. Pure.
 
 
 LAWS: Final = ("goto", "goto-baseline")
 GOALS_M: Final = (0.2, 2.0, 10.0)
 """The waypoints of the legacy plots."""
-_SLOWEST_MPS: Final = 0.2  # what either law keeps up on a free way, and then some time to settle
+_SLOWEST_MPS: Final = 0.2  # speed that either law reaches on a free path, with time to settle
 _SETTLES_S: Final = 8.0
-_ACROSS: Final = 5  # samples to either side: an acceleration over 0.2 s, for the physics' own steps are noise
+_ACROSS: Final = 5  # samples to either side: the acceleration over 0.2 s, because single physics steps are noisy
 
 
 @dataclass(frozen=True, slots=True)
 class SpeedCase:
-    """One drive to make."""
+    """One drive to run."""
 
     law: str
     goal_m: float
@@ -179,30 +179,30 @@ class SpeedCase:
 
 @dataclass(frozen=True, slots=True)
 class SpeedRun:
-    """The result of one drive, from the world's own record: one entry of each list per sample."""
+    """The result of one drive, from the record of the world: one entry of each list per sample."""
 
     wish: SpeedCase
     times_s: list[float]
     speeds_mps: list[float]
     accelerations_mps2: list[float]
     arrived_s: float | None
-    """When it first was at the waypoint."""
+    """Time of the first arrival at the waypoint."""
     off_m: float
-    """From the waypoint, at the end."""
+    """Distance from the waypoint at the end."""
 
     @property
     def top_mps(self) -> float:
-        """The highest speed."""
+        """Return the highest speed."""
         return max(self.speeds_mps)
 
 
 def speed_cases(seed: int) -> list[SpeedCase]:
-    """Every law to every waypoint."""
+    """Return every law with every waypoint."""
     return [SpeedCase(law, goal_m, seed) for law in LAWS for goal_m in GOALS_M]
 
 
 def free_way(goal_m: float) -> Scenario:
-    """The Thymio's scenario with nothing in the way and the waypoint straight ahead."""
+    """Return the Thymio's scenario without obstacles and with the waypoint straight ahead."""
     thymio = load_scenario("thymio")
     return thymio.model_copy(update={
         "things": (), "goals_m": ((goal_m, 0.0),), "start": Start(at_m=(0.0, 0.0)),
@@ -212,7 +212,7 @@ def free_way(goal_m: float) -> Scenario:
 
 
 def speed_run(wish: SpeedCase) -> SpeedRun:
-    """Drive it, under the conditions of the page."""
+    """Run a drive under the conditions of the page."""
     scenario = free_way(wish.goal_m)
     mission = None if wish.law == scenario.mission else wish.law
     run = run_lockstep(scenario, robot_of(scenario), wish.seed, Conditions(LATENCY_MS, LOSS), mission=mission)
@@ -220,7 +220,7 @@ def speed_run(wish: SpeedCase) -> SpeedRun:
 
 
 def speeds_of(wish: SpeedCase, samples: Sequence[Truth]) -> SpeedRun:
-    """The figures of a drive along x."""
+    """Return the figures of a drive along x."""
     times_s = [(truth.t_us - samples[0].t_us) / 1e6 for truth in samples]
     speeds_mps = [truth.linear_mps for truth in samples]
     off_m = [abs(complex(truth.x_m - wish.goal_m, truth.y_m)) for truth in samples]
@@ -278,7 +278,7 @@ _IN_LIGHT: Final = ("wrong_states_percent", "crossed_on_red", "crossed_late", "l
 
 
 def picture_name(case: ScoreCase) -> str:
-    """The file of the picture of this run."""
+    """Return the file name of the picture of this run."""
     return "-".join(part for part in (case.scenario, case.robot and f"on-{case.robot}", case.mission) if part) + ".png"
 
 
@@ -319,7 +319,7 @@ def merged(old: str, new: str) -> str:
 
 
 def _parts(page: str) -> tuple[str, dict[str, str], dict[str, str]]:
-    """Return what is before the lines of the overview, these lines and the sections, by title."""
+    """Return the text before the lines of the overview, these lines and the sections, by title."""
     head, *sections = page.split("\n## ")
     begin, *lines = head.rstrip("\n").split("\n| [")
     by_title = {section.partition("\n")[0]: f"## {section}".rstrip("\n") + "\n" for section in sections}
@@ -327,7 +327,7 @@ def _parts(page: str) -> tuple[str, dict[str, str], dict[str, str]]:
 
 
 def kept(row: Row, results: Results, seeds: Sequence[int]) -> bool:
-    """Return True if every run kept every bound. A baseline has no bounds."""
+    """Return True if every run was within every bound. A baseline has no bounds."""
     return bool(row.baseline) or all(
         check.ok for case in row.all_cases(seeds) for check in _checks(row, results[case])
     )
@@ -337,7 +337,7 @@ def page_lines(
     rows: Sequence[Row], results: Results, seeds: Sequence[int], folder: str, speeds: Sequence[SpeedRun],
     *, tables: Sequence[Table] = (),
 ) -> Iterator[str]:
-    """The page, block by block; pictures lie in `folder`."""
+    """Yield the page, block by block; pictures lie in `folder`."""
     names = ",".join(map(str, seeds))
     yield "# Behaviors\n"
     yield (
@@ -375,7 +375,7 @@ def _overview(rows: Sequence[Row], results: Results, seeds: Sequence[int]) -> It
 
 
 def _tightest(row: Row, checks: Sequence[Check]) -> str:
-    """The figure that came nearest to its bound, of those that leave room."""
+    """Return the figure nearest to its bound, among those with a margin."""
     names = load_scenario(row.scenario).bounds.keys() - set(EXACT)
     shares = [(_share(check), check) for check in checks if check.name in names and check.value is not None]
     share, check = max(shares, key=lambda one: one[0], default=(0.0, None))
@@ -414,7 +414,7 @@ def _behavior(row: Row, results: Results, seeds: Sequence[int], folder: str) -> 
 
 
 def _in_other_light(row: Row, results: Results, seeds: Sequence[int]) -> Iterator[str]:
-    """The same starts in each light of `looks`: the worst of each figure."""
+    """Yield the worst of each figure for the same starts in each light of `looks`."""
     yield (
         f"\nIn other light (`--look`), the worst of {len(seeds)} starts each. A frame is misread if it does not name "
         f"the lit color, from\n{SETTLED_S:g} s after each change and from {READ_WITHIN_M:g} m before the line. A "
@@ -446,7 +446,7 @@ def _shown(row: Row, seeds: Sequence[int], folder: str) -> str:
 
 
 def _failures(row: Row, results: Results, seeds: Sequence[int]) -> str:
-    """Which of the bounds it would break, and how often."""
+    """Return the bounds that it would break, and how often."""
     judged = [_checks(row, results[case]) for case in row.cases(seeds)]
     broken = [(same[0].name, sum(not check.ok for check in same)) for same in zip(*judged, strict=True)]
     text = ", ".join(f"{name} ({count})" for name, count in broken if count)
@@ -481,14 +481,14 @@ def _figure(value: float | None, unit: str) -> str:
 
 # docs/reference/results/behaviors.md: every behavior and its baseline in lockstep. Shell (files).
 #
-# An image is of the first seed. The page names the command that wrote it; no figure in it is typed by hand.
+# An image is of the first seed. The page names the command that wrote it; all figures in it are generated.
 
 
 def write_page(
     page: Path, seeds: Sequence[int], jobs: int, rows: Sequence[Row] = ROWS, tables: Sequence[Table] = (),
     *, only: bool = False,
 ) -> bool:
-    """Run `rows` and `tables` and write `page`, and its pictures into a folder beside it. True if every bound was kept.
+    """Run `rows` and `tables`. Write `page`, and its pictures to a folder next to it. True if all are within bounds.
 
     With `only` the page keeps its other parts.
     """
@@ -511,13 +511,13 @@ def write_page(
 def _run_all(
     wanted: Sequence[ScoreCase], wishes: Sequence[SpeedCase], shown: Mapping[ScoreCase, Path], jobs: int
 ) -> tuple[Results, list[SpeedRun]]:
-    """Return the scores of `wanted` and the drives of `wishes`. Each run of `shown` leaves its picture."""
+    """Return the scores of `wanted` and the drives of `wishes`. Each run of `shown` writes its picture."""
     with progress_bar(len(wanted) + len(wishes)) as advance, worker_pool(jobs) as pool:
         runs = {pool.submit(_run, case, shown.get(case)): case for case in wanted}
         drives = [pool.submit(speed_run, wish) for wish in wishes]
         everything: list[Future[Any]] = [*runs, *drives]
         for future in as_completed(everything):
-            future.result()  # a run that failed ends the others here
+            future.result()  # a failed run ends the others here
             advance()
     return {case: run.result() for run, case in runs.items()}, [drive.result() for drive in drives]
 

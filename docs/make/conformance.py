@@ -1,9 +1,9 @@
-"""Runs the kit over every peer of this repository and rewrites docs/reference/results/conformance.md.
+"""Run the kit on every peer of this repository and rewrite docs/reference/results/conformance.md.
 
-    python -m docs.make.conformance                    # all, one after another: most of an hour
-    python -m docs.make.conformance "vision, Zenoh"    # one again; the others keep their last run
+    python -m docs.make.conformance                    # all in turn: most of an hour
+    python -m docs.make.conformance "vision, Zenoh"    # only this one; the others keep their last run
 
-Results lie in runs/conformance, one JSON for each peer; the page is made of what is there.
+Results are in runs/conformance, one JSON file per peer. The page shows all of them.
 """
 
 import json
@@ -71,7 +71,7 @@ def end_at(scheme: str) -> str:
 
 @contextmanager
 def started(*arguments: str, prints: str = "") -> Iterator[None]:
-    """Run a command of Sightline. The block starts when it printed `prints`; the command ends with the block."""
+    """Run a command of Sightline. The block starts after it printed `prints`; the command ends with the block."""
     with tempfile.NamedTemporaryFile("w+") as log:
         process = subprocess.Popen([*SIGHTLINE, *arguments], stdout=log, stderr=log)
         try:
@@ -83,11 +83,11 @@ def started(*arguments: str, prints: str = "") -> Iterator[None]:
 
 
 def conform(name: str, *arguments: str) -> None:
-    """Run the kit once and store its result with the date. Raises RuntimeError if the kit left none."""
+    """Run the kit once and store its result with the date. Raises RuntimeError without a result."""
     KEPT.mkdir(parents=True, exist_ok=True)
     side, *rest = arguments
     file = file_of(name)
-    file.unlink(missing_ok=True)  # or the page would show an earlier run as this one
+    file.unlink(missing_ok=True)  # otherwise the page would show an earlier run as this one
     print(f"--- {name}", flush=True)
     done = subprocess.run([*SIGHTLINE, "conform", side, "--save", str(file), "--name", name, *rest],
                           stdout=subprocess.DEVNULL, check=False)
@@ -102,7 +102,7 @@ def file_of(name: str) -> Path:
 
 
 def our_robot(name: str, scheme: str, guarded: bool = False) -> None:
-    """Our robot with a simulated lidar that it publishes; its wheels are a log, so it stays where it is."""
+    """Test our robot with a simulated lidar that it publishes. Its wheels are a log, so it does not move."""
     with ExitStack() as ending:
         folder = Path(ending.enter_context(tempfile.TemporaryDirectory()))
         sockets = folder / "sim"
@@ -134,7 +134,7 @@ def our_vision(name: str, scheme: str) -> None:
 
 
 def their_robot(name: str, guarded: bool = False) -> None:
-    """The JavaScript robot; with a token only what a token is about, and the rest of its WebSocket."""
+    """Test the JavaScript robot; with a token only the token cases and the rest of its WebSocket."""
     with tempfile.TemporaryDirectory() as folder:
         token = Path(folder) / "token"
         token.write_text(TOKEN)
@@ -145,7 +145,7 @@ def their_robot(name: str, guarded: bool = False) -> None:
 
 
 def their_vision(name: str) -> None:
-    """The JavaScript vision, with a token."""
+    """Test the JavaScript vision service, with a token."""
     with tempfile.TemporaryDirectory() as folder:
         endpoint, token = f"ws://127.0.0.1:{free_port()}", Path(folder) / "token"
         token.write_text(TOKEN)
@@ -154,7 +154,7 @@ def their_vision(name: str) -> None:
 
 
 def minimal_robot(name: str, transport: str) -> None:
-    """The example without Sightline. It states what it leaves out, so it does not conform."""
+    """Test the example without Sightline. It declares the parts that it leaves out, so it does not conform."""
     endpoint, port = minimal_end(transport)
     with subprocess.Popen([sys.executable, EXAMPLES.parent / "minimal_robot.py", transport, str(port),
                            EXAMPLES.parent / "pictures"], stdout=subprocess.DEVNULL) as robot:
@@ -163,7 +163,7 @@ def minimal_robot(name: str, transport: str) -> None:
 
 
 def minimal_vision(name: str, transport: str) -> None:
-    """The example without Sightline. On Zenoh it ends without a robot, so it is started until the kit listens."""
+    """Test the example without Sightline. On Zenoh it ends without a robot, so it restarts until the kit listens."""
     endpoint, _ = minimal_end(transport)
     command = f"until {sys.executable} {EXAMPLES.parent / 'minimal_vision.py'} {endpoint}; do sleep 0.2; done"
     with subprocess.Popen(["/bin/sh", "-c", command], start_new_session=True, stdout=subprocess.DEVNULL,
@@ -196,7 +196,7 @@ RUNS: dict[str, Callable[[str], None]] = {
 
 
 def to_page(runs: Sequence[Mapping[str, Any]]) -> str:
-    """The Markdown page of several runs (their JSON): peers, what did not pass at once, every case of each side."""
+    """Return the page of several runs (their JSON): peers, cases that did not pass the first time, all cases."""
     lines = ["# Conformance", "", PREFACE, ""]
     lines += ["| peer | side | conforms | passed | failed | SHOULD failed | not applicable | cases | measured |",
               "|" + "---|" * 9]
@@ -242,7 +242,7 @@ def cell(text: str) -> str:
 
 
 def main(names: Sequence[str]) -> None:
-    """Run what is named, or all, and make the page of what is there."""
+    """Run the named peers, or all, and write the page from all results."""
     for name in names or RUNS:
         RUNS[name](name)
     PAGE.write_text(to_page([json.loads(file_of(name).read_text()) for name in RUNS if file_of(name).exists()]))

@@ -1,9 +1,9 @@
 """Write docs/reference/results/faults.md, and its worst values into the safety page. Shell.
 
     python -m docs.make.faults --repeat 10 --jobs 3                     # all rows: about an hour
-    python -m docs.make.faults --only wire.thin --repeat 10 --jobs 3    # these again; the other rows stay as they are
+    python -m docs.make.faults --only wire.thin --repeat 10 --jobs 3    # these again; other rows keep their results
 
-docs/reference/results/faults.json has the results. Both pages are made of it, so that they cannot disagree.
+docs/reference/results/faults.json has the results. Both pages are generated from it, so that they agree.
 """
 
 import json
@@ -46,11 +46,11 @@ _LEGEND: Final = (
 )
 
 Record = Mapping[str, Any]
-"""The object that the command printed, with the command, the machine and the commands that ran rows again."""
+"""The JSON object of the command, with the command, the machine and the commands that repeated rows."""
 
 
 def describe_machine() -> list[str]:
-    """CPU, cores, load, date, kernel, Python and the packages that matter, one line each."""
+    """Return CPU, cores, load, date, kernel, Python and the packages that matter, one line each."""
     load = f"load average at the start {os.getloadavg()[0]:.1f}, on {datetime.now(UTC):%Y-%m-%d}"
     return [
         f"CPU: {processor()}, {os.cpu_count()} cores; {load}",
@@ -71,7 +71,7 @@ def measured(arguments: Sequence[str]) -> Record:
 
 
 def merged(record: Record, newer: Record) -> Record:
-    """`record` with the rows that `newer` ran in place of its own; rows that only `newer` has come last.
+    """Return `record` with its rows replaced by those of `newer`; rows that only `newer` has come last.
 
     A row that had not passed keeps its figures in the note of the later run.
     """
@@ -86,7 +86,7 @@ def merged(record: Record, newer: Record) -> Record:
 
 
 def report_page(record: Record, known: Iterable[str] = ()) -> str:
-    """The whole of docs/reference/results/faults.md, which names those `known` rows that `record` has not."""
+    """Return docs/reference/results/faults.md, which names those `known` rows that `record` does not have."""
     ran = _ran(record)
     missing = [f"`{row}`" for row in known if row not in {one["id"] for one in record["rows"]}]
     again = [f"by `{one['command']}` on {one['machine'][0].removeprefix('CPU: ')}: "
@@ -127,7 +127,7 @@ def _figures(row: Record, checks: Iterable[Record]) -> str:
 
 
 def safety_page(page: str, record: Record) -> str:
-    """`page` with the worst figures, by what broke, between its marks; as it was if it has no marks."""
+    """Return `page` with the worst figures by cause between its marks; unchanged without marks."""
     return _MARKS.sub(lambda marks: marks[1] + _worst_values(record) + marks[2], page)
 
 
@@ -143,7 +143,7 @@ def _worst_values(record: Record) -> str:
 
 
 def _broken(what: str) -> str:
-    """Return what broke, without the variant in parentheses."""
+    """Return the cause, without the variant in parentheses."""
     return what.partition(":")[0].partition(" (")[0]
 
 
@@ -160,7 +160,7 @@ def _worst(values: Sequence[float | None]) -> str:
 
 
 def _checks(record: Record, row: Record) -> list[Record]:
-    """The worst checks of a row, by their name within it."""
+    """Return the worst checks of a row, by their name within it."""
     return [{**one, "name": one["name"].partition(": ")[2]} for one in record["checks"] if _id_of(one) == row["id"]]
 
 

@@ -1,6 +1,6 @@
 """Run each mutant at the cases that must catch it, and write docs/reference/results/conformance-mutants.md.
 
-    python -m docs.make.mutants              # a minute or two: those on sockets run in real time
+    python -m docs.make.mutants              # a minute or two: mutants on sockets run in real time
 """
 
 from collections import Counter
@@ -13,7 +13,7 @@ from tests.conformance.mutants import peers
 
 PAGE = Path(__file__).parent.parent / "reference" / "results" / "conformance-mutants.md"
 AT_ONCE = 8
-"""Mutants on sockets at a time: they wait far more than they compute."""
+"""Mutants on sockets in parallel: they wait far more than they compute."""
 
 FOLDER = "https://github.com/sightline-robot/sightline/tree/main/tests/conformance/mutants"
 PREFACE = f"""`python -m docs.make.mutants` runs these mutants and writes this page. A mutant is a peer with one fault.
@@ -25,21 +25,21 @@ Each mutant must fail each case in the last column. `python -m tests.conformance
 
 
 def measured(mutants: Sequence[Any]) -> Iterator[tuple[Any, dict[str, str]]]:
-    """Yield each mutant with the cases that failed; those on sockets run beside each other."""
+    """Yield each mutant with the cases that failed. Mutants on sockets run in parallel."""
     with peers.Stage() as stage, ThreadPoolExecutor(AT_ONCE) as pool:
         def run(mutant: Any) -> dict[str, str]:
             chosen = [case for case in peers.CASES[mutant.peer] if mutant.survives or case.id in mutant.caught_by]
             return dict(peers.failed(stage.results(mutant.peer, mutant, chosen)))
 
         real = [one for one in mutants if one.peer in peers.REAL_TIME]
-        # Before all others: a change of the source of a Python peer is seen by every thread.
+        # Before all others, because every thread sees a change of the source of a Python peer.
         on_sockets = dict(zip(map(str, real), pool.map(run, real), strict=True))
         for one in mutants:
             yield one, on_sockets[str(one)] if str(one) in on_sockets else run(one)
 
 
 def to_page(results: Sequence[tuple[Any, dict[str, str]]]) -> str:
-    """The page: how many, what no case catches, then all mutants by peer."""
+    """Return the page: counts, mutants that no case catches, then all mutants by peer."""
     missed = [one for one, failed in results if set(one.caught_by) - set(failed)]
     lines = ["# Mutants of the conformance kit", "", PREFACE, ""]
     lines += ["| peer | mutants | caught | listed |", "|---|---|---|---|"]
@@ -59,17 +59,17 @@ def to_page(results: Sequence[tuple[Any, dict[str, str]]]) -> str:
 
 
 def name_of(mutant: Any) -> str:
-    """Return the name; that of a program stands in its source."""
+    """Return the name. That of a program is in its source."""
     return f"`{cell(mutant.name)}`" if mutant.exact or mutant.peer == "codec" else cell(mutant.name)
 
 
 def short(names: Sequence[str]) -> str:
-    """Return the ids; of many, the first and their number."""
+    """Return the ids, or the first and the number of many."""
     return ", ".join(names) if len(names) <= 8 else f"{names[0]} and {len(names) - 1} more"
 
 
 def cell(text: str) -> str:
-    """Return text that a table can hold."""
+    """Return text in a form for a table."""
     return " ".join(text.replace("|", "\\|").split())
 
 

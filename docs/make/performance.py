@@ -25,7 +25,7 @@ from sightline.protocol.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One command of the page and why it is there; `name` is its argument of this script.
+    """One command of the page and its reason. `name` is its argument of this script.
 
     With a `picture` the command gets `--out`, and its loop.png is shown under that name. `since` is the date of the
     last change of its figures or bounds; the page marks an earlier measurement.
@@ -41,7 +41,7 @@ class Section:
 
 _SEEDS: Final = "201,202,203,204,205,206"
 _BALLS: Final = "behind,circle,eight,pushed,static,walls"
-"""All others are on docs/reference/results/behaviors.md."""
+"""All others are in docs/reference/results/behaviors.md."""
 
 
 def _rows(*names: str, extra: tuple[str, ...] = (), seconds: int = 60) -> tuple[str, ...]:
@@ -221,9 +221,9 @@ SECTIONS: Final = (
 )
 
 
-# Writes docs/reference/results/performance.md: runs the commands, one after the other, and sets down what each printed.
+# Writes docs/reference/results/performance.md: runs the commands in turn, and records their output.
 #
-# Nothing in the page is typed by hand: a figure is there because its command measured it, on the date and machine that
+# All figures in the page are generated: the command measured them, on the date and machine that
 # its section names.
 
 
@@ -249,9 +249,9 @@ def sections_named(names: Sequence[str]) -> tuple[Section, ...]:
 
 
 def write_report(path: Path, sections: Sequence[Section], say: Callable[[str], None]) -> bool:
-    """Run every section's command and write it into the page, where the other sections stay; whether all checks held.
+    """Run each section's command and write its section; other sections stay. Returns True if all checks passed.
 
-    After each section, so that what was measured before a failure is kept.
+    Writes after each section, so that a later failure loses nothing.
     """
     ok = True
     for section in sections:
@@ -264,7 +264,7 @@ def write_report(path: Path, sections: Sequence[Section], say: Callable[[str], N
 
 
 def noted(page: str) -> str:
-    """`page` in the order of `SECTIONS`, unknown sections last, with what was never measured and what is outdated.
+    """Return `page` in the order of `SECTIONS`, unknown sections last, with marks for missing and outdated sections.
 
     Of two sections with one title the last one counts.
     """
@@ -287,7 +287,7 @@ def _marked(text: str, section: Section | None) -> str:
 
 
 def _measured(section: Section, pictures: Path) -> dict[str, Any]:
-    """The command's result; its picture, if it has one, is copied to where the page shows it."""
+    """Return the command's result. Copies its picture, if any, to where the page shows it."""
     if not section.picture:
         return _run(section.arguments)
     with tempfile.TemporaryDirectory(prefix="sightline-report-") as folder:
@@ -298,7 +298,7 @@ def _measured(section: Section, pictures: Path) -> dict[str, Any]:
 
 
 def _run(arguments: Sequence[str]) -> dict[str, Any]:
-    """The command's JSON object. Raises RuntimeError with its error line if it printed none."""
+    """Return the command's JSON object. Raises RuntimeError with its error line if it printed none."""
     command = [sys.executable, "-P", "-m", "sightline.operator_side.cli.app", *arguments, "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode not in (0, CHECK_FAILED):
@@ -315,7 +315,7 @@ def _machine() -> str:
 
 
 def processor() -> str:
-    """The model of the CPU."""
+    """Return the model of the CPU."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
     return next((line.partition(": ")[2] for line in lines if line.startswith("model name")), platform.machine())
 
@@ -336,7 +336,7 @@ def _section(section: Section, result: dict[str, Any]) -> str:
 
 
 def _race(contestants: Sequence[dict[str, Any]]) -> list[str]:
-    """One row for each contestant of `bench loop`."""
+    """Return one row for each contestant of `bench loop`."""
     heads = ("", "answered %", "fps", "p50 ms", "p95 ms", "p99 ms", "validated p50 ms", "unpaced p50 ms",
              "bytes a picture", "CPU ms a picture", "memory MB")
     rows = [

@@ -32,7 +32,7 @@ from sightline.vision_side.detect.onnx.detector import shipped_digest
 PAGE: Final = Path(__file__).parents[1] / "reference" / "results" / "photographs.md"
 NAMES: Final = ("onnx", "hsv")
 SEED = 1
-"""As in the command that the page prints, where each photograph is shown once with a ball of each kind."""
+"""As in the command on the page, where each photograph is shown once with a ball of each kind."""
 HARD: Final = "all at once"
 _LEAST_EXPECTED: Final = {"white": 85, "basketball": 90, "football": 75}
 SHOWN_SEED: Final = 2
@@ -70,7 +70,7 @@ def image_of(picture: PhotoPicture, subject: Subject) -> Any:
 def bound_lines(
     once: PhotoReport, plain: PhotoReport, tracked: PhotoReport, colored: Mapping[str, PhotoReport]
 ) -> Iterator[str]:
-    """Yield a table of what the detector is meant to reach, and what it reaches. A bound that is missed is bold."""
+    """Yield a table of bounds and figures of the detector. A missed bound is bold."""
     name = NAMES[0]
 
     def least_hits(reports: Mapping[str, PhotoReport]) -> float:

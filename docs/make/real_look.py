@@ -1,7 +1,7 @@
-"""Write docs/reference/results/real-look.md: every scenario with the look `real`, and how fast it is drawn. Shell.
+"""Write docs/reference/results/real-look.md: every scenario with the look `real`, and its drawing speed. Shell.
 
     python -m docs.make.real_look --seeds 301,302,303
-    python -m docs.make.real_look --only legs-crowd,three-balls      # these again; the others keep their last run
+    python -m docs.make.real_look --only legs-crowd,three-balls      # these again; other rows keep their last run
 """
 
 import argparse
@@ -30,13 +30,13 @@ LOOK: Final = "real"
 LATENCY_MS, LOSS = 50.0, 0.1
 LEARNED, COLOR = "onnx", "hsv"
 WIDER: Final = 1.5
-"""Times the bounds of the plain world: what is granted in this look."""
+"""Factor on the bounds of the plain world, permitted in this look."""
 LEAST_PER_S: Final = 30.0
 """Images that must be drawn in a second, 320x240."""
 TIMED: Final = ("circle", "walls", "traffic-light", "legs-crowd")
 SHOWN: Final = (*TIMED, "legs")
-_IMAGES: Final = 300  # drawn for each time; a quick machine needs 3 s
-_STEPS: Final = 8  # of the world between two of them, about 30 images per second of its time
+_IMAGES: Final = 300  # drawn for each time; a fast machine needs 3 s
+_STEPS: Final = 8  # of the world between two images, about 30 images per second of world time
 _SHOWN_SEED: Final = 301
 _SHOWN_AFTER_S: Final = 1.0
 _TIMES: Final = "## Time to draw"
@@ -67,7 +67,7 @@ def with_look(name: str, look: str) -> Scenario:
 
 
 def draw_time(name: str, look: str, images: int = _IMAGES) -> DrawTime:
-    """Draw images while the robot drives a curve, which is when the shutter has the most to do."""
+    """Draw images while the robot drives a curve, when the shutter has the most work."""
     from sightline.sim.world.world import World
 
     scenario, times_ms = with_look(name, look), []
@@ -112,7 +112,7 @@ def wanted_cases(names: Sequence[str], seeds: Sequence[int]) -> list[ScoreCase]:
 
 
 def own_detector(name: str) -> str:
-    """Return what detects in a scenario: its detector, or the simulation or range sensor in place of one."""
+    """Return the source of detections in a scenario: detector, simulation or range sensor."""
     scenario = load_scenario(name)
     if scenario.goals_m:
         return "none: range sensor"
@@ -122,7 +122,7 @@ def own_detector(name: str) -> str:
 
 
 def color_detector(name: str) -> str | None:
-    """Return the color detector for a scenario that leaves the choice, and None for all others."""
+    """Return the color detector for a scenario without a fixed detector, None for all others."""
     scenario = load_scenario(name)
     leaves_it = vision_config(scenario, robot_of(scenario)).detector.kind == DetectorConfig().kind
     return COLOR if leaves_it and not scenario.labels and not scenario.goals_m else None
@@ -229,7 +229,7 @@ def _draw_lines(draws: Sequence[DrawTime]) -> Iterator[str]:
 
 
 def write_page(page: Path, names: Sequence[str], seeds: Sequence[int], jobs: int, *, only: bool = False) -> bool:
-    """Measure, run and write `page`. Returns True if the images are drawn fast enough; a score may be anything.
+    """Measure, run and write `page`. Returns True if images are drawn fast enough, regardless of scores.
 
     With `only` the page keeps its other rows and its times.
     """

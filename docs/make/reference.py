@@ -1,7 +1,7 @@
-"""Write the pages that follow from the code: commands, exit codes, rejections, settings, detector card.
+"""Write the pages that are generated from the code: commands, exit codes, rejections, settings, detector card.
 
     python -m docs.make.reference            # write the pages
-    python -m docs.make.reference --check    # print the pages that are not current; exit code 5 if there is one
+    python -m docs.make.reference --check    # print the outdated pages; exit code 5 if there is one
 """
 
 import ast
@@ -182,7 +182,7 @@ def attribute_docstrings(model: type[Config]) -> dict[str, str]:
 
 
 def _plain(value: Any) -> str:
-    """Return a default as it is written in a configuration file."""
+    """Return a default in the notation of a configuration file."""
     if hasattr(value, "model_dump"):
         value = value.model_dump(mode="json", exclude_unset=True)
     if isinstance(value, list | tuple) and value and hasattr(value[0], "model_dump"):
@@ -203,7 +203,7 @@ def settings_page() -> str:
 
 
 def detector_card_page() -> str:
-    """Return the model card of the detector that ships, for the site."""
+    """Return the model card of the shipped detector, for the site."""
     card = (ROOT / "vision_side" / "models" / "sightline.md").read_text("utf-8")
     return NOTE + re.sub(r"\]\((?![a-z]+:|#)[^)]*/docs/", "](../../", card)
 
@@ -227,7 +227,7 @@ def figures(language: str) -> str:
     page = (results / "performance.md").read_text("utf-8")
     eight_deg = float(re.search(r"\| eight \+50 ms 10% loss: bearing_rms_deg \| [\d.]+ \| ([\d.]+) \|", page)[1])
     slow = page.partition("## A detector of 80 ms")[2].partition("\n## ")[0]
-    # After the name: answered in percent, images per second, the median age.
+    # After the name: answered in percent, images per second, median age.
     ours_ms, callback_ms = (float(re.search(rf"\| {name} \| [\d.]+ \| [\d.]+ \| ([\d.]+) \|", slow)[1])
                             for name in ("sightline", "callback"))
     stop_s, stop_m, eight_deg = (math.ceil(worst * 100) / 100 for worst in (stop_s, stop_m, eight_deg))
@@ -247,11 +247,11 @@ BLOCKS: Final[Mapping[str, tuple[str, Callable[[], str]]]] = {
     "README.zh-CN.md": ("figures", lambda: figures("zh")),
     "docs/how-to/teleop.md": ("keys", _keys),
 }
-"""Pages written by hand with one generated block: the page, the name of its block, and its text."""
+"""Handwritten pages with one generated block: the page, the name of its block, and its text."""
 
 
 def _files(root: Path) -> Iterator[tuple[Path, str]]:
-    """Yield each file that follows from the code, with its text."""
+    """Yield each generated file with its text."""
     for name, page in PAGES.items():
         yield root / "docs" / "reference" / name, page()
     for name, (block, text) in BLOCKS.items():

@@ -83,7 +83,7 @@ def _cell(pair: SabotagedPair, reasons: list[str]) -> str:
 
 
 def write_page(page: Path, seeds: Sequence[int], jobs: int, names: Sequence[str]) -> bool:
-    """Run everything and write `page`. True if each sabotage was noticed and no healthy run failed."""
+    """Run everything and write `page`. Returns True if each sabotage was noticed and no healthy run failed."""
     wanted = cases(names, seeds, [LATENCY_MS], [LOSS], None)
     broken = sabotaged(wanted, list(SABOTAGES))
     with progress_bar(len(wanted) + len(broken)) as advance:

@@ -2,7 +2,7 @@
 
     python -m docs.make.scale                                     # write the tables of the page
     python -m docs.make.scale --print --fps 15 --core-hour 0.02   # print them for other values
-    python -m docs.make.scale --measure                           # measure what a frame costs a router: 20 s
+    python -m docs.make.scale --measure                           # measure the cost of a frame for a router: 20 s
 
 The figures come from docs/reference/results/performance.md and router.json next to it. Prices and the speed of a GPU
 are examples: pass your own.
@@ -42,7 +42,7 @@ class Figures:
     """Measured inputs."""
 
     frame_bytes: float
-    """Of one 640x480 frame with its header and answer."""
+    """Bytes of one 640x480 frame with its header and answer."""
     vision_ms: float
     """CPU time of a vision service for one such frame: receive, decode, color detector, track, steer, answer."""
     hsv_ms: float
@@ -50,7 +50,7 @@ class Figures:
     onnx_ms: float
     """The learned detector at 320x240, decoding included."""
     memory_mb: float
-    """Of a vision service."""
+    """Memory of a vision service."""
     router_us: float
     """CPU time of a router for one such frame and its answer."""
     router_date: str
@@ -80,7 +80,7 @@ HELP: Final = {
 
 @dataclass(frozen=True)
 class Plan:
-    """The needs of a number of robots."""
+    """The resources for a number of robots."""
 
     robots: int
     frames_s: float
@@ -93,7 +93,7 @@ class Plan:
     gpus: int
     memory_gb: float
     cost: float
-    """Of a robot for an hour."""
+    """Cost of a robot for an hour."""
 
     @property
     def cores(self) -> int:
@@ -119,7 +119,7 @@ def _number(pattern: str, text: str) -> float:
 
 
 def read_figures(docs: Path = DOCS) -> Figures:
-    """Read the measured figures. Raises ValueError for one that is missing."""
+    """Read the measured figures. Raises ValueError if one is missing."""
     text = (docs / PERFORMANCE).read_text("utf-8")
     loop = "The whole loop"
     router = json.loads((docs / ROUTER).read_text("utf-8"))
@@ -135,7 +135,7 @@ def read_figures(docs: Path = DOCS) -> Figures:
 
 
 def plan(robots: int, figures: Figures, given: Assumptions, extra_ms: float = 0.0, on_gpu: bool = False) -> Plan:
-    """Compute what `robots` need.
+    """Compute the resources for `robots`.
 
     Args:
         extra_ms: CPU time of the detector for one frame, above that of the color detector.
@@ -145,11 +145,11 @@ def plan(robots: int, figures: Figures, given: Assumptions, extra_ms: float = 0.
     mbit_s = frames_s * figures.frame_bytes * 8 / 1e6
     cores = frames_s * (figures.vision_ms + extra_ms) / 1e3 / given.busy
     sites = 0 if robots == 1 else math.ceil(mbit_s / (given.nic_gbit * 1e3 * given.busy))
-    # When one router is gone, the other one has all sessions.
+    # When one router has failed, the other one has all sessions.
     while sites and math.ceil(robots / sites) + _services(cores, sites) / sites + SPARE_SESSIONS > MAX_SESSIONS:
         sites += 1
     # A frame crosses both routers when the robot and its vision service are at different ones, and one router carries
-    # everything when the other one is gone.
+    # everything when the other one has failed.
     router_cores = 2 * sites * math.ceil(frames_s * figures.router_us / 1e6 / given.busy / max(sites, 1))
     services = _services(cores, sites)
     gpus = math.ceil(frames_s / (given.gpu_fps * given.busy)) if on_gpu else 0
@@ -217,7 +217,7 @@ def page_text(page: str, figures: Figures, given: Assumptions) -> str:
     return text
 
 
-# --- what a frame costs a router --------------------------------------------------------------------------------------
+# --- the cost of a frame for a router --------------------------------------------------------------------------------
 
 FRAMES: Final = 1_000
 PACE_S: Final = 0.01
@@ -238,7 +238,7 @@ def _cpu_s(pid: int) -> float:
 
 
 def measure_router(docs: Path = DOCS) -> float:
-    """Send frames through a router to one vision service that answers each, and store what one costs it, in us."""
+    """Send frames through a router to one vision service that answers each, and store the cost of one, in us."""
     from sightline.protocol.channels import ACK, FRAME
     from sightline.protocol.codec import encode
     from sightline.protocol.messages import FrameHeader

@@ -64,14 +64,14 @@ class DelayLine:
 
     @property
     def next_us(self) -> int | None:
-        """When the next message is due; None if none waits."""
+        """Return when the next message is due, or None if none waits."""
         return self._waiting[0][0] if self._waiting else None
 
 
 class ShapedLink(LinkWrapper):
-    """`link` with `latency_ms` added in all, half on each leg, and `loss` (0..1) on each leg by itself.
+    """A link with `latency_ms` added in total, half on each leg, and `loss` (0..1) on each leg.
 
-    Raises ValueError for a delay or loss that no network has. Closing it closes `link`.
+    Raises ValueError for an impossible delay or loss. Closing it closes `link`.
     """
 
     def __init__(self, link: Link, latency_ms: float, loss: float, seed: int) -> None:
@@ -128,7 +128,7 @@ class ShapedLink(LinkWrapper):
             return due
 
 
-# The vision service on a link made worse on purpose: `demo --latency-ms --loss` runs it. Shell.
+# The vision service on a degraded link, for `demo --latency-ms --loss`. Shell.
 
 
 INJECTED = "injected: "

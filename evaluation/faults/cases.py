@@ -80,7 +80,7 @@ def _restart_vision(rig: RobotFixture) -> Injected:
 def _hurt(rig: RobotFixture, part: str, number: signal.Signals) -> Injected:
     """Send the network or driver process a signal that ends or stops it. Its parent starts a new one.
 
-    The new network process sends frames at once, so the robot may drive from the first command on.
+    The new network process sends frames immediately, so the robot may drive from the first command on.
     """
     pid = partial(getattr(rig.processes, part), "robot")
     before, at_us = pid(), monotonic_us()

@@ -2,7 +2,7 @@
 
     python examples/compose/older_client.py ws://127.0.0.1:9091
 
-It knows nothing of Sightline: no header, no age, no lease. So the robot takes it for a guest, if its owner lets it.
+It has nothing of Sightline: no header, age or lease. The robot treats it as a guest, if guests are enabled.
 """
 
 import base64
@@ -17,21 +17,22 @@ from websockets.sync.client import ClientConnection, connect
 
 YELLOW = (18, 128, 40), (34, 255, 255)
 STAND_OFF_PX = 57.0
-"""How wide a ball of 0.2 m is in the simulated camera (320 pixels, 80 degrees) from 0.67 m; behind a rolling one the
-robot stays further back, since only distance makes it drive."""
+"""Width of a ball of 0.2 m in the simulated camera (320 pixels, 80 degrees) from 0.67 m. Behind a rolling ball the
+robot stays further back, since only distance makes it drive.
+"""
 TURN, AHEAD = 2.2, 1.2
-"""rad/s for a ball at the picture's very edge, m/s for one that is infinitely far."""
+"""rad/s for a ball at the image border, m/s for an infinitely distant ball."""
 
 
 def steer(text: str | bytes) -> str:
-    """A picture as text in, a twist as text out: towards the largest yellow thing, or turning to find it."""
+    """Map an image as text to a twist as text: towards the largest yellow object, or turning to find it."""
     bgr = cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR)
     if bgr is None:
         return "0.0|0.0"
     mask = cv2.inRange(cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV), np.array(YELLOW[0]), np.array(YELLOW[1]))
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     if not outlines:
-        # The robot stops a guest that repeats one twist for 2 s: only another one shows that the picture changes.
+        # The robot stops a guest that repeats one twist for 2 s. Only a new twist shows that the image changes.
         return f"0.0|{0.5 + crc32(text if isinstance(text, bytes) else text.encode()) % 8 / 1000}"
     x, _, width, height = cv2.boundingRect(max(outlines, key=cv2.contourArea))
     half = bgr.shape[1] / 2
@@ -40,7 +41,7 @@ def steer(text: str | bytes) -> str:
 
 
 def drive(robot: ClientConnection) -> None:
-    """Answer every picture."""
+    """Answer every image."""
     for text in robot:
         robot.send(steer(text))
 

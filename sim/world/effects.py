@@ -39,7 +39,7 @@ class DistortedLens:
     """A pinhole model with the distortion of a look, after Brown and Conrady, as OpenCV has it."""
 
     def __init__(self, model: CameraModel, look: Look) -> None:
-        """`model` is the pinhole. Raises ConfigError for a distortion that folds the image."""
+        """Set up the lens. `model` is the pinhole. Raises ConfigError for a distortion that folds the image."""
         self._focal_px = np.array([model.fx_px, model.fy_px])
         self._middle_px = np.array([model.cx_px, model.cy_px])
         self.is_distorted = any(look.distortion)
@@ -106,7 +106,7 @@ class Shutter:
     """Lens distortion, rolling shutter and motion blur, from an image that is drawn without them."""
 
     def __init__(self, model: CameraModel, look: Look) -> None:
-        """`model` is the pinhole of the delivered image. Raises ConfigError for a distortion that folds it."""
+        """Set up the effects. `model`: pinhole of the delivered image. Raises ConfigError if a distortion folds it."""
         self.model = model
         self.lens = DistortedLens(model, look)
         self._readout_s, self._exposure_s = look.rolling_shutter_ms / 1000, look.motion_blur_ms / 1000

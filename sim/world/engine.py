@@ -34,7 +34,7 @@ CameraArrays = tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32], npt.NDArray
 
 
 def camera_arrays(image: Sequence[Any]) -> CameraArrays:
-    """Read what `pybullet.getCameraImage` returns, whether PyBullet was compiled with or without NumPy.
+    """Read the result of `pybullet.getCameraImage`, whether PyBullet was compiled with or without NumPy.
 
     Without NumPy the pixels are flat tuples; with NumPy they are arrays, which are not copied.
 

@@ -32,7 +32,7 @@ Pattern = npt.NDArray[np.float32]
 Random = np.random.Generator
 
 NEEDED_M: Final = 1.0
-"""Area around each place of target and robot, beside the largest distance at the start."""
+"""Area around each place of target and robot, in addition to the largest distance at the start."""
 CEILING_M: Final = 2.4
 LEAST_HUE_OFF_DEG: Final = 25.0
 """From the target's hue, because color alone cannot separate two objects of one hue."""

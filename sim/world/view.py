@@ -36,7 +36,7 @@ class Scenery:
     def __init__(
         self, client: int, scenario: Scenario, things: Sequence[ThingBodies], light: LightBodies | None
     ) -> None:
-        """`things` include the target."""
+        """Store the bodies. `things` include the target."""
         self.client, self.things = client, things
         self._light = light
         self._walls = [corners_of(wall)[0] for wall in scenario.walls]

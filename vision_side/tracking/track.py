@@ -169,7 +169,7 @@ class Track:
         self._followed: _Object | None = None
         self._others: list[_Object] = []
         self._lost: _Object | None = None
-        """The last target, for a while after its loss. Its sighting is not of a rival."""
+        """The last target, until another one is followed. Its sighting is not of a rival."""
         self._lost_look: Look | None = None
         self._unsure_us = 0
         """Time in doubt, or since the loss of the target."""
@@ -278,8 +278,6 @@ class Track:
             taken = [place for one, place in fits.items() if one.is_rival or one in in_doubt]
             places = [one for one in places if difference(self._lost_look, one.sighting.look) < OTHER
                       and all(_apart_m(one, two) > self._config.apart_m for two in taken)]
-        else:
-            self._lost = None
         chosen = next(iter(places), None)
         if chosen is not None:
             known = next((one for one in self._others if fits.get(one) is chosen), None)

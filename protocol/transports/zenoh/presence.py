@@ -74,7 +74,7 @@ def parse_presence_reply(
     Args:
         key: key of the reply.
         payload: JSON of a `Presence`.
-        asked_us: local monotonic time of the query.
+        requested_us: local monotonic time of the query.
         answered_us: local monotonic time of the reply.
         clock_us: local wall clock at the arrival of the reply.
 

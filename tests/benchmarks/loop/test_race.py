@@ -86,8 +86,8 @@ def test_a_percentile_is_a_value_that_so_many_do_not_exceed(values, percent):
 def test_every_image_of_a_tally_counts_once(captured_us, data):
     answered = data.draw(st.sets(st.sampled_from(captured_us)))
     begin_us, end_us = sorted(data.draw(st.tuples(st.integers(0, 10**6), st.integers(0, 10**6))))
-    judged_us = sorted((t_us + 5, t_us) for t_us in answered)
-    course = course_of_tally(captured_us, [(t_us, at_us) for at_us, t_us in judged_us], begin_us, end_us)
+    commands_us = sorted((t_us + 5, t_us) for t_us in answered)
+    course = course_of_tally(captured_us, [(t_us, at_us) for at_us, t_us in commands_us], begin_us, end_us)
     inside = [t_us for t_us in captured_us if begin_us <= t_us < end_us]
     assert course.captured == len(inside)
     assert course.answered_percent == pytest.approx(100 * len(answered & set(inside)) / max(1, len(inside)))

@@ -179,7 +179,7 @@ def test_gate_widens_with_the_time_without_a_sighting(off_m, inside):
 @pytest.mark.parametrize("hidden", [0, 3, 9])
 @pytest.mark.parametrize(("share", "inside"), [(0.999, True), (1.001, False)])
 def test_gate_widens_no_further_than_three_sigma(hidden, share, inside):
-    """Of the difference of place and sighting: 0.3 m/s and 0.35 m/s2 are those of a target that was seen once."""
+    """Sigma is that of place and sighting: 0.3 m/s and 0.35 m/s2 are those of a target that was seen once."""
     track, noise, hidden_s = started((2.0, 0.0), gate_m=0.2, gate_growth_mps=10.0), 0.032**2, DT_S * (hidden + 1)
     for _ in range(hidden):
         track.step(DT_S, HERE, [])
@@ -371,14 +371,9 @@ def test_sighting_between_a_lost_target_and_the_other_is_of_neither_until_the_ot
     assert track.step(DT_S, HERE, [at(2.0, 0.52), at(2.0, 0.22)]).y_m == 0.22
 
 
-def test_lost_target_is_remembered_for_three_seconds():
-    """Then it takes no sighting from the other object, whatever fits better."""
+def test_other_object_is_followed_three_seconds_after_the_loss_though_the_target_could_be_there():
     track = lost_beside((2.0, 0.5), 5)
-    for number in range(30):
-        assert (number, track.step(DT_S, HERE, [at(2.0, 0.5)])) == (number, None)
-    assert track._lost is not None
-    assert track.step(DT_S, HERE, [at(2.0, 0.5)]) is not None
-    assert track._lost is None
+    assert steps_until(track, lambda seen: seen, (2.0, 0.5)) == 31
 
 
 def look(share):
@@ -647,6 +642,14 @@ def test_target_that_was_in_doubt_for_half_a_second_is_lost_and_neither_is_follo
             assert track.step(DT_S, HERE, places) is None
         assert track.step(1e-6, HERE, places) is places[0]
         assert len(others(track)) == 1
+
+
+def test_target_that_was_lost_in_doubt_goes_on_as_one_of_the_others():
+    track = pair(0.2, give_up_s=5.0)
+    for dt_s, places in [(DT_S, [at(*TARGET), at(*about(0.2))])] * 6 + [(DT_S, [])] * 4:
+        track.step(dt_s, HERE, places)
+    assert track.target is None
+    assert [one.state.unseen_us for one in track._others] == [1_000_000] * 2
 
 
 def test_time_in_doubt_counts_from_the_last_frame_without():

@@ -1,4 +1,4 @@
-"""A model for Triton's Python backend: finds the yellow things in a JPEG. Shell (Triton calls it).
+"""A model for Triton's Python backend: finds the yellow objects in a JPEG. Shell (Triton calls it).
 
 Put your own network into `look`. Unused rows have the score 0, which is not a box for any client.
 """
@@ -11,12 +11,12 @@ import triton_python_backend_utils as pb_utils
 
 ROWS = 16
 YELLOW = (18, 128, 40), (34, 255, 255)
-"""Hue (0 to 180), saturation, value (0 to 255), as OpenCV counts them: two-sided, so that green and skin stay out."""
+"""Hue (0 to 180), saturation, value (0 to 255) in OpenCV's units: limited on both sides, to exclude green and skin."""
 SMALLEST_PX = 6
 
 
 def look(bgr: Any) -> list[tuple[int, int, int, int]]:
-    """Boxes (x1, y1, x2, y2), the largest first."""
+    """Return boxes (x1, y1, x2, y2), the largest first."""
     mask = cv2.inRange(cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV), np.array(YELLOW[0]), np.array(YELLOW[1]))
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     found = [cv2.boundingRect(outline) for outline in sorted(outlines, key=cv2.contourArea, reverse=True)[:ROWS]]
@@ -27,7 +27,7 @@ class TritonPythonModel:
     """The class that Triton loads."""
 
     def execute(self, requests: list[Any]) -> list[Any]:
-        """One response for each request; a request holds a batch of one or more pictures."""
+        """Return one response for each request; a request holds a batch of one or more images."""
         return [self._answer(pb_utils.get_input_tensor_by_name(one, "image").as_numpy()) for one in requests]
 
     def _answer(self, jpegs: Any) -> Any:

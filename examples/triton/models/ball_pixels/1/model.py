@@ -1,4 +1,4 @@
-"""A model for Triton's Python backend: finds the yellow things in pixels (BGR, rows first). Shell (Triton calls it)."""
+"""A model for Triton's Python backend: finds yellow objects in pixels (BGR, rows first). Shell (Triton calls it)."""
 
 from typing import Any
 
@@ -9,14 +9,14 @@ import triton_python_backend_utils as pb_utils
 ROWS = 16
 YELLOW = (18, 128, 40), (34, 255, 255)
 BALL = 0
-"""Labels are numbers here; their names are the client's, e.g. --set 'detector.options.labels=["ball"]'."""
+"""Labels are numbers here. Their names are set at the client, e.g. --set 'detector.options.labels=["ball"]'."""
 
 
 class TritonPythonModel:
     """The class that Triton loads."""
 
     def execute(self, requests: list[Any]) -> list[Any]:
-        """One response for each request; a request holds a batch of one or more pictures."""
+        """Return one response for each request; a request holds a batch of one or more images."""
         return [self._answer(pb_utils.get_input_tensor_by_name(one, "image").as_numpy()) for one in requests]
 
     def _answer(self, pictures: Any) -> Any:
