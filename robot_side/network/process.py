@@ -353,13 +353,19 @@ def _run(setup: NetworkSetup, driver: NetworkEnd) -> None:
         process.run()
 
 
+def _ignore_exit_signals() -> None:
+    """Survive the signals that a terminal and systemd send to all processes: the driver ends this one, after zero."""
+    for number in EXIT_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    # Not ignored: a child of a camera plug-in, e.g. rpicam-vid, would inherit that, and not end by SIGTERM.
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, EXIT_SIGNALS)
+
+
 def main() -> None:
     """Run the network process. argv[1] and argv[2] are the descriptors of its sockets."""
     start_log(None, "robot")
-    # A terminal and systemd send them to all processes. The driver ends this one, after wheels at zero.
-    for number in EXIT_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, EXIT_SIGNALS)
+    _ignore_exit_signals()
     driver = NetworkEnd(*(socket.socket(fileno=int(number)) for number in sys.argv[1:3]))
     setup = NetworkSetup.model_validate_json(driver.receive())
     code = 1

@@ -240,6 +240,25 @@ def test_camera_loop_wakes_for_an_answer_only_once_a_frame_is_due(process, monke
     assert (slept, waited) == (slept_s, waited_s)
 
 
+def test_process_survives_exit_signals_and_its_child_ends_by_sigterm():
+    """A camera plug-in may run a program of its own."""
+    code = """if True:
+        import os, subprocess, sys
+        from sightline.robot_side.driver.supervision import EXIT_SIGNALS
+        from sightline.robot_side.network import process
+        process._ignore_exit_signals()
+        for number in EXIT_SIGNALS:
+            os.kill(os.getpid(), number)
+        child = subprocess.Popen([sys.executable, "-c", "print('runs', flush=True); import time; time.sleep(30)"],
+                                 stdout=subprocess.PIPE)
+        child.stdout.readline()
+        child.terminate()
+        print(child.wait(10))
+    """
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+    assert done.stdout == f"{-signal.SIGTERM}\n", done.stderr
+
+
 @pytest.mark.parametrize("number", EXIT_SIGNALS)
 def test_signal_during_a_start_of_the_network_process_does_not_end_it(tmp_path, monkeypatch, number):
     """Whatever it does then, e.g. importing, a traceback would be the last that the operator reads."""
