@@ -210,7 +210,7 @@ class MissionChannel:
         Args:
             pipeline: the pipeline of the robot.
             frame: header of the frame, or of a status.
-            waited_us: time since the frame came here; what came later may be newer by it.
+            waited_us: delay of the frame, on its way and here; a message that came later may be newer by it.
         """
         message = self._missions.take()
         if message is not None:

@@ -403,7 +403,8 @@ class Service:
         if self._pipeline is None:
             self._publish(header, PipelineAnswer(None, Observation("no image", note="no camera model yet")), 0)
             return
-        self._mission_channel.prepare(self._pipeline, header, self._queue_ages_us[-1])
+        late_us = self._sessions.clock.age_us(header.session, header.t_us, self._now_us()) or 0
+        self._mission_channel.prepare(self._pipeline, header, max(late_us, self._queue_ages_us[-1]))
         deadline_us = monotonic_us() + round(self._config.detector.deadline_s * 1e6)
         answer = self._pipeline.step(Frame(header, message.payload, deadline_us))
         if answer.skipped:

@@ -318,15 +318,18 @@ def test_a_mission_that_uses_scans_is_given_the_newest_and_cites_it():
 
 @pytest.fixture(params=[0, 700_000])
 def late(request, monkeypatch):
-    """A bench, and the time for which each frame waits there for its turn."""
-    bench, clock_us = Bench(), [0]
+    """A bench, and the time for which each frame waits there for its turn. Both clocks run alike."""
+    bench, taken = Bench(), [0]
     take = bench.service._frames.take
 
     def taken_late(wait_s):
-        clock_us[0] += request.param
+        taken[0] = bench.seq
         return take(wait_s)
 
-    monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: clock_us[0])
+    def now_us():
+        return bench.seq * FRAME_US + (request.param if taken[0] == bench.seq else 0)
+
+    monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", now_us)
     monkeypatch.setattr(bench.service._frames, "take", taken_late)
     return bench, request.param
 
@@ -338,6 +341,16 @@ def test_mission_that_cites_a_status_of_the_future_is_rejected(late):
     assert bench.report().refused == (f"FROM_FUTURE: cites a status {newer_s:.1f} s newer than the newest frame here; "
                                       "repeat the request")
     assert bench.ask(number=2, age_us=-400_000 - waited_us).report().refused == ""
+
+
+def test_mission_with_a_frame_that_the_network_delayed_is_applied(monkeypatch):
+    """An operator cites the newest status. The newest frame here may be older, by as much as the frame was late."""
+    bench, late_us = Bench(), 0
+    monkeypatch.setattr("sightline.vision_side.serving.service.monotonic_us", lambda: bench.seq * FRAME_US + late_us)
+    bench.frames(30)
+    late_us = 700_000
+    assert bench.ask(age_us=-late_us).report().refused == ""
+    assert bench.ask(number=2, age_us=-late_us - 600_000).report().refused.startswith("FROM_FUTURE")
 
 
 def test_scan_of_the_future_is_rejected(late):
