@@ -213,8 +213,8 @@ def summary(scored: DemoReport) -> list[str]:
 def _detector_lines(log: Path) -> list[str]:
     """Return the notices of the detector in a log of vision, e.g. that the color range marks the floor."""
     parts = (line.partition(" vision: detector: ") for line in log.read_text("utf-8", "replace").splitlines())
-    lines_of = dict.fromkeys(line for _, found, line in parts if found)
-    return [f"detector: {line}" for line in list(lines_of)[:MOST_NOTICES]]
+    notices = dict.fromkeys(line for _, found, line in parts if found)
+    return [f"detector: {line}" for line in list(notices)[:MOST_NOTICES]]
 
 
 def _replay_line(replayed: Replayed) -> str:

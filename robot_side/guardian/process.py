@@ -133,16 +133,16 @@ class Guardian:
 
     def _log_end(self, code: int, *, was_zeroed: bool) -> None:
         if self._reason:
-            self._print(f"the driver process was killed: {self._reason}")
+            self._log_line(f"the driver process was killed: {self._reason}")
         elif code < 0:
-            self._print(f"the driver process was ended by signal {-code}")
+            self._log_line(f"the driver process was ended by signal {-code}")
         elif self._monitor.is_running:
-            self._print(f"the driver process ended by itself with code {code}; did a plug-in end it?")
+            self._log_line(f"the driver process ended by itself with code {code}; did a plug-in end it?")
         if (error := self._zero_failed) is not None:
             _log.error("robot %s: motors NOT set to zero: %s: %s; switch off their supply",
                        self._setup["robot"], type(error).__name__, error, exc_info=error)
         elif was_zeroed:
-            self._print("the motors are set to zero")
+            self._log_line("the motors are set to zero")
 
     def _needs_zero(self, code: int) -> bool:
         """Return True if the wheels may turn, maybe since an earlier process. One that ends with 0 stopped them."""
@@ -207,7 +207,7 @@ class Guardian:
             self._permit_silence(os.environ.get("WATCHDOG_USEC", ""))
             # Once, after the lines of a driver process that does not start. An operator watches a tool.
             if not self._fed_us and self._setup["driver"] is not None:
-                self._print(_NOT_COVERED.format("" if self._systemd.is_active else _NO_WATCHDOG))
+                self._log_line(_NOT_COVERED.format("" if self._systemd.is_active else _NO_WATCHDOG))
         self._monitor.on_beat(kind, sent_us)
         if kind == ENDING:
             self._systemd.notify("STOPPING=1")
@@ -252,7 +252,7 @@ class Guardian:
         self._driver_pid = self._start([theirs, *([self._receiver.near] if self._receiver else [])])
         theirs.close()
         self._monitor = HeartbeatMonitor(heartbeat_us())
-        self._print("a new driver process starts")
+        self._log_line("a new driver process starts")
 
     def _start(self, ends: Sequence[socket.socket]) -> int:
         """Start a driver process whose arguments are the descriptors of `ends`. Returns its process id."""
@@ -299,7 +299,7 @@ class Guardian:
     def _may_not_wait(self, now_us: int) -> bool:
         return not self._monitor.is_ready or now_us >= self._end_by_us
 
-    def _print(self, line: str) -> None:
+    def _log_line(self, line: str) -> None:
         _log.info("robot %s: %s", self._setup["robot"], line)
 
 

@@ -419,7 +419,7 @@ class _Motor:
 
     def __init__(self, pins: tuple[int, ...], is_reversed: bool) -> None:
         self._pins = (pins[1], pins[0]) if is_reversed else (pins[0], pins[1])
-        self._set = dict.fromkeys(pins, 0.0)
+        self._duty = dict.fromkeys(pins, 0.0)
 
     def let_go(self, pins: Pins, duty: float) -> bool:
         """Put low what `duty` does not drive; whether a pin that was driven has to make way for the other one."""
@@ -440,13 +440,13 @@ class _Motor:
                     pins.write(number, 0.0)
             except Exception:  # the others still have to go down
                 continue
-            self._set[number] = 0.0
+            self._duty[number] = 0.0
 
     def _write(self, pins: Pins, number: int, duty: float) -> bool:
-        if self._set[number] == duty:
+        if self._duty[number] == duty:
             return False
         pins.write(number, duty)
-        self._set[number] = duty
+        self._duty[number] = duty
         return True
 
 

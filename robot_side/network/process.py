@@ -137,7 +137,7 @@ class NetworkProcess:
             return
         header, message = sent
         # The driver process must know a frame before a peer can answer it.
-        # A checksum may be 0, that of an empty image is, and 0 means that the camera is not live.
+        # 0 means that the camera is not live; the checksum of an empty image is 0, too.
         fingerprint = zlib.crc32(picture.jpeg) or 1 if self.camera and self.camera.live else 0
         if self._network_end.send_aside(ipc.pack_issued(header.seq, header.t_us, fingerprint)):
             self._link.publish(message.channel, message.header, message.payload)
