@@ -12,10 +12,11 @@ applicable, since another case reports its fault.
 import itertools
 import json
 import zlib
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
-from sightline.conformance.case import NOT_DRIVING, Bench, Received
+from sightline.conformance.case import KEPT_MESSAGES, NOT_DRIVING, Bench, Received
 from sightline.conformance.vision.images import CAMERA as LENS
 from sightline.conformance.vision.images import picture
 from sightline.protocol.channels import ACK, CAMERA, FRAME, STATUS, TWIST, Channel
@@ -119,7 +120,7 @@ class RobotPlayed:
         self._began_us, self._mark, self._dropped = bench.now_us, bench.mark(), bench.dropped_here.total()
         self._first_t_us, self._last_t_us, self._next_seq = first_t_us, first_t_us - 1, first_seq
         self._stamps, self._stopped = itertools.count(1), False
-        self._read: dict[int, VisionAnswer] = {}
+        self._answers: list[VisionAnswer] = []
         self._plain: list[Sent] = []
         self._announce_camera()
         self._announce_status()
@@ -193,12 +194,12 @@ class RobotPlayed:
 
     def answers(self, since: int | None = None) -> list[VisionAnswer]:
         """Return twists and acks since the start of this robot, or since a mark, in order of arrival."""
-        since = self._mark if since is None else since
-        received = [*self.bench.received(TWIST, since), *self.bench.received(ACK, since)]
-        for one in received:
-            if one.number not in self._read:
-                self._read[one.number] = read_answer(one)
-        return [self._read[number] for number in sorted(one.number for one in received)]
+        newest = self._answers[-1].received.number if self._answers else 0
+        new = [*self.bench.received(TWIST, newest), *self.bench.received(ACK, newest)]
+        self._answers += [read_answer(one) for one in sorted(new, key=lambda one: one.number)]
+        del self._answers[: -2 * KEPT_MESSAGES]
+        first = bisect_right(self._answers, self._mark if since is None else since, key=lambda one: one.received.number)
+        return self._answers[first:]
 
     def twists(self, since: int | None = None) -> list[VisionAnswer]:
         """Return only the twists."""
@@ -214,8 +215,10 @@ class RobotPlayed:
         return [one for one in self.answers(since) if [one.echo.get(name) for name in names] not in plain]
 
     def answers_to(self, sent: Sent) -> list[VisionAnswer]:
-        """Return all answers that cite `sent`."""
-        return [one for one in self.answers() if one.cites(sent)]
+        """Return all answers since it was sent that cite `sent`."""
+        answers = self.answers()
+        first = bisect_left(answers, sent.at_us, key=lambda one: one.received.at_us)
+        return [one for one in answers[first:] if one.cites(sent)]
 
     def is_answered(self, sent: Sent, within_us: int = ANSWER_US) -> bool:
         """Return True if an answer to `sent` arrives in time."""

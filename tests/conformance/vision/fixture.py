@@ -71,7 +71,7 @@ class VirtualVision(Service):
         self.network = network
         self.link: MemoryLink = network.link(robot, role="vision")
         self.now_us = 0
-        super().__init__(CONFIG, self.link, lambda line: None)
+        super().__init__(CONFIG, self.link, lambda line: None, RememberingDetector())
 
     def tick(self, now_us: int) -> None:
         self.now_us = now_us

@@ -44,6 +44,8 @@ class Leg:
         self.random = Random(self.seed)
 
     def rate(self, now_us):
+        if not self.steps:  # called once per packet, millions of times
+            return self.rate_bit_s
         return next((rate for since, rate in reversed(self.steps) if now_us >= since), self.rate_bit_s)
 
     def send(self, size_bytes, now_us):
