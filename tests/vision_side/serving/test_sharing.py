@@ -1,6 +1,7 @@
 """Several services share robots: who drives after each event, in virtual time with late tokens."""
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import groupby, pairwise
 from math import inf
 from random import Random
@@ -54,10 +55,17 @@ class Robot:
 
     def status(self, now_us):
         holds = self.holder and now_us - self.received_us < LEASE_US
-        shown = LeaseHolder(source="vision", digest=self.holder) if holds else None
-        stream = StreamStatus(sent=self.sent, credit_timeouts=self.unanswered)
-        return Status(state=self.state, reason="", holder=shown, accepted=self.accepted,
-                      refused={"STALE": self.rejected, "UNKNOWN_SOURCE": self.strange}, stream=stream)
+        holder = self.holder if holds else ""
+        return status_of(self.state, holder, self.accepted, self.rejected, self.strange, self.sent, self.unanswered)
+
+
+@lru_cache
+def status_of(state, holder, accepted, stale, strange, sent, unanswered):
+    """Build a status once for all services that see it."""
+    shown = LeaseHolder(source="vision", digest=holder) if holder else None
+    stream = StreamStatus(sent=sent, credit_timeouts=unanswered)
+    return Status(state=state, reason="", holder=shown, accepted=accepted,
+                  refused={"STALE": stale, "UNKNOWN_SOURCE": strange}, stream=stream)
 
 
 class Service:
