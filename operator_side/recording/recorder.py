@@ -1,8 +1,9 @@
 """Writes the messages of a link to MCAP and reads them back. Shell (threads, files).
 
-One MCAP channel per Sightline channel (and source: `twist/vision`), encoding `sightline.v1`: message data = header
-length (uint16, big-endian), header, payload, exactly as they came. `log_time` is when this end received it, for the
-robot's own clock is in the header. It never goes back: the wall clock is read once. Opens in any MCAP tool. A file cut
+One MCAP channel per Sightline channel (and source: `twist/vision`), as JSON with a schema, which other tools show
+(`foxglove`). A message that is not valid JSON, and every message of older recordings, has the encoding `sightline.v1`:
+header length (uint16, big-endian), header, payload. Both read back exactly as the message came. `log_time` is when this
+end received it, for the robot's own clock is in the header. It never goes back: the wall clock is read once. A file cut
 short by a kill reads here up to the cut; for other tools, `mcap recover` writes its index.
 """
 
@@ -21,6 +22,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, Self, cast
 
 from sightline.operator_side.preflight import needs
+from sightline.operator_side.recording import foxglove
 from sightline.protocol.channels import (
     ACK,
     CAMERA,
@@ -72,7 +74,7 @@ class Recorder:
         self._queue: queue.Queue[tuple[int, Message] | None] = queue.Queue(MAX_WAITING)
         self._path, self._file = path, _open_new(path)
         self._writer, self._about = _writer(self._file), dict(about)
-        self._ids: dict[str, int] = {}
+        self._ids: dict[tuple[str, str], int] = {}
         self._counts: dict[str, int] = {}
         self.dropped = 0
         """Number of messages that the disk was too slow for."""
@@ -125,11 +127,27 @@ class Recorder:
 
     def _write(self, log_time_ns: int, message: Message) -> None:
         topic = message.channel.name + (f"/{message.source}" if message.source else "")
-        if topic not in self._ids:
-            self._ids[topic] = self._writer.register_channel(topic=topic, message_encoding=ENCODING, schema_id=0)
         count = self._counts[topic] = self._counts.get(topic, 0) + 1
-        data = _LENGTH.pack(len(message.header)) + message.header + message.payload
-        self._writer.add_message(self._ids[topic], log_time_ns, data, publish_time=log_time_ns, sequence=count)
+        try:
+            encoding, data = foxglove.ENCODING, foxglove.shown(message, log_time_ns)
+        except ValueError:
+            encoding, data = ENCODING, _LENGTH.pack(len(message.header)) + message.header + message.payload
+        number = self._channel_id(topic, encoding, message.channel)
+        self._writer.add_message(number, log_time_ns, data, log_time_ns, count)
+        pose = foxglove.transform(message, log_time_ns)
+        if pose is not None:
+            number = self._channel_id(foxglove.TRANSFORM, foxglove.ENCODING, None)
+            self._writer.add_message(number, log_time_ns, pose, log_time_ns)
+
+    def _channel_id(self, topic: str, encoding: str, channel: Channel | None) -> int:
+        """Return the number of a topic in the file. JSON has the schema of `channel`, or of the transforms for None."""
+        if (topic, encoding) not in self._ids:
+            schema_id = 0
+            if encoding == foxglove.ENCODING:
+                name, schema = foxglove.schema_of(channel)
+                schema_id = self._writer.register_schema(name, foxglove.SCHEMA_ENCODING, schema)
+            self._ids[topic, encoding] = self._writer.register_channel(topic, encoding, schema_id)
+        return self._ids[topic, encoding]
 
     def close(self) -> None:
         """Write the waiting messages and finish the file, for `CLOSE_S` at most; a second call does nothing."""
@@ -183,7 +201,7 @@ def read_recording(path: Path) -> Iterator[Recorded]:
     """Yield every message in the order of arrival, to the end of the file. Raises ConfigError for another file."""
     with _reading(path) as reader:
         for _schema, channel, message in reader.iter_messages(log_time_order=False):
-            parsed = _parse(channel.topic, message.data)
+            parsed = _parse(channel.topic, channel.message_encoding, message.data)
             if parsed is not None:
                 yield Recorded(message.log_time, parsed)
 
@@ -214,9 +232,11 @@ def _reading(path: Path) -> Iterator[Any]:
         raise ConfigError(f"invalid recording {path}: {type(error).__name__}") from None
 
 
-def _parse(topic: str, data: bytes) -> Message | None:
+def _parse(topic: str, encoding: str, data: bytes) -> Message | None:
     name, _, source = topic.partition("/")
     channel = CHANNELS.get(name)
+    if channel is not None and encoding == foxglove.ENCODING:
+        return foxglove.received(channel, source, data)
     if channel is None or len(data) < _LENGTH.size:
         return None
     end = _LENGTH.size + _LENGTH.unpack_from(data)[0]

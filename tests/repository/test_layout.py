@@ -51,6 +51,7 @@ PURE = (
     "vision_side/missions/*.py",
     "vision_side/detect/port.py",
     "vision_side/detect/color/*.py",
+    "operator_side/recording/foxglove.py",
     "protocol/*.py",
     "protocol/spec/*.py",
     "protocol/transports/websocket/framing.py",
@@ -314,7 +315,9 @@ _CODE = re.compile(r"`([^`\n]+)`")
 _PATH = re.compile(rf"(?<![\w./-])(?:{'|'.join(PACKAGES)}|tests|docs|examples)(?:/[\w.-]+)+(?![\w<*])")
 _DOTTED = re.compile(rf"sightline\.(?:{'|'.join(PACKAGES)})(?:\.\w+)*")
 _CAMEL_CASE = re.compile(r"\b[A-Z][a-z0-9]+(?:[A-Z][a-z0-9]*)+\b(?!\.\w+\()")
-FOREIGN_CLASSES = {"MyClass", "NaN", "VideoCapture"}
+FOREIGN_CLASSES = {
+    "MyClass", "NaN", "VideoCapture", "CameraCalibration", "CompressedImage", "FrameTransform", "LaserScan",
+}
 
 
 def texts():
