@@ -66,25 +66,21 @@ class DemoReport:
             "score": asdict(self.score),
             "scenario": options.scenario, "seed": options.seed, "latency_ms": options.latency_ms, "loss": options.loss,
             "replayed": asdict(self.replayed), "injected": self.injected,
-            "recorder_dropped": self.run.dropped_by_recorder, "recorder_failed": self.run.recorder_failed,
+            "recorder_dropped": self.run.dropped_by_recorder,
             "interrupted": self.run.interrupted, "folder": str(self.run.folder),
         }
 
 
 def report(run: DemoRun) -> DemoReport:
-    """Score `run`. Raises CheckError for a run that ended before its start."""
+    """Score `run`. Raises CheckError for a run that ended before its start, ConfigError for an incomplete recording."""
+    recording = run.folder / RECORDING
+    if run.recorder_failed:  # without the rest, a run that drove well would fail
+        raise ConfigError(f"recording {recording} ends too early to be scored: {run.recorder_failed}; {OTHER_FOLDER}")
     if not run.samples:
         raise CheckError(f"ended before the robot drove; the logs are in {run.folder}")
-    recording = run.folder / RECORDING
     answered: list[AnsweredFrame] = []
-    try:  # the same pipeline gives the same results for the same frames
-        replayed = replay(
-            recording, lambda step: answered.append(AnsweredFrame.of(step.frame.header.t_us, step.answer.seen)))
-    except ConfigError:
-        if not run.recorder_failed:
-            raise
-        why = f"recording {recording} ends too early to be scored: {run.recorder_failed}"
-        raise ConfigError(f"{why}; {OTHER_FOLDER}") from None
+    replayed = replay(  # the same pipeline gives the same results for the same frames
+        recording, lambda step: answered.append(AnsweredFrame.of(step.frame.header.t_us, step.answer.seen)))
     during = [one for one in answered if run.samples[0].t_us <= one.t_us <= run.samples[-1].t_us]
     record = RunRecord(run.samples, during, accepted_us(recording), _wheels(run))
     result = score(run.scenario, record)
@@ -201,8 +197,6 @@ def summary(scored: DemoReport) -> list[str]:
     lines.append(_replay_line(replayed))
     if run.dropped_by_recorder:
         lines.append(f"the recorder dropped {run.dropped_by_recorder} messages: the disk was too slow")
-    if run.recorder_failed:
-        lines.append(f"the recording ends early: {run.recorder_failed}")
     if run.killed:
         lines.append(f"had to be killed: {', '.join(run.killed)}; see their logs")
     lines += _detector_lines(run.folder / "vision.log")

@@ -181,7 +181,7 @@ def _drive(run: DemoRun, processes: Processes, sockets: str, print_line: Callabl
         processes.start("vision", _vision_arguments(run, for_vision))
         arm_robot(operator, processes)
         try:
-            _watch(run, processes, operator, truth, block)
+            _watch(run, processes, operator, truth, block, failure=lambda: recorder.failed)
         finally:
             run.holds = holds_in(processes.log("robot").read_text("utf-8", "replace"))
             recorder.close()
@@ -203,13 +203,16 @@ def arm_robot(operator: Operator, processes: Processes) -> None:
             )
 
 
-def _watch(run: DemoRun, processes: Processes, operator: Operator, truth: TruthReader, block: LiveBlock) -> None:
-    """Collect and show the truth until the time is over."""
+def _watch(
+    run: DemoRun, processes: Processes, operator: Operator, truth: TruthReader, block: LiveBlock, *,
+    failure: Callable[[], str],
+) -> None:
+    """Collect and show the truth until the time is over, or the recording fails."""
     _discard_old(truth)
     started_s = time.monotonic()
     seconds = run.options.seconds
     end_s, until = (started_s + seconds, f"of {seconds:g} s") if seconds else (float("inf"), "s, Ctrl-C ends it")
-    while time.monotonic() < end_s:
+    while time.monotonic() < end_s and not failure():
         processes.check()
         sample = truth.read(timeout_s=_SILENT_S)
         if sample is None:

@@ -162,6 +162,31 @@ def test_full_disk_leaves_no_damaged_file(lights, tmp_path, monkeypatch, room_by
     assert sorted(path.name for path in tmp_path.iterdir()) == [RECORDING, *files]
 
 
+@pytest.mark.parametrize("share", [10, 60, 100])
+def test_recording_that_ends_early_fails_no_check(lights, tmp_path, monkeypatch, capsys, share):
+    """A part of the answers would show a mission that does nothing from there on."""
+    shutil.copytree(lights.folder, tmp_path, dirs_exist_ok=True)
+    os.truncate(tmp_path / RECORDING, (tmp_path / RECORDING).stat().st_size * share // 100)
+    cut = replace(lights, folder=tmp_path, recorder_failed="No space left on device")
+    for samples in (lights.samples, []):
+        driven = replace(cut, samples=samples)
+        monkeypatch.setattr(demo_run, "run_demo", lambda *_given, driven=driven: driven)
+        code, out, err = run(capsys, "demo", "--scenario", "traffic-light")
+        assert code == 2 and "FAIL" not in out
+        assert err == (f"error: recording {tmp_path / RECORDING} ends too early to be scored: No space left on device; "
+                       "free some space or pass another folder with --out\n")
+
+
+@pytest.mark.parametrize("seconds", [0.0, 20.0])
+def test_demo_ends_when_its_recording_does(lights, seconds):
+    failures = iter(["", "", "No space left on device"])
+    truth = SimpleNamespace(read=lambda timeout_s: lights.samples[0] if timeout_s else None)
+    driven = replace(lights, samples=[], options=replace(lights.options, seconds=seconds))
+    idle = SimpleNamespace(check=lambda: None, report=None, show=lambda _lines: None)
+    demo_run._watch(driven, idle, idle, truth, idle, failure=lambda: next(failures))
+    assert driven.samples == lights.samples[:1] * 2
+
+
 def test_recording_without_a_camera_model_names_the_error_of_the_disk(lights, tmp_path):
     with Recorder(StatusLink(), tmp_path / RECORDING, {VISION_CONFIG: VisionConfig().model_dump_json()}):
         pass
