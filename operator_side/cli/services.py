@@ -452,7 +452,9 @@ def metrics(
     robot: Robot = None,
     connect: Connect = None,
     secure: Secure = "",
-    host: Annotated[str, typer.Option(help="Address to listen on; 0.0.0.0 accepts every network.")] = "127.0.0.1",
+    host: Annotated[
+        str, typer.Option(help="Address to listen on; 0.0.0.0 accepts every network, :: also IPv6.")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port to listen on.")] = 9464,
 ) -> int:
     """Serve a robot's status to Prometheus
@@ -463,6 +465,8 @@ def metrics(
         import_module("prometheus_client")
     from sightline.operator_side.cockpit.metrics import Watched, serving
 
+    if not host:
+        raise ConfigError("invalid --host '': expected an address of this machine, e.g. 127.0.0.1")
     target, ending = target_of(robot, connect, secure), threading.Event()
     with (
         open_link(target.robot, connect=target.connect, role=ROLE, secure=target.secure) as link,

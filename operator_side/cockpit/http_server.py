@@ -5,6 +5,7 @@ something must come from the page itself.
 """
 
 import json
+import socket
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -75,6 +76,8 @@ def served(routes: Mapping[str, Route], port: int, host: str = HOST, *, names: S
     Raises:
         LinkError: the port is in use.
     """
+    host = host.strip("[]")
+    shown = f"[{host}]" if ":" in host else host
     handler = type("Handler", (_Handler,), {"routes": dict(routes), "names": names})
     try:
         server = _Server((host, port), handler)
@@ -82,10 +85,10 @@ def served(routes: Mapping[str, Route], port: int, host: str = HOST, *, names: S
         owner = port_owner(port)
         busy = f"port {port} is in use by {owner}; choose another"
         other = f"{getattr(error, 'strerror', None) or error}; choose another port, or an address of this machine"
-        raise LinkError(f"cannot serve on {host}:{port}: {busy if owner else other}") from None
+        raise LinkError(f"cannot serve on {shown}:{port}: {busy if owner else other}") from None
     threading.Thread(target=server.serve_forever, args=(0.05,), name="http", daemon=True).start()
     try:
-        yield f"http://{host}:{server.server_port}/"
+        yield f"http://{shown}:{server.server_port}/"
     finally:
         server.shutdown()
         server.server_close()
@@ -108,9 +111,10 @@ class _Server(ThreadingMixIn, HTTPServer):
     block_on_close = False
     request_queue_size = MAX_CONNECTIONS  # a connection beyond the queue waits for a second to try again
 
-    def __init__(self, *arguments: Any) -> None:
+    def __init__(self, address: tuple[str, int], handler: Any) -> None:
         self._places = threading.BoundedSemaphore(MAX_CONNECTIONS)
-        super().__init__(*arguments)
+        self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+        super().__init__(address, handler)
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if self._places.acquire(blocking=False):
@@ -146,6 +150,9 @@ class _Handler(BaseHTTPRequestHandler):
     names: Sequence[str]
 
     def do_GET(self) -> None:
+        self._answer("GET")
+
+    def do_HEAD(self) -> None:
         self._answer("GET")
 
     def do_POST(self) -> None:
@@ -188,4 +195,5 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in {**fixed, **answer.headers}.items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(answer.body)
+        if self.command != "HEAD":
+            self.wfile.write(answer.body)

@@ -16,7 +16,7 @@ from sightline.vision_side.serving.service import Observe, ServiceCounts, Servin
 if TYPE_CHECKING:
     from sightline.operator_side.cockpit.metrics import Family
 
-_WHERE: Final = re.compile(r"(?:([^\s:]+):)?([0-9]{1,5})")
+_WHERE: Final = re.compile(r"(?:(\[[^\s\]]+\]|[^\s:\[\]]+):)?([0-9]{1,5})")
 _LOOPBACK: Final = "127.0.0.1"
 
 

@@ -119,7 +119,7 @@ def _ready_if_up(port):
         return 0
 
 
-@pytest.mark.parametrize("where", ["", "x", "0", "70000", "1:2:3", "a b:9"])
+@pytest.mark.parametrize("where", ["", "x", "0", "70000", "1:2:3", "a b:9", "::1:9465", "[::1]", "[]:9", "[:9"])
 def test_invalid_address_is_rejected(where, capsys):
     assert cli.run(["vision", "--metrics", where]) == 2
     assert capsys.readouterr().err.startswith(f"error: invalid --metrics '{where}'")

@@ -1,5 +1,7 @@
 """The small server of `/metrics` and the probes: silent or closed connections delay no other."""
 
+import http.client
+import re
 import select
 import socket
 import threading
@@ -16,10 +18,12 @@ import pytest
 from sightline.operator_side.cockpit import http_server, vision_metrics
 from sightline.operator_side.cockpit.http_server import MAX_CONNECTIONS
 from sightline.operator_side.cockpit.metrics import serving
-from sightline.operator_side.cockpit.vision_metrics import VisionMetrics, served
+from sightline.operator_side.cockpit.vision_metrics import VisionMetrics, listening_address, served
+from sightline.protocol.errors import LinkError
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving import fleet
 from sightline.vision_side.serving.service import LIVE_S, ServiceCounts, ServingState
+from tests.fixtures.commands import run
 from tests.fixtures.links import until
 from tests.fixtures.ports import free_port
 
@@ -59,6 +63,50 @@ def test_probes_of_a_supervisor(live, ready):
     with served_port(live=live, ready=ready) as port:
         found = [_status(port, path) for path in ("live", "ready", "health")]
     assert found == [codes[live], codes[ready], codes[ready]], "/health is the former name of /ready"
+
+
+@pytest.mark.parametrize(("host", "shown", "reached"), [
+    ("::1", "[::1]", ["::1"]), ("[::1]", "[::1]", ["::1"]), ("::", "[::]", ["::1", "127.0.0.1"]),
+    ("0.0.0.0", "0.0.0.0", ["127.0.0.1"]), ("localhost", "localhost", ["127.0.0.1"]),
+])  # fmt: skip
+def test_metrics_are_served_over_ipv6_and_ipv4(host, shown, reached):
+    with serving(Nothing(), host, 0) as address:
+        port = urlsplit(address).port
+        assert address == f"http://{shown}:{port}/"
+        for one in reached:
+            with socket.create_connection((one, port), 3) as connection:
+                connection.sendall(b"GET /ready HTTP/1.0\r\n\r\n")
+                assert connection.recv(12) == b"HTTP/1.1 200"
+        with pytest.raises(LinkError, match=re.escape(f"cannot serve on {shown}:{port}: port {port} is in use by")), (
+                serving(Nothing(), host, port)):
+            pass
+
+
+@pytest.mark.parametrize(("where", "address"), [
+    ("[::1]:9465", ("[::1]", 9465)), ("[::]:1", ("[::]", 1)), ("0.0.0.0:9", ("0.0.0.0", 9)), ("h:9", ("h", 9)),
+    ("65535", ("127.0.0.1", 65535)),
+])  # fmt: skip
+def test_address_of_metrics_is_read(where, address):
+    assert listening_address(where) == address
+
+
+def test_empty_host_of_metrics_is_rejected(capsys):
+    """It would listen on every network."""
+    code, _, err = run(capsys, "metrics", "--host", "")
+    assert (code, err) == (2, "error: invalid --host '': expected an address of this machine, e.g. 127.0.0.1\n")
+
+
+@pytest.mark.parametrize(("path", "code"), [("metrics", 200), ("ready", 503), ("live", 200), ("x", 404)])
+def test_head_has_the_headers_of_get_without_its_body(path, code):
+    with served_port(ready=False) as port, socket.create_connection(("127.0.0.1", port), 3) as connection:
+        answers = {}
+        for method in ("HEAD", "GET"):
+            connection.sendall(f"{method} /{path} HTTP/1.1\r\nHost: h\r\n\r\n".encode())
+            answer = http.client.HTTPResponse(connection, method=method)
+            answer.begin()
+            kept = {name: value for name, value in answer.getheaders() if name != "Date"}
+            answers[method] = answer.status, kept, answer.read()
+    assert answers["HEAD"] == (*answers["GET"][:2], b"") and answers["GET"][0] == code
 
 
 def test_vision_service_is_live_while_its_loop_turns_and_ready_until_it_ends():
