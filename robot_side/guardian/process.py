@@ -5,7 +5,6 @@ no device while a driver process lives: a GPIO line has one owner, so it kills t
 """
 
 import ctypes
-import importlib
 import json
 import logging
 import os
@@ -45,6 +44,7 @@ from sightline.robot_side.guardian.core import (
     needs_zero,
     unpack_beat,
 )
+from sightline.robot_side.guardian.zero import load_zero
 
 _log: Final = logging.getLogger("sightline.guardian")
 
@@ -71,15 +71,7 @@ class Guardian:
     def __init__(self, setup: dict[str, Any]) -> None:
         self._setup = setup
         self._zero_config = setup["zero"]["config"]
-        try:
-            module = importlib.import_module(setup["zero"]["module"])
-        except ImportError:  # of a plug-in that is installed in an unusual way
-            importlib.import_module("site").main()
-            module = importlib.import_module(setup["zero"]["module"])
-        getattr(module, "prepare", lambda: None)()
-        self._zero: Any = module
-        for part in setup["zero"]["name"].split("."):
-            self._zero = getattr(self._zero, part)
+        self._zero: Any = load_zero(setup["zero"])
         self._path = json.dumps(setup["path"])
         self._beats = socket.socket(fileno=setup["beats"])
         self._receiver: StopProcess | None = None

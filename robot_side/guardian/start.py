@@ -25,6 +25,7 @@ from sightline.robot_side.config import RobotConfig
 from sightline.robot_side.driver.supervision import EXIT_SIGNALS, GUARDIAN_PRIORITY, schedule_real_time
 from sightline.robot_side.guardian import stop_receiver
 from sightline.robot_side.guardian.core import FAILED, LOST, STARTS_WITHIN_US, pack_beat
+from sightline.robot_side.guardian.zero import write_note
 from sightline.robot_side.plugins import DRIVES
 
 _log: Final = logging.getLogger(__name__)
@@ -103,6 +104,11 @@ def become_guardian(config: RobotConfig, *, restarts: bool) -> GuardianEnd:
             "near": receiver.near.fileno(), "far": receiver.far.fileno(),
         },
     }
+    try:
+        write_note(setup)
+    except OSError as error:
+        _log.warning("robot %s: no note of its drive: %s; its wheels stop seconds later if all its processes die at "
+                     "once", config.robot, error)
     for handler in (*logging.getLogger().handlers, sys.stdout, sys.stderr):
         handler.flush()
     signal.pthread_sigmask(signal.SIG_BLOCK, EXIT_SIGNALS)  # until the guardian can forward them

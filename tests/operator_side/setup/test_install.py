@@ -49,7 +49,8 @@ def test_unit_has_the_paths_of_this_machine(service, tmp_path):
 
 def test_unit_zeroes_the_motors_after_every_end(tmp_path):
     unit = _parsed(install.plan("robot", PROGRAM, CONFIG, "pi", tmp_path).text)
-    assert unit["Service"]["ExecStopPost"] == f"{PROGRAM} robot --config {CONFIG} --zero-motors"
+    at_once = f"{PROGRAM.with_name('python')} -P -m sightline.robot_side.guardian.zero"
+    assert unit["Service"]["ExecStopPost"] == f"{at_once} {PROGRAM} robot --config {CONFIG} --zero-motors"
     assert unit["Service"]["Type"] == "notify"
 
 
@@ -227,7 +228,8 @@ def test_instances_share_one_template_and_each_has_a_name(vision, capsys):
 @pytest.mark.parametrize(("service", "instances"), [("robot", None), ("vision", None), ("vision", 2)])
 def test_command_line_accepts_the_commands_of_the_unit(service, instances, tmp_path):
     unit = install.plan(service, PROGRAM, CONFIG, "pi", tmp_path, instances=instances).text
-    commands = [line.partition("=")[2].split() for line in unit.splitlines() if line.startswith("Exec")]
+    lines = [line for line in unit.splitlines() if line.startswith("Exec")]
+    commands = [line[line.index(str(PROGRAM)):].split() for line in lines]
     assert [command[:2] for command in commands] == [[str(PROGRAM), service]] * len(commands) and commands
     for _, name, *options in commands:
         words = [name, *options]

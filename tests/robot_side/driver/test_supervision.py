@@ -34,8 +34,7 @@ def test_the_unit_watches_restarts_and_zeroes():
     service = unit_file()["Service"]
     assert service["Type"] == "notify" and service["NotifyAccess"] == "main"
     assert 0 < float(service["WatchdogSec"]) <= 2 and service["Restart"] == "on-failure"
-    assert service["ExecStopPost"].endswith("--zero-motors")
-    assert service["ExecStart"].split(" --zero")[0] == service["ExecStopPost"].split(" --zero")[0]
+    assert service["ExecStopPost"].endswith(f" {service['ExecStart']} --zero-motors")
     assert float(service["TimeoutStopSec"]) > ENDS_WITHIN_US / 1e6, "the guardian waits so long for the driver process"
     assert int(service["LimitRTPRIO"]) >= GUARDIAN_PRIORITY > DRIVER_PRIORITY
 
