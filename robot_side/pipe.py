@@ -298,7 +298,7 @@ class DriverEnd:
         self._gone_us = 0
         self._start_at_us = 0
         self._backoff_us = _FIRST_BACKOFF_US
-        self._was_ready = False
+        self._was_ready = self._is_ready = False
         self._camera_fault = ""
         self._camera_patience_us = _FIRST_PATIENCE_US
         self.restarts = -1
@@ -339,7 +339,7 @@ class DriverEnd:
             unmask.callback(signal.pthread_sigmask, signal.SIG_SETMASK, before)
             self._process = subprocess.Popen(_command(ends), pass_fds=ends, stdin=subprocess.DEVNULL)
             undo.pop_all()
-        self.socket, self._aside = ours, aside
+        self.socket, self._aside, self._is_ready = ours, aside, False
         self.restarts += 1
 
     def _is_read(self, now_us: int) -> bool:
@@ -361,7 +361,7 @@ class DriverEnd:
 
     def on_ready(self) -> None:
         """Note that its endpoint is open. From now on it is restarted after each end."""
-        self._was_ready = True
+        self._was_ready = self._is_ready = True
         self._backoff_us = _FIRST_BACKOFF_US
 
     def on_camera(self, fault: str) -> None:
@@ -371,8 +371,12 @@ class DriverEnd:
             self._camera_patience_us = _FIRST_PATIENCE_US
 
     def send(self, packet: bytes) -> None:
-        """Hand over a packet or drop it: a network process that does not read must not slow the driver."""
-        _send_or_drop(self.socket, packet)
+        """Hand over a packet or drop it: a network process that does not read must not slow the driver.
+
+        One that still starts would publish a status of then as if it were new.
+        """
+        if self._is_ready:
+            _send_or_drop(self.socket, packet)
 
     def send_aside(self, packet: bytes) -> None:
         """Send a packet that does not wake the driver. The driver reads it when it needs it."""

@@ -1,5 +1,6 @@
 """A STOP that reached the robot's machine reaches the gate: through a full socket, and past a process that dies."""
 
+import os
 import signal
 import socket
 import time
@@ -11,8 +12,9 @@ from sightline.protocol.codec import encode
 from sightline.protocol.messages import Request, RequestHeader, Verb
 from sightline.protocol.transports.link import Message, OutgoingQueue
 from sightline.protocol.transports.zenoh.link import open_zenoh
+from sightline.robot_side import pipe
 from sightline.robot_side.config import RobotConfig
-from sightline.robot_side.pipe import MAX_PENDING, DriverEnd, NetworkEnd
+from sightline.robot_side.pipe import MAX_PACKET_BYTES, MAX_PENDING, DriverEnd, NetworkEnd
 from tests.fixtures.links import until
 from tests.fixtures.robot_process import RobotProcess, Vision, driving
 
@@ -95,11 +97,44 @@ def test_packets_of_a_dead_process_are_read_after_unread_ones(child):
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     ours.setblocking(False)
     child.socket = ours
+    child.on_ready()
     child.send(b"never read")
     theirs.send(b"STOP")
     theirs.close()
     assert list(child.packets()) == [b"STOP"]
     assert child.socket is None
+
+
+def test_a_process_gets_nothing_from_before_it_is_ready_however_often_it_starts(child, monkeypatch):
+    """It would publish a status of then as if it were new, and an operator would cite it."""
+
+    class Starting:
+        returncode = None
+
+        def __init__(self, _command, pass_fds, **_):
+            self.end = socket.socket(fileno=os.dup(pass_fds[0]))
+
+        def poll(self):
+            return self.returncode
+
+        def kill(self):
+            self.returncode = -9
+
+        wait = kill
+
+    monkeypatch.setattr(pipe.subprocess, "Popen", Starting)
+    for now_us in range(0, 40_000_000, 10_000_000):
+        child.keep_alive(now_us, 0)
+        process = child._process
+        child.send(b"status of before")
+        child.on_ready()
+        child.send(b"status")
+        assert process.end.recv(MAX_PACKET_BYTES).startswith(b"{"), "its configuration"
+        assert process.end.recv(MAX_PACKET_BYTES) == b"status"
+        process.end.close()
+        process.kill()
+        list(child.packets())
+        child.keep_alive(now_us + 1, 0)
 
 
 def test_a_dead_process_is_not_forgotten_before_all_it_sent_is_read(child):
