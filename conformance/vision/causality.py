@@ -29,7 +29,12 @@ _BURST = 20
 _RECOVERS_US = 1_000_000
 _STARTING: Final = 10
 _HOUR_US: Final = 3_600_000_000
+_SECONDS_US: Final = 10_000_000
+_SEQ_LEAP: Final = 100_000
+"""Less than an hour and than the largest `seq`, and still far above what 2.6 allows: 500 ms, and 1000 in `seq`."""
 _OTHER_SESSION: Final = "fffffff0"
+_MAX_FIRST_SEQ: Final = 2**32
+_MAX_SEQ_STEP: Final = 2**20
 _RAYS: Final[dict[str, Any]] = {
     "angle_min_rad": -1.0, "angle_increment_rad": 0.5, "range_min_m": 0.1, "range_max_m": 8.0,
 }  # fmt: skip
@@ -162,10 +167,10 @@ def gaps_are_fine(_bench: Bench, robot: RobotPlayed) -> None:
 
 
 def _forged_frame(robot: RobotPlayed, **changes: Any) -> None:
-    """Send a frame with these changes to the robot's next one; `ahead_us` is added to its time."""
+    """Send a frame with these changes to the robot's next one; `ahead_us` and `seq_ahead` are added to its fields."""
     fields = robot.next_fields()
     t_us = min(fields["t_us"] + changes.pop("ahead_us", 0), MAX_INTEGER)
-    robot.frame("left", **{"seq": fields["seq"], "t_us": t_us, **changes})
+    robot.frame("left", **{"seq": fields["seq"] + changes.pop("seq_ahead", 0), "t_us": t_us, **changes})
 
 
 def _forged_stamps(robot: RobotPlayed, channel: Channel, payload: bytes, **fields: Any) -> None:
@@ -197,6 +202,8 @@ _FORGED: Final[dict[str, tuple[str, Callable[[RobotPlayed], None]]]] = {
                   partial(_forged_stamps, channel=STATUS, payload=encode(ARMED))),
     "V-CAUS-19": ("A `scan` of another session or an hour ahead",
                   partial(_forged_stamps, channel=SCAN, payload=bytes(16), **_RAYS)),
+    "V-CAUS-20": ("A frame of ten seconds ahead", partial(_forged_frame, ahead_us=_SECONDS_US)),
+    "V-CAUS-21": ("A frame whose `seq` is a hundred thousand ahead", partial(_forged_frame, seq_ahead=_SEQ_LEAP)),
 }
 """Forged messages that must not stop the service: title, function that sends them."""
 SUITE.must_all(met, {
@@ -228,6 +235,16 @@ def twists_count_up(bench: Bench, robot: RobotPlayed) -> None:
     """The `seq` of its twists rises by at least one each."""
     robot.film("left", 40)
     _rises(bench, robot.twists(), "twists")
+
+
+@SUITE.must("V-SEQ-07", "2.5 Session and sequence", met)
+def counts_within_reach(bench: Bench, robot: RobotPlayed) -> None:
+    """The first `seq` of its twists is at most 2^32, and steps are at most 2^20: else a robot rejects them."""
+    robot.film("left", 10)
+    numbers = [number for one in robot.twists() if isinstance(number := one.fields.get("seq"), int)]
+    largest, step = max(numbers, default=0), max((after - one for one, after in itertools.pairwise(numbers)), default=0)
+    bench.expect(largest <= _MAX_FIRST_SEQ, f"its twists count {numbers[:3]} ...")
+    bench.expect(step <= _MAX_SEQ_STEP, f"its twists count {numbers[:3]} ..., with steps up to {step}")
 
 
 @SUITE.must("V-SEQ-03", "2.5 Session and sequence", met)

@@ -11,6 +11,7 @@ applicable, since another case reports its fault.
 
 import itertools
 import json
+import math
 import zlib
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
@@ -243,6 +244,11 @@ class RobotPlayed:
     def expect_any_twist(self, sent: list[Sent]) -> None:
         """Fail the case unless a twist cites one of `sent`."""
         self.bench.expect(self.is_driven(*sent), "no twist came")
+
+    def expect_finite(self) -> None:
+        """Fail the case if a number of a twist is not finite."""
+        for twist in self.twists():
+            self.bench.expect(all(map(math.isfinite, twist.speeds)), f"{twist.text!r} is not finite")
 
     def twists_to(self, sent: Sent) -> list[VisionAnswer]:
         """Return the twists that cite `sent`."""

@@ -236,6 +236,12 @@ class Nostalgic(BrokenVision):
         return header, jpeg
 
 
+@breaks("V-SEQ-07", "counts by the microsecond since 1970")
+class CountsTheTime(BrokenVision):
+    def writes(self, fields, text):
+        self.puts(fields | {"seq": 1_800_000_000_000_000 + self.now_us}, text)
+
+
 # --- proofs ----------------------------------------------------------------------------------------------------------
 
 

@@ -165,17 +165,27 @@ breaks("V-CAUS-14", "believes in an hour")(type("Believing", (Believing,), {"bel
 breaks("V-CAUS-15", "believes in any time")(type("Believing", (Believing,), {"believed_us": (10**14, 2**63)}))
 
 
-@breaks("V-CAUS-16", "drops each frame that is not above the largest `seq`")
+breaks("V-CAUS-20", "believes in a minute")(type("Believing", (Believing,), {"believed_us": (6_000_000, 60_000_000)}))
+
+
 class LargestSeq(BrokenVision):
+    """Drops each frame that is not above the largest `seq`, which may leap by a number in `believed`."""
+
     newest = ("", 0)
 
     def hears(self, header, jpeg):
         with suppress(ValueError):
             known = frame_header(header)
-            if known.session == self.newest[0] and known.seq <= self.newest[1]:
+            leap, (least, most) = known.seq - self.newest[1], self.believed
+            if known.session != self.newest[0] or 0 < leap <= 1_000 or least < leap < most:
+                self.newest = known.session, known.seq
+            elif leap <= 0:
                 return None
-            self.newest = known.session, known.seq
         return header, jpeg
+
+
+breaks("V-CAUS-16", "believes in any `seq`")(type("AnySeq", (LargestSeq,), {"believed": (10**9, 2**53)}))
+breaks("V-CAUS-21", "believes in a million of `seq`")(type("Million", (LargestSeq,), {"believed": (1_000, 10**6)}))
 
 
 @breaks("V-CAUS-17", "bans each session that it left")

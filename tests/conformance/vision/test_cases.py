@@ -131,6 +131,36 @@ class NamesNoDetector(vision_broken_flow.Reporting):
         return {name: fields[name] for name in ("mission", "phase", "target") if name in fields}
 
 
+@pytest.mark.parametrize(("first", "step", "outcome"), [
+    (2**32 - 20 * 2**20, 2**20, Outcome.PASSED), (1, 2**20 + 1, Outcome.FAILED), (2**32 + 1, 1, Outcome.FAILED)])
+def test_vision_service_counts_its_twists_as_a_robot_accepts_them(first, step, outcome):
+    def writes(self, fields, text):
+        self.puts(fields | {"seq": first + step * self.answered}, text)
+
+    counting = type("Counting", (BrokenVision,), {"writes": writes})
+    result = result_of(next(case for case in VIRTUAL if case.id == "V-SEQ-07"), counting)
+    assert result.outcome is outcome, result.reason
+
+
+class NotFinite(BrokenVision):
+    """Answers an image with a number that is not finite where the odometry or the lens is at its bounds."""
+
+    far = False
+
+    def hears(self, header, jpeg):
+        self.far = b"1000000.0" in header or (self._camera is not None and abs(self._camera.cx_px) > 1e5)
+        return header, jpeg
+
+    def writes(self, fields, text):
+        self.puts(fields, b"0.1000|nan" if self.far and text is not None else text)
+
+
+@pytest.mark.parametrize("name", ["V-HOST-33", "V-HOST-51"])
+def test_vision_service_without_finite_answers_to_absurd_numbers_fails(name):
+    result = result_of(next(case for case in VIRTUAL if case.id == name), NotFinite)
+    assert (result.outcome, "not finite" in result.reason) == (Outcome.FAILED, True), result.reason
+
+
 @pytest.mark.parametrize(("name", "vision"), [
     ("V-FRAM-19", StrictClock), ("V-SEQ-05", LearnsFirst), ("V-REP-03", NamesNoDetector)])
 def test_case_demands_no_more_than_the_specification(name, vision):
