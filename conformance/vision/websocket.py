@@ -6,6 +6,7 @@ It implements only the part of RFC 6455 that accepts one client at a time. The c
 import base64
 import hashlib
 import json
+import math
 import secrets
 import socket
 import ssl
@@ -78,6 +79,18 @@ class RawServer:
                 connection.close()
         return None
 
+    def turn_away(self, within_s: float) -> float:
+        """Close the next connection without a word. Returns the seconds until it came; infinite if none came."""
+        began_s = time.monotonic()
+        self._socket.settimeout(within_s)
+        try:
+            connection, _ = self._socket.accept()
+        except TimeoutError:
+            return math.inf
+        came_s = time.monotonic() - began_s
+        connection.close()
+        return came_s
+
     def __enter__(self) -> Self:
         return self
 
@@ -130,6 +143,10 @@ class AcceptedClient(RawConnection):
 SUITE = Suite("V")
 BACK_S: Final = 5.0
 """At most a second between two tries, and two until a silent peer is given up."""
+_TRIES: Final = 5
+_LEAST_PAUSE_S: Final = 0.15
+"""Of 0.2 s; timers differ."""
+_LATER_PAUSE_S: Final = 0.35
 _HELLO_S: Final = 2.0
 _END_S: Final = 3.0
 _ANSWER_S: Final = 1.0
@@ -392,6 +409,18 @@ def comes_back_after_a_reset(bench: Bench) -> None:
     with server_of(bench) as server:
         met(bench, server).drop()
         bench.expect(server.accept(BACK_S), f"it did not connect again within {BACK_S:g} s")
+
+
+@SUITE.must("V-SOCK-23", "14.8 Liveness", real=True)
+def tries_again_at_a_pace(bench: Bench) -> None:
+    """A robot that closes each connection is tried again after 0.2 s, and after longer pauses from then on."""
+    with server_of(bench) as server:
+        bench.expect(server.turn_away(BACK_S) <= BACK_S, f"it did not connect within {BACK_S:g} s")
+        pauses_s = [server.turn_away(BACK_S) for _ in range(_TRIES)]
+        shown = ", ".join(f"{pause_s:.2f}" for pause_s in pauses_s)
+        bench.expect(max(pauses_s) <= BACK_S, f"its pauses were {shown} s")
+        bench.expect(min(pauses_s) >= _LEAST_PAUSE_S, f"its pauses were {shown} s, the first must be 0.2 s")
+        bench.expect(pauses_s[-1] >= _LATER_PAUSE_S, f"its pauses were {shown} s, and must rise")
 
 
 # Cases on opening a WebSocket: the vision service's token, its names, and a robot that falls silent. Shell (sockets).

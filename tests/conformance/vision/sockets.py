@@ -39,6 +39,7 @@ SOCKETS = {
     "V-SOCK-20": "takes any session",
     "V-SOCK-21": "reads one hello only",
     "V-SOCK-22": "draws unasked",
+    "V-SOCK-23": "tries again at once",
 }
 
 SILENCE_S = 3.0
@@ -51,7 +52,7 @@ class SocketVision:
     def __init__(self, endpoint, broken="", token=""):
         self.endpoint, self.broken, self.token = endpoint, broken, token
         self.ending = threading.Event()
-        self.seq, self.greeted = 0, False
+        self.seq, self.greeted, self.pause_s = 0, False, 0.2
         self.thread = threading.Thread(target=self.run, daemon=True)
 
     def __enter__(self):
@@ -71,7 +72,8 @@ class SocketVision:
                     return
             except (OSError, WebSocketException, EOFError):
                 pass
-            self.ending.wait(0.1)
+            self.ending.wait(0.05 if self.broken == "V-SOCK-23" else self.pause_s)
+            self.pause_s = min(1.0, 1.5 * self.pause_s)
 
     def connected(self):
         protocols = ["sightline.v9"] if self.broken == "V-SOCK-01" else ["sightline.v1"]
@@ -84,6 +86,7 @@ class SocketVision:
         with connect(url, subprotocols=protocols, compression=None, open_timeout=1, close_timeout=0.5,
                      additional_headers=twice, origin=origin, ping_interval=pings, ping_timeout=patience,
                      max_size=None if self.broken == "V-SOCK-11" else 1_100_000) as link:
+            self.pause_s = 0.2
             if self.broken == "V-SOCK-08":
                 send = link.protocol.send_frame
                 link.protocol.send_frame = lambda frame: None if frame.opcode is Opcode.PONG else send(frame)
