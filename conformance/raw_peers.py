@@ -16,6 +16,7 @@ from contextlib import ExitStack, suppress
 from typing import Any, Final, NamedTuple, Self
 
 from sightline.protocol.errors import ConfigError, LinkError
+from sightline.protocol.transports.endpoints import stop_addresses
 from sightline.protocol.transports.security import load_role_keys
 from sightline.protocol.transports.tokens import Token
 from sightline.protocol.transports.websocket.framing import SUBPROTOCOL
@@ -213,6 +214,40 @@ class RawWebSocket(RawConnection):
         first, answered = self.read_head()
         status = first.split(" ")[1] if first.count(" ") else ""
         self.status, self.headers = int(status) if status.isdigit() else 0, dict(answered)
+
+
+class RawStopPort:
+    """Sends datagrams to the STOP port beside an endpoint. A context manager."""
+
+    def __init__(self, endpoint: str) -> None:
+        """Open a socket. Raises LinkError for a host without an address."""
+        ((host, port),) = stop_addresses([endpoint])
+        try:
+            family, kind, _, _, place = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        except OSError as error:
+            raise LinkError(f"{endpoint}: {error.strerror}; check the address") from None
+        self._socket = socket.socket(family, kind)
+        self._socket.connect(place)
+        self._socket.setblocking(False)
+
+    def send(self, data: bytes) -> None:
+        """Send a datagram, or drop it where no process listens."""
+        with suppress(OSError):
+            self._socket.send(data)
+
+    def received(self) -> list[bytes]:
+        """Return the datagrams that have arrived."""
+        found: list[bytes] = []
+        with suppress(OSError):  # nothing more, or the report that the port is closed
+            while True:
+                found.append(self._socket.recv(_MAX_HEAD_BYTES))
+        return found
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_raised: object) -> None:
+        self._socket.close()
 
 
 def split_url(url: str) -> tuple[bool, str, int]:

@@ -8,8 +8,8 @@ from sightline.conformance.robot import (
     frames,
     hostile,
     lease,
-    legacy,
     motion,
+    ports,
     requests,
     twists,
     websocket,
@@ -18,7 +18,7 @@ from sightline.conformance.robot.fixture import Robot, Sender
 from sightline.protocol.channels import STATUS
 from sightline.protocol.messages import State, Status
 
-_PARTS: Final = (arming, frames, hostile, lease, legacy, motion, requests, twists, websocket)
+_PARTS: Final = (arming, frames, hostile, lease, motion, ports, requests, twists, websocket)
 _SETTLES_US: Final = 6_000_000
 _FIRST_US: Final = 5_000_000
 _COASTS_US: Final = 500_000

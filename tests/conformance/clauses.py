@@ -30,12 +30,8 @@ UNTESTED = {
     "19.1 Overlay and preview":
         "for a vision service that draws for viewers, which is optional; tests/vision_side/test_viewing.py",
     "19.3 Passing on": "optional for a robot; tests/e2e/test_relay.py",
-    "20.1 Port": "optional, and beside a link that the kit's endpoint need not be; tests/e2e/test_stop_port.py",
-    "20.2 Datagram": "the golden vectors `stop` hold it",
-    "20.3 Answer": "as 20.1",
     "20.4 Sender": "for operators; tests/protocol/transports/test_stop_datagram.py",
-    "20.5 Keys": "as 20.1",
-    "20.6 Routers": "as 20.1",
+    "20.6 Routers": "for routers; tests/operator_side/setup/test_router.py",
 }
 """Clauses without a case of their own, and why; a test demands that all others have one."""
 

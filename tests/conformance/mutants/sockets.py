@@ -12,7 +12,7 @@ from sightline.protocol.transports.open import open_link
 from sightline.vision_side.config import VisionConfig
 from sightline.vision_side.serving.process import serve
 from tests.conformance.robot.broken.websocket import BEHIND_TOKENS, DEFECTS
-from tests.conformance.robot.small_server import SmallServer
+from tests.conformance.robot.small_server import STOP_SECRET, SmallServer
 from tests.conformance.vision.sockets import SocketVision
 from tests.fixtures.javascript import EXAMPLES, JsRobot, JsVision
 from tests.fixtures.ports import free_endpoint
@@ -43,6 +43,7 @@ def small_server(defect="", guarded=None):
     with TemporaryDirectory() as folder, SmallServer({defect} if defect else (), TOKENS if guarded else None) as server:
         for role, token in TOKENS.items():
             (Path(folder) / f"{role}.token").write_text(token)
+        (Path(folder) / "stop.secret").write_bytes(STOP_SECRET)
         with kit_at(server.endpoint, server.older, folder if guarded else "") as kit:
             yield kit
 

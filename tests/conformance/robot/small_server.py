@@ -9,6 +9,7 @@ is met by two servers, or by neither.
 
 import base64
 import hashlib
+import hmac
 import json
 import selectors
 import socket
@@ -29,6 +30,7 @@ TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 HELLO_S = HANDSHAKE_S = 2.0
 MOST_BYTES = 2 + 576 + 256
 MOST_CLIENTS = 16
+STOP_SECRET = b"0123456789abcdef0123456789abcdef"
 
 
 class EndError(Exception):
@@ -52,7 +54,7 @@ class SmallServer:
         self.network.advance(time.monotonic_ns() // 1000)
         self.robot = ReferenceRobot(self.network)
         self._selector = selectors.DefaultSelector()
-        self.endpoint = f"ws://127.0.0.1:{self._listen(False)}"
+        self.endpoint = f"ws://127.0.0.1:{self._listen_beside_stop()}"
         self.older = f"ws-legacy://127.0.0.1:{self._listen(True)}"
         self.clients = []
         self._running = True
@@ -63,6 +65,21 @@ class SmallServer:
         door.setblocking(False)
         self._selector.register(door, selectors.EVENT_READ, lambda: self._accept(door, older))
         return door.getsockname()[1]
+
+    def _listen_beside_stop(self):
+        """Open the link and, at the next higher port, UDP for STOP. Another process may have that one."""
+        while True:
+            port = self._listen(False)
+            if self.has("has no STOP port"):
+                return port
+            try:
+                self.stops = StopPort(self, port + 1)
+            except OSError:
+                if self._port is not None:
+                    return port
+                continue
+            self._selector.register(self.stops.socket, selectors.EVENT_READ, self.stops.read)
+            return port
 
     def __enter__(self):
         self._thread.start()
@@ -102,6 +119,49 @@ class SmallServer:
 
     def has(self, defect):
         return defect in self.defects
+
+
+class StopPort:
+    """The STOP port (20), behind a STOP secret where tokens are required."""
+
+    def __init__(self, server, port):
+        self.server, self.has, self.number = server, server.has, 0
+        self.secret = STOP_SECRET if server.tokens else b""
+        self.challenge = b"of this start 16" if self.secret else bytes(16)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.socket.bind(("127.0.0.1", port))
+
+    def read(self):
+        data, address = self.socket.recvfrom(2048)
+        if answer := self.answer(data):
+            self.socket.sendto(answer, address)
+
+    def hmac(self, head):
+        return hmac.digest(self.secret, head, "sha256") if self.secret else bytes(32)
+
+    def answer(self, data):
+        """The answer to a datagram, or nothing."""
+        good = len(data) == 112 and data[:6] == b"STOP\1\1" and data[8:40] == b"r1".ljust(32, b"\0")
+        if not good and not self.has("each datagram is a STOP"):
+            return b""
+        if self.secret and data[48:64] == bytes(16):
+            return self.packed(data, 0, 4, 0)
+        signed = data[48:64] == self.challenge and data[80:] == self.hmac(data[:80])
+        if self.secret and not signed and not self.has("needs no HMAC"):
+            return b""
+        self.number += 1
+        state = 5
+        if not self.has("answers STOP and drives on"):
+            self.server.robot.driving.gate.stop("STOP by a datagram")
+        if self.has("answers STOP without the state"):
+            state = 0
+        return self.packed(data, state, 1 + 4 * bool(self.secret), self.number)
+
+    def packed(self, data, state, flags, number):
+        head = b"STOP\1\2" + bytes((state, flags)) + data[8:48].ljust(40, b"\0") + self.challenge
+        head += number.to_bytes(8) * 2
+        return head + self.hmac(head)
 
 
 class Client:
@@ -341,7 +401,8 @@ class Client:
         wants = set(hello.get("wants", ()))
         self.want(wants)
         if not self.greeted:
-            answer = {"v": 1, "robot": "r2" if self.odd("sends another name") else "r1", "session": "00000001"}
+            name = "r2" if self.odd("sends another name") else "r1"
+            answer = {"v": 1, "robot": name, "session": "00000001", "wants": ["twist", "ack", "request"]}
             self.send(TEXT, json.dumps(answer).encode())
         self.greeted = True
         if set(hello.get("wants", ())) - set(CHANNELS) and self.has("knows all wants"):

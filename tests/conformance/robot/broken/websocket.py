@@ -64,8 +64,13 @@ DEFECTS = {
     "R-DIAL-20": "one client at a time",
     "R-DIAL-21": "any client drives",
     "R-DIAL-22": "older any host",
+    "R-STOP-22": "has no STOP port",
+    "R-STOP-23": "answers STOP and drives on",
+    "R-STOP-24": "answers STOP without the state",
+    "R-STOP-25": "each datagram is a STOP",
+    "R-STOP-26": "needs no HMAC",
 }
 
-BEHIND_TOKENS = tuple(name for name in DEFECTS if "R-SOCK-34" <= name <= "R-SOCK-40")
+BEHIND_TOKENS = (*(name for name in DEFECTS if "R-SOCK-34" <= name <= "R-SOCK-40"), "R-STOP-26")
 """Defects that show only where the server requires a token."""
 
