@@ -51,7 +51,7 @@ GROUPS: Final = {
     "REQ": "requests",
     "STAT": "status",
     "FLOW": "flow",
-    "DIAL": "dialect",
+    "DIAL": "legacy clients",
     "HOST": "hostile input",
     "RECO": "reconnect",
     "SOCK": "websocket",
