@@ -194,6 +194,13 @@ class LegacyCommands:
         # A link that never sent a command belongs to a viewer. It must not stop the robot of another driver.
         self._last: bytes | None = None
         self._last_us = self._zeros = self._closed_by_text = 0
+        self._unreadable = ""
+
+    def received(self, fault: str = "") -> None:
+        """Note an image, or why a message is not an image. Logs the first of several faults in a row."""
+        if fault and not self._unreadable:
+            self._log(f"robot at {self._endpoint}: {fault}; it must send each image as base64 text and nothing else")
+        self._unreadable = fault
 
     def sent(self, text: bytes, now_us: int) -> None:
         """Record a command that is being sent."""
@@ -282,8 +289,14 @@ class LegacyToRobot:
 
     def read(self, message: str | bytes) -> list[IncomingMessage]:
         if isinstance(message, bytes):
+            self._commands.received("its message is binary")
             raise PeerError(BAD_FRAMING, 1003, "binary message; the legacy protocol is text: base64 images")
-        jpeg = decode_picture(message.encode("utf-8", "surrogatepass"), self._max_frame_bytes)
+        try:
+            jpeg = decode_picture(message.encode("utf-8", "surrogatepass"), self._max_frame_bytes)
+        except WireError as error:
+            self._commands.received(error.detail)
+            raise
+        self._commands.received()
         self._seq += 1
         # Two messages of one read arrive in the same microsecond, but the time of a frame must rise.
         self._last_us = max(self._now_us(), self._last_us + 1)

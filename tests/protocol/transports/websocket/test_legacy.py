@@ -15,12 +15,12 @@ from websockets.sync.server import serve
 
 from sightline.protocol.channels import ACK, CAMERA, DETECTIONS, FRAME, STATUS, TWIST
 from sightline.protocol.codec import decode, encode
-from sightline.protocol.errors import RejectReason
+from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.messages import AnswerHeader, DetectedBox, Detections, DetectionsHeader, FrameHeader
 from sightline.protocol.transports.endpoints import parse_websocket_endpoint
 from sightline.protocol.transports.link import OVERSIZE, Message
-from sightline.protocol.transports.websocket.framing import BAD_FRAMING
-from sightline.protocol.transports.websocket.legacy import LegacyCommands
+from sightline.protocol.transports.websocket.framing import BAD_FRAMING, PeerError
+from sightline.protocol.transports.websocket.legacy import LegacyCommands, LegacyToRobot
 from sightline.protocol.transports.websocket.link import open_websocket
 from sightline.protocol.transports.websocket.server import CROSS_SITE
 from tests.fixtures.links import until
@@ -415,6 +415,25 @@ def test_three_connections_that_end_after_a_text_are_reported_with_another_forma
         f"robot at ws-legacy://robot:9091{options} closed 3 connections within 100 ms after '{last.decode()}'; "
         f"use the text format that it reads, probably ws-legacy://robot:9091{better}"
     ]
+
+
+@pytest.mark.parametrize(("message", "fault"), [
+    (JPEG, "its message is binary"),
+    (f"data:image/jpeg;base64,{TEXT}", "image text is not base64: "),
+    ("hello", "image text is not base64: "),
+])
+def test_robot_whose_messages_are_not_images_is_reported_once_until_an_image_comes(message, fault):
+    told = []
+    commands = LegacyCommands("ws-legacy://robot:9091", OPTIONS[""], told.append)
+    for count in (1, 2):
+        for _ in range(3):  # each connection has a codec of its own
+            codec = LegacyToRobot("r1", commands, lambda: 1, "0a1b2c3d", 100_000)
+            with pytest.raises((WireError, PeerError)):
+                codec.read(message)
+        assert len(told) == count
+        assert told[-1].startswith(f"robot at ws-legacy://robot:9091: {fault}")
+        assert told[-1].endswith("; it must send each image as base64 text and nothing else")
+        codec.read("/9j/")
 
 
 def test_a_later_end_of_a_connection_is_not_blamed_on_the_text():
