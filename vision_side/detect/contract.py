@@ -22,7 +22,7 @@ from sightline.protocol.messages import MAX_DETECTED_BOXES, FrameHeader
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.onnx.self_test import difference
 from sightline.vision_side.detect.plugin_calls import annotation_problem, close_detector
-from sightline.vision_side.detect.port import NO_DEADLINE, DetectFrame, DetectionResult, Detector
+from sightline.vision_side.detect.port import NO_DEADLINE, NORMALIZED_PX, DetectFrame, DetectionResult, Detector
 
 SIZES: Final = ((320, 240), (640, 480), (97, 61), (16, 16), (1280, 720), (641, 481))
 LATE_S: Final = 0.25
@@ -113,14 +113,17 @@ def _keeps_answering(detector: Detector, _make: Make, seed: int) -> str:
 
 
 def _keeps_bounds(detector: Detector, _make: Make, seed: int) -> str:
-    """Boxes lie in the image, of finite numbers, with scores from 0 to 1 and a word each."""
+    """Boxes lie in the image, in pixels, of finite numbers, with scores from 0 to 1 and a word each."""
+    furthest_px = 0.0
     for size in SIZES:
         for frame in drawn_frames(seed, 8, size):
             for result in detector.detect([frame], NO_DEADLINE):
                 wrong = result and _out_of_bounds(result)
                 if wrong:
                     return wrong
-    return ""
+                ends = [max(one.x2_px, one.y2_px) for one in result.detections] if result else []
+                furthest_px = max(furthest_px, *ends, 0.0)
+    return "all boxes lie within two pixels of the corner, as if from 0 to 1" if 0 < furthest_px < NORMALIZED_PX else ""
 
 
 def _keeps_silence(detector: Detector, _make: Make, seed: int) -> str:

@@ -19,6 +19,8 @@ Label = Annotated[str, Field(min_length=1, max_length=LONGEST_LABEL)]
 """A label in a configuration."""
 
 
+NORMALIZED_PX: Final = 2.0
+"""All boxes of a detector within so many pixels of the corner of the image are boxes from 0 to 1."""
 COLOR_LABEL: Final = "target"
 """Label of every detection of a color detector. It always counts, because a color detector may be the fallback."""
 _NO_TARGETS: Final = ("legs", "light")

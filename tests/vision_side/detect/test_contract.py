@@ -85,6 +85,12 @@ class Flat(Broken):
         return [one and replace(one, detections=(flat,)) for one in super().detect(frames, deadline_us)]
 
 
+class Normalized(Broken):
+    def detect(self, frames, deadline_us):
+        small = tuple(Detection(share / 2, 0.2, share, 0.9, 0.5, "target") for share in (0.3, 1.9))
+        return [one and replace(one, detections=small) for one in super().detect(frames, deadline_us)]
+
+
 class Numbered(Broken):
     def detect(self, frames, deadline_us):
         odd = Detection(1.0, 1.0, 9.0, 10.0, 0.5, "target", track_id=-1)
@@ -163,12 +169,22 @@ class Halved(Broken):
 @pytest.mark.parametrize(
     ("broken", "promise"),
     [(Backwards, "order"), (Short, "order"), (Tired, "answering"), (Beyond, "bounds"), (Sure, "bounds"),
-     (Flat, "bounds"), (Numbered, "bounds"), (Crowded, "bounds"),
+     (Flat, "bounds"), (Normalized, "bounds"), (Numbered, "bounds"), (Crowded, "bounds"),
      (Raising, "silence"), (Inventing, "silence"), (Slow, "deadline"), (Moody, "the_same"), (Mixing, "robots_apart"),
      (Nameless, "its_name"), (Halved, "its_name")],
 )
 def test_broken_detector_fails_the_promise_that_it_breaks(broken: type[Broken], promise: str) -> None:
     assert promise in {one.name for one in check_detector(broken, 3) if one.wrong}
+
+
+@pytest.mark.parametrize("furthest_px", [2.0, 9.0])
+def test_small_boxes_that_reach_further_than_two_pixels_are_kept(furthest_px: float) -> None:
+    class Small(Broken):
+        def detect(self, frames, deadline_us):
+            near = (Detection(0.0, 0.0, 0.5, 0.5, 0.5, "target"), Detection(0.5, 0.5, 1.0, furthest_px, 0.5, "target"))
+            return [one and replace(one, detections=near) for one in super().detect(frames, deadline_us)]
+
+    assert "bounds" not in {one.name for one in check_detector(Small, 3) if one.wrong}
 
 
 def test_author_sees_the_line_that_raises(caplog) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from sightline.protocol.messages import MAX_DETECTED_BOXES
 from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.onnx.engine import OnnxHeader, Tensor
-from sightline.vision_side.detect.port import Circle, Detection, clean_label, clipped
+from sightline.vision_side.detect.port import NORMALIZED_PX, Circle, Detection, clean_label, clipped
 
 Arrays = Mapping[str, NDArray[Any]]
 _MAX_ROWS: Final = 100_000
@@ -35,6 +35,7 @@ _COMPARED: Final = 1000
 _LEAST_ROUND: Final = 0.8
 """Share of the enclosing circle that a mask fills if it is round. A square fills 0.64."""
 _MAX_LABELS: Final = 1000
+_ROUNDING_PX: Final = 1.0
 _COCO: Final = (
     "person,bicycle,car,motorcycle,airplane,bus,train,truck,boat,traffic light,fire hydrant,stop sign,parking meter,"
     "bench,bird,cat,dog,horse,sheep,cow,elephant,bear,zebra,giraffe,backpack,umbrella,handbag,tie,suitcase,frisbee,"
@@ -209,6 +210,7 @@ def read_outputs(
         raise ValueError("a box, score or label is nan or infinite")
     if (scores > 1).any():
         raise ValueError(f"invalid score {scores.max():g}: not between 0 and 1")
+    _check_corners(boxes)
     first = np.argsort(-scores, kind="stable")
     if form.kind.startswith("yolo"):
         first = first[:_COMPARED]
@@ -222,6 +224,21 @@ def read_outputs(
              for (x1, y1, x2, y2), score, label, ring in
              zip(placed.tolist(), scores[first].tolist(), labels[first].tolist(), circles, strict=True))
     return tuple(one for one in (clipped(one, width, height) for one in found) if one is not None)
+
+
+def _check_corners(boxes: NDArray[Any]) -> None:
+    """Raises ValueError for boxes in another order than x1, y1, x2, y2, or in another unit than pixels.
+
+    Without this they would lie outside of the image, which is the same as "saw nothing".
+    """
+    turned = boxes[(boxes[:, 2:] < boxes[:, :2] - _ROUNDING_PX).any(axis=1)]
+    if len(turned):
+        raise ValueError(f"a box ({', '.join(f'{one:g}' for one in turned[0])}) ends before it begins; expected x1, "
+                         "y1, x2, y2")
+    areas = boxes[(boxes[:, 2:] > boxes[:, :2]).all(axis=1)]
+    if len(areas) and areas.max() < NORMALIZED_PX:
+        raise ValueError("all boxes lie within two pixels of the corner, as if from 0 to 1; export them in pixels of "
+                         "the input")
 
 
 def split_batch(outputs: Arrays, count: int) -> list[dict[str, NDArray[Any]]]:

@@ -101,6 +101,42 @@ def test_yolov5_score_is_that_of_the_box_times_that_of_the_class() -> None:
     assert (one.x1_px, one.y1_px, one.x2_px, one.y2_px) == pytest.approx((135, 95, 185, 145))
 
 
+TRIPLE = ModelFormat(True, True, (640, 640), "triple", CUP_NAMES, "float32")
+
+
+def triple(*boxes: tuple[float, float, float, float], scores: tuple[float, ...] = ()) -> dict:
+    given = np.array(scores or [0.9] * len(boxes), np.float32)
+    return {"boxes": np.array(boxes, np.float32), "scores": given, "labels": np.zeros(len(boxes), np.int64)}
+
+
+@pytest.mark.parametrize("boxes", [
+    [(0.1, 0.2, 0.3, 0.4)], [(0.0, 0.0, 1.0, 1.0)], [(0.5, 0.4, 1.9, 0.7), (0.9, 0.9, 1.0, 1.99)],
+    [(0.1, 0.2, 0.3, 0.4), (320.0, 320.0, 320.0, 400.0)],  # the second one has no area
+])
+def test_boxes_from_0_to_1_are_an_error_and_not_an_empty_answer(boxes: list) -> None:
+    """Before, they lay in the gray border, so that the answer was "saw nothing"."""
+    with pytest.raises(ValueError, match="from 0 to 1; export them in pixels"):
+        read(triple(*boxes), TRIPLE)
+    columns = np.array([[((x1 + x2) / 2, (y1 + y2) / 2, x2 - x1, y2 - y1, 0.9, 0.1) for x1, y1, x2, y2 in boxes]])
+    with pytest.raises(ValueError, match="from 0 to 1; export them in pixels"):
+        read({"output0": columns.transpose(0, 2, 1)}, form_of((1, 6, 8400), names=CUP_NAMES))
+
+
+@pytest.mark.parametrize("box", [(200, 180, 40, 200), (200, 180, 240, 60), (300, 300, 298.9, 310)])
+def test_box_that_ends_before_it_begins_is_an_error(box: tuple) -> None:
+    """It is x, y, width and height: before, it was left out without a line."""
+    with pytest.raises(ValueError, match=r"a box \(.* ends before it begins; expected x1, y1, x2, y2"):
+        read(triple((100, 300, 140, 340), box), TRIPLE)
+
+
+def test_boxes_that_do_not_count_or_have_no_area_change_nothing() -> None:
+    thing, flat, corner = (100, 300, 140, 340), (300, 300, 299.1, 310), (0.1, 0.1, 0.9, 0.9)
+    assert len(read(triple(thing, (200, 180, 40, 40), corner, scores=(0.9, 0.2, 0.2)), TRIPLE)) == 1
+    assert len(read(triple(thing, flat, corner), TRIPLE)) == 1
+    assert read(triple(flat, (0, 0, 0, 0)), TRIPLE) == ()
+    assert read(triple((0, 78, 2, 90)), TRIPLE) != ()
+
+
 def disk(rows: int, columns: int, x: float, y: float, radius: float) -> np.ndarray:
     down, across = np.mgrid[:rows, :columns] + 0.5
     return (across - x) ** 2 + (down - y) ** 2 <= radius**2
