@@ -45,6 +45,9 @@ _LOOK_MISFIT = 12.0
 _ODDS = 4.0
 # Longest time in doubt.
 _DOUBT_US = 500_000
+# Time between two frames from which on the next frame may be too late: one sighting beside the target is then enough
+# for another object. In a faster stream a second one follows before it has come far.
+_SLOW_S = 0.09
 # Time between two frames of the slowest stream. After a longer one, frames are missing.
 _GAP_S = 0.5
 
@@ -81,7 +84,8 @@ class _Object:
         self._unlike_us = 0
         """Time since it last looked so."""
         self.was_beside = False
-        """True once it was seen again, beside the target. A sighting that fits it better is not of the target."""
+        """True once it was seen again, in a slow stream once, beside the target. A sighting that fits it better is not
+        of the target."""
 
     def advance(self, dt_s: float) -> None:
         """Predict with constant velocity and white acceleration."""
@@ -208,7 +212,7 @@ class Track:
             seen = None if in_doubt else fits.get(self._followed)
             self._unsure_us = self._unsure_us + round(dt_s * 1e6) if in_doubt else 0
             self._end(self._followed)
-        self._update_others(places, fits, self._followed if seen else None)
+        self._update_others(places, fits, self._followed if seen else None, is_slow=dt_s >= _SLOW_S)
         return seen.sighting if seen else None
 
     def _forget_hidden(self) -> None:
@@ -294,7 +298,9 @@ class Track:
             self._lost, self._lost_look = None if followed.was_beside else followed, followed.look
             self._followed, self._unsure_us = None, 0
 
-    def _update_others(self, places: list[_Place], fits: dict[_Object, _Place], target: _Object | None) -> None:
+    def _update_others(
+        self, places: list[_Place], fits: dict[_Object, _Place], target: _Object | None, *, is_slow: bool
+    ) -> None:
         """Add objects that are new; forget those that were long not seen, and parts of a target that was seen."""
         apart_m = self._config.apart_m
         self._others = [one for one in self._others if one is not self._followed and not one.is_forgotten
@@ -305,6 +311,7 @@ class Track:
             is_apart = all(one.away_m(place) > apart_m for one in self._objects())
             if is_apart and place not in fits.values() and len(self._others) < _MAX_OTHERS:
                 self._others.append(self._new(place))
+                self._others[-1].was_beside = is_slow and target is not None and target.is_known
 
     def _new(self, place: _Place) -> _Object:
         return _Object(place, self._config.acceleration_mps2)

@@ -282,6 +282,29 @@ def test_sighting_of_an_object_that_was_seen_beside_the_target_again_is_not_of_t
     assert (seen is None) == is_other and track.target.unseen_us == is_other * 100_000
 
 
+@pytest.mark.parametrize(("dt_s", "known", "is_other"), [
+    (0.5, 5, True), (0.2, 5, True), (0.1, 5, True), (0.09, 5, True), (0.089, 5, False), (0.033, 9, False),
+    (0.2, 4, False),
+])
+@pytest.mark.parametrize("aside_m", [-0.3, 0.25])
+def test_object_of_a_slow_stream_that_was_seen_once_beside_a_known_target_does_not_take_its_place(
+    dt_s, known, is_other, aside_m
+):
+    """It comes nearer by a third and hides the target. A target of few sightings may be the error of a detector."""
+    track = Track(TrackConfig())
+    for _ in range(known - 1):
+        track.step(dt_s, HERE, [at(*TARGET)])
+    assert track.step(dt_s, HERE, [at(*TARGET), at(1.9, aside_m)]).x_m == 2.0
+    assert (track.step(dt_s, HERE, [at(1.9, aside_m * 2 / 3)]) is None) == is_other
+    assert (track.target.unseen_us > 0) == is_other
+
+
+def test_object_that_was_seen_once_while_the_target_was_hidden_is_not_beside_it():
+    track = started(*[TARGET] * 6, gate_growth_mps=0.0)
+    assert track.step(DT_S, HERE, [at(2.0, 0.5)]) is None
+    assert track.step(DT_S, HERE, [at(2.0, 0.34)]) is not None
+
+
 def test_object_that_was_seen_twice_beside_the_target_and_then_alone_is_not_followed_after_the_loss():
     track = beside((2.0, 0.9), frames=2, give_up_s=0.4)
     assert steps_until(track, lambda _: track.target is None, (2.0, 0.9)) == 5
