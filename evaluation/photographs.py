@@ -46,6 +46,8 @@ def read_photographs(folder: Path) -> tuple[Photograph, ...]:
 
 def _read(path: Path) -> npt.NDArray[np.uint8]:
     """Read one image as 8-bit RGB, turned upright by its EXIF, at most `_LONGEST_PX` long."""
+    if path.exists() and not path.is_file():  # a pipe or a device may have no end
+        raise ConfigError(f"{path} is not a regular file; remove it, or rename it")
     try:
         data = path.read_bytes()
     except OSError as error:

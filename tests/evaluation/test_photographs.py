@@ -1,7 +1,9 @@
 """A folder of photographs: what is read, what is rejected with one line, and which show the same."""
 
+import os
 import struct
 import zlib
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -60,6 +62,19 @@ def png_of(width, height):
     head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     chunk = b"IHDR" + head
     return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", len(head)) + chunk + struct.pack(">I", zlib.crc32(chunk))
+
+
+def test_pipe_device_or_folder_that_is_named_as_an_image_is_one_line(folder):
+    """A pipe without a writer, or a device without an end, would block the command."""
+    makes = (os.mkfifo, Path.mkdir, lambda path: path.symlink_to("/dev/zero"))
+    for make, name in zip(makes, ("a.jpg", "b.png", "c.JPEG"), strict=True):
+        make(folder / name)
+        with pytest.raises(ConfigError, match=f"{name} is not a regular file; remove it"):
+            read_photographs(folder)
+        (folder / name).rename(folder / "other")
+        (folder / "other").rmdir() if (folder / "other").is_dir() else (folder / "other").unlink()
+    (folder / "link.jpg").symlink_to(folder / "07.jpg")
+    assert len(read_photographs(folder)) == FEWEST + 1
 
 
 @pytest.mark.parametrize(("content", "reason"), [
