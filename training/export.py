@@ -86,6 +86,8 @@ def weights_in(data: bytes) -> Weights:
         model = onnx.load_from_string(data)
     except DecodeError:
         raise ValueError("it is not an ONNX model") from None
+    if not model.graph.node:
+        raise ValueError("it is not an ONNX model, or an empty one")
     held = {one.name: numpy_helper.to_array(one) for one in model.graph.initializer}
     weights: Weights = {}
     channels = {"image": COLORS}

@@ -463,6 +463,8 @@ def _begun(model: Path) -> "tuple[Weights, str]":
     """Read the weights of a model and its SHA-256."""
     from sightline.training.export import weights_in
 
+    if model.exists() and not model.is_file():  # a pipe or a device may have no end
+        raise ConfigError(f"--start {model} is not a regular file; name a model from `sightline train`")
     try:
         data = model.read_bytes()
         return weights_in(data), hashlib.sha256(data).hexdigest()

@@ -4,6 +4,7 @@ import errno
 import hashlib
 import multiprocessing
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -244,6 +245,21 @@ def test_start_from_another_network_gives_one_error_line(content, tmp_path, caps
     assert cli.run(["train", "--out", str(tmp_path / "out"), *little, "--start", str(path)]) == 2
     error = capsys.readouterr().err.strip()
     assert f"--start {path}" in error and "\n" not in error and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("/dev/zero")])
+def test_start_from_a_pipe_device_or_folder_gives_one_error_line(make, tmp_path, capsys):
+    """A pipe without a writer would block the command; a device without an end would fill the memory."""
+    make(tmp_path / "begin")
+    assert cli.run(["train", "--out", str(tmp_path / "out"), "--start", str(tmp_path / "begin")]) == 2
+    error = capsys.readouterr().err
+    assert f"--start {tmp_path / 'begin'} is not a regular file; name a model from `sightline train`\n" in error
+
+
+@pytest.mark.parametrize("content", [b"", onnx.ModelProto(graph=onnx.GraphProto(name="bare")).SerializeToString()])
+def test_weights_of_a_file_without_nodes_are_not_looked_for(content):
+    with pytest.raises(ValueError, match="it is not an ONNX model, or an empty one"):
+        weights_in(content)
 
 
 def test_a_gpu_takes_each_batch_whole(tmp_path, monkeypatch):
