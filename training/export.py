@@ -67,7 +67,7 @@ def onnx_bytes(weights: Weights, properties: dict[str, str]) -> bytes:
     outputs = _suppressed(graph)
     model = helper.make_model(
         helper.make_graph(
-            graph.nodes, "eyes",
+            graph.nodes, "detector",
             [helper.make_tensor_value_info("image", TensorProto.UINT8, [1, HEIGHT_PX, WIDTH_PX, 3])],
             [helper.make_tensor_value_info(name, kind, shape) for name, kind, shape in outputs], graph.constants,
         ),
