@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import shlex
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any
@@ -216,6 +217,9 @@ def check(
         ok = not any(one.wrong for one in results)
         times = time_detector(make, seed=seed) if ok else []
         notices = list(dict.fromkeys(line for one in made for line in notices_of(one)))
+    if times and not any(one.boxes for one in times):
+        notices.append("it found nothing in the drawn images, so that no box was checked; look at its boxes in images "
+                       f"of yours: `sightline vision --dry-run --camera v4l2 --detector {shlex.quote(name)}`")
     report = _as_json(name, ok, results, times) | {"notices": notices}
     return print_result(report, [_as_text(name, results, times, notices)], as_json)
 
@@ -246,8 +250,8 @@ def _nested(options: dict[str, Any]) -> dict[str, Any]:
 def _as_json(name: str, ok: bool, results: Sequence["PromiseResult"], times: Sequence["Times"]) -> dict[str, Any]:
     checks = [{"name": one.name, "value": one.wrong or "kept", "unit": "", "bound": one.promise, "ok": not one.wrong}
               for one in results]
-    took = [{"size": f"{one.width_px}x{one.height_px}", "p50_ms": _or_none(one.p50_ms), "p95_ms": _or_none(one.p95_ms)}
-            for one in times]
+    took = [{"size": f"{one.width_px}x{one.height_px}", "p50_ms": _or_none(one.p50_ms), "p95_ms": _or_none(one.p95_ms),
+             "boxes": one.boxes} for one in times]
     return {"ok": ok, "detector": name, "checks": checks, "times": took}
 
 

@@ -17,11 +17,12 @@ import cv2
 import numpy as np
 
 from sightline.protocol.config import PLUGIN_ERRORS
+from sightline.protocol.errors import ConfigError
 from sightline.protocol.log import report_fault
 from sightline.protocol.messages import MAX_DETECTED_BOXES, FrameHeader
 from sightline.vision_side.decode import Decoder
 from sightline.vision_side.detect.onnx.self_test import difference
-from sightline.vision_side.detect.plugin_calls import annotation_problem, close_detector
+from sightline.vision_side.detect.plugin_calls import annotation_problem, close_detector, labels_of
 from sightline.vision_side.detect.port import NO_DEADLINE, NORMALIZED_PX, DetectFrame, DetectionResult, Detector
 
 SIZES: Final = ((320, 240), (640, 480), (97, 61), (16, 16), (1280, 720), (641, 481))
@@ -47,12 +48,14 @@ class PromiseResult:
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """Time for one image as the detector reports it, in milliseconds."""
+    """Time for one image in milliseconds, as the detector reports it, or of its call if it reports none."""
 
     width_px: int
     height_px: int
     p50_ms: float
     p95_ms: float
+    boxes: int
+    """Boxes in all images. Without any, the check has seen no box."""
 
 
 def check_detector(make: Make, seed: int = 1) -> list[PromiseResult]:
@@ -77,15 +80,18 @@ def time_detector(make: Make, frames: int = 60, seed: int = 1) -> list[Times]:
 
 
 def _time_size(make: Make, size: tuple[int, int], frames: int, seed: int) -> Times:
-    detector, took = make(), []
+    detector, took, boxes = make(), [], 0
     for frame in drawn_frames(seed, frames, size):
+        began_s = time.perf_counter()
         result = detector.detect([frame], NO_DEADLINE)[0]
-        took.append(result.compute_us / 1000 if result else math.nan)
+        call_ms = (time.perf_counter() - began_s) * 1000
+        took.append((result.compute_us / 1000 or call_ms) if result else math.nan)
+        boxes += len(result.detections) if result else 0
     close_detector(detector)
     known = sorted(one for one in took[frames // 4 :] if not math.isnan(one))
     if not known:
-        return Times(*size, math.nan, math.nan)
-    return Times(*size, median(known), known[min(len(known) - 1, round(0.95 * len(known)))])
+        return Times(*size, math.nan, math.nan, boxes)
+    return Times(*size, median(known), known[min(len(known) - 1, round(0.95 * len(known)))], boxes)
 
 
 # --- the promises ----------------------------------------------------------------------------------------------------
@@ -174,7 +180,11 @@ def _keeps_robots_apart(detector: Detector, make: Make, seed: int) -> str:
 
 
 def _keeps_its_name(detector: Detector, _make: Make, seed: int) -> str:
-    """Every result names its detector, model, device and time."""
+    """Every result names its detector, model, device and time, and `labels` is a list of texts."""
+    try:
+        labels_of(detector)
+    except ConfigError as error:
+        return str(error)
     for result in _seen(detector, drawn_frames(seed, 2, SIZES[0])):
         if result is None:
             continue

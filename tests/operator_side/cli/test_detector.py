@@ -79,6 +79,50 @@ def test_detector_that_keeps_the_contract_passes(capsys) -> None:
     assert report["notices"] == []
 
 
+PLAIN = """
+import time
+from sightline.protocol.config import Config as Settings
+from sightline.vision_side.detect.port import Detection, Maker, result_of
+
+class Plain:
+    class Config(Settings):
+        boxes: int = 0
+        took_us: int = 0
+    def __init__(self, config):
+        self.config = config
+    def detect(self, frames, deadline_us):
+        return [self.look(one) for one in frames]
+    def look(self, frame):
+        try:
+            frame.picture()
+        except Exception:
+            return None
+        time.sleep(0.002)
+        found = [Detection(1, 2, 9, 8, 0.9, "ball")] * self.config.boxes
+        return result_of(frame, found, Maker("plain", device="cpu"), self.config.took_us)
+"""
+
+
+@pytest.mark.parametrize(("boxes", "took_us", "least_ms", "most_ms"), [
+    (0, 0, 2, 999), (1, 0, 2, 999), (2, 500, 0.5, 0.5),
+])  # fmt: skip
+def test_time_of_a_plug_in_is_what_it_reports_or_that_of_its_call(
+    capsys, tmp_path: Path, monkeypatch, boxes, took_us, least_ms, most_ms
+) -> None:
+    """`result_of` without a time, as on the page, gave 0.00 ms. Without a box, no box was checked."""
+    (tmp_path / "plain_detector.py").write_text(PLAIN)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    options = [f"--set=boxes={boxes}", f"--set=took_us={took_us}"]
+    code, out, _ = run(capsys, "detector", "check", "plain_detector:Plain", "--json", *options)
+    report = json.loads(out)
+    assert code == 0 and all(least_ms <= one["p50_ms"] <= most_ms for one in report["times"])
+    assert [one["boxes"] for one in report["times"]] == [60 * boxes] * 2
+    nothing = "it found nothing in the drawn images, so that no box was checked; look at its boxes in images of yours: "
+    assert report["notices"] == ([] if boxes else [
+        nothing + "`sightline vision --dry-run --camera v4l2 --detector plain_detector:Plain`"])
+
+
 def test_plug_in_that_breaks_the_contract_is_reported(capsys, tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "late_detector.py").write_text(BROKEN)
     monkeypatch.chdir(tmp_path)

@@ -161,6 +161,14 @@ class Nameless(Broken):
         return [one and replace(one, device="") for one in super().detect(frames, deadline_us)]
 
 
+class Labelled(Broken):
+    labels = "ball"
+
+
+class Numbers(Broken):
+    labels = 5
+
+
 class Halved(Broken):
     def detect(self, frames, deadline_us):
         return [one and replace(one, compute_us=12.5) for one in super().detect(frames, deadline_us)]
@@ -171,7 +179,7 @@ class Halved(Broken):
     [(Backwards, "order"), (Short, "order"), (Tired, "answering"), (Beyond, "bounds"), (Sure, "bounds"),
      (Flat, "bounds"), (Normalized, "bounds"), (Numbered, "bounds"), (Crowded, "bounds"),
      (Raising, "silence"), (Inventing, "silence"), (Slow, "deadline"), (Moody, "the_same"), (Mixing, "robots_apart"),
-     (Nameless, "its_name"), (Halved, "its_name")],
+     (Nameless, "its_name"), (Labelled, "its_name"), (Numbers, "its_name"), (Halved, "its_name")],
 )
 def test_broken_detector_fails_the_promise_that_it_breaks(broken: type[Broken], promise: str) -> None:
     assert promise in {one.name for one in check_detector(broken, 3) if one.wrong}
