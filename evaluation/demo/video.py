@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from sightline.evaluation.plots import StatusAt, scale_length_m, wall_corners
 from sightline.operator_side.recording.film import Film
-from sightline.operator_side.recording.replay import Step, replay_steps
+from sightline.operator_side.recording.replay import recorded_frames, replay_steps
 from sightline.sim.scenario import Scenario, Static
 from sightline.sim.truth import Truth
+from sightline.vision_side.pipeline import Frame, PipelineAnswer
 
 Image = NDArray[np.uint8]
 Point = tuple[int, int]
@@ -115,22 +116,34 @@ def film_run(
     view = TopView(samples, scenario, HEIGHT_PX)
     times_us = [truth.t_us for truth in samples]
     with Film(path, FPS) as film:
-        for step in _thinned(recording, times_us[0]):
-            index = min(bisect_right(times_us, step.frame.header.t_us), len(samples) - 1)
-            status = newest_status(statuses, step.frame.header.t_us)
-            film.add(np.hstack([_robot_view(step, status), view.draw(index)]), step.frame.header.t_us)
+        for frame, answer in _thinned(recording, times_us[0]):
+            index = min(bisect_right(times_us, frame.header.t_us), len(samples) - 1)
+            status = newest_status(statuses, frame.header.t_us)
+            film.add(np.hstack([_robot_view(frame, answer, status), view.draw(index)]), frame.header.t_us)
+        if not film.frames:  # FFmpeg writes no file without an image
+            film.add(view.draw(len(samples) - 1), times_us[-1])
     return film.frames
 
 
-def _thinned(recording: Path, start_us: int) -> Iterator[Step]:
-    """Yield the steps of the run at `FPS` at most."""
+def _thinned(recording: Path, start_us: int) -> Iterator[tuple[Frame, PipelineAnswer | None]]:
+    """Yield the frames of the run, with their answers, at `FPS` at most."""
     due_us = start_us
-    for step in replay_steps(recording):
-        t_us = step.frame.header.t_us
+    for frame, answer in _views(recording):
+        t_us = frame.header.t_us
         if t_us >= due_us:
             # At least one tick on, because a frame that was acknowledged and then answered comes twice.
             due_us = max(due_us, t_us - 1_000_000 // FPS + 1) + 1_000_000 // FPS
-            yield step
+            yield frame, answer
+
+
+def _views(recording: Path) -> Iterator[tuple[Frame, PipelineAnswer | None]]:
+    """Yield each answered frame with its answer; all frames without one if the answers crossed another transport."""
+    is_answered = False
+    for step in replay_steps(recording):
+        is_answered = True
+        yield step.frame, step.answer
+    if not is_answered:
+        yield from ((frame, None) for frame in recorded_frames(recording))
 
 
 def newest_status(statuses: Sequence[StatusAt], t_us: int) -> StatusAt | None:
@@ -147,21 +160,22 @@ def status_text(status: StatusAt | None) -> str:
     return f"{status.state}  {age}"
 
 
-def _robot_view(step: Step, status: StatusAt | None) -> Image:
+def _robot_view(frame: Frame, answer: PipelineAnswer | None, status: StatusAt | None) -> Image:
     """Draw the image with detections, phase, state, frame age and twist, `HEIGHT_PX` high, its width even."""
-    decoded = cv2.imdecode(np.frombuffer(step.frame.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    decoded = cv2.imdecode(np.frombuffer(frame.jpeg, np.uint8), cv2.IMREAD_COLOR)
     if decoded is None:
         decoded = np.zeros((HEIGHT_PX, HEIGHT_PX * 4 // 3, 3), np.uint8)
     scale = HEIGHT_PX / decoded.shape[0]
     width_px = round(decoded.shape[1] * scale / 2) * 2
     picture = np.asarray(cv2.resize(decoded, (width_px, HEIGHT_PX), interpolation=cv2.INTER_LINEAR), np.uint8)
-    _overlay(picture, step, scale)
+    if answer is not None:
+        _overlay(picture, answer, scale)
     _write(picture, status_text(status), 54)
     return picture
 
 
-def _overlay(picture: Image, step: Step, scale: float) -> None:
-    seen = step.answer.seen
+def _overlay(picture: Image, answer: PipelineAnswer, scale: float) -> None:
+    seen = answer.seen
     for one in seen.detections:
         width = 2 if one is seen.target else 1
         if one.circle is not None:
@@ -169,7 +183,7 @@ def _overlay(picture: Image, step: Step, scale: float) -> None:
             cv2.circle(picture, center, round(one.circle.radius_px * scale), _BOX, width, cv2.LINE_AA)
         corners = [round(value * scale) for value in (one.x1_px, one.y1_px, one.x2_px, one.y2_px)]
         cv2.rectangle(picture, (corners[0], corners[1]), (corners[2], corners[3]), _BOX, width)
-    twist = step.answer.twist
+    twist = answer.twist
     command = f"{twist.linear_mps:+.2f} m/s {twist.angular_rad_s:+.2f} rad/s" if twist else "no command"
     _write(picture, seen.phase + (f"  {seen.distance_m:.2f} m" if seen.distance_m is not None else ""), 28)
     _write(picture, command, HEIGHT_PX - 14)

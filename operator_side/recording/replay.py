@@ -105,6 +105,13 @@ def replay_steps(path: Path) -> Iterator[Step]:
     return _steps(path, answers)
 
 
+def recorded_frames(path: Path) -> Iterator[Frame]:
+    """Yield every frame, answered or not, in order. Raises ConfigError if `path` is not a recording."""
+    for message in _messages(path):
+        if message.channel is FRAME:
+            yield Frame(decode(FrameHeader, message.header), message.payload)
+
+
 def _messages(path: Path) -> Iterator[Message]:
     """Yield the valid messages; the services ignored the others, too."""
     for recorded in read_recording(path):

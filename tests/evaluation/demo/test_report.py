@@ -11,18 +11,20 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import av
 import pytest
 
 from sightline.benchmarks import real_time
 from sightline.benchmarks.real_time import Kinds, _figures, measure_demos
 from sightline.evaluation.demo import report as demo_report
 from sightline.evaluation.demo import run as demo_run
+from sightline.evaluation.demo import video
 from sightline.evaluation.demo.run import MOTOR_LOG, RECORDING, DemoOptions, DemoRun
 from sightline.evaluation.lockstep import Conditions, Lockstep
 from sightline.evaluation.processes import ProcessError
 from sightline.evaluation.scenario_config import robot_config, robot_of, vision_config
 from sightline.evaluation.score.figures import EXACT
-from sightline.operator_side.recording.recorder import Recorder
+from sightline.operator_side.recording.recorder import Recorder, read_about, read_recording
 from sightline.operator_side.recording.replay import VISION_CONFIG, Replayed
 from sightline.protocol.channels import CAMERA, STATUS
 from sightline.protocol.codec import encode
@@ -185,6 +187,23 @@ def test_demo_ends_when_its_recording_does(lights, seconds):
     idle = SimpleNamespace(check=lambda: None, report=None, show=lambda _lines: None)
     demo_run._watch(driven, idle, idle, truth, idle, failure=lambda: next(failures))
     assert driven.samples == lights.samples[:1] * 2
+
+
+@pytest.mark.parametrize(("kept", "least_s", "most_s"), [
+    (("camera", "twist", "ack", "frame"), 1.5, 2.1), (("camera", "frame"), 1.5, 2.1), (("camera",), 0, 0),
+])  # fmt: skip
+def test_run_whose_answers_crossed_another_transport_has_its_film(lights, tmp_path, kept, least_s, most_s):
+    """The recorder uses Zenoh, so it has no answer of a WebSocket or legacy vision service."""
+    link, recording = StatusLink(), tmp_path / RECORDING
+    with Recorder(link, recording, read_about(lights.folder / RECORDING)):
+        for recorded in read_recording(lights.folder / RECORDING):
+            if recorded.message.channel.name in kept:
+                link.callbacks[recorded.message.channel](recorded.message)
+    frames = video.film_run(tmp_path / "run.mp4", recording, lights.samples, lights.scenario)
+    with av.open(str(tmp_path / "run.mp4")) as film:
+        times_s = [frame.time for frame in film.decode(video=0)]
+    assert len(times_s) == frames > 0
+    assert least_s <= times_s[-1] <= most_s
 
 
 def test_recording_without_a_camera_model_names_the_error_of_the_disk(lights, tmp_path):
