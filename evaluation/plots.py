@@ -180,7 +180,8 @@ def _plot_age(axes: "Axes", samples: Sequence[Truth], statuses: Sequence[StatusA
     axes.set_ylim(0, 1.5 * limits.zero_ms)
     axes.set(xlabel="time (s)", ylabel="frame age (ms)",
              title=f"frame age and state; limits {limits.full_ms:g} ms and {limits.zero_ms:g} ms")
-    axes.legend(loc="upper right", ncols=4, fontsize="small")
+    if named:  # without a status during the run, Matplotlib warns of an empty legend
+        axes.legend(loc="upper right", ncols=4, fontsize="small")
 
 
 def _plot_speed(axes: "Axes", times_s: list[float], samples: Sequence[Truth]) -> None:

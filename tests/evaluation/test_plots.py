@@ -7,7 +7,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sightline.evaluation.demo.video import TopView, newest_status, status_text
-from sightline.evaluation.plots import AgeLimits, StatusAt, _plot_things, plot_run, scale_length_m
+from sightline.evaluation.plots import AgeLimits, StatusAt, _plot_age, _plot_things, plot_run, scale_length_m
 from sightline.sim.scenario import Light, load_scenario
 from sightline.sim.truth import Truth
 
@@ -48,6 +48,16 @@ def area_like(path, color) -> int:
 
 def test_title_may_have_any_letters(samples, tmp_path, recwarn):
     plot_run(tmp_path / "run.png", samples, load_scenario("static"), "\u5706\u5708 $x{$, seed 1")
+    assert [str(one.message) for one in recwarn] == []
+
+
+@pytest.mark.parametrize(("status_us", "states"), [(-1, []), (0, ["ACTIVE"]), (4_900_000, ["ACTIVE"]), (5_000_000, [])])
+def test_legend_has_the_states_of_the_run_and_without_one_gives_no_warning(samples, recwarn, status_us, states):
+    axes = Figure().subplots()
+    _plot_age(axes, samples, [StatusAt(status_us, "ACTIVE", 30_000)], LIMITS)
+    legend = axes.get_legend()
+    assert (legend is not None) == bool(states)
+    assert not legend or [text.get_text() for text in legend.get_texts()] == states
     assert [str(one.message) for one in recwarn] == []
 
 
