@@ -20,7 +20,6 @@ import os
 import select
 import socket
 import struct
-import tempfile
 import time
 from collections import OrderedDict
 from collections.abc import Iterable
@@ -48,8 +47,13 @@ _BATTERY_WAIT_S = 0.1
 
 
 def default_socket_dir() -> str:
-    """Return a folder of this user that is short enough for the path of a socket."""
-    return str(Path(tempfile.gettempdir()) / f"sightline-sim-{os.getuid()}")
+    """Return a folder of this user that is short enough for the path of a socket.
+
+    It is the same for simulation and robot also while a disk gets full, where `tempfile` would name another one.
+    """
+    named = (os.environ.get(name, "") for name in ("TMPDIR", "TEMP", "TMP"))
+    folder = next((path for path in named if path and os.access(path, os.W_OK | os.X_OK)), "/tmp")
+    return str(Path(folder).absolute() / f"sightline-sim-{os.getuid()}")
 
 
 class SimSocketConfig(Config):

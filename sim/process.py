@@ -170,9 +170,9 @@ class SocketFolder:
         try:
             self.path.mkdir(mode=0o700, parents=True, exist_ok=True)
             self._lock = os.open(self.path / "sim.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            self._hold()
         except OSError as error:
             raise ConfigError(f"socket_dir {path}: {error.strerror}; choose another with --set socket_dir=") from None
-        self._hold()
 
     def _hold(self) -> None:
         try:
@@ -184,8 +184,12 @@ class SocketFolder:
                 f"socket_dir {self.path} is held by another simulation, process {holder}; "
                 "end it or choose another with --set socket_dir="
             ) from None
-        os.ftruncate(self._lock, 0)
-        os.write(self._lock, f"{os.getpid()}\n".encode())
+        try:
+            os.ftruncate(self._lock, 0)
+            os.write(self._lock, f"{os.getpid()}\n".encode())
+        except OSError:  # the disk is full
+            os.close(self._lock)
+            raise
 
     def listen(self, name: str) -> socket.socket:
         """Return a listening socket. Replaces one that a dead simulation left."""

@@ -156,7 +156,7 @@ def _discard(stream: TextIO | None) -> None:
 
 
 def _of_system(error: OSError, arguments: Sequence[str]) -> int:
-    """Report an output that cannot be written, and a current folder that is gone; others are unexpected."""
+    """Report an output that cannot be written, and a folder of the machine that is not there; others are unexpected."""
     if error.filename is None and error.errno in (errno.EPIPE, errno.ENOSPC):
         _discard(sys.stdout)
         if error.errno == errno.EPIPE:
@@ -166,6 +166,9 @@ def _of_system(error: OSError, arguments: Sequence[str]) -> int:
         Path.cwd()
     except FileNotFoundError:
         return _print_error("the current folder no longer exists; change to another", USAGE)
+    if isinstance(error, FileNotFoundError) and error.filename is None and "temporary directory" in str(error):
+        return _print_error("no temporary folder can be written: the disk is full or read-only; free some space, or "
+                            "set TMPDIR to a folder that you may write", USAGE)
     return _unexpected(error, arguments)
 
 

@@ -1,6 +1,9 @@
 """The simulation as a process behind the robot's ports: real sockets, real kills, the motors' log."""
 
+import errno
 import json
+import os
+import resource
 import select
 import signal
 import socket
@@ -21,7 +24,7 @@ demanded.module("pybullet", "sim")
 from sightline.protocol.errors import ConfigError, HardwareError
 from sightline.protocol.jpeg import read_jpeg_size
 from sightline.robot_side.ports import Camera, Drive, RangeSensor
-from sightline.sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange, TruthReader
+from sightline.sim.bus import MOTION, MOTION_SET, SimCamera, SimDrive, SimRange, TruthReader, default_socket_dir
 from sightline.sim.process import SimConfig, SocketFolder, run
 from sightline.sim.robot import load_robot
 
@@ -269,6 +272,38 @@ def test_bad_settings_are_one_line(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="socket_dir"):
         SocketFolder(str(tmp_path / "file"))
+
+
+@pytest.mark.parametrize(("given", "expected"), [
+    ({"TMPDIR": "first", "TMP": "second"}, "first"), ({"TMPDIR": "absent", "TMP": "second"}, "second"),
+    ({"TMPDIR": "", "TEMP": "first"}, "first"), ({"TMPDIR": "absent"}, "/tmp"), ({}, "/tmp"),
+])  # fmt: skip
+def test_robot_and_simulation_look_in_the_same_folder_also_on_a_full_disk(tmp_path, monkeypatch, given, expected):
+    for name in ("TMPDIR", "TEMP", "TMP"):
+        monkeypatch.delenv(name, raising=False)
+    for name, folder in given.items():
+        monkeypatch.setenv(name, folder and str(tmp_path / folder))
+    for folder in ("first", "second"):
+        (tmp_path / folder).mkdir()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
+    try:
+        found = default_socket_dir()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert found == str(tmp_path / expected / f"sightline-sim-{os.getuid()}")
+
+
+@pytest.mark.parametrize("step", ["os.open", "os.ftruncate", "os.write"])
+def test_full_disk_names_the_folder_of_the_sockets(tmp_path, monkeypatch, step):
+    def fail(*_given):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr(step, fail)
+        with pytest.raises(ConfigError, match=f"^socket_dir {tmp_path}: No space left on device; choose another with"):
+            SocketFolder(str(tmp_path))
+    SocketFolder(str(tmp_path)).close()  # the failed one let go of the lock
 
 
 def test_the_robots_plug_ins_import_no_numpy_and_no_pybullet():

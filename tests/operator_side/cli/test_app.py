@@ -1,6 +1,7 @@
 """The command line: help, one line and an exit code for each error, and no heavy import before it is needed."""
 
 import ast
+import errno
 import importlib.metadata
 import io
 import json
@@ -421,6 +422,20 @@ def test_current_folder_that_is_gone_is_one_line(capsys, monkeypatch, tmp_path, 
     monkeypatch.chdir(tmp_path / "gone")
     (tmp_path / "gone").rmdir()
     assert run(capsys, *arguments) == (2, "", "error: the current folder no longer exists; change to another\n")
+
+
+@pytest.mark.parametrize("arguments", [["demo", "--out", "run"], ["faults", "--only", "vision.kill"]])
+def test_full_temporary_folders_are_one_line(capsys, monkeypatch, tmp_path, arguments):
+    def fail(folders):
+        raise FileNotFoundError(errno.ENOENT, f"No usable temporary directory found in {folders}")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("tempfile.tempdir", None)
+    monkeypatch.setattr("tempfile._get_default_tempdir", lambda: fail(["/tmp"]))
+    code, _, err = run(capsys, *arguments)
+    assert (code, err.splitlines()[-1]) == (2, (
+        "error: no temporary folder can be written: the disk is full or read-only; free some space, or set TMPDIR to "
+        "a folder that you may write"))
 
 
 @pytest.mark.parametrize("number", [math.inf, -math.inf, math.nan])
