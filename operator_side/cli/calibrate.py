@@ -164,7 +164,7 @@ _BALL_PICTURES = 20
 _FARTHEST_LENS_M = 100.0
 _MOST_IN_FOLDER = 100  # the whole folder, within limits: the time of the fit grows with every view
 
-Meters = Annotated[float | None, typer.Option(help="Position of the lens, from the center of the axle on the floor.")]
+_MOUNTED: Final = "[default: of the robot, or 0]."
 
 
 def register(app: typer.Typer) -> None:
@@ -186,17 +186,17 @@ def camera(
     secure: Secure = "",
     board: Annotated[str, typer.Option(metavar="CxR", help="Inner corners of the chessboard.")] = "9x6",
     square_m: Annotated[float, typer.Option(min=0.001, max=1, help="Ignored: it does not change the model.")] = 0.025,
-    ball_radius_m: Annotated[float | None, typer.Option(min=0.005, max=2, help="Radius of a ball, meters.")] = None,
-    distance_m: Annotated[float | None, typer.Option(min=0.1, max=20, help="Lens to ball on the floor.")] = None,
+    ball_radius_m: Annotated[float | None, typer.Option(min=0.005, max=2, help="Radius of a ball, m.")] = None,
+    distance_m: Annotated[float | None, typer.Option(min=0.1, max=20, help="Lens to ball along the floor, m.")] = None,
     config: Annotated[
         str | None, typer.Option(metavar="FILE", help="TOML file of the vision service, with the color of the ball.")
     ] = None,
     views: Annotated[int, typer.Option(min=5, max=100, help="Views of the board from a live camera.")] = 15,
-    seconds: Annotated[float, typer.Option(min=1, max=600, help="Longest time for a live camera.")] = 90.0,
-    x_m: Meters = None,
-    y_m: Meters = None,
-    z_m: Meters = None,
-    pitch_rad: Annotated[float | None, typer.Option(help="Tilt of the lens, up is positive.")] = None,
+    seconds: Annotated[float, typer.Option(min=1, max=600, help="Longest time for a live camera, s.")] = 90.0,
+    x_m: Annotated[float | None, typer.Option(help="Lens ahead of the axle's center, m " + _MOUNTED)] = None,
+    y_m: Annotated[float | None, typer.Option(help="Lens left of the axle's center, m " + _MOUNTED)] = None,
+    z_m: Annotated[float | None, typer.Option(help="Lens above the floor, m " + _MOUNTED)] = None,
+    pitch_rad: Annotated[float | None, typer.Option(help="Tilt of the lens up, rad " + _MOUNTED)] = None,
     out: Annotated[Path, typer.Option(metavar="FILE", help="Model to write.")] = Path("camera.toml"),
     as_json: Json = False,
 ) -> None:
@@ -213,6 +213,9 @@ def camera(
         source, mounted = _source(ending, pictures, (camera, camera_sets or []), (robot, connect, secure), seconds)
         mounting = _mounting(mounted, given)
         report = _quiet if as_json else _print_board
+        if pictures is None and not as_json:
+            searched = "the ball" if ball_radius_m is not None else f"a board of {board} inner corners"
+            typer.echo(f"searching the live images for {searched}, for {seconds:g} s at most; Ctrl-C ends it")
         most = _MOST_IN_FOLDER if pictures is not None else views
         made = _measure(source, wanted, mounting, views=most, config=config, report=report, is_live=pictures is None)
     _write(out, made)

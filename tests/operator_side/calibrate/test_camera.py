@@ -254,6 +254,24 @@ def test_a_ball_through_a_camera_plug_in(tmp_path, capsys, kind):
     assert read_model(tmp_path / "camera.toml").fx_px == said["model"]["fx_px"]
 
 
+@pytest.mark.parametrize(("given", "subject"), [
+    (("--ball-radius-m", 0.1, "--distance-m", 0.8), "the ball"), (("--board", "7x5"), "a board of 7x5 inner corners"),
+    (("--board", "7x5", "--json"), ""),
+])  # fmt: skip
+@pytest.mark.parametrize("seconds", [0, 7])
+def test_search_in_live_images_is_announced_with_its_longest_time(
+    tmp_path, capsys, monkeypatch, given, subject, seconds
+):
+    """It may last 90 s without a board or ball."""
+    folder(tmp_path, [EMPTY])
+    monkeypatch.setattr(cli_calibrate, "_measure", lambda *_, **__: Calibration(TRUTH, 8, 9, 0.1, "px RMS"))
+    live = ("--camera", "still", "--camera-set", f"path={tmp_path / '00.jpg'}", "--seconds", seconds)
+    run(*live if seconds else ("--pictures", tmp_path), *given, "--out", tmp_path / "camera.toml")
+    line = f"searching the live images for {subject}, for 7 s at most; Ctrl-C ends it"
+    lines = [one for one in capsys.readouterr().out.splitlines() if one.startswith("search")]
+    assert lines == ([line] if seconds and subject else [])
+
+
 def test_no_board_found_is_one_line(tmp_path):
     out = tmp_path / "camera.toml"
     with pytest.raises(ConfigError, match=r"no board in 3 images: .* a chessboard of 9 x 6 inner corners") as error:

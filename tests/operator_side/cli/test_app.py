@@ -99,6 +99,12 @@ def assert_is_summary(text):
     assert text[0].isupper() and not text.endswith("."), text
 
 
+@pytest.mark.parametrize("path", COMMANDS, ids=" ".join)
+def test_no_two_options_of_a_command_have_the_same_help(path):
+    helps = [option.help for option in COMMANDS[path].params if getattr(option, "help", None)]
+    assert sorted(set(helps)) == sorted(helps)
+
+
 def test_program_help_lists_every_command_uncut(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     code, out, err = run(capsys, "--help")
