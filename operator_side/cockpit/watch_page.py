@@ -65,7 +65,7 @@ def _robot_lines(status: Status) -> list[tuple[str, str]]:
         ("driver", driver),
         ("wheels", twist_text(status.applied)),
         ("frame age", age if status.frame_age_us is not None else "no command in force"),
-        ("stream", f"{stream.fps:.0f} frames per second, {encoding_text(stream)}"),
+        ("stream", f"{stream.fps:.0f} frames per second, encoding {encoding_text(stream)}"),
         ("dropped", drops_text(stream)),
         ("commands", f"{status.accepted} accepted, {rejections_text(status)}"),
     ]

@@ -3,10 +3,10 @@
 import pytest
 
 from sightline.operator_side.client.missions import MissionClient
-from sightline.operator_side.cockpit.watch_page import state_of
+from sightline.operator_side.cockpit.watch_page import _robot_lines, state_of
 from sightline.protocol.channels import STATUS
 from sightline.protocol.codec import encode
-from sightline.protocol.messages import Stamp, State, Status
+from sightline.protocol.messages import Stamp, State, Status, StreamStatus
 from sightline.protocol.transports.memory import MemoryNetwork
 
 
@@ -24,3 +24,13 @@ def test_state_of_an_offline_robot_is_empty(is_online):
     assert [name for name, _text in shown["lines"]] == (
         ["driver", "wheels", "frame age", "stream", "dropped", "commands"] if is_online else []
     )
+
+
+@pytest.mark.parametrize(("quality", "expected"), [
+    (100, "7 frames per second, encoding as configured"),
+    (80, "7 frames per second, encoding reduced for this link: quality 80 %, side length 100 %"),
+])  # fmt: skip
+def test_stream_line_does_not_call_the_rate_configured(quality, expected):
+    stream = StreamStatus(fps=7.2, quality_percent=quality)
+    lines = dict(_robot_lines(Status(state=State.ACTIVE, reason="drives", stream=stream)))
+    assert lines["stream"] == expected
