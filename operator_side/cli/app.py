@@ -169,6 +169,9 @@ def _of_system(error: OSError, arguments: Sequence[str]) -> int:
     if isinstance(error, FileNotFoundError) and error.filename is None and "temporary directory" in str(error):
         return _print_error("no temporary folder can be written: the disk is full or read-only; free some space, or "
                             "set TMPDIR to a folder that you may write", USAGE)
+    if arguments[:1] == ["--install-completion"]:
+        return _print_error(f"cannot write {error.filename}: {error.strerror}; set HOME to a folder that you may "
+                            "write, or add the lines of `sightline --show-completion` to your shell by hand", USAGE)
     return _unexpected(error, arguments)
 
 

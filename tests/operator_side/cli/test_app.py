@@ -444,6 +444,16 @@ def test_full_temporary_folders_are_one_line(capsys, monkeypatch, tmp_path, argu
         "a folder that you may write"))
 
 
+@pytest.mark.parametrize("home", ["file", "/proc/absent"])
+def test_completion_in_a_home_that_cannot_be_written_is_one_line(tmp_path, home):
+    (tmp_path / "file").touch()
+    command = [sys.executable, "-m", "sightline.operator_side.cli.app", "--install-completion"]
+    environ = os.environ | {"HOME": str(tmp_path / home), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
+    done = subprocess.run([*command, "bash"], capture_output=True, text=True, env=environ, check=False)
+    assert done.returncode == 2
+    assert re.fullmatch(rf"error: cannot write {tmp_path / home}.*: .*; set HOME to a folder .*\n", done.stderr)
+
+
 @pytest.mark.parametrize("number", [math.inf, -math.inf, math.nan])
 def test_result_with_a_number_that_json_lacks_is_valid_json(capsys, number):
     checks = [asdict(at_most("age", number, "ms", math.inf))]
