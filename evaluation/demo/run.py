@@ -19,6 +19,7 @@ from sightline.evaluation.processes import Processes, free_port, terminated_like
 from sightline.evaluation.scenario_config import robot_of, robot_table, vision_config, vision_table
 from sightline.operator_side.client.requests import SOURCE, Operator
 from sightline.operator_side.client.status import millis, twist_text
+from sightline.operator_side.config.errors import no_such_name
 from sightline.operator_side.config.loading import load_service
 from sightline.operator_side.config.toml_text import toml_text
 from sightline.operator_side.preflight import writes
@@ -97,7 +98,7 @@ class DemoOptions:
             if not is_valid:
                 raise ConfigError(f"{option} {value}: expected {expected}")
         if self.transport not in TRANSPORTS:
-            raise ConfigError(f"--transport {self.transport!r}: {', '.join(TRANSPORTS)}")
+            raise ConfigError(no_such_name("--transport", self.transport, TRANSPORTS))
 
 
 @dataclass(slots=True)

@@ -274,6 +274,8 @@ def test_command_whose_standard_streams_are_closed_has_the_null_device_and_so_ha
         (["sim", "--seed", "-1"], 2, "--seed"),
         (["demo", "--scenario", "egiht"], 2, "'eight'"),
         (["demo", "--loss", "1.5"], 2, "--loss 1.5: expected a share from 0 to below 1, e.g. 0.1"),
+        (["demo", "--transport", "foo"], 2, "error: unknown --transport 'foo'; expected zenoh, websocket, legacy"),
+        (["demo", "--transport", "websockt"], 2, "error: unknown --transport 'websockt'; did you mean 'websocket'?"),
         (["demo", "--seconds", "-3"], 2, "--seconds -3.0: expected 0 to 3600"),
         (["status", "r1", "--connect", "tcp://robot:7447"], 2, "write tcp/robot:7447"),
         (["vision", "--connect", "tls/127.0.0.1:1"], 2, "a tls/ endpoint needs keys; pass --secure"),
