@@ -29,7 +29,7 @@ class HsvRange(Config):
 
     @model_validator(mode="after")
     def _is_not_empty(self) -> Self:
-        """Reject a range that no pixel is in: only hues wrap around."""
+        """Reject a range without any color: only hue may wrap around."""
         for name in ("saturation", "value"):
             low, high = getattr(self, f"{name}_low"), getattr(self, f"{name}_high")
             if low > high:
@@ -43,21 +43,21 @@ class HsvConfig(Config):
     ranges: Annotated[tuple[HsvRange, ...], Field(min_length=1, max_length=8)] = (
         HsvRange(hue_low_deg=36, hue_high_deg=68, saturation_low=0.5),
     )
-    """Colors of the target; hue 0 to 360, saturation and value 0 to 1. From a high to a low hue means through red."""
+    """Colors of the target; hue 0 to 360, saturation and value 0 to 1. A hue range from high to low includes red."""
     shape: Literal["disc", "any"] = "disc"
     """`disc`: round objects. `any`: each object of the color; its range follows from `boxes.height_m` or `width_m`."""
     min_radius_px: Annotated[float, Field(gt=1, le=200)] = 3.0
     """Radius of the smallest target in the image."""
     max_contours: Annotated[int, Field(ge=1, le=256)] = 16
-    """Security limit: most blobs that the detector measures in one image, the longest outlines first."""
+    """Security limit: most blobs that the detector measures in one image, longest outlines first."""
     max_roughness: Annotated[float, Field(gt=0, le=0.5)] = 0.07
     """RMS distance of the outline from a circle, in radii; a square has 0.10."""
     min_outline_kept: Annotated[float, Field(ge=0.2, le=1)] = 0.55
-    """Share of the outline that must lie on the circle; an object in front may hide the rest."""
+    """Least share of the outline on the circle; an object in front may hide the rest."""
 
 
 Device = Literal["auto", "cpu", "cuda", "tensorrt"]
-"""Device of a model. `auto` takes the best available one and logs it. Any other value is required at the start."""
+"""Device of a model. `auto` uses the best available device and logs it. The start fails without any other device."""
 
 
 class DetectorConfig(Config):
@@ -66,7 +66,7 @@ class DetectorConfig(Config):
     renamed_keys: ClassVar[Mapping[str, str]] = {"only_colour": "only_color"}
     kind: Annotated[str, Field(min_length=1, max_length=256)] = "auto"
     """A name, or `package.module:Name`; a file or address follows a colon: onnx:ball.onnx, oip+http://... `auto` is the
-    learned model, or `hsv` without ONNX Runtime and for `hsv.shape` `any`."""
+    learned model. It is `hsv` without ONNX Runtime, and if `hsv.shape` is `any`."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Options of the detector."""
     device: Device = "auto"
@@ -74,26 +74,26 @@ class DetectorConfig(Config):
     deadline_s: Annotated[float, Field(ge=0.005, le=1)] = 0.1
     """Deadline of a remote detector. After it, the robot already slows down, so a later answer does not count."""
     labels: Annotated[tuple[str, ...], Field(max_length=64)] = ()
-    """Only detections with one of these labels count, and `target` of the color detectors; empty for all."""
+    """Only detections with these labels count, and those labeled `target` by a color detector; empty for all."""
     only_color: bool = False
-    """Only detections mostly of the colors of `hsv.ranges` count.
+    """Use only detections that are mostly of the colors of `hsv.ranges`.
 
     The model finds balls, the color selects one.
     """
     tracked: bool = False
     """Give an object the same `track_id` from frame to frame."""
     fallback: Annotated[str, Field(max_length=256)] = ""
-    """Detector that steers while the other gives no answer; empty: the robot holds."""
+    """Detector that steers while `kind` gives no answer. Empty: the robot holds."""
     shadow: Annotated[str, Field(max_length=256)] = ""
     """Second detector on the same frames, for comparison; it never steers."""
     shadow_options: dict[str, Any] = Field(default_factory=dict)
-    """Options of the shadow."""
+    """Options of the shadow detector."""
 
 
 class BoxesConfig(Config):
     """Steering by boxes, when the detector is `boxes`. Without a size the robot only turns toward the box.
 
-    The sizes are also those of what the color detector finds with `hsv.shape` `any`.
+    The color detector with `hsv.shape` `any` uses the same sizes.
     """
 
     source: Source = "guest"
@@ -103,18 +103,18 @@ class BoxesConfig(Config):
     min_score: Fraction = 0.25
     """Boxes below this score do not count."""
     height_m: Annotated[float | None, Field(gt=0.01, le=10)] = None
-    """Height of the object, for its range while top and bottom are in view."""
+    """Height of the object. It gives the range while the top and bottom edges are in view."""
     width_m: Annotated[float | None, Field(gt=0.01, le=10)] = None
-    """Width of the object, for its range without the height."""
+    """Width of the object. It gives the range if the height does not."""
 
 
 class MissionConfig(Config):
-    """The mission: its name or `package.module:Name`. `options` are for its own `Config`."""
+    """The mission and its options."""
 
     kind: Annotated[str, Field(min_length=1, max_length=64)] = "follow"
     """Name of the mission, or `package.module:Name`."""
     options: dict[str, Any] = Field(default_factory=dict)
-    """Options of the mission."""
+    """Options of the mission, for its own `Config`."""
 
 
 class TargetConfig(Config):
@@ -143,17 +143,17 @@ class TrackConfig(Config):
     acceleration_mps2: Annotated[float, Field(gt=0, le=20)] = 0.35
     """Expected acceleration of the target (1 sigma); a higher value follows faster and smooths less."""
     range_noise: Annotated[float, Field(gt=0, le=1)] = 0.008
-    """1 sigma of one position measured at one meter, in meters; grows with the square of the distance."""
+    """1 sigma of a position measured at 1 m, in meters; grows with the square of the distance."""
     gate_m: Annotated[float, Field(gt=0, le=5)] = 0.35
     """A detection further than this from the expected position is another object."""
     gate_growth_mps: Annotated[float, Field(ge=0, le=10)] = 1.5
     """Growth of this gate while the target is not detected, up to three sigma of the expected position."""
     apart_m: Annotated[float, Field(ge=0, le=5)] = 0.15
-    """A detection nearer than this to an object is a part of it, or the same object found twice."""
+    """A detection nearer than this to an object is a part of it, or a second detection of it."""
     coast_s: Annotated[float, Field(ge=0, le=5)] = 0.5
     """Time without a detection in which the robot drives to the expected position; then it only turns."""
     give_up_s: Annotated[float, Field(gt=0, le=10)] = 1.2
-    """Time without a detection after which the target is lost; only its side is stored."""
+    """Time without a detection after which the target is lost. Only its side remains known."""
     confirm: Annotated[int, Field(ge=1, le=30)] = 2
     """Detections before the robot drives toward a target; it turns immediately."""
 
@@ -184,7 +184,7 @@ class SteerConfig(Config):
     back_calculation_hz: Annotated[float, Field(ge=0, le=50)] = 5.0
     """Rate at which an integral shrinks by the part of the command that the robot did not apply."""
     drive_within_rad: Annotated[float, Field(gt=0, le=1.5)] = 0.9
-    """Forward speed fades to zero as the bearing grows to this."""
+    """Forward speed fades to zero as the bearing grows to this value."""
 
 
 class LatencyConfig(Config):
@@ -193,11 +193,11 @@ class LatencyConfig(Config):
     first_guess_s: Annotated[float, Field(ge=0, le=0.5)] = 0.03
     """Latency before the first measurement."""
     max_s: Annotated[float, Field(gt=0, le=1)] = 0.4
-    """Highest latency that counts."""
+    """Upper limit of the measured latency."""
     smoothing_s: Annotated[float, Field(gt=0, le=10)] = 0.5
     """Time constant of the smoothing."""
     actuation_s: Annotated[float, Field(ge=0, le=0.3)] = 0.03
-    """Time from an accepted command to the motion of the wheels; the robot cannot measure this part."""
+    """Time from an accepted command to the motion of the wheels. The robot cannot measure this part."""
     linear_acceleration_mps2: Annotated[float, Field(gt=0, le=50)] = 2.0
     """Acceleration limit of the robot, for the prediction of commands in flight."""
     angular_acceleration_rad_s2: Annotated[float, Field(gt=0, le=200)] = 10.0
@@ -231,7 +231,7 @@ class ViewingConfig(Config):
     preview_hz: Annotated[float, Field(gt=0, le=60)] = 10.0
     """Most preview images per second."""
     preview_width_px: Annotated[int, Field(ge=64, le=640)] = 320
-    """Greatest width of the preview."""
+    """Largest width of the preview."""
     preview_quality_percent: Annotated[int, Field(ge=20, le=95)] = 60
     """JPEG quality of the preview."""
 
@@ -240,9 +240,9 @@ class ShareConfig(Config):
     """Several vision services that share the robots of a site."""
 
     enabled: bool = False
-    """True to share: the service drives the robots that it owns, and stands by for others. It needs Zenoh."""
+    """True to share: the service drives the robots that it owns, and is standby for others. It needs Zenoh."""
     name: Annotated[str, Field(pattern=f"^({NAME_PATTERN})?$")] = ""
-    """Name among the services, each with its own; empty for a new one at each start."""
+    """Unique name among the services; empty for a new name at each start."""
     weight: Annotated[float, Field(ge=LEAST_WEIGHT, le=MOST_WEIGHT)] = 1.0
     """Share of the robots, relative to the weights of the other services."""
 

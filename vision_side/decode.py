@@ -1,4 +1,4 @@
-"""JPEG bytes -> `DecodedImage`, bounded before any decoder sees them. Pure."""
+"""Decode JPEG bytes to a `DecodedImage`, after a check of their bounds. Pure."""
 
 from dataclasses import dataclass
 
@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 from sightline.protocol.errors import RejectReason, WireError
 from sightline.protocol.jpeg import MAX_SEGMENTS, read_jpeg_size
 
-cv2.setNumThreads(1)  # one stream, one thread: images this small only lose by being split
+cv2.setNumThreads(1)  # one thread per stream: to split images this small only costs time
 
 HALF_SCALE_FROM_PIXELS = 640 * 480
 MAX_SCANS = 16
-"""A progressive JPEG of 20-byte scans costs a whole-picture pass each; real encoders write about ten."""
+"""Each scan of a progressive JPEG costs one pass over the whole image; real encoders write about ten scans."""
 _SOS = b"\xff\xda"
 _BASELINE = (b"\xff\xc0", b"\xff\xc1")
 _SEGMENTS = frozenset(bytes([0xFF, one]) for one in (0xC0, 0xC1, 0xC4, 0xDB, 0xDD, *range(0xE0, 0xF0), 0xFE))
-"""What a plain baseline header is made of: frame, Huffman and quantisation tables, restarts, application, comment."""
+"""Segments of a baseline header: frame, Huffman and quantization tables, restarts, application, comment."""
 
 
 @dataclass(frozen=True, slots=True)
 class DecodedImage:
-    """Decoded pixels, valid until the next decode. `scale` turns their pixels into those of the encoded image."""
+    """Decoded pixels, valid until the next decode. `scale` converts their coordinates to those of the encoded image."""
 
     bgr: NDArray[np.uint8]
     scale: int
@@ -52,7 +52,7 @@ class Decoder:
             self._checked_head = self._head_of(jpeg)
 
     def _head_of(self, jpeg: bytes) -> bytes | None:
-        """Return the head that a camera repeats byte for byte, so that its next images skip this check, or None."""
+        """Return the header if the camera repeats it in each image, so that the next check is skipped, else None."""
         size = read_jpeg_size(jpeg, self._max_pixels)
         if (size.width_px, size.height_px) != self.size_px:
             own = f"{self.size_px[0]}x{self.size_px[1]}"
@@ -74,8 +74,8 @@ class Decoder:
 def _cached_pixels(rows: int, columns: int) -> NDArray[np.uint8]:
     """Return a buffer 16 bytes off a 32-byte boundary.
 
-    On the boundary libjpeg-turbo stores past the cache: its decode takes 10 % longer, and every look at the pixels
-    after it waits for memory.
+    On the boundary libjpeg-turbo stores past the cache. Decoding takes 10 % longer, and each later access to the
+    pixels waits for memory.
     """
     size = rows * columns * 3
     block = np.zeros(size + 48, np.uint8)
@@ -84,9 +84,9 @@ def _cached_pixels(rows: int, columns: int) -> NDArray[np.uint8]:
 
 
 def _head_of_one_scan(jpeg: bytes, components: int) -> bytes | None:
-    """Return all up to the pixels of a baseline image whose first scan has every component. Decoders end after it.
+    """Return the bytes before the pixels of a baseline image whose first scan has every component.
 
-    None for progressive and for several scans. Expects a header that `read_jpeg_size` took.
+    Decoders end after that scan. None for progressive images and for several scans. `read_jpeg_size` has accepted them.
     """
     at, baseline = 2, False
     for _ in range(MAX_SEGMENTS):
@@ -101,7 +101,7 @@ def _head_of_one_scan(jpeg: bytes, components: int) -> bytes | None:
 
 
 def _count_scans(jpeg: bytes) -> int:
-    """SOS markers; as vectors, since `bytes.count` would cost five times as much on every image."""
+    """Count the SOS markers. A vectorized search is five times faster than `bytes.count`."""
     data = np.frombuffer(jpeg, np.uint8)
     return int(np.count_nonzero((data[:-1] == 0xFF) & (data[1:] == 0xDA)))
 

@@ -1,4 +1,4 @@
-"""Draws what vision saw over the image it saw it in: axes, outline, raw and filtered centroid, words. Pure."""
+"""Draw the results over their image: axes, outline, raw and filtered center, text. Pure."""
 
 import math
 from bisect import bisect_right
@@ -26,11 +26,11 @@ RAW: Final = (70, 110, 255)
 FILTERED: Final = (255, 120, 255)
 TEXT_COLOR: Final = (255, 255, 255)
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
-_FONT_PER_WIDTH: Final = 0.48 / 640  # about sixty letters from edge to edge
-_STRIP_SHADE: Final = 0.35  # what is left of the image under words, so that they can be read on anything
-_LINE_PER_FONT: Final = 40  # pixels from line to line where letters have the size 1
+_FONT_PER_WIDTH: Final = 0.48 / 640  # about sixty letters across the image
+_STRIP_SHADE: Final = 0.35  # brightness of the image under text, so that the text is legible
+_LINE_PER_FONT: Final = 40  # line height in pixels at font size 1
 _GAP: Final = "    "
-_FAR_PX: Final = 9e3  # OpenCV draws in 16 bits
+_FAR_PX: Final = 9e3  # OpenCV drawing coordinates have 16 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ def draw_preview(picture: Image, width_px: int) -> Image:
 
 
 def raw_px(target: Detection) -> Point:
-    """Return the center of the circle, else of the box."""
+    """Return the center of the circle, or of the box without a circle."""
     if target.circle is not None:
         return target.circle.cx_px, target.circle.cy_px
     return target.center_px
@@ -104,7 +104,7 @@ def filtered_px(shown: OverlayData) -> Point | None:
     up = shown.radius_m - camera.z_m
     tilt_cos, tilt_sin = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)
     ahead, down = forward * tilt_cos + up * tilt_sin, forward * tilt_sin - up * tilt_cos
-    if not (math.isfinite(ahead) and ahead > 0.01):  # behind the lens there are no pixels
+    if not (math.isfinite(ahead) and ahead > 0.01):  # a point behind the lens has no pixel
         return None
     across_px, down_px = camera.cx_px - camera.fx_px * left / ahead, camera.cy_px + camera.fy_px * down / ahead
     # A mission without a height follows objects of any height. The detection gives the height.
@@ -137,12 +137,12 @@ def _draw_target(canvas: Image, target: Detection, scale: float) -> None:
 
 
 def _at(point: Point, scale: float) -> tuple[int, int]:
-    """Convert a point to the canvas. Points far outside and nan go where drawing them costs nothing."""
+    """Convert a point to the canvas. Points far outside, and nan, go where drawing is fast."""
     across, down = (-_FAR_PX if math.isnan(value) else min(max(value * scale, -_FAR_PX), _FAR_PX) for value in point)
     return round(across), round(down)
 
 
-# --- words -------------------------------------------------------------------------------------------------------
+# --- text --------------------------------------------------------------------------------------------------------
 
 StyledText = Sequence[tuple[str, Color]]
 

@@ -20,13 +20,13 @@ from sightline.vision_side.tracking.track import Target, from_odometry
 SOURCE = "vision"
 NO_ANSWER = "NO_ANSWER"
 """Value of `skipped` for a frame without an answer of the detector in time."""
-# A longer gap between frames contains no further information about the motion in it.
+# The longest time step. A longer gap contains no further information about the motion.
 _MAX_DT_S = 0.5
-# A target that was seen so long ago, at most, is expected near its last place.
+# Largest age of a sighting for which the target is expected near its last place.
 _EXPECTED_US = 500_000
-# Rounding of a camera model, at most, that its robot scales to another size.
+# Largest rounding error of a camera model that the robot scales to another size.
 _SAME_LENS_PX = 0.5
-# Weight of the earlier frames in the share of lost ones. About sixty frames decide, two seconds at 30 fps.
+# Weight of earlier frames in the share of lost frames. The mean is over about sixty frames, two seconds at 30 fps.
 _LOSS_WEIGHT = 63 / 64
 # Share of lost frames above which each twist is sent twice. A long run of losses is then rare in both directions.
 _TWICE_ABOVE = 0.05
@@ -46,12 +46,12 @@ class Observation:
     """The result of one step for viewers.
 
     Args:
-        phase: word of the mission (`follow`: tracking, coasting, searching, lost), or "no image".
+        phase: phase of the mission (`follow`: tracking, coasting, searching, lost), or "no image".
         detections: all detections, best first.
         target: the detection that the mission follows.
         bearing_rad: bearing of the target, left positive.
         distance_m: distance of the target, m.
-        note: the rest of the line.
+        note: the rest of the line for the operator.
         done: True after the end of the mission.
         track: number of the track that the mission follows.
     """
@@ -104,7 +104,7 @@ class Pipeline:
         self._config = config
         self._camera = camera
         self._next_camera: CameraModel | None = None
-        """A model of another size, until its first image comes."""
+        """A camera model for another image size, until the first such image."""
         self._detector = detector
         self._decoder = Decoder(camera.width_px, camera.height_px, config.max_pixels)
         self._first = chosen or configured_mission(config)
@@ -119,7 +119,7 @@ class Pipeline:
         self.restart_clock()
 
     def restart_clock(self) -> None:
-        """Forget the time of the last frame, if it was not true or is of another lens."""
+        """Forget the time of the last frame, if it was false or is of another lens."""
         self._latency = LatencyEstimator(self._config.latency)
         self._last_us: int | None = None
         self._seen_at: tuple[int, tuple[float, float]] | None = None
@@ -167,13 +167,13 @@ class Pipeline:
 
     def set_camera(self, camera: CameraModel) -> None:
         """Use another camera model from the next frame on, or from its first image on if that has another size."""
-        # Images of the former size may still come: they wait behind a computation, or this model overtook them.
+        # Images of the former size may still arrive, because of a computation or another order on the network.
         self._next_camera = camera
         if _size_px(camera) == _size_px(self._camera):
             self._use_next_camera()
 
     def _use_next_camera(self) -> None:
-        """Use the model that waits. The mission of another lens starts again, that of another size continues."""
+        """Use the waiting camera model. A mission starts again with another lens, and continues with another size."""
         if self._next_camera is None:
             return
         former, camera, self._next_camera = self._camera, self._next_camera, None
@@ -214,7 +214,7 @@ class Pipeline:
                 self._use_next_camera()
             picture = self._decoder.decode(frame.jpeg)
         except WireError as error:
-            # An invalid image is acknowledged too. Otherwise the robot waits for its credit until the timeout.
+            # An invalid image is acknowledged, too. Otherwise the robot waits for its credit until the timeout.
             return self._skip(error.reason, error.detail)
         shown = DetectFrame(self._config.robot, frame.header, frame.jpeg, self._decoder, picture)
         shown.goes_by = self.mission.goes_by
@@ -222,7 +222,7 @@ class Pipeline:
         # A result that does not fit its frame counts as no answer: a plug-in must not steer by another frame.
         (result,) = checked_results(self._detector, [shown], frame.deadline_us)
         if isinstance(result, str):
-            # No twist, so that the robot holds. Only "saw nothing" may start a search.
+            # No twist, so the robot holds. Only "detected nothing" may start a search.
             return self._skip(NO_ANSWER, result, "no answer")
         return self._answer(frame.header, result.detections, picture, result)
 
@@ -231,11 +231,11 @@ class Pipeline:
 
         Args:
             header: header of the examined frame.
-            detections: objects, best first; empty means "saw nothing".
+            detections: objects, best first; empty means "detected nothing".
         """
         if not self._is_new(header):
             return self._skip("OUT_OF_ORDER", "the examined frame is not newer than the last")
-        self._use_next_camera()  # the caller read the boxes by it
+        self._use_next_camera()  # the caller has read the boxes with it
         return self._answer(header, detections, None)
 
     def _is_new(self, header: FrameHeader) -> bool:
@@ -274,13 +274,13 @@ class Pipeline:
         return dt_s
 
     def _expected_px(self, header: FrameHeader) -> tuple[float, float] | None:
-        """Return the place where the image shows the followed target, if one did a moment ago."""
+        """Return the expected image position of the followed target, if it was seen a moment ago."""
         if self._seen_at is None or header.t_us - self._seen_at[0] > _EXPECTED_US:
             return None
         if self._track is None:
             return self._seen_at[1]
-        # A robot that turns at 1.5 rad/s moves the target by 14 of 320 px from one image to the next at 30 fps, and by
-        # 95 px at 3 fps, which is half the width of the part that is enlarged.
+        # A robot that turns at 1.5 rad/s moves the target by 14 of 320 px between two images at 30 fps, and by 95 px at
+        # 3 fps. That is half the width of the enlarged part.
         before_us, target = self._track
         place = target.after((header.t_us - before_us) / 1e6)
         return place_px(*from_odometry(header.pose, *place), self._seen_at[1], self._camera)
@@ -319,7 +319,7 @@ def _seen(plan: Plan, detections: tuple[Detection, ...]) -> Observation:
 
 
 class FrameLoss:
-    """Estimates the share of frames that the network lost, by the gaps in their sequence numbers."""
+    """Estimates the share of frames that the network lost, by the gaps in the sequence numbers."""
 
     def __init__(self) -> None:
         self._share = 0.0
@@ -340,7 +340,7 @@ class FrameLoss:
 
     @property
     def copies(self) -> int:
-        """Return how often to send a twist, each time with a new number, so that one loss does not cost the twist."""
+        """Return how many times to send a twist, each with a new number, so that one loss does not lose the twist."""
         return 2 if self._share > _TWICE_ABOVE else 1
 
 

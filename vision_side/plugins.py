@@ -1,4 +1,4 @@
-"""Options of detectors and missions, laid over the sections of the vision service's configuration. Pure."""
+"""Options of detectors and missions, merged over the sections of the vision configuration. Pure."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,9 +10,9 @@ from sightline.vision_side.config import VisionConfig
 
 
 def shared_options(plugin: Any, options: Mapping[str, Any], config: VisionConfig) -> dict[str, Any]:
-    """Merge `options` over each section of `config` that the plug-in's `Config` has by name and type.
+    """Merge `options` over the sections of `config` that the plug-in's `Config` has with the same name and type.
 
-    Such a section is, for example, `target`, `hsv` or `boxes`.
+    Such sections are, for example, `target`, `hsv` and `boxes`.
     """
     merged: dict[str, Any] = dict(options)
     settings = config_model(plugin)

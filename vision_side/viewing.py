@@ -28,11 +28,11 @@ from sightline.vision_side.overlay import OverlayData, draw_overlay, draw_previe
 from sightline.vision_side.pipeline import SOURCE, PipelineAnswer
 
 _EARLY: Final = 0.25
-"""Share of a period that one may come early: else every second of 30 frames a second would often be a third."""
+"""Share of a period by which an image may be early. Without it, 15 Hz would often use every third frame of 30 fps."""
 
 
 class RateLimiter:
-    """At most `rate_hz` in the mean."""
+    """Limits the mean rate to `rate_hz`."""
 
     def __init__(self, rate_hz: float) -> None:
         self._period_us = 1e6 / rate_hz
@@ -42,7 +42,7 @@ class RateLimiter:
         """Return True if an image may pass now, and count it."""
         if now_us < self._due_us - _EARLY * self._period_us:
             return False
-        # Counted from when it was due, so that neither early nor late ones change the mean; after a pause, from now.
+        # Counted from the due time, so that early and late images do not change the mean; after a pause, from now.
         was_due_us = self._due_us if now_us - self._due_us < self._period_us else now_us
         self._due_us = was_due_us + self._period_us
         return True
@@ -50,31 +50,31 @@ class RateLimiter:
 
 # The channels `overlay` and `preview`: only while a viewer subscribes, newest only.
 #
-# The twist never waits for them. A frame is passed on after its answer is sent, as the received JPEG, and a thread of
-# low priority decodes, draws and encodes. Without a viewer, each frame costs one check of the link.
+# The twist never waits for them. A frame is passed on after its answer is sent, as the received JPEG. A thread of low
+# priority decodes, draws and encodes it. Without a viewer, each frame costs one check of the link.
 
 
 KEPT: Final = 4
-"""Frames whose answer comes later, from another service's detector: one that is further behind is not shown."""
+"""Stored frames whose answer comes later, from another service's detector. Older frames are not shown."""
 NO_PICTURE: Final = "no image"
 """Phase of an image that the pipeline rejected. It is not decoded here either."""
-_NICE: Final = 10  # of the threads that draw: answering the next frame comes first
+_NICE: Final = 10  # nice value of the drawing threads: the next frame has priority
 _QUALITIES_BELOW: Final = (50, 30)
-"""Tried where an image is over the channel's bound, before it is left out."""
+"""Lower qualities for an image above the size limit of the channel. Without success the image is dropped."""
 
 
 def _become_nice() -> None:
-    with suppress(OSError, AttributeError):  # of this thread alone, where the system can
+    with suppress(OSError, AttributeError):  # of this thread only, if the system supports it
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
 
 
 _DRAWING: Final = ThreadPoolExecutor(os.cpu_count(), "viewing", _become_nice)
-"""Shared by the robots of a process: OpenCV 5 loads its font once a thread, which takes 30 ms of CPU."""
+"""Shared by the robots of a process, because OpenCV 5 loads its font once per thread, which takes 30 ms of CPU."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """One frame to show, and where."""
+    """One frame to show, and its channels."""
 
     shown: OverlayData
     jpeg: bytes
@@ -86,7 +86,7 @@ class ViewPublisher:
     """The images that a vision service publishes for one robot."""
 
     def __init__(self, config: VisionConfig, link: Link, log_change: Callable[[str, str], None]) -> None:
-        """Create the viewing. `log_change(subject, line)` prints a changed line."""
+        """Create the publisher. `log_change(subject, line)` prints a changed line."""
         self._config, self._link, self._log_change = config, link, log_change
         self._paces = {OVERLAY: RateLimiter(config.viewing.overlay_hz), PREVIEW: RateLimiter(config.viewing.preview_hz)}
         self._kept: deque[tuple[FrameHeader, bytes]] = deque(maxlen=KEPT)
@@ -100,7 +100,7 @@ class ViewPublisher:
         self._clock = RobotClock()
 
     def keep(self, header: FrameHeader, jpeg: bytes) -> None:
-        """Remember a frame whose answer comes later."""
+        """Store a frame whose answer comes later."""
         if any(self._link.has_listener(channel) for channel in self._paces):
             self._kept.append((header, jpeg))
         else:
@@ -128,12 +128,12 @@ class ViewPublisher:
             self._draw_newest()
 
     def publish_detections(self, header: FrameHeader, answer: PipelineAnswer, started_ns: int) -> None:
-        """Publish what was found in an answered frame, if a client subscribes to it."""
+        """Publish the detections of an answered frame, if a client subscribes to them."""
         if answer.result is None or not self._link.has_listener(DETECTIONS):
             return
         try:
             payload = detections_payload(answer.result)
-        except ValueError as error:  # of a plug-in
+        except ValueError as error:  # from a plug-in
             self._log_change("detections", f"the result cannot be sent: {error_text(error)}")
             return
         self._link.publish(DETECTIONS, self._header(DETECTIONS, header, started_ns), payload, SOURCE)
@@ -142,13 +142,13 @@ class ViewPublisher:
         return next((jpeg for kept, jpeg in self._kept if kept == header), None)
 
     def _draw_newest(self) -> None:
-        """Request a thread, behind other robots, unless one is coming or nothing is new. The lock is held."""
+        """Request a thread, unless one is requested or no frame is new. The caller holds the lock."""
         if self._newest is not None and not self._is_drawing:
             self._is_drawing = True
             with suppress(RuntimeError):  # the process ends
                 _DRAWING.submit(self._draw)
 
-    # --- on a thread that draws --------------------------------------------------------------------------------------
+    # --- on a drawing thread -----------------------------------------------------------------------------------------
 
     def _draw(self) -> None:
         with self._lock:
@@ -156,7 +156,7 @@ class ViewPublisher:
         assert job is not None
         try:
             self._publish(job)
-        except Exception as error:  # whatever a plug-in's detections hold: people see less, the robot drives on
+        except Exception as error:  # e.g. invalid detections of a plug-in; the robot must continue
             text = report_fault("viewing", error)
             self._log_change("viewing", f"cannot show an image: {type(error).__name__}: {text}")
         with self._lock:

@@ -1,5 +1,5 @@
 """Detectors behind one port, and the wrappers around them.
 
 May import: `protocol`, `vision_side`.
-Interface: `port.Detector` is what a detector implements; `registry` finds and builds one by name.
+Interface: `port.Detector` is the interface of a detector; `registry` finds and builds a detector by name.
 """

@@ -27,12 +27,12 @@ from sightline.vision_side.detect.port import NO_DEADLINE, NORMALIZED_PX, Detect
 
 SIZES: Final = ((320, 240), (640, 480), (97, 61), (16, 16), (1280, 720), (641, 481))
 LATE_S: Final = 0.25
-"""Limit for the answer to a frame after its deadline, when the caller no longer waits for it."""
+"""Longest delay of an answer after the deadline of its frame. By then the caller no longer waits."""
 _MAX_PIXELS: Final = 1920 * 1080
 _FRAME_US: Final = 33_333
 _QUALITY: Final = 80
 _HASH = re.compile(r"[0-9a-f]{0,64}")
-_SAME_SCORE: Final = 0.5  # what is less sure may come and go on a device that rounds
+_SAME_SCORE: Final = 0.5  # on a device that rounds, less certain detections may come and go
 
 Make = Callable[[], Detector]
 
@@ -66,7 +66,7 @@ def check_detector(make: Make, seed: int = 1) -> list[PromiseResult]:
         detector = make()
         try:
             wrong = check(detector, make, seed)
-        except PLUGIN_ERRORS as error:  # it promised not to
+        except PLUGIN_ERRORS as error:  # violates the promise to raise nothing
             wrong = f"it raises {type(error).__name__}: {report_fault('detector', error)}"[:160]
         finally:
             close_detector(detector)
@@ -201,7 +201,7 @@ _CHECKS: Final = (_keeps_order, _keeps_answering, _keeps_bounds, _keeps_silence,
                   _keeps_robots_apart, _keeps_its_name)
 
 
-# --- what they are made of -------------------------------------------------------------------------------------------
+# --- frames and comparisons ------------------------------------------------------------------------------------------
 
 
 def _seen(detector: Detector, frames: Iterator[DetectFrame]) -> list[DetectionResult | None]:
@@ -242,7 +242,7 @@ def _is_bad(frame: DetectFrame) -> bool:
         frame.picture()
     except Exception:
         return True
-    return False  # a decoder fills up what is cut off at the end: that is an image
+    return False  # a decoder fills the missing end of a truncated image, so it is an image
 
 
 def drawn_frames(seed: int, count: int, size: tuple[int, int], robot: str = "r1") -> Iterator[DetectFrame]:

@@ -21,7 +21,7 @@ from sightline.vision_side.detect.port import (
 
 
 class LabelFilter(DetectorWrapper):
-    """A detector that leaves out what another one finds under other labels."""
+    """A detector that removes the detections of another detector with other labels."""
 
     def __init__(self, detector: Detector, labels: tuple[str, ...]) -> None:
         super().__init__(detector)
@@ -29,7 +29,7 @@ class LabelFilter(DetectorWrapper):
 
     @property
     def labels(self) -> Sequence[str]:
-        """Return those labels of the one inside that pass."""
+        """Return the labels of the inner detector that pass."""
         return [one for one in super().labels if one in self._labels]
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
@@ -41,18 +41,18 @@ class LabelFilter(DetectorWrapper):
         return result if len(kept) == len(result.detections) else replace(result, detections=kept)
 
 
-# Combinator: only detections with the configured colors. The model finds balls, the color selects one. Pure.
+# Combinator: keep only detections with the configured colors. The model finds balls, the color selects one. Pure.
 
 
 class ColorFilter(DetectorWrapper):
-    """A detector that leaves out what another one finds in other colors."""
+    """A detector that removes the detections of another detector in other colors."""
 
     def __init__(self, detector: Detector, ranges: tuple[HsvRange, ...]) -> None:
         super().__init__(detector)
         self._mask = ColorMask(ranges)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
-        """Return the detections of the inner detector with the colors. Without pixels there is no answer."""
+        """Return the inner detector's detections that have the colors. Without pixels there is no answer."""
         results = self.inner.detect(frames, deadline_us)
         return [one and self._kept(frame, one) for frame, one in zip(frames, results, strict=True)]
 
@@ -65,17 +65,17 @@ class ColorFilter(DetectorWrapper):
         return result if len(kept) == len(result.detections) else replace(result, detections=kept)
 
 
-# Combinator: gives what is found in one frame after the other the same `track_id`, by how much boxes overlap. Pure.
+# Combinator: give an object the same `track_id` in successive frames, by the overlap of its boxes. Pure.
 #
-# The clock is the frames' capture time. An id is never given twice in a session, and what was away for longer than a
-# second comes back as another one: better two ids for one thing than one id for two.
+# The clock is the frames' capture time. An id is not reused in a session. After more than a second without a detection
+# an object gets a new id: two ids for one object are better than one id for two objects.
 
 
 KEPT_US: Final = 1_000_000
 LEAST_OVERLAP: Final = 0.2
-"""Intersection over union; a thing that moves by half its width from frame to frame still has 0.33."""
+"""Intersection over union; an object that moves by half its width between two frames still has 0.33."""
 MAX_TRACKS: Final = 64
-"""Of one robot; every pair is compared. The best so many detections of a frame get ids, the rest none."""
+"""Tracks of one robot. Every pair is compared. The best detections of a frame, up to this number, get ids."""
 
 
 @dataclass(slots=True)
@@ -86,7 +86,7 @@ class _Track:
 
 
 class TrackIds(DetectorWrapper):
-    """A detector whose detections carry ids."""
+    """A detector whose detections carry track ids."""
 
     def __init__(self, detector: Detector) -> None:
         super().__init__(detector)

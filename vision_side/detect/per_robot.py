@@ -1,4 +1,4 @@
-"""State per robot: memory that is reset by a new session, and a pool of decoders. Pure."""
+"""State per robot: a memory that a new session resets, and a pool of decoders. Pure."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -11,8 +11,8 @@ from sightline.vision_side.detect.port import DetectFrame
 Memory = TypeVar("Memory")
 
 MAX_ROBOTS: Final = 1_000
-"""Of which something is remembered, as many as a site meets: with fewer, robots that take turns would each be forgotten
-just before theirs. The robot that was not seen for the longest is forgotten first."""
+"""Robots with a stored memory. With fewer, robots that take turns would lose their memory just before their turn. The
+robot that was not seen for the longest time is forgotten first."""
 
 
 class PerSession(Generic[Memory]):
@@ -23,11 +23,11 @@ class PerSession(Generic[Memory]):
         self._kept: OrderedDict[str, tuple[object, Memory]] = OrderedDict()
 
     def find(self, robot: str) -> Memory | None:
-        """Return the item of the robot's newest session, or None."""
+        """Return the memory of the robot's newest session, or None."""
         return self._kept[robot][1] if robot in self._kept else None
 
     def of(self, robot: str, session: object) -> Memory:
-        """Return the item of a session. Its name may have more parts than the id."""
+        """Return the memory of a session. The key `session` may have more parts than the session id."""
         before = self._kept.pop(robot, None)
         memory = before[1] if before is not None and before[0] == session else self._begin()
         self._kept[robot] = session, memory
@@ -36,13 +36,13 @@ class PerSession(Generic[Memory]):
         return memory
 
 
-# Frames for a detector on a separate thread. The decoder of the pipeline replaces its pixels meanwhile. Pure.
+# Frames for a detector on a separate thread, because the decoder of the pipeline replaces its pixels meanwhile. Pure.
 
 
 MAX_DECODERS: Final = 64
-"""Security limit: of decoders kept, one for each robot and place in a batch; the longest unused goes first.
+"""Security limit: stored decoders, one for each robot and place in a batch. The longest unused one is removed first.
 
-Images of 1920x1080, decoded at half scale, are 1.6 MB each: 100 MB at most. A robot whose decoder went gets another.
+A decoded image of 1920x1080 at half scale is 1.6 MB, 100 MB in all. A robot whose decoder was removed gets a new one.
 """
 
 
@@ -55,7 +55,7 @@ class DecoderPool:
         self._decoders: OrderedDict[tuple[str, int], Decoder] = OrderedDict()
 
     def again(self, frame: DetectFrame, place: int = 0) -> DetectFrame:
-        """Return the frame with a decoder of this place. It is valid until the next one of its robot and `place`."""
+        """Return the frame with the decoder of its robot and `place`. It is valid until that decoder's next frame."""
         copy = self.frame(frame.robot, frame.header, frame.jpeg, (frame.width_px, frame.height_px), place)
         copy.goes_by, copy.expected_px, copy.looks_once = frame.goes_by, frame.expected_px, frame.looks_once
         return copy

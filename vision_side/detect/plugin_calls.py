@@ -27,13 +27,13 @@ from sightline.vision_side.detect.port import (
 )
 
 OLD_NOTICES: Final = "news"
-"""The name of `notices` in the release before; accepted for one release."""
+"""The name of `notices` in the last release; accepted for one release."""
 MAX_NOTICES: Final = 16
-"""Lines stored between two calls of `take`; the oldest go first."""
+"""Lines stored between two calls of `take`; the oldest are dropped first."""
 
 
 class Notices:
-    """Lines for the operator, until they are taken; another thread may add to them."""
+    """Lines for the operator, stored until `take`; another thread may add lines."""
 
     def __init__(self) -> None:
         self._lines: deque[str] = deque(maxlen=MAX_NOTICES)
@@ -57,36 +57,36 @@ _LONGEST: Final = 160
 
 
 class DetectorWrapper:
-    """The base of combinators: one detector inside."""
+    """Base class of combinators: one inner detector."""
 
     def __init__(self, inner: Detector) -> None:
         self.inner = inner
 
     def attach(self, link: Link) -> None:
-        """Give the one inside a robot's link."""
+        """Pass a robot's link to the inner detector."""
         attach_detector(self.inner, link)
 
     def notices(self) -> list[str]:
-        """Return the lines of the one inside."""
+        """Return the lines of the inner detector."""
         return notices_of(self.inner)
 
     @property
     def labels(self) -> Sequence[str]:
-        """Return the labels of the one inside."""
+        """Return the labels of the inner detector."""
         return labels_of(self.inner)
 
     @property
     def maker(self) -> Maker | None:
-        """Return the maker of the results, if the inner detector names it."""
+        """Return the maker of the results, if the inner detector provides it."""
         return maker_of(self.inner)
 
     def close(self) -> None:
-        """Close the one inside."""
+        """Close the inner detector."""
         close_detector(self.inner)
 
 
 def attach_detector(detector: Any, link: Link) -> None:
-    """Give a detector that receives something else of a robot than frames its link, before the first frame."""
+    """Pass a robot's link, before its first frame, to a detector that has `attach`."""
     attach: Callable[[Link], None] | None = getattr(detector, "attach", None)
     if attach is not None:
         with plugin_guard("the detector's attach()"):
@@ -94,13 +94,13 @@ def attach_detector(detector: Any, link: Link) -> None:
 
 
 def notices_of(detector: Any) -> list[str]:
-    """Return the detector's lines for the operator since the last call; one that raises is reported."""
+    """Return the detector's lines for the operator since the last call, or a line about its error."""
     notices: Callable[[], list[str]] | None = getattr(detector, "notices", getattr(detector, OLD_NOTICES, None))
     if notices is None:
         return []
     try:
         return [" ".join(str(line).split()) for line in notices()]
-    except PLUGIN_ERRORS as error:  # a detector that only reports badly may still detect well
+    except PLUGIN_ERRORS as error:  # a detector with broken notices may still detect well
         report_fault("detector", error)
         return [_raises("the detector's notices()", error)]
 
@@ -115,7 +115,7 @@ def labels_of(detector: Any) -> Sequence[str]:
 
 
 def maker_of(detector: Any) -> Maker | None:
-    """Return the maker of its results, where that is known before the first of them."""
+    """Return the maker of its results, if it is known before the first result."""
     maker: Maker | None = getattr(detector, "maker", None)
     return maker
 
@@ -130,7 +130,7 @@ def close_detector(detector: Any) -> None:
 
 @contextmanager
 def plugin_guard(what: str) -> Iterator[None]:
-    """Turn any error of a plug-in's own code into a ConfigError that names the plug-in."""
+    """Turn any error of a plug-in into a ConfigError that names the plug-in."""
     try:
         yield
     except SightlineError:
@@ -144,23 +144,23 @@ def _raises(what: str, error: BaseException) -> str:
     return f"{what} raises {type(error).__name__}: {error_text(error)}"[:_LONGEST]
 
 
-# Validates a detector's answer: of this frame, finite, within the image, not too many. Pure.
+# Validates the result of a detector: right frame, finite numbers, boxes in the image, not too many. Pure.
 #
-# The detector may be a plug-in or another machine; a mission receives only what passes here.
+# The detector may be a plug-in or another machine. A mission receives only validated results.
 
 
 _LONGEST_WHY: Final = 160
 NO_ANSWER_IN_TIME: Final = "the detector gave no answer in time"
 _FURTHEST_PX: Final = 1e6
-"""The same bound as for any number on the wire."""
+"""The limit of any coordinate on the wire."""
 
 
 def checked_results(
     detector: Detector, frames: Sequence[DetectFrame], deadline_us: int, clock: Callable[[], int] = lambda: 0
 ) -> list[DetectionResult | str]:
-    """Return the result of `detector` for each frame, or why it has none. Raises nothing, whatever a plug-in does.
+    """Return the result of `detector` for each frame, or the reason for none. Raises nothing, even for a bad plug-in.
 
-    Where it fails on several frames, it gets them one by one, as long as `clock` is not past the deadline.
+    After an error with several frames it gets them one by one, until `clock` is past the deadline.
     """
     try:
         results = detector.detect(frames, deadline_us)
@@ -168,7 +168,7 @@ def checked_results(
             raise ValueError(f"{len(results)} results for {len(frames)} frames")
     except PLUGIN_ERRORS as error:
         report_fault("detector", error)
-        if len(frames) > 1:  # the frame that it failed on is not known, and should cost no other robot its answer
+        if len(frames) > 1:  # the frame with the error is unknown, and other robots should get their answers
             why = _why(error)
             return [
                 why if clock() > deadline_us else checked_results(detector, [one], deadline_us)[0] for one in frames
@@ -180,7 +180,7 @@ def checked_results(
 def _answer(frame: DetectFrame, result: DetectionResult | None) -> DetectionResult | str:
     try:
         return validated(frame, result) if result is not None else NO_ANSWER_IN_TIME
-    except Exception as error:  # the result may be anything
+    except Exception as error:  # the result may be any object
         report_fault("detector", error)
         return _why(error)
 
@@ -190,7 +190,7 @@ def _why(error: BaseException) -> str:
 
 
 def validated(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
-    """Return `result` with boxes clipped to the image, without boxes outside, and with its time in whole microseconds.
+    """Return `result` with boxes clipped to the image, without boxes outside, and with integer microseconds.
 
     Raises ValueError, with the reason, for an invalid answer to `frame`.
     """
@@ -200,7 +200,7 @@ def validated(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
     if (result.width_px, result.height_px) != (frame.width_px, frame.height_px):
         raise ValueError(f"it is for a {result.width_px}x{result.height_px} image")
     found = result.detections
-    if len(found) > MAX_DETECTED_BOXES:  # the wire's own bound: only the detector knows which of more are the best
+    if len(found) > MAX_DETECTED_BOXES:  # limit of the wire; only the detector knows which boxes are the best
         raise ValueError(f"{len(found)} boxes; at most {MAX_DETECTED_BOXES}")
     repaired = _repaired_maker(result)
     inside = tuple(part for one in found if (part := _validated(one, frame.width_px, frame.height_px)))
@@ -211,8 +211,8 @@ def validated(frame: DetectFrame, result: DetectionResult) -> DetectionResult:
 
 
 def _repaired_maker(result: DetectionResult) -> dict[str, Any]:
-    """Return the fields of the maker and of the time that change: printable, in whole microseconds. A plug-in may be
-    called after any file, and count in any kind of number."""
+    """Return changed fields of the maker and the time: printable text, integer microseconds. A plug-in may use any
+    file name and any number type."""
     repaired: dict[str, Any] = {}
     for what in ("detector", "model_hash", "device"):
         text = getattr(result, what)
@@ -236,15 +236,15 @@ def _validated(one: Detection, width_px: int, height_px: int) -> Detection | Non
     wrong = annotation_problem(one)
     if wrong:
         raise ValueError(wrong)
-    if one.track_id is not None:  # of any kind of integer, e.g. NumPy's
+    if one.track_id is not None:  # any integer type, e.g. of NumPy
         one = replace(one, track_id=index(one.track_id))
     return clipped(one, width_px, height_px)
 
 
 def annotation_problem(one: Detection) -> str:
-    """Return why the wire cannot carry its label, circle or track; empty if it can."""
+    """Return why the wire cannot carry label, circle or track id, or ""."""
     label: object = one.label
-    if not isinstance(label, str):  # e.g. the number of a class
+    if not isinstance(label, str):  # e.g. a class number
         return f"invalid label {label!r}: not text"[:_LONGEST_WHY]
     if not is_label(one.label):
         return f"invalid label {one.label[:20]!r}, {len(one.label)} characters: not 1 to {LONGEST_LABEL} printable ones"

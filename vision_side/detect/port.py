@@ -56,8 +56,8 @@ def clean_label(text: str) -> str:
 
 # The detector port: `Detector`, its frames and its results. Pure.
 #
-# A `DetectionResult` without detections means "detected nothing", and may start a search. None means "no answer". After
-# it the vision service does not steer, and the robot holds.
+# A `DetectionResult` without detections means "detected nothing", and may start a search. None means "no answer": the
+# vision service then sends no twist, and the robot holds.
 
 
 NO_DEADLINE: Final = 2**63 - 1

@@ -1,8 +1,8 @@
-"""Finds a detector by name and builds it with its wrappers. Shell (imports plug-ins).
+"""Find a detector by name and build it with its wrappers. Shell (imports plug-ins).
 
-Names are those of the entry points `sightline.detectors`, or, from a configuration or a command line only,
-`package.module:Name`. What stands after the name is the option `address`: `onnx:ball.onnx` gives "ball.onnx",
-`oip+http://box/ball` all of it. A `Config` is filled in from vision's where it has sections or fields of the same name.
+A name is an entry point of `sightline.detectors`. A configuration or command line may also name `package.module:Name`.
+The text after the name is the option `address`: "ball.onnx" for `onnx:ball.onnx`, all of `oip+http://box/ball`.
+A `Config` gets the sections and fields of the vision configuration that have the same name.
 """
 
 import difflib
@@ -21,7 +21,7 @@ from sightline.vision_side.missions.registry import MissionSpec, check_missions,
 from sightline.vision_side.plugins import shared_options
 
 BOXES: Final = "boxes"
-"""No detector here: boxes of another publisher, see vision_side/serving/service.py."""
+"""No local detector: another client publishes the boxes, see vision_side/serving/service.py."""
 REGISTRY: Final = PluginRegistry("detector", "sightline.detectors", (BOXES,))
 _FILLED: Final = ("robot", "connect", "listen", "secure", "max_frame_bytes", "max_pixels")
 _MOST_NAMED: Final = 12
@@ -31,7 +31,7 @@ _OF_DETECTOR: Final = ("device", "deadline_s")
 def configured_detector(config: VisionConfig) -> Detector:
     """Create the detector of `config.detector` with its filters, fallback and shadow.
 
-    Raises ConfigError for an unknown one or a wrong option, HardwareError for a device that is not there.
+    Raises ConfigError for an unknown detector or a wrong option, HardwareError for an unavailable device.
     """
     one = config.detector
     if one.kind == BOXES:
@@ -54,7 +54,7 @@ def configured_detector(config: VisionConfig) -> Detector:
 
 
 def _built(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Detector:
-    """Create one of the configured detectors. Raises ConfigError, also for a label in use that it never gives."""
+    """Create one of the configured detectors. Raises ConfigError, also for a configured label that it never gives."""
     detector = build_detector(kind, options, config)
     _check_used_labels(kind, labels_of(detector), config)
     return detector
@@ -80,20 +80,20 @@ def _narrowed(detector: Detector, config: VisionConfig) -> Detector:
 
 
 def _check_used_labels(kind: str, known: Sequence[str], config: VisionConfig) -> None:
-    """Raise ConfigError for a label of the filter or of the mission that is not among those that the detector lists."""
+    """Raise ConfigError for a label of the filter or of the mission that the detector does not list."""
     _check_labels("detector.labels", kind, config.detector.labels, known)
     if known:
         check_mission_label(configured_mission(config), kind, known)
 
 
 def check_mission_label(mission: MissionSpec, kind: str, known: Sequence[str]) -> None:
-    """Raise ConfigError for a mission whose label is not among those that the detector lists, if it lists any."""
+    """Raise ConfigError for a mission whose label the detector does not list, if it lists any."""
     if mission.label:
         _check_labels(f"mission {mission.name!r}", kind, (mission.label,), known)
 
 
 def _check_labels(place: str, kind: str, wanted: Sequence[str], known: Sequence[str]) -> None:
-    """Raise ConfigError for a label that is not among those that the detector lists."""
+    """Raise ConfigError for a label that is not in the detector's list `known`, if it is not empty."""
     for label in wanted if known else ():
         if label not in known:
             nearest = difflib.get_close_matches(label, known, n=1)
@@ -103,28 +103,28 @@ def _check_labels(place: str, kind: str, wanted: Sequence[str], known: Sequence[
 
 
 def waits_for_service(config: VisionConfig) -> bool:
-    """Return True if one of the configured detectors waits for another service and should not delay others."""
+    """Return True if a configured detector waits for another service and should not delay other robots."""
     one = config.detector
     kinds = [kind for kind in (one.kind, one.fallback, one.shadow) if kind and kind != BOXES]
     return any(getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False) for kind in kinds)
 
 
 def _check_fallback(config: VisionConfig) -> None:
-    """Raise ConfigError for a fallback that may itself be late or gone."""
+    """Raise ConfigError for a fallback that is remote itself."""
     kind = config.detector.fallback
     if kind and (kind == BOXES or getattr(REGISTRY.load(split_kind(kind)[0]), "waits", False)):
         raise ConfigError(f"detector.fallback {kind!r} is remote; choose a local detector, e.g. hsv")
 
 
 def check_takes_pictures(kind: str) -> None:
-    """Raise ConfigError for a detector that only receives boxes of a robot's frames, where there is no robot."""
+    """Raise ConfigError for a detector that only receives boxes of a robot's frames, for a run without a robot."""
     if kind != BOXES and getattr(REGISTRY.load(split_kind(kind)[0]), "only_receives", False):
         raise ConfigError(f"detector {kind!r} receives boxes of a robot's own frames, and there is no robot here; "
                           "name the detector that the service serves")
 
 
 def check_device(config: VisionConfig) -> None:
-    """Raise ConfigError for a device that no configured detector can choose."""
+    """Raise ConfigError for a device if no configured detector has a choice of devices."""
     one = config.detector
     if one.device == "auto":
         return
@@ -140,7 +140,7 @@ def _has_field(kind: str, field: str) -> bool:
 
 
 def split_kind(kind: str) -> tuple[str, str]:
-    """Split a kind into name and address. `package.module:Name` is all name.
+    """Split a kind into name and address. `package.module:Name` is a name without an address.
 
     Raises ConfigError for a file without the name of a detector, and for a colon without an address.
     """
@@ -158,7 +158,7 @@ def build_detector(kind: str, options: Mapping[str, Any], config: VisionConfig) 
     """Create the detector called `kind`, without wrappers.
 
     Raises ConfigError, one line, for an unknown kind (nearest named), a missing package or a wrong option, and
-    HardwareError for a device that is not there.
+    HardwareError for an unavailable device.
     """
     plugin, settings = _checked(kind, options, config)
     with plugin_guard(f"{kind}, when it is made,"):
@@ -167,7 +167,7 @@ def build_detector(kind: str, options: Mapping[str, Any], config: VisionConfig) 
 
 
 def check_vision(config: VisionConfig) -> None:
-    """Raise ConfigError for what can be known to be wrong with all that `config` names, before any of it is built."""
+    """Check the detectors and missions of `config` before any is built. Raises ConfigError."""
     check_missions(config)
     one = config.detector
     if one.kind == BOXES:
@@ -181,10 +181,10 @@ def check_vision(config: VisionConfig) -> None:
 
 
 def check_choice(kind: str, options: Mapping[str, Any], config: VisionConfig) -> Sequence[str]:
-    """Raise ConfigError for what can be known to be wrong before the detector is built: its name, options, model.
+    """Check name, options and model before the detector is built. Raises ConfigError.
 
     Returns:
-        The labels of its model, or none if they are unknown.
+        The labels of its model, empty if they are unknown.
     """
     plugin, settings = _checked(kind, options, config)
     read_model: Callable[[Any], Any] | None = getattr(plugin, "read_model", None)

@@ -1,7 +1,7 @@
-"""A second detector that runs beside the first one, and how often they agree. Shell (a thread).
+"""A second detector next to the first one, and how often they agree. Shell (a thread).
 
-The clock is the frames' capture time. What counts is what would be steered by: the surest detection of each that the
-mission may go by.
+The clock is the capture time of the frames. Only the best detection of each detector that the mission may use is
+compared.
 """
 
 import threading
@@ -28,11 +28,11 @@ from sightline.vision_side.detect.port import (
 )
 
 WINDOW: Final = 300
-"""Frames: ten seconds at 30 a second."""
+"""Frames: ten seconds at 30 fps."""
 REPORT_EVERY_US: Final = 5_000_000
-"""Between two lines, however much the two disagree."""
+"""Shortest time between two lines about a difference."""
 LEAST_OVERLAP: Final = 0.3
-"""Boxes of one thing by two detectors: one draws the ball, the other its shadow too."""
+"""Least overlap of two boxes of one object: one detector may include the shadow of a ball."""
 
 
 class Agreement:
@@ -63,7 +63,7 @@ class Agreement:
 
 def disagreement(driving: DetectionResult, shadow: DetectionResult, goes_by: LabelTest) -> str:
     """Describe the difference between the best detections of two results, or return "". Only detections that the
-    mission may use count, and only their place, not their label."""
+    mission may use count. Places are compared, labels are not."""
     mine, other = _surest(driving, goes_by), _surest(shadow, goes_by)
     if mine is None and other is None:
         return ""
@@ -87,8 +87,8 @@ def _where(one: Detection | None) -> str:
     return f"{one.label} at ({x:.0f}, {y:.0f})"
 
 
-# A second detector beside the driving one: it looks at the same frames and never steers. Shell. It has a thread and a
-# decoder of its own and sees the newest frame only, so it delays no answer. Which one drives is configured.
+# A second detector that gets the same frames and never steers. Shell. It has a separate thread and decoder and takes
+# only the newest frame, so it delays no answer. The configuration selects the driving detector.
 
 
 _PATIENCE_US: Final = 1_000_000
@@ -98,7 +98,7 @@ _END_S: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """A frame, what the driving detector answered, and where the comparison is counted."""
+    """A frame, the result of the driving detector, and the counter of the comparison."""
 
     frame: DetectFrame
     result: DetectionResult | None
@@ -106,7 +106,7 @@ class _Task:
 
 
 class ShadowDetector:
-    """A detector that drives, and one that is compared with it."""
+    """A driving detector, and a shadow detector that is compared with it."""
 
     def __init__(self, driving: Detector, shadow: Detector, name: str, max_pixels: int) -> None:
         self._driving, self._shadow, self._name = driving, shadow, name
@@ -123,17 +123,17 @@ class ShadowDetector:
         """Return the results of the driving detector. The shadow detector receives the frames afterwards."""
         results = self._driving.detect(frames, deadline_us)
         for frame, result in zip(frames, results, strict=True):
-            counted = (frame.header.session, frame.goes_by)  # counting begins again where one of them changes
+            counted = (frame.header.session, frame.goes_by)  # a change of either resets the counter
             self._put(_Task(frame, result, self._agreements.of(frame.robot, counted)))
         return results
 
     def attach(self, link: Link) -> None:
-        """Give both a robot's link."""
+        """Pass a robot's link to both."""
         attach_detector(self._driving, link)
         attach_detector(self._shadow, link)
 
     def shadow_text(self, robot: str) -> str:
-        """Describe the share of the robot's frames with the same result of the shadow detector."""
+        """Describe the share of the robot's frames on which both detectors agree."""
         agreement = self._agreements.find(robot)
         return f"shadow {agreement.share:.0%} agree" if agreement and agreement.compared else "shadow no answer yet"
 
@@ -142,12 +142,12 @@ class ShadowDetector:
         return [*notices_of(self._driving), *notices_of(self._shadow), *self._notices.take()]
 
     def close(self) -> None:
-        """End the thread, then close both."""
+        """End the thread, then close both detectors."""
         with self._bell:
             self._ending = True
             self._bell.notify()
         self._thread.join(_END_S)
-        with ExitStack() as ending:  # both, also where one fails to
+        with ExitStack() as ending:  # closes both, even if one of them fails
             ending.callback(close_detector, self._driving)
             ending.callback(close_detector, self._shadow)
 
@@ -168,7 +168,7 @@ class ShadowDetector:
                 _, task = self._tasks.popitem(last=False)
             try:
                 self._compare(task)
-            except PLUGIN_ERRORS as error:  # a plug-in's own fault, which must not end the shadow for good
+            except PLUGIN_ERRORS as error:  # an error of a plug-in must not end the thread
                 text = report_fault("detector", error, self._name)
                 self._notices.add(f"{self._name} failed: {type(error).__name__}: {text}"[:160])
 

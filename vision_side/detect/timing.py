@@ -1,4 +1,4 @@
-"""Times what looks at images, and makes results of what it finds. Shell (a clock)."""
+"""Measure the time of a detection function, and build its results. Shell (a clock)."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -23,7 +23,7 @@ def _picture_of(frame: DetectFrame) -> DecodedImage | None:
 
 
 def _inside(frame: DetectFrame, found: Sequence[Detection]) -> list[Detection]:
-    """Clip to the encoded image. An image of odd size at half scale is a pixel larger."""
+    """Clip boxes to the encoded image. The half-scale image of an odd size is one pixel larger."""
     return [part for one in found if (part := clipped(one, frame.width_px, frame.height_px))]
 
 
@@ -31,7 +31,7 @@ def timed_together(
     frames: Sequence[DetectFrame], maker: Maker,
     look: Callable[[Sequence[tuple[DetectFrame, DecodedImage]]], list[Sequence[Detection]]],
 ) -> list[DetectionResult | None]:
-    """Measure a batch, and give each image its share of the time. Frames whose image is invalid are left out."""
+    """Measure a batch, and assign each image its share of the time. Frames with an invalid image get None."""
     pictures = [_picture_of(frame) for frame in frames]
     there = [(frame, picture) for frame, picture in zip(frames, pictures, strict=True) if picture is not None]
     started_ns = time.perf_counter_ns()

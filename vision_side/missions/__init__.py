@@ -1,6 +1,6 @@
-"""Missions: plug-ins that map detections to a twist. Pure, but for the registry.
+"""Missions: plug-ins that map detections to a twist. Pure, except the registry.
 
 May import: `protocol`, `vision_side`.
-Interface: `port.Mission` is what a mission implements; `registry` finds and builds one by name; `switch` changes the
-    active one.
+Interface: `port.Mission` is the interface of a mission; `registry` finds and builds a mission by name; `switch` changes
+    the active mission.
 """

@@ -1,6 +1,6 @@
-"""The default mission: turn toward one target and keep a distance to it; when it is lost, look around. Pure.
+"""The default mission: turn toward one target and keep a distance to it; search for a lost target. Pure.
 
-Track, predict, steer and search are separate files. A detection is located as a sphere of known size. A box from
+Track, prediction, steering and search are separate files. A detection is located as a sphere of known size. A box from
 another service is located by its height or width.
 """
 
@@ -29,22 +29,22 @@ from sightline.vision_side.tracking.track import Target, Track, from_odometry
 PERSON: Final = "person"
 """Label of a whole human, as in COCO."""
 PERSON_M: Final = {"height_m": 1.7, "width_m": 0.45}
-"""Size of a standing adult, unless the configuration has a size. Without it a human is located as a ball at 0.3 m."""
+"""Size of a standing adult, used if the configuration has no size. Without it a human is located as a ball at 0.3 m."""
 
 _LOOKS_EACH: Final = 8
-"""Frames. A look takes as long as a tenth of the rest of a step, and changes slowly while an object is alone."""
+"""Frames between two looks of a single object. A look changes slowly, and takes a tenth of the rest of a step."""
 PERSON_APART_M: Final = 0.4
-"""Two humans are at least so far apart, so that what is nearer is a part of one."""
+"""Least distance between two humans. A nearer detection is a part of the same human."""
 
 
 class Follow:
     """Follows one target. `phase` is tracking, coasting, searching or lost.
 
-    Bearing and distance are the track's at the time of capture, over the floor from the lens.
+    Bearing and distance are those of the track at capture time, over the floor from the lens.
     """
 
     class Config(Settings):
-        """The sections of vision's configuration of the same names."""
+        """The sections of the vision configuration with these names."""
 
         target: TargetConfig = TargetConfig()
         track: TrackConfig = TrackConfig()
@@ -55,7 +55,7 @@ class Follow:
 
     scales: ClassVar[bool] = True
     has_look: ClassVar[bool] = True
-    """Whether the middle of a box shows the object. That of two legs shows what is behind them."""
+    """True if the middle of a box shows the object. The middle of a box around two legs shows the background."""
 
     def __init__(self, config: Config, camera: CameraModel) -> None:
         self._config = config
@@ -79,15 +79,15 @@ class Follow:
         return plan
 
     def _gap_s(self, view: View) -> float:
-        """Return the seconds since the last frame. By `dt_s`, which has an upper bound, an old track would not end."""
+        """Return the seconds since the last frame. With the limit of `dt_s`, an old track would not end."""
         last_us, self._last_us = self._last_us, view.header.t_us
-        # With a `dt_s` of 0, the time of the last frame was not true.
+        # A `dt_s` of 0 means that the time of the last frame was false.
         if last_us is None or view.dt_s == 0:
             return view.dt_s
         return max(view.dt_s, (view.header.t_us - last_us) / 1e6)
 
     def _receive(self, view: View) -> None:
-        """Let the delay estimate and the integrals know what the robot did."""
+        """Update the latency estimate, and the integrals by the applied twist."""
         header, dt_s = view.header, view.dt_s
         self._motion_predictor.measure(header.latency_us, dt_s)
         expected = self._motion_predictor.expected(header.t_us)
@@ -110,12 +110,12 @@ class Follow:
         return view.picture is None or (sized and one.outline_px is None)
 
     def _is_meant(self, one: Detection, view: View) -> bool:
-        """Return True if the label fits. Boxes from another service were selected on arrival."""
+        """Return True if the label fits. Boxes from another service were selected at arrival."""
         label = self._config.target.label
         return (view.picture is None and not label) or is_followable(one.label, label)
 
     def _sightings(self, places: list[Sighting | None], view: View, gap_s: float) -> list[Sighting]:
-        """Return the places within the range, with the look of each object where it may matter."""
+        """Return the places within the range. Measure the look of an object only if it can matter."""
         most_m = self._config.target.max_range_m
         near = [one for one in places if one and one.x_m**2 + one.y_m**2 <= most_m**2]
         is_alone = len(near) == 1 and self._is_expected(near[0], view, gap_s)
@@ -124,7 +124,7 @@ class Follow:
         return [replace(one, look=look_of(view.picture, one.detection)) for one in near]
 
     def _is_expected(self, one: Sighting, view: View, gap_s: float) -> bool:
-        """Return True if the target was in the last frame, and `one` is where it should be by now."""
+        """Return True if the target was in the last frame, and `one` is at its expected position."""
         target = self._track.target
         if target is None or target.unseen_us:
             return False
@@ -132,7 +132,7 @@ class Follow:
         return math.dist((one.x_m, one.y_m), expected) < self._config.track.apart_m
 
     def _expected_m(self, pose: Pose) -> float:
-        """Return the assumed distance of a box without a known size, in m: its last one, or the stand-off."""
+        """Return the assumed distance of a box of unknown size, in m: its last distance, or the stand-off."""
         target, boxes = self._track.target, self._sizes
         if target is None or (boxes.height_m is None and boxes.width_m is None):
             return self._config.target.stand_off_m
@@ -170,14 +170,14 @@ class Follow:
 
 
 def _sizes(config: Follow.Config) -> BoxesConfig:
-    """Return the size of a box's object: as configured, or that of an adult if the label is `person`."""
+    """Return the size of the object in a box: as configured, or the size of an adult for the label `person`."""
     boxes = config.boxes
     is_sized = boxes.height_m is not None or boxes.width_m is not None
     return boxes if is_sized or config.target.label != PERSON else boxes.model_copy(update=PERSON_M)
 
 
 def _track(config: Follow.Config) -> TrackConfig:
-    """Return the configuration of the track. With the label `person`, objects are as far apart as humans are."""
+    """Return the track configuration. For the label `person`, the least distance of objects is that of humans."""
     track = config.track
     if config.target.label != PERSON:
         return track

@@ -31,7 +31,7 @@ class Footprint(Config):
         return math.hypot(max(self.front_m, self.rear_m), self.half_width_m)
 
     def nearest(self, points: Points) -> Points:
-        """Return the place of the outline nearest to each of `points`, relative to the robot."""
+        """Return the point of the footprint nearest to each of `points`, relative to the robot."""
         return np.column_stack([np.clip(points[:, 0], -self.rear_m, self.front_m),
                                 np.clip(points[:, 1], -self.half_width_m, self.half_width_m)])
 
@@ -47,7 +47,7 @@ def braking_mps(room_m: float, delay_s: float, brake_mps2: float) -> float:
 def clear_of(points: Points, body: Footprint, twist: tuple[float, float], keep_m: float, brake_mps2: float) -> float:
     """Return the share (0..1) of `twist` that keeps the robot at least `keep_m` from all `points`.
 
-    Speed toward a point is what counts: along a wall and away from it the robot may go as it likes.
+    Only speed toward a point counts. Motion along a wall or away from it is not limited.
     """
     if not len(points):
         return 1.0
@@ -76,18 +76,18 @@ class ProgressCheckerConfig(Config):
     closed_s: Annotated[float, Field(ge=0, le=60)] = 1.5
     """Waiting time with every way closed. A false echo or a passer-by may disappear."""
     stuck_s: Annotated[float, Field(gt=0, le=3600)] = 20.0
-    """Driving this long without coming nearer by the known way, and without anything new seen, is going round."""
+    """Longest time of driving without progress on the known way and without new obstacles."""
 
 
 class ProgressChecker:
-    """Counts the time that brought nothing."""
+    """Counts the time without progress."""
 
     def __init__(self, config: ProgressCheckerConfig) -> None:
         self._config = config
         self.start_again()
 
     def start_again(self) -> None:
-        """There is a new goal."""
+        """Reset for a new goal."""
         self._closed_s = self._stuck_s = 0.0
         self._best_m = math.inf
         self._discoveries = -1
@@ -95,9 +95,9 @@ class ProgressChecker:
         self._stands_at: Pose | None = None
 
     def step(self, view: View, left_m: float | None, discoveries: int) -> str:
-        """Why to give up, or nothing. `left_m` is None where no way is left.
+        """Return the reason to give up, or "". `left_m` is the rest of the way, None if there is no way.
 
-        A robot that is held (disarmed, stopped) is not running out of time: only driving counts as being stuck.
+        Only driving counts as being stuck. A robot that is held (disarmed, stopped) may wait forever.
         """
         if left_m is None:
             self._closed_s += view.dt_s
@@ -131,50 +131,49 @@ class ProgressChecker:
             self._stuck_s += view.dt_s
 
 
-# Mission `goto`: drive to waypoints, round what short-sighted range sensors find on the way, or report that it cannot.
-# Pure.
+# Mission `goto`: drive to waypoints around obstacles that short-range sensors detect, or report a failure. Pure.
 #
-# Straight to the goal while nothing known is in between; else along the wall, at a clearance, the way that is shortest
-# by all obstacles so far. The range of the sensors limits the speed: an obstacle just beyond it must still leave
-# the clearance. Waypoints are in the odometry frame, in meters.
+# The robot drives straight to the goal if no known obstacle is between them. Otherwise it drives along the wall, at the
+# clearance, on the shortest way around the known obstacles. The sensor range limits the speed: an obstacle just beyond
+# the range must still leave the clearance. Waypoints are in the odometry frame, in meters.
 
 
 Meters = Annotated[float, Field(ge=-100, le=100)]
 
 _NEAR_M = 0.8  # the brake ignores points beyond this distance
-_BRAKE_SLACK_M = 0.017  # what steering and cells of 0.03 m may be off, and so much that it can turn where it stopped
+_BRAKE_SLACK_M = 0.017  # for steering errors and cells of 0.03 m, and so that the robot can still turn after it stopped
 _ROOMY_M = 0.03  # extra clearance without a long detour, so that the brake does not act next to a wall
-_OUTSIDE_M = 1.2 * CELL_M  # no free cell nearer than this: the robot is where it should not be
+_OUTSIDE_M = 1.2 * CELL_M  # with the nearest free cell further away, the robot is too near to an obstacle
 _SHY_RAD_S = 0.4
-_WHEELS_S = 0.03  # so much later than the gate's own ramp the wheels give way
+_WHEELS_S = 0.03  # delay of the wheels behind the speed ramp of the gate
 _TURN_RAD = math.radians(25)  # a turn by more than this brings the robot's corners to the front
 _CORNER_SLACK_M = 0.002
-_SIDE_RAD, _SIDE_M = math.radians(45), 0.15  # to the other side of what is in the way only for this much shorter a way
+_SIDE_RAD, _SIDE_M = math.radians(45), 0.15  # least advantage of a way on the other side of an obstacle
 
 
 class GotoConfig(Config):
     """Goal, robot and clearance of a `goto` mission."""
 
     waypoints: Annotated[tuple[tuple[Meters, Meters], ...], Field(min_length=1, max_length=64)]
-    """(x, y) in the odometry frame, one after the other."""
+    """(x, y) in the odometry frame, in their order."""
     body: Footprint = Footprint()
     sensor_x_m: Annotated[float, Field(ge=-2, le=2)] = 0.0
-    """Where the scan's rays start, forward of the axle."""
+    """Position of the range sensor, forward of the axle."""
     sight_m: Annotated[float, Field(gt=0, le=50)] = 0.2
-    """How far beyond the robot's front its range sensors see; what bounds the speed into the unknown."""
+    """Range of the sensors beyond the robot's front. It limits the speed into unknown space."""
     clearance_m: Annotated[float, Field(ge=0.01, le=2)] = 0.112
-    """Between the robot's outline and anything seen."""
+    """Distance between the robot's outline and any echo."""
     tolerance_m: Annotated[float, Field(ge=0.01, le=1)] = 0.05
     max_linear_mps: Annotated[float, Field(gt=0, le=2)] = 0.5
     max_angular_rad_s: Annotated[float, Field(gt=0, le=6)] = 2.5
     bearing_kp: Annotated[float, Field(gt=0, le=20)] = 5.0
-    """Per second; times latency it never exceeds 0.9, as for following."""
+    """Gain of the bearing, 1/s. Times latency it never exceeds 0.9, as for following."""
     drive_within_rad: Annotated[float, Field(gt=0, le=1.5)] = 0.7
-    """Forward speed fades to zero as the bearing of the way grows to this."""
+    """Forward speed fades to zero as the bearing of the way grows to this value."""
     brake_mps2: Annotated[float, Field(gt=0, le=10)] = 0.8
-    """What stopping counts on; below what the robot can."""
+    """Assumed deceleration for stopping; less than the robot can reach."""
     creep_mps: Annotated[float, Field(gt=0, le=1)] = 0.1
-    """For backing out."""
+    """Speed for backing out."""
     max_scan_age_s: Annotated[float, Field(gt=0, le=2)] = 0.4
     patience: ProgressCheckerConfig = ProgressCheckerConfig()
     latency: LatencyConfig = LatencyConfig()
@@ -189,13 +188,13 @@ class GotoConfig(Config):
 
 
 class Goto:
-    """To each waypoint in turn."""
+    """Drives to each waypoint in turn."""
 
     Config = GotoConfig
     wants_scan: ClassVar[bool] = True
     needs_camera: ClassVar[bool] = False
 
-    def __init__(self, config: GotoConfig, camera: CameraModel) -> None:  # noqa: ARG002  every mission is given it
+    def __init__(self, config: GotoConfig, camera: CameraModel) -> None:  # noqa: ARG002  part of the interface
         self._config = config
         self._keep_m = config.body.radius_m + config.clearance_m
         self._ground = Costmap()
@@ -221,7 +220,7 @@ class Goto:
         return plan
 
     def _look(self, view: View) -> None:
-        """Take in a scan that is new."""
+        """Add a new scan to the costmap."""
         scan = view.scan
         if scan is None or (self._scan is not None and scan.t_us <= self._scan.t_us):
             return
@@ -264,7 +263,7 @@ class Goto:
         return self._drive(view, route, self._carrot)
 
     def _leave(self, view: View, out: Point) -> Plan:
-        """Too near to something: straight out forward or backward, and turn only afterwards, where there is room."""
+        """Leave an obstacle that is too near: straight forward or backward, then turn where there is room."""
         then = self._then(view)
         bearing_rad = _bearing(then.pose, self._room(then) or out)
         backs = abs(bearing_rad) > math.pi / 2
@@ -295,7 +294,7 @@ class Goto:
         return self._motion_predictor.motion(header.t_us, header.pose, header.moving, header.applied)
 
     def _chosen(self, route: Planner, robot: Point, carrot: Point, left_m: float) -> Point:
-        """`carrot`, or the one before it where the way over that, on the other side, is hardly longer."""
+        """Return `carrot`, or the previous one if that is on another side and its way is hardly longer."""
         old = self._carrot
         if old is None or math.dist(robot, old) < self._config.clearance_m or not route.sees(robot, old):
             return carrot
@@ -337,7 +336,7 @@ class Goto:
     def _sight_mps(self, then: PredictedMotion) -> float:
         """Limit the speed so that an obstacle just beyond the sensor range still leaves the clearance.
 
-        The reach is counted from where the newest scan was taken, so speed gives way when scans are late or lost.
+        The range starts at the place of the newest scan, so the speed decreases when scans are late or lost.
         """
         config = self._config
         seen_from = self._poses.at(self._scan.t_us) if self._scan else then.pose
@@ -354,5 +353,5 @@ class Goto:
 
 
 def _bearing(pose: Pose, point: Point) -> float:
-    """Left positive, within half a turn."""
+    """Return the bearing of a point, left positive, within half a turn."""
     return math.remainder(math.atan2(point[1] - pose[1], point[0] - pose[0]) - pose[2], math.tau)

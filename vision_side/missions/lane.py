@@ -1,7 +1,7 @@
-"""A lane marked by a row of blocks: where it runs, in the odometry frame. Pure.
+"""Position of a lane, marked by a row of blocks, in the odometry frame. Pure.
 
-Blocks stand on one side of the lane, or on both. Each is remembered where it was seen; the lane's middle passes it at a
-set distance, on the side where the robot was when it first saw it. So the robot drives along the row, never at a block.
+Blocks stand on one or both sides of the lane. The position of each block is stored. The center line passes a block at a
+set distance, on the side where the robot first saw it. So the robot drives along the row, never toward a block.
 """
 
 import math
@@ -15,10 +15,10 @@ from sightline.protocol.config import Config
 from sightline.protocol.messages import Pose
 
 _MAX_BLOCKS = 64
-_SAME_M = 0.20  # two blocks are never this near; one's measured place is off by this much where it is far away
-_SAME_SHARE = 0.12  # ... and by this part of its distance
-_BEHIND_M, _AHEAD_M = 1.2, 2.5  # the part of the row that defines the lane's direction here
-_MIN_SPREAD_M = 0.4  # blocks nearer together than this along the lane define no direction
+_SAME_M = 0.20  # two blocks have a larger distance; the measured place of a far block is this inaccurate
+_SAME_SHARE = 0.12  # ... plus this share of its distance
+_BEHIND_M, _AHEAD_M = 1.2, 2.5  # part of the row that defines the local direction of the lane
+_MIN_SPREAD_M = 0.4  # blocks with a smaller distance along the lane define no direction
 _MOST_WEIGHT = 1e4
 
 
@@ -26,20 +26,20 @@ class LaneConfig(Config):
     """The position of the lane relative to its blocks."""
 
     pass_m: Annotated[float, Field(gt=0.05, le=5)] = 0.5
-    """From a block's middle to the middle of the lane."""
+    """Distance from the center of a block to the center of the lane."""
     in_the_way: Annotated[str, Field(pattern="^(left|right)$")] = "left"
-    """Where a block counts as standing that is straight ahead: the robot passes it on the other side."""
+    """Assumed side of a block straight ahead. The robot passes it on the other side."""
     straight_m: Annotated[float, Field(ge=0, le=5)] = 0.12
-    """So little off the middle is straight ahead."""
+    """Largest distance from the center line that counts as straight ahead."""
     beyond_m: Annotated[float, Field(ge=0, le=20)] = 0.8
     """The lane ends this far after its last block."""
     max_aside_m: Annotated[float, Field(gt=0.1, le=10)] = 1.5
-    """A block further from the lane is not of it."""
+    """A block further from the lane does not belong to it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One block: place in the odometry frame, how surely, and on which side of the lane: 1 left, -1 right."""
+    """One block: place in the odometry frame, weight, and side of the lane: 1 left, -1 right."""
 
     x_m: float
     y_m: float
@@ -49,7 +49,7 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A straight piece of the lane's middle."""
+    """A straight part of the center line."""
 
     x_m: float
     y_m: float
@@ -64,12 +64,12 @@ class Line:
         return (y_m - self.y_m) * math.cos(self.heading_rad) - (x_m - self.x_m) * math.sin(self.heading_rad)
 
     def at(self, along_m: float) -> tuple[float, float]:
-        """Return the point of the center line that far along."""
+        """Return the point of the center line at this distance along it."""
         return self.x_m + along_m * math.cos(self.heading_rad), self.y_m + along_m * math.sin(self.heading_rad)
 
 
 class Lane:
-    """Remembers the blocks; `line` is None until one was seen."""
+    """Stores the blocks. `line` is None before the first block."""
 
     def __init__(self, config: LaneConfig) -> None:
         self._config = config
@@ -77,7 +77,7 @@ class Lane:
         self.line: Line | None = None
 
     def see(self, pose: Pose, places: Iterable[tuple[float, float]]) -> None:
-        """Add the places of blocks in the odometry frame, seen from `pose`, and fit the line again."""
+        """Add block positions in the odometry frame, seen from `pose`, and fit the line again."""
         before = self.line or Line(*pose)
         for x_m, y_m in places:
             if abs(before.aside_m(x_m, y_m)) <= self._config.max_aside_m:
@@ -86,7 +86,7 @@ class Lane:
             self.line = self._laid(pose, before.heading_rad)
 
     def _meet(self, line: Line, away_m: float, x_m: float, y_m: float) -> None:
-        """Remember a block, or know better where a known one is: near looks count most."""
+        """Add a block, or update the place of a known block. Near measurements have the largest weight."""
         weight = 1.0 / max(away_m, 0.1) ** 4
         same_m = _SAME_M + _SAME_SHARE * away_m
         for index, one in enumerate(self._blocks):
@@ -103,7 +103,7 @@ class Lane:
         self._blocks = [*self._blocks[-_MAX_BLOCKS + 1 :], Block(x_m, y_m, weight, side)]
 
     def _laid(self, pose: Pose, heading_rad: float) -> Line:
-        """Lay the center line next to the blocks near here. One block alone keeps the direction."""
+        """Compute the center line next to the near blocks. A single block keeps the old direction."""
         here = Line(pose[0], pose[1], heading_rad)
         near = [one for one in self._blocks if -_BEHIND_M <= here.along_m(one.x_m, one.y_m) <= _AHEAD_M]
         near = near or [min(self._blocks, key=lambda one: math.hypot(one.x_m - pose[0], one.y_m - pose[1]))]

@@ -1,7 +1,7 @@
-"""Mission `legs`: follow two legs that walk, by boxes of legs and a lidar. Pure.
+"""Mission `legs`: follow two walking legs, by boxes of legs and a lidar. Pure.
 
-The lidar echoes within the span of a box around both legs give the place of each leg. The robot follows the middle
-between them, which moves steadily while the legs swing. All further steps are those of `follow`.
+The lidar echoes in the angle of a box around both legs give the place of each leg. The robot follows the point between
+the legs, which moves steadily while the legs swing. All other steps are those of `follow`.
 """
 
 import math
@@ -20,8 +20,8 @@ from sightline.vision_side.missions.ranges import Points, PoseMemory, about_robo
 from sightline.vision_side.tracking.locate import Sighting, points_ahead
 from sightline.vision_side.tracking.track import from_odometry
 
-_SPAN_MARGIN_RAD = math.radians(1.5)  # a lidar's rays stand 1 degree apart, and the target walks on meanwhile
-_GAP_M = 0.10  # echoes further apart than this, one after the other, are of two legs
+_SPAN_MARGIN_RAD = math.radians(1.5)  # lidar rays are 1 degree apart, and the target moves between scan and frame
+_GAP_M = 0.10  # a larger gap between successive echoes separates two legs
 
 
 class LegsTrack(TrackConfig):
@@ -34,20 +34,20 @@ class LegsTrack(TrackConfig):
 
 
 class Legs(Follow):
-    """Follows one person. `phase` as in `follow`; without echoes in the box it only turns."""
+    """Follows one human. `phase` as in `follow`; without echoes in the box the robot only turns."""
 
     class Config(Follow.Config):
-        """Those of `follow`, and what legs and the lidar need."""
+        """The options of `follow`, the label of the legs, and their size for the lidar."""
 
         track: LegsTrack = LegsTrack()
         label: Annotated[str, Field(max_length=64)] = "legs"
-        """Boxes with this label are of legs, both legs in one box; empty for any."""
+        """Label of boxes that contain both legs; empty for any."""
         leg_radius_m: Annotated[float, Field(gt=0, le=0.3)] = 0.055
-        """The lidar sees a leg's surface; its middle is this much further."""
+        """Radius of a leg. The lidar measures its surface; the center is this much further."""
         stride_m: Annotated[float, Field(gt=0, le=2)] = 0.6
-        """The second leg is at most this much further away than the first; what is beyond is something else."""
+        """Largest distance of the second leg behind the first. A further echo is another object."""
         sensor_x_m: Annotated[float, Field(ge=-2, le=2)] = 0.055
-        """Where the lidar is, forward of the axle."""
+        """Position of the lidar, forward of the axle."""
         max_scan_age_s: Annotated[float, Field(gt=0, le=2)] = 0.4
 
     wants_scan: ClassVar[bool] = True
@@ -76,7 +76,7 @@ class Legs(Follow):
             self._echoes = in_odometry(echoes(scan, self._legs.sensor_x_m), self._poses.at(scan.t_us))
 
     def _places(self, view: View) -> list[Sighting | None]:
-        """Return the middle between the legs of each box."""
+        """Return the point between the legs of each box."""
         near = about_robot(self._echoes + self._walked(view), view.header.pose) - (self._camera.x_m, self._camera.y_m)
         return [self._place(one, near, view) for one in view.detections if self._legs.label in ("", one.label)]
 
@@ -92,7 +92,7 @@ class Legs(Follow):
         right_rad, left_rad = _span(one, self._camera)
         if left_rad <= right_rad:
             return None
-        # If one leg hides the other, or the scan missed both, the middle may be a quarter of a stride off.
+        # If one leg hides the other, or the scan missed both, the point may be a quarter of a stride off.
         radius_m, exactness = self._legs.leg_radius_m, 0.5
         centers_rad, centers_m = np.array([(right_rad + left_rad) / 2]), np.array([self._remembered_m(view)])
         bearings_rad = np.arctan2(about_lens[:, 1], about_lens[:, 0])
@@ -103,8 +103,8 @@ class Legs(Follow):
             expected_m = None if self._track.target is None else float(centers_m[0]) - radius_m
             legs = nearest_legs(near, away_m, self._legs.stride_m, expected_m)[:2]
             centers_m = away_m[legs] + radius_m
-            # The nearer leg reaches further to its side of the box, so the middle of the box sways with each step; and
-            # the box contains a human in between, too.
+            # The nearer leg reaches further to its side of the box, so the center of the box sways with each step. A
+            # human between robot and legs is in the box, too.
             if len(legs) > 1 or away_m[legs[0]] > away_m.min():
                 centers_rad = np.array([_middle_rad(near, leg, 2 * radius_m) for leg in legs])
             exactness = 1.0 if len(legs) > 1 else exactness
@@ -123,10 +123,10 @@ class Legs(Follow):
 def nearest_legs(
     points: Points, away_m: NDArray[np.float64], stride_m: float, expected_m: float | None = None
 ) -> list[int]:
-    """Return the index of each leg's nearest echo, nearest first, within a stride of the nearest leg.
+    """Return the index of the nearest echo of each leg, nearest leg first, within a stride of the nearest leg.
 
-    `points` come in the order of the scan; a gap between two of them parts one leg from the next. Legs within half a
-    stride of `expected_m` come before all others: a human in between is nearer, but is not the one to follow.
+    `points` are in scan order; a gap between two points separates two legs. Legs within half a stride of `expected_m`
+    come before all others, because a human in between is nearer but is not the target.
     """
     is_first = np.hypot(*(points - np.roll(points, 1, axis=0)).T) > _GAP_M
     # Modulo, because a leg straight ahead is at both ends of a scan that begins there.
@@ -139,13 +139,13 @@ def nearest_legs(
 
 
 def _middle_rad(points: Points, leg: int, width_m: float) -> float:
-    """Return the bearing of the middle of the echoes of one leg, of which `leg` is one."""
+    """Return the bearing of the center of the echoes of one leg. `leg` is the index of one of them."""
     x_m, y_m = points[np.hypot(*(points - points[leg]).T) <= width_m].mean(axis=0)
     return math.atan2(y_m, x_m)
 
 
 def _span(one: Detection, camera: CameraModel) -> tuple[float, float]:
-    """Bearings of a box's right and left edge at half height, left positive; not limited to a symmetric lens."""
+    """Return the bearings of the right and left edge of a box at half height, left positive. Valid for any lens."""
     middle = (one.y1_px + one.y2_px) / 2
     rays = points_ahead(np.array([[one.x2_px, middle], [one.x1_px, middle]]), camera)
     cos, sin = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)

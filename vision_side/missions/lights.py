@@ -1,7 +1,7 @@
-"""Reads traffic lights in an image. Pure.
+"""Read traffic lights in an image. Pure.
 
-A lamp counts when place and color agree: the brightest of three places in a dark upright housing, and the hue that
-belongs there. The ranges are two-sided and do not touch, so that light of another tint makes no other color of it.
+A lamp counts if place and color agree: the brightest of three places in a dark upright housing, with the hue of that
+place. The color ranges are two-sided and do not touch, so tinted light does not turn one color into another.
 """
 
 from collections.abc import Iterable
@@ -26,36 +26,36 @@ Bgr = NDArray[np.uint8]
 COLOURS: Final = ("red", "yellow", "green")
 """From top to bottom."""
 UNKNOWN: Final = "unknown"
-_MAX_SHAPES = 24  # security limit: no more dark shapes than this are looked at, the largest first
-_MOST_TINT = 1.5  # no room's light is more colored than this; what seems to be is a colored thing that fills the view
+_MAX_SHAPES = 24  # security limit: number of examined dark shapes, the largest first
+_MOST_TINT = 1.5  # largest tint of room light; more means a colored object that fills the image
 _PALEST = 0.08  # below it hue is noise; JPEG spreads the color of a lamp of 5 pixels over 16
-_FLAT = 0.6  # rows of a housing that are narrower than this part of its widest are its pole
+_FLAT = 0.6  # rows of a housing that are narrower than this share of its widest row are the pole
 _DISC = 0.85  # of a lamp's radius: its edge is mixed with the housing
-_BRIGHT_SHARE = 0.4  # share of a lamp's brightest pixels, which show its color when it is only a few pixels wide
+_BRIGHT_SHARE = 0.4  # share of the brightest pixels of a lamp, which give its color
 
 
 class LampConfig(Config):
-    """The light's size and colors."""
+    """Size and colors of the light."""
 
     housing_width_m: Annotated[float, Field(gt=0.01, le=3)] = 0.10
     housing_height_m: Annotated[float, Field(gt=0.01, le=3)] = 0.26
     housing_depth_m: Annotated[float, Field(ge=0, le=3)] = 0.06
     lamp_radius_m: Annotated[float, Field(gt=0.005, le=1)] = 0.033
     lamp_pitch_m: Annotated[float, Field(gt=0.005, le=1)] = 0.0867
-    """From the middle of one lamp to the next."""
+    """Distance between the centers of two neighboring lamps."""
     box_width_m: Annotated[float, Field(gt=0.01, le=3)] = 0.317
     box_height_m: Annotated[float, Field(gt=0.01, le=3)] = 0.281
     box_depth_m: Annotated[float, Field(ge=0, le=3)] = 0.266
-    """Of a whole box that changes its color."""
+    """Depth of a box light, which changes its color as a whole."""
     red: HsvRange = HsvRange(hue_low_deg=335, hue_high_deg=24, saturation_low=0.3, value_low=0.1)
     yellow: HsvRange = HsvRange(hue_low_deg=34, hue_high_deg=72, saturation_low=0.3, value_low=0.1)
     green: HsvRange = HsvRange(hue_low_deg=90, hue_high_deg=172, saturation_low=0.3, value_low=0.1)
     dark: Fraction = 0.4
-    """The housing is darker than this part of the image's middle brightness."""
+    """Largest brightness of the housing, relative to the median brightness of the image."""
     contrast: Annotated[float, Field(gt=1, le=10)] = 1.3
-    """A lit lamp is so many times brighter than the next brightest."""
+    """Brightness of a lit lamp, relative to the next brightest."""
     min_height_px: Annotated[float, Field(ge=6, le=500)] = 13.0
-    """Below it the three lamps cannot be distinguished."""
+    """Least height of a housing. In a smaller one the three lamps cannot be distinguished."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class DetectedLight:
 
 
 class HousingLightReader:
-    """Lights with three lamps in a dark housing."""
+    """Reads lights with three lamps in a dark housing."""
 
     def __init__(self, config: LampConfig) -> None:
         self._config = config
@@ -75,7 +75,7 @@ class HousingLightReader:
         self._lit = color_table(tuple(self._ranges.values()))
 
     def read(self, picture: DecodedImage, not_these: Iterable[Detection] = ()) -> list[DetectedLight]:  # noqa: ARG002
-        """Return every housing in view, largest first. The color is unknown where place and hue do not agree."""
+        """Return every visible housing, largest first. The color is unknown if place and hue disagree."""
         bgr = balanced(picture.bgr)
         bright = _brightest_channel(bgr)
         dark = bright < self._config.dark * float(np.median(bright[::4, ::4]))
@@ -83,7 +83,7 @@ class HousingLightReader:
         return sorted(lights, key=lambda one: one.box.y2_px - one.box.y1_px, reverse=True)
 
     def _housings(self, bgr: Bgr, dark: NDArray[np.bool_]) -> list[Box]:
-        """Dark shapes of a housing's proportions: with the lamps in them, or without where a block joins a lamp."""
+        """Return the dark shapes with the proportions of a housing. An object may have merged with a lamp."""
         codes = cv2.cvtColor(bgr, cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
         boxes = self._upright_shapes(dark | (cv2.LUT(codes, self._lit) > 0), dark)
         alone = self._upright_shapes(dark, dark)
@@ -97,7 +97,7 @@ class HousingLightReader:
         return [box for box in boxes if box is not None and self._is_dark(box, dark)]
 
     def _upright(self, shape: NDArray[Any], size: tuple[int, ...]) -> Box | None:
-        """Return the housing of `shape` without its pole, with the top that the border of the image cut off."""
+        """Return the housing of `shape` without its pole, extended by the top that the image border cuts off."""
         x, y, width, height = cv2.boundingRect(shape)
         if height < self._config.min_height_px:
             return None
@@ -121,7 +121,7 @@ class HousingLightReader:
         return float(left), float(top), float(right), float(bottom)
 
     def _is_dark(self, box: Box, dark: NDArray[np.bool_]) -> bool:
-        """Return True if the box is dark enough and its surroundings are not, unlike the corner of a shadow."""
+        """Return True if the box is dark enough and its surroundings are not. It rejects the corner of a shadow."""
         left, top, right, bottom = (round(side) for side in box)
         inside = dark[max(0, top) : bottom, left:right]
         margin = max(2, (right - left) // 3)
@@ -155,7 +155,7 @@ class HousingLightReader:
 
 
 class BoxLightReader:
-    """Lights that are one box, which changes its color as a whole."""
+    """Reads lights that are one box, which changes its color as a whole."""
 
     def __init__(self, config: LampConfig) -> None:
         self._config = config
@@ -188,10 +188,10 @@ class BoxLightReader:
 
 
 def balanced(bgr: Bgr) -> Bgr:
-    """Remove the tint of the light. Most of an image is floor and wall, so its median tint is that of the light.
+    """Remove the tint of the light. Most of an image is floor and wall, so its median tint is the tint of the light.
 
-    Without it a floor in lamplight is as yellow as a yellow lamp. Tints are compared pixel by pixel: a middle of each
-    channel alone would be the floor's in one and the sky's in another.
+    Without it a floor in lamplight is as yellow as a yellow lamp. Tints are computed per pixel, because the medians of
+    two channels may come from different surfaces, e.g. floor and sky.
     """
     some = bgr[::8, ::8].reshape(-1, 3).astype(np.float64) + 1.0
     tint = np.median(some[:, 1:2] / some, axis=0)
@@ -201,7 +201,7 @@ def balanced(bgr: Bgr) -> Bgr:
 
 
 def _brightest_channel(bgr: Bgr) -> Bgr:
-    """Return the largest of the three values of each pixel, in a tenth of the time of NumPy's maximum along an axis."""
+    """Return the largest channel of each pixel. It takes a tenth of the time of NumPy's maximum along an axis."""
     blue, green, red = cv2.split(bgr)
     return np.asarray(cv2.max(cv2.max(blue, green), red), np.uint8)
 
@@ -217,7 +217,7 @@ def _ranges(config: LampConfig) -> dict[str, HsvRange]:
 def _is(bgr: NDArray[np.float64], one: HsvRange) -> bool:
     """Return True if a color has the hue of a range.
 
-    It may be paler, as the edge of a small lamp blends with the housing.
+    It may be paler, because the edge of a small lamp is mixed with the housing.
     """
     pixel = (bgr / 255).astype(np.float32)[None, None]
     hue, saturation, value = cv2.cvtColor(pixel, cv2.COLOR_BGR2HSV)[0, 0].tolist()

@@ -1,7 +1,7 @@
 """Costmap of the echoes of the range sensors, and the path over it. Pure.
 
-Sensors with a range of 0.2 m see a wall only while they are next to it. The costmap stores the echoes in the odometry
-frame. It removes an echo when rays pass its place: after a drift of the odometry, or when the obstacle is gone.
+Sensors with a range of 0.2 m detect a wall only next to it. The costmap stores the echoes in the odometry frame. It
+removes an echo when rays pass through its place: after odometry drift, or when the obstacle is gone.
 """
 
 import math
@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from sightline.vision_side.missions.ranges import Points
 
 Cells = NDArray[np.int64]
-"""(N, 2), whole numbers of cells."""
+"""(N, 2), integer cell coordinates."""
 
 CELL_M = 0.03
-"""Fine enough for a robot of 0.11 m; a plan over 6 x 6 m still takes a few milliseconds."""
+"""Cell size. Fine enough for a robot of 0.11 m; a plan over 6 x 6 m still takes a few milliseconds."""
 MAX_CELLS = 20_000
 """Security limit: 18 square meters of solid echoes; above it the costmap removes the oldest."""
-_ECHO, _SUREST = 3, 6  # one echo counts immediately; after two, six rays through the cell remove it
-_SHY_CELLS = 2.5  # a ray does not clear the cells this near to its echo: a wall at a grazing angle fills several
+_ECHO, _SUREST = 3, 6  # one echo fills a cell; after two echoes, six rays through the cell clear it
+_SHY_CELLS = 2.5  # a ray clears no cells this near to its echo: a wall at a grazing angle fills several
 _PROGRESS_CELL_M = 0.12  # progress: a cell of this size is occupied for the first time
 
 
@@ -32,13 +32,13 @@ class Costmap:
         self._known: set[tuple[int, int]] = set()
         self.version = 0
         self.discoveries = 0
-        """Number of coarse cells that were ever occupied. It stops to grow when the robot makes no progress."""
+        """Number of coarse cells that were ever occupied. It stops growing when the robot makes no progress."""
 
     def see(self, sensor: tuple[float, float], echoes: Points) -> None:
         """Add the echoes of a sensor at `sensor`.
 
-        Only a ray with an echo shows that the floor before it is free: of several sensors merged into one scan, a
-        number without an echo may stand for a ray that no sensor sends.
+        Only a ray with an echo shows free floor in front of the echo. In a merged scan of several sensors, a number
+        without an echo may belong to no ray at all.
         """
         filled = {(x, y) for x, y in cells_of(echoes).tolist()}
         for cell in _passed(np.array([sensor]), echoes, self.cells()) - filled:
@@ -77,13 +77,13 @@ class Costmap:
 
 
 def cells_of(points: Points) -> Cells:
-    """Return the cells of `points`."""
+    """Return the cell of each point."""
     return np.floor(points / CELL_M).astype(np.int64)
 
 
 def _passed(sensor: Points, ends: Points, cells: Cells) -> set[tuple[int, int]]:
-    """Return those of `cells` that the rays passed well before their ends, within the horizon."""
-    # Rays that end in one cell show the same floor.
+    """Return the cells that the rays passed through well before their ends, within the horizon."""
+    # Rays that end in one cell cross the same floor.
     ends = ends[np.unique(cells_of(ends), axis=0, return_index=True)[1]]
     along = ends - sensor
     length_m = np.hypot(along[:, 0], along[:, 1])
@@ -99,31 +99,31 @@ def _passed(sensor: Points, ends: Points, cells: Cells) -> set[tuple[int, int]]:
     return {(x, y) for x, y in near[seen[tuple((near - corner).T)]].tolist()}
 
 
-# The path to a goal over the known floor; the unknown floor counts as free. Pure. From the goal a wave spreads over all
-# cells that the center of the robot may enter. A robot that moves against the wave reaches the goal by a shortest path.
-# If the wave does not reach the robot, there is no path: what was seen blocks it, and the unknown floor cannot open it.
-# Each new plan comes from new observations, so a robot that follows the plans cannot circle forever.
+# The path to a goal over the known floor; the unknown floor counts as free. Pure. A wave spreads from the goal over all
+# cells that the center of the robot may enter. A robot that moves against the wave takes a shortest path to the goal.
+# If the wave does not reach the robot, known obstacles block every path, and unknown floor cannot open one. Each new
+# plan comes from new observations, so a robot that follows the plans cannot circle forever.
 
 
 Point = tuple[float, float]
 Cell = tuple[int, int]
 
 HORIZON_M = 6.0
-"""Half the width of the largest plan; the way to a goal beyond it leads over the border of the plan."""
+"""Half the width of the largest plan. The way to a further goal leads over the border of the plan."""
 _UNREACHED = np.int32(2**30)
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 _SQUARE = np.ones((3, 3), np.uint8)  # alternates with the cross: circles become octagons, at most 6 % off
 _TIGHT_STEPS = 3
 _AROUND = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
 _LOOK_AHEAD_CELLS = 48
-_NEAREST_CELLS = 6  # a robot that steers toward a nearer point weaves
-_TRIED_EVERY = 3  # of the cells of the path, which are tried for a straight line
+_NEAREST_CELLS = 6  # steering toward a nearer point oscillates
+_TRIED_EVERY = 3  # only every third cell of the path is tested for a straight line
 
 
 class Planner:
     """One plan, valid for any place of the robot until the costmap changes.
 
-    `keep_m`: smallest distance between the centers of a filled cell and of the robot. `roomy_m`: preferred distance, if
+    `keep_m`: least distance between the centers of a filled cell and of the robot. `roomy_m`: preferred distance, if
     it needs no long detour.
     """
 
@@ -140,7 +140,7 @@ class Planner:
         self._steps = _flooded(self._blocked, self._tight, self._seeds(size))
 
     def _seeds(self, size: NDArray[np.int64]) -> list[tuple[int, Cell]]:
-        """Return (step, cell) of each start of the wave: the goal, or border cells by their distance to it."""
+        """Return (step, cell) of each start of the wave: the goal, or border cells by their distance to the goal."""
         i, j = self._cell(self.goal)
         if 0 <= i < size[0] and 0 <= j < size[1]:
             return [(0, (i, j))]
@@ -179,7 +179,7 @@ class Planner:
         return (int(cells[nearest, 0]), int(cells[nearest, 1])) if away[nearest] <= reach else None
 
     def left_m(self, entry: Cell) -> float:
-        """Length of the way from `entry`, about 6 % off; beyond the plan's border it is straight."""
+        """Return the length of the way from `entry`, within 6 %. Beyond the plan's border it is a straight line."""
         return float(self._steps[entry]) * CELL_M + self._beyond_m
 
     def carrot(self, robot: Point, entry: Cell) -> Point:
@@ -195,7 +195,7 @@ class Planner:
         return self.middle(way[min(len(way) - 1, _NEAREST_CELLS)])
 
     def left_from(self, point: Point) -> float:
-        """Length of the way from `point`; inf where none leads from there."""
+        """Return the length of the way from `point`, or inf without a way."""
         steps = self._steps[self._cell(point)] if self.covers(point) else _UNREACHED
         return float(steps) * CELL_M + self._beyond_m if steps < _UNREACHED else math.inf
 
@@ -224,8 +224,8 @@ class Planner:
         return best[0] if len(best) == 1 else min(best, key=lambda one: math.dist(self.middle(one), self.goal))
 
     def sees(self, start: Point, end: Point, skip_cells: float = 1.5) -> bool:
-        """Return True if a straight line meets only free cells, apart from the first `skip_cells` and from those
-        outside the plan. One that begins in a tight place has to keep out of blocked cells only.
+        """Return True if a straight line crosses only free cells. The first `skip_cells` and cells outside the plan do
+        not count. A line that starts in a tight place may cross tight cells, but no blocked ones.
         """
         count = max(2, math.ceil(2 * math.dist(start, end) / CELL_M))
         first = min(count, math.ceil(2 * skip_cells))
@@ -241,7 +241,7 @@ class Planner:
 
 
 def _window(filled: Cells, robot: Point, goal: Point, keep_m: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the corner cells of the plan. It has robot, goal, obstacles and a margin, within the horizon."""
+    """Return the corner cells of the plan: around robot, goal and obstacles with a margin, within the horizon."""
     own, margin = cells_of(np.array([robot]))[0], math.ceil(keep_m / CELL_M) + 4
     horizon = round(HORIZON_M / CELL_M)
     near = filled[(np.abs(filled - own) < horizon - margin).all(axis=1)]
@@ -253,7 +253,7 @@ def _window(filled: Cells, robot: Point, goal: Point, keep_m: float) -> tuple[ND
 
 
 def _away(filled: Cells, size: NDArray[np.int64]) -> NDArray[np.float32]:
-    """Return the distance of each cell's center from the nearest filled cell, in m."""
+    """Return the distance of the center of each cell from the nearest filled cell, in m."""
     room = np.ones(size, np.uint8)
     inside = ((filled >= 0) & (filled < size)).all(axis=1)
     room[tuple(filled[inside].T)] = 0
@@ -265,7 +265,7 @@ def _away(filled: Cells, size: NDArray[np.int64]) -> NDArray[np.float32]:
 
 def _flooded(blocked: NDArray[np.bool_], tight: NDArray[np.bool_], seeds: list[tuple[int, Cell]]
              ) -> NDArray[np.int32]:
-    """Count the steps of the wave to each cell. The wave enters tight cells only every third step."""
+    """Return the number of wave steps to each cell. The wave enters tight cells only every third step."""
     free, roomy = (~blocked).astype(np.uint8), (~(blocked | tight)).astype(np.uint8)
     wave, waited = np.zeros_like(free), np.zeros(free.shape, np.int32)
     pending = sorted((one for one in seeds if free[one[1]]), reverse=True)

@@ -20,7 +20,7 @@ from sightline.vision_side.tracking.track import Target
 class RangeScan:
     """One turn of a range sensor: `ranges_m[i]` at `angle_min_rad + i * angle_increment_rad`, never NaN.
 
-    inf: no obstacle. 0, or above `range_max_m`: nothing is known. Else below `range_min_m`: an obstacle too close to
+    inf: no obstacle. 0, or above `range_max_m`: unknown. Below `range_min_m`, but not 0: an obstacle too close to
     measure.
 
     Angles start at the robot's x axis, counter-clockwise positive. Distances start at the sensor. The robot does not

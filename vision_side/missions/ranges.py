@@ -23,17 +23,17 @@ def decode_scan(header: bytes, payload: bytes) -> tuple[ScanHeader, RangeScan]:
     return stamp, scan
 
 
-# Where a scan's echoes are, at the pose of the scan's own time. Pure.
+# Positions of the echoes of a scan, for the pose at the time of the scan. Pure.
 #
-# A scan is older than the frame it comes with, by up to a turn of the sensor: what a turning robot saw 0.1 s ago is
-# elsewhere about it now. So echoes are laid out in the odometry frame from where the robot was when it met them.
+# A scan is older than its frame by up to one turn of the sensor. The robot may have turned since then. So the echoes
+# are converted to the odometry frame with the pose of the scan time.
 
 
 Points = NDArray[np.float64]
 """(N, 2), meters."""
 
-_REMEMBERED = 64  # poses: two seconds at 30 fps, longer than any scan is believed
-_MAX_AHEAD_S = 0.2  # a scan newer than the newest pose is laid out by dead reckoning, no further than this
+_REMEMBERED = 64  # poses: two seconds at 30 fps, longer than the largest accepted age of a scan
+_MAX_AHEAD_S = 0.2  # longest extrapolation of the newest pose to a newer scan
 
 
 class PoseMemory:
@@ -49,7 +49,7 @@ class PoseMemory:
         self._moving = header.moving
 
     def at(self, t_us: int) -> Pose:
-        """Return the pose at `t_us`, between two known poses or shortly after the newest, else the nearest in time."""
+        """Return the pose at `t_us`: interpolated, extrapolated for a short time, or else the nearest in time."""
         newest_us, newest = self._poses[-1]
         if t_us >= newest_us:
             return _moved(newest, self._moving, min((t_us - newest_us) / 1e6, _MAX_AHEAD_S))
@@ -76,7 +76,7 @@ def _between(one: Pose, other: Pose, share: float) -> Pose:
 def echoes(scan: RangeScan, sensor_x_m: float) -> Points:
     """Return the points of `scan` relative to the robot. The sensor is `sensor_x_m` ahead of the axle.
 
-    An obstacle too close to measure is one at `range_min_m`.
+    An obstacle too close to measure gets the distance `range_min_m`.
     """
     ranges = scan.ranges_m.astype(np.float64)
     met = np.flatnonzero((ranges > 0) & (ranges <= scan.range_max_m))
@@ -85,14 +85,14 @@ def echoes(scan: RangeScan, sensor_x_m: float) -> Points:
 
 
 def in_odometry(points: Points, pose: Pose) -> Points:
-    """Points about the robot at `pose`, in the odometry frame."""
+    """Convert points relative to the robot at `pose` to the odometry frame."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     x, y = points[:, 0], points[:, 1]
     return np.column_stack([pose[0] + cos * x - sin * y, pose[1] + sin * x + cos * y])
 
 
 def about_robot(points: Points, pose: Pose) -> Points:
-    """Points of the odometry frame, about the robot at `pose`."""
+    """Convert points of the odometry frame to points relative to the robot at `pose`."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     x, y = points[:, 0] - pose[0], points[:, 1] - pose[1]
     return np.column_stack([cos * x + sin * y, cos * y - sin * x])

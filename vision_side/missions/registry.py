@@ -1,8 +1,8 @@
-"""Finds a mission by name and builds it with its configuration. Shell (imports plug-ins).
+"""Find a mission by name and build it with its configuration. Shell (imports plug-ins).
 
-Names are those of the entry points `sightline.missions`, or, from a configuration or a command line only,
-`package.module:Name`. A mission whose `Config` has a section of vision's configuration by name and type (`target`,
-`track`, `steer`, `latency`, `search`, `boxes`) begins with that section; its options lie over it.
+A name is an entry point of `sightline.missions`. A configuration or command line may also name `package.module:Name`.
+A section of the vision configuration (`target`, `track`, `steer`, `latency`, `search`, `boxes`) is the default of a
+section of the mission's `Config` with the same name and type. The options of the mission override it.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ REGISTRY: Final = PluginRegistry("mission", "sightline.missions")
 
 @dataclass(frozen=True, slots=True)
 class MissionSpec:
-    """A mission that can be built again for each session of the robot."""
+    """A mission with its configuration. It is built for each session of the robot."""
 
     name: str
     plugin: Any
@@ -45,7 +45,7 @@ class MissionSpec:
 
     @property
     def label(self) -> str:
-        """The label that it follows, by the `label` or `target` of its configuration; empty for any."""
+        """The label of its targets, from `label` or `target` of its configuration; empty for any."""
         own, target = getattr(self.config, "label", None), getattr(self.config, "target", None)
         if isinstance(own, str):
             return own
@@ -59,7 +59,7 @@ class MissionSpec:
         return is_followable(label, self.label) if has_target else True
 
     def build(self, camera: CameraModel) -> Mission:
-        """Create a new mission without a state."""
+        """Create a new mission in its initial state."""
         mission: Mission = self.plugin(self.config, camera)
         return mission
 
@@ -70,14 +70,14 @@ def configured_mission(config: VisionConfig) -> MissionSpec:
 
 
 def _own_options(kind: str, config: VisionConfig) -> dict[str, Any]:
-    """Return the options of this mission in `config`."""
+    """Return the options of `config` for the mission `kind`."""
     own = config.mission.options if kind == config.mission.kind else {}
     return {**config.missions.get(kind, {}), **own}
 
 
 def check_missions(config: VisionConfig) -> None:
-    """Raise ConfigError for an error in the configured mission, or in the options of missions that can be requested.
-    The waypoints of those come with the request."""
+    """Raise ConfigError for an error in the configured mission, or in the options of missions for later requests.
+    Waypoints are not checked, because they come with the request."""
     configured_mission(config)
     for kind, options in config.missions.items():
         settings = config_model(REGISTRY.load(kind))
@@ -88,9 +88,9 @@ def check_missions(config: VisionConfig) -> None:
 def requested_mission(request: MissionRequest, config: VisionConfig) -> MissionSpec:
     """Return the mission of a request. Its options override those of `config` for the same mission.
 
-    Raises ConfigError for an unknown one or a wrong option.
+    Raises ConfigError for an unknown mission or a wrong option.
     """
-    if ":" in request.name:  # the wire's model has no such name; should it ever, code is still not named by a message
+    if ":" in request.name:  # the wire's model rejects it too; a message must never name code to import
         raise ConfigError(f"no mission called {request.name!r}")
     options = _own_options(request.name, config)
     for name, value in request.options.items():
@@ -101,7 +101,7 @@ def requested_mission(request: MissionRequest, config: VisionConfig) -> MissionS
 
 
 def _lay(options: dict[str, Any], path: list[str], value: Any) -> None:
-    """Put `value` at `path`, leaving what is beside it and the given tables themselves as they are."""
+    """Set `value` at `path` in `options`. It copies tables instead of changing them."""
     for name in path[:-1]:
         inner = options.get(name)
         options[name] = options = dict(inner) if isinstance(inner, Mapping) else {}

@@ -1,6 +1,6 @@
-"""The active mission, and the switch to the next one by way of standing still. Pure.
+"""The active mission, and the change to another mission while the robot stands. Pure.
 
-A mission can be a third-party plug-in. One that raises, or returns an impossible plan, ends, and the robot stops.
+A mission can be a third-party plug-in. A mission that raises, or returns an invalid plan, ends, and the robot stops.
 """
 
 import math
@@ -19,13 +19,13 @@ from sightline.vision_side.missions.registry import MissionSpec
 from sightline.vision_side.tracking.track import Target
 
 SETTLE_S: Final = 1.0
-"""A robot that still moves after this long is not moved by us; the new mission begins all the same."""
+"""Longest wait for a standing robot. After it the new mission starts: the motion is not caused by these commands."""
 STILL_MPS: Final = 0.01
 STILL_RAD_S: Final = 0.03
 MAX_COMMAND: Final = 1000.0
-"""m/s and rad/s; beyond it a mission computes nonsense, and its text might not fit a twist's 64 bytes."""
+"""Limit in m/s and rad/s. A larger command is an error of the mission, and might not fit a twist's 64 bytes."""
 _FURTHEST_PX: Final = 1e6
-"""The same bound as for any number on the wire."""
+"""The limit of any coordinate on the wire."""
 _TYPES: Final[dict[str, type | UnionType]] = {
     "twist": Twist, "phase": str, "note": str, "target": Detection | None,
     "bearing_rad": Real | None, "distance_m": Real | None, "track": Target | None,
@@ -37,17 +37,17 @@ class MissionSwitch:
 
     def __init__(self, chosen: MissionSpec, camera: CameraModel) -> None:
         self.chosen = chosen
-        """The newest chosen, also while the robot still comes to rest for it."""
+        """The newest mission, also while the robot comes to rest for it."""
         self._switching = False
         self._waited_s = 0.0
         self._begin(camera)
 
     def switch(self, chosen: MissionSpec) -> None:
-        """Come to rest from the next frame on, then start `chosen`."""
+        """Let the robot come to rest from the next frame on, then start `chosen`."""
         self.chosen, self._switching, self._waited_s = chosen, True, 0.0
 
     def set_camera(self, camera: CameraModel, *, is_scaled: bool) -> bool:
-        """Start a running mission again if it needs the camera. One that is over stays over.
+        """Start a running mission again if it needs the camera. A mission that has ended stays ended.
 
         Args:
             camera: the new model.
@@ -69,13 +69,13 @@ class MissionSwitch:
             if not self._is_at_rest(view):
                 return Plan(STILL, "switching", f"standing still before {self.chosen.name}")
             self._begin(view.camera)
-            view = replace(view, dt_s=0.0)  # the first of the new mission's own
+            view = replace(view, dt_s=0.0)  # first frame of the new mission
         if self._over is None:
             return self._checked(view)
         return self._over
 
     def _is_at_rest(self, view: View) -> bool:
-        """Wheels at zero after a command of ours had the time to act, or waited for long enough."""
+        """Return True if the wheels stand and a command had time to act, or after the longest wait."""
         if self._waited_s >= SETTLE_S:
             return True
         speeds = (view.header.moving, view.header.applied)
@@ -93,7 +93,7 @@ class MissionSwitch:
     def _checked(self, view: View) -> Plan:
         try:
             plan = _usable(self._mission.step(view))
-        except PLUGIN_ERRORS as error:  # vision goes on, the robot stands still
+        except PLUGIN_ERRORS as error:  # the service continues, the robot stands
             plan = _failed(error)
         if plan.done:
             self._over = plan = replace(plan, twist=STILL, target=None)
@@ -101,12 +101,12 @@ class MissionSwitch:
 
 
 def _usable(plan: Plan) -> Plan:
-    """Return a plan that a report and the log can carry. Raises TypeError or ValueError for one that cannot be used."""
+    """Convert a plan to types that report and log accept. Raises TypeError or ValueError for an invalid plan."""
     for name, kind in _TYPES.items():
         if not isinstance(getattr(plan, name), kind):
             raise TypeError(f"returned a {name} of type {type(getattr(plan, name)).__name__}")
     linear_mps, angular_rad_s = plan.twist.linear_mps, plan.twist.angular_rad_s
-    if not (abs(linear_mps) <= MAX_COMMAND and abs(angular_rad_s) <= MAX_COMMAND):  # or not a number
+    if not (abs(linear_mps) <= MAX_COMMAND and abs(angular_rad_s) <= MAX_COMMAND):  # also for nan
         raise ValueError(f"returned {linear_mps:g} m/s, {angular_rad_s:g} rad/s")
     track = plan.track
     if track and not all(map(math.isfinite, (track.x_m, track.y_m, track.vx_mps, track.vy_mps))):
@@ -123,7 +123,7 @@ def _line(text: str) -> str:
 
 
 def _float(number: float | None) -> float | None:
-    """Convert any real number, e.g. of NumPy or a fraction, which the wire and a format do not take."""
+    """Convert any real number, e.g. of NumPy, to a float for the wire."""
     return None if number is None else float(number)
 
 
@@ -137,7 +137,7 @@ def _usable_target(one: Detection | None) -> Detection | None:
     if wrong := annotation_problem(one):
         raise ValueError(f"returned a target with {wrong}")
     if all(isinstance(number, float) for number in numbers):
-        return one  # itself: the overlay knows the target among the detections
+        return one  # the same object, because the overlay finds it among the detections
     x1_px, y1_px, x2_px, y2_px, score = map(float, numbers)
     return replace(one, x1_px=x1_px, y1_px=y1_px, x2_px=x2_px, y2_px=y2_px, score=score)
 

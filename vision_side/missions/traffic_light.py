@@ -17,34 +17,34 @@ from sightline.vision_side.tracking.locate import locate_box
 from sightline.vision_side.tracking.prediction import MotionPredictor, PredictedMotion
 from sightline.vision_side.tracking.track import to_odometry
 
-_FRAMES = 2  # green must be read this often, without another color or a hidden light between; others count at once
+_FRAMES = 2  # green counts after this many readings without another color or UNKNOWN between; others immediately
 _AT_REST_MPS = 0.01
-_CROSSED_M = 0.15  # a robot that stops for a line never ends so far beyond it: it has crossed, or started there
+_CROSSED_M = 0.15  # further beyond the line the robot has crossed it, or started there; stopping is more exact
 
 
 class StopConfig(Config):
     """Stopping and starting at a light."""
 
     line_m: Annotated[float, Field(ge=0, le=20)] = 0.6
-    """The line is this far before the light."""
+    """Distance of the line before the light."""
     front_m: Annotated[float, Field(ge=0, le=2)] = 0.07
-    """The robot's front is this far ahead of its axle: what must not cross the line."""
+    """Distance of the robot's front ahead of its axle. The front must not cross the line."""
     margin_m: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """It stops this far before the line: what the light's range may be off, and near enough to see all of it."""
+    """Stopping distance before the line. It covers the range error of the light and leaves all of it in view."""
     brake_mps2: Annotated[float, Field(gt=0, le=10)] = 0.5
-    """How it brakes for a line seen in time."""
+    """Deceleration for a line that is seen in time."""
     hardest_mps2: Annotated[float, Field(gt=0, le=10)] = 1.2
-    """What it counts on when a light turns yellow: it stops if that is enough, and else clears the line."""
+    """Highest deceleration, when a light turns yellow. If it is not sufficient, the robot clears the line."""
     hidden_s: Annotated[float, Field(ge=0, le=10)] = 0.4
-    """A light that is not seen for this long counts as red."""
+    """Time without a reading after which a light counts as red."""
     cleared_m: Annotated[float, Field(ge=0, le=5)] = 0.3
-    """With its front this far beyond the line the robot is done with the light."""
+    """Distance of the front beyond the line at which the robot forgets the light."""
 
 
 class StopLine:
     """The stop line of one light.
 
-    `colour` is the color in use. `clearing` is set after the line, or too late to stop.
+    `colour` is the color in use. `clearing` is True after the line, or if it is too late to stop.
     """
 
     def __init__(self, config: StopConfig) -> None:
@@ -76,7 +76,7 @@ class StopLine:
         return min(cruise_mps, math.sqrt(2 * self._config.brake_mps2 * max(0.0, room_m)), max(0.0, 3.0 * room_m))
 
     def _decide(self, left_m: float, moving_mps: float) -> None:
-        """Across already, or too late to stop when green ends: the hardest braking would end beyond the line."""
+        """Set `clearing` after the line, or if the hardest braking from the end of green would end beyond it."""
         if left_m < -_CROSSED_M:
             self.clearing = True
         elif self.colour == "green":
@@ -84,7 +84,7 @@ class StopLine:
         elif self._was_green and left_m < moving_mps**2 / (2 * self._config.hardest_mps2):
             self.clearing = True
         elif left_m > 0 and moving_mps < _AT_REST_MPS:
-            self.clearing = False  # it was held before the line, where it can wait
+            self.clearing = False  # the robot stands before the line and can wait
         self._was_green = self.colour == "green"
 
 
@@ -97,31 +97,31 @@ class StopLine:
 
 Place = tuple[float, float]
 
-_SAME_M, _SAME_SHARE = 0.3, 0.15  # two sightings are of one light within this, and this part of its distance
+_SAME_M, _SAME_SHARE = 0.3, 0.15  # largest distance of two sightings of one light: constant, and share of its range
 _OUTER_PX = 3.0  # a lamp's edge may lie this far outside the housing's box
 
 
 class TrafficLightConfig(Settings):
-    """The lane, the light, the line, and how to drive."""
+    """The lane, the light, the line, and the driving."""
 
     lane: LaneConfig = LaneConfig()
     lamp: LampConfig = LampConfig()
     stop: StopConfig = StopConfig()
     latency: LatencyConfig = LatencyConfig()
     label: Annotated[str, Field(max_length=64)] = "target"
-    """Detections with this label are the lane's blocks; empty for any."""
+    """Label of the lane's blocks; empty for any."""
     block_height_m: Annotated[float, Field(gt=0.01, le=5)] = 0.281
-    """How tall a block is: its distance follows from it."""
+    """Height of a block. It gives the distance of a block."""
     max_range_m: Annotated[float, Field(gt=0.3, le=50)] = 4.0
-    """Blocks and lights further off are measured too badly."""
+    """Largest range of blocks and lights. Further ones are too inaccurate."""
     cruise_mps: Annotated[float, Field(gt=0, le=2)] = 0.3
     look_ahead_m: Annotated[float, Field(gt=0.1, le=5)] = 0.6
-    """It steers for the lane's middle this far ahead."""
+    """Distance ahead of the point of the center line toward which the robot steers."""
     max_angular_rad_s: Annotated[float, Field(gt=0, le=6)] = 1.5
 
 
 class TrafficLight:
-    """Three lamps in a housing."""
+    """Lights with three lamps in a housing."""
 
     Config = TrafficLightConfig
     scales: ClassVar[bool] = True
@@ -186,7 +186,7 @@ class TrafficLight:
     # --- the light -----------------------------------------------------------------------------------------------
 
     def _look(self, lights: list[DetectedLight], line: Line, view: View) -> None:
-        """Which of the lights is the next, what it shows, and where it is."""
+        """Select the next light, and update its place and its color."""
         pose = view.header.pose
         if self._light and self._left_m(line, self._light, pose) < -self._config.stop.cleared_m:
             self._light, self._stop = None, StopLine(self._config.stop)
@@ -198,7 +198,7 @@ class TrafficLight:
                 continue
             left_m = self._left_m(line, place, pose)
             if not self._is_known(place, pose) and (one.colour == UNKNOWN or left_m >= known_m):
-                continue  # a dark shape may be anything, and the known light counts as red while it is hidden
+                continue  # a dark shape may be any object; the known light counts as red while it is hidden
             if -self._config.stop.cleared_m <= left_m < next_m:
                 next_m, shown = left_m, one.colour
                 self._meet(place, pose, self._is_cut(one.box) or shown == UNKNOWN)
@@ -206,7 +206,7 @@ class TrafficLight:
             self._stop.see(shown, view.dt_s)
 
     def _light_place(self, one: DetectedLight, pose: Pose) -> Place | None:
-        """Return its center. The measurement is of its front, half its depth nearer."""
+        """Return the center of a light. The measured front is nearer by half its depth."""
         lamp, is_box = self._config.lamp, self.reader is BoxLightReader
         height_m = lamp.box_height_m if is_box else lamp.housing_height_m
         depth_m = lamp.box_depth_m if is_box else lamp.housing_depth_m
@@ -228,7 +228,7 @@ class TrafficLight:
         return off_m <= _SAME_M + _SAME_SHARE * math.dist(place, pose[:2])
 
     def _meet(self, place: Place, pose: Pose, is_vague: bool) -> None:
-        """Know better where the light is, near looks most; or that another one comes first.
+        """Update the place of the light, near measurements with the largest weight, or use a new light.
 
         A light that is cut off or unreadable has an inaccurate place. It may update the color, but not the place.
         """
@@ -271,7 +271,7 @@ class TrafficLight:
         return "waiting" if linear < 0.01 else "stopping"
 
     def _steered(self, line: Line, then: PredictedMotion, linear: float) -> Twist:
-        """Along the arc that meets the lane's middle ahead; on the spot where that lies far to the side."""
+        """Drive an arc to the center line ahead. Turn on the spot if that point is far to the side."""
         look_m, limit = self._config.look_ahead_m, self._config.max_angular_rad_s
         x, y = line.at(line.along_m(then.pose[0], then.pose[1]) + look_m)
         bearing_rad = math.remainder(math.atan2(y - then.pose[1], x - then.pose[0]) - then.pose[2], math.tau)
@@ -283,7 +283,7 @@ class TrafficLight:
 
 
 class TrafficLightBoxes(TrafficLight):
-    """A whole box that changes its color. The lane's blocks must have another color."""
+    """Lights that are one box, which changes its color. The lane's blocks must have another color."""
 
     reader = BoxLightReader
 

@@ -1,7 +1,7 @@
 """Assign robots to vision services: weighted rendezvous hashing with bounded load. Pure.
 
-Every service computes the same assignment from the same tokens, so none of them has to decide for the others. A robot
-moves only if its service leaves, if a service that comes is its better choice, or to keep the load within its bound.
+Every service computes the same assignment from the same tokens, so the services need no coordinator. A robot moves in
+three cases: its service leaves, a new service is its better choice, or the load limit requires it.
 
 Sources: Thaler and Ravishankar, "Using name-based mappings to increase hit rates" (1998); the weights as in
 Schindelhauer and Schomaker, "Weighted distributed hash tables" (2005); the bound as in Mirrokni, Thorup and
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_LOAD: Final = 1.25
-"""Most robots of a service, in shares of what its weight stands for."""
+"""Upper limit of a service's robots, relative to the share of its weight."""
 
 
 def ranked(robot: str, weights: Mapping[str, float]) -> list[str]:
@@ -54,7 +54,7 @@ def assign(robots: Collection[str], weights: Mapping[str, float], choices: int =
 
 
 def _scores(robots: list[str], names: list[str], weights: Mapping[str, float]) -> NDArray[np.float64]:
-    """Return the score of each robot (row) for each service (column): -weight / ln(uniform number of the pair)."""
+    """Return the score of each robot (row) for each service (column): -weight / ln(u), u a uniform hash of the pair."""
     mixed = _mixed(_hashes(robots)[:, None] ^ _hashes(names)[None, :])
     # 53 bits, in the open interval from 0 to 1.
     uniform = ((mixed >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53

@@ -1,4 +1,4 @@
-"""Decides which frames a detector examines next: newest only, fair turns, deadlines, and the next batch. Pure."""
+"""Selects the next frames for a detector: newest only, fair turns, deadlines, batches. Pure."""
 
 from collections import OrderedDict, deque
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from typing import Final, Generic, TypeVar
 Item = TypeVar("Item")
 
 _BATCH_SHARE: Final = 0.5
-"""Share of a deadline for one batch: frames that arrive meanwhile must still have their own turn."""
+"""Share of a deadline for one batch. Frames that arrive meanwhile must still have their own turn."""
 _SMOOTHING: Final = 0.2
 _AGES: Final = 512
 """Ages stored for the percentiles; some seconds of a busy service."""
@@ -17,7 +17,7 @@ _AGES: Final = 512
 
 @dataclass(frozen=True, slots=True)
 class QueuedFrame(Generic[Item]):
-    """One robot's newest frame, and when it came."""
+    """The newest frame of one robot, and its arrival time."""
 
     robot: str
     item: Item
@@ -26,18 +26,18 @@ class QueuedFrame(Generic[Item]):
 
 @dataclass(slots=True)
 class FrameCounters:
-    """Outcomes of one robot's frames; the numbers only grow."""
+    """Outcomes of the frames of one robot; the counters never decrease."""
 
     offered: int = 0
     served: int = 0
     overtaken: int = 0
-    """Replaced by a newer one before their turn."""
+    """Frames that a newer frame replaced before their turn."""
     stale: int = 0
-    """Too old when their turn came, or when the detector was free: not computed."""
+    """Frames that were too old at their turn, or when the detector was free. They are not computed."""
     late: int = 0
-    """Detected, but not by their deadline: not published."""
+    """Frames that were detected after their deadline. The boxes are not published."""
     rejected: int = 0
-    """Not a frame, not an image, or an invalid result."""
+    """Invalid frames, invalid images, and invalid results."""
 
     def __add__(self, other: "FrameCounters") -> "FrameCounters":
         return FrameCounters(*map(add, astuple(self), astuple(other)))
@@ -54,7 +54,7 @@ class FrameCounters:
 
 
 class FairQueue(Generic[Item]):
-    """One place for each robot. The robot whose last turn is longest ago is next."""
+    """One slot for each robot. The robot with the oldest last turn is next."""
 
     def __init__(self, max_batch: int, deadline_us: int) -> None:
         self._max_batch, self._deadline_us = max_batch, deadline_us
@@ -62,7 +62,7 @@ class FairQueue(Generic[Item]):
         self.counters: dict[str, FrameCounters] = {}
 
     def offer(self, robot: str, item: Item, now_us: int) -> None:
-        """Put the newest frame of `robot` in place of the one before."""
+        """Store the newest frame of `robot`. It replaces the one that waits."""
         counters = self.counters.setdefault(robot, FrameCounters())
         counters.offered += 1
         counters.overtaken += self._waiting.get(robot) is not None
@@ -79,7 +79,7 @@ class FairQueue(Generic[Item]):
         return any(turn is not None for turn in self._waiting.values())
 
     def take(self, now_us: int, each_us: int = 0) -> list[QueuedFrame[Item]]:
-        """Take waiting frames as one batch that fits in half a deadline if a frame takes `each_us`; may be empty."""
+        """Take waiting frames as one batch. At `each_us` per frame it fits in half a deadline. It may be empty."""
         most = self._max_batch
         if each_us > 0:
             most = max(1, min(most, int(self._deadline_us * _BATCH_SHARE) // each_us))
@@ -98,16 +98,16 @@ class FairQueue(Generic[Item]):
 
 
 def _is_too_old(turn: QueuedFrame[Item], now_us: int, each_us: int, deadline_us: int) -> bool:
-    """Return True if its boxes would come after its deadline."""
-    # One slow frame (a device that warms up) must not rule out all later ones: nothing would be measured again.
+    """Return True if the boxes would come after the deadline of the frame."""
+    # One slow frame (a device that warms up) must not reject all later ones, because then no new time is measured.
     return now_us - turn.arrived_us + min(each_us, int(deadline_us * _BATCH_SHARE)) > deadline_us
 
 
 class BatchClock:
-    """When batches begin and end: how long a frame takes, when to prepare the next batch, and how busy the detector is.
+    """Times of batches: duration of a frame, start of the next preparation, and load of the detector.
 
-    Two batches are in progress at most: the detector examines one while the next one is decoded. A batch that is
-    decoded too early grows old for nothing, so it is taken just in time.
+    At most two batches are in progress: one is decoded while the detector examines the other. A batch that is decoded
+    too early only becomes older, so it is taken just in time.
     """
 
     def __init__(self, deadline_us: int, began_us: int) -> None:
@@ -124,9 +124,9 @@ class BatchClock:
         return int(self._each_us)
 
     def wait_us(self, now_us: int) -> int:
-        """Return how long to wait before the next batch is taken, us. It may be taken earlier once the detector ends.
+        """Return the wait before the next batch is taken, us. A batch may be taken earlier if the detector is free.
 
-        Before the first batch has ended, its time is unknown: then one deadline.
+        Before the end of the first batch, the duration is unknown, and the wait is one deadline.
         """
         if self._busy_since_us is None:
             return 0
@@ -135,7 +135,7 @@ class BatchClock:
         return max(0, round(self._busy_since_us + self._detect_us - self._prepare_us - now_us))
 
     def prepared(self, batch: Iterable[QueuedFrame[Item]], began_us: int, now_us: int) -> None:
-        """Note a batch that was taken at `began_us` and is decoded now."""
+        """Note a batch that was taken at `began_us` and whose decoding ends now."""
         self._queue_ages_us.extend(began_us - turn.arrived_us for turn in batch)
         self._prepare_us = _smoothed(self._prepare_us, now_us - began_us)
 
@@ -163,7 +163,7 @@ class BatchClock:
         self._answer_ages_us.append(age_us)
 
     def busy_us(self, now_us: int) -> int:
-        """Return for how long the detector has examined the present batch, us; 0 without one."""
+        """Return the time since the detector began the current batch, us; 0 without a batch."""
         return 0 if self._busy_since_us is None else now_us - self._busy_since_us
 
     def busy_ratio(self, now_us: int) -> float:

@@ -1,12 +1,12 @@
-"""Serves one detector to many robots: their newest frames in, boxes out, as one batch for whatever waits. Shell.
+"""Serves one detector to many robots: their newest frames in, boxes out, waiting frames as one batch. Shell.
 
     sightline detector --serve onnx:ball.onnx --device cuda --connect tcp/192.168.1.20:7447
 
-It drives nothing and returns no credit: boxes name the frame in which they were found, and a vision service that
-steers by them (`--detector zenoh`) answers that frame. `sightline robots` shows it and its health.
+It sends no twists and returns no credit. The boxes name their frame. A vision service that steers by them
+(`--detector zenoh`) answers that frame. `sightline robots` shows the detector service and its health.
 
-The detector stays on the thread that serves. Under load another thread takes the next batch and decodes it meanwhile.
-With `--share` several services divide the robots among them (`detector_sharing`).
+The detector runs on the serving thread. Under load another thread takes and decodes the next batch meanwhile.
+With `--share` several services divide the robots (`detector_sharing`).
 """
 
 import logging
@@ -54,22 +54,22 @@ _log: Final = logging.getLogger(__name__)
 ROLE: Final = "detector"
 _WAIT_S: Final = 0.2
 _END_S: Final = 1.0
-"""Longest wait for a detector at the end; one that hangs is left behind."""
+"""Longest wait for a detector at the end. The service does not wait longer for a detector that hangs."""
 _MOST_DECODERS: Final = 4
-"""Threads that decode a batch, at most."""
+"""Largest number of threads that decode a batch."""
 _LOAD_PERIOD_S: Final = 5.0
 _MAX_REASONS: Final = 8
-"""Reasons that are reported: a plug-in's may be another each time."""
+"""Number of different reasons in the log. A plug-in may give a new text for each frame."""
 _OVERLOAD: Final = 0.1
-"""Share of unanswered frames, above which an overload is reported."""
+"""Share of unanswered frames above which an overload is reported."""
 _LOOK_PERIOD_S, _LOOK_EACH_S = 0.02, 20e-6
-"""Between two looks at robots and other services, unless one of them has changed; and more for each robot: a look takes
-3 us for each."""
+"""Time between two updates of robots and services without a change, plus a time for each robot. An update takes 3 us
+for each robot."""
 _FOREIGN: Final = 10
-"""Answers of a service that does not share, after which they are reported. One that joins may answer before its token
-has come."""
+"""Answers of a service that does not share, before they are reported. A service that joins may answer before its token
+arrives."""
 _JOIN_S: Final = 0.2
-"""Time for the tokens of the other services to come, before this one serves its first robot."""
+"""Wait for the tokens of the other services before the first robot is served."""
 _WARM_UP_PX: Final = (320, 240)
 _WARM_UP_US: Final = 60_000_000
 LogLine = Callable[[str], None]
@@ -81,18 +81,18 @@ class ServingOptions:
 
     name: str
     deadline_us: int = 100_000
-    """From a frame's arrival to its boxes; later they are of no use, so they are not sent."""
+    """Time from the arrival of a frame to its boxes. Later boxes are of no use and are not sent."""
     max_batch: int = 16
     max_pixels: int = 1920 * 1080
     weight: float | None = None
-    """Its share of the robots, if it divides them with other services of the same detector."""
+    """Weight of this service, if it shares the robots with other services of the same detector."""
     robots: str = "*"
     """Pattern of the robots that it shares."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceHealth:
-    """The state of a service now; `counters` are those of all robots so far."""
+    """The current state of a service; `counters` are the sums over all robots so far."""
 
     robots: int
     services: int
@@ -138,7 +138,7 @@ def run(
 
 @dataclass(frozen=True, slots=True)
 class _Batch:
-    """Frames that are ready for the detector, when they were taken, and the earliest deadline once it begins."""
+    """Frames that are ready for the detector, the time when they were taken, and their earliest deadline."""
 
     frames: list[QueuedFrame[DetectFrame]]
     taken_us: int
@@ -146,13 +146,13 @@ class _Batch:
 
 
 class DetectorService:
-    """One detector, a place for the newest frame of each robot, and turns. Frames arrive on the link's threads."""
+    """One detector, a slot for the newest frame of each robot, and fair turns. Frames arrive on threads of the link."""
 
     def __init__(
         self, fleet_link: FleetLink, detector: Detector, options: ServingOptions, report: LogLine,
         needs_peer: bool = False,
     ) -> None:
-        """Create the service. With `needs_peer` it is not ready without a session to a router or robot."""
+        """Create the service. With `needs_peer` it is ready only with a session to a router or robot."""
         self._fleet_link, self._detector, self._options, self._report = fleet_link, detector, options, report
         self._needs_peer, self._is_warm, self._ending = needs_peer, False, threading.Event()
         self._session = secrets.token_hex(4)
@@ -169,7 +169,7 @@ class DetectorService:
         self._prepared: _Batch | None = None
         """A batch that was decoded while the detector was busy."""
         self._ahead: LatestSlot[bool] = LatestSlot()
-        """True to prepare the next batch while the detector is busy, False to end."""
+        """True requests the next batch while the detector is busy; False ends the thread."""
         self._detected = threading.Event()
         """Set while the detector is free."""
         self._failure: Exception | None = None
@@ -183,20 +183,20 @@ class DetectorService:
         self._duties: dict[str, Duty] = {}
         self._looked_s = time.monotonic()
         self._gone = FrameCounters()
-        """Of the robots that have left."""
+        """Counters of the robots that have left."""
         self._reasons: set[str] = set()
         fleet_link.on_new_robot(self._on_change)
 
     def join(self, weight: float, robots: str) -> None:
-        """Warm the detector up, then divide the robots with the other services of the same model.
+        """Warm up the detector, then share the robots with the other services of the same model.
 
         Raises:
-            ConfigError: no other service would accept the share.
+            ConfigError: other services would not accept the share.
         """
         self.warm_up()
         maker = maker_of(self._detector)
         what = maker.model_hash if maker is not None and maker.model_hash else self._options.name
-        # A token has three decimals. All services must compute with one weight.
+        # A token has three decimals. All services must compute with the same weight.
         own = DetectorToken(blake2b(what.encode(), digest_size=4).hexdigest(), round(weight, 3), self._session, robots)
         if parse_token(own.key) != own:
             raise ConfigError(f"invalid share (weight {weight:g}, robots {robots!r}): expected a weight from 0.01 to "
@@ -225,7 +225,7 @@ class DetectorService:
         self._report(f"detector: ended; {self.about()}")
 
     def counters(self) -> dict[str, FrameCounters]:
-        """Outcomes of each robot's frames."""
+        """Outcomes of the frames of each robot."""
         with self._guard:
             return dict(self._queue.counters)
 
@@ -243,7 +243,7 @@ class DetectorService:
         return f"{what}: {state}{now.robots} robots{shared}, {served} frames answered, {dropped} dropped{load}"
 
     def health(self) -> ServiceHealth:
-        """Return the present state, for a supervisor. From any thread."""
+        """Return the current state, for a supervisor. Safe from any thread."""
         total = sum(self.counters().values(), self._gone)
         robots = list(self._duties.copy().values()).count(Duty.SERVE)
         services = self._sharing.services if self._sharing is not None else 1
@@ -252,13 +252,13 @@ class DetectorService:
         return ServiceHealth(robots, services, self._busy_ratio, queue_us or 0, answer_us or 0, total)
 
     def is_live(self) -> bool:
-        """Return True while the service turns, and its detector ends each batch."""
+        """Return True while the loop runs and the detector ends each batch."""
         with self._guard:
             busy_us = self._batch_clock.busy_us(monotonic_us())
         return busy_us < LIVE_S * 1e6 and time.monotonic() - self._looked_s <= LIVE_S
 
     def is_ready(self) -> bool:
-        """Return True while frames would be answered: detector and session are open, and it does not end."""
+        """Return True while frames are answered: detector and session are open, and the service does not end."""
         is_open = self._fleet_link.connected or not self._needs_peer
         return self._is_warm and is_open and not self._ending.is_set() and self.is_live()
 
@@ -273,7 +273,7 @@ class DetectorService:
             self._look_around()
 
     def _look_around(self) -> None:
-        """Report the detector's notices, drop robots that left, add new ones, and take up or end their service."""
+        """Report the detector's notices, drop robots that left, add new ones, and change their duties."""
         for line in notices_of(self._detector):
             self._report(f"detector: {line}")
         if self._sharing is not None:
@@ -299,7 +299,7 @@ class DetectorService:
         self._report(f"detector: {robot} left")
 
     def _change_duty(self, robot: str, before: Duty, now: Duty) -> None:
-        """Subscribe to what the new duty needs, and end what it does not need."""
+        """Subscribe to the channels of the new duty, and unsubscribe from all others."""
         if now is Duty.NOTHING:
             self._links.pop(robot).close()
         elif robot not in self._links:
@@ -328,14 +328,14 @@ class DetectorService:
         return receive
 
     def warm_up(self) -> None:
-        """Detect in a gray image: the first one takes seconds on some devices."""
+        """Detect in a gray image. The first detection takes seconds on some devices."""
         jpeg = simplejpeg.encode_jpeg(np.full((*reversed(_WARM_UP_PX), 3), 128, np.uint8))
         header = FrameHeader(session="00000000", seq=0, t_us=0)
         frame = self._pixels.frame("", header, jpeg, _WARM_UP_PX)
         checked_results(self._detector, [frame], monotonic_us() + _WARM_UP_US, monotonic_us)
         self._is_warm = True
 
-    # --- batches: taken and decoded, here or ahead on another thread, then examined here ---
+    # --- batches: taken and decoded here or on another thread, then examined here ---
 
     def _serve_batch(self) -> bool:
         with self._preparing:
@@ -349,7 +349,7 @@ class DetectorService:
         return True
 
     def _prepare_ahead(self) -> None:
-        """Prepare each next batch just in time for the end of the one before."""
+        """Prepare each next batch just before the detector is free."""
         try:
             while self._ahead.take(threading.TIMEOUT_MAX):
                 with self._guard:
@@ -364,7 +364,7 @@ class DetectorService:
             self._bell.put(True)
 
     def _prepare(self) -> _Batch | None:
-        """Take and decode the next batch; None if no frame waits. Frames without an image are counted."""
+        """Take and decode the next batch. Returns None if no frame waits. Invalid images are counted."""
         taken_us = monotonic_us()
         with self._guard:
             turns = self._queue.take(taken_us, self._batch_clock.each_us)
@@ -380,7 +380,7 @@ class DetectorService:
         return _Batch(frames, taken_us)
 
     def _frame(self, turn: QueuedFrame[Message]) -> QueuedFrame[DetectFrame] | None:
-        """Return the detector's input; None, counted, for an invalid frame."""
+        """Return the input of the detector. Counts an invalid frame and returns None."""
         jpeg = turn.item.payload
         try:
             header = decode(FrameHeader, turn.item.header)
@@ -389,16 +389,16 @@ class DetectorService:
             self._count(turn.robot, "rejected")
             return None
         sides = size.width_px, size.height_px
-        if min(sides) < LEAST_SIDE_PX or max(sides) > MOST_SIDE_PX:  # the wire could not carry its boxes
+        if min(sides) < LEAST_SIDE_PX or max(sides) > MOST_SIDE_PX:  # the wire cannot carry boxes of this size
             self._count(turn.robot, "rejected")
             return None
         return QueuedFrame(turn.robot, self._pixels.frame(turn.robot, header, jpeg, sides), turn.arrived_us)
 
     def _begin(self, batch: _Batch) -> tuple[_Batch, bool]:
-        """Note the begin of a batch.
+        """Begin a batch.
 
         Returns:
-            The batch without the frames whose deadline has passed, which are counted; and True if more frames wait.
+            The batch without the frames after their deadline, which are counted; and True if more frames wait.
         """
         with self._guard:
             fresh, deadline_us = self._batch_clock.begin(batch.frames, monotonic_us())
@@ -412,7 +412,7 @@ class DetectorService:
         return _Batch(fresh, batch.taken_us, deadline_us), is_more
 
     def _examine(self, batch: _Batch) -> None:
-        """Detect in a batch that has begun, and answer its frames."""
+        """Run the detector on a batch that has begun, and answer its frames."""
         if not batch.frames:
             return
         frames = [turn.item for turn in batch.frames]
@@ -429,7 +429,7 @@ class DetectorService:
                 self._answer(turn, result, ended_us - batch.taken_us)
 
     def _reject(self, robot: str, why: str, late: bool = False) -> None:
-        """Count it, and report each reason once, as far as there are few."""
+        """Count a rejected frame, and report each new reason once, up to a limit."""
         self._count(robot, "late" if late else "rejected")
         if why not in self._reasons and len(self._reasons) < _MAX_REASONS:
             self._reasons.add(why)
@@ -447,7 +447,7 @@ class DetectorService:
             return
         self._seq += 1
         stamp = _stamp(turn.item.header, self._session, self._seq, took_us)
-        if link := self._links.get(turn.robot):  # it may have left
+        if link := self._links.get(turn.robot):  # the robot may have left
             link.publish(DETECTIONS, stamp, payload, ROLE)
         self._count(turn.robot, "served")
         with self._guard:
@@ -461,7 +461,7 @@ class DetectorService:
             setattr(counters, outcome, getattr(counters, outcome) + 1)
 
     def _check_load(self, now_s: float) -> None:
-        """Report an overload, and its end."""
+        """Report the begin and the end of an overload."""
         if now_s - self._load_checked_s < _LOAD_PERIOD_S:
             return
         counters, before = [*self.counters().values(), self._gone], self._load_before
@@ -478,18 +478,18 @@ class DetectorService:
 
 
 class _Sharing:
-    """The duties of this service among those that share the robots. Tokens and answers arrive on the link's threads."""
+    """The duties of this service among services that share robots. Tokens and answers arrive on threads of the link."""
 
     def __init__(
         self, own: DetectorToken, deadline_us: int, fleet_link: FleetLink, report: LogLine,
         on_change: Callable[[], None],
     ) -> None:
-        """Find the other services, and show that this one is ready. `on_change` is called after each change of them."""
+        """Watch the other services, and show that this one is ready. Each change calls `on_change`."""
         self._own, self._fleet_link, self._report, self._on_change = own, fleet_link, report, on_change
         self._guard = threading.Lock()
         self._assignment = Assignment(own, deadline_us)
         self._foreign = 0
-        """Answers of services that do not share."""
+        """Number of answers of services that do not share."""
         fleet_link.watch_detectors(own.group, self._note)
         self._end_recall: Callable[[], None] = lambda: None
         self._watch_robots(RobotTokens(own.robots))
@@ -508,7 +508,7 @@ class _Sharing:
         self._on_change()
 
     def _watch_robots(self, robots: RobotTokens) -> None:
-        """Note the tokens of robots in `robots` from now on, also those that are there."""
+        """Pass robot tokens to `robots` from now on, also those that are present."""
 
         def note(token: Token, is_present: bool) -> None:
             if isinstance(token, RobotToken):
@@ -534,7 +534,7 @@ class _Sharing:
         return self._assignment.services
 
     def update(self, now_us: int) -> None:
-        """Find out which services are present."""
+        """Use the tokens so far. Watch them again if there is room."""
         with self._guard:
             needs_tokens = self._assignment.needs_tokens(now_us)
             was_shared, is_other = self._assignment.is_shared, self._assignment.update(now_us)
@@ -548,7 +548,7 @@ class _Sharing:
             self._report("detector: more services than sharing supports; this one serves every robot until some end")
 
     def duty(self, robot: str, now_us: int) -> Duty:
-        """Return what this service does for a robot now."""
+        """Return the current duty of this service for a robot."""
         with self._guard:
             return self._assignment.duty(robot, now_us)
 
@@ -558,7 +558,7 @@ class _Sharing:
             return self._assignment.on_frame(robot, now_us)
 
     def receiver(self, robot: str) -> Callable[[Message], None]:
-        """Return what receives the answers of other services to a robot's frames."""
+        """Return the callback for answers of other services to a robot's frames."""
 
         def receive(message: Message) -> None:
             try:
@@ -587,9 +587,9 @@ class _Sharing:
 
 
 class _BatchDecoder:
-    """Decodes the images of a batch on several threads, once the detector has shown that it uses pixels.
+    """Decodes the images of a batch on several threads, if the detector uses pixels.
 
-    The pixels of a batch stay valid while the next one is decoded.
+    The pixels of a batch stay valid while the next batch is decoded.
     """
 
     def __init__(self, max_pixels: int) -> None:
@@ -600,17 +600,17 @@ class _BatchDecoder:
         self._executor = ThreadPoolExecutor(self._threads, "decode")
 
     def next_batch(self) -> None:
-        """Use the pixels of the batch before the last one again."""
+        """Reuse the pixels of the batch before the last one."""
         self._now = 1 - self._now
 
     def frame(self, robot: str, header: FrameHeader, jpeg: bytes, size_px: tuple[int, int]) -> DetectFrame:
-        """Return a frame of this batch, not decoded yet."""
+        """Return a frame of this batch, not yet decoded."""
         frame = self._pools[self._now].frame(robot, header, jpeg, size_px)
         frame.looks_once = True
         return frame
 
     def decode(self, frames: Sequence[QueuedFrame[DetectFrame]]) -> list[QueuedFrame[DetectFrame]]:
-        """Decode all. Returns those whose image does not decode."""
+        """Decode all frames. Returns the frames whose image is invalid."""
         if not self._wanted or not frames:
             return []
         own, *others = (frames[index :: self._threads] for index in range(self._threads))
@@ -618,7 +618,7 @@ class _BatchDecoder:
         return _broken(own) + [one for part in waiting for one in part.result()]
 
     def learn(self, frames: Sequence[QueuedFrame[DetectFrame]]) -> None:
-        """Note whether the detector uses the pixels of these frames."""
+        """Note if the detector used the pixels of these frames."""
         self._wanted = self._wanted or any(turn.item.decoded is not None for turn in frames)
 
     def close(self) -> None:
@@ -627,7 +627,7 @@ class _BatchDecoder:
 
 
 def _broken(frames: Sequence[QueuedFrame[DetectFrame]]) -> list[QueuedFrame[DetectFrame]]:
-    """Decode frames on this thread. Returns those that do not decode."""
+    """Decode frames on this thread. Returns the frames whose image is invalid."""
     broken = []
     for turn in frames:
         try:

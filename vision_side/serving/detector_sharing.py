@@ -1,10 +1,10 @@
-"""Decides which of several detector services serves a robot, and the next choice while the first is silent. Pure.
+"""Select which of several detector services serves a robot, and its replacement while it is silent. Pure.
 
-Each service computes the same order of services for a robot (`assignment.ranked`) from the tokens of all. The first one
-serves the robot. A service that serves a robot continues until one that is before it in the order has answered, so that
-a service that joins, or only claims to, leaves no robot without answers. The next two receive the answers of a robot.
-Each later one looks there only if it receives no answer of the services before it, to any robot, for its own number of
-seconds.
+Each service computes the same order of services for a robot (`assignment.ranked`) from the tokens of all services. The
+first one serves the robot. A service stops serving a robot only after an earlier service in the order has answered it.
+So a service that joins, or falsely claims to, leaves no robot without answers. The next two services receive the
+answers for the robot. A later service subscribes only if none of the services before it answers any robot for a time
+that grows with its place.
 """
 
 from collections.abc import Iterable
@@ -19,19 +19,19 @@ from sightline.vision_side.serving.assignment import ranked
 MAX_SERVICES: Final = 64
 """Security limit: with more services, each one serves every robot."""
 MAX_KEPT_TOKENS: Final = 1_000
-"""Security limit: tokens that are stored. After a flood of more, the caller watches all that are present once more."""
+"""Security limit: stored tokens. After a flood of more, the caller watches all present tokens again."""
 LEFT_US: Final = 10_000_000
-"""Time without its token after which a robot has left. Its link, or that of this service, may be back before."""
+"""Time without its token after which a robot has left. Its link, or the link of this service, may return before."""
 _STANDING_BY: Final = 2
-"""Services that stand by for a robot, behind the one that serves it."""
+"""Number of standby services of a robot, after the service that serves it."""
 SILENT_US: Final = 1_000_000
-"""Time without an answer, after which the next service looks whether there are frames to answer."""
+"""Time without an answer after which the next service receives frames, to see if any wait for an answer."""
 SILENT_INTERVALS: Final = 10
-"""The same, in times between two answers, where they come often. A slow stream crosses the network once only."""
+"""The same time in intervals between answers, if they are frequent. So a slow stream is sent only once."""
 LEAST_SILENT_US: Final = 300_000
 UNANSWERED_US: Final = 200_000
-"""Time for which the next service receives frames that the one before does not answer, before it serves them; twice the
-deadline of an answer at least."""
+"""Time for which frames get no answer before the next service serves the robot; at least twice the deadline of an
+answer."""
 _SMOOTHING: Final = 0.1
 _GAP_US: Final = 500_000
 """Longest time between two frames of one stream."""
@@ -48,7 +48,7 @@ class Duty(Enum):
 
 @dataclass(slots=True)
 class _Robot:
-    """One robot, as far as this service knows."""
+    """State of one robot, as known to this service."""
 
     order: list[str]
     since_us: int
@@ -56,28 +56,28 @@ class _Robot:
     answered_us: dict[str, int] = field(default_factory=dict)
     """Time of the newest answer of each service."""
     interval_us: float = 0.0
-    """Time between two answers; 0 if unknown."""
+    """Mean time between two answers; 0 if unknown."""
     silent: set[str] = field(default_factory=set)
     """Services that do not answer while others do."""
     frames_since_us: int | None = None
-    """Time of the first frame of the stream that this service watches."""
+    """Time of the first frame of the watched stream."""
     frame_us: int = 0
 
 
 class RobotTokens:
-    """The robots that have a token, or had one a moment ago. After a flood, the caller watches all once more."""
+    """The robots that have a token, or had one recently. After a flood, the caller watches all tokens again."""
 
     def __init__(self, pattern: str, before: Iterable[str] = (), now_us: int = 0) -> None:
-        """Create it. The robots in `before` leave unless their token is reported once more.
+        """Create it. A robot of `before` leaves unless its token is reported again.
 
         Args:
-            pattern: of the robots that count. One without wildcards needs no token, so that an older robot is served.
+            pattern: robots that count. A pattern without wildcards needs no token, for robots of older releases.
             before: robots that were known.
             now_us: time.
         """
         self._pattern = pattern
         self._ended_us: dict[str, int | None] = dict.fromkeys(before, now_us)
-        """Robots, and when their token ended; None while it is present."""
+        """Robot -> time when its token ended, or None while it is present."""
         if not set("*?") & set(pattern):
             self._ended_us[pattern] = None
         self._began_us, self._left_out = now_us, False
@@ -92,21 +92,21 @@ class RobotTokens:
             self._left_out |= is_present
 
     def present(self, now_us: int) -> list[str]:
-        """Return the robots, and forget those that have left."""
+        """Return the present robots, and forget robots that have left."""
         for robot in [one for one, at_us in self._ended_us.items() if at_us is not None and now_us - at_us >= LEFT_US]:
             del self._ended_us[robot]
         return list(self._ended_us)
 
     def needs_tokens(self, now_us: int) -> bool:
-        """Return True if there is room for tokens that were left out: the caller watches all once more."""
+        """Return True if there is room for ignored tokens. The caller then watches all tokens again."""
         return self._left_out and len(self._ended_us) < MAX_ROBOTS and now_us - self._began_us >= LEFT_US
 
 
 class Assignment:
-    """The duties of one service among those of its group."""
+    """The duties of one service in its group."""
 
     def __init__(self, own: DetectorToken, deadline_us: int = 0) -> None:
-        """Create the duties of the service `own`, whose answers come within `deadline_us`, as those of the others."""
+        """Create the duties of the service `own`. All services of the group answer within `deadline_us`."""
         self._own = own
         self._unanswered_us = max(UNANSWERED_US, 2 * deadline_us)
         self._tokens: set[DetectorToken] = set()
@@ -121,7 +121,7 @@ class Assignment:
         """Note a token that appeared or ended. It counts from the next `update` on."""
         if not is_present:
             self._tokens.discard(token)
-            if not self._second_watch.on_end(token):  # what it reports may have ended
+            if not self._second_watch.on_end(token):  # a token that it has reported may have ended
                 self._second_watch.end()
                 self._left_out = True
         elif len(self._tokens) < MAX_KEPT_TOKENS:
@@ -131,7 +131,7 @@ class Assignment:
         self._changed = True
 
     def needs_tokens(self, now_us: int) -> bool:
-        """Return True, once, if there is room for tokens that were left out: the caller watches them once more."""
+        """Return True, once, if there is room for ignored tokens. The caller then watches all tokens again."""
         if self._second_watch.is_on(now_us) or not self._left_out or len(self._tokens) > MAX_SERVICES:
             return False
         self._left_out = False
@@ -144,18 +144,18 @@ class Assignment:
             self.on_token(token, True)
 
     def update(self, now_us: int) -> bool:
-        """Use the tokens so far. Returns True if other services are present than before."""
+        """Use the tokens so far. Returns True if the set of present services has changed."""
         if not self._changed:
             return False
         self._changed, before = False, self._services.keys()
-        # Sorted, so that of two tokens with one session the same one counts on every machine.
+        # Sorted, so that every machine uses the same one of two tokens with one session.
         services = {one.session: one for one in sorted(self._tokens)} | {self._own.session: self._own}
         if services == self._services:
             return False
         self._services = services
         for name in self._answered_us.keys() - services.keys():
             del self._answered_us[name]
-        # Without sharing no order is used, and that of a flood would take long.
+        # Without sharing no order is used, and the order of a flood of services takes long.
         for robot, state in self._robots.items() if self.is_shared else ():
             state.order = self._order(robot)
             for name in state.answered_us.keys() - set(state.order):
@@ -171,11 +171,11 @@ class Assignment:
 
     @property
     def is_shared(self) -> bool:
-        """Return True while the services divide the robots, False while there are too many and each serves all."""
+        """Return False if there are too many services. Then each service serves all robots."""
         return len(self._services) <= MAX_SERVICES
 
     def duty(self, robot: str, now_us: int) -> Duty:
-        """Return what this service does for a robot now."""
+        """Return the current duty of this service for a robot."""
         if not self.is_shared:
             return Duty.SERVE
         state = self._state(robot, now_us)
@@ -238,7 +238,7 @@ class Assignment:
         """Return the time of the newest answer that counts for this robot."""
         if len(before) <= _STANDING_BY:
             return _answered_us(state)
-        # It does not receive the robot's answers. That a service before it answers another robot shows that it works.
+        # This service does not receive the robot's answers. An earlier service that answers any robot works.
         return max(_answered_us(state), *(self._answered_us.get(name, 0) for name in before))
 
     def _before(self, state: _Robot) -> list[str]:
@@ -246,7 +246,7 @@ class Assignment:
 
 
 def _until(order: Iterable[str], name: str) -> list[str]:
-    """Return what is before `name`, all without it."""
+    """Return the elements before `name`, or all without it."""
     before = []
     for one in order:
         if one == name:
@@ -268,6 +268,6 @@ def _silent_us(state: _Robot) -> float:
 
 
 def _is_unanswered(state: _Robot, now_us: int, for_us: int) -> bool:
-    """Return True if frames have come for a while, also now."""
+    """Return True if frames have come for at least `for_us`, and still come."""
     since_us = state.frames_since_us
     return since_us is not None and now_us - since_us >= for_us and now_us - state.frame_us <= _GAP_US

@@ -1,6 +1,6 @@
 """Runs the pipeline on a robot's frames or a local camera and only prints. Shell.
 
-A robot's frames are acknowledged, so that it goes on sending; no twist is ever published.
+The frames of a robot are acknowledged, so that it continues to send. No twist is published.
 """
 
 import secrets
@@ -27,7 +27,7 @@ LogLine = Callable[[str], None]
 
 
 class Capture(Protocol):
-    """One JPEG and when it was captured, in microseconds of a monotonic clock."""
+    """One JPEG and its capture time, in microseconds of a monotonic clock."""
 
     @property
     def jpeg(self) -> bytes: ...
@@ -81,7 +81,7 @@ def _repeat(turn: Callable[[], None], seconds: float | None) -> int:
 
 
 class AckingService(Service):
-    """The vision service as it is, but every answer goes out as an acknowledgement."""
+    """The vision service with an acknowledgement in place of each twist."""
 
     def __init__(self, config: VisionConfig, link: Link, report: LogLine) -> None:
         super().__init__(config, link, report)
@@ -95,7 +95,7 @@ class AckingService(Service):
 
 
 class ScansOnly(MissionChannel):
-    """Takes no missions and reports nothing: what the robot does is not this one's doing."""
+    """Accepts no missions and publishes no reports, because this service does not drive the robot."""
 
     def prepare(self, pipeline: Pipeline, frame: FrameHeader, waited_us: int = 0) -> None:
         """Give `pipeline` the newest scan."""
@@ -107,7 +107,7 @@ class ScansOnly(MissionChannel):
 
 
 class LocalRun:
-    """A local camera straight into the pipeline, as if its robot stood still."""
+    """Runs the pipeline on a local camera, as if its robot stood still."""
 
     def __init__(self, config: VisionConfig, camera: LocalCamera, report: LogLine) -> None:
         self._camera, self._report = camera, report
@@ -121,7 +121,7 @@ class LocalRun:
         self._fault = ""
 
     def turn(self) -> None:
-        """Process the next image. The loss of the camera is logged once, and the next turn tries it again."""
+        """Process the next image. The loss of the camera is logged once. The next turn tries again."""
         try:
             picture = self._camera.read(_WAIT_S)
         except HardwareError as error:
@@ -147,7 +147,7 @@ class LocalRun:
 
 
 class ProgressPrinter:
-    """One line at most every half second, with the images per second since the last."""
+    """Prints at most one line per half second, with the images per second since the last line."""
 
     def __init__(self, report: LogLine) -> None:
         self._report = report

@@ -40,9 +40,9 @@ from sightline.vision_side.serving.sharing import Sharing, SharingPart
 
 _LONGEST_WAIT_S = 0.2
 _CHANGES_FOR_S = 0.01
-"""Of one turn, for new robots, and for those that left: each takes up to 4 ms, and the others wait meanwhile."""
+"""Part of a turn for new robots, and for robots that left. Each takes up to 4 ms, and the other robots wait."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S, _DOUBLINGS = 1.0, 30.0, 16
-"""From the error of a robot's service to the start of its next one: twice as long each time."""
+"""Pauses from the error of a robot's service to the next start. Each pause is twice the last one."""
 
 
 class _NotifyingLink(LinkWrapper):
@@ -61,17 +61,17 @@ class _NotifyingLink(LinkWrapper):
 
 
 class Fleet:
-    """A service for each robot that is present. One turn gives every robot with something new its turn.
+    """A service for each present robot. One turn answers each robot that has a new message.
 
-    An error in one robot's service ends that service alone; it is logged, counted, and a new one starts after a pause.
-    With a detector that waits for another service, each robot has its own detector and thread: an answer that one of
-    them waits for keeps no other waiting.
+    An error in a robot's service ends only that service. It is logged and counted, and a new service starts after a
+    pause. If the detector waits for another service, each robot has its own detector and thread, so that no robot
+    waits for another robot's answer.
     """
 
     def __init__(
         self, config: VisionConfig, fleet_link: FleetLink, report: LogLine, detector: Detector | None = None
     ) -> None:
-        """Create the fleet. `detector` (default: that of `config`) serves every robot that has no separate one."""
+        """Create the fleet. `detector` (default: that of `config`) serves every robot without a separate detector."""
         self._config, self._fleet_link, self._report = config, fleet_link, report
         self._waits_for_service = waits_for_service(config)
         self._detector = detector or configured_detector(config)
@@ -79,7 +79,7 @@ class Fleet:
         self._threads: dict[str, threading.Thread] = {}
         self._links: dict[str, Link] = {}
         self._failed: deque[tuple[str, Exception]] = deque()
-        """Errors of the robots' threads."""
+        """Errors of the threads of the robots."""
         self._starts_s: dict[str, float] = {}
         """Earliest start of the next service of a robot that failed."""
         self._restarts: Counter[str] = Counter()
@@ -113,10 +113,10 @@ class Fleet:
                 for robot, service in services]
 
     def turn(self) -> None:
-        """Add new robots, and answer at most one frame of each robot without a thread of its own.
+        """Add new robots, and answer at most one frame of each robot without its own thread.
 
-        So no robot waits longer than one round, however many frames another one sends. Raises ConfigError for an
-        invalid configuration, which is that of every robot.
+        So no robot waits longer than one round, even if another robot sends many frames. Raises ConfigError for an
+        invalid configuration, which all robots share.
         """
         present = self._present()
         self._drop_left(present)
@@ -128,7 +128,7 @@ class Fleet:
             self._on_error(*self._failed.popleft())
 
     def _drop_left(self, present: list[str]) -> None:
-        """Drop robots that left, for a short time only, see `_add_new`."""
+        """Drop robots that left, for a limited time per turn, see `_add_new`."""
         until_s = time.monotonic() + _CHANGES_FOR_S
         for robot in self._links.keys() - present:
             self._report_left(robot)
@@ -139,7 +139,7 @@ class Fleet:
                 return
 
     def _add_new(self, present: list[str]) -> None:
-        """Add new robots for a short time only: of a thousand that come at once, most wait for a later turn."""
+        """Add new robots for a limited time per turn. If a thousand come together, most wait for a later turn."""
         until_s = time.monotonic() + _CHANGES_FOR_S
         for robot in present:
             if robot not in self._links and time.monotonic() >= self._starts_s.get(robot, 0.0):
@@ -203,7 +203,7 @@ class Fleet:
         thread.start()
 
     def _another_detector(self, config: VisionConfig) -> Detector:
-        """Open the detector of one more robot. If it does not open, that robot alone has failed: the first did."""
+        """Open the detector of one more robot. An error affects only that robot, because the first one has opened."""
         try:
             return configured_detector(config)
         except ConfigError as error:
@@ -222,7 +222,7 @@ class Fleet:
                 self._bell.set()
 
     def _end(self) -> None:
-        """End the robots' threads together; one whose detector hangs is left behind."""
+        """End the threads of the robots together. It does not wait longer for a detector that hangs."""
         self._ending.set()
         until_s = time.monotonic() + _LONGEST_WAIT_S + self._config.detector.deadline_s
         for thread in self._threads.values():
@@ -237,22 +237,22 @@ class Fleet:
 
 _LONGEST_SHARED_WAIT_S = 0.02
 _QUIET_US, _COUNTS_WITHIN_US = 30_000, 100_000
-"""If the link ends, the tokens beyond it end one after the other before that is known: those of 200 robots for 0.1 s.
-The end of a driver or service must count at once, but not then: it counts with the first message after it, for nothing
-comes over a link that ended. Without a message it counts after so long without the end of another token, or in all."""
+"""If the link ends, remote tokens end one after the other before the loss of the link is known, for 0.1 s with 200
+robots. The end of a driver or service must count immediately, but not in that case. So it counts with the next message,
+which shows that the link works. Without a message it counts after a time without further ends, or after a limit."""
 _ROBOT_ENDS_AFTER_US, _MISSION_ENDS_AFTER_US = 500_000, 10_000_000
-"""A robot whose own link is cut for a moment is back so soon. Its requested mission goes on after a longer cut too, as
-without other services."""
+"""Time after which a robot without a token has left. A short loss of its link ends earlier. A robot with a requested
+mission has longer, so that the mission continues, as it does without other services."""
 _NEVER_US = 1 << 62
 _LOOKS_EVERY_S, _TOKENS_COME_S = 60.0, 2.0
-"""Time between two looks for robots of older releases, which have no token; and that of a robot that has just begun."""
-_MAX_REPORTED = 256  # security limit: such robots that are reported
+"""Time between two searches for robots of older releases, which have no token; and time for a new robot's token."""
+_MAX_REPORTED = 256  # security limit: reported robots without a token
 _HANDS_OVER_WITHIN_S = 0.6
-_MAX_TOKENS = 20_000  # security limit: tokens that wait for the next turn, and ends that do not count yet
+_MAX_TOKENS = 20_000  # security limit: tokens for the next turn, and token ends that do not count yet
 
 
 class SharedFleet(Fleet):
-    """A fleet that drives the robots of its own and stands by for others, beside other services like it."""
+    """A fleet that drives its own robots and is standby for others, among other services of this kind."""
 
     def __init__(
         self, config: VisionConfig, fleet_link: FleetLink, report: LogLine, detector: Detector | None = None
@@ -260,16 +260,16 @@ class SharedFleet(Fleet):
         """Create the fleet, see `Fleet`. It is present from now on."""
         super().__init__(config, fleet_link, report, detector)
         self._tokens: deque[tuple[Token, bool, int]] = deque(maxlen=_MAX_TOKENS)
-        """Each with its presence and the time when that was noted."""
+        """Token, presence, and time of the event."""
         self._ends_us: dict[Token, int] = {}
-        """Tokens that ended and whose end does not count yet: when they ended."""
+        """Tokens that ended -> end time, until the end counts."""
         self._newest_end_us = self._received_us = 0
         self._second_watch = SecondWatch(_MAX_TOKENS)
         self._end_second_watch: Callable[[], None] | None = None
         self._is_up, self._losses = True, fleet_link.losses
         self._statuses: dict[str, LatestSlot[Message]] = {}
         self._withdraw: dict[str, Callable[[], None]] = {}
-        """Ends the token with which a robot is driven."""
+        """Withdraws the driver token of a robot."""
         instance = secrets.token_hex(4)
         # The key of a token has three decimals.
         own = VisionToken(config.share.name or f"vision-{instance}", round(config.share.weight, 3), instance)
@@ -287,7 +287,7 @@ class SharedFleet(Fleet):
         super().serve(ending, observe)
 
     def _report_older(self) -> None:
-        """Report each robot without a token once: no service that shares drives it."""
+        """Report each robot without a token once, because no sharing service drives it."""
         reported: set[str] = set()
         while len(reported) < _MAX_REPORTED:
             found = [one for one in self._fleet_link.find_robots() - reported if one not in self.sharing.robots]
@@ -301,7 +301,7 @@ class SharedFleet(Fleet):
                 return
 
     def turn(self) -> None:
-        """Decide the part in each robot, then serve those that it drives."""
+        """Decide the part in each robot, then serve the robots that this service drives."""
         now_us = monotonic_us()
         self._watch_link(now_us)
         self._take_tokens(now_us)
@@ -316,7 +316,7 @@ class SharedFleet(Fleet):
                          "service its own --name")
 
     def _watch_link(self, now_us: int) -> None:
-        """Note the end and the return of the link to a router. With it, robots lost the sessions that drove them."""
+        """Note the loss and the return of the link to a router. Robots then have lost the driving sessions."""
         if self._config.listen:
             return
         if self._losses != self._fleet_link.losses:
@@ -336,10 +336,10 @@ class SharedFleet(Fleet):
 
     def _begin(self, service: Service) -> None:
         service.begin()
-        self._bell.set()  # its first frame may wait there already
+        self._bell.set()  # a frame may already wait
 
     def _take_tokens(self, now_us: int) -> None:
-        """Note the tokens that came, and those whose end counts by now. Without a link each end counts at once."""
+        """Process new tokens, and ends that count by now. While the link is lost, each end counts immediately."""
         while self._tokens:
             token, is_present, at_us = self._tokens.popleft()
             if is_present:
@@ -356,7 +356,7 @@ class SharedFleet(Fleet):
             self.sharing.on_token(token, False, now_us)
 
     def _counts_us(self, token: Token) -> int:
-        """Return when the end of a token counts."""
+        """Return the time when the end of a token counts."""
         ended_us = self._ends_us[token]
         if not isinstance(token, RobotToken):
             if self._received_us > ended_us:
@@ -379,7 +379,7 @@ class SharedFleet(Fleet):
         self._carry_out(robot, self.services[robot], now_us)
 
     def _end(self) -> None:
-        """Hand the robots over, and end. A robot that no service claims keeps its last command until it is too old."""
+        """Hand over the robots, and end. An unclaimed robot applies its last command until it is too old."""
         self._leave_services()
         self.sharing.leave()
         until_s = time.monotonic() + _HANDS_OVER_WITHIN_S
@@ -401,7 +401,7 @@ class SharedFleet(Fleet):
             self._bell.set()
 
     def _recall_tokens(self, now_us: int) -> None:
-        """Watch the tokens once more, for a while, when there is room for those that did not count."""
+        """Watch the tokens again, for a while, when there is room for ignored tokens."""
         if self._end_second_watch is not None and not self._second_watch.is_on(now_us):
             self._end_second_watch()
             self._end_second_watch = None
@@ -456,7 +456,7 @@ class SharedFleet(Fleet):
         if part is not SharingPart.DRIVE and not is_about_to_drive:
             service.rest()
         if is_about_to_drive:
-            service.listen()  # before the token, so that the former driver leaves when this one has frames
+            service.listen()  # before the token, so that this driver has frames when the former driver leaves
         if part in (SharingPart.CLAIM, SharingPart.DRIVE) and robot not in self._withdraw:
             self._renew(robot)
         if part is SharingPart.DRIVE and service.is_standby:
@@ -465,7 +465,7 @@ class SharedFleet(Fleet):
             self._withdraw_token(robot)
 
     def _renew(self, robot: str) -> None:
-        """Drive with a new session from now on. Its token is there before its first command."""
+        """Drive with a new session from now on. Its token is declared before its first command."""
         sender = DriverSession()
         token = DriverToken(robot, self.sharing.own.name, sender.proofs.token)
         self.sharing.add_own(token)

@@ -1,13 +1,13 @@
-"""Stands in for a legacy robot, which has no gate: STOP, disarm and arm of operators, status, a camera model. Shell.
+"""Replaces the gate of a legacy robot: STOP, disarm and arm of operators, status, a camera model. Shell.
 
     with legacy_link(config) as link:
         serve(config, link, ...)
 
-A legacy robot applies each command for ever and validates nothing. Its operators therefore send their requests to the
-vision service that drives it, and the commands of that service pass through here.
+A legacy robot applies each command forever and validates nothing. Its operators therefore send requests to the vision
+service that drives it, and the commands of that service pass through this link.
 
-The robot confirms no command. A zero counts as delivered once an image comes 100 ms later by the same connection. Until
-then the robot may drive on: its state is ACTIVE, and STOP and disarm are not confirmed.
+The robot confirms no command. A zero counts as delivered if an image comes at least 100 ms later on the same
+connection. Until then the robot may move: its state is ACTIVE, and STOP and disarm are not confirmed.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ from sightline.protocol.transports.link import Link, LinkWrapper, Message
 from sightline.vision_side.detect.port import Detection
 
 FIELD_OF_VIEW_DEG: Final = 60.0
-"""Horizontal, of the assumed camera. Most webcams and phone cameras have 55 to 70 degrees."""
+"""Horizontal field of view of the assumed camera. Most webcams and phone cameras have 55 to 70 degrees."""
 STATUS_PERIOD_S: Final = 0.1
 _ZERO: Final = format_twist(STILL)
 _NO_BOX: Final = encode(Detections(width_px=LEAST_SIDE_PX, height_px=LEAST_SIDE_PX))
 _FRESH: Final = round(2.0 / STATUS_PERIOD_S)
-"""Statuses that a request may cite: those of the last two seconds."""
+"""Number of statuses that a request may cite: those of the last two seconds."""
 _IN_FLIGHT_US: Final = 100_000
-"""An image that arrives earlier after a zero may have left before it, and shows no delivery."""
+"""An image that arrives sooner after a zero may be older than the zero, so it shows no delivery."""
 _PATIENCE_US: Final = 1_000_000
-"""Time for the delivery of a zero before a request is answered as failed. Its sender repeats it."""
+"""Longest wait for the delivery of a zero before a request fails. Its sender repeats the request."""
 _NOT_DELIVERED: Final = "zero is not delivered to the robot; cut its power by hand"
 _DRIVING: Final = "legacy robot: it validates no image age, and has no watchdog"
 
@@ -70,7 +70,7 @@ def assumed_camera(size: JpegSize) -> CameraModel:
     """Return a camera model of 60 degrees for a robot that publishes none.
 
     Raises:
-        WireError: MALFORMED for a size that no camera model has.
+        WireError: MALFORMED for a size that no camera model can have.
     """
     if not LEAST_SIDE_PX <= min(size.width_px, size.height_px) <= max(size.width_px, size.height_px) <= MOST_SIDE_PX:
         raise WireError(RejectReason.MALFORMED, f"image is {size.width_px}x{size.height_px}, each side must have "
@@ -89,7 +89,7 @@ def camera_line(camera: CameraModel) -> str:
 
 
 def target_box(target: Detection | None, camera: CameraModel) -> bytes:
-    """Encode the box of the target, or no box, for a legacy robot that steers by boxes."""
+    """Encode the box of the target, or no boxes, for a legacy robot that steers by boxes."""
     boxes = () if target is None else (DetectedBox(
         label=target.label or "target", score=target.score, x1_px=target.x1_px, y1_px=target.y1_px, x2_px=target.x2_px,
         y2_px=target.y2_px),)
@@ -97,7 +97,7 @@ def target_box(target: Detection | None, camera: CameraModel) -> bytes:
 
 
 class LegacyRobotLink(LinkWrapper):
-    """A link to a legacy robot and its operators. Only in state ACTIVE do commands pass; else zero replaces them."""
+    """A link to a legacy robot and its operators. Commands pass only in state ACTIVE; otherwise zero replaces them."""
 
     def __init__(self, link: Link, now_us: Callable[[], int] = monotonic_us) -> None:
         super().__init__(link)
@@ -107,11 +107,11 @@ class LegacyRobotLink(LinkWrapper):
         self._state, self._reason = State.ACTIVE, _DRIVING
         self._applied = (0.0, 0.0)
         self._is_at_rest, self._zero_us = False, 0
-        """Whether zero is delivered since the last motion, and the first time that it was sent for that."""
+        """Whether zero is delivered since the last motion, and the time of the first zero after it."""
         self._connection = ""
         self._accepted = 0
         self._seqs = {STATUS: 0, REPLY: 0}
-        # A request that permits motion cites one of these. STOP and disarm clear them.
+        # A request that permits motion cites one of these statuses. STOP and disarm clear them.
         self._issued: deque[Echo] = deque(maxlen=_FRESH)
         self._ending = threading.Event()
         link.subscribe(REQUEST, self._on_request)
@@ -201,7 +201,7 @@ class LegacyRobotLink(LinkWrapper):
         except WireError:
             return
         with self._lock:
-            if session != self._connection:  # the one before may have lost the zero
+            if session != self._connection:  # the earlier connection may have lost the zero
                 self._connection, self._zero_us = session, now_us
             if self._state is State.ACTIVE or self._is_at_rest or now_us - self._zero_us < _IN_FLIGHT_US:
                 return
@@ -209,7 +209,7 @@ class LegacyRobotLink(LinkWrapper):
         self._post_status()
 
     def _shown(self) -> tuple[State, str]:
-        """Return state and reason for the operators."""
+        """Return state and reason as shown to the operators."""
         if self._is_at_rest or self._state is State.ACTIVE:
             return self._state, self._reason
         return State.ACTIVE, f"{self._reason}; {_NOT_DELIVERED}"

@@ -1,7 +1,7 @@
 """Mission requests, scans and reports of one robot. Shell (slots).
 
-Times are the robot's: a request must cite a status not much older than the frame at hand, so that a message that
-a network kept back does not start anything.
+Times are those of the robot. A request must cite a status that is not much older than the current frame. So a message
+that a network delayed starts nothing.
 """
 
 import secrets
@@ -37,21 +37,23 @@ from sightline.vision_side.missions.registry import MissionSpec, configured_miss
 from sightline.vision_side.pipeline import SOURCE, Observation, Pipeline, PipelineAnswer
 
 MAX_AGE_US: Final = 2_000_000
-"""As old as the status that a request to a robot may cite."""
+"""Largest age of the cited status, as for a request to a robot."""
 _LONGEST: Final = 200
 
 
 class MissionRequests:
-    """Applies each request once. `newest` is the last one, `rejection` why it was not applied."""
+    """Applies each request once. `newest` is the last request, `rejection` the reason why it was not applied."""
 
     def __init__(self, config: VisionConfig, labels: Sequence[str] = ()) -> None:
-        """Reject missions that follow a label that is not among `labels` of the detector, if it lists any."""
+        """Reject missions with a label that is not among the `labels` of the detector, if it lists any."""
         self._config, self._labels = config, labels
         self.newest: RequestId | None = None
         self.rejection = ""
 
     def take(self, message: Message, frame: FrameHeader, waited_us: int) -> MissionSpec | None:
-        """Return the mission from `frame`, which waited here, on, or None for a repeated or rejected request.
+        """Return the mission from `frame` on, or None for a repeated or rejected request.
+
+        `waited_us` is the delay of the frame.
 
         Raises WireError for an invalid message; `rejection` then contains it too.
         """
@@ -89,7 +91,7 @@ def _check(header: RequestHeader, source: str, frame: FrameHeader, waited_us: in
         raise WireError(RejectReason.OTHER_SESSION, f"requested in session {echo.session}, the robot is in "
                                                f"{frame.session}; repeat the request")
     age_us = frame.t_us - echo.t_us
-    if age_us < -AHEAD_US - waited_us:  # while a frame waits for a slow detector, newer statuses come
+    if age_us < -AHEAD_US - waited_us:  # while a frame waits for a slow detector, newer statuses arrive
         raise WireError(RejectReason.FROM_FUTURE,
                         f"cites a status {-age_us / 1e6:.1f} s newer than the newest frame here; repeat the request")
     if age_us > MAX_AGE_US:
@@ -103,12 +105,12 @@ PERIOD_S: Final = 0.5
 LEAST_GAP_S: Final = 0.1
 """Shortest time between two reports, even if the target appears and disappears with every frame."""
 _LEFT_OUT: Final = ("note", "target", "refused", "faults")
-"""Fields that a report loses, one after the other, until the wire carries it: a letter may take four bytes."""
+"""Fields that a report loses, one after the other, until the wire can carry it: a letter may take four bytes."""
 _PHASE_LENGTH, _TEXT_LENGTH, _NAME_LENGTH, _DEVICE_LENGTH = 32, 200, 64, 32
 
 
 def reported_target(seen: Observation, camera: CameraModel | None) -> ReportedTarget | None:
-    """Return the target of a step for a report, or None without one, or for one that the wire cannot carry."""
+    """Return the target of a step for a report, or None without a target or if the wire cannot carry it."""
     one = seen.target
     if one is None or camera is None:
         return None
@@ -120,15 +122,15 @@ def reported_target(seen: Observation, camera: CameraModel | None) -> ReportedTa
             distance_m=seen.distance_m, cx_px=center_px[0], cy_px=center_px[1],
             radius_px=circle.radius_px if circle else None, width_px=camera.width_px, height_px=camera.height_px,
         )
-    except ValidationError:  # of a plug-in
+    except ValidationError:  # from a plug-in
         return None
 
 
 class Reporter:
-    """Makes the reports of one vision for one robot."""
+    """Creates the reports of one vision service for one robot."""
 
     def __init__(self, detector: DetectorConfig) -> None:
-        self._detector = detector.kind.partition(":")[0]  # until the first result
+        self._detector = detector.kind.partition(":")[0]  # until the first result names the detector
         self._device = "cpu" if detector.kind == "hsv" else ""
         self._reported: tuple[object, ...] | None = None
         self._reported_s = 0.0
@@ -139,8 +141,8 @@ class Reporter:
     ) -> MissionReport | None:
         """Return a report if one is due.
 
-        `result` is the newest of the detector, `beside` describes the shadow detector. `camera` is the model of the
-        image of `seen`.
+        `result` is the newest result of the detector, `beside` describes the shadow detector. `camera` is the model of
+        the image of `seen`.
         """
         state = (mission, seen.phase, seen.done, newest, rejection)
         gap_s = LEAST_GAP_S if state != self._reported or seen.target is not None else PERIOD_S
@@ -172,7 +174,7 @@ class Reporter:
 
 
 def _line(text: str, most: int) -> str:
-    """Format the text of a mission on one line within the bound of the wire."""
+    """Format the text of a mission on one line within the limit of the wire."""
     return " ".join(text.split())[:most]
 
 
@@ -192,7 +194,7 @@ class MissionChannel:
     ) -> None:
         """Create the channel. `log_change(subject, line)` prints a changed line, `reject` counts.
 
-        Raises ConfigError for a configured mission that there is not.
+        Raises ConfigError for an unknown configured mission.
         """
         self._link, self._detector, self._log_change, self._reject = link, detector, log_change, reject
         self._mission = configured_mission(config).name
@@ -205,12 +207,12 @@ class MissionChannel:
         self._reports = 0
 
     def prepare(self, pipeline: Pipeline, frame: FrameHeader, waited_us: int = 0) -> None:
-        """Give `pipeline` what it has to know before it answers `frame`: a requested mission, the newest scan.
+        """Pass a requested mission and the newest scan to `pipeline` before it answers `frame`.
 
         Args:
             pipeline: the pipeline of the robot.
             frame: header of the frame, or of a status.
-            waited_us: delay of the frame, on its way and here; a message that came later may be newer by it.
+            waited_us: delay of the frame on the network and here. Later messages may be newer by this time.
         """
         message = self._missions.take()
         if message is not None:

@@ -26,23 +26,23 @@ from sightline.vision_side.serving.service import LogLine, Observe, ServingState
 
 _log: Final = logging.getLogger(__name__)
 
-_WAIT_S = 0.2  # how long a stop signal may go unnoticed
+_WAIT_S = 0.2  # longest delay before a stop signal is noticed
 
 
 ENDS_WITHIN_S: Final = 3.0
-"""Longest end after a signal: before systemd and containers kill the process without a line (4 s)."""
+"""Longest end after a signal. After 4 s systemd and containers kill the process without a log line."""
 _THREADS_END_S: Final = 0.5
-"""Least time for threads after the main thread: that of `viewing` ends only then."""
+"""Least time for the other threads after the main thread. Only then the thread of `viewing` ends."""
 
 
 @contextmanager
 def ends_on_signal(ending: threading.Event) -> Iterator[None]:
-    """SIGTERM and SIGINT set `ending` while inside. A process that is still there ENDS_WITHIN_S later is ended."""
+    """Let SIGTERM and SIGINT set `ending` in this context. After ENDS_WITHIN_S the process is ended."""
 
     def end(_number: int, _frame: FrameType | None) -> None:
         ending.set()
 
-    # Python calls a handler only between two steps of this thread, which may hang in native code. The number of the
+    # Python runs a handler only between two steps of this thread, which may hang in native code. The number of the
     # signal is written to the socket in any case.
     signals, written = socket.socketpair()
     written.setblocking(False)
@@ -61,8 +61,8 @@ def ends_on_signal(ending: threading.Event) -> Iterator[None]:
 
 
 def _end_hanging(signals: socket.socket, left: threading.Event) -> None:
-    """Wait for a signal, and end this process if it does not leave `ends_on_signal`, or does not end then, in time."""
-    with signals:  # open until the end: a second signal is written to it, too
+    """Wait for a signal. End this process if it does not leave `ends_on_signal`, or does not end, in time."""
+    with signals:  # open until the end, because a second signal is written to it, too
         number = signals.recv(1)
         if not number:
             return
@@ -86,18 +86,18 @@ def _has_hanging_thread(until_s: float) -> bool:
 
 
 def run(config: VisionConfig, observe: Observe | None = None) -> int:
-    """Serve until SIGTERM or SIGINT. Returns the exit code 0. `observe` receives its state.
+    """Serve until SIGTERM or SIGINT. Returns the exit code 0. `observe` receives the state.
 
     Raises ConfigError for an invalid endpoint or mission, LinkError if the link cannot be opened.
     """
     from sightline.protocol.transports.flood_limits import limit_floods
 
-    configured_mission(config)  # report an unknown mission before any endpoint is opened
+    configured_mission(config)  # an unknown mission must fail before any endpoint is opened
     ending, detector = threading.Event(), configured_detector(config)
     if problem := date_problem(config.secure, SOURCE):
         _log.warning("vision: %s", problem)
     run_it = _run_fleet if set("*?") & set(config.robot) or config.share.enabled else _run_one
-    with ExitStack() as guard:  # it also covers the end of the link and of the detector
+    with ExitStack() as guard:  # also around the end of the link and of the detector
         try:
             with limit_floods(config.listen, lambda line: _log.info("vision: %s", line)):
                 return run_it(config, ending, observe, detector, guard)
@@ -113,11 +113,11 @@ def _run_one(
     legacy = any(is_legacy(one) for one in config.connect)
     listen = config.listen
     if not listen and all(is_legacy(one) for one in config.connect):
-        # A legacy robot has no STOP. Its operators send theirs here, to the address that they use without options.
+        # A legacy robot has no STOP. Its operators send STOP to this service, at the default address.
         listen = (DEFAULT_ENDPOINT,)
     opened = open_link(config.robot, listen=listen, connect=config.connect, role=SOURCE,
                         max_frame_bytes=config.max_frame_bytes, secure=config.secure)
-    # Signals are caught only from here on: until the link is open, they end the process by themselves.
+    # Signals are caught only from here on. Until the link is open, they end the process directly.
     with LegacyRobotLink(opened) if legacy else opened as link:
         guard.enter_context(ends_on_signal(ending))
         if legacy:

@@ -1,4 +1,4 @@
-"""`Service`: answers the frames of one robot, by its own detector or by boxes that are published. Shell."""
+"""`Service`: answers the frames of one robot, with its own detector or with published boxes. Shell."""
 
 import secrets
 import threading
@@ -32,38 +32,38 @@ from sightline.vision_side.viewing import ViewPublisher
 
 @dataclass(frozen=True, slots=True)
 class ServiceCounts:
-    """The counters of one robot, which never decrease. Times are those of the newest frame, or None."""
+    """The counters of one robot, which never decrease. Times belong to the newest frame, or are None."""
 
     robot: str
     receives: bool
-    """Whether frames came within the last seconds."""
+    """True if frames came within the last seconds."""
     answered: int
     steered: int
-    """Answers that were twists; the others gave credit back."""
+    """Answers with a twist; the other answers only return credit."""
     skipped: dict[str, int]
-    """By reason: what was not looked at."""
+    """Unused frames, by reason."""
     overtaken: int
-    """Frames that a newer one replaced while an older was looked at."""
+    """Frames that a newer frame replaced while an older one was processed."""
     compute_us: int
     latency_us: int | None
-    """Capture to accepted command, as the robot measured it."""
+    """Time from capture to accepted command, as the robot measured it."""
     drives: bool = True
-    """False for a robot that this service only stands by for."""
+    """False for a robot for which this service is standby only."""
     restarts: int = 0
-    """Times that this robot's service failed and another one was started."""
+    """How many times the robot's service failed and a new one started."""
     received: int = 0
-    """Frames that came, also those that no turn took."""
+    """Received frames, also those that no turn took."""
     busy_us: int = 0
-    """Time in which its frames were answered, in `thread`."""
+    """Time in which `thread` answered its frames."""
     thread: int = 0
     queue_p95_us: int | None = None
-    """95th percentile of the age of its frames when their turn came; None without one."""
+    """95th percentile of the age of its frames at their turn; None without frames."""
 
 
 _QUEUE_AGES: Final = 256
 """Ages stored for the percentile: those of some seconds."""
 LIVE_S: Final = 10.0
-"""A loop that has not turned for this long hangs. A turn waits 0.2 s for a frame, and computes one detection."""
+"""Time without a turn after which the loop hangs. A turn waits 0.2 s for a frame, and computes one detection."""
 
 
 @dataclass(slots=True)
@@ -71,12 +71,12 @@ class ServingState:
     """The state of a vision service for a supervisor. Safe from any thread."""
 
     counts: Callable[[], list[ServiceCounts]]
-    """Counts of each robot."""
+    """Returns the counters of each robot."""
     ending: threading.Event
     turned_s: float
-    """Begin of the newest turn of its loop, on `time.monotonic`."""
+    """Start of the newest turn of its loop, on `time.monotonic`."""
     is_open: Callable[[], bool]
-    """Whether there is a session to a router or robot. It need not be there where the service only listens."""
+    """Returns True with a session to a router or robot. A service that only listens does not need it."""
 
     @property
     def is_live(self) -> bool:
@@ -85,7 +85,7 @@ class ServingState:
 
     @property
     def is_ready(self) -> bool:
-        """Return True while new robots may come: session and detector are open, and it does not end."""
+        """Return True while new robots are served: session and detector are open, and the service does not end."""
         return self.is_live and self.is_open() and not self.ending.is_set()
 
     def turns(self) -> bool:
@@ -95,22 +95,22 @@ class ServingState:
 
 
 Observe = Callable[[ServingState], None]
-"""Receives the state, once, when the loop begins."""
+"""Receives the state once, when the loop begins."""
 
 
-# The session of a robot to steer, when frames of several sessions arrive. Pure.
+# The session of the steered robot, when frames of several sessions arrive. Pure.
 #
 # A robot that restarts begins a new session, and the newest session is used immediately. But on a network without keys
 # any client can send one frame of a new session, and two robots may have one id. Therefore an earlier session that
 # continues is used again, because a restarted robot cannot continue its old session. From then on it is replaced only
-# after silence. Within a session, a frame whose time or number runs ahead of this machine's clock is not of the robot.
+# after silence. Within a session, a frame is invalid if its time or number runs ahead of this machine's clock.
 
 
 GOES_ON_US: Final = 300_000
-"""An earlier session is alive if frames of it were captured, and came, over this long: more than a late frame or two
-that the network held back, and as little as a robot without answers can show (it sends one every 120 to 500 ms)."""
+"""An earlier session is alive if its frames cover this time, both in capture and in arrival. That is more than a few
+delayed frames, and as little as a robot without answers can show (it sends a frame every 120 to 500 ms)."""
 SILENT_US: Final = 1_000_000
-"""Silence after which a session may be replaced. The slowest stream sends twice as often, and no robot restarts so
+"""Silence after which a session may be replaced. The slowest stream sends twice in this time, and no robot restarts so
 fast."""
 KEPT: Final = 8
 """Number of stored earlier sessions. A forgotten session counts as new."""
@@ -118,14 +118,14 @@ KEPT: Final = 8
 
 @dataclass(slots=True)
 class _Earlier:
-    """A session that another replaced: first frame after that on both clocks, and last frame."""
+    """A session that was replaced: arrival of its last frame, and the first later frame on both clocks."""
 
     received_us: int
     again_us: int = 0
     captured_us: int = 0
 
     def goes_on(self, captured_us: int, now_us: int) -> bool:
-        """Return True if its frames continue for so long that the session cannot be over."""
+        """Return True if its frames continue for so long that the session cannot have ended."""
         if not self.again_us or now_us - self.received_us > SILENT_US:
             self.again_us, self.captured_us = now_us, captured_us
         self.received_us = now_us
@@ -133,13 +133,13 @@ class _Earlier:
 
 
 class SessionSelector:
-    """Selects frames by their session. Times are of this machine's clock, except `captured_us` of the robot's."""
+    """Selects frames by their session. Times use this machine's clock, except `captured_us` (robot's clock)."""
 
     def __init__(self) -> None:
         self.current = ""
         self._received_us = 0
         self._is_proven = False
-        """True if the current session continued next to another one, which is then no sign of its end."""
+        """True if the current session continued next to another one. Then the other session does not end it."""
         self._earlier: dict[str, _Earlier] = {}
         self.clock = RobotClock()
 
@@ -147,7 +147,7 @@ class SessionSelector:
         """Check that a frame is from the steered robot. This frame may change the session.
 
         Raises:
-            WireError: OTHER_SESSION, or FROM_FUTURE for a time or a number that runs ahead or goes far back.
+            WireError: OTHER_SESSION, or FROM_FUTURE for a time or number that runs ahead or goes back too far.
         """
         if stamp.session != self.current:
             if not self._replaces(stamp.session, stamp.t_us, now_us):
@@ -182,11 +182,11 @@ class SessionSelector:
 
 # The vision service: newest frame in, twist or acknowledgement out, over a `Link`. Shell.
 #
-# One printed line per change of state, never one per frame. Ends within a second of SIGTERM or SIGINT.
+# One printed line per change of state, never one per frame. It ends within a second of SIGTERM or SIGINT.
 
 
 _SILENCE_S = 3.0
-_NO_FRAMES_S = 1.0  # twice what the slowest stream takes between two frames
+_NO_FRAMES_S = 1.0  # twice the time between two frames of the slowest stream
 _CAMERA_PATIENCE_S = 1.5
 _REPORTED_COUNTS = tuple(10**power for power in range(10))
 _LONG_ROW = 30  # a second at 30 fps
@@ -198,16 +198,15 @@ Model = TypeVar("Model", CameraModel, FrameHeader, Stamp)
 def open_service(
     config: VisionConfig, link: Link, report: LogLine, detector: Detector | None = None, *, is_standby: bool = False
 ) -> "Service":
-    """Create the service for one robot that fits its detector (default: that of `config`)."""
+    """Create the service for one robot, for the kind of its detector (default: that of `config`)."""
     kind = BoxesService if config.detector.kind == "boxes" else Service
     return kind(config, link, report, detector, is_standby=is_standby)
 
 
 class SkipCounter:
-    """Counts what is skipped, and selects what to log of it: at 1, 10, 100 ..., and a reason that is new.
+    """Counts skipped frames, and selects those to log: number 1, 10, 100 ..., and each new reason.
 
-    After a long row without a skip each reason is new again, so that one that comes and goes is not logged each time.
-    One that comes and goes for long is logged after 1, 2, 4 ... 60 s.
+    After a long row of used frames each reason is new again. A frequent one is then logged after 1, 2, 4 ... 60 s.
     """
 
     def __init__(self) -> None:
@@ -217,13 +216,13 @@ class SkipCounter:
         self._limiter = RepeatLimiter()
 
     def use(self) -> None:
-        """Note one that is not skipped."""
+        """Note a frame that is not skipped."""
         self._used_in_a_row += 1
         if self._used_in_a_row == _LONG_ROW:
             self._known.clear()
 
     def skip(self, reason: str, now_us: int) -> bool:
-        """Count one. Returns True if it should be logged."""
+        """Count a skipped frame. Returns True if it should be logged."""
         is_new = reason not in self._known and self._limiter.due(reason, now_us) > 0
         if is_new:
             self._known.add(reason)
@@ -232,7 +231,7 @@ class SkipCounter:
 
 
 class DriverSession:
-    """A session of a driver: what its commands have in common."""
+    """A session of a driver: the common data of its commands."""
 
     def __init__(self) -> None:
         self.session = secrets.token_hex(4)
@@ -241,7 +240,7 @@ class DriverSession:
 
 
 class Service:
-    """Serves one robot: its camera, its sessions, and the pipeline for them."""
+    """Serves one robot: its camera, its sessions, and its pipeline."""
 
     _looks_at: tuple[Channel, ...] = (FRAME,)
 
@@ -287,7 +286,7 @@ class Service:
         return LatestSlot()
 
     def listen(self) -> None:
-        """Receive frames from now on. A standby keeps the newest for `begin`."""
+        """Receive frames from now on. A standby stores the newest frame for `begin`."""
         if not self._is_subscribed:
             self._is_subscribed, self._ahead = True, LatestSlot()
             for channel in self._looks_at:
@@ -300,7 +299,7 @@ class Service:
         (self._ahead if self.is_standby else self._frames).put(message)
 
     def begin(self) -> None:
-        """Answer frames from now on, first the newest one. Those before were not lost."""
+        """Answer frames from now on, first the stored one. Earlier frames do not count as lost."""
         self._loss, self._received_s = FrameLoss(), time.monotonic()
         self.listen()
         if (newest := self._ahead.take()) is not None:
@@ -308,24 +307,24 @@ class Service:
         self.is_standby = False
 
     def rest(self) -> None:
-        """Receive no more frames, but the model of the camera and requested missions."""
+        """Receive only camera models and mission requests from now on, no frames."""
         self.is_standby = True
         if self._is_subscribed:
             self._is_subscribed = False
             for channel in self._looks_at:
                 self._link.unsubscribe(channel)
-            while self._frames.take() is not None:  # the next driver has it too
+            while self._frames.take() is not None:  # the next driver receives these frames, too
                 pass
 
     def note_status(self, stamp: Stamp) -> None:
-        """Take in a requested mission without a frame: it cites a status that is about as old as this one."""
+        """Apply a requested mission without a frame. The request cites a status about as old as this one."""
         if self._pipeline is not None:
             frame = FrameHeader(session=stamp.session, seq=stamp.seq, t_us=stamp.t_us)
             self._mission_channel.prepare(self._pipeline, frame)
 
     @property
     def has_request(self) -> bool:
-        """Return True if the mission of the robot was requested here, also after its end."""
+        """Return True if the robot's mission was requested from this service, also after its end."""
         return self._pipeline is not None and self._pipeline.request is not None
 
     def turn(self, wait_s: float) -> None:
@@ -334,7 +333,7 @@ class Service:
         started_ns = time.perf_counter_ns()
         if message is not None and self._pipeline is not None:
             self._frame(message, started_ns)
-            self._look_at_camera()  # afterwards: the model repeats twice a second, and frames are urgent
+            self._look_at_camera()  # after the answer: the model repeats twice a second, and frames are urgent
             return
         self._look_at_camera()
         if message is not None:
@@ -343,7 +342,7 @@ class Service:
             self._note_silence(time.monotonic())
 
     def _note_silence(self, now_s: float) -> None:
-        # After a turn this late, e.g. of a suspended computer, frames may wait here: their silence begins now.
+        # After a turn this late, e.g. of a suspended computer, frames may already wait. The silence starts now.
         if now_s - max(self._waited_s, self._received_s) > _SILENCE_S / 2:
             self._received_s = now_s
         self._waited_s = now_s
@@ -363,7 +362,7 @@ class Service:
                       queue_p95_us=percentile_95(self._queue_ages_us))
 
     def _look_at_camera(self) -> None:
-        """Take in the camera's model; a new one needs a new pipeline."""
+        """Receive the camera model; a new model needs a new pipeline."""
         message = self._cameras.take()
         if message is None or self._decoded(Stamp, message.header, MAX_HEADER_BYTES) is None:
             return
@@ -382,7 +381,7 @@ class Service:
                          is_frequent=is_frequent)
 
     def _frame(self, message: Message, started_ns: int) -> None:
-        """Answer a message. Note how long a frame waited, and how long its answer took."""
+        """Answer a message. Measure how long a frame waited, and how long its answer took."""
         if message.channel is FRAME:
             arrived_us = self._arrived_us  # read before the clock: the next frame may arrive now
             self._queue_ages_us.append(monotonic_us() - arrived_us)
@@ -427,7 +426,7 @@ class Service:
 
         Args:
             header: header of the frame.
-            replaced_frames: number of frames so far that came, and whose headers are not given to this method.
+            replaced_frames: number of frames so far that arrived but did not reach this method.
         """
         replaced = self._sessions.clock.replaced
         try:
@@ -455,7 +454,7 @@ class Service:
         return self._pipeline.acknowledge(seen) if self._pipeline else PipelineAnswer(None, seen)
 
     def _find_camera(self, jpeg: bytes) -> None:
-        """Find the model of an image without one. It comes twice a second, so only a longer wait is logged."""
+        """Find the model for an image without one. It comes twice a second, so only a longer wait is logged."""
         self._look_at_camera()  # the robot publishes the model of a new size before its first image
         if self._is_legacy and self._camera is self._assumed_camera:
             self._assume_camera(jpeg)
@@ -527,10 +526,10 @@ class Service:
             self._log_change("phase", ": ".join(filter(None, (seen.phase, seen.note))), seen.phase)
 
     def _log_change(self, about: str, line: str, state: str = "", *, is_frequent: bool = False) -> None:
-        """Log `line` if its subject changed since the last line about it.
+        """Log `line` if the state of its subject has changed.
 
-        A frequent change is logged at once and then after 1, 2, 4 ... 60 s, because any client of a network without
-        keys can cause it with each message.
+        A frequent change is logged immediately and then after 1, 2, 4 ... 60 s, because on a network without keys any
+        client can cause it with each message.
         """
         if self._reported.get(about) == (state or line):
             return
@@ -548,7 +547,7 @@ def endpoints_text(config: VisionConfig) -> str:
     return ", ".join([*config.connect, *(f"{one} (listening)" for one in config.listen)]) or "nowhere"
 
 
-# The vision service without a detector of its own: it steers by boxes that another service publishes. Shell.
+# The vision service without its own detector: it steers by boxes that another service publishes. Shell.
 #
 # Every frame is acknowledged immediately, because no detector runs here. Boxes are answered with a twist that cites
 # their frame at any age, because the robot validates the age. Without boxes there is no twist, and the robot holds.
@@ -559,7 +558,7 @@ _NO_BOXES = Observation("no boxes")
 
 
 class BoxesInbox(LatestSlot[Message]):
-    """The newest frame and the newest boxes of one source; also the headers of replaced frames, which it counts."""
+    """The newest frame and the newest boxes of one source. It also stores and counts headers of replaced frames."""
 
     def __init__(self, source: str) -> None:
         super().__init__()
@@ -569,7 +568,7 @@ class BoxesInbox(LatestSlot[Message]):
         self.headers: deque[bytes] = deque(maxlen=REMEMBERED)
 
     def put(self, item: Message) -> None:
-        """Replace what is there of that channel; never blocks."""
+        """Store the newest message of its channel; never blocks."""
         if item.channel is DETECTIONS and item.source != self._source:
             return
         with self._arrived:
@@ -588,7 +587,7 @@ class BoxesInbox(LatestSlot[Message]):
 
 
 class BoxesService(Service):
-    """A `Service` whose detector is elsewhere."""
+    """A `Service` that uses the boxes of another service."""
 
     _looks_at = (FRAME, DETECTIONS)
 
@@ -651,7 +650,7 @@ class BoxesService(Service):
         self._viewing.show(frame, answer, self._camera, started_ns=started_ns)
 
     def _remember_replaced(self) -> None:
-        """Store the headers of the frames that newer ones replaced before use."""
+        """Store the headers of the frames that newer frames replaced."""
         while self._inbox.headers:
             self._remember(self._inbox.headers.popleft())
 

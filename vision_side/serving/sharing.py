@@ -1,15 +1,15 @@
-"""Decide which robots this vision service drives, beside other services. Pure.
+"""Decide which robots this vision service drives, among other services. Pure.
 
     tokens of robots and services -> assignment -> owner and two standbys of each robot
-    part      subscribes to           its token of a driver   left when
-    STANDBY   camera model, status    no                      the robot gets other choices, and its driver works
-    CLAIM     frames too              yes                     no other driver is left, or one is silent or newer
-    DRIVE     the same                yes                     a better choice claims it, or another one keeps the lease
+    part      subscribes to           has a driver token  ends when
+    STANDBY   camera model, status    no                  the robot gets other choices, and its driver works
+    CLAIM     + frames                yes                 no other driver is left, or one is silent or newer
+    DRIVE     + frames                yes                 a better choice claims it, or another driver keeps the lease
 
 The owner claims; the former driver sees the token and leaves; then the owner drives, first by the newest frame. A claim
-that has no effect for a second, e.g. because a mission goes on, receives no more frames. So two services never look at
-the frames of one robot, except while one of them hangs. The robot decides by its lease who drives. Nothing here does.
-A service that left for a claim stands by until the claimer works: the token may be that of one that never answers.
+without effect for a second, e.g. because a mission continues, receives no more frames. So two services never receive
+the frames of one robot, except while one of them hangs. The robot's lease decides who drives, not this module. A
+service that left for a claim is standby until the claimer works, because the token may be of one that never answers.
 """
 
 from collections.abc import Sized
@@ -33,45 +33,45 @@ SILENT_US: Final = 380_000
 """Time without a sign of the driver after which the standby drives: four statuses. The robot permits it after 400 ms,
 and the first command comes later."""
 SECOND_STANDBY_US: Final = 1_000_000
-"""Time from the silence, or the newest token of a driver, after which the second standby drives; the first hangs too"""
+"""The same time for the second standby, from the silence or the newest driver token: the first standby hangs, too."""
 NO_DRIVER_US, NEXT_CHOICE_US = 1_500_000, 500_000
-"""Time without a token of a driver after which the standby claims a robot, and the two next choices later."""
+"""Time without a driver token after which the standby claims a robot, and the delay of each of the next two choices."""
 BETWEEN_CHANGES_US: Final = 1_000_000
-"""Shortest time between two claims of one robot by one service. It doubles while they have no effect."""
+"""Shortest time between two claims of one robot by one service. It doubles while claims have no effect."""
 SETTLED_US: Final = 1_200_000
-"""Age of the newest token of a driver at which the owner claims from one that works. A service that has just started
-knows nothing of earlier changes, and a claim takes up to 0.2 s until it has an effect: one change a second remains."""
+"""Age of the newest driver token from which the owner claims a robot whose driver works. A new service does not know
+earlier changes, and a claim needs up to 0.2 s to have an effect. So a robot changes at most once a second."""
 MAX_DOUBLINGS: Final = 2
 NO_FRAMES_US: Final = 2_300_000
-"""Time without a frame of the robot after which a driver without a command is silent. A camera that fails is named in
-`status` by then. A driver that does not subscribe to frames gets none either."""
+"""Time without a frame of the robot after which a driver without a command is silent. By then `status` reports a failed
+camera. A driver that does not subscribe to frames gets none either."""
 NOT_MINE_US: Final = 300_000
-"""Time without the lease, although commands leave, after which a driver needs a new session."""
+"""Time without the lease, although commands are sent, after which a driver needs a new session."""
 FRESH_COMMANDS: Final = 48
-"""Commands of one session without the lease. After 64 a robot no longer knows whose token it is."""
+"""Commands of one session without the lease. After 64 a robot no longer knows the owner of the token."""
 STATUS_GAP_US: Final = 150_000
-"""Longest time between two statuses of a link that works. Of a longer gap nothing is known."""
+"""Longest time between two statuses of a link that works. A longer gap gives no information."""
 OF_DRIVERS: Final = (
     RejectReason.STALE, RejectReason.OUT_OF_ORDER, RejectReason.OTHER_SESSION, RejectReason.UNKNOWN_FRAME,
     RejectReason.FROM_FUTURE, RejectReason.DISARMED,
 )
-"""Rejections that show a driver at work. Other programs, and drivers without the lease, cause the others."""
+"""Rejections that show a driver at work. Other programs, and drivers without the lease, cause the other rejections."""
 ROBOT_RETURNS_US: Final = 2_000_000
-"""Time from the return of the link of this service until the token of a robot that ended with it, and is not back,
-counts as ended. A robot tries to connect once a second, or more often."""
+"""Time after the return of this service's link at which a missing robot token counts as ended. A robot tries to connect
+at least once a second."""
 SERVICE_RETURNS_US: Final = 300_000
-"""The same for tokens of services and drivers. A service may have died with its router, and its robots stand. One that
-returns later gets its robots back. As long, nothing is claimed: the token of a driver may follow that of its robot."""
+"""The same for tokens of services and drivers. A service may have died with its router, so its robots stand. A service
+that returns later gets its robots back. Until then nothing is claimed, because driver tokens may arrive late."""
 MAX_DRIVERS: Final = 16
-"""Security limit: drivers of one robot. Further tokens, as those of robots and services, count when there is room."""
+"""Security limit: drivers of one robot. Further tokens, also of robots and services, count when there is room."""
 MAX_OWN: Final = 2 * MAX_ROBOTS
-"""Newest tokens of this service that are stored."""
+"""Number of stored tokens of this service, the newest ones."""
 _UNKNOWN: Final = -1
-"""A time or a count before a status showed it."""
+"""A time or a count before the first status."""
 
 
 class SharingPart(Enum):
-    """The part of this service in driving a robot."""
+    """The part of this service for one robot."""
 
     NONE = "none"
     STANDBY = "standby"
@@ -86,23 +86,23 @@ class SharedRobot:
     drivers: set[DriverToken]
     part: SharingPart = SharingPart.NONE
     is_busy: bool = False
-    """True for a mission that an operator requested here: another service does not know it, so the robot stays."""
+    """True for a mission that an operator requested here. The robot stays, because other services do not know it."""
     ignored: set[DriverToken] = field(default_factory=set)
-    """Drivers that were silent. A new session of them counts again."""
+    """Drivers that were silent. A new session of such a driver counts again."""
     driverless_us: int = 0
-    """When the token of a driver ended last, or this robot became known."""
+    """Time when the last driver token ended, or when this robot became known."""
     driver_us: int = _UNKNOWN
-    """When the newest token of a driver appeared."""
+    """Time when the newest driver token appeared."""
     has_left: bool = False
-    """True after it left for another driver, until a status shows that one at work."""
+    """True after it left for another driver, until a status shows that this driver works."""
     changed_us: int = -BETWEEN_CHANGES_US << MAX_DOUBLINGS
     renewed_us: int = -BETWEEN_CHANGES_US << MAX_DOUBLINGS
     tries: int = 0
-    """Claims and new sessions since this service last held the lease. Each one waits twice as long."""
+    """Claims and new sessions since this service last held the lease. Each one doubles the wait."""
     arrived: int = _UNKNOWN
-    """Commands of its driver, accepted or not, as the newest status shows them."""
+    """Commands of its driver in the newest status, accepted or not."""
     answered: int = _UNKNOWN
-    """Frames that were answered or are on their way, at the last sign of more answers than frames on their way."""
+    """Answered frames, or frames in flight, at the last status with more answers than frames in flight."""
     status_us: int = _UNKNOWN
     """Time of the newest status."""
     active_us: int = _UNKNOWN
@@ -110,19 +110,19 @@ class SharedRobot:
     worked_us: int = _UNKNOWN
     """Last time at which the driver worked, or the first status of this part."""
     frames: int = _UNKNOWN
-    """Frames that the robot had sent then, as a status showed them. Without a later one there is nothing to answer."""
+    """Frames sent by the robot at that time. Without a later frame there is nothing to answer."""
     sent: int = _UNKNOWN
     """Commands of the session of this service."""
     held: int = _UNKNOWN
-    """Those when it last held the lease."""
+    """The value of `sent` when it last held the lease."""
     has_held: bool = False
-    """True if this service held the lease since it drives."""
+    """True if this service has held the lease since it drives."""
     mine_us: int = _UNKNOWN
     """Last time at which this service held the lease, or had no reason to."""
 
     @property
     def others(self) -> set[DriverToken]:
-        """Return the drivers that count."""
+        """Return the drivers that are not ignored."""
         return self.drivers - self.ignored
 
     @property
@@ -131,22 +131,22 @@ class SharedRobot:
         return self.status_us - self.active_us >= SILENT_US
 
     def is_kept(self, now_us: int) -> bool:
-        """Return True if another driver, which appeared after this one, keeps the robot and may ignore its token."""
+        """Return True if another driver that appeared after this one keeps the robot. It may ignore this token."""
         if self.part is SharingPart.DRIVE:
             return not self.has_held and self.is_not_mine and bool(self.others)
         return self.driver_us >= self.changed_us and now_us - self.changed_us >= BETWEEN_CHANGES_US
 
     @property
     def is_not_mine(self) -> bool:
-        """Return True if its statuses show that commands of this service leave and it has no lease."""
+        """Return True if its statuses show that this service sends commands but does not hold the lease."""
         return self.status_us - self.mine_us >= NOT_MINE_US
 
     def begin_session(self, now_us: int) -> None:
-        """Forget the commands of the session before."""
+        """Forget the commands of the earlier session."""
         self.mine_us, self.sent, self.held = now_us, 0, 0
 
     def begin_part(self) -> None:
-        """Forget what the statuses showed before."""
+        """Forget the earlier statuses."""
         self.frames = self.status_us = _UNKNOWN
 
 
@@ -155,7 +155,7 @@ class Sharing:
 
     Args:
         own: the token of this service.
-        named: robots that it serves without a token of theirs, e.g. older ones.
+        named: robots that it serves without a robot token, e.g. of older releases.
     """
 
     def __init__(self, own: VisionToken, named: tuple[str, ...] = ()) -> None:
@@ -167,29 +167,29 @@ class Sharing:
         self._named = frozenset(named)
         self._services: set[VisionToken] = set()
         self._twins = 0
-        """Services of this name that count before this one."""
+        """Number of services with this name that take precedence."""
         self._choices: dict[str, tuple[str, ...]] = {}
         self._is_changed = True
         self._full: dict[int, tuple[Sized, int]] = {}
-        """Tables that had no room for a token, with their limits."""
+        """Tables that had no room for a token, and their limits."""
         self._is_up, self._up_us = True, -SERVICE_RETURNS_US
         self._ended: set[Token] = set()
-        """Tokens that ended with the link of this service, so that nothing is known of what they stand for."""
+        """Tokens that ended with the link of this service. The state of their owners is unknown."""
 
     @property
     def has_twin(self) -> bool:
-        """Return True if another service has this name and counts instead of this one."""
+        """Return True if another service has this name and takes precedence."""
         return self._twins > 0
 
     def add_own(self, token: DriverToken) -> None:
-        """Note a token with which this service drives, before it is declared."""
-        # It is never a driver beside this one, also after its end: a link that comes back declares it once more.
+        """Add a driver token of this service before it is declared."""
+        # It never counts as another driver, even after its end, because a link that returns declares it again.
         self._own_drivers[token] = None
         if len(self._own_drivers) > MAX_OWN:
             del self._own_drivers[next(iter(self._own_drivers))]
 
     def is_named(self, robot: str) -> bool:
-        """Return True if this service serves a robot also without a token of it."""
+        """Return True if this service serves a robot that has no token."""
         return robot in self._named
 
     def leave(self) -> None:
@@ -197,12 +197,12 @@ class Sharing:
         self._is_leaving = self._is_changed = True
 
     def services(self) -> dict[str, float]:
-        """Return the weight of each service, this one included. Of two with one name the lower instance counts."""
+        """Return the weight of each service, with this one. Of two with one name the lower instance counts."""
         present = sorted((*self._services, self.own), key=lambda one: one.instance, reverse=True)
         return {one.name: one.weight for one in present if not (self._is_leaving and one == self.own)}
 
     def on_link(self, is_up: bool, now_us: int) -> None:
-        """Note the end or the begin of the link of this service. Until it is back, nothing changes."""
+        """Note the loss or the return of the link of this service. Nothing changes while the link is lost."""
         self._is_up, self._up_us = is_up, now_us
         for robot in self.robots.values():
             robot.begin_part()
@@ -210,7 +210,7 @@ class Sharing:
             robot.begin_session(now_us)
 
     def on_token(self, token: Token, is_present: bool, now_us: int) -> None:
-        """Note a token that appeared or ended. If it ended with the link of this service, note that first."""
+        """Note a token that appeared or ended. If it ended with the link, call `on_link` first."""
         self._ended.discard(token)
         if not is_present and not self._is_up:
             self._ended.add(token)
@@ -263,19 +263,19 @@ class Sharing:
         return len(table) >= limit
 
     def needs_tokens(self) -> bool:
-        """Return True, once, if there is room for tokens that did not count: the caller watches all once more."""
+        """Return True, once, if there is room for ignored tokens. The caller then watches all tokens again."""
         has_room = any(len(table) < limit for table, limit in self._full.values())
         if has_room:
             self._full.clear()
         return has_room
 
     def on_status(self, robot: str, status: Status, *, is_mine: bool, sent: int, now_us: int) -> None:
-        """Note a status of a robot that this service has a part in.
+        """Note a status of a robot in which this service has a part.
 
         Args:
             robot: robot id.
             status: its newest status.
-            is_mine: True if its holder is the session of this service.
+            is_mine: True if the lease holder is the session of this service.
             sent: commands of this session so far.
             now_us: monotonic clock.
         """
@@ -285,15 +285,15 @@ class Sharing:
         human = status.holder is not None and status.holder.source != "vision"
         needs_no_driver = human or status.state in (State.STOPPED, State.FAULT) or bool(status.stream.camera_fault)
         if one.status_us != _UNKNOWN:
-            # While no status came, the link was cut, also for the driver: its silence does not count.
+            # Without statuses the link was cut, also for the driver, so its silence does not count.
             gap_us = max(0, now_us - one.status_us - STATUS_GAP_US)
             one.active_us, one.mine_us = min(now_us, one.active_us + gap_us), min(now_us, one.mine_us + gap_us)
-        # A driver that hangs neither sends commands nor gives credit back. Its rejected commands are work.
+        # A driver that hangs sends no commands and returns no credit. Rejected commands show that it works.
         refused = sum(count for reason, count in status.refused.items() if reason in OF_DRIVERS)
         stream, arrived = status.stream, status.accepted + refused
         answered = stream.sent - stream.credit_timeouts
         is_first = one.frames == _UNKNOWN
-        # After a restart of the robot they begin again. Those before this part are of another driver.
+        # A restart of the robot resets the counters. Counts before this part belong to another driver.
         one.answered = answered if is_first else min(one.answered, stream.sent)
         answers = answered > one.answered + stream.window
         one.answered = answered if answers else one.answered
@@ -311,10 +311,10 @@ class Sharing:
         one.sent, one.status_us = sent, now_us
 
     def needs_session(self, robot: str, now_us: int) -> bool:
-        """Return True if this service drives but the robot no longer accepts its session, at most once a second."""
+        """Return True, at most once a second, if this service drives but the robot no longer accepts its session."""
         one = self.robots[robot]
         stale = one.is_not_mine or one.sent - one.held >= FRESH_COMMANDS
-        # Without another driver its claim does not count: a robot that lost a router ends sessions of any age.
+        # Without another driver the claim does not count, because a robot that lost a router ends all its sessions.
         before_us = one.changed_us if one.drivers else one.renewed_us
         if one.part is not SharingPart.DRIVE or not stale or _is_within_wait(before_us, one.tries, now_us):
             return False
@@ -330,7 +330,7 @@ class Sharing:
                 and now_us - one.changed_us < BETWEEN_CHANGES_US)
 
     def step(self, now_us: int) -> dict[str, SharingPart]:
-        """Decide the part in each robot from now on. Returns the robots whose part changed."""
+        """Decide the part for each robot from now on. Returns the robots whose part changed."""
         if not self._is_up:
             return {}
         for token in tuple(self._ended):
@@ -342,7 +342,7 @@ class Sharing:
         changed = {}
         for name, robot in self.robots.items():
             before = robot.part
-            # Without another driver, a claim becomes the drive in one step. A repeated claim needs a new token.
+            # Without another driver, a claim becomes DRIVE in the same step. A repeated claim needs a new token.
             while (part := self._next_part(name, robot, now_us)) is not robot.part:
                 self._change(robot, part, now_us)
                 if part is SharingPart.STANDBY:
@@ -359,7 +359,7 @@ class Sharing:
             robot.has_held = False
             robot.begin_session(now_us)
         robot.has_left |= robot.part is SharingPart.DRIVE
-        # Without a part, no status came: what it showed before is over. A standby knows that the driver is silent.
+        # Without a part, no status came, so old ones do not count. A standby knows that the driver is silent.
         if part is not SharingPart.CLAIM or robot.part is SharingPart.NONE:
             robot.begin_part()
         robot.part = part
@@ -386,7 +386,7 @@ class Sharing:
         return bool(others) and not {other.name for other in others}.isdisjoint(self._before(name))
 
     def _before(self, robot: str) -> list[str]:
-        """Return the services that may claim a robot before this one, in their order. Twins follow one another."""
+        """Return the services that may claim a robot before this one, in order. Twins are adjacent."""
         first = self._choices[robot]
         order = first if self.own.name in first else [*first, *ranked(robot, self.services())]
         return [*order[: order.index(self.own.name)], *self._twins * [self.own.name]]
@@ -398,7 +398,7 @@ class Sharing:
         if not robot.drivers:
             if is_owner:
                 return True
-            # The order of all services takes long to compute for each of a thousand robots, and makes no difference.
+            # The order of all services takes long to compute for a thousand robots, and makes no difference.
             place = len(self._before(name)) if self.own.name in self._choices[name] else len(self._choices[name])
             return now_us - robot.driverless_us - NO_DRIVER_US >= NEXT_CHOICE_US * min(2, place - 1)
         if robot.is_silent:

@@ -13,15 +13,15 @@ Look = NDArray[np.float32]
 """(64,), square roots of the shares of the colors. The product of two looks is their Bhattacharyya coefficient."""
 
 OTHER: Final = 0.4
-"""Difference of two looks from which they are of two objects (docs/explanation/decisions/0013-identity.md)."""
-# Colors by their shares of red and green, 8 of each. Finer ones would separate a yellow ball from itself under a lamp.
+"""Difference of two looks from which they belong to two objects (docs/explanation/decisions/0013-identity.md)."""
+# Bins of the red and green shares, for each of both. Finer bins would separate a yellow ball from itself under a lamp.
 _BINS = 8
-# Share of the width and height of a box that is looked at: its corners show the background of a ball.
+# Used share of the width and height of a box, because its corners show the background of a ball.
 _MIDDLE = 0.6
-# Most pixels along each side that count, and fewest in all.
+# Largest number of pixels along each side, and least number in all.
 _SIDE_PX = 20
 _LEAST_PIXELS = 16
-# Weight of the newest look, so that a look follows the light.
+# Weight of the newest look, so that the look follows the light.
 _NEWEST = 0.3
 
 
@@ -60,12 +60,12 @@ def _normal(look: Look) -> Look:
 
 
 def difference(one: Look | None, other: Look | None) -> float:
-    """Return 0 for equal looks, or if one is unknown, to 1 for looks without a common color."""
+    """Return the difference, from 0 for equal or unknown looks to 1 for looks without a common color."""
     return 0.0 if one is None or other is None else 1.0 - min(1.0, float(one @ other))
 
 
 def updated(look: Look | None, newest: Look | None) -> Look | None:
-    """Return the look of an object after its newest one."""
+    """Return the look of an object, updated by its newest look."""
     if look is None or newest is None:
         return newest if look is None else look
     return _normal((1 - _NEWEST) * look + _NEWEST * newest)

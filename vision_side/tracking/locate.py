@@ -2,11 +2,11 @@
 
 A sphere projects to an ellipse, not to a circle about its center. Its outline rays form a circular cone. For every unit
 ray u, u . c = cos(alpha) with c toward the center, and the center is at radius / sin(alpha). So u . w = 1, or
-p . w = |p| for any point p of the ray, is linear in w = c / cos(alpha). The equation is exact at any angle off the
-axis, and holds for each part of the outline that is in view.
+p . w = |p| for any point p of the ray, is linear in w = c / cos(alpha). The equation is exact at any angle to the
+axis, and holds for each visible part of the outline.
 
 The planes through the lens and the sides of a box touch the sphere. For the normal n of such a plane
-n . c = radius * |n|, which is linear in c. So three sides locate a sphere that the border of the image cuts.
+n . c = radius * |n|, which is linear in c. So three sides locate a sphere that the image border cuts off.
 """
 
 import math
@@ -30,9 +30,9 @@ Column = NDArray[np.float64]
 
 _MIN_POINTS = 6
 _TRIMS = 3
-# Times the median error. The stair-step of a pixel is always nearer, the edge of an occluder is not.
+# Times the median error. The pixel grid causes smaller errors, the edge of an occluder larger ones.
 _OUTLIER = 4.0
-# Two borders of the image hide the true size of a box. The range may be 80 % too large, the bearing is still useful.
+# If two image borders cut a box, its true size is unknown. The range may be 80 % too large, the bearing is still good.
 _CUT_TWICE_EXACTNESS = 0.3
 _BOX_ANGLES = np.linspace(0.0, 2 * math.pi, 24, endpoint=False)
 
@@ -46,7 +46,7 @@ class Sighting:
         y_m: left.
         detection: its detection.
         exactness: above 0 to 1. Less than 1 for a range that is partly assumed.
-        look: its look, or None if it is unknown.
+        look: its look, or None if unknown.
     """
 
     x_m: float
@@ -112,7 +112,7 @@ def place_px(x_m: float, y_m: float, was_px: tuple[float, float], camera: Camera
     Args:
         x_m: forward of the midpoint of the axle.
         y_m: left of it.
-        was_px: its place in an earlier image. In this one its ray slopes as much.
+        was_px: its place in an earlier image. The vertical slope of the ray stays the same.
         camera: model of this image.
 
     Returns:
@@ -120,7 +120,7 @@ def place_px(x_m: float, y_m: float, was_px: tuple[float, float], camera: Camera
     """
     _, (down,) = points_ahead(np.array([was_px]), camera)[:2].tolist()
     forward, ahead_m = math.cos(camera.pitch_rad) + down * math.sin(camera.pitch_rad), x_m - camera.x_m
-    if not (ahead_m > 0 and forward > 0):  # or not a number
+    if not (ahead_m > 0 and forward > 0):  # also for nan
         return None
     right = (camera.y_m - y_m) / ahead_m * forward
     none = np.zeros(3)
@@ -133,12 +133,12 @@ def place_px(x_m: float, y_m: float, was_px: tuple[float, float], camera: Camera
 @lru_cache(maxsize=64)
 def _pinhole(cx_px: float, cy_px: float, fx_px: float, fy_px: float) -> tuple[Column, Column]:
     """Return principal point and focal lengths as columns."""
-    # Cached: to build them costs as much as to use them.
+    # Cached, because creating them takes as long as using them.
     return np.array([[cx_px], [cy_px]]), np.array([[fx_px], [fy_px]])
 
 
 def _opencv_distortion(camera: CameraModel) -> NDArray[np.float64]:
-    """Extend the coefficients with zeros to 4, 5 or 8, the numbers that OpenCV takes."""
+    """Pad the coefficients with zeros to 4, 5 or 8, the lengths that OpenCV accepts."""
     count = next(size for size in (4, 5, 8) if len(camera.distortion) <= size)
     return np.array(camera.distortion + (0.0,) * (count - len(camera.distortion)))
 
@@ -163,7 +163,7 @@ def _cone_center(points: NDArray[np.float64], radius_m: float) -> tuple[float, f
     if not 1.0 < square < math.inf or ahead <= 0:
         # Not a cone that opens forward.
         return None
-    # radius / sin(alpha), by the length of w.
+    # radius / sin(alpha), from the length of w.
     per_w = radius_m / math.sqrt(square - 1.0)
     return right * per_w, down * per_w, ahead * per_w
 
@@ -205,11 +205,11 @@ def _box_outline(detection: Detection, camera: CameraModel) -> NDArray[np.float6
 
 # Boxes of another service: their frame, the selected box, and its position. Pure.
 #
-# Boxes count only for the frame that they name, and only if this service received it. The twist cites that frame, so
-# that the robot validates its age by its own record. "No boxes" differs from "no answer".
+# Boxes count only if this service received the frame that they name. The twist cites that frame, so the robot validates
+# its age by its own record. "No boxes" differs from "no answer".
 
 
-# Frames; at 60 per second twice what any robot would still move for.
+# Frames; at 60 fps twice the longest frame age at which a robot still moves.
 REMEMBERED = 128
 # A box this near to the image border may continue beyond it, so its size is unknown.
 _EDGE_PX = 1.0
@@ -284,7 +284,7 @@ def locate_box(one: Detection, camera: CameraModel, config: BoxesConfig, otherwi
     (left, middle), (right, _), (across, top), (_, bottom) = _edges(one, camera)
     ahead_m = _range(right - left, bottom - top, one, camera, config)
     tilt_cos, tilt_sin = math.cos(camera.pitch_rad), math.sin(camera.pitch_rad)
-    # Over the floor, for each meter along the axis of the lens.
+    # Over the floor, per meter along the axis of the lens.
     forward = tilt_cos + middle * tilt_sin
     if forward <= 0 or right <= left or bottom <= top:
         return None
@@ -294,7 +294,7 @@ def locate_box(one: Detection, camera: CameraModel, config: BoxesConfig, otherwi
 
 
 def _edges(one: Detection, camera: CameraModel) -> list[list[float]]:
-    """Return the rays (right, down, at 1 m) of the centers of the left, right, top and bottom edges."""
+    """Return the rays (right, down, at 1 m ahead) of the centers of the left, right, top and bottom edges."""
     x, y = one.center_px
     pixels = np.array([[one.x1_px, y], [one.x2_px, y], [x, one.y1_px], [x, one.y2_px]])
     rays: list[list[float]] = points_ahead(pixels, camera)[:2].T.tolist()
@@ -302,7 +302,7 @@ def _edges(one: Detection, camera: CameraModel) -> list[list[float]]:
 
 
 def _range(width: float, height: float, one: Detection, camera: CameraModel, config: BoxesConfig) -> float | None:
-    """Return the meters along the axis of the lens, by the configured height or else width, if it is fully in view."""
+    """Return the range along the axis of the lens, m, by the height or else the width, if it is fully in view."""
     left, right, top, bottom = _whole_sides(one, camera)
     if config.height_m is not None and top and bottom and height > 0:
         return config.height_m / height

@@ -1,7 +1,7 @@
-"""Latency estimate and Smith predictor: where the robot will be when a command acts. Pure.
+"""Latency estimate and Smith predictor: the pose of the robot when a command acts. Pure.
 
-Before a command acts, the robot still carries out the commands in flight. Steering from the image alone corrects the
-same error several times. Steering from the predicted pose does not.
+Before a command acts, the robot still applies the commands in flight. Steering from the image alone corrects the same
+error several times. Steering from the predicted pose does not.
 """
 
 import math
@@ -108,7 +108,7 @@ class MotionPredictor:
                 step_s = length_s / steps
                 linear += _bounded(goal[0] - linear, self._config.linear_acceleration_mps2 * step_s)
                 angular += _bounded(goal[1] - angular, self._config.angular_acceleration_rad_s2 * step_s)
-                # The heading in the middle of the step, so that an arc ends where it should.
+                # The heading in the middle of the step, so that an arc ends at the right place.
                 middle = yaw + angular * step_s / 2
                 x, y = x + linear * math.cos(middle) * step_s, y + linear * math.sin(middle) * step_s
                 yaw += angular * step_s

@@ -119,10 +119,10 @@ def _bounded(value: float, limit: float) -> float:
     return max(-limit, min(limit, value))
 
 
-# The bounded search: turn on the spot after "saw nothing", toward the side where the target was last seen. Pure.
+# The bounded search: turn on the spot after "detected nothing", toward the side where the target was last seen. Pure.
 #
-# Only decoded images without a target count. The turn in odometry consumes the budget, so that a disarmed robot does
-# not use up its search. Where the robot turned and then stands, an obstacle is in its way: it turns the other way.
+# Only decoded images without a target count. The measured turn uses up the limit, so a disarmed robot keeps its search.
+# If the robot turned and then stands, an obstacle blocks it, and it turns the other way.
 
 
 _BLOCKED_S = 1.0
@@ -153,7 +153,7 @@ class Search:
             applied: twist on the wheels, m/s, rad/s.
 
         Returns:
-            The turn, or None before the waiting time and after the budget.
+            The turn, or None before the waiting time and after the limit.
         """
         self._spend(dt_s, pose[2], applied[1])
         config = self._config
@@ -172,6 +172,6 @@ class Search:
         self._turning_s += dt_s if is_turning else 0.0
         self._standing_s = 0.0 if is_turning else self._standing_s + dt_s
         self._one_way_rad += turned_rad
-        # A robot that is disarmed stands too, but has not turned.
+        # A disarmed robot stands, too, but it has not turned.
         if self._standing_s >= _BLOCKED_S and self._one_way_rad >= _TURNED_RAD:
             self._side, self._one_way_rad = -self._side, 0.0

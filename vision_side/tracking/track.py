@@ -1,14 +1,14 @@
 """Track one target among other objects in the odometry frame. Pure.
 
-In this frame the state of an object is only its position and velocity, without the robot's motion: a Kalman filter, in
-which both axes share one 2x2 covariance, because they have the same noise. The clock is the capture time of the frames.
+In this frame the state of an object is its position and velocity, without the robot's motion: a Kalman filter, in which
+both axes share one 2x2 covariance, because they have the same noise. The clock is the capture time of the frames.
 
-The other objects in view are tracked too, so that the target does not become one of them where they cross or hide each
-other. Each sighting belongs to the object that it fits best, by the likelihood of its position and its look. One of
-another look is of another object, except at the place of the object, because the light changes a look and moves
-nothing. Where two objects could be exchanged, neither is corrected: both go on as before, until they are apart. Where
-one hides a part of the other, both are corrected less. A target that stays in doubt is lost. For a while after its loss
-nothing is followed that looks like another object.
+The other visible objects are tracked, too. So the target does not change to another object when they cross or hide each
+other. Each sighting is assigned to the object that it fits best, by the likelihood of its position and its look. A
+sighting with another look belongs to another object, except at the position of the object, because light changes the
+look but not the position. If two objects could be exchanged, neither is corrected; both are predicted until they are
+apart. If one hides a part of the other, both are corrected less. A target that stays in doubt is lost. For a while
+after its loss the track follows nothing that looks like another object.
 """
 
 import math
@@ -22,20 +22,20 @@ from sightline.vision_side.tracking.locate import Sighting
 
 # 1 sigma of the speed of a new target.
 _FIRST_SPEED_MPS = 0.3
-# A sighting three sigma off means that the target was pushed. Without more variance the filter would lag behind it.
+# A sighting three sigma off: the target was pushed. Without more variance the filter would lag behind it.
 _SURPRISE = 9.0
 _PUSHED_MPS = 0.4
 
-# A limit for boxes of another service; a room has fewer.
+# A limit for boxes of another service; a usual scene has fewer.
 _MAX_OTHERS = 16
-# Sightings after which an object is a rival of the target. Errors of a detector seldom last as long.
+# Sightings after which an object is a rival of the target. False detections seldom last as long.
 _KNOWN_AFTER = 5
-# Time without a sighting after which another object is forgotten: it may have left the view for a moment. As long after
-# the loss of the target, another object, or one of another look, may become the target.
+# Time without a sighting after which another object is forgotten. It may have left the view for a moment. After the
+# same time since the loss of the target, another object, or an object with another look, may become the target.
 _MEMORY_US = 3_000_000
-# The same for one with fewer sightings. After as long, a sighting of another look is another object.
+# The same for an object with fewer sightings. After this time, a sighting with another look is another object.
 _BRIEFLY_US = 300_000
-# Variance that no filter knows: an outline that is partly hidden, a step, a bump.
+# Variance that the filter does not model: a partly hidden outline, a step, a bump.
 _LEAST_NOISE_M2 = 0.05**2
 # A sighting of unknown range has a larger variance along its ray. Across the ray it is as exact as any other.
 _MOST_NOISE_M2 = 0.15**2
@@ -43,7 +43,7 @@ _MOST_NOISE_M2 = 0.15**2
 _LOOK_MISFIT = 12.0
 # Difference of two log-likelihoods, times two, below which two objects could be exchanged: odds of 7 to 1.
 _ODDS = 4.0
-# Longest time in doubt.
+# Longest time in doubt before the target is lost.
 _DOUBT_US = 500_000
 # Time between two frames from which on the next frame may be too late: one sighting beside the target is then enough
 # for another object. In a faster stream a second one follows before it has come far.
@@ -63,7 +63,7 @@ class Target:
     unseen_us: int
     sightings: int
     number: int = 0
-    """Of the frame from which on it is followed; another object, or the same one again, has another number."""
+    """Number of the frame in which it was first followed. Another object, or the same one again, has another number."""
 
     def after(self, dt_s: float) -> tuple[float, float]:
         """Return the position that is expected `dt_s` later."""
@@ -79,13 +79,13 @@ class _Object:
         self._acceleration_mps2 = acceleration_mps2
         self.state = Target(place.x_m, place.y_m, 0.0, 0.0, 0, 1)
         self.variance = (place.noise_m2, 0.0, _FIRST_SPEED_MPS**2)
-        """Of position, both, velocity."""
+        """Variance of position, covariance, variance of velocity."""
         self.look = place.sighting.look
         self._unlike_us = 0
-        """Time since it last looked so."""
+        """Time since its last sighting with this look."""
         self.was_beside = False
-        """True once it was seen again, in a slow stream once, beside the target. A sighting that fits it better is not
-        of the target."""
+        """True after it was seen together with the target again, in a slow stream once. A sighting that fits it better is
+        not of the target."""
 
     def advance(self, dt_s: float) -> None:
         """Predict with constant velocity and white acceleration."""
@@ -110,7 +110,7 @@ class _Object:
 
     @property
     def is_forgotten(self) -> bool:
-        """Return True if it was not seen for so long that it may be gone."""
+        """Return True if it was not seen for so long that it may have left."""
         return self.state.unseen_us > (_MEMORY_US if self.is_known else _BRIEFLY_US)
 
     def away_m(self, place: "_Place") -> float:
@@ -118,7 +118,7 @@ class _Object:
         return _apart_m(self.state, place)
 
     def three_sigma_m(self, place: "_Place") -> float:
-        """Return the distance of a sighting from the expected position that the filter still expects."""
+        """Return the largest expected distance of a sighting from the expected position (three sigma)."""
         return math.sqrt(_SURPRISE * (self.variance[0] + place.noise_m2))
 
     def unlike(self, place: "_Place") -> float:
@@ -131,7 +131,7 @@ class _Object:
         return self.away_m(place) ** 2 / variance + 2 * math.log(variance) + _LOOK_MISFIT * self.unlike(place)
 
     def rank(self, place: "_Place") -> tuple[bool, float]:
-        """Return less for a sighting that fits better: one of another look comes last."""
+        """Return a sort key, lower for a better fit. Sightings with another look come last."""
         return self.unlike(place) >= OTHER, self.misfit(place)
 
     def correct(self, place: "_Place") -> None:
@@ -149,7 +149,7 @@ class _Object:
                             was.vy_mps + gain_velocity * dy, 0, was.sightings + 1, was.number)
 
     def _update_look(self, place: "_Place") -> None:
-        """Update the look. Another one is that of an object in front, until it stays: then it is the light."""
+        """Update the look. Another look is that of an object in front, until it lasts: then the light has changed."""
         look, is_alike = place.sighting.look, self.unlike(place) < OTHER
         if look is not None and (is_alike or self._unlike_us > _MEMORY_US):
             self.look, self._unlike_us = updated(self.look, look) if is_alike else look, 0
@@ -173,7 +173,7 @@ class Track:
         self._followed: _Object | None = None
         self._others: list[_Object] = []
         self._lost: _Object | None = None
-        """The last target, until another one is followed. Its sighting is not of a rival."""
+        """The last target, until another one is followed. A sighting of it does not belong to a rival."""
         self._lost_look: Look | None = None
         self._unsure_us = 0
         """Time in doubt, or since the loss of the target."""
@@ -216,7 +216,7 @@ class Track:
         return seen.sighting if seen else None
 
     def _forget_hidden(self) -> None:
-        """Forget what was hidden for too long. By now its gate would let in objects that are far away."""
+        """Forget objects that were hidden for too long, because their gates would now include distant objects."""
         if self._followed is not None:
             self._end(self._followed)
         self._others = [one for one in self._others if not one.is_forgotten]
@@ -226,7 +226,7 @@ class Track:
         return [target, *self._others] if target else self._others
 
     def _fits(self, places: list[_Place]) -> dict[_Object, _Place]:
-        """Assign places to objects: first to the target and those beside it; the best fit that looks alike first."""
+        """Assign places to objects: first for the target and objects next to it; best fit with the same look first."""
         fits, apart_m, target = dict[_Object, _Place](), self._config.apart_m, self._followed or self._lost
         for is_first in (True, False):
             objects = [one for one in self._objects() if (one is target or one.was_beside) == is_first]
@@ -254,15 +254,15 @@ class Track:
 
     @staticmethod
     def _inexact(place: _Place) -> _Place:
-        # The outline is of a part, or of both.
+        # The outline is of a part, or of both objects.
         return replace(place, noise_m2=max(place.noise_m2, _MOST_NOISE_M2))
 
     def _in_doubt(self, fits: dict[_Object, _Place]) -> set[_Object]:
-        """Return the target and the rivals that could as well have its sighting, and it theirs; empty if none could."""
+        """Return the target and the rivals with exchangeable sightings; otherwise an empty set."""
         target = self._followed or self._lost
         if target is None:
             return set()
-        # Where both are seen, the lost target is the one that is not at the place of the other.
+        # If both are seen, the lost target is the object that is not at the place of the other.
         rivals = [one for one in self._others if one.is_rival and (self._followed or not {target, one} <= fits.keys())]
         found = {one for one in rivals if self._could_exchange(target, one, fits)}
         return {target, *found} if found else found
@@ -276,7 +276,7 @@ class Track:
     def _start(
         self, dt_s: float, places: list[_Place], fits: dict[_Object, _Place], in_doubt: set[_Object], number: int
     ) -> _Place | None:
-        """Follow the best sighting; for a while none of a rival of the last target, and none that looks other."""
+        """Follow the best sighting. For a while exclude rivals of the last target, and sightings with another look."""
         self._unsure_us += round(dt_s * 1e6)
         if self._unsure_us <= _MEMORY_US:
             taken = [place for one, place in fits.items() if one.is_rival or one in in_doubt]
@@ -301,7 +301,7 @@ class Track:
     def _update_others(
         self, places: list[_Place], fits: dict[_Object, _Place], target: _Object | None, *, is_slow: bool
     ) -> None:
-        """Add objects that are new; forget those that were long not seen, and parts of a target that was seen."""
+        """Add new objects; forget objects without a recent sighting, and parts of a visible target."""
         apart_m = self._config.apart_m
         self._others = [one for one in self._others if one is not self._followed and not one.is_forgotten
                         and not (target and _apart_m(one.state, target.state) < apart_m)]

@@ -1,7 +1,7 @@
-"""Follows one target while its color changes with the light: color model, Kalman filter, gate. Pure.
+"""Detect one target while its color changes with the light: color model, Kalman filter, gate. Pure.
 
-Chromaticity is red and green as shares of the whole, so that neither shade nor exposure moves it; warm or cold light
-does, slowly, and the cloud goes along.
+Chromaticity is the share of red and of green in a color. Shade and exposure do not change it. Warm or cold light
+changes it slowly, and the color model adapts.
 """
 
 import math
@@ -23,16 +23,16 @@ from sightline.vision_side.detect.port import Circle, Detection, Label
 Shares = NDArray[np.float32]
 """(..., 2): red and green shares."""
 
-_LEAST_SIGMA: Final = 0.012  # JPEG at quality 30 spreads one color by as much
-_MOST_SIGMA: Final = 0.05  # a cloud wider than this holds half of all colors
-_DARKEST: Final = 36.0  # of 765, below which shares are noise
-_MAX_STEP: Final = 0.01  # of the middle in one image: light changes slowly, another thing's color at once
-_MOVED: Final = 0.25  # of a sigma: as long as the cloud moved no further, its table of colors is as good as new
+_LEAST_SIGMA: Final = 0.012  # JPEG at quality 30 spreads a color by this much
+_MOST_SIGMA: Final = 0.05  # a wider distribution contains half of all colors
+_DARKEST: Final = 36.0  # of 765; the shares of darker pixels are noise
+_MAX_STEP: Final = 0.01  # of the mean in one image: light changes slowly, another object changes the color immediately
+_MOVED: Final = 0.25  # sigmas; the color table is computed again after a larger change of the mean
 _KERNEL: Final = np.ones((3, 3), np.uint8)
 
 
 class ColorModel:
-    """The color of one thing."""
+    """Mean and covariance of the color of one object."""
 
     def __init__(self, bgr: NDArray[np.uint8]) -> None:
         """Learn the color from its pixels `bgr` (N, 3)."""
@@ -46,7 +46,7 @@ class ColorModel:
         return math.sqrt(float(self._square(middle[None])[0]))
 
     def learn(self, bgr: NDArray[np.uint8], part: float) -> None:
-        """Go along with pixels of the thing by `part` (0..1) of the way, no step larger than light makes."""
+        """Move the model by the share `part` (0..1) toward pixels of the object. The step is limited."""
         middle, spread = _cloud(_shares(bgr)[0])
         step = (middle - self._middle) * part
         length = float(np.hypot(*step))
@@ -54,7 +54,7 @@ class ColorModel:
         self._spread = self._spread + (spread - self._spread) * part
 
     def mask(self, bgr: NDArray[np.uint8], sigmas: float) -> NDArray[Any]:
-        """255 where a pixel of `bgr` (rows, columns, 3) has the color, speckle removed."""
+        """Return 255 where a pixel of `bgr` (rows, columns, 3) has the color, 0 elsewhere, without speckle."""
         if self._table is None or math.sqrt(float(self._square(self._table_middle[None])[0])) > _MOVED:
             shares, bright = _code_shares()
             inside = (self._square(shares) <= sigmas * sigmas) & bright
@@ -62,7 +62,7 @@ class ColorModel:
         return cv2.morphologyEx(cv2.LUT(codes_565(bgr), self._table), cv2.MORPH_OPEN, _KERNEL)
 
     def _square(self, shares: NDArray[Any]) -> NDArray[Any]:
-        """Squared distance of each from the middle, in sigmas."""
+        """Return the squared distance of each color from the mean, in sigmas."""
         (a, b), (_, d) = self._spread.tolist()
         determinant = a * d - b * b
         red, green = shares[..., 0] - float(self._middle[0]), shares[..., 1] - float(self._middle[1])
@@ -80,15 +80,15 @@ def _shares(bgr: NDArray[Any]) -> tuple[Shares, NDArray[np.bool_]]:
 
 @lru_cache(maxsize=1)
 def _code_shares() -> tuple[Shares, NDArray[np.bool_]]:
-    """Those of every BGR565 code."""
+    """Return the shares of every BGR565 code."""
     return _shares(colors_565())
 
 
 def _cloud(shares: Shares) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Middle and covariance, no narrower than noise and no wider than a color is."""
+    """Return mean and covariance, with a lower and an upper limit."""
     middle = np.median(shares, axis=0)
     off = shares - middle
-    off = off[np.abs(off).max(axis=-1) <= 3 * _MOST_SIGMA]  # shine and what is in front
+    off = off[np.abs(off).max(axis=-1) <= 3 * _MOST_SIGMA]  # without highlights and objects in front
     (a, b), (_, d) = (off.T @ off / max(1, len(off))).tolist() if len(off) else ((0.0, 0.0), (0.0, 0.0))
     low, high = _LEAST_SIGMA**2, _MOST_SIGMA**2
     a, d = min(high, max(low, a)), min(high, max(low, d))
@@ -97,20 +97,20 @@ def _cloud(shares: Shares) -> tuple[NDArray[Any], NDArray[Any]]:
     return middle, np.array(((a, b), (b, d)))
 
 
-# Where in the image a thing should be: a Kalman filter of its place, a smoothed size, and a gate. Pure.
+# Expected place of an object in the image: Kalman filter of its position, smoothed size, gate. Pure.
 
 
-_ACCELERATION: Final = 6.0  # image widths per s^2: a robot that begins to turn as hard as it may
-_FIRST_SPEED: Final = 1.5  # image widths per s: a robot that turns as fast as it may
+_ACCELERATION: Final = 6.0  # image widths per s^2: the robot starts to turn at its limit
+_FIRST_SPEED: Final = 1.5  # image widths per s: the robot turns at its highest rate
 _NOISE_PX: Final = 0.7
 _SIGMAS: Final = 4.0
-_GATE_RADII, _GATE_WIDTHS = 1.5, 0.06  # whatever the filter thinks: further off it is another thing
+_GATE_RADII, _GATE_WIDTHS = 1.5, 0.06  # upper limit of the gate
 _LEAST_SIZE, _MOST_SIZE = 0.65, 1.55  # of the radius, from one image to the next
-_SIZE_PART: Final = 0.4  # of a new radius; what is partly hidden looks smaller for a while
+_SIZE_PART: Final = 0.4  # weight of a new radius; a partly hidden object looks smaller for a while
 
 
 class PixelTrack:
-    """The place of one thing, both axes with one covariance, since nothing prefers one of them."""
+    """Position of one object. Both axes share one covariance, because their noise is equal."""
 
     def __init__(self, circle: Circle, width_px: int) -> None:
         self.cx_px, self.cy_px, self.radius_px = circle.cx_px, circle.cy_px, circle.radius_px
@@ -134,7 +134,7 @@ class PixelTrack:
         return self.away_px(circle) <= self.gate_px and _LEAST_SIZE <= size <= _MOST_SIZE
 
     def advance(self, dt_s: float) -> None:
-        """Constant velocity, with white acceleration."""
+        """Predict with constant velocity and white acceleration."""
         position, both, velocity = self._variance
         power = (_ACCELERATION * self._width_px) ** 2 * dt_s
         self._variance = (position + dt_s * (2 * both + dt_s * velocity) + power * dt_s**2 / 3,
@@ -143,7 +143,7 @@ class PixelTrack:
         self.cy_px += self._vy * dt_s
 
     def correct(self, circle: Circle) -> None:
-        """Take in where it was found."""
+        """Correct the prediction with the detected circle."""
         position, both, velocity = self._variance
         gain, gain_velocity = position / (position + _NOISE_PX**2), both / (position + _NOISE_PX**2)
         dx, dy = circle.cx_px - self.cx_px, circle.cy_px - self.cy_px
@@ -153,37 +153,37 @@ class PixelTrack:
         self._variance = (position * (1 - gain), both * (1 - gain), velocity - gain_velocity * both)
 
 
-# Color detector for one thing whose light changes: it learns the color, looks where the thing should be, and would
-# rather lose it than jump to another. Pure: the clock is the frames' capture time.  Found by the configured ranges in
-# several images in a row, the thing is then followed by its own color, near where a Kalman filter of its place in
-# the image expects it. What else has the color elsewhere is not looked at.
+# Color detector for one object under changing light. It learns the color and searches near the expected position. It
+# loses the target rather than jump to another object. Pure: the clock is the capture time of the frames. First the
+# configured ranges must find the object in several images in a row. Then the detector follows its learned color near
+# the position that a Kalman filter predicts. It ignores the same color elsewhere.
 
 
-_CLEAR: Final = 0.8  # of the outline in view: of a thing more hidden than this, no color is learned
-_SAMPLES: Final = 400  # pixels: enough for a middle and a spread
-_CORE: Final = 0.7  # of the radius: the rim's pixels are half the floor's
+_CLEAR: Final = 0.8  # least visible share of the outline from which the color is learned
+_SAMPLES: Final = 400  # pixels: enough for a mean and a covariance
+_CORE: Final = 0.7  # of the radius: pixels at the edge are mixed with the floor
 
 
 class AdaptiveConfig(Settings):
-    """The ranges to begin with, and how much it goes along with."""
+    """Color ranges of the first detection, and the speed of adaptation."""
 
     renamed_keys: ClassVar[Mapping[str, str]] = {"colour_sigmas": "color_sigmas"}
     hsv: HsvConfig = HsvConfig()
     label: Label = "target"
     confirm: Annotated[int, Field(ge=1, le=30)] = 3
-    """Images in a row with the thing at one place before it is believed."""
+    """Images in a row with the object at one place before it is the target."""
     lost_after_s: Annotated[float, Field(gt=0, le=5)] = 0.5
-    """Not seen for this long, it is lost, and is looked for everywhere again."""
+    """Time without a detection after which the target is lost and the whole image is searched again."""
     remembered_s: Annotated[float, Field(ge=0, le=60)] = 5.0
     """Time in which a lost target is accepted again only with the learned color."""
     color_sigmas: Annotated[float, Field(gt=1, le=8)] = 4.0
     """Largest distance of a target pixel from the learned color."""
     adapt_s: Annotated[float, Field(gt=0.05, le=60)] = 0.3
-    """How slowly the color goes along with the light. A lamp that turns from warm to cold in 3 s is not lost yet."""
+    """Time constant of the color adaptation. A lamp that turns from warm to cold in 3 s does not lose the target."""
 
 
 class AdaptiveTracker:
-    """Follows one thing in one robot's images."""
+    """Follows one object in the images of one robot."""
 
     def __init__(self, config: AdaptiveConfig) -> None:
         self._config = config
@@ -208,7 +208,7 @@ class AdaptiveTracker:
         return (found,)
 
     def _follow(self, track: PixelTrack, picture: DecodedImage, dt_s: float) -> Detection | None:
-        """Return the object nearest to the expected position, of the learned color and about the same size."""
+        """Return the object nearest to the expected position, with the learned color and about the same size."""
         track.advance(dt_s)
         region = self._region(picture, track)
         if region is None:
@@ -220,7 +220,7 @@ class AdaptiveTracker:
         return best
 
     def _region(self, picture: DecodedImage, track: PixelTrack) -> Region | None:
-        """Around where it should be, with what has its color marked."""
+        """Return the region around the expected position, with the learned color marked."""
         if self._color_model is None:
             return None
         half = track.gate_px + 1.4 * track.radius_px + 4
@@ -265,7 +265,7 @@ class AdaptiveTracker:
 
 
 def _circle(one: Detection) -> Circle:
-    """Return its circle, or the one in its box."""
+    """Return the circle of a detection, or the circle in its box."""
     if one.circle is not None:
         return one.circle
     width, height = one.x2_px - one.x1_px, one.y2_px - one.y1_px
@@ -279,7 +279,7 @@ def _cut(low_px: float, high_px: float, scale: int, size: int) -> slice:
 
 
 def _pixels(picture: DecodedImage, circle: Circle) -> NDArray[np.uint8]:
-    """Some of the pixels (N, 3) well within the circle."""
+    """Return some of the pixels (N, 3) well inside the circle."""
     reach = circle.radius_px * _CORE
     rows = _cut(circle.cy_px - reach, circle.cy_px + reach, picture.scale, picture.bgr.shape[0])
     columns = _cut(circle.cx_px - reach, circle.cx_px + reach, picture.scale, picture.bgr.shape[1])

@@ -16,10 +16,10 @@ from sightline.vision_side.detect.timing import timed
 _CPU: Final = "cpu"
 
 class Hsv:
-    """The color detector; it remembers nothing from frame to frame."""
+    """The color detector. It has no memory of earlier frames."""
 
     class Config(Settings):
-        """The section `hsv` of vision's configuration, and what its detections are called."""
+        """The section `hsv` of the vision configuration, and the label of the detections."""
 
         hsv: HsvConfig = HsvConfig()
         label: Label = "target"
@@ -32,7 +32,7 @@ class Hsv:
         self._notices: list[str] = []
 
     def notices(self) -> list[str]:
-        """Return, once, that the range marks more than a target."""
+        """Return, once, a line if the range marks more than a target."""
         notices, self._notices = self._notices, []
         return notices
 
@@ -47,7 +47,7 @@ class Hsv:
 
 
 class Adaptive:
-    """The color detector that learns the target's color as it goes, one memory for each robot."""
+    """The color detector that learns the color of the target, separately for each robot."""
 
     Config = AdaptiveConfig
     maker = Maker("adaptive", device=_CPU)

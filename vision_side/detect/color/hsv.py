@@ -1,6 +1,6 @@
-"""Finds disks and blobs of configured colors: mask, sharp edge, circle fit. Pure.
+"""Find disks and blobs of configured colors: mask, sharp edge, circle fit. Pure.
 
-The table is over BGR565, so any number of ranges, and a hue range through red, cost the same.
+The color table is over BGR565, so its cost does not depend on the number of ranges.
 """
 
 import math
@@ -18,26 +18,26 @@ from sightline.vision_side.decode import DecodedImage
 from sightline.vision_side.detect.port import Circle, Detection
 
 COARSE = 4
-"""Where to look is decided on every fourth pixel of every fourth row, which no disk worth measuring slips between."""
+"""The first search reads every fourth pixel of every fourth row. Each disk of measurable size has such a pixel."""
 MARGIN_PX = 10
-"""Around that: the smallest disk reaches 6 pixels from its only one that was looked at; the rest is background."""
+"""Margin around the found pixels: the smallest disk extends 6 px from its only found pixel; the rest is background."""
 _KERNEL = np.ones((3, 3), np.uint8)
 LEAST_SHARE = 0.3
-"""Of the pixels in the box's middle: shade and shine take some of a ball's color, another ball has none of it."""
+"""Least share of pixels with the color, in the middle of a box. Shade and highlights change some pixels of a ball."""
 _MIDDLE = 0.6
-"""The middle part of a box lies wholly on a ball, whose disk leaves the box's corners out."""
+"""Share of the box that lies fully on a ball, whose disk does not fill the corners."""
 _FLOODED_SHARE = 0.25
-"""Of an image: a range that marks so much of it marks a floor or a wall. Of 365 photographs of places without a target,
-the default range marks that much in 2 %."""
+"""Share of an image from which a color range marks a floor or a wall. Of 365 photographs of places without a target,
+the default range marks this share in 2 %."""
 _FLOODED_IMAGES = 15
-"""So many ..."""
+"""Number of flooded images ..."""
 _CHECKED_IMAGES = 90
-"""... of the first images, for a notice."""
+"""... among this number of first images, for a notice."""
 
 
 @dataclass(frozen=True, slots=True)
 class Region:
-    """The part of an image that holds everything of the color, a margin around it, and where it lies."""
+    """The part of an image that contains all pixels of the color and a margin, with its origin."""
 
     bgr: NDArray[np.uint8]
     mask: NDArray[Any]
@@ -57,12 +57,12 @@ class ColorMask:
             return None
         x1, y1 = max(0, x * COARSE - MARGIN_PX), max(0, y * COARSE - MARGIN_PX)
         part = bgr[y1 : (y + height) * COARSE + MARGIN_PX, x1 : (x + width) * COARSE + MARGIN_PX]
-        # Speckle would cost findContours a hundredfold; a 3x3 opening removes it and keeps disks.
+        # Speckle makes findContours a hundred times slower; a 3x3 opening removes it and preserves disks.
         mask = cv2.morphologyEx(cv2.LUT(codes_565(part), self._table), cv2.MORPH_OPEN, _KERNEL)
         return Region(part, mask, (x1, y1))
 
     def share(self, bgr: NDArray[np.uint8]) -> float:
-        """Return the share of the pixels with the color, 0..1, of those that are looked at."""
+        """Return the share of the sampled pixels that have the color, 0..1."""
         marked = self._coarse(bgr)
         return cv2.countNonZero(marked) / max(1, marked.size)
 
@@ -78,7 +78,7 @@ class ColorMask:
 
 
 class RangeCheck:
-    """Finds, in the first images, whether a color range marks the floor or a wall."""
+    """Checks in the first images whether a color range marks the floor or a wall."""
 
     def __init__(self, mask: ColorMask) -> None:
         self._mask = mask
@@ -103,28 +103,28 @@ class RangeCheck:
 
 
 def _middle(low_px: float, high_px: float, scale: int, size: int) -> slice:
-    """Return the middle of a box's rows or columns, at least one pixel of the decoded image."""
+    """Return the middle of the rows or columns of a box, at least one pixel of the decoded image."""
     cut = (high_px - low_px) * (1 - _MIDDLE) / 2
     first = min(size - 1, max(0, int((low_px + cut) / scale)))
     return slice(first, max(first + 1, min(size, int((high_px - cut) / scale) + 1)))
 
 
 def codes_565(bgr: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """BGR565 of each pixel."""
+    """Return the BGR565 code of each pixel."""
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2BGR565).view(np.uint16)[..., 0]
 
 
 @cache
 def colors_565() -> NDArray[np.float64]:
-    """Return the color (65536, 3) in the middle of each BGR565 code: blue, green, red, 0..255."""
+    """Return the center color (65536, 3) of each BGR565 code: blue, green, red, 0..255."""
     codes = np.arange(65536, dtype=np.uint32)
     blue, green, red = (codes & 31) * 8 + 3.5, (codes >> 5 & 63) * 4 + 1.5, (codes >> 11) * 8 + 3.5
     return _read_only(np.stack([blue, green, red], axis=-1))
 
 
-@lru_cache(maxsize=32)  # 64 KB each; a fleet's robots share one
+@lru_cache(maxsize=32)  # 64 KB each; the robots of a fleet share one table
 def color_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
-    """255 for every BGR565 code whose color is within one of `ranges`, 0 elsewhere; 65536 entries, read-only."""
+    """Return 255 for each BGR565 code with a color in one of `ranges`, 0 elsewhere; 65536 entries, read-only."""
     bgr = (colors_565() / 255).astype(np.float32)[None]
     hue, saturation, value = cv2.cvtColor(bgr, cv2.COLOR_BGR2HSV)[0].T
     inside = np.zeros(65536, bool)
@@ -137,21 +137,21 @@ def color_table(ranges: tuple[HsvRange, ...]) -> NDArray[np.uint8]:
 
 
 def _read_only(values: NDArray[Any]) -> NDArray[Any]:
-    """Return a result that is stored and shared."""
+    """Make an array read-only, because it is cached and shared."""
     values.flags.writeable = False
     return values
 
 
 # The exact edge of a colored blob: half-way between its color and that of its surroundings. Pure.
 #
-# A color range selects the blob. Its bounds lie anywhere between the two colors, so that a mask alone makes the same
-# ball 7 % smaller in cold light and larger in warm light. Brightness is ignored, so that neither shade nor a dark floor
-# moves the edge.
+# A color range selects the blob. The limits of the range lie anywhere between the two colors. With the mask alone, the
+# same ball is 7 % smaller in cold light, and larger in warm light. Brightness is ignored, because shade and a dark
+# floor must not move the edge.
 
 
 _MARGIN_PX = 4
-_AROUND = np.ones((3, 5), np.uint8)  # two pixels each way, where every second row is left out
-_MIN_CONTRAST = 200.0  # squared steps of color; below it, noise would draw the edge
+_AROUND = np.ones((3, 5), np.uint8)  # two pixels in each direction, on every second row
+_MIN_CONTRAST = 200.0  # squared color difference; below it, noise defines the edge
 
 Box = Sequence[int]
 
@@ -159,7 +159,7 @@ Box = Sequence[int]
 def sharp_outline(bgr: NDArray[np.uint8], mask: NDArray[Any], box: Box) -> NDArray[Any] | None:
     """Return the outermost pixels (N, 1, 2) of the blob of `mask` in `box` (x, y, width, height).
 
-    None if the blob's color differs too little from its surroundings.
+    Returns None if the blob's color differs too little from its surroundings.
     """
     x1, y1 = max(0, box[0] - _MARGIN_PX), max(0, box[1] - _MARGIN_PX)
     rows, columns = slice(y1, box[1] + box[3] + _MARGIN_PX), slice(x1, box[0] + box[2] + _MARGIN_PX)
@@ -171,7 +171,7 @@ def sharp_outline(bgr: NDArray[np.uint8], mask: NDArray[Any], box: Box) -> NDArr
 
 
 def _blob(bgr: NDArray[np.uint8], inside: NDArray[Any]) -> NDArray[Any] | None:
-    """Not zero where a pixel is more like the color inside the mask than like the one outside, brightness left out."""
+    """Return nonzero where a pixel is nearer to the color inside the mask than outside, without brightness."""
     inside = inside[::2]  # every second row gives the same mean
     return blob_between(bgr, bgr[::2], inside, cv2.bitwise_not(cv2.dilate(inside, _AROUND)))
 
@@ -179,9 +179,9 @@ def _blob(bgr: NDArray[np.uint8], inside: NDArray[Any]) -> NDArray[Any] | None:
 def blob_between(
     bgr: NDArray[np.uint8], rows: NDArray[np.uint8], inside: NDArray[Any], outside: NDArray[Any]
 ) -> NDArray[Any] | None:
-    """Not zero where a pixel of `bgr` is more like those of `rows` that are `inside` than like those `outside`.
+    """Return nonzero where a pixel of `bgr` is nearer to the mean color `inside` than `outside`, both of `rows`.
 
-    None where the two differ too little.
+    None if the two colors differ too little.
     """
     blue, green, red, _ = cv2.mean(rows, inside)
     other_blue, other_green, other_red, _ = cv2.mean(rows, outside)
@@ -192,10 +192,10 @@ def blob_between(
     if contrast < _MIN_CONTRAST:
         return None
     half_way = blue * other_blue + green * other_green + red * other_red + contrast / 2
-    return cv2.transform(bgr, np.array(((blue, green, red, -half_way),)))  # what is below zero saturates to zero
+    return cv2.transform(bgr, np.array(((blue, green, red, -half_way),)))  # negative values saturate to zero
 
 
-# Is an outline round, and which part of it is? Circle fits through outline points. Pure.
+# Circle fits through the points of an outline, and the part of the outline that is round. Pure.
 
 
 Outline = NDArray[np.float64]
@@ -203,19 +203,19 @@ Outline = NDArray[np.float64]
 Fit = tuple[float, float, float]
 """Circle: cx, cy, radius."""
 Terms = NDArray[np.float64]
-"""Of each point, the columns (4, N) that a circle is linear in: x, y, x^2 + y^2, 1."""
+"""Columns (4, N) of the linear circle equation for each point: x, y, x^2 + y^2, 1."""
 
 MIN_POINTS = 8
-_OVAL = 0.1  # a ball at the side of a wide image is drawn oval; its outline leaves the circle by this part of it
-_TRIMS = 4  # each leaves out what the fit before shows to be off the circle, and so bends the next fit less
-_STAIRS_PX = 1.5  # no pixel of a clean disk's outline is further from its circle
-_CLEAN = 0.25  # RMS, by the limit for a single point: so few points off it bend no circle, and none is looked for
+_OVAL = 0.1  # in radii: at the side of a wide image, the outline of a ball is oval and leaves the circle by this much
+_TRIMS = 4  # rounds; each removes the points that the last fit shows off the circle
+_STAIRS_PX = 1.5  # largest distance of an outline pixel from the circle of a clean disk
+_CLEAN = 0.25  # RMS by the limit for one point; below it, too few points are off the circle to change the fit
 
 
 def fit_round_part(outline: NDArray[Any], min_radius_px: float, max_roughness: float) -> tuple[Fit, Outline] | None:
     """Fit the circle of `outline` without the part that an object in front hides. Returns None if it is not round.
 
-    `max_roughness` bounds the RMS distance from the circle, in radii.
+    `max_roughness` limits the RMS distance from the circle, in radii.
     """
     terms = _terms(outline)
     circle, rough_px = _fit(terms)
@@ -230,7 +230,7 @@ def fit_round_part(outline: NDArray[Any], min_radius_px: float, max_roughness: f
         circle, rough_px = _fit(terms)
     if terms.shape[1] < MIN_POINTS or circle[2] < min_radius_px:
         return None
-    # The stair-steps of pixels are up to half a pixel. Without this allowance, distant disks would be rejected.
+    # The pixel grid moves points by up to half a pixel. Without this allowance, distant disks would be rejected.
     return (circle, terms[:2].T) if rough_px <= max_roughness * circle[2] + 0.5 else None
 
 
@@ -244,10 +244,10 @@ def _terms(points: NDArray[Any]) -> Terms:
 
 
 def _fit(terms: Terms) -> tuple[Fit, float]:
-    """Fit a circle by least squares (Kåsa's linear form). Returns it, and the RMS distance of the points from it, to
-    first order. Radius 0 for a straight line or fewer than three points.
+    """Fit a circle by least squares (Kåsa's linear form).
 
-    One product of matrices holds every sum; the rest is plain numbers: normal equations about the points' middle.
+    Returns the circle, and the RMS distance of the points from it to first order. The radius is 0 for a straight line
+    or fewer than three points. One matrix product gives every sum for the normal equations about the mean point.
     """
     count = terms.shape[1]
     if count < 3:
@@ -261,29 +261,29 @@ def _fit(terms: Terms) -> tuple[Fit, float]:
         return (mx, my, 0.0), math.inf
     cx, cy = (bx * yy - by * xy) / determinant, (by * xx - bx * xy) / determinant
     radius = math.sqrt(max(0.0, mean - 2 * (cx * mx + cy * my) + cx * cx + cy * cy))
-    left = max(0.0, ss - square * mean - 4 * (cx * bx + cy * by))  # squares of d^2 - r^2, which is 2r (d - r)
+    left = max(0.0, ss - square * mean - 4 * (cx * bx + cy * by))  # squares of d^2 - r^2, about 2r (d - r)
     return (cx, cy, radius), math.sqrt(left / count) / (2 * radius) if radius else math.inf
 
 
 def _off(terms: Terms, circle: Fit) -> Outline:
-    """Distance of each point from the circle."""
+    """Return the distance of each point from the circle."""
     cx, cy, radius = circle
     square = np.array((-2 * cx, -2 * cy, 1.0, cx * cx + cy * cy)) @ terms
     away: Outline = np.abs(np.sqrt(np.maximum(square, 0.0)) - radius)
     return away
 
 
-# Detector of objects of one color, by default round ones: mask, outlines, sharp edge, circle fit. Pure.
+# Detector of objects of one color, round objects by default: mask, outlines, sharp edge, circle fit. Pure.
 
 
 Pixels = NDArray[Any]
-"""Outline as OpenCV gives it: (N, 1, 2), integers."""
+"""Outline from OpenCV: (N, 1, 2), integers."""
 
-_EDGE_PX = 0.45  # the true edge lies this far outside the center of an outermost pixel, on average over directions
+_EDGE_PX = 0.45  # distance of the true edge outside the center of an outermost pixel, mean over all directions
 
 
 class HsvDetector:
-    """Finds disks of the configured colors, or anything that has them."""
+    """Finds disks, or objects of any shape, of the configured colors."""
 
     def __init__(self, config: HsvConfig, label: str = "target") -> None:
         self._config = config
@@ -304,7 +304,7 @@ class HsvDetector:
         return tuple(sorted((one for one in found if one), key=_radius, reverse=True))
 
     def _thing(self, picture: DecodedImage, region: Region, outline: Pixels) -> Detection | None:
-        """Return the box around the region, or None if it is too small."""
+        """Return the box around the outline, or None if it is too small."""
         box = cv2.boundingRect(outline)
         if min(box[2], box[3]) < 2 * self._config.min_radius_px:
             return None
@@ -348,7 +348,7 @@ def disc_detection(shape: tuple[Box, Fit, Outline], whose: tuple[float, str], or
 def own_edge(pixels: Pixels, box: Box, origin_px: tuple[int, int], shape: tuple[int, ...]) -> Pixels:
     """Return the pixels (N, 2) of the outline without those at the border of the image."""
     flat = pixels[:, 0]
-    left, top = -origin_px[0], -origin_px[1]  # where the image begins, in the region's pixels
+    left, top = -origin_px[0], -origin_px[1]  # image origin, in pixels of the region
     right, bottom = left + shape[1] - 1, top + shape[0] - 1
     x, y, width, height = box
     if x <= left or y <= top or x + width > right or y + height > bottom:
@@ -358,5 +358,5 @@ def own_edge(pixels: Pixels, box: Box, origin_px: tuple[int, int], shape: tuple[
 
 
 def _radius(detection: Detection) -> float:
-    """Return the radius of its circle, or half its height without one, in px."""
+    """Return the radius of the circle, or half the height of the box without a circle, in px."""
     return detection.circle.radius_px if detection.circle else (detection.y2_px - detection.y1_px) / 2

@@ -1,6 +1,6 @@
-"""Finds the exact edge of a ball inside a model's box. Pure.
+"""Find the exact edge of a ball inside the box of a model. Pure.
 
-A model's box is a pixel or two off, which is 5 % of a ball's distance; the edge in the image is not.
+The box of a model is one or two pixels off, which is 5 % of the distance of a ball. The edge in the image is exact.
 """
 
 from dataclasses import replace
@@ -22,18 +22,18 @@ from sightline.vision_side.detect.color.hsv import (
 )
 from sightline.vision_side.detect.port import Circle, Detection
 
-_WITHIN: Final = 0.7  # of the box: surely the ball, even where the box is a little off
-_BEYOND: Final = 1.2  # of the box: surely not
-_MARGIN: Final = 0.35  # of the box, around it: where what is not the ball is looked at
+_WITHIN: Final = 0.7  # of the box: inside the ball, also if the box is slightly off
+_BEYOND: Final = 1.2  # of the box: outside the ball
+_MARGIN: Final = 0.35  # of the box, around it: the sample of the background
 _MARGIN_PX: Final = 5
 _LEAST_RADIUS_PX: Final = 3.0
 _ROUGHNESS: Final = 0.09
 _LEAST_EDGE: Final = 0.4  # of the outline on the circle; the rest may be hidden
-_OFF: Final = 0.4  # radii: a circle further from the box's middle, or so much larger or smaller, is another thing's
+_OFF: Final = 0.4  # radii: a circle further off the box center, or of another size by more, is another object
 
 
 def refined(picture: DecodedImage, one: Detection) -> Detection:
-    """Add the circle and the outline from the image to `one`. Returns `one` unchanged without them."""
+    """Add the circle and the outline from the image to `one`. Returns `one` unchanged if there is no circle."""
     scale = picture.scale
     box = np.array([one.x1_px, one.y1_px, one.x2_px, one.y2_px]) / scale
     around = _around(box, picture.bgr.shape)
@@ -49,7 +49,7 @@ def refined(picture: DecodedImage, one: Detection) -> Detection:
 
 
 def _around(box: NDArray[np.float64], shape: tuple[int, ...]) -> tuple[slice, slice] | None:
-    """Rows and columns of the box with its margin; None for a box with hardly a pixel in it."""
+    """Return rows and columns of the box with its margin, or None for a box that is too small."""
     x1, y1, x2, y2 = box.tolist()
     if x2 - x1 < 2 * _LEAST_RADIUS_PX or y2 - y1 < 2 * _LEAST_RADIUS_PX:
         return None
@@ -62,7 +62,7 @@ def _around(box: NDArray[np.float64], shape: tuple[int, ...]) -> tuple[slice, sl
 def _disc(
     part: NDArray[np.uint8], box: NDArray[np.float64], origin_px: tuple[int, int], shape: tuple[int, ...]
 ) -> tuple[Box, Fit, Outline] | None:
-    """Box, circle and edge of the ball, in pixels of `part`."""
+    """Return box, circle and edge of the ball, in pixels of `part`."""
     inside = _ellipse(part, box, _WITHIN)
     outside = cv2.bitwise_not(_ellipse(part, box, _BEYOND))
     if not inside.any() or not outside.any():
@@ -81,7 +81,7 @@ def _disc(
 
 
 def _ellipse(part: NDArray[np.uint8], box: NDArray[np.float64], share: float) -> NDArray[Any]:
-    """255 in the ellipse that fills `share` of the box, to an eighth of a pixel."""
+    """Return 255 in the ellipse that fills `share` of the box, to an eighth of a pixel."""
     x1, y1, x2, y2 = (box * 8).tolist()
     mask = np.zeros(part.shape[:2], np.uint8)
     middle = round((x1 + x2) / 2 - 4), round((y1 + y2) / 2 - 4)

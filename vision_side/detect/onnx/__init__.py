@@ -1,4 +1,4 @@
-"""Detectors that are trained models: ONNX files, and adapters of PyTorch, Ultralytics and Transformers.
+"""Detectors with a trained model: ONNX files, and adapters of PyTorch, Ultralytics and Transformers.
 
 May import: `protocol`, `vision_side`; ONNX Runtime, and inside functions the frameworks.
 Interface: The entry points `onnx`, `torch`, `ultralytics` and `transformers`, each with `:PATH`.

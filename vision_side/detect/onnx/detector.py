@@ -1,8 +1,8 @@
 """The detector `onnx:PATH`. Shell.
 
-Without a path it is the model that comes with Sightline; `onnx:nanodet` is its model of the 80 classes of COCO. Before
-the first frame it has run warm, and its answer to a known image was compared. Models of other frameworks are subclasses
-that open another engine.
+Without a path it is the model that comes with Sightline. `onnx:nanodet` is the shipped model of the 80 classes of COCO.
+Before the first frame, the detector runs the model to warm up, and checks its answer to a known image. Subclasses open
+other engines for models of other frameworks.
 """
 
 import hashlib
@@ -48,85 +48,85 @@ _MODELS: Final = Path(__file__).parent.parent.parent / "models"
 SHIPPED: Final = _MODELS / "sightline.onnx"
 NANODET: Final = _MODELS / "nanodet.onnx"
 _EXPECTED_BONUS: Final = 0.2
-"""Chosen on 500 photographs of BSDS500 with a random place each, which no training uses: 0.1, 0.2 and 0.3 give 4.4, 4.8
-and 6.8 % of false balls there, and 91.8, 94.0 and 96.0 % of hits."""
+"""Chosen on 500 photographs of BSDS500, which no training uses, each with a random place. There, 0.1, 0.2 and 0.3 give
+4.4, 4.8 and 6.8 % of false balls, and 91.8, 94.0 and 96.0 % of hits."""
 _EXPECTED_WITHIN: Final = 0.1
-"""Of the image's width: how far from where a track expects the target its bonus falls to 0."""
+"""Distance from the expected place, in image widths, at which the bonus has fallen to 0."""
 _DOUBTFUL: Final = 0.5
-"""Share of the least score from which on a thing gets a second look where no track expects one."""
+"""Share of the least score from which an object gets a second look if no track expects it there."""
 _SURE: Final = 0.1
-"""A target elsewhere than a track expects it needs this above the least score."""
+"""Margin above the least score that a target needs away from the place where a track expects it."""
 _DOUBTED: Final = 0.2
-"""Without a track a target with less than this above the least score is in doubt, too ..."""
+"""Without a track, a target with a smaller margin above the least score is in doubt, too ..."""
 _TWICE: Final = 0.05
-"""... and the mean score of both looks needs this above it. On 5000 scenes of "all at once" that choose thresholds,
-false alarms and hits then are 1.7 and 65.6 % (one look: 3.4 and 69.3 %); on 1000 beside boxes of the ball's color 0 and
-90.5 % (2.0 and 88.6 %)."""
+"""... and the mean score of both looks needs this margin. On the 5000 scenes of "all at once" that choose thresholds,
+this gives 1.7 % false alarms and 65.6 % hits (one look: 3.4 and 69.3 %). On 1000 scenes next to boxes of the ball's
+color it gives 0 and 90.5 % (2.0 and 88.6 %)."""
 HASH_DIGITS: Final = 16
 _SAME: Final = 0.3
-"""Overlap from which on boxes of two looks are of one thing."""
+"""Overlap from which boxes of two looks belong to one object."""
 MAX_BYTES: Final = 2**31
-"""A protocol buffer can be no larger."""
+"""Size limit of a protocol buffer."""
 _WARM_UP: Final = 3
-DEFAULT_MIN_SCORE: Final = 0.25  # for a model without `min_score`
+DEFAULT_MIN_SCORE: Final = 0.25  # for a model without `min_score` in its metadata
 _NOISE: Final = 0.05
-"""Scores below may be of boxes that the model has ruled out."""
+"""Boxes with a lower score may be boxes that the model has suppressed."""
 _NAME_LENGTH: Final = 48
 _MAX_BATCH: Final = 32
-"""Images in one run: bounds a GPU's memory."""
+"""Images in one run; limits the memory on a GPU."""
 _Place = tuple[float, float]
 """x, y in px of the encoded image."""
 
 
 class OnnxDetector:
-    """One model."""
+    """A detector with one model."""
 
     kind: ClassVar[str] = "onnx"
 
     class Config(Settings):
-        """The model, its device, and which of its answers count."""
+        """The model, its device, and the limits of its detections."""
 
         renamed_keys: ClassVar[Mapping[str, str]] = {"colour": "color"}
         address: str = ""
-        """The file; empty for the model that comes with Sightline, `nanodet` for its model of people and COCO."""
+        """The file; empty for the shipped ball model, `nanodet` for the shipped model of humans and COCO classes."""
         device: Device = "auto"
         threads: Annotated[int, Field(ge=1, le=64)] = 1
-        """Threads on the CPU. A small image only loses by being split."""
+        """Threads on the CPU. To split a small image only costs time."""
         min_score: Annotated[float | None, Field(ge=0, le=1)] = None
-        """None: `min_score` of the model's metadata, or else 0.25."""
+        """None: `min_score` of the model's metadata, or 0.25 without one."""
         names: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
-        """The labels, in order, or `coco` or `coco91`; empty for those of the model's metadata."""
+        """The labels, in order, or `coco` or `coco91`; empty for the labels of the model's metadata."""
         color: Literal["auto", "bgr", "rgb"] = "auto"
-        """The order of an input's channels; `auto`: bytes are BGR, floats RGB."""
+        """Channel order of the input; `auto`: bytes are BGR, floats RGB."""
         refine: Annotated[tuple[str, ...], Field(max_length=64)] = ("ball", "sports ball")
-        """Things with these labels are round: their edge is looked for in the image."""
+        """Labels of round objects. The detector searches for their edge in the image."""
         second_look: bool = True
-        """True to enlarge the part of the image where the followed target is expected, if nothing is found there,
-        and to look again at a thing in doubt without such a target (the model that comes with Sightline)."""
+        """True to enlarge the expected place of the followed target if nothing is detected there. Without a followed
+        target, the shipped model also looks again at an object in doubt."""
         expected_bonus: Annotated[float | None, Field(ge=0, le=1)] = None
-        """Added to the score of a target where one is expected, for a weaker sign is enough there, and less and less
-        up to a tenth of the image's width beside. None: 0.2 for the model that comes with Sightline, 0 for others."""
+        """Bonus for the score of a target at its expected place. It falls to 0 at a tenth of the image width from that
+        place. None: 0.2 for the model that comes with Sightline, 0 for others."""
         hsv: HsvConfig = HsvConfig()
         color_bonus: Annotated[float, Field(ge=0, le=1)] = 0.3
-        """Where `hsv.ranges` differs from the default: added to the score of a target of that color."""
+        """Bonus for the score of a target with a color of `hsv.ranges`, if these differ from the default."""
 
     def __init__(self, config: Config) -> None:
-        """Raises ConfigError for a file that is not such a model, HardwareError for a device that is not there."""
+        """Raises ConfigError for a file without a usable model, HardwareError for an unavailable device."""
         model = self.read_model(config)
         path, self._form, self._min_score = model.path, model.form, model.min_score
         self.labels = model.form.labels
-        """All that it can call a thing; empty where the model has only numbers."""
+        """All labels that it can give; empty if the model has only numbers."""
         self._refine = frozenset(config.refine)
         self._color = ColorMask(config.hsv.ranges) if config.hsv.ranges != HsvConfig().ranges else None
         self._color_check = RangeCheck(self._color) if self._color else None
         self._colored = self._color
-        """The color that counts in the images at hand."""
+        """Color mask for the current images, or None."""
         self._bonus = config.color_bonus
-        # What a pale image and a doubt need is not known of other models.
+        # The measures for pale images and for doubts are tested with the shipped models only.
         self._is_shipped = model.digest == shipped_digest() != ""
         own_bonus, given = _EXPECTED_BONUS if self._is_shipped else 0.0, config.expected_bonus
         self._expected_bonus = own_bonus if given is None else given
-        # A model of any size gets the image unscaled, and a part of it would be no larger.
+        # A model without a fixed input size gets the image unscaled, so a part of it would not be larger.
         self._second_look = config.second_look and model.form.size is not None
         self._looks_at_doubts = self._second_look and self._is_shipped
         self._engine = model.engine
@@ -138,7 +138,7 @@ class OnnxDetector:
 
     @classmethod
     def read_model(cls, config: Any) -> "LoadedModel":
-        """Load the model that `config` names, a `Config` of this class. Raises ConfigError and HardwareError."""
+        """Load the model of `config`, a `Config` of this class. Raises ConfigError and HardwareError."""
         return read_onnx_model(config)
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
@@ -146,7 +146,7 @@ class OnnxDetector:
         return self._in_parts(frames, deadline_us, self._max_batch)
 
     def notices(self) -> list[str]:
-        """Return the device, where that may surprise, and the first failure."""
+        """Return an unexpected choice of the device, and the first failure."""
         notices, self._notices = self._notices, []
         return notices
 
@@ -161,7 +161,7 @@ class OnnxDetector:
     def _run(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
         try:
             return timed_together(frames, self.maker, self._detections)
-        except Exception as error:  # an engine that fails on an image gives no answer, and reports that once
+        except Exception as error:  # an engine that fails on an image gives no answer; the first error is reported
             if len(frames) > 1:
                 return self._fewer_at_once(frames, deadline_us, error)
             text = report_fault("detector", error)
@@ -193,12 +193,12 @@ class OnnxDetector:
                 for (_, picture), found in zip(shown, together, strict=True)]
 
     def _finished(self, picture: DecodedImage, one: Detection) -> Detection:
-        """Refine a round thing. One that counts only where it is expected has the least score that counts."""
+        """Refine a round object. A detection that passes by its bonus only gets the least score."""
         one = refined(picture, one) if one.label in self._refine else one
         return one if one.score >= self._min_score else replace(one, score=self._min_score)
 
     def _is_color_usable(self, picture: DecodedImage) -> bool:
-        """Return False if the color marks the floor: all that stands there would get its bonus."""
+        """Return False if the color marks the floor, because any object there would get the bonus."""
         if self._color is None or self._color_check is None:
             return True
         if line := self._color_check.look(picture):
@@ -210,9 +210,9 @@ class OnnxDetector:
         self, frames: Sequence[DetectFrame], pictures: Sequence[DecodedImage], places: Sequence[_Place | None],
         least: float,
     ) -> list[tuple[Detection, ...]]:
-        """Run the model. Return what has the score `least` with the bonuses of a target, best first.
+        """Run the model. Return the detections with the score `least` after their bonuses, best first.
 
-        `places` are those of the pictures where the target is expected; its bonus there is not in the score.
+        `places` are the expected places in the pictures. The returned score does not include the bonus of a place.
         """
         color_bonus = self._bonus if self._colored else 0.0
         expected_bonus = self._expected_bonus if any(places) else 0.0
@@ -226,7 +226,7 @@ class OnnxDetector:
                 for frame, place, found in zip(frames, places, colored, strict=True)]
 
     def _with_color(self, frame: DetectFrame, picture: DecodedImage, one: Detection) -> Detection:
-        """Add its bonus to the score of a target of the configured color."""
+        """Add the color bonus to the score of a target of the configured color."""
         if self._colored is None or not frame.goes_by(one.label) or not self._colored.has_color(picture, one):
             return one
         return replace(one, score=min(1.0, one.score + self._bonus))
@@ -234,7 +234,7 @@ class OnnxDetector:
     def _best_first(
         self, frame: DetectFrame, place: _Place | None, found: Iterable[Detection], least: float = 0.0
     ) -> tuple[Detection, ...]:
-        """Sort by the score with the bonus of a target near `place`. Leave out what has less than `least`."""
+        """Sort by the score with the bonus of a target near `place`. Omit detections with less than `least`."""
         raised = [(one.score + self._expected_bonus * _nearness(frame, place, one), one) for one in found]
         best = sorted((pair for pair in raised if pair[0] >= least), key=lambda pair: -pair[0])
         return tuple(one for _, one in best[:MAX_DETECTED_BOXES])
@@ -242,10 +242,10 @@ class OnnxDetector:
     def _counted(
         self, frame: DetectFrame, picture: DecodedImage, seen: tuple[Detection, ...]
     ) -> tuple[Detection, ...]:
-        """Return what counts, best first.
+        """Return the detections that count, best first.
 
-        Where the target is expected, look again, enlarged, if the first look shows no sure target there. What counts
-        only by the bonus of the place counts as the enlarged part shows it, or else as the first look does.
+        Look again at the enlarged expected place if the first look has no sure target there. A detection that passes
+        only by the bonus comes from the enlarged part, or else from the first look.
         """
         found, place = tuple(one for one in seen if one.score >= self._min_score), frame.expected_px
         if place is None:
@@ -258,14 +258,14 @@ class OnnxDetector:
         return tuple(one for one in found if not self._is_doubtful(frame, one))
 
     def _is_doubtful(self, frame: DetectFrame, one: Detection) -> bool:
-        """Return True for a target that is not sure, elsewhere than it is expected."""
+        """Return True for a target with a low score away from its expected place."""
         return (self._looks_at_doubts and frame.goes_by(one.label) and one.score < self._min_score + _SURE
                 and not _nearness(frame, frame.expected_px, one))
 
     def _without_doubt(
         self, frame: DetectFrame, picture: DecodedImage, seen: tuple[Detection, ...], found: tuple[Detection, ...]
     ) -> tuple[Detection, ...]:
-        """Look again if the surest target is in doubt. Then the mean score of both looks counts for each target."""
+        """Look again if the surest target is in doubt. Then each target needs a sufficient mean score of both looks."""
         targets = [one for one in seen if frame.goes_by(one.label)]
         is_sure = not targets or targets[0].score >= self._min_score + _DOUBTED
         if is_sure or frame.looks_once or not self._looks_at_doubts:
@@ -298,7 +298,7 @@ class OnnxDetector:
             if expected is None and self._engine.device != "cpu":
                 on_cpu = self.read_model(config.model_copy(update={"device": "cpu"})).engine
                 expected = list(_found(on_cpu, [picture], form, least)[0])
-        except Exception as error:  # whatever an engine raises
+        except Exception as error:  # an engine may raise any error
             why = " ".join(str(error).split())[:160]
             raise ConfigError(f"model {path} does not run: {why}; see docs/how-to/detectors.md") from None
         wrong = difference(expected, found, least) if expected is not None else ""
@@ -317,19 +317,19 @@ class LoadedModel:
     form: ModelFormat
     min_score: float
     expected: list[Detection] | None
-    """Detections in the known image, if the metadata have them: its own labels, from its own least score on."""
+    """Detections in the known image, or None: with its own labels, from its own least score."""
     own_form: ModelFormat
     own_min_score: float
     digest: str
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """All labels that it can give; empty where it has only numbers."""
+        """All labels that it can give; empty if it has only numbers."""
         return self.form.labels
 
 
 def _nearness(frame: DetectFrame, place: _Place | None, one: Detection) -> float:
-    """Return 1 for a target at the place where it is expected, 0 from `_EXPECTED_WITHIN` on and without a place."""
+    """Return 1 for a target at its expected place, down to 0 at `_EXPECTED_WITHIN`; 0 without a place."""
     if place is None or not frame.goes_by(one.label):
         return 0.0
     share = math.dist(one.center_px, place) / (_EXPECTED_WITHIN * frame.width_px)
@@ -337,7 +337,7 @@ def _nearness(frame: DetectFrame, place: _Place | None, one: Detection) -> float
 
 
 def _mean(one: Detection, again: Sequence[Detection]) -> Detection:
-    """Return a thing as another look shows it, with the mean of both scores: half its own if that look lacks it."""
+    """Return a detection with the mean score of both looks. If the other look lacks it, half its own score."""
     shares = [(overlap(corners(one), corners(other)), other) for other in again if other.label == one.label]
     share, same = max(shares, key=lambda pair: pair[0], default=(0.0, one))
     return replace(same, score=(one.score + same.score) / 2) if share >= _SAME else replace(one, score=one.score / 2)
@@ -351,8 +351,8 @@ def read_onnx_model(config: OnnxDetector.Config) -> LoadedModel:
     """Load the model that `config` names.
 
     Raises:
-        ConfigError: for a file that is not a model, or of a form unknown here.
-        HardwareError: for a device that is not there.
+        ConfigError: for a file that is not a model, or has unknown inputs or outputs.
+        HardwareError: for an unavailable device.
     """
     named = {"": SHIPPED, "nanodet": NANODET}
     path = named.get(config.address) or home_path(config.address)
@@ -374,7 +374,7 @@ def read_onnx_model(config: OnnxDetector.Config) -> LoadedModel:
 def _found(
     engine: ModelEngine, pictures: Sequence[DecodedImage], form: ModelFormat, min_score: float
 ) -> list[tuple[Detection, ...]]:
-    """Return the detections of each image; more than one only where form and engine take them."""
+    """Return the detections of each image; several images only if form and engine accept a batch."""
     fitted = [fit_picture(picture, form) for picture in pictures]
     if len(fitted) == 1:
         each = [engine.run(fitted[0][0])]
@@ -385,21 +385,21 @@ def _found(
 
 
 class AutoDetector(DetectorWrapper):
-    """The default: the learned model, or the color range where that model cannot find the target."""
+    """The default: the learned model, or the color range for a target that the model does not know."""
 
     Config = OnnxDetector.Config
 
     def __init__(self, config: OnnxDetector.Config) -> None:
         is_learned = _is_learned(config)
         super().__init__(OnnxDetector(config) if is_learned else Hsv(Hsv.Config(hsv=config.hsv)))
-        notices_of(self.inner)  # that no GPU runs it only surprises a user who has named a model
+        notices_of(self.inner)  # drop the notice that no GPU is used: the user has not chosen a model
         self._notices: list[str] = [] if is_learned or config.hsv.shape == "any" else [
             "a color range finds the target, because ONNX Runtime is missing; for the learned detector: "
             + install_command("vision")]
 
     @classmethod
     def read_model(cls, config: OnnxDetector.Config) -> "LoadedModel | None":
-        """Load the model, where there is one. Raises ConfigError and HardwareError."""
+        """Load the model, if one is used. Raises ConfigError and HardwareError."""
         return read_onnx_model(config) if _is_learned(config) else None
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
@@ -413,18 +413,18 @@ class AutoDetector(DetectorWrapper):
 
 
 def _is_learned(config: OnnxDetector.Config) -> bool:
-    """Return False for a target of any shape, which no model knows, and where ONNX Runtime is missing and no device is
-    demanded."""
+    """Return False for a target of any shape, which no model knows. Also return False if ONNX Runtime is missing and
+    no device is required."""
     return config.hsv.shape != "any" and (config.device != "auto" or find_spec("onnxruntime") is not None)
 
 
 def shipped_digest() -> str:
-    """Return the hash of the model that comes with Sightline, as results carry it; empty without one."""
+    """Return the hash of the shipped model as in results; empty without a model."""
     return digest_of(SHIPPED) if SHIPPED.is_file() else ""
 
 
 def digest_of(*paths: Path) -> str:
-    """Return the first digits of the files' SHA-256, as results carry it. Raises ConfigError, one line."""
+    """Return the first digits of the files' SHA-256, as in results. Raises ConfigError, one line."""
     whole = hashlib.sha256()
     for path in paths:
         whole.update(_bytes_of(path))

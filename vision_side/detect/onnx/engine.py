@@ -1,7 +1,7 @@
 """Runs an ONNX model with ONNX Runtime, and reads the inputs, outputs and metadata of its file. Shell (loads files).
 
-It reports the device that the session really got, read after it was made: a runtime built for a GPU lists the GPU and
-silently runs on the CPU when it cannot have it.
+It reads the device from the open session. A runtime that is built for a GPU lists the GPU, but silently runs on the CPU
+if the GPU is not available.
 """
 
 import importlib
@@ -24,7 +24,7 @@ _TYPES: Final = {"tensor(float)": "float32", "tensor(uint8)": "uint8", "tensor(i
                  "tensor(float16)": "float16"}
 _DEVICES: Final = {provider: device for device, provider in PROVIDERS.items()}
 _BEHIND: Final = {"tensorrt": ("tensorrt", "cuda", "cpu"), "cuda": ("cuda", "cpu"), "cpu": ("cpu",)}
-"""Providers that a session for a device may fall back on for single operations."""
+"""Providers of a session for each device, in order; later providers run the operations that the first cannot."""
 _FIX: Final = ("install onnxruntime-gpu in place of onnxruntime (never both), see that `nvidia-smi` shows the GPU, or "
                "take --device auto")
 _USUAL_REASONS: Final = (
@@ -33,14 +33,14 @@ _USUAL_REASONS: Final = (
     ("not a registered function/op|No Op registered", "ONNX Runtime lacks one of its operators; export it without"),
     ("[Ee]xternal data|external tensors", "its weights are in a file of their own; put that file beside it"),
 )
-"""Patterns in the errors of ONNX Runtime, and what they mean."""
+"""Patterns in the errors of ONNX Runtime, and their causes."""
 _ERRORS_ONLY: Final = 3
 _LONGEST: Final = 200
 
 
 @dataclass(frozen=True, slots=True)
 class Tensor:
-    """An input or output; `shape` has None where the model leaves it open."""
+    """An input or output; `shape` has None for each open dimension."""
 
     name: str
     type: str
@@ -49,7 +49,7 @@ class Tensor:
 
 @dataclass(frozen=True, slots=True)
 class OnnxHeader:
-    """The head of one model."""
+    """Inputs, outputs and metadata of one model."""
 
     inputs: tuple[Tensor, ...]
     outputs: tuple[Tensor, ...]
@@ -57,7 +57,7 @@ class OnnxHeader:
 
 
 class ModelEngine(Protocol):
-    """Runs a model of any framework. `device` is what it runs on, `note` what an operator should know about that."""
+    """Runs a model of any framework. `device` is the device in use, `note` a remark on it for the operator."""
 
     name: str
     device: str
@@ -78,7 +78,7 @@ def _size(dimension: object) -> int | None:
 
 def import_runtime() -> Any:
     """Import ONNX Runtime. Raises ImportError."""
-    # Otherwise it sends telemetry, and stores a number of the device. It reads this once, when it is imported.
+    # Otherwise it sends telemetry and stores a device id. It reads this variable once, at import.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     return importlib.import_module("onnxruntime")
 
@@ -88,7 +88,7 @@ def open_engine(path: Path, device: Device, threads: int) -> "Engine":
 
     Raises:
         ConfigError: without ONNX Runtime, or for a file that is not a model.
-        HardwareError: for a device that the model did not get.
+        HardwareError: for a device that is not available to the model.
     """
     try:
         runtime = import_runtime()
@@ -101,7 +101,7 @@ def open_engine(path: Path, device: Device, threads: int) -> "Engine":
         engine = Engine(runtime, path, device, threads)
     except HardwareError:
         raise
-    except Exception as error:  # ONNX Runtime raises classes of its own for a bad file
+    except Exception as error:  # ONNX Runtime raises its own classes for a bad file
         raise ConfigError(f"model {path} cannot be opened: {_unfit(path, error)}"[:_LONGEST]) from None
     if device not in ("auto", engine.device):
         raise HardwareError(f"--device {device}: {engine.name} runs {path.name} on {engine.device} instead; {_FIX}")
@@ -109,7 +109,7 @@ def open_engine(path: Path, device: Device, threads: int) -> "Engine":
 
 
 def _unfit(path: Path, error: Exception) -> str:
-    """Return why a file is not a model that opens: the usual reasons, or what ONNX Runtime reports."""
+    """Return why a file does not open as a model: a usual reason, or the text of ONNX Runtime."""
     with path.open("rb") as file:
         head = file.read(2)
     if head == b"PK" or head[:1] == b"\x80":
@@ -119,24 +119,24 @@ def _unfit(path: Path, error: Exception) -> str:
 
 
 class Engine:
-    """A session of ONNX Runtime. `device` is what it runs on, `note` what an operator should know about that."""
+    """A session of ONNX Runtime. `device` is the device in use, `note` a remark on it for the operator."""
 
     def __init__(self, runtime: Any, path: Path, device: Device, threads: int) -> None:
-        """Raises HardwareError for a device that this runtime was not built for."""
+        """Raises HardwareError for a device that this runtime does not support."""
         self.name = f"onnxruntime {runtime.__version__}"
         available = set(runtime.get_available_providers())
         wanted = device if device != "auto" else ("cuda" if PROVIDERS["cuda"] in available else "cpu")
         if PROVIDERS[wanted] not in available:
             raise HardwareError(f"--device {wanted}: this onnxruntime has no {PROVIDERS[wanted]}; {_FIX}")
         if wanted != "cpu" and hasattr(runtime, "preload_dlls"):
-            runtime.preload_dlls()  # CUDA's libraries from wheels, which are on no path of the loader's
+            runtime.preload_dlls()  # CUDA libraries from wheels are not on the path of the loader
         options = runtime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.log_severity_level = _ERRORS_ONLY
         providers = [PROVIDERS[one] for one in _BEHIND[wanted] if PROVIDERS[one] in available]
         self._session = _session(runtime, path, options, providers)
-        self._session.disable_fallback()  # or a GPU that is lost later becomes the CPU without a word
+        self._session.disable_fallback()  # otherwise a GPU that is lost later is silently replaced by the CPU
         got = self._session.get_providers()[0]
         self.device = _DEVICES.get(got, got)
         self.note = "" if device != "auto" or self.device != "cpu" else _why_cpu(wanted)
@@ -150,7 +150,7 @@ class Engine:
 
 
 def _session(runtime: Any, path: Path, options: Any, providers: list[str]) -> Any:
-    """On the CPU where the others fail; ONNX Runtime would do that by itself, and print it where our output goes."""
+    """Open a session, on the CPU if the other providers fail. ONNX Runtime's own fallback would print to stdout."""
     try:
         return runtime.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
     except Exception:  # ONNX Runtime's own errors do not derive from RuntimeError

@@ -1,8 +1,7 @@
 """The detectors `torch:FILE`, `torch:package.module:Class`, `ultralytics:FILE` and `transformers:FOLDER`. Shell.
 
-Each opens an engine of another framework for the detector of ONNX models. No framework is a dependency: a missing one
-is one line with the command that installs it. A pickle can run any code when it is loaded, so that it needs the option
-`pickle`.
+Each opens an engine of another framework for the ONNX detector. No framework is a dependency. For a missing one, the
+error has the command that installs it. A pickle can run any code when it is loaded, so it needs the option `pickle`.
 """
 
 import importlib
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 _CLASSES: Final = PluginRegistry("model class", "sightline.torch_models")
 _IS_CLASS: Final = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 _SIDE_PX: Final = 640
-_Side = Annotated[int, Field(ge=1, le=8192)]  # a size of 0 would count as open
+_Side = Annotated[int, Field(ge=1, le=8192)]  # 0 would mean an open dimension
 _LONGEST: Final = 200
 _RISK: Final = "may be a Python pickle, which can run any code on this machine when it is loaded"
 _ULTRALYTICS: Final = {"YOLO_AUTOINSTALL": "false", "YOLO_OFFLINE": "true", "YOLO_VERBOSE": "false"}
@@ -42,20 +41,20 @@ _ULTRALYTICS: Final = {"YOLO_AUTOINSTALL": "false", "YOLO_OFFLINE": "true", "YOL
 
 
 class FrameworkDetector(OnnxDetector):
-    """A model that another package runs."""
+    """A detector whose model another package runs."""
 
     package: ClassVar[str] = ""
-    """The package that it needs, as pip and `import` name it."""
+    """The required package, as pip and `import` name it."""
     license: ClassVar[str] = ""
     """The license of the package."""
     example: ClassVar[str] = "FILE"
-    """An address, for the line that reports a missing one."""
+    """An example address for the line that reports a missing address."""
 
     class Config(OnnxDetector.Config):
-        """Those of `onnx`, and whether a pickle may be loaded."""
+        """The options of `onnx`, and the permission to load a pickle."""
 
         pickle: bool = False
-        """True to load a file that is a Python pickle. It can run any code, so use it for files that you trust only."""
+        """True to load a file that is a Python pickle. It can run any code, so use only files that you trust."""
 
     @classmethod
     def read_model(cls, config: Any) -> LoadedModel:
@@ -97,13 +96,13 @@ def _one_line(address: str) -> "Iterator[None]":
         raise
     except ValueError as error:
         raise ConfigError(f"model {address}: {' '.join(str(error).split())}"[:_LONGEST]) from None
-    except Exception as error:  # frameworks raise classes of their own for a bad file
+    except Exception as error:  # frameworks raise their own classes for a bad file
         text = " ".join(str(error).split())
         raise ConfigError(f"model {address} cannot be opened: {type(error).__name__}: {text}"[:_LONGEST]) from None
 
 
 def _allowed_pickle(path: Path, config: Any) -> str:
-    """Return the risk, for the operator. Raises ConfigError unless the configuration requests the pickle."""
+    """Return the risk, for the operator. Raises ConfigError unless the configuration permits a pickle."""
     if not config.pickle:
         raise ConfigError(f"model {path} {_RISK}; export it to ONNX, or if you trust it, "
                           "--set detector.options.pickle=true (`detector check`: --set pickle=true)")
@@ -111,7 +110,7 @@ def _allowed_pickle(path: Path, config: Any) -> str:
 
 
 def _device(torch: Any, wanted: str) -> str:
-    """Return cpu or cuda. Raises HardwareError for a device that this package does not have."""
+    """Return cpu or cuda. Raises HardwareError for a device that this package does not support."""
     has_cuda = bool(torch.cuda.is_available())
     if wanted == "tensorrt" or (wanted == "cuda" and not has_cuda):
         raise HardwareError(f"--device {wanted}: torch {torch.__version__} has no {wanted} here; try --device auto")
@@ -130,7 +129,7 @@ def _loaded(path: Path, engine: Any, form: ModelFormat, config: Any, digest: str
 
 
 class TorchDetector(FrameworkDetector):
-    """A TorchScript file, or a class of `torch.nn.Module` by its path."""
+    """A TorchScript file, or a class of `torch.nn.Module` by its import path."""
 
     kind = "torch"
     package = "torch"
@@ -138,12 +137,12 @@ class TorchDetector(FrameworkDetector):
     example = "model.torchscript, or torch:my_model:Net"
 
     class Config(FrameworkDetector.Config):
-        """Those of each framework, and what a PyTorch model does not state by itself."""
+        """The options of each framework, and facts that a PyTorch model does not contain."""
 
         size: Annotated[tuple[_Side, ...], Field(min_length=2, max_length=2)] | None = None
-        """Rows and columns of the input; None: those in the file, as Ultralytics writes them, or else 640x640."""
+        """Rows and columns of the input; None: the size in a file of Ultralytics, or else 640x640."""
         weights: str = ""
-        """For a class: the file of its `state_dict`, loaded without a pickle's code."""
+        """For a class: the file of its `state_dict`, loaded without the code of a pickle."""
 
     @classmethod
     def opened(cls, framework: Any, config: Any) -> LoadedModel:
@@ -173,7 +172,7 @@ def _of_class(torch: Any, config: Any) -> tuple[Any, str]:
         path = home_path(config.weights)
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
-        except pickle.UnpicklingError:  # it has more than tensors
+        except pickle.UnpicklingError:  # it contains more than tensors
             note = _allowed_pickle(path, config)
             state = torch.load(path, map_location="cpu", weights_only=False)
         module.load_state_dict(state)
@@ -181,12 +180,12 @@ def _of_class(torch: Any, config: Any) -> tuple[Any, str]:
 
 
 def _of_file(torch: Any, path: Path, config: Any) -> tuple[Any, dict[str, Any], str]:
-    """Return the module of a file, what the file states of it, and a note for the operator."""
+    """Return the module of a file, its metadata, and a note for the operator."""
     with path.open("rb") as file:
         head = file.read(2)
     names = zipfile.ZipFile(path).namelist() if zipfile.is_zipfile(path) else []
     if any(name.endswith("/constants.pkl") for name in names):
-        extra = {"config.txt": ""}  # as Ultralytics writes it
+        extra = {"config.txt": ""}  # metadata of Ultralytics
         return torch.jit.load(str(path), map_location="cpu", _extra_files=extra), _stated(extra["config.txt"]), ""
     if head == b"PK" and not names:
         raise ValueError("it is truncated; fetch the file again")
@@ -217,7 +216,7 @@ class _TorchEngine:
         self._as_list = False
 
     def header(self, rows: int, columns: int, metadata: Mapping[str, Any]) -> OnnxHeader:
-        """Run the module on an empty image, as a batch or as a list of images, and return what it takes and gives."""
+        """Run the module on an empty image, as a batch or as a list of images. Return its inputs and outputs."""
         pixels = np.zeros((1, 3, rows, columns), np.float32)
         try:
             outputs = self.run(pixels)
@@ -237,7 +236,7 @@ class _TorchEngine:
 
 
 def _arrays(given: Any) -> Arrays:
-    """Return the arrays of a module's answer: tensors, or as torchvision a table for each image, of YOLO the first."""
+    """Return the arrays of a module's answer: tensors, a table per image (torchvision), or the first output (YOLO)."""
     while isinstance(given, list | tuple) and given:
         tables = [one for one in given if isinstance(one, dict) and "boxes" in one]
         inner = [one for one in given if isinstance(one, list) and one and isinstance(one[0], dict)]
@@ -258,7 +257,7 @@ def _array(tensor: Any) -> NDArray[Any]:
     return array
 
 
-# --- Ultralytics and Transformers: models that take an image and give boxes ----------------------------------------
+# --- Ultralytics and Transformers: models from an image to boxes ---------------------------------------------------
 
 
 class _ImageEngine:
@@ -281,7 +280,7 @@ def _form(rgb: bool, labels: tuple[str, ...]) -> ModelFormat:
 
 
 class UltralyticsDetector(FrameworkDetector):
-    """A file of Ultralytics: YOLO, RT-DETR, with masks as circles."""
+    """A file of Ultralytics: YOLO, RT-DETR. A round mask gives a circle."""
 
     kind = "ultralytics"
     package = "ultralytics"
@@ -310,14 +309,14 @@ class UltralyticsDetector(FrameworkDetector):
 
     @classmethod
     def imported(cls) -> Any:
-        """Import the package, which then installs and downloads nothing."""
+        """Import the package with its installs and downloads disabled."""
         for name, value in _ULTRALYTICS.items():
             os.environ.setdefault(name, value)
         return super().imported()
 
 
 class TransformersDetector(FrameworkDetector):
-    """A folder of Transformers with a model for object detection: DETR, RT-DETR, YOLOS and others."""
+    """A folder of Transformers with an object detection model: DETR, RT-DETR, YOLOS and others."""
 
     kind = "transformers"
     package = "transformers"
@@ -326,7 +325,7 @@ class TransformersDetector(FrameworkDetector):
 
     @classmethod
     def opened(cls, framework: Any, config: Any) -> LoadedModel:
-        """Open the folder without downloads and without code in it."""
+        """Open the folder without downloads, and without running its code."""
         folder = home_path(config.address)
         files = sorted([*folder.glob("*.safetensors"), *folder.glob("*.bin")]) if folder.is_dir() else []
         digest = digest_of(folder / "config.json", *files)

@@ -1,7 +1,7 @@
-"""An image with a known answer: checks a model on this device. Pure.
+"""An image with a known answer, to check a model on this device. Pure.
 
-The image is drawn with integers only, so that it is the same everywhere. A model may carry its answer to it in its
-metadata, as `golden`; one that does not is compared with itself on the CPU.
+The image is drawn with integers only, so it is the same everywhere. The metadata of a model may contain its answer, as
+`golden`. Without it, the answer is compared with that of the same model on the CPU.
 """
 
 import json
@@ -17,13 +17,13 @@ KEY: Final = "golden"
 SIZE_PX: Final = (320, 240)
 LEAST_OVERLAP: Final = 0.8
 MOST_SCORE_APART: Final = 0.1
-"""Devices round differently; float16, as TensorRT may use, by the third digit."""
+"""Devices round differently; float16, e.g. of TensorRT, differs in the third digit."""
 _DISCS: Final = ((70, 80, 22, (13, 199, 242)), (180, 120, 40, (30, 180, 220)), (270, 60, 12, (200, 80, 30)))
 _MAX_TEXT: Final = 20_000
 
 
 def golden_picture() -> NDArray[np.uint8]:
-    """Disks on a chequered floor under a slope of light, BGR."""
+    """Draw disks on a checkered floor under a gradient of light, BGR."""
     width, height = SIZE_PX
     down, right = np.mgrid[0:height, 0:width]
     gray = 90 + (down * 60) // height + ((right // 20 + down // 20) % 2) * 18
@@ -38,13 +38,13 @@ def golden_picture() -> NDArray[np.uint8]:
 
 
 def golden_text(found: Sequence[Detection]) -> str:
-    """Write the detections for the metadata."""
+    """Format the detections for the metadata."""
     return json.dumps([[round(one.x1_px, 2), round(one.y1_px, 2), round(one.x2_px, 2), round(one.y2_px, 2),
                         round(one.score, 4), one.label] for one in found])
 
 
 def read_golden(text: str) -> list[Detection]:
-    """Raises ValueError for what `golden_text` does not write."""
+    """Parse the text of `golden_text`. Raises ValueError for other texts."""
     try:
         rows = json.loads(text[:_MAX_TEXT])
         return [Detection(float(x1), float(y1), float(x2), float(y2), float(score), str(label))
@@ -54,7 +54,7 @@ def read_golden(text: str) -> list[Detection]:
 
 
 def difference(expected: Sequence[Detection], found: Sequence[Detection], min_score: float) -> str:
-    """Why `found` is not what was expected; empty if it is. What is hardly sure enough to count may come or go."""
+    """Return why `found` differs from `expected`, or "". Detections near `min_score` may come and go."""
     surely = min_score + MOST_SCORE_APART
     for one in expected:
         if one.score >= surely and not any(_is_same(one, other) for other in found):

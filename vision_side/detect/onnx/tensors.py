@@ -1,10 +1,10 @@
-"""Images to input tensors, output tensors to detections. Pure.
+"""Convert images to input tensors, and output tensors to detections. Pure.
 
-Inputs: uint8 rows of pixels (1, H, W, 3), BGR unless configured, or float (1, 3, H, W), RGB as 0..1. Outputs:
-`boxes` (K, 4), `scores` (K), `labels` (K), as Sightline's own, and maybe `masks` (K, h, w); one (N, 6) of x1, y1, x2,
-y2, score, class; one (4 + classes, N) of cx, cy, w, h and a score for each class, as YOLO gives it since version 8, or
-one (N, 5 + classes) with a score of the box before those of the classes, as YOLOv5 gives it, both with overlaps still
-to be removed. Each box of YOLO may have numbers for a mask at its end, and a second output their prototypes.
+Inputs: uint8 rows of pixels (1, H, W, 3), BGR unless configured, or float (1, 3, H, W), RGB from 0 to 1. Outputs, one
+of these: `boxes` (K, 4), `scores` (K), `labels` (K), as in Sightline's model, with optional `masks` (K, h, w);
+(N, 6) of x1, y1, x2, y2, score, class; (4 + classes, N) of cx, cy, w, h and a score for each class, as in YOLO since
+version 8; (N, 5 + classes) with a score of the box before the class scores, as in YOLOv5. The last two forms still
+contain overlaps. A YOLO row may end with numbers for a mask; a second output then has the prototypes of the masks.
 """
 
 import ast
@@ -25,15 +25,15 @@ from sightline.vision_side.detect.port import NORMALIZED_PX, Circle, Detection, 
 Arrays = Mapping[str, NDArray[Any]]
 _MAX_ROWS: Final = 100_000
 _MAX_OVERLAP: Final = 0.5
-_GRAY: Final = 114  # beside an image that is narrower or lower than the input; what YOLO was trained with
-_STEP_PX: Final = 32  # an input of any size is rounded up to this
+_GRAY: Final = 114  # border next to an image that does not fill the input, as in the training of YOLO
+_STEP_PX: Final = 32  # an open input size is rounded up to a multiple of this
 _TRIPLE: Final = {"boxes", "scores", "labels"}
 _SUPPRESSED: Final = 1000
-"""Rows from which six numbers are YOLOv5's single class, and not the few boxes of a model that removes overlaps."""
+"""With more rows, six numbers are one class of YOLOv5. With fewer, they are boxes without overlaps."""
 _COMPARED: Final = 1000
-"""The surest so many boxes are compared for overlaps; at most 64 of them count."""
+"""Boxes with the highest scores that are compared for overlaps; at most 64 of them count."""
 _LEAST_ROUND: Final = 0.8
-"""Share of the enclosing circle that a mask fills if it is round. A square fills 0.64."""
+"""Least share of the enclosing circle that a round mask fills. A square fills 0.64."""
 _MAX_LABELS: Final = 1000
 _ROUNDING_PX: Final = 1.0
 _COCO: Final = (
@@ -47,12 +47,12 @@ _COCO: Final = (
 COCO: Final = tuple(_COCO.split(","))
 """The labels of the 80 classes of COCO, in their usual order. Source: Lin et al., Microsoft COCO, 2014."""
 _NO_CLASS: Final = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
-"""Numbers without a class among the 91 of COCO's own files, which torchvision and DETR use."""
+"""Numbers without a class among the 91 of the original COCO files, which torchvision and DETR use."""
 
 
 @dataclass(frozen=True, slots=True)
 class Letterbox:
-    """Place of the image in the input: `scale` input pixels for each of its own, from (`left`, `top`)."""
+    """Place of the image in the input: `scale` input pixels for each image pixel, from (`left`, `top`)."""
 
     scale: float
     left: int
@@ -61,24 +61,24 @@ class Letterbox:
 
 @dataclass(frozen=True, slots=True)
 class ModelFormat:
-    """The inputs and outputs of one model."""
+    """Layout of the inputs and outputs of one model."""
 
     floats: bool
     rgb: bool
     size: tuple[int, int] | None
-    """(rows, columns); None where any will do."""
+    """(rows, columns); None if the model accepts any size."""
     kind: str
     """triple, rows, yolo or yolov5."""
     labels: tuple[str, ...]
     dtype: str = "uint8"
     batched: bool = False
-    """True if it takes several images at once: inputs and outputs leave the number open."""
+    """True if it accepts several images: inputs and outputs leave the first dimension open."""
     masks: int = 0
-    """Numbers at the end of each row that, with the prototypes, give a mask."""
+    """Numbers at the end of each row, which combine the prototypes to a mask."""
 
 
 def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelFormat:
-    """Raises ValueError for a model that takes or gives something else."""
+    """Parse inputs and outputs. Raises ValueError for an unknown layout."""
     if len(header.inputs) != 1:
         raise ValueError(f"it takes {len(header.inputs)} inputs; expected one image")
     one = header.inputs[0]
@@ -103,7 +103,7 @@ def model_format(header: OnnxHeader, names: Sequence[str], color: str) -> ModelF
 
 
 def named_labels(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the labels of a configuration. `coco` and `coco91` stand for those of COCO, by either numbering."""
+    """Return the labels of a configuration. `coco` and `coco91` are the labels of COCO, in either numbering."""
     if tuple(names) == ("coco91",):
         words = iter(COCO)
         return tuple("none" if number in _NO_CLASS else next(words) for number in range(len(COCO) + len(_NO_CLASS)))
@@ -117,7 +117,7 @@ def _is_for_several(output: Tensor, kind: str) -> bool:
 
 
 def _is_prototypes(output: Tensor) -> bool:
-    """Return True for (1, M, h, w), of which each box's M numbers make a mask."""
+    """Return True for (1, M, h, w): prototypes, which the M numbers of a box combine to its mask."""
     return len(output.shape) == 4 and output.shape[1] is not None
 
 
@@ -148,7 +148,7 @@ def _kind(outputs: Sequence[Tensor], labels: Sequence[str]) -> tuple[str, int, i
 
 
 def _is_by_row(shape: Sequence[int | None], labels: int, masks: int) -> bool:
-    """Return True for a box in each row. By the number of labels, else there are more boxes than classes."""
+    """Return True if each row is a box: by the number of labels, otherwise because boxes outnumber classes."""
     if labels and shape[1] == 4 + labels + masks:
         return False
     if labels and shape[2] == 5 + labels + masks:
@@ -157,7 +157,7 @@ def _is_by_row(shape: Sequence[int | None], labels: int, masks: int) -> bool:
 
 
 def own_labels(metadata: Mapping[str, str]) -> tuple[str, ...]:
-    """Read the labels: `labels` is a JSON list; `names`, as others write it, a Python dictionary of numbers."""
+    """Read the labels: `labels` is a JSON list; `names`, of other exporters, a Python dictionary by number."""
     try:
         if "labels" in metadata:
             found = json.loads(metadata["labels"])
@@ -197,14 +197,14 @@ def read_outputs(
 ) -> tuple[Detection, ...]:
     """Return the detections, best first, in px of the encoded image.
 
-    Raises ValueError for outputs of another shape than in the header, and for numbers that are not finite in what
-    counts: that is not the same as "saw nothing".
+    Raises ValueError for outputs with another shape than in the header, and for non-finite numbers in boxes that
+    count. Such an answer differs from "detected nothing".
     """
     boxes, scores, labels = _READERS[form.kind](outputs, form.masks)
     count = len(boxes)
     if boxes.shape != (count, 4) or scores.shape != (count,) or labels.shape != (count,):
         raise ValueError(f"boxes {boxes.shape}, scores {scores.shape}, labels {labels.shape}")
-    counts = np.flatnonzero(~(scores < min_score))  # nan counts, too
+    counts = np.flatnonzero(~(scores < min_score))  # includes nan
     boxes, scores, labels = boxes[counts], scores[counts], labels[counts]
     if not (np.isfinite(boxes).all() and np.isfinite(scores).all() and np.isfinite(labels).all()):
         raise ValueError("a box, score or label is nan or infinite")
@@ -215,7 +215,7 @@ def read_outputs(
     if form.kind.startswith("yolo"):
         first = first[:_COMPARED]
         first = first[_uncovered(boxes[first], scores[first], labels[first])]
-    first = first[:MAX_DETECTED_BOXES]  # the surest so many count
+    first = first[:MAX_DETECTED_BOXES]  # the boxes with the highest scores
     circles = _circles(outputs, form, counts[first], boxes[first])
     corner, scale = np.array([letterbox.left, letterbox.top]), picture.scale / letterbox.scale
     placed = (boxes[first] - [*corner, *corner]) * scale
@@ -287,7 +287,7 @@ def _yolov5(outputs: Arrays, masks: int) -> _Columns:
 
 
 def _surest(columns: NDArray[Any], first: int, masks: int) -> _Columns:
-    """Return box and surest class of each column: cx, cy, w, h, and from `first` on a score for each class."""
+    """Return box and best class of each column: cx, cy, w, h, and from row `first` a score for each class."""
     _bounded(columns.T)
     half, classes = columns[2:4].astype(np.float64) / 2, columns[first : columns.shape[0] - masks]
     labels = classes.argmax(axis=0)
@@ -296,7 +296,7 @@ def _surest(columns: NDArray[Any], first: int, masks: int) -> _Columns:
 
 
 def _of_boxes(outputs: Arrays) -> NDArray[Any]:
-    """Return the output that has the boxes: prototypes of masks have four dimensions."""
+    """Return the output with the boxes, which does not have the four dimensions of mask prototypes."""
     return next((one for one in outputs.values() if one.ndim != 4), np.zeros(0))
 
 
@@ -309,13 +309,13 @@ def _bounded(rows: NDArray[Any]) -> NDArray[Any]:
 _READERS: Final = {"triple": _triple, "rows": _rows, "yolo": _yolo, "yolov5": _yolov5}
 
 
-# --- masks: only the circle of a round one is used -----------------------------------------------------------------
+# --- masks: only the circle of a round mask is used ----------------------------------------------------------------
 
 
 def _circles(
     outputs: Arrays, form: ModelFormat, rows: NDArray[np.intp], boxes: NDArray[Any]
 ) -> list[Circle | None]:
-    """Return the circle of each of these rows' masks, px of the input; None for those that are not round."""
+    """Return the circle of the mask of each row, px of the input; None for a mask that is not round."""
     if form.kind == "triple":
         masks = np.asarray(outputs.get("masks", np.zeros(0)))
         if not masks.size:
@@ -334,7 +334,7 @@ def _circles(
 
 
 def _of_prototypes(mask: NDArray[np.bool_], box: NDArray[Any], scale: float) -> Circle | None:
-    """Return the circle of a mask, which counts within its box only."""
+    """Return the circle of the part of a mask inside its box."""
     x1, y1, x2, y2 = (max(0, round(float(one))) for one in box)
     inside = np.zeros_like(mask)
     inside[y1:y2, x1:x2] = mask[y1:y2, x1:x2]
@@ -351,7 +351,7 @@ def circle_of(mask: NDArray[np.bool_]) -> Circle | None:
     points = np.argwhere(mask)[:, ::-1].astype(np.float32)
     if not len(points):
         return None
-    radius = cv2.minEnclosingCircle(points)[1] + 0.5  # to the edge of a pixel
+    radius = cv2.minEnclosingCircle(points)[1] + 0.5  # to the outer edge of the pixels
     if len(points) < _LEAST_ROUND * np.pi * radius * radius:
         return None
     x, y = points.mean(axis=0) + 0.5
@@ -367,7 +367,7 @@ def _moved(ring: Circle, corner: NDArray[Any], scale: float) -> Circle:
 
 
 def _uncovered(boxes: NDArray[Any], scores: NDArray[Any], labels: NDArray[Any]) -> NDArray[np.intp]:
-    """Indices of the boxes that no surer one of the same class overlaps: a cup may stand on a plate."""
+    """Return the boxes without an overlapping box of the same class and a higher score: a cup may stand on a plate."""
     corners = np.column_stack([boxes[:, :2], boxes[:, 2:] - boxes[:, :2]])
     kept = np.zeros(len(boxes), bool)
     for label in np.unique(labels):
@@ -380,25 +380,25 @@ def _uncovered(boxes: NDArray[Any], scores: NDArray[Any], labels: NDArray[Any]) 
 # --- a part of an image, enlarged by the fit to the input ---------------------------------------------------------
 
 
-# Mean difference of the largest and smallest channel, by the mean brightness: of the plain world; of a pale image; and
-# of a gray one, whose color is noise. With 0.3 of the saturation the plain world has 0.023.
+# Mean difference of largest and smallest channel, divided by the mean brightness: for a usual image; limit of a pale
+# image; limit of a gray image, whose color is noise. A usual image at 0.3 of its saturation has 0.023.
 _USUAL, _PALE, _COLORLESS = 0.077, 0.04, 0.005
 _MOST_VIVID = 3.3
 TILE_SHARE: Final = 0.6
-"""Of the image's sides: the sides of a tile."""
+"""Sides of a tile, as a share of the sides of the image."""
 _SMALL_SHARE: Final = 24 / 320
-"""Of the image's width: a narrower thing in doubt is enlarged. Decision 14 compares it with other rules."""
+"""Share of the image width: an object in doubt that is narrower is enlarged. Decision 14 compares other rules."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImageTile:
-    """A part of an image as an image of its own, and its place: its upper left corner, px of the encoded image."""
+    """A part of an image, with its upper left corner in px of the encoded image."""
 
     picture: DecodedImage
     left_px: int
     top_px: int
     is_mirrored: bool = False
-    """Left and right are swapped in it, which must then show the whole image."""
+    """True if left and right are swapped. Such a tile must show the whole image."""
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -407,18 +407,18 @@ class ImageTile:
         return int(columns) * self.picture.scale, int(rows) * self.picture.scale
 
     def shows_all(self, one: Detection) -> bool:
-        """Return True if `one`, in px of this tile, is clear of its border: it may go on beyond."""
+        """Return True if `one`, in px of this tile, is clear of the border, where an object may continue outside."""
         width, height = self.size_px
         is_clear = one.x1_px > 1 and one.y1_px > 1 and one.x2_px < width - 1 and one.y2_px < height - 1
         return is_clear or self.is_mirrored
 
     def holds(self, one: Detection) -> bool:
-        """Return True if `one`, in px of the whole image, is clear of the border of this tile."""
+        """Return True if `one`, in px of the whole image, does not touch the border of this tile."""
         return self.shows_all(replace(one, x1_px=one.x1_px - self.left_px, y1_px=one.y1_px - self.top_px,
                                       x2_px=one.x2_px - self.left_px, y2_px=one.y2_px - self.top_px))
 
     def in_image(self, one: Detection) -> Detection:
-        """Return a detection in this tile in px of the whole image."""
+        """Convert a detection from px of this tile to px of the whole image."""
         if self.is_mirrored:
             width = self.size_px[0]
             circle = one.circle and replace(one.circle, cx_px=width - one.circle.cx_px)
@@ -429,7 +429,7 @@ class ImageTile:
 
 
 def vivid(picture: DecodedImage) -> DecodedImage:
-    """Return a pale image with the usual saturation, as the shipped models know it; any other image as it is."""
+    """Give a pale image the saturation of the training images; return any other image unchanged."""
     part = picture.bgr[::8, ::8].astype(np.int16)
     chroma = float((part.max(axis=2) - part.min(axis=2)).mean()) / max(1.0, float(part.mean()))
     if not _COLORLESS < chroma < _PALE:
@@ -440,7 +440,7 @@ def vivid(picture: DecodedImage) -> DecodedImage:
 
 
 def tile_about(picture: DecodedImage, place_px: tuple[float, float]) -> ImageTile:
-    """Cut the tile about a place, in px of the encoded image; at the border it moves inside."""
+    """Cut the tile around a place, in px of the encoded image. Near the border it moves inside the image."""
     rows, columns = picture.bgr.shape[:2]
     height, width = max(1, round(rows * TILE_SHARE)), max(1, round(columns * TILE_SHARE))
     left = min(max(0, round(place_px[0] / picture.scale - width / 2)), columns - width)
@@ -450,7 +450,7 @@ def tile_about(picture: DecodedImage, place_px: tuple[float, float]) -> ImageTil
 
 
 def view_again(picture: DecodedImage, one: Detection) -> ImageTile:
-    """Return an image in which a thing in doubt looks different: a small one is enlarged, another one mirrored."""
+    """Return an image in which an object in doubt looks different: enlarged if it is small, otherwise mirrored."""
     tile = tile_about(picture, one.center_px)
     if (one.x2_px - one.x1_px) < _SMALL_SHARE * picture.bgr.shape[1] * picture.scale and tile.holds(one):
         return tile

@@ -1,5 +1,5 @@
-"""Shared by remote detectors: addresses, reasons for no answer, reading boxes, one request for each frame. Shell (a
-clock).
+"""Shared parts of remote detectors: addresses, reasons for no answer, parsing of boxes, one request per frame. Shell
+(a clock).
 """
 
 import re
@@ -30,7 +30,7 @@ from sightline.vision_side.detect.port import (
 )
 
 DEFAULT_PORTS: Final = {"oip+http": 8000, "http+jpeg": 80}
-"""Those of Triton, and of HTTP."""
+"""Default ports of Triton and of HTTP."""
 _HOST = r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9_.-]+)"
 _FORM = re.compile(rf"(oip\+http|http\+jpeg)://{_HOST}(?::([0-9]{{1,5}}))?(/[!-~]*)?")
 _MODEL = re.compile(r"/([A-Za-z0-9_.-]{1,128})(?:/([0-9]{1,9}))?")
@@ -42,7 +42,7 @@ EXAMPLES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """A server, and the path there, or the model and perhaps its version."""
+    """A server with a path, or with a model and an optional version."""
 
     scheme: str
     host: str
@@ -53,7 +53,7 @@ class Address:
 
 
 def parse_address(kind: str) -> Address:
-    """Split an address. Raises ConfigError, with the right form, for an invalid one."""
+    """Split an address. Raises ConfigError, with the expected form, for an invalid one."""
     scheme = kind.partition("://")[0]
     example = EXAMPLES.get(scheme, EXAMPLES["oip+http"])
     match = _FORM.fullmatch(kind)
@@ -71,33 +71,32 @@ def parse_address(kind: str) -> Address:
     return Address(scheme, host, port, path, named[1], named[2] or "")
 
 
-# Reasons why a remote detector gave no valid answer: one list, one exception, one counter. Pure.
+# Reasons why a remote detector gave no valid answer: a list, an exception, a counter. Pure.
 
 
 _LONGEST: Final = 160
 _REPORTED_AT: Final = frozenset(10**power for power in range(10))
-"""A server that fails is reported at the 1st, 10th, 100th ... rejection of a kind, when its answers are good again, and
-when they are bad again."""
+"""The 1st, 10th, 100th ... rejection of a kind is logged. A change between good and bad answers is logged, too."""
 _IN_A_ROW: Final = 10
-"""After so many good answers, or so many rejections, it is bad again. Fewer come and go, as where one robot of several
-is not answered; a line for each of them would be one for each frame."""
+"""Good answers, or rejections, in a row after which the log reports a bad server again. Without it, a fleet with one
+robot that gets no answers would log a line for each frame."""
 
 
 class NoAnswerReason(StrEnum):
-    """Reasons that are counted. All of them mean "no answer": none of them moves the robot."""
+    """Counted reasons. Each of them means "no answer", which never moves the robot."""
 
-    LATE = "LATE"  # not there by the deadline
-    UNREACHABLE = "UNREACHABLE"  # no server there, or gone in the middle of the answer
-    REJECTED = "REJECTED"  # it answered with an error of its own
-    TOO_LARGE = "TOO_LARGE"  # more bytes than any answer needs
-    ENCODED = "ENCODED"  # compressed, which was not requested; never unpacked
-    MALFORMED = "MALFORMED"  # not the protocol: grammar, type, shape
-    NOT_FINITE = "NOT_FINITE"  # a box or score that is nan or infinite
-    TOO_MANY = "TOO_MANY"  # more boxes than any scene has
+    LATE = "LATE"  # no answer by the deadline
+    UNREACHABLE = "UNREACHABLE"  # no connection, or lost during the answer
+    REJECTED = "REJECTED"  # the server returned an error
+    TOO_LARGE = "TOO_LARGE"  # more bytes than a valid answer needs
+    ENCODED = "ENCODED"  # compressed without request; it is not decompressed
+    MALFORMED = "MALFORMED"  # wrong syntax, type or shape
+    NOT_FINITE = "NOT_FINITE"  # a box or score is nan or infinite
+    TOO_MANY = "TOO_MANY"  # more boxes than the limit
     OTHER_FRAME = "OTHER_FRAME"  # it names another frame than the request
-    OTHER_SIZE = "OTHER_SIZE"  # it looked at an image of another size
-    UNFIT = "UNFIT"  # its model takes or gives what this end does not speak
-    BAD_PICTURE = "BAD_PICTURE"  # the robot's own frame is not a JPEG of its size: nothing was requested
+    OTHER_SIZE = "OTHER_SIZE"  # it is for another image size
+    UNFIT = "UNFIT"  # the inputs or outputs of the model are not supported
+    BAD_PICTURE = "BAD_PICTURE"  # the frame is not a JPEG of the robot's size; nothing was sent
 
 
 class NoAnswerError(Exception):
@@ -110,7 +109,7 @@ class NoAnswerError(Exception):
 
 
 class ErrorCounters:
-    """Counts the rejected answers of one remote detector, and reports each change."""
+    """Counts the rejected answers of one remote detector, and logs each change."""
 
     def __init__(self, name: str) -> None:
         self.rejected: Counter[str] = Counter()
@@ -118,10 +117,10 @@ class ErrorCounters:
         self._name = name
         self._reported = ""
         self._good = self._bad = 0
-        """In a row."""
+        """Good and bad answers in a row."""
 
     def reject(self, error: NoAnswerError) -> None:
-        """Count one answer that does not count."""
+        """Count a rejected answer."""
         self.rejected[error.reason] += 1
         count, good_before = self.rejected[error.reason], self._good
         self._good, self._bad = 0, self._bad + 1
@@ -131,20 +130,20 @@ class ErrorCounters:
             self.notices.add(f"detector {self._name}: no answer: {error.reason}: {error.detail} ({count} so far)")
 
     def good(self) -> None:
-        """Count one answer that counts."""
+        """Count a valid answer."""
         self._good, self._bad = self._good + 1, 0
         if self._reported != "good":
             before, self._reported = self._reported, "good"
             self.notices.add(f"detector {self._name} answers" + (" again" if before else ""))
 
 
-# Columns of numbers from a server -> detections, nothing taken on trust. Pure.
+# Convert columns of numbers from a server to detections, with every number validated. Pure.
 
 
 MAX_ROWS: Final = 1024
-"""Security limit: a model with a fixed number of rows fills up with scores of 0; no detector needs more."""
+"""Security limit. A model with a fixed number of rows fills the rest with scores of 0. No detector needs more rows."""
 MIN_SCORE: Final = 0.25
-"""The least score of a box, as for boxes on the wire, unless configured otherwise."""
+"""Least score of a box, as for boxes on the wire, unless configured."""
 _HASH: Final = re.compile("[0-9a-fA-F]{8,64}")
 Numbers = NDArray[Any]
 
@@ -153,10 +152,10 @@ def read_columns(
     boxes: Numbers, scores: Numbers, labels: Sequence[str], *, stretch: tuple[float, float], size_px: tuple[int, int],
     min_score: float,
 ) -> tuple[Detection, ...]:
-    """Boxes (K, 4) xyxy, scores (K,) and labels (K) as detections, best first, at most as many as the wire allows.
+    """Convert boxes (K, 4) xyxy, scores (K,) and labels (K) to detections, best first, up to the limit of the wire.
 
-    `stretch` turns the boxes' pixels into those of the encoded image. Rows below `min_score` are left out and
-    may hold anything finite. Raises NoAnswerError for a wrong shape or order, too many rows, and what is not finite.
+    `stretch` converts pixels of the boxes to pixels of the encoded image. Rows below `min_score` are dropped, with any
+    finite values. Raises NoAnswerError for a wrong shape or order, too many rows, and numbers that are not finite.
     """
     _check_shapes(boxes, scores, labels)
     if not (np.isfinite(boxes).all() and np.isfinite(scores).all()):
@@ -189,7 +188,7 @@ def _detection(
 
 
 def read_boxes(boxes: Sequence[DetectedBox], size_px: tuple[int, int], min_score: float) -> tuple[Detection, ...]:
-    """Boxes of the wire, which checked each by itself, as detections in the image, best first."""
+    """Convert boxes of the wire, which are valid one by one, to detections in the image, best first."""
     found = [clipped(_of_wire(box), *size_px) for box in boxes if box.score >= min_score]
     return tuple(sorted((one for one in found if one), key=lambda one: one.score, reverse=True))
 
@@ -206,13 +205,13 @@ def hash_of(text: str) -> str:
     return text[:16].lower() if _HASH.fullmatch(text) else ""
 
 
-# A detector that sends a server one frame after the other. Shell (the clock, for how long it took).
+# A detector that sends one frame after the other to a server. Shell (the clock, for the computing time).
 
 
 REMOTE: Final = "remote"
-"""The device of a result, where the server does not name one."""
+"""The device of a result if the server names none."""
 LONGEST_WAIT_S: Final = 2.0
-"""For an answer, whatever the deadline: twice the longest that can be configured."""
+"""Longest wait for an answer without a deadline; twice the longest configurable deadline."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,10 +223,10 @@ class ServerAnswer:
 
 
 class DetectorServer(Protocol):
-    """The client of one kind of server."""
+    """Interface of a client for one kind of server."""
 
     def request(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
-        """Return its answer; block until about `until_us`. Raises NoAnswerError for everything else."""
+        """Return the answer; block until about `until_us`. Raises NoAnswerError without a valid answer."""
         ...
 
     def close(self) -> None:
@@ -236,14 +235,14 @@ class DetectorServer(Protocol):
 
 
 class FrameByFrame(ABC):
-    """A `Detector` that requests one frame after the other from elsewhere, and counts the answers that it rejects."""
+    """A `Detector` that requests one frame after the other from a remote side, and counts the rejected answers."""
 
     def __init__(self, name: str) -> None:
         self._error_counters = ErrorCounters(name)
 
     @property
     def rejected(self) -> Counter[str]:
-        """Answers rejected so far, by reason."""
+        """Return the number of rejected answers, by reason."""
         return self._error_counters.rejected
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> list[DetectionResult | None]:
@@ -269,7 +268,7 @@ class FrameByFrame(ABC):
 
 
 class ServerDetector(FrameByFrame):
-    """A detector over one server. It may block for longer than the deadline; `DeadlineDetector` around it does not."""
+    """A detector with one server. It may block longer than the deadline; a `DeadlineDetector` around it does not."""
 
     def __init__(self, name: str, server: DetectorServer) -> None:
         super().__init__(name)
@@ -284,7 +283,7 @@ class ServerDetector(FrameByFrame):
         _check_picture(frame)
         try:
             answer = self._server.request(frame, deadline_us)
-        except WireError as error:  # of pixels that the model needs
+        except WireError as error:  # invalid image, for a model that needs pixels
             raise NoAnswerError(NoAnswerReason.BAD_PICTURE, error.detail) from None
         ended_us = monotonic_us()
         if ended_us > deadline_us:
@@ -293,7 +292,7 @@ class ServerDetector(FrameByFrame):
 
 
 def _check_picture(frame: DetectFrame) -> None:
-    """Check the size in the JPEG's head: its bytes are sent undecoded."""
+    """Check the image size in the JPEG header, because the JPEG is sent undecoded."""
     try:
         size = read_jpeg_size(frame.jpeg, frame.width_px * frame.height_px)
     except WireError as error:
@@ -303,5 +302,5 @@ def _check_picture(frame: DetectFrame) -> None:
 
 
 def seconds_left(until_us: int) -> float:
-    """Return the time left until `until_us`, at least 0; bounded where there is no deadline."""
+    """Return the time left until `until_us`, at least 0 and at most `LONGEST_WAIT_S`."""
     return min(max(0, until_us - monotonic_us()) / 1e6, LONGEST_WAIT_S)

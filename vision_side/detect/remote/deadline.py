@@ -1,7 +1,7 @@
-"""Runs any detector on a thread of its own and waits for it until the deadline. Shell.
+"""Run any detector on a separate thread and wait for it until the deadline. Shell.
 
-Whatever hangs in there (a name server, a socket, a model) hangs alone. While it is busy, newer frames replace each
-other in one place; an answer that comes too late is dropped.
+A call that hangs (a name server, a socket, a model) blocks only this thread. While the thread is busy, each newer frame
+replaces the one that waits. An answer after the deadline is dropped.
 """
 
 import threading
@@ -31,25 +31,25 @@ Results = list[DetectionResult | None]
 PixelBound = Annotated[int, Field(ge=256, le=4096 * 4096)]
 MAX_PIXELS: Final = 1920 * 1080
 FAILED: Final = "FAILED"
-"""Counted beside the rejections of the inner detector: it raised or returned an invalid answer."""
+"""Counter, next to the rejections of the inner detector, of errors and invalid answers."""
 _CLOSE_S: Final = 1.0
 
 
 class Pending:
-    """Requested frames, and the place where their results will be."""
+    """Requested frames, and the slot for their results."""
 
     def __init__(self, frames: Sequence[DetectFrame], deadline_us: int) -> None:
         self.frames, self.deadline_us = frames, deadline_us
         self.begun = False
-        """True once the inner detector has them; newer ones may have taken their place before."""
+        """True once the inner detector has the frames. Newer frames may replace them before."""
         self._place: LatestSlot[Results] = LatestSlot()
 
     def answer(self, results: Results) -> None:
-        """Put the results there."""
+        """Put the results into the slot."""
         self._place.put(results)
 
     def take(self, wait: bool) -> Results | None:
-        """Take the results, once; None if they are not there, with `wait` by the deadline."""
+        """Take the results once. Without `wait` it returns immediately. None if no results are there in time."""
         return self._place.take(seconds_left(self.deadline_us) if wait else 0.0)
 
     @property
@@ -59,7 +59,7 @@ class Pending:
 
 
 class DeadlineDetector:
-    """A `Detector` over another one, which is used on one thread only and closed there."""
+    """A `Detector` over another detector, which runs and closes on one separate thread."""
 
     waits: ClassVar[bool] = True
 
@@ -77,7 +77,7 @@ class DeadlineDetector:
 
     @property
     def rejected(self) -> Counter[str]:
-        """Rejections of the inner detector, if it counts them; and how often it raised, or gave an invalid answer."""
+        """Return the rejections of the inner detector, if it counts them, plus its errors and invalid answers."""
         return Counter(getattr(self._inner, "rejected", Counter())) + self._failed
 
     @property
@@ -91,13 +91,13 @@ class DeadlineDetector:
         return [None for _ in frames] if results is None else results
 
     def request(self, frames: Sequence[DetectFrame], deadline_us: int) -> Pending:
-        """Begin to request `frames`, in place of any that wait."""
+        """Request `frames`. They replace frames that still wait."""
         pending = Pending(frames, deadline_us)
         self._pending.put(pending)
         return pending
 
     def attach(self, link: Link) -> None:
-        """Give the inner one a robot's link."""
+        """Pass a robot's link to the inner detector."""
         attach_detector(self._inner, link)
 
     def notices(self) -> list[str]:
@@ -105,7 +105,7 @@ class DeadlineDetector:
         return [*notices_of(self._inner), *self._news.take()]
 
     def close(self) -> None:
-        """End the thread; one that hangs is left behind. Raises ConfigError if the inner one's `close` fails."""
+        """End the thread, without waiting for a call that hangs. Raises ConfigError if the inner `close` fails."""
         self._ending.set()
         self._pending.put(None)
         self._thread.join(_CLOSE_S)
@@ -119,7 +119,7 @@ class DeadlineDetector:
                 pending.begun = True
                 try:
                     self._answer(pending)
-                except Exception as error:  # no memory for another decoder: this thread must not end by it
+                except Exception as error:  # e.g. no memory for a decoder; it must not end this thread
                     self._fail(f"{type(error).__name__}: {report_fault('detector', error)}")
         try:
             close_detector(self._inner)
@@ -136,7 +136,7 @@ class DeadlineDetector:
             pending.answer([None if isinstance(one, str) else one for one in results])
 
     def _fail(self, why: str) -> None:
-        """Count it; report the first."""
+        """Count a failure; report the first."""
         if not self._failed:
             self._news.add(why)
         self._failed[FAILED] += 1

@@ -1,7 +1,7 @@
-"""A local detector that takes over while the remote one is late. Shell.
+"""A local detector that steers while the remote detector is late. Shell.
 
-While the local one drives, the remote is requested beside it, and drives again after ten good answers in a row. Each
-robot for itself: one whose frames are not answered changes nothing for the others.
+While the local detector steers, the remote one still gets requests. After ten good answers in a row, the remote one
+steers again. This holds for each robot separately: a robot without answers changes nothing for the others.
 """
 
 from collections import OrderedDict
@@ -17,13 +17,13 @@ from sightline.vision_side.detect.port import DetectFrame, Detector
 from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, DeadlineDetector, Pending, Results
 
 GOOD_ANSWERS: Final = 10
-"""In a row; a third of a second at 30 fps."""
+"""Good answers in a row; a third of a second at 30 fps."""
 RESERVE_US: Final = 20_000
-"""Part of a deadline for the local detector, half of it at most: several times what it needs for one image."""
+"""Part of a deadline for the local detector, at most half: several times its computing time for one image."""
 
 
 class Fallback:
-    """A `Detector` over two."""
+    """A `Detector` with a first and a second detector."""
 
     def __init__(
         self, first: Detector, second: Detector, good_answers: int = GOOD_ANSWERS, max_pixels: int = MAX_PIXELS
@@ -34,9 +34,9 @@ class Fallback:
         self._news = Notices()
         self._good_answers = good_answers
         self._good: OrderedDict[str, int] = OrderedDict()
-        """For each robot that the second drives: good answers of the first in a row."""
+        """Robots that the second detector steers -> good answers of the first in a row."""
         self._beside: list[tuple[list[str], Pending]] = []
-        """Robots and their frames that the first looks at beside; each robot is in one at most."""
+        """Requests to the first detector for frames that the second answers: at most one per robot."""
 
     def detect(self, frames: Sequence[DetectFrame], deadline_us: int) -> Results:
         """See `Detector`."""
@@ -49,28 +49,28 @@ class Fallback:
         for frame, result in zip(frames, results, strict=True):
             if result is None and frame.robot not in self._good:
                 self._switch(frame.robot)
-        self._request_beside(others, first_us)  # an answer that would be late if it drove is late here, too
+        self._request_beside(others, first_us)  # with the deadline that holds while the first detector steers
         return self._filled(results, frames, deadline_us)
 
     def attach(self, link: Link) -> None:
-        """Give both a robot's link."""
+        """Pass a robot's link to both."""
         attach_detector(self._first, link)
         attach_detector(self._second, link)
 
     def close(self) -> None:
-        """Close both, also where one fails to."""
+        """Close both, even if one of them fails to close."""
         with ExitStack() as ending:
             ending.callback(close_detector, self._second)
             ending.callback(close_detector, self._first)
 
     def notices(self) -> list[str]:
-        """Return the lines of both, and which of them drives."""
+        """Return the lines of both, and each change between them."""
         return [*notices_of(self._first), *self._news.take(), *notices_of(self._second)]
 
     def _switch(self, robot: str) -> None:
-        """Let the second drive from now on."""
+        """Use the second detector from now on."""
         self._good[robot] = 0
-        if len(self._good) > MAX_ROBOTS:  # the robot that was switched first has the first detector again
+        if len(self._good) > MAX_ROBOTS:  # the robot that switched first uses the first detector again
             self._good.popitem(last=False)
         self._news.add(f"the first detector is late or silent for {robot}: the fallback drives on")
 
@@ -81,20 +81,20 @@ class Fallback:
         return [next(more) if result is None else result for result in results]
 
     def _request_beside(self, frames: Sequence[DetectFrame], deadline_us: int) -> None:
-        """Request from the first the frames that the second answers, of robots without a request in flight."""
+        """Request frames also from the first detector, for robots of the second without a request in flight."""
         in_flight = {robot for robots, _ in self._beside for robot in robots}
         new = [one for one in frames if one.robot not in in_flight]
         if new:
             self._beside.append(([one.robot for one in new], self._first.request(new, deadline_us)))
 
     def _count_beside(self) -> None:
-        """Count the answers of the first beside the second: those that came, and those that did not."""
+        """Count good and missing answers of the first detector, for robots of the second."""
         waiting = []
         for robots, pending in self._beside:
             results = pending.take(wait=False)
             if results is None and not pending.over:
                 waiting.append((robots, pending))
-            elif results is not None or pending.begun:  # frames that were never looked at are not its failure
+            elif results is not None or pending.begun:  # frames that it did not begin are not its failure
                 self._count(robots, results or [])
         self._beside = waiting
 

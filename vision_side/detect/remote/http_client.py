@@ -1,7 +1,7 @@
 """HTTP/1.1 with one deadline for the whole exchange, and the detector `http+jpeg`. Shell.
 
-Nothing is unpacked, nothing is followed: a redirect, a compressed body and a body over the limit are rejected. The
-standard library's own client waits again for every byte that drips in; here one deadline holds for the whole exchange.
+A redirect, a compressed body and a body over the limit are rejected. The standard library's client waits again for each
+received byte. Here one deadline limits the whole exchange.
 """
 
 import http.client
@@ -37,43 +37,44 @@ from sightline.vision_side.detect.remote.client import (
 from sightline.vision_side.detect.remote.deadline import MAX_PIXELS, DeadlineDetector, PixelBound
 
 MAX_ANSWER_BYTES: Final = 1 << 20
-"""Security limit: 1024 rows of boxes as JSON are a tenth of it."""
+"""Security limit: 1024 rows of boxes as JSON need a tenth of it."""
 _MAX_TAKEN_BYTES: Final = 2 * MAX_ANSWER_BYTES
-"""Security limit: with headers and what parts an answer into chunks; the client believes in chunks of any size."""
+"""Security limit, with headers and the framing of chunks: http.client accepts chunks of any size."""
 RETRY_US: Final = 200_000
-"""A server that could not be reached is tried again this much later: often enough to be back well within a second."""
+"""Pause after a failed connection. The detector is back well within a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class HttpReply:
-    """A status of 200 with these headers (names in lower case) and this body."""
+    """A reply with status 200: headers (names in lower case) and body."""
 
     headers: Mapping[str, str]
     body: bytes
 
 
 class HttpExchange:
-    """One server. Not for several threads."""
+    """HTTP connection to one server. Not thread-safe."""
 
     def __init__(self, host: str, port: int) -> None:
         self._host, self._port = host, port
         self._socket: socket.socket | None = None
         self._not_before_us = 0
         self._reached: Any = None
-        """The address of the host that was reached last."""
+        """The last address of the host that accepted a connection."""
         self.lost = 0
-        """Open connections that turned out to be over: the server behind the next may be another."""
+        """Number of connections that the server closed. The next one may reach another server."""
 
     def get(self, path: str, until_us: int) -> HttpReply:
-        """Raises NoAnswerError as `post` does."""
+        """Send a GET. Raises NoAnswerError as `post` does."""
         return self._exchange("GET", self._head("GET", path, {}, 0), b"", until_us)
 
     def post(self, path: str, headers: Mapping[str, str], body: bytes, until_us: int) -> HttpReply:
-        """Raises NoAnswerError: LATE, UNREACHABLE, REJECTED (any status but 200), TOO_LARGE, ENCODED, MALFORMED."""
+        """Send a POST. Raises NoAnswerError: LATE, UNREACHABLE, REJECTED (status not 200), TOO_LARGE, ENCODED,
+        MALFORMED."""
         return self._exchange("POST", self._head("POST", path, headers, len(body)), body, until_us)
 
     def close(self) -> None:
-        """Close the connection; the next exchange opens another."""
+        """Close the connection; the next exchange opens a new one."""
         if self._socket is not None:
             with suppress(OSError):
                 self._socket.close()
@@ -86,7 +87,7 @@ class HttpExchange:
         return ("\r\n".join(lines) + "\r\n\r\n").encode("ascii")
 
     def _exchange(self, method: str, head: bytes, body: bytes, until_us: int) -> HttpReply:
-        """Use the open connection; once more a new one if the server had closed that meanwhile."""
+        """Use the open connection. If the server has closed it meanwhile, try once with a new one."""
         kept = self._is_kept()
         try:
             return self._once(method, head, body, until_us)
@@ -117,7 +118,7 @@ class HttpExchange:
             raise NoAnswerError(NoAnswerReason.MALFORMED, f"not HTTP: {type(error).__name__}: {error}") from None
 
     def _is_kept(self) -> bool:
-        """Check that the last connection can be used again. Bytes that wait on it answer no later request."""
+        """Return True if the last connection can be used again. Unread bytes on it do not answer a later request."""
         if self._socket is None:
             return False
         self._socket.setblocking(False)
@@ -140,7 +141,7 @@ class HttpExchange:
         return connection
 
     def _reach(self, until_us: int) -> socket.socket:
-        """Connect to one of the host's addresses. Each remaining address gets its share of the time."""
+        """Connect to one of the host's addresses. The remaining time is divided among the remaining addresses."""
         found = socket.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
         found.sort(key=lambda one: one[4] != self._reached)
         for number, one in enumerate(found):
@@ -201,7 +202,7 @@ def _connected(found: Any, timeout_s: float) -> socket.socket:
 
 
 class _Timed(io.RawIOBase):
-    """A response's source: each read waits no longer than is left for the whole, and all have one limit."""
+    """Input of a response: each read has the remaining time of the exchange, and all reads share one byte limit."""
 
     def __init__(self, connection: socket.socket, until_us: int) -> None:
         self._connection, self._until_us = connection, until_us
@@ -224,18 +225,18 @@ class _Timed(io.RawIOBase):
 
 
 def _left_s(until_us: int) -> float:
-    """Raises TimeoutError when nothing is left: a timeout of 0 would mean something else to a socket."""
+    """Return the remaining time. Raises TimeoutError at 0, because a socket timeout of 0 means non-blocking."""
     left = seconds_left(until_us)
     if left <= 0:
         raise TimeoutError
     return left
 
 
-# `http+jpeg://HOST/PATH`: POST a JPEG, JSON back. For Ray Serve, BentoML, FastAPI and whatever serves HTTP. Shell.
+# `http+jpeg://HOST/PATH`: POST a JPEG, JSON back. For Ray Serve, BentoML, FastAPI and any other HTTP server. Shell.
 #
-# The answer is what the wire's channel `detections` carries: `{"width_px", "height_px", "boxes": [{"label", "score",
-# "x1_px", "y1_px", "x2_px", "y2_px"}]}`, and may add `model_hash`, and `session` and `seq` of the frame, which came as
-# headers.
+# The answer has the form of the channel `detections`: `{"width_px", "height_px", "boxes": [{"label", "score",
+# "x1_px", "y1_px", "x2_px", "y2_px"}]}`. It may add `model_hash`, and the `session` and `seq` of the frame from the
+# request headers.
 
 
 SESSION, SEQ = "X-Sightline-Session", "X-Sightline-Seq"
@@ -251,7 +252,7 @@ class JpegAnswer(Detections):
 
 
 class JpegServer:
-    """A `Server`."""
+    """A `DetectorServer` over HTTP."""
 
     def __init__(self, address: Address, min_score: float) -> None:
         self._http = HttpExchange(address.host, address.port)
@@ -259,7 +260,7 @@ class JpegServer:
         self._name = f"{address.scheme}:{address.path}"[:64]
 
     def request(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
-        """See `Server`."""
+        """See `DetectorServer`."""
         named = {"Content-Type": "image/jpeg", SESSION: frame.header.session, SEQ: str(frame.header.seq)}
         body = self._http.post(self._path, named, frame.jpeg, until_us).body
         answer = read_jpeg_answer(body, frame)
@@ -277,14 +278,14 @@ class HttpJpeg(DeadlineDetector):
     """The detector `http+jpeg://HOST[:PORT]/PATH`."""
 
     class Config(Settings):
-        """The address, and which boxes count."""
+        """The address, and the least score of boxes."""
 
         address: str
         min_score: Fraction = MIN_SCORE
         max_pixels: PixelBound = MAX_PIXELS
 
     def __init__(self, config: Config) -> None:
-        """Raises ConfigError for an invalid address. Nothing is connected before the first frame."""
+        """Raises ConfigError for an invalid address. The first frame opens the connection."""
         address = parse_address(config.address)
         server = JpegServer(address, config.min_score)
         super().__init__(ServerDetector(config.address, server), config.max_pixels)

@@ -1,8 +1,8 @@
 """The Open Inference Protocol v2: models, tensors, configuration. Pure.
 
 Specification: https://github.com/kserve/open-inference-protocol (JSON over HTTP), with Triton's binary tensors. A
-model that can be used here takes one input, a JPEG (datatype BYTES) or its pixels (UINT8, three channels), and gives
-`boxes` (K, 4) xyxy in pixels of what it was given, `scores` (K) and, if it knows several things, `labels` (K).
+supported model takes one input, a JPEG (datatype BYTES) or its pixels (UINT8, three channels). It gives `boxes` (K, 4)
+xyxy in pixels of its input, `scores` (K) and, if it has several classes, `labels` (K).
 """
 
 import math
@@ -25,12 +25,12 @@ NUMBERS: Final = {"FP16": "<f2", "FP32": "<f4", "FP64": "<f8", "UINT8": "u1", "I
                   "UINT16": "<u2", "INT32": "<i4", "UINT32": "<u4", "INT64": "<i8", "UINT64": "<u8", "BOOL": "?"}
 MAX_DIMENSIONS: Final = 6
 MAX_ELEMENTS: Final = 1 << 20
-"""Security limit: of one tensor; the answer as a whole is bounded in bytes before it is read."""
+"""Security limit of one tensor. The answer as a whole has a limit in bytes."""
 MAX_TENSORS: Final = 16
 BOXES, SCORES, LABELS = "boxes", "scores", "labels"
 _CHANNELS: Final = 3
 _MAX_SIDE: Final = 8192
-_MAX_LABEL_NUMBER: Final = 1 << 31  # of labels written as floats
+_MAX_LABEL_NUMBER: Final = 1 << 31  # for label numbers that are floats
 
 
 class OipSettings(Settings):
@@ -38,16 +38,16 @@ class OipSettings(Settings):
 
     address: str
     labels: Annotated[tuple[Label, ...], Field(max_length=1024)] = ()
-    """Names of labels that the model gives as numbers, from 0 on."""
+    """Names of the label numbers of the model, from 0."""
     min_score: Fraction = MIN_SCORE
     order: Literal["bgr", "rgb"] = "bgr"
-    """Order of the colors, where the model takes pixels."""
+    """Channel order of the input, for a model that takes pixels."""
     max_pixels: PixelBound = MAX_PIXELS
 
 
 @dataclass(frozen=True, slots=True)
 class TensorSlot:
-    """One input or output in a model's metadata: -1 is any size."""
+    """One input or output in a model's metadata; -1 is an open dimension."""
 
     name: str
     datatype: str
@@ -64,9 +64,9 @@ class OipModel:
     outputs: tuple[str, ...]
 
     def title(self, scheme: str, answered: str) -> str:
-        """Return the detector's name in results, with the version: servers give no hash.
+        """Return the detector's name in results. It contains the version, because servers give no hash.
 
-        The answer's version counts, for a server takes new versions while it runs; else that of the metadata.
+        The version of the answer is used if there is one, because a server may change the version while it runs.
         """
         version = answered or self.version
         return f"{scheme}:{self.name[:40]}" + (f" {version[:8]}" if version else "")
@@ -93,7 +93,7 @@ class Inferred:
 
     tensors: Mapping[str, NDArray[Any] | list[str]]
     version: str = ""
-    """Version of the model that answered; empty where the server does not give one."""
+    """Version of the model that answered; empty if the server gives none."""
 
 
 def model_of(name: str, version: str, inputs: Sequence[TensorSlot], outputs: Sequence[TensorSlot]) -> OipModel:
@@ -119,7 +119,7 @@ def _unfit(name: str, why: str) -> NoAnswerError:
 
 
 def _layout(shape: tuple[int, ...]) -> tuple[int, int, bool] | None:
-    """(rows, columns, channels first) of one image; None if nothing of it is three channels."""
+    """Return (rows, columns, channels first) of one image, or None without three channels."""
     last = shape[-3:]
     if last[2] == _CHANNELS:
         return last[0], last[1], False
@@ -127,9 +127,9 @@ def _layout(shape: tuple[int, ...]) -> tuple[int, int, bool] | None:
 
 
 def tensor_of(model: OipModel, frame: DetectFrame, rgb: bool) -> tuple[OipTensor, tuple[float, float]]:
-    """Return the input for `frame`, and what turns the answer's pixels into those of the encoded image.
+    """Return the input for `frame`, and the factors from pixels of the answer to pixels of the encoded image.
 
-    Raises WireError where the model takes pixels and the JPEG has none.
+    Raises WireError if the model takes pixels and the JPEG does not decode.
     """
     one = model.input
     if model.takes_jpeg:
@@ -144,7 +144,7 @@ def tensor_of(model: OipModel, frame: DetectFrame, rgb: bool) -> tuple[OipTensor
 
 
 def _fitted(bgr: NDArray[np.uint8], shape: tuple[int, ...], rgb: bool) -> NDArray[Any]:
-    """Return the pixels at the model's size, if the model has a fixed size."""
+    """Return the pixels, scaled if the model has a fixed input size."""
     rows, columns, _ = _layout(shape) or (-1, -1, False)
     rows, columns = (rows if rows > 0 else bgr.shape[0]), (columns if columns > 0 else bgr.shape[1])
     if max(rows, columns) > _MAX_SIDE:
@@ -186,7 +186,7 @@ def read_text_tensor(shape: Sequence[int], data: bytes) -> list[str]:
 
 
 def elements_of(shape: Sequence[int]) -> int:
-    """Count the elements of a tensor of `shape`. Raises NoAnswerError for an invalid shape, or too many elements."""
+    """Count the elements of a tensor. Raises NoAnswerError for an invalid shape, or too many elements."""
     if len(shape) > MAX_DIMENSIONS or any(not 0 <= size <= MAX_ELEMENTS for size in shape):
         raise NoAnswerError(NoAnswerReason.MALFORMED, f"a tensor of shape {list(shape)[:MAX_DIMENSIONS]}")
     count = math.prod(shape)
@@ -198,7 +198,7 @@ def elements_of(shape: Sequence[int]) -> int:
 def detections_of(
     answer: Inferred, settings: OipSettings, stretch: tuple[float, float], size_px: tuple[int, int]
 ) -> tuple[Detection, ...]:
-    """Read an answer's tensors. Raises NoAnswerError for a missing or misshapen one."""
+    """Read the tensors of an answer. Raises NoAnswerError for a missing tensor or a wrong shape."""
     outputs = answer.tensors
     boxes, scores = (_numbers(outputs, name) for name in (BOXES, SCORES))
     boxes = boxes.reshape(boxes.shape[-2:]) if boxes.ndim > 2 and math.prod(boxes.shape[:-2]) == 1 else boxes
@@ -216,19 +216,19 @@ def _numbers(outputs: Mapping[str, NDArray[Any] | list[str]], name: str) -> NDAr
 
 
 def _flat(column: NDArray[Any]) -> NDArray[Any]:
-    """(1, K) and (K, 1) as (K)."""
+    """Convert (1, K) and (K, 1) to (K)."""
     return column.reshape(-1) if column.ndim > 1 and sum(size != 1 for size in column.shape) < 2 else column
 
 
 def _labels(found: NDArray[Any] | list[str] | None, rows: int, names: tuple[str, ...]) -> list[str]:
-    """Texts as they are, numbers by their names; one that has no name is named by its number."""
+    """Return texts unchanged, and numbers by their names. A number without a name becomes its own text."""
     if found is None:
         return [names[0] if names else "target"] * rows
     if isinstance(found, list):
         return found
     numbers = _flat(found)
     if np.issubdtype(numbers.dtype, np.floating) and (np.abs(numbers.astype(np.float64)) < _MAX_LABEL_NUMBER).all():
-        whole = numbers.astype(np.int64)  # many exported models give their classes as floats
+        whole = numbers.astype(np.int64)  # many exported models give class numbers as floats
         numbers = whole if np.array_equal(whole, numbers) else numbers
     if numbers.ndim != 1 or not np.issubdtype(numbers.dtype, np.integer):
         raise NoAnswerError(

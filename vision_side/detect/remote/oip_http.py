@@ -38,13 +38,13 @@ from sightline.vision_side.detect.remote.oip import (
 )
 
 HEADER_LENGTH: Final = "Inference-Header-Content-Length"
-"""Header with the number of bytes of a body that are JSON; tensors follow."""
+"""Header with the number of JSON bytes in a body; binary tensors follow them."""
 _Name = Annotated[str, Field(max_length=256)]
 _Shape = Annotated[tuple[int, ...], Field(max_length=MAX_DIMENSIONS)]
 
 
 class _FromServer(BaseModel):
-    """A part of an answer; fields unknown here are ignored."""
+    """A part of an answer; unknown fields are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -90,7 +90,8 @@ def read_metadata(body: bytes) -> OipModel:
 
 
 def infer_body(model: OipModel, tensor: OipTensor, number: str) -> tuple[int, bytes]:
-    """The body of `POST v2/models/NAME/infer`, and how much of it is JSON; `number` comes back as the answer's id."""
+    """Return the body of `POST v2/models/NAME/infer`, and its number of JSON bytes. The answer repeats the id `number`.
+    """
     head = json.dumps({
         "id": number,
         "inputs": [{"name": tensor.name, "shape": tensor.shape, "datatype": tensor.datatype,
@@ -101,7 +102,7 @@ def infer_body(model: OipModel, tensor: OipTensor, number: str) -> tuple[int, by
 
 
 def read_infer(body: bytes, json_length: str | None, number: str) -> Inferred:
-    """Read an answer. Raises NoAnswerError, also if it is the answer to something else."""
+    """Parse an answer. Raises NoAnswerError, also for the answer to another request."""
     length = _json_length(json_length, len(body))
     answer = _validated(_Answer, body[:length])
     if answer.id not in (None, "", number):
@@ -134,7 +135,7 @@ def _from_bytes(one: _Output, data: bytes) -> NDArray[Any] | list[str]:
 
 
 def _from_list(one: _Output) -> NDArray[Any] | list[str]:
-    """Servers without the extension write numbers as JSON, flat or nested."""
+    """Read a tensor from JSON, flat or nested, of a server without the binary extension."""
     try:
         values = np.asarray(one.data, dtype=object if one.datatype == "BYTES" else NUMBERS[one.datatype]).reshape(-1)
     except (ValueError, TypeError, OverflowError, KeyError) as error:
@@ -155,8 +156,8 @@ def _validated(model: type[FromServer], data: bytes) -> FromServer:
 
 
 class HttpServer:
-    """A `Server`. The model's metadata are requested once, and again after every error but lateness and every
-    connection that the server ended."""
+    """A `DetectorServer` for OIP. It requests the model's metadata once, and again after each error except LATE and
+    after each connection that the server closed."""
 
     def __init__(self, address: Address, settings: OipSettings) -> None:
         self._http = HttpExchange(address.host, address.port)
@@ -166,14 +167,14 @@ class HttpServer:
         self._scheme = address.scheme
         self._model: OipModel | None = None
         self._lost_before = 0
-        """Connections that were lost when the metadata were requested."""
+        """Lost connections at the time of the metadata request."""
 
     def request(self, frame: DetectFrame, until_us: int) -> ServerAnswer:
-        """See `Server`."""
+        """See `DetectorServer`."""
         try:
             return self._answer(frame, until_us)
         except NoAnswerError as error:
-            if error.reason is not NoAnswerReason.LATE:  # metadata again would make the next answer later still
+            if error.reason is not NoAnswerReason.LATE:  # a metadata request would delay the next answer even more
                 self._model = None
             raise
 
@@ -204,6 +205,6 @@ class OipHttp(DeadlineDetector):
     Config = OipSettings
 
     def __init__(self, config: OipSettings) -> None:
-        """Raises ConfigError for an invalid address. Nothing is connected before the first frame."""
+        """Raises ConfigError for an invalid address. The first frame opens the connection."""
         server = HttpServer(parse_address(config.address), config)
         super().__init__(ServerDetector(config.address, server), config.max_pixels)

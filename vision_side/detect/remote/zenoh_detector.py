@@ -1,12 +1,12 @@
-"""`zenoh`: a detector service on another machine that looks at the robot's own frames. Shell.
+"""`zenoh`: a detector service on another machine that receives the robot's own frames. Shell.
 
     sightline detector --serve onnx:ball.onnx --connect tcp/192.168.1.20:7447
     sightline vision --detector zenoh --connect tcp/192.168.1.20:7447
 
-Nothing is sent: robot and service find each other. This end waits, until the deadline, for boxes that cite the frame.
+This side sends nothing: robot and service find each other. It waits, until the deadline, for boxes that cite the frame.
 
-Of several services this end prefers the one whose boxes it used last. Boxes of another service with the same model take
-their place when those of the preferred one do not come: it ended, or services that share robots have moved this one.
+Of several services this side prefers the service of the last used boxes. Boxes of another service with the same model
+replace missing ones, because the preferred service may have ended or passed this robot to another service.
 """
 
 from dataclasses import dataclass
@@ -33,40 +33,40 @@ from sightline.vision_side.detect.remote.client import (
 )
 
 ROLE: Final = "detector"
-"""The source under which a detector service publishes."""
+"""The source name of a detector service."""
 _NEWER_US: Final = 1_000_000
-"""Boxes of a frame that is newer than the requested one by up to this are kept for it. A frame that claims to be from
-later may never come, and one such message would stand in the way of all others."""
+"""Boxes of a frame that is newer than the request by up to this are stored for it. A frame from further in the future
+may never arrive, and one such message would block all others."""
 _SILENT_US: Final = 500_000
-"""A service that is silent for so long is gone; another one takes its place, also with another model."""
+"""After this silence the service is gone. Any other service replaces it, also with another model."""
 _FIRST_RIGHT: Final = 0.5
-"""Part of the time left that the preferred service has for its boxes, once those of another one have come."""
+"""Share of the remaining time for boxes of the preferred service, after those of another service have arrived."""
 _MANY: Final = 10
-"""Boxes of a second service, after which it is reported. Where a robot moves, two services answer for a moment."""
+"""Boxes of a second service before it is reported. While a robot changes services, both answer for a moment."""
 
 
 class _RobotDetections:
-    """The newest boxes of one robot's frames, first those of the preferred service.
+    """The newest boxes of one robot's frames, with a preferred service.
 
-    What two models call a thing, or two trackers its number, is nothing to each other. So boxes of another service
-    count only with the same model, when those of the preferred one are missing, or after a longer silence.
+    Labels of two models, and ids of two trackers, are not comparable. So boxes of another service count only with the
+    same model, when the boxes of the preferred service are missing, or after a longer silence.
     """
 
     def __init__(self, link: Link, source: str) -> None:
         self._source = source
         self._slot: LatestSlot[tuple[str, Message]] = LatestSlot()
         self._has_preferred = False
-        """True while boxes of the preferred service wait in the slot."""
+        """True while boxes of the preferred service are in the slot."""
         self._session, self._received_us = "", 0
         self._maker: tuple[str, str] = ("", "")
         self.missed = False
         """True if the preferred service did not answer the last request."""
         self.others = 0
-        """Boxes of other services than the preferred one."""
+        """Number of boxes of other services than the preferred one."""
         self.kept: Message | None = None
-        """Boxes of a frame that was not requested yet."""
+        """Boxes of a frame that is not requested yet."""
         self.reported = False
-        """True once it was reported that there are several services."""
+        """True after the report of several services."""
         link.subscribe(DETECTIONS, self._put)
 
     def take(self, wait_s: float) -> tuple[Message, bool] | None:
@@ -83,7 +83,7 @@ class _RobotDetections:
         return (taken[1], self._is_other(taken[0])) if taken else None
 
     def prefer(self, session: str, result: DetectionResult) -> None:
-        """Prefer a service whose boxes were valid: only such exclude others."""
+        """Prefer a service after valid boxes. Invalid boxes must not exclude other services."""
         if session != self._session:
             self.others = 0
         self._session, self._received_us = session, monotonic_us()
@@ -94,7 +94,7 @@ class _RobotDetections:
         return _model_of(result) == self._maker or monotonic_us() - self._received_us > _SILENT_US
 
     def _put(self, item: Message) -> None:
-        """Drop the boxes of other sources. Boxes that cannot be read pass: `detect` counts them."""
+        """Drop boxes of other sources. Unreadable boxes pass, because `detect` counts them."""
         if item.source != self._source:
             return
         session = _session_of(item)
@@ -111,7 +111,7 @@ class _RobotDetections:
 
 
 def _session_of(message: Message) -> str:
-    """Return the service that sent the boxes, or "" if they cannot be read."""
+    """Return the session of the service that sent the boxes, or "" if they cannot be read."""
     try:
         return decode(DetectionsHeader, message.header).session
     except WireError:
@@ -123,13 +123,13 @@ def _model_of(result: DetectionResult) -> tuple[str, str]:
 
 
 class ZenohDetector(FrameByFrame):
-    """The detector `zenoh`: waits for one source's boxes on the links that vision has to its robots."""
+    """The detector `zenoh`: waits for boxes of one source on the links from vision to its robots."""
 
     waits: ClassVar[bool] = True
     only_receives: ClassVar[bool] = True
 
     class Config(Settings):
-        """The source of the boxes, and which of them count."""
+        """The source of the boxes, and their least score."""
 
         source: Source = ROLE
         min_score: Fraction = MIN_SCORE
@@ -140,7 +140,7 @@ class ZenohDetector(FrameByFrame):
         self._received: dict[str, _RobotDetections] = {}
 
     def attach(self, link: Link) -> None:
-        """Receive the boxes of its robot's frames."""
+        """Receive the boxes of a robot's frames."""
         self._received[link.robot] = _RobotDetections(link, self._config.source)
 
     def _request(self, frame: DetectFrame, deadline_us: int) -> DetectionResult:
@@ -177,13 +177,13 @@ class ZenohDetector(FrameByFrame):
     def _read(self, message: Message, frame: DetectFrame, is_other: bool) -> "_Answer | None":
         """Return the boxes; None for those of another frame.
 
-        Raises NoAnswerError for invalid boxes of the preferred service. All others are only counted: they must not end
-        the wait for valid ones.
+        Raises NoAnswerError for invalid boxes of the preferred service. Other invalid boxes are only counted, because
+        the wait for valid boxes must continue.
         """
         cited = False
         try:
             header, ahead = _cites(message, frame)
-            if ahead < 0:  # counted as late when that frame was requested
+            if ahead < 0:  # already counted as late for that frame
                 return None
             cited = True
             return _Answer(message, header.session, ahead > 0, _result(message, header, frame, self._config.min_score))
@@ -222,8 +222,8 @@ def _used(received: _RobotDetections, answer: _Answer) -> DetectionResult:
 
 
 def _cites(message: Message, frame: DetectFrame) -> tuple[DetectionsHeader, int]:
-    """The header of boxes of `frame`, or of one so many frames after it, or before it if negative. Raises NoAnswerError
-    for those of any other."""
+    """Return the header of the boxes, and how many frames after `frame` their frame is; negative: before. Raises
+    NoAnswerError for an unrelated frame."""
     try:
         header = decode(DetectionsHeader, message.header)
     except WireError as error:
